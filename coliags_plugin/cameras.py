@@ -1,0 +1,101 @@
+"""The pinhole camera every field and renderer works with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A posed pinhole camera, OpenCV axes: x right, y down, z forward.
+
+    Pixel centres lie at integers + 0.5, so pixel (column i, row j) sees image point (i + 0.5, j + 0.5). A calibration
+    whose pixel centres are integers (OpenCV, C3VD) has 0.5 added to its principal point by the loader.
+
+    Attributes:
+        fx, fy: Focal lengths, pixels.
+        cx, cy: Principal point, pixels, centres at integers + 0.5. Need not be the image centre.
+        width, height: Image size, pixels.
+        camera_to_world: Rigid transform. Scene units (mm for C3VD). [4, 4]
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    camera_to_world: Float[Tensor, "4 4"]
+
+    @property
+    def center(self) -> Float[Tensor, "3"]:
+        """Optical centre in the world. [3]"""
+        return self.camera_to_world[:3, 3]
+
+    @property
+    def optical_axis(self) -> Float[Tensor, "3"]:
+        """Unit viewing direction in the world. [3]"""
+        axis = self.camera_to_world[:3, 2]
+        return axis / axis.norm()
+
+    @property
+    def world_to_camera(self) -> Float[Tensor, "4 4"]:
+        """Inverse of :attr:`camera_to_world`, using that it is rigid. [4, 4]"""
+        rotation = self.camera_to_world[:3, :3].T
+        inverse = torch.eye(4, dtype=rotation.dtype, device=rotation.device)
+        inverse[:3, :3] = rotation
+        inverse[:3, 3] = -rotation @ self.center
+        return inverse
+
+    @property
+    def intrinsics(self) -> Float[Tensor, "3 3"]:
+        """K for pixel centres at integers + 0.5. [3, 3]"""
+        matrix = [[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]]
+        return torch.tensor(matrix, dtype=self.camera_to_world.dtype, device=self.camera_to_world.device)
+
+    def rays(self) -> Float[Tensor, "H W 3"]:
+        """World directions through the pixel centres, scaled so that z-depth 1 is one direction long.
+
+        A point at z-depth ``z`` is ``center + z * rays()``. [H, W, 3]
+        """
+        options = {"dtype": self.camera_to_world.dtype, "device": self.camera_to_world.device}
+        x = (torch.arange(self.width, **options) + 0.5 - self.cx) / self.fx
+        y = (torch.arange(self.height, **options) + 0.5 - self.cy) / self.fy
+        directions = torch.stack(
+            [x.expand(self.height, -1), y[:, None].expand(-1, self.width), torch.ones_like(x).expand(self.height, -1)],
+            dim=-1,
+        )
+        return directions @ self.camera_to_world[:3, :3].T
+
+    def project(self, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N 2"], Float[Tensor, "N"]]:
+        """Project world points.
+
+        Args:
+            points: World positions. [N, 3]
+
+        Returns:
+            Pixel positions (column, row) and z-depths. Points at or behind the camera plane project nowhere useful:
+            look at the depth first. [N, 2], [N]
+        """
+        local = (points - self.center) @ self.camera_to_world[:3, :3]
+        x, y, z = local.unbind(-1)
+        return torch.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], dim=-1), z
+
+    def unproject(self, depth: Float[Tensor, "H W"]) -> Float[Tensor, "H W 3"]:
+        """World position of every pixel at its z-depth (NaN where the depth is NaN). [H, W, 3]"""
+        return self.center + depth[..., None] * self.rays()
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Camera:
+        """The same camera with its pose on another device or of another dtype."""
+        return replace(self, camera_to_world=self.camera_to_world.to(device=device, dtype=dtype))
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same view sampled at another size; the image's edges stay where they are."""
+        x, y = width / self.width, height / self.height
+        return replace(
+            self, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y, width=width, height=height
+        )

@@ -1,0 +1,42 @@
+"""The one kind of error a user is meant to see."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+class InputError(Exception):
+    """Something the user gave cannot be used.
+
+    The command line prints it without a traceback and exits with status 2.
+
+    Args:
+        seen: What was found, naming the file, key or value.
+        expected: What would have been right.
+        do: The next thing to try.
+    """
+
+    def __init__(self, seen: str, expected: str = "", do: str = "") -> None:
+        self.seen = seen
+        self.expected = expected
+        self.do = do
+        parts = [seen.rstrip(".")]
+        if expected:
+            parts.append(f"Expected {expected.rstrip('.')}")
+        if do:
+            parts.append(do.rstrip("."))
+        super().__init__(". ".join(parts) + ".")
+
+
+class UnavailableError(Exception):
+    """A quantity cannot be had here (missing weights, missing truth); the text is the reason.
+
+    Not a fault: whoever asked records the reason beside a null.
+    """
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """The nearest known words as a hint, or an empty string."""
+    near = get_close_matches(word, list(known), n=1, cutoff=0.5)
+    return f"Did you mean '{near[0]}'?" if near else ""
