@@ -96,6 +96,4 @@ class Camera:
     def resized(self, width: int, height: int) -> Camera:
         """The same view sampled at another size; the image's edges stay where they are."""
         x, y = width / self.width, height / self.height
-        return replace(
-            self, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y, width=width, height=height
-        )
+        return replace(self, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y, width=width, height=height)

@@ -15,7 +15,7 @@ from typing_extensions import Self
 
 from coliags_plugin.cameras import Camera
 from coliags_plugin.gaussians import Gaussians, RenderOutput
-from coliags_plugin.scenes import Frame, PointCloud, Scene
+from coliags_plugin.scenes import Frame, Scene
 from coliags_plugin.settings import Settings
 
 
@@ -45,8 +45,8 @@ class Field(nn.Module, ABC):
 
     @classmethod
     @abstractmethod
-    def from_points(cls, points: PointCloud, settings: Any, generator: torch.Generator) -> Self:
-        """A fresh field on initial points."""
+    def from_scene(cls, scene: Scene, settings: Any, generator: torch.Generator) -> Self:
+        """A fresh field on the scene's initial points."""
 
     @classmethod
     @abstractmethod
@@ -128,7 +128,7 @@ class Strategy(ABC):
         """Counters for the checkpoint."""
         return {}
 
-    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:  # noqa: B027 (stateless unless overridden)
         """Restore what :meth:`state_dict` gave."""
 
 
@@ -140,13 +140,13 @@ class Loss(ABC):
     def __init__(self, settings: Any) -> None:
         self.settings = settings
 
-    #: Outputs beyond rgb and alpha that the renderer must deliver.
-    @property
-    def wants(self) -> frozenset[str]:
-        return frozenset()
-
     #: Whether frames without depth make this term meaningless.
     needs_depth: ClassVar[bool] = False
+
+    @property
+    def wants(self) -> frozenset[str]:
+        """Outputs beyond rgb and alpha that the renderer must deliver."""
+        return frozenset()
 
     @abstractmethod
     def __call__(self, output: RenderOutput, frame: Frame) -> Float[Tensor, ""]:

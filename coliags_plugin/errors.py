@@ -1,4 +1,4 @@
-"""The one kind of error a user is meant to see."""
+"""The errors a user is meant to see."""
 
 from __future__ import annotations
 
@@ -6,16 +6,22 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 
 
-class InputError(Exception):
-    """Something the user gave cannot be used.
+class ReportedError(Exception):
+    """The command line prints it as one line, without a traceback, and exits with its status."""
 
-    The command line prints it without a traceback and exits with status 2.
+    exit_status = 1
+
+
+class InputError(ReportedError):
+    """Something the user gave cannot be used.
 
     Args:
         seen: What was found, naming the file, key or value.
         expected: What would have been right.
         do: The next thing to try.
     """
+
+    exit_status = 2
 
     def __init__(self, seen: str, expected: str = "", do: str = "") -> None:
         self.seen = seen
@@ -27,6 +33,16 @@ class InputError(Exception):
         if do:
             parts.append(do.rstrip("."))
         super().__init__(". ".join(parts) + ".")
+
+
+class InterruptedRunError(ReportedError):
+    """The user asked to stop, and what was done is saved."""
+
+    exit_status = 130
+
+
+class NotFiniteError(ReportedError):
+    """A loss became NaN or infinite."""
 
 
 class UnavailableError(Exception):

@@ -31,7 +31,8 @@ class Gaussians:
         scales: Standard deviations along the local axes; two for surfels. [N, 3] or [N, 2]
         opacities: In (0, 1]. [N]
         colors: RGB in [0, 1]. [N, 3]
-        source_index: Which slot of the field each Gaussian comes from (the anchor field: anchor * children + child). [N]
+        source_index: Which slot of the field each Gaussian comes from (the anchor field: anchor * children + child).
+            [N]
         visible_sources: Field elements evaluated for this view, those that yielded no Gaussian included
             (the anchor field: anchors in the frustum). [V]
     """

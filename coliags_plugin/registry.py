@@ -141,7 +141,13 @@ appearance_heads = Registry(
         "imia": "coliags_plugin.fields.appearance_heads:IMIAAppearanceHead",
     },
 )
-renderers = Registry("renderers", {"torch": "coliags_plugin.renderers.torch_renderer:TorchRenderer"})
+renderers = Registry(
+    "renderers",
+    {
+        "auto": "coliags_plugin.renderers.auto:AutoRenderer",
+        "torch": "coliags_plugin.renderers.torch_renderer:TorchRenderer",
+    },
+)
 strategies = Registry(
     "strategies",
     {

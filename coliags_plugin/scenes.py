@@ -77,7 +77,8 @@ class Scene:
     Attributes:
         name: Short name for folders and tables.
         train: Frames to train on, in video order.
-        test_sets: Held-out frames by set name; ``"test"`` is the split's own, others (``"rotation"``) come with the data.
+        test_sets: Held-out frames by set name; ``"test"`` is the split's own, others (``"rotation"``) come with
+            the data.
         points: Initial points.
         provenance: Where all this came from: dataset, layout, calibration, pose convention, split, fingerprints.
     """
@@ -93,3 +94,21 @@ class Scene:
         """1.1 times the largest distance of a training camera from their mean, scene units (methods.md 0.1)."""
         centers = torch.stack([frame.camera.center for frame in self.train])
         return 1.1 * float((centers - centers.mean(0)).norm(dim=1).max())
+
+    @property
+    def pixel_footprint(self) -> float:
+        """Median size of a training pixel on the surface, scene units: depth over focal length of the points in view.
+
+        Occlusion is not tested. Falls back to all points in front of the cameras where none is in view.
+        """
+        sizes, fallback = [], []
+        points = self.points.positions.double()
+        for frame in self.train[:: max(1, len(self.train) // 16)]:
+            camera = frame.camera
+            pixels, depth = camera.to(points.device, points.dtype).project(points)
+            size = depth / (camera.fx * camera.fy) ** 0.5
+            inside = ((pixels >= 0) & (pixels < pixels.new_tensor([camera.width, camera.height]))).all(dim=1)
+            sizes.append(size[(depth > 0) & inside])
+            fallback.append(size[depth > 0])
+        found = torch.cat(sizes)
+        return float((found if len(found) else torch.cat(fallback)).median())

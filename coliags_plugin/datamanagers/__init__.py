@@ -1,0 +1,1 @@
+"""Datasets on disk, each read into a scene."""

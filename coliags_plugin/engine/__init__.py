@@ -1,0 +1,1 @@
+"""Training, evaluation, checkpoints and reports: where the components meet."""

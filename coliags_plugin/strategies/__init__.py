@@ -1,0 +1,1 @@
+"""Strategies: growing, splitting and pruning between optimiser steps."""

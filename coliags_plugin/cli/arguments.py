@@ -1,0 +1,42 @@
+"""Arguments that several commands share, and how they are written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from coliags_plugin.errors import InputError
+
+#: ``--set key=value``, as often as needed.
+Assignments = Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="KEY=VALUE"), tyro.conf.UseAppendAction]
+
+OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH")]
+OptionalText = Annotated[str | None, tyro.conf.arg(metavar="TEXT")]
+OptionalInt = Annotated[int | None, tyro.conf.arg(metavar="INT")]
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """``WxH`` -> (width, height), pixels.
+
+    Raises:
+        InputError: It is something else.
+    """
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise InputError(f"--size {text}", "WIDTHxHEIGHT in pixels, for instance 338x270")
+    return int(width), int(height)
+
+
+def parse_vector(option: str, text: str) -> tuple[float, float, float]:
+    """``X,Y,Z`` -> three numbers.
+
+    Raises:
+        InputError: It is something else.
+    """
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise InputError(f"{option} {text}", "three numbers X,Y,Z") from error
+    return x, y, z

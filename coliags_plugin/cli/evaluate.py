@@ -1,0 +1,44 @@
+"""``coliags eval``: figures of a run's held-out views."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from coliags_plugin.cli.arguments import OptionalPath, OptionalText
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Take the figures of a run's held-out views under a protocol."""
+
+    path: tyro.conf.Positional[Path]
+    """Run folder."""
+    protocol: OptionalText = None
+    """Protocol by name (`coliags list protocols`); default: the method config's."""
+    data: OptionalPath = None
+    """The scene's folder, where it has moved since training."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to compute."""
+
+    def run(self) -> None:
+        """Evaluate, print a table, and say where the figures are."""
+        import json
+
+        from rich.console import Console
+
+        from coliags_plugin.engine.backends import choose_device
+        from coliags_plugin.engine.evaluator import evaluate
+        from coliags_plugin.engine.figures_table import figures_table
+        from coliags_plugin.engine.trained import load_trained
+
+        trained = load_trained(self.path, choose_device(self.device), self.data)
+        folder = evaluate(trained, self.protocol or trained.config.protocol)
+        summary = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+        Console().print(figures_table(summary))
+        for name, reason in summary["reasons"].items():
+            print(f"{name}: {reason}")
+        print(folder / "metrics.json")

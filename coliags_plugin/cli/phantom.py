@@ -1,0 +1,75 @@
+"""``coliags phantom``: write a synthetic colon."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+
+from coliags_plugin.cli.arguments import Assignments, OptionalText, parse_size, parse_vector
+
+
+@dataclass(frozen=True)
+class Phantom:
+    """Write a synthetic, physically lit colon with exact truth, in C3VD's own layouts."""
+
+    output: tyro.conf.Positional[Path]
+    """Folder to make."""
+    seed: int = 0
+    """The whole phantom follows from it."""
+    layout: Literal["c3vd", "c3vd-raw"] = "c3vd"
+    """Undistorted pinhole frames, or the release's own files through its omnidirectional lens."""
+    trajectory: Literal["pullback", "rotation"] = "pullback"
+    """Withdrawal along the lumen, or mostly turning on the spot."""
+    frames: int = 120
+    """Frames of the sequence; every 8th is a test frame."""
+    size: OptionalText = None
+    """Image size WxH, pixels. Default 338x270, or 1350x1080 for c3vd-raw."""
+    light: Literal["c3vd", "strong"] = "c3vd"
+    """Preset of light and motion: c3vd is the fair default, strong the stress case."""
+    gain: Literal["auto", "fixed"] | None = None
+    """Exposure; default: the preset's."""
+    light_offset: OptionalText = None
+    """Lamp position X,Y,Z in camera axes, mm; default: the preset's."""
+    polyps: int = 4
+    """Sessile polyps, 3 to 10 mm wide."""
+    rotation_views: int = 12
+    """Extra test views turned 15 to 30 degrees beyond the path."""
+    set: Assignments = ()
+    """Any other phantom setting, for instance roughness=0.4 (docs/data.md lists them)."""
+    overwrite: bool = False
+    """Replace the output folder where it exists."""
+
+    def run(self) -> None:
+        """Generate and say where."""
+        from coliags_plugin.datamanagers.phantom.generate import generate
+        from coliags_plugin.datamanagers.phantom.settings import phantom_settings
+        from coliags_plugin.engine.progress import progress_callback
+        from coliags_plugin.errors import InputError
+        from coliags_plugin.yaml_tree import parse_value
+
+        options: dict[str, Any] = {
+            "seed": self.seed,
+            "layout": self.layout,
+            "trajectory": self.trajectory,
+            "frames": self.frames,
+            "light": self.light,
+            "gain": self.gain,
+            "polyps": self.polyps,
+            "rotation_views": self.rotation_views,
+        }
+        if self.size is not None:
+            options["width"], options["height"] = parse_size(self.size)
+        if self.light_offset is not None:
+            options["light_offset"] = parse_vector("--light-offset", self.light_offset)
+        for assignment in self.set:
+            key, equals, value = assignment.partition("=")
+            if not equals:
+                raise InputError(f"--set {assignment}", "KEY=VALUE")
+            options[key] = parse_value(value)
+        settings = phantom_settings(options)
+        with progress_callback() as progress:
+            generate(settings, self.output, overwrite=self.overwrite, progress=progress)
+        print(self.output)

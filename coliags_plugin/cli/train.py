@@ -1,0 +1,77 @@
+"""``coliags train``: reconstruct a scene with a method."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from coliags_plugin.cli.arguments import Assignments, OptionalInt, OptionalPath, OptionalText
+
+
+@dataclass(frozen=True)
+class Train:
+    """Reconstruct a scene with a method and write a run folder."""
+
+    method: tyro.conf.Positional[str]
+    """Name of a method (`coliags list methods`) or path of a YAML file."""
+    data: Path
+    """The scene's folder."""
+    output: OptionalPath = None
+    """Run folder; default runs/SCENE/METHOD/STAMP."""
+    steps: OptionalInt = None
+    """Training steps; schedules are compressed to them."""
+    seed: int = 0
+    """Seed of every random stream."""
+    renderer: OptionalText = None
+    """Renderer by name (`coliags list renderers`); default: the method's."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to compute."""
+    set: Assignments = ()
+    """Change a value of the method config, for instance field.voxel_size=1.0."""
+    resume: bool = False
+    """Go on from the run's latest checkpoint (without --output: of the newest run of this method on this scene)."""
+    overwrite: bool = False
+    """Replace an existing run folder."""
+
+    def run(self) -> None:
+        """Train, and say where the run is."""
+        import logging
+
+        from coliags_plugin.config import load_method
+        from coliags_plugin.engine.backends import choose_device
+        from coliags_plugin.engine.run_folder import RunFolder
+        from coliags_plugin.engine.trained import load_scene
+        from coliags_plugin.engine.trainer import Trainer
+        from coliags_plugin.errors import InputError
+
+        if self.resume and self.overwrite:
+            raise InputError("--resume and --overwrite together", "one of them")
+        overrides = list(self.set)
+        if self.steps is not None:
+            overrides.append(f"schedule.steps={self.steps}")
+        if self.renderer is not None:
+            overrides.append(f"renderer.name={self.renderer}")
+        method = load_method(self.method, overrides)
+        device = choose_device(self.device)
+        short = method.name.rsplit("/", maxsplit=1)[-1]
+        scene_name = self.data.resolve().name
+        if self.output is not None:
+            run = RunFolder(self.output)
+        else:
+            run = RunFolder.newest(scene_name, short) if self.resume else RunFolder.default(scene_name, short)
+        if self.resume:
+            run = RunFolder.existing(run.path)
+        else:
+            run.check_free(self.overwrite)
+        scene = load_scene(method.config, self.data)
+        trainer = Trainer(method, scene, str(self.data.resolve()), run, self.seed, device)
+        logging.getLogger(__name__).info("renderer %s: %s", trainer.chosen.name, trainer.chosen.reason)
+        if self.resume:
+            trainer.resume()
+        else:
+            trainer.start(self.overwrite)
+        trainer.train()
+        print(run.path)

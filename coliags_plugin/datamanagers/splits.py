@@ -1,0 +1,35 @@
+"""Which frames are held out."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool
+
+Split = Literal["every-8th", "endogslam", "block", "all-train"]
+
+EVERY = 8
+
+
+def held_out(split: Split, count: int, block: tuple[float, float] = (0.4, 0.6)) -> Bool[np.ndarray, "N"]:
+    """Which of ``count`` frames, in video order, are test frames.
+
+    Args:
+        split: ``every-8th``: 0, 8, 16, ... (the paper, Gaussian Pancakes); ``endogslam``: 7, 15, 23, ... (EndoGSLAM,
+            PR-Endo; data_layouts.md 4); ``block``: one stretch of the video, which no training frame interrupts, so
+            that test views are not merely in-betweens; ``all-train``: none.
+        count: Number of frames.
+        block: Where the stretch begins and ends, as shares of the video.
+
+    Returns:
+        True for test frames. [N]
+    """
+    place = np.arange(count)
+    if split == "every-8th":
+        return np.asarray(place % EVERY == 0)
+    if split == "endogslam":
+        return np.asarray(place % EVERY == EVERY - 1)
+    if split == "block":
+        return np.asarray((place >= round(block[0] * count)) & (place < round(block[1] * count)))
+    return np.zeros(count, bool)

@@ -1,0 +1,122 @@
+"""Checkpoints: safetensors for tensors, JSON for the rest; written beside, then renamed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from coliags_plugin.contracts import Field, Strategy
+from coliags_plugin.engine.optimizers import Optimizers
+from coliags_plugin.engine.randomness import FrameOrder
+from coliags_plugin.errors import InputError
+from coliags_plugin.files import atomic_folder
+
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint as read.
+
+    Attributes:
+        step: Steps taken.
+        method: Name of the method it belongs to.
+        tensors: By ``<part>/<name>``, the parts being field, optimizer, strategy and generator.
+        queue: Frames left in the current round, the last being next.
+    """
+
+    step: int
+    method: str
+    tensors: Mapping[str, Tensor]
+    queue: list[int]
+
+    def part(self, name: str) -> dict[str, Tensor]:
+        """The tensors of one part."""
+        prefix = f"{name}/"
+        return {key[len(prefix) :]: value for key, value in self.tensors.items() if key.startswith(prefix)}
+
+
+def save_checkpoint(
+    folder: Path,
+    step: int,
+    method: str,
+    field: Field,
+    optimizers: Optimizers,
+    strategy: Strategy,
+    generators: Mapping[str, torch.Generator],
+    order: FrameOrder,
+) -> Path:
+    """Write ``step-<step>`` into ``folder``, so that training goes on from there to the bit.
+
+    Returns:
+        The checkpoint's folder.
+    """
+    tensors: dict[str, Tensor] = {f"field/{name}": value for name, value in field.state_dict().items()}
+    for group, adam in optimizers.adam.items():
+        for index, parameter in enumerate(adam.param_groups[0]["params"]):
+            for key, value in adam.state.get(parameter, {}).items():
+                tensors[f"optimizer/{group}/{index}/{key}"] = value
+    tensors |= {f"strategy/{name}": value for name, value in strategy.state_dict().items()}
+    tensors |= {f"generator/{name}": generator.get_state() for name, generator in generators.items()}
+    target = folder / f"step-{step:06d}"
+    state: dict[str, Any] = {"format": FORMAT, "step": step, "method": method, "frame_queue": order.queue}
+    with atomic_folder(target, overwrite=True) as scratch:
+        save_file({key: value.detach().contiguous() for key, value in tensors.items()}, scratch / "state.safetensors")
+        (scratch / "state.json").write_text(json.dumps(state, indent=2) + "\n", encoding="utf-8")
+    return target
+
+
+def latest_checkpoint(folder: Path) -> Path:
+    """The checkpoint of the highest step.
+
+    Raises:
+        InputError: There is none.
+    """
+    found = sorted(folder.glob("step-*/state.json"), key=lambda path: int(path.parent.name.split("-")[1]))
+    if not found:
+        raise InputError(f"no checkpoint in {folder}", "at least one step-* folder", "Train first: `coliags train`")
+    return found[-1].parent
+
+
+def read_checkpoint(path: Path, method: str, device: torch.device) -> Checkpoint:
+    """Read one checkpoint.
+
+    Raises:
+        InputError: It is damaged, of another format, or of another method.
+    """
+    try:
+        state = json.loads((path / "state.json").read_text(encoding="utf-8"))
+        tensors = load_file(path / "state.safetensors")
+        step, owner, queue, version = (state[key] for key in ("step", "method", "frame_queue", "format"))
+    except (OSError, ValueError, KeyError, SafetensorError) as error:
+        raise InputError(f"checkpoint {path} cannot be read: {error}", "an intact checkpoint") from error
+    if version != FORMAT:
+        raise InputError(f"checkpoint {path} has format {version}", f"format {FORMAT}", "Train again with this version")
+    if owner != method:
+        raise InputError(
+            f"checkpoint {path} is of method '{owner}'", f"one of method '{method}'", "Name its own method"
+        )
+    placed = {key: value if key.startswith("generator/") else value.to(device) for key, value in tensors.items()}
+    return Checkpoint(step, owner, placed, queue)
+
+
+def restore_optimizers(checkpoint: Checkpoint, optimizers: Optimizers) -> None:
+    """Put Adam's moments back."""
+    for key, value in checkpoint.part("optimizer").items():
+        group, index, name = key.split("/")
+        adam = optimizers.adam[group]
+        adam.state[adam.param_groups[0]["params"][int(index)]][name] = value
+
+
+def restore_generators(checkpoint: Checkpoint, generators: Mapping[str, torch.Generator]) -> None:
+    """Put the random streams back."""
+    for name, state in checkpoint.part("generator").items():
+        generators[name].set_state(state)

@@ -1,0 +1,172 @@
+"""Figures of a run's held-out views under one protocol."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from coliags_plugin import registry
+from coliags_plugin.components import make_component
+from coliags_plugin.contracts import Comparison, Metric, Protocol
+from coliags_plugin.engine.progress import ProgressReport
+from coliags_plugin.engine.provenance import software
+from coliags_plugin.engine.trained import TrainedRun
+from coliags_plugin.errors import InputError, UnavailableError
+from coliags_plugin.files import atomic_folder, atomic_write, write_json
+from coliags_plugin.outputs.figures import depth_error_picture
+from coliags_plugin.outputs.pictures import write_depth_tiff, write_png
+from coliags_plugin.scenes import Frame
+
+#: The main test set: its figures stand at the top of metrics.json.
+MAIN_SET = "test"
+#: Figures that are also taken over only what a training frame saw, where the data tell.
+SEEN_METRICS = ("psnr", "ssim", "depth_mse", "depth_median_error")
+SEEN_SUFFIX = "_seen"
+#: Full scale of the depth error pictures, mm.
+ERROR_LIMIT_MM = 2.0
+
+
+@dataclass
+class _Figures:
+    """Per-frame figures of one test set, and why some are missing."""
+
+    rows: dict[str, dict[str, float]] = field(default_factory=dict)
+    reasons: dict[str, str] = field(default_factory=dict)
+
+    def take(self, frame: str, name: str, metric: Metric, comparison: Comparison) -> None:
+        """Compute one figure of one frame, or note why it cannot be had."""
+        row = self.rows.setdefault(frame, {})
+        try:
+            row[name] = metric(comparison)
+        except UnavailableError as error:
+            self.reasons.setdefault(name, str(error))
+
+    def means(self, names: list[str]) -> dict[str, float | None]:
+        """Mean over the frames that have a figure; None where none has."""
+        found: dict[str, float | None] = {}
+        for name in names:
+            values = [row[name] for row in self.rows.values() if name in row]
+            found[name] = sum(values) / len(values) if values else None
+        return found
+
+
+def evaluate(trained: TrainedRun, protocol_name: str) -> Path:
+    """Render every held-out view, take the protocol's figures, and write them with the pictures.
+
+    Writes ``eval/<protocol>/metrics.json`` (means per test set; the main set's also at the top; null where a figure
+    cannot be had, with the reason), ``per_frame.csv`` and the pictures. A former evaluation under the same protocol is
+    replaced once the new one is whole.
+
+    Returns:
+        The evaluation's folder.
+
+    Raises:
+        InputError: The protocol is unknown or wants what the renderer cannot deliver, or there is no test frame.
+    """
+    protocol: Protocol = registry.protocols.get(protocol_name)()
+    wants = tuple(sorted({"rgb", "alpha"} | protocol.wants))
+    if not set(wants) <= trained.renderer.outputs:
+        raise InputError(f"protocol '{protocol_name}' wants {', '.join(wants)}", "a renderer that delivers them")
+    sets = {name: frames for name, frames in trained.scene.test_sets.items() if frames}
+    if not sets:
+        raise InputError(f"scene '{trained.scene.name}' has no test frames", "a split that holds some out")
+    metrics = {key: _metric(name, options) for key, (name, options) in protocol.metrics.items()}
+    total, done = sum(map(len, sets.values())), 0
+    target = trained.run.evaluation(protocol.name)
+    figures = {name: _Figures() for name in sets}
+    with atomic_folder(target, overwrite=True) as scratch, ProgressReport("evaluate", total) as progress:
+        for set_name, frames in sets.items():
+            for frame in frames:
+                comparison = _compare(trained, protocol, wants, frame)
+                _take_figures(figures[set_name], frame, metrics, comparison)
+                _write_pictures(scratch, set_name, frame, comparison)
+                done += 1
+                progress.update(done)
+        write_json(scratch / "metrics.json", _summary(trained, protocol, metrics, figures))
+        atomic_write(scratch / "per_frame.csv", _table(figures, _columns(metrics, figures)))
+    return target
+
+
+def _metric(name: str, options: Mapping[str, Any]) -> Metric:
+    component = make_component("metrics", {"name": name, **options})
+    metric: Metric = component.target(component.settings)
+    return metric
+
+
+@torch.no_grad()
+def _compare(trained: TrainedRun, protocol: Protocol, wants: tuple[str, ...], frame: Frame) -> Comparison:
+    placed = frame.to(trained.device)
+    return protocol.compare(trained.renderer.render(trained.field, placed.camera, wants), placed)
+
+
+def _take_figures(figures: _Figures, frame: Frame, metrics: Mapping[str, Metric], comparison: Comparison) -> None:
+    figures.rows.setdefault(frame.name, {})
+    for name, metric in metrics.items():
+        figures.take(frame.name, name, metric, comparison)
+    if frame.seen is None:
+        return
+    seen = frame.seen.to(comparison.valid.device)
+    depth_valid = None if comparison.depth_valid is None else comparison.depth_valid & seen
+    within = replace(comparison, valid=comparison.valid & seen, depth_valid=depth_valid)
+    for name in SEEN_METRICS:
+        if name in metrics:
+            figures.take(frame.name, name + SEEN_SUFFIX, metrics[name], within)
+
+
+def _write_pictures(folder: Path, set_name: str, frame: Frame, comparison: Comparison) -> None:
+    name = f"{set_name}/{frame.name}"
+    write_png(folder / "renders" / f"{name}.png", _eight_bit(comparison.rgb))
+    write_png(folder / "truth" / f"{name}.png", frame.image)
+    if comparison.depth is None or comparison.true_depth is None or comparison.depth_valid is None:
+        return
+    known = torch.where(comparison.depth_valid, comparison.true_depth, torch.nan)
+    write_depth_tiff(folder / "depth" / f"{name}.tiff", comparison.depth)
+    write_depth_tiff(folder / "true_depth" / f"{name}.tiff", known)
+    picture = depth_error_picture(comparison.depth, known, comparison.depth_valid, ERROR_LIMIT_MM)
+    write_png(folder / "errors" / f"{name}.png", picture)
+
+
+def _eight_bit(rgb: torch.Tensor) -> torch.Tensor:
+    return (rgb.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
+
+
+def _columns(metrics: Mapping[str, Metric], figures: Mapping[str, _Figures]) -> list[str]:
+    seen = {name for part in figures.values() for row in part.rows.values() for name in row if name not in metrics}
+    return [*metrics, *(name + SEEN_SUFFIX for name in SEEN_METRICS if name + SEEN_SUFFIX in seen)]
+
+
+def _summary(
+    trained: TrainedRun, protocol: Protocol, metrics: Mapping[str, Metric], figures: Mapping[str, _Figures]
+) -> dict[str, Any]:
+    columns = _columns(metrics, figures)
+    base = {name: name.removesuffix(SEEN_SUFFIX) for name in columns}
+    main = figures.get(MAIN_SET) or next(iter(figures.values()))
+    reasons = {name: text for part in [*figures.values()][::-1] for name, text in part.reasons.items()}
+    return {
+        "protocol": {"name": protocol.name, "version": protocol.version, "description": protocol.description},
+        "method": trained.method,
+        "scene": trained.scene.name,
+        "step": trained.step,
+        **main.means(list(metrics)),
+        "reasons": reasons,
+        "directions": {name: "higher" if metrics[base[name]].higher_is_better else "lower" for name in columns},
+        "units": {name: metrics[base[name]].unit for name in columns},
+        "sets": {name: {"frames": len(part.rows), **part.means(columns)} for name, part in figures.items()},
+        "software": software(),
+    }
+
+
+def _table(figures: Mapping[str, _Figures], columns: list[str]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["set", "frame", *columns])
+    for set_name, part in figures.items():
+        for frame, row in part.rows.items():
+            writer.writerow([set_name, frame, *(repr(row[name]) if name in row else "" for name in columns)])
+    return text.getvalue()

@@ -1,0 +1,103 @@
+"""Pictures and a video of a trained run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from coliags_plugin.engine.progress import ProgressReport
+from coliags_plugin.engine.trained import TrainedRun
+from coliags_plugin.errors import InputError
+from coliags_plugin.files import atomic_folder
+from coliags_plugin.gaussians import RenderOutput
+from coliags_plugin.outputs.figures import color_bar, depth_error_picture, depth_picture, rgb_error_picture
+from coliags_plugin.outputs.pictures import write_png
+from coliags_plugin.outputs.video import write_video
+from coliags_plugin.scenes import Frame
+
+#: Full scale of the depth error pictures, mm, and of the colour error pictures, parts of full scale.
+DEPTH_ERROR_LIMIT_MM = 2.0
+RGB_ERROR_LIMIT = 0.2
+
+
+def render_run(trained: TrainedRun, output: Path, frames: str, video: bool, fps: float, overwrite: bool) -> None:
+    """Write rgb, depth and error pictures of a set of frames, and a video along the whole trajectory.
+
+    Args:
+        trained: The run.
+        output: The folder to make.
+        frames: ``train``, ``all`` (train and test in video order), or the name of a test set.
+        video: Also write ``trajectory.mp4``: every frame's view in video order, rgb beside depth.
+        fps: Of the video.
+        overwrite: Replace ``output`` where it exists.
+
+    Raises:
+        InputError: No such frames, or the folder exists or cannot be written.
+    """
+    chosen = _choose(trained, frames)
+    path = _choose(trained, "all")
+    limits = _depth_limits(trained, chosen)
+    with (
+        atomic_folder(output, overwrite) as folder,
+        ProgressReport("render", len(chosen) + len(path) * video) as progress,
+    ):
+        for count, frame in enumerate(chosen, start=1):
+            _write_frame(folder, frame, _render(trained, frame), limits)
+            progress.update(count)
+        write_png(folder / "depth_scale.png", color_bar(limits, "mm", "depth"))
+        write_png(folder / "depth_error_scale.png", color_bar((0.0, DEPTH_ERROR_LIMIT_MM), "mm", "error"))
+        write_png(folder / "rgb_error_scale.png", color_bar((0.0, RGB_ERROR_LIMIT), "of full scale", "error"))
+        if video:
+            write_video(_film(trained, path, limits, progress, len(chosen)), folder / "trajectory.mp4", fps)
+
+
+def _choose(trained: TrainedRun, frames: str) -> list[Frame]:
+    scene = trained.scene
+    groups = {"train": scene.train, **scene.test_sets}
+    groups["all"] = sorted([*scene.train, *scene.test_sets.get("test", [])], key=lambda frame: frame.index)
+    if not groups.get(frames):
+        known = ", ".join(name for name, group in groups.items() if group)
+        raise InputError(f"scene '{scene.name}' has no frames called '{frames}'", f"one of {known}")
+    return groups[frames]
+
+
+@torch.no_grad()
+def _render(trained: TrainedRun, frame: Frame) -> RenderOutput:
+    camera = frame.camera.to(trained.device)
+    return trained.renderer.render(trained.field, camera, ("rgb", "alpha", "depth_accumulated"))
+
+
+def _depth_limits(trained: TrainedRun, frames: list[Frame]) -> tuple[float, float]:
+    """From 0 to the largest rendered depth in a few of the frames, rounded up to 10 mm."""
+    sample = frames[:: max(1, len(frames) // 4)][:4]
+    largest = max(float(_render(trained, frame)["depth_accumulated"].max()) for frame in sample)
+    return 0.0, max(10.0, 10.0 * float(np.ceil(largest / 10.0)))
+
+
+def _write_frame(folder: Path, frame: Frame, output: RenderOutput, limits: tuple[float, float]) -> None:
+    name = f"{frame.name}.png"
+    depth = output["depth_accumulated"]
+    write_png(folder / "rgb" / name, _eight_bit(output.rgb))
+    write_png(folder / "depth" / name, depth_picture(depth, limits))
+    valid = frame.valid.cpu()
+    write_png(folder / "rgb_error" / name, rgb_error_picture(output.rgb.cpu(), frame.image, valid, RGB_ERROR_LIMIT))
+    if frame.depth is not None:
+        picture = depth_error_picture(depth.cpu(), frame.depth, valid, DEPTH_ERROR_LIMIT_MM)
+        write_png(folder / "depth_error" / name, picture)
+
+
+def _film(
+    trained: TrainedRun, path: list[Frame], limits: tuple[float, float], progress: ProgressReport, done: int
+) -> Iterator[np.ndarray]:
+    for count, frame in enumerate(path, start=1):
+        output = _render(trained, frame)
+        rgb = _eight_bit(output.rgb).cpu().numpy()
+        yield np.concatenate([rgb, depth_picture(output["depth_accumulated"], limits)], axis=1)
+        progress.update(done + count)
+
+
+def _eight_bit(rgb: torch.Tensor) -> torch.Tensor:
+    return (rgb.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)

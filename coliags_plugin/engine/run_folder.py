@@ -1,0 +1,126 @@
+"""The folder a run lives in."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from coliags_plugin.config import LoadedMethod, load_method
+from coliags_plugin.errors import InputError
+from coliags_plugin.files import atomic_write, make_folder, not_writable, write_json
+
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """``config.yaml``, ``provenance.json``, ``metrics.jsonl``, ``checkpoints/`` and ``eval/`` of one run."""
+
+    path: Path
+
+    @property
+    def config_file(self) -> Path:
+        """The resolved method config."""
+        return self.path / "config.yaml"
+
+    @property
+    def provenance_file(self) -> Path:
+        """Where the run came from."""
+        return self.path / "provenance.json"
+
+    @property
+    def log_file(self) -> Path:
+        """One JSON object per logged step."""
+        return self.path / "metrics.jsonl"
+
+    @property
+    def checkpoints(self) -> Path:
+        """One folder per checkpoint."""
+        return self.path / "checkpoints"
+
+    def evaluation(self, protocol: str) -> Path:
+        """Where the results of a protocol go."""
+        return self.path / "eval" / protocol
+
+    @classmethod
+    def default(cls, scene: str, method: str) -> RunFolder:
+        """``runs/<scene>/<method>/<stamp>`` under the working directory."""
+        return cls(Path("runs") / scene / method / datetime.now().strftime("%Y%m%d-%H%M%S"))
+
+    @classmethod
+    def newest(cls, scene: str, method: str) -> RunFolder:
+        """The latest run of a method on a scene under the working directory.
+
+        Raises:
+            InputError: There is none.
+        """
+        parent = Path("runs") / scene / method
+        found = sorted(path for path in parent.glob("*") if (path / "config.yaml").is_file())
+        if not found:
+            raise InputError(f"no run under {parent}", "one to resume", "Name it with --output RUN")
+        return cls(found[-1])
+
+    @classmethod
+    def existing(cls, path: Path) -> RunFolder:
+        """A run made earlier.
+
+        Raises:
+            InputError: This is no run folder.
+        """
+        folder = cls(path)
+        if not folder.config_file.is_file() or not folder.provenance_file.is_file():
+            raise InputError(f"{path} is not a run folder", "a folder with config.yaml and provenance.json")
+        return folder
+
+    def create(self, config_yaml: str, provenance: dict[str, Any], overwrite: bool) -> None:
+        """Make the folder and write what the run starts from.
+
+        Raises:
+            InputError: It exists and ``overwrite`` is off, or it cannot be written.
+        """
+        self.check_free(overwrite)
+        if self.path.is_dir():
+            try:
+                shutil.rmtree(self.path)
+            except OSError as error:
+                raise not_writable(self.path, error) from error
+        make_folder(self.path)
+        atomic_write(self.config_file, config_yaml)
+        write_json(self.provenance_file, {"format": FORMAT, **provenance})
+
+    def check_free(self, overwrite: bool) -> None:
+        """Refuse a folder that holds anything, or that is not a run and would be overwritten.
+
+        Raises:
+            InputError: See above.
+        """
+        if not self.path.exists() or (self.path.is_dir() and not any(self.path.iterdir())):
+            return
+        if not overwrite:
+            raise InputError(
+                f"{self.path} already exists",
+                "a new folder",
+                "Choose another --output, or pass --resume or --overwrite",
+            )
+        if not self.config_file.is_file():
+            raise InputError(f"{self.path} is not a run folder", "a run to overwrite", "Choose another --output")
+
+    def method(self) -> LoadedMethod:
+        """The run's resolved config."""
+        return load_method(str(self.config_file.resolve()))
+
+    def provenance(self) -> dict[str, Any]:
+        """What :meth:`create` was given.
+
+        Raises:
+            InputError: The file is damaged.
+        """
+        try:
+            found: dict[str, Any] = json.loads(self.provenance_file.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise InputError(f"cannot read {self.provenance_file}: {error}", "what `coliags train` wrote") from error
+        return found

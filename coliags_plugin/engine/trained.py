@@ -1,0 +1,75 @@
+"""A finished (or interrupted) run, loaded to look at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from coliags_plugin.config import MethodConfig
+from coliags_plugin.contracts import Field, Renderer
+from coliags_plugin.engine.backends import choose_renderer
+from coliags_plugin.engine.checkpoints import latest_checkpoint, read_checkpoint
+from coliags_plugin.engine.run_folder import RunFolder
+from coliags_plugin.errors import InputError
+from coliags_plugin.scenes import Scene
+
+
+@dataclass(frozen=True)
+class TrainedRun:
+    """Scene, field and renderer of a run at its latest checkpoint."""
+
+    run: RunFolder
+    config: MethodConfig
+    method: str
+    scene: Scene
+    field: Field
+    renderer: Renderer
+    step: int
+    device: torch.device
+
+
+def load_scene(config: MethodConfig, path: Path) -> Scene:
+    """Read the data with the method's data manager.
+
+    Raises:
+        InputError: It cannot be read.
+    """
+    scene: Scene = config.datamanager.target(config.datamanager.settings).load(path)
+    return scene
+
+
+def load_trained(path: Path, device: torch.device, data: Path | None = None) -> TrainedRun:
+    """Load a run.
+
+    Args:
+        path: The run folder.
+        device: Where to compute.
+        data: The scene, where it no longer lies where the run found it.
+
+    Raises:
+        InputError: No run, no checkpoint, or the data are gone or have changed.
+    """
+    run = RunFolder.existing(path)
+    config = run.method().config
+    provenance = run.provenance()
+    try:
+        method, recorded = provenance["method"], provenance["scene"]
+        scene_path, fingerprint = recorded["path"], recorded["provenance"].get("fingerprint")
+    except (KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{run.provenance_file} lacks {error}", "what `coliags train` wrote") from error
+    saved = read_checkpoint(latest_checkpoint(run.checkpoints), method, device)
+    scene = load_scene(config, data or Path(scene_path))
+    _check_same_data(scene, fingerprint, data or Path(scene_path))
+    field: Field = config.field.target.from_state(saved.part("field"), config.field.settings).to(device)
+    renderer = choose_renderer(config.renderer, field.primitive, device).renderer
+    return TrainedRun(run, config, method, scene, field.eval(), renderer, saved.step, device)
+
+
+def _check_same_data(scene: Scene, fingerprint: Any, path: Path) -> None:
+    if scene.provenance.get("fingerprint") != fingerprint:
+        raise InputError(
+            f"{path} is not the data the run was trained on", "the same, unchanged data", "Pass --data SCENE"
+        )

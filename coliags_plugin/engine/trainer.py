@@ -1,0 +1,279 @@
+"""Training: one view per step."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from coliags_plugin.config import LoadedMethod
+from coliags_plugin.contracts import Field, Loss
+from coliags_plugin.engine import checkpoints
+from coliags_plugin.engine.backends import ChosenRenderer, choose_renderer
+from coliags_plugin.engine.optimizers import Optimizers
+from coliags_plugin.engine.progress import ProgressReport
+from coliags_plugin.engine.provenance import software
+from coliags_plugin.engine.randomness import FrameOrder, generators
+from coliags_plugin.engine.run_folder import RunFolder
+from coliags_plugin.errors import InputError, InterruptedRunError, NotFiniteError
+from coliags_plugin.files import atomic_write
+from coliags_plugin.gaussians import RenderOutput
+from coliags_plugin.scenes import Frame, Scene
+
+logger = logging.getLogger(__name__)
+
+
+class Trainer:
+    """Trains one method on one scene into one run folder.
+
+    Args:
+        method: The method, resolved.
+        scene: What to train on.
+        scene_path: Where it was read from, for the record.
+        run: Where to write.
+        seed: Of every random stream.
+        device: Where to compute.
+
+    Raises:
+        InputError: The components do not fit each other or the scene; found out before anything is written.
+    """
+
+    def __init__(
+        self, method: LoadedMethod, scene: Scene, scene_path: str, run: RunFolder, seed: int, device: torch.device
+    ) -> None:
+        config = method.config
+        self.method, self.scene, self.scene_path, self.run = method, scene, scene_path, run
+        self.seed, self.device = seed, device
+        self.steps = config.schedule.steps
+        self.chosen: ChosenRenderer = choose_renderer(config.renderer, config.field.target.primitive, device)
+        self.losses: dict[str, Loss] = {key: node.target(node.settings) for key, node in config.losses.items()}
+        self.wants = self._wanted_outputs()
+        self._check_depth()
+        self.generators = generators(seed)
+        self.order = FrameOrder(len(scene.train), self.generators["frame_order"])
+        self.strategy = config.strategy.target(config.strategy.settings, self.generators["densification"])
+        self.field: Field = config.field.target.from_scene(
+            scene, config.field.settings, self.generators["initialisation"]
+        ).to(device)
+        self.optimizers = self._optimizers()
+        self.step = 0
+        self.seconds = 0.0
+
+    def start(self, overwrite: bool = False) -> None:
+        """Make the run folder.
+
+        Raises:
+            InputError: It exists, or cannot be written.
+        """
+        self.run.create(self.method.config.to_yaml(), self.provenance(), overwrite)
+
+    def resume(self) -> None:
+        """Go on from the run's latest checkpoint; CPU runs continue to the bit.
+
+        Raises:
+            InputError: The checkpoint is damaged or of another method, or the run's config or data differ.
+        """
+        self._check_same_run()
+        path = checkpoints.latest_checkpoint(self.run.checkpoints)
+        saved = checkpoints.read_checkpoint(path, self.method.name, self.device)
+        config = self.method.config
+        try:
+            self.field = config.field.target.from_state(saved.part("field"), config.field.settings).to(self.device)
+        except (KeyError, RuntimeError) as error:
+            raise InputError(f"checkpoint {path} does not fit the field: {error}", "one of this method") from error
+        self.optimizers = self._optimizers()
+        checkpoints.restore_optimizers(saved, self.optimizers)
+        checkpoints.restore_generators(saved, self.generators)
+        self.strategy.load_state_dict(saved.part("strategy"))
+        self.order.queue = list(saved.queue)
+        self.step = saved.step
+        self._cut_log()
+        logger.info("resuming %s at step %d", self.run.path, self.step)
+
+    def train(self) -> None:
+        """Train to the last step, logging and saving on the way.
+
+        Raises:
+            InterruptedRunError: Ctrl-C; what was done is saved.
+            NotFiniteError: A loss term is NaN or infinite.
+        """
+        schedule = self.method.config.schedule
+        began = time.monotonic() - self.seconds
+        with (
+            _deferred_interrupt() as interrupted,
+            ProgressReport(f"train {self.method.name}", self.steps, self.step) as progress,
+            self.run.log_file.open("a", encoding="utf-8") as log,
+        ):
+            while self.step < self.steps:
+                row = self._train_step()
+                self.seconds = time.monotonic() - began
+                if self.step % schedule.log_every == 0 or self.step == self.steps:
+                    log.write(json.dumps({**row, "seconds": round(self.seconds, 3)}, allow_nan=False) + "\n")
+                    log.flush()
+                progress.update(self.step, f"loss {row['loss']:.4f}, {row['psnr']:.2f} dB")
+                stop = interrupted()
+                if self.step % schedule.checkpoint_every == 0 or self.step == self.steps or stop:
+                    self.save()
+                if stop and self.step < self.steps:
+                    where = f"--output {self.run.path} --resume"
+                    raise InterruptedRunError(f"stopped after step {self.step}, which is saved; go on with {where}")
+
+    def save(self) -> None:
+        """Write a checkpoint of the current step."""
+        checkpoints.save_checkpoint(
+            self.run.checkpoints,
+            self.step,
+            self.method.name,
+            self.field,
+            self.optimizers,
+            self.strategy,
+            self.generators,
+            self.order,
+        )
+
+    def provenance(self) -> dict[str, Any]:
+        """What makes this run what it is."""
+        return {
+            "method": self.method.name,
+            "seed": self.seed,
+            "steps": self.steps,
+            "device": str(self.device),
+            "renderer": self.chosen.name,
+            "renderer_reason": self.chosen.reason,
+            **software(),
+            "scene": {
+                "name": self.scene.name,
+                "path": self.scene_path,
+                "extent": self.scene.extent,
+                "pixel_footprint": self.scene.pixel_footprint,
+                "points": len(self.scene.points),
+                "provenance": self.scene.provenance,
+            },
+        }
+
+    def _train_step(self) -> dict[str, Any]:
+        step = self.step + 1
+        frame = self.scene.train[self.order.next()].to(self.device)
+        output = self.chosen.renderer.render(self.field, frame.camera, self.wants)
+        terms = {key: loss(output, frame) for key, loss in self.losses.items()}
+        weights = {key: loss.settings.weight_at(step, self.steps) for key, loss in self.losses.items()}
+        self._check_finite(terms, step, frame)
+        total = torch.stack([weights[key] * term for key, term in terms.items()]).sum()
+        if total.requires_grad:
+            torch.autograd.backward(total)
+        done = self.strategy.after_backward(step, self.field, self.optimizers.adam, output)
+        self.optimizers.step(step)
+        self.step = step
+        return {
+            "step": step,
+            "loss": total.item(),
+            "terms": {key: term.item() for key, term in terms.items()},
+            "psnr": _psnr(output, frame),
+            "gaussians": len(output.gaussians),
+            "visible": len(output.gaussians.visible_sources),
+            **done,
+        }
+
+    def _check_finite(self, terms: dict[str, Tensor], step: int, frame: Frame) -> None:
+        for key, term in terms.items():
+            if not bool(torch.isfinite(term)):
+                raise NotFiniteError(
+                    f"step {step}, frame {frame.name}: loss term '{key}' is {term.item()}. "
+                    "The last checkpoint is whole; look for too large a learning rate or damaged data in that frame."
+                )
+
+    def _wanted_outputs(self) -> tuple[str, ...]:
+        wants = {"rgb", "alpha"}.union(*(loss.wants for loss in self.losses.values()))
+        missing = wants - self.chosen.renderer.outputs
+        if missing:
+            raise InputError(
+                f"the losses want {', '.join(sorted(missing))}, which renderer '{self.chosen.name}' does not deliver",
+                f"losses on {', '.join(sorted(self.chosen.renderer.outputs))}",
+            )
+        return tuple(sorted(wants))
+
+    def _check_depth(self) -> None:
+        if any(frame.depth is not None for frame in self.scene.train):
+            return
+        for key, loss in self.losses.items():
+            if loss.needs_depth:
+                raise InputError(
+                    f"loss term '{key}' needs depth, and no training frame of scene '{self.scene.name}' has any",
+                    "frames with depth, or no such term",
+                    f"Remove it with --set losses.{key}=null",
+                )
+
+    def _optimizers(self) -> Optimizers:
+        return Optimizers(self.field, self.method.config.optimizers, self.steps, self.scene.extent)
+
+    def _check_same_run(self) -> None:
+        saved = self.run.method().config.model_dump(exclude={"schedule", "description"})
+        now = self.method.config.model_dump(exclude={"schedule", "description"})
+        differing = [key for key in now if now[key] != saved[key]]
+        if self.run.provenance().get("method") != self.method.name:
+            owner = self.run.provenance().get("method")
+            raise InputError(f"{self.run.path} is a run of method '{owner}'", f"one of '{self.method.name}'")
+        if differing:
+            raise InputError(
+                f"{self.run.path} was trained with other settings of {', '.join(differing)}",
+                "the settings it was started with",
+                f"Compare with {self.run.config_file}",
+            )
+        before = self.run.provenance()["scene"]["provenance"].get("fingerprint")
+        if before != self.scene.provenance.get("fingerprint"):
+            raise InputError(f"{self.scene_path} is not the data this run was started on", "unchanged data")
+
+    def _cut_log(self) -> None:
+        """Drop rows of steps that the checkpoint does not hold: they are about to be taken again."""
+        if not self.run.log_file.is_file():
+            return
+        rows = self.run.log_file.read_text(encoding="utf-8").splitlines()
+        kept = [row for row in rows if _logged_step(row) <= self.step]
+        if kept:
+            self.seconds = json.loads(kept[-1])["seconds"]
+        atomic_write(self.run.log_file, "".join(f"{row}\n" for row in kept))
+
+
+def _logged_step(row: str) -> float:
+    try:
+        return float(json.loads(row)["step"])
+    except (ValueError, KeyError):
+        return math.inf  # a line cut short by a kill
+
+
+@torch.no_grad()
+def _psnr(output: RenderOutput, frame: Frame) -> float:
+    """Of this training view, dB; capped at 100 so that a perfect view stays a number."""
+    error = (output.rgb - frame.rgb)[frame.valid].square().mean()
+    return min(100.0, -10.0 * math.log10(max(float(error), 1e-10)))
+
+
+@contextmanager
+def _deferred_interrupt() -> Iterator[Any]:
+    """Ctrl-C waits for the step in hand; a second one does not."""
+    asked = False
+
+    def remember(number: int, frame: Any) -> None:
+        nonlocal asked
+        if asked:
+            raise KeyboardInterrupt
+        asked = True
+        logger.info("stopping after this step; Ctrl-C again to stop at once")
+
+    try:
+        before = signal.signal(signal.SIGINT, remember)
+    except ValueError:  # not the main thread: there Ctrl-C cannot arrive anyway
+        yield lambda: False
+        return
+    try:
+        yield lambda: asked
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -1,0 +1,39 @@
+"""Where anchors start: merging points into voxels, and the size of a voxel."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+#: Floor of the mean squared neighbour distance, scene units squared (methods.md 1.2).
+MIN_SQUARED_DISTANCE = 1e-7
+
+
+def voxelize(points: Float[Tensor, "N 3"], size: float) -> Float[Tensor, "M 3"]:
+    """One point at the centre of every voxel that holds any, sorted (methods.md 1.2).
+
+    Args:
+        points: Scene units. [N, 3]
+        size: Edge of a voxel, scene units.
+
+    Returns:
+        ``round(x / size) * size``, unique. [M, 3]
+    """
+    return torch.unique(torch.round(points / size), dim=0) * size
+
+
+def neighbour_log_scales(points: Float[Tensor, "M 3"]) -> Float[Tensor, "M"]:
+    """Log of the root mean squared distance to the three nearest neighbours (methods.md 0.2, 1.2).
+
+    With fewer than four points, those that there are; a lone point gets the floor.
+    """
+    neighbours = min(3, len(points) - 1)
+    if neighbours == 0:
+        return torch.full((len(points),), 0.5 * torch.log(torch.tensor(MIN_SQUARED_DISTANCE)).item())
+    positions = points.detach().cpu().numpy()
+    distances, _ = cKDTree(positions).query(positions, k=neighbours + 1, workers=-1)
+    squared = torch.from_numpy(np.asarray(distances)[:, 1:]).square().mean(dim=1).clamp_min(MIN_SQUARED_DISTANCE)
+    return (0.5 * squared.log()).to(points.dtype).to(points.device)

@@ -1,0 +1,71 @@
+"""Geometry heads: anchor feature and viewing direction -> opacity, scale and rotation of every child."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor, nn
+
+from coliags_plugin.fields.embedding import cosine_embedding
+from coliags_plugin.fields.perceptron import perceptron
+from coliags_plugin.settings import Settings
+
+
+class PlainGeometrySettings(Settings):
+    """Options of the plain geometry head."""
+
+    hidden: int = Field(default=32, ge=1)
+
+
+class PlainGeometryHead(nn.Module):
+    """Scaffold-GS's: both perceptrons see the viewing direction as it is (methods.md 2)."""
+
+    Settings: ClassVar[type[Settings]] = PlainGeometrySettings
+
+    def __init__(self, settings: Any, features: int, children: int, generator: torch.Generator) -> None:
+        super().__init__()
+        self.settings = settings
+        self.children_per_anchor = children
+        inputs = features + self.embed(torch.zeros(1, 3)).shape[1]
+        self.opacity_mlp = perceptron(inputs, settings.hidden, children, generator)
+        self.covariance_mlp = perceptron(inputs, settings.hidden, 7 * children, generator)
+
+    def embed(self, directions: Float[Tensor, "V 3"]) -> Float[Tensor, "V E"]:
+        """What the perceptrons see of the viewing direction."""
+        return directions
+
+    def forward(
+        self, features: Float[Tensor, "V F"], directions: Float[Tensor, "V 3"]
+    ) -> tuple[Float[Tensor, "V K"], Float[Tensor, "V K 7"]]:
+        """Decode the children of the visible anchors.
+
+        Args:
+            features: Anchor features. [V, F]
+            directions: Unit vectors from the camera to the anchors, world frame. [V, 3]
+
+        Returns:
+            Signed opacities in (-1, 1), of which only positive ones are drawn [V, K]; and three scale logits and four
+            quaternion components (w first) per child [V, K, 7].
+        """
+        seen = torch.cat([features, self.embed(directions)], dim=1)
+        covariances = self.covariance_mlp(seen).view(len(seen), self.children_per_anchor, 7)
+        return self.opacity_mlp(seen).tanh(), covariances
+
+
+class IMVEGeometrySettings(PlainGeometrySettings):
+    """Options of IMVE."""
+
+    frequencies: int = Field(default=10, ge=0)
+
+
+class IMVEGeometryHead(PlainGeometryHead):
+    """Improved geometry Modelling with View Embedding: gamma(v) in place of v (paper, Eq. 6; methods.md 1.3)."""
+
+    Settings: ClassVar[type[Settings]] = IMVEGeometrySettings
+
+    def embed(self, directions: Float[Tensor, "V 3"]) -> Float[Tensor, "V E"]:
+        """gamma(v), 63 numbers at ten frequencies."""
+        return cosine_embedding(directions, self.settings.frequencies)

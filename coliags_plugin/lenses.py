@@ -1,0 +1,402 @@
+"""The lenses C3VD is read through: between pixels of the distorted image and viewing directions.
+
+Everything here is float64 and counts pixel centres at INTEGERS, as OpenCV and C3VD do; :class:`Camera` adds 0.5.
+Directions are in camera axes: x right, y down, z forward.
+
+Three calibrations of one colonoscope are in use for the same 1350 x 1080 frames (data_layouts.md 1, methods.md 9.3).
+``fisheye`` agrees with ``omnidirectional``, which rendered the ground truth, to 0.02 degrees; ``legacy-pinhole``,
+behind most published numbers, is off by up to 2.3 degrees.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+from numpy.typing import ArrayLike, NDArray
+from typing_extensions import Self
+
+Array = NDArray[np.float64]
+
+#: Where :func:`undistortion_map` sends pixels that no source pixel shows: outside any image, whatever the border.
+NOWHERE = -10.0
+
+
+class Pinhole(NamedTuple):
+    """Intrinsics of an undistorted image, pixels, centres at integers."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def scaled(self, x: float, y: float) -> Pinhole:
+        """The same view with the image stretched by ``x`` and ``y``; its edges stay where they are."""
+        return Pinhole(self.fx * x, self.fy * y, (self.cx + 0.5) * x - 0.5, (self.cy + 0.5) * y - 0.5)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lens(ABC):
+    """A calibrated lens, seen through an image that may be a scaled or cropped copy of the calibrated one.
+
+    The calibration itself is never rescaled: pixels are first carried back to the calibrated image, so that
+    scaling and cropping are exact for every model.
+
+    Attributes:
+        width, height: Size of the image at hand, pixels.
+        stretch: Pixels of the calibrated image per pixel of this one, (x, y).
+        origin: Where this image's top left corner lies in the calibrated image, pixels from its corner, (x, y).
+    """
+
+    width: int
+    height: int
+    stretch: tuple[float, float] = (1.0, 1.0)
+    origin: tuple[float, float] = (0.0, 0.0)
+
+    def scaled(self, width: int, height: int) -> Self:
+        """The lens of the same image resampled to another size; the image's edges stay where they are."""
+        x, y = self.width / width, self.height / height
+        return replace(self, width=width, height=height, stretch=(self.stretch[0] * x, self.stretch[1] * y))
+
+    def cropped(self, x0: int, y0: int, width: int, height: int) -> Self:
+        """The lens of the part of the image whose top left pixel is (x0, y0)."""
+        origin = (self.origin[0] + self.stretch[0] * x0, self.origin[1] + self.stretch[1] * y0)
+        return replace(self, width=width, height=height, origin=origin)
+
+    def unproject(self, pixels: ArrayLike) -> Float[np.ndarray, "N 3"]:
+        """Viewing directions of pixels.
+
+        Args:
+            pixels: (column, row), centres at integers. [N, 2]
+
+        Returns:
+            Directions with z = 1, so that a point at z-depth ``z`` is ``z * direction``; NaN where the model does not
+            reach (a direction at or beyond 90 degrees, or past its turning point). [N, 3]
+        """
+        calibrated = (np.asarray(pixels, np.float64) + 0.5) * self.stretch + self.origin - 0.5
+        xy = self._tangents(calibrated)
+        return np.concatenate([xy, np.where(np.isnan(xy[:, :1]), np.nan, 1.0)], axis=1)
+
+    def project(self, points: ArrayLike) -> Float[np.ndarray, "N 2"]:
+        """Pixels of points.
+
+        Args:
+            points: In camera axes, any unit. [N, 3]
+
+        Returns:
+            (column, row), centres at integers, inside the image or not; NaN where the model does not reach and for
+            points not in front of the camera. [N, 2]
+        """
+        points = np.asarray(points, np.float64)
+        z = points[:, 2:]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            tangents = np.where(z > 0.0, points[:, :2] / z, np.nan)
+        return (self._calibrated_pixels(tangents) + 0.5 - self.origin) / self.stretch - 0.5
+
+    @property
+    def pinhole(self) -> Pinhole:
+        """The pinhole camera this lens nominally is: what an undistorted image of the same size is given."""
+        k = self._calibrated_pinhole
+        cornered = k._replace(cx=k.cx - self.origin[0], cy=k.cy - self.origin[1])
+        return cornered.scaled(1.0 / self.stretch[0], 1.0 / self.stretch[1])
+
+    @property
+    @abstractmethod
+    def _calibrated_pinhole(self) -> Pinhole:
+        """The nominal pinhole at the calibrated size."""
+
+    @abstractmethod
+    def _tangents(self, pixels: Array) -> Array:
+        """(x / z, y / z) of pixels of the calibrated image. [N, 2]"""
+
+    @abstractmethod
+    def _calibrated_pixels(self, tangents: Array) -> Array:
+        """Inverse of :meth:`_tangents`. [N, 2]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OmnidirectionalLens(Lens):
+    """Scaramuzza's polynomial model, with which C3VD's ground truth was rendered (data_layouts.md 1).
+
+    A pixel (u, v) lies at ``A q + (cx, cy)``, and its ray is ``(q_x, q_y, a0 + a2 rho^2 + a3 rho^3 + a4 rho^4)`` with
+    ``rho = |q|``.
+
+    The source says ``c, d, e`` and leaves the order open. C3VD's Python loader, followed here, has
+    ``A = [[c, d], [e, 1]]``; its C++ renderer fills the same numbers column by column, ``A = [[c, e], [d, 1]]``,
+    which is this lens with ``d`` and ``e`` exchanged. As d is nearly -e, the two differ by a turn of the image of
+    0.33 degrees about its centre: up to 3.9 pixels at the left and right edges. Which is right is not known.
+
+    Attributes:
+        cx, cy: Centre, pixels.
+        a0, a2, a3, a4: Polynomial in rho, pixels.
+        c, d, e: The affine part.
+    """
+
+    cx: float
+    cy: float
+    a0: float
+    a2: float
+    a3: float
+    a4: float
+    c: float
+    d: float
+    e: float
+
+    @property
+    def _calibrated_pinhole(self) -> Pinhole:
+        return Pinhole(self.a0, self.a0, self.cx, self.cy)
+
+    @property
+    def _affine(self) -> Array:
+        return np.array([[self.c, self.d], [self.e, 1.0]])
+
+    def _height(self, rho: Array) -> Array:
+        return self.a0 + rho**2 * (self.a2 + rho * (self.a3 + rho * self.a4))
+
+    def _slope(self, rho: Array) -> Array:
+        return rho * (2.0 * self.a2 + rho * (3.0 * self.a3 + rho * 4.0 * self.a4))
+
+    @property
+    def _rim(self) -> float:
+        """The radius seen at 90 degrees."""
+        return _first_root([self.a0, 0.0, self.a2, self.a3, self.a4])
+
+    def _tangents(self, pixels: Array) -> Array:
+        q = (pixels - (self.cx, self.cy)) @ np.linalg.inv(self._affine).T
+        rho = np.linalg.norm(q, axis=1, keepdims=True)
+        height = self._height(rho)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where((rho < self._rim) & (height > 0.0), q / height, np.nan)
+
+    def _calibrated_pixels(self, tangents: Array) -> Array:
+        tangent = np.linalg.norm(tangents, axis=1)
+        # rho = tangent * height(rho), divided by sqrt(1 + tangent^2) so that grazing rays stay well scaled.
+        cosine = 1.0 / np.hypot(1.0, tangent)
+        rho = _solve_increasing(
+            lambda rho: cosine * (rho - tangent * self._height(rho)),
+            lambda rho: cosine * (1.0 - tangent * self._slope(rho)),
+            np.where(np.isnan(tangent), np.nan, self._rim),
+        )
+        return _along(tangents, tangent, rho, self.a0) @ self._affine.T + (self.cx, self.cy)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _FocalLens(Lens):
+    """A radial distortion in front of a pinhole camera: fx, fy, cx, cy in pixels."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    @property
+    def _calibrated_pinhole(self) -> Pinhole:
+        return Pinhole(self.fx, self.fy, self.cx, self.cy)
+
+    @abstractmethod
+    def _bent(self, radius: Array) -> Array:
+        """The radius after distortion; increasing up to :attr:`_turning_point`."""
+
+    @abstractmethod
+    def _bent_slope(self, radius: Array) -> Array:
+        """Derivative of :meth:`_bent`."""
+
+    @property
+    @abstractmethod
+    def _turning_point(self) -> float:
+        """Up to where :meth:`_bent` increases; infinite where it always does."""
+
+    @abstractmethod
+    def _radius_of_tangent(self, tangent: Array) -> Array:
+        """What the model bends: the tangent itself or its angle."""
+
+    @abstractmethod
+    def _tangent_of_radius(self, radius: Array) -> Array:
+        """Inverse of :meth:`_radius_of_tangent`."""
+
+    def _tangents(self, pixels: Array) -> Array:
+        bent = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
+        target = np.linalg.norm(bent, axis=1)
+        upper = np.full_like(target, self._turning_point)
+        if np.isinf(self._turning_point):
+            # No natural end for the bracket: let it grow until it holds the answer.
+            upper = np.where(np.isfinite(target), 1.0, np.nan)
+            while np.any(short := self._bent(upper) < target):
+                upper[short] *= 2.0
+        upper = np.where(target <= self._bent(upper), upper, np.nan)
+        radius = _solve_increasing(lambda radius: self._bent(radius) - target, self._bent_slope, upper)
+        return _along(bent, target, self._tangent_of_radius(radius), 1.0)
+
+    def _calibrated_pixels(self, tangents: Array) -> Array:
+        tangent = np.linalg.norm(tangents, axis=1)
+        radius = self._radius_of_tangent(tangent)
+        bent = np.where(radius < self._turning_point, self._bent(radius), np.nan)
+        return _along(tangents, tangent, bent, 1.0) * (self.fx, self.fy) + (self.cx, self.cy)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BrownLens(_FocalLens):
+    """OpenCV's pinhole with radial distortion: ``r (1 + k1 r^2 + k2 r^4)`` of the tangent r."""
+
+    k1: float
+    k2: float
+
+    def _bent(self, radius: Array) -> Array:
+        square = radius**2
+        return radius * (1.0 + square * (self.k1 + square * self.k2))
+
+    def _bent_slope(self, radius: Array) -> Array:
+        square = radius**2
+        return 1.0 + square * (3.0 * self.k1 + square * 5.0 * self.k2)
+
+    @property
+    def _turning_point(self) -> float:
+        return float(np.sqrt(_first_root([1.0, 3.0 * self.k1, 5.0 * self.k2])))
+
+    def _radius_of_tangent(self, tangent: Array) -> Array:
+        return tangent
+
+    def _tangent_of_radius(self, radius: Array) -> Array:
+        return radius
+
+
+@dataclass(frozen=True, kw_only=True)
+class FisheyeLens(_FocalLens):
+    """OpenCV's fisheye (Kannala-Brandt): ``t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)`` of the angle t, radians."""
+
+    k1: float
+    k2: float
+    k3: float
+    k4: float
+
+    def _bent(self, radius: Array) -> Array:
+        square = radius**2
+        return radius * (1.0 + square * (self.k1 + square * (self.k2 + square * (self.k3 + square * self.k4))))
+
+    def _bent_slope(self, radius: Array) -> Array:
+        square = radius**2
+        return 1.0 + square * (
+            3.0 * self.k1 + square * (5.0 * self.k2 + square * (7.0 * self.k3 + square * 9.0 * self.k4))
+        )
+
+    @property
+    def _turning_point(self) -> float:
+        slope = [1.0, 3.0 * self.k1, 5.0 * self.k2, 7.0 * self.k3, 9.0 * self.k4]
+        return min(float(np.sqrt(_first_root(slope))), np.pi / 2.0)
+
+    def _radius_of_tangent(self, tangent: Array) -> Array:
+        return np.arctan(tangent)
+
+    def _tangent_of_radius(self, radius: Array) -> Array:
+        return np.tan(radius)
+
+
+LENSES: dict[str, Lens] = {
+    "omnidirectional": OmnidirectionalLens(
+        width=1350,
+        height=1080,
+        cx=678.544839263292,
+        cy=542.975887548343,
+        a0=769.243600037458,
+        a2=-0.000812770624150226,
+        a3=6.25674244578925e-07,
+        a4=-1.19662182144280e-09,
+        c=0.999986882249990,
+        d=0.00288273829525059,
+        e=-0.00296316513429569,
+    ),
+    "legacy-pinhole": BrownLens(
+        width=1350, height=1080, fx=802.319, fy=801.885, cx=668.286, cy=547.733, k1=-0.42234, k2=0.10654
+    ),
+    "fisheye": FisheyeLens(
+        width=1350,
+        height=1080,
+        fx=767.3861511125845,
+        fy=767.5058656118406,
+        cx=679.054265997005,
+        cy=543.646891684636,
+        k1=-0.18867185058223412,
+        k2=-0.003927337093919806,
+        k3=0.030524814153620117,
+        k4=-0.012756926010904904,
+    ),
+}
+"""C3VD's calibrations by name, at 1350 x 1080."""
+
+#: How much of its width and height each corner of the frame loses: 202.5 of 1350 and 252 of 1080 pixels. Measured on
+#: C3VD's published mask, which this reproduces but for pixels on the oblique edges themselves.
+CORNER_CUT = (0.15, 7.0 / 30.0)
+
+
+def octagon_mask(width: int, height: int) -> Bool[np.ndarray, "H W"]:
+    """The part of a raw C3VD frame that the colonoscope fills: True inside the octagon. [H, W]"""
+    x = (np.arange(width) + 0.5) / width
+    y = (np.arange(height) + 0.5) / height
+    across = np.minimum(x, 1.0 - x) / CORNER_CUT[0]
+    down = np.minimum(y, 1.0 - y) / CORNER_CUT[1]
+    inside: NDArray[np.bool_] = across[None, :] + down[:, None] >= 1.0
+    return inside
+
+
+def undistortion_map(
+    lens: Lens, fx: float, fy: float, cx: float, cy: float, width: int, height: int
+) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
+    """Where each pixel of a pinhole image lies in the distorted image.
+
+    Args:
+        lens: The lens of the distorted image.
+        fx: The pinhole image's focal length, pixels.
+        fy: The same, downwards.
+        cx: Its principal point, pixels, centres at integers.
+        cy: The same, downwards.
+        width: Its size, pixels.
+        height: The same, downwards.
+
+    Returns:
+        Columns and rows in the distorted image for ``cv2.remap``, :data:`NOWHERE` where the lens does not reach;
+        they may lie outside the distorted image. Two of [H, W]
+    """
+    x, y = np.meshgrid((np.arange(width) - cx) / fx, (np.arange(height) - cy) / fy)
+    pixels = lens.project(np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1))
+    pixels = np.where(np.isnan(pixels), NOWHERE, pixels).astype(np.float32)
+    return pixels[:, 0].reshape(height, width), pixels[:, 1].reshape(height, width)
+
+
+def _along(direction: Array, length: Array, new_length: Array, ratio_at_zero: float) -> Array:
+    """Vectors of new lengths along ``direction``, whose lengths are ``length``; smooth through zero. [N, 2]"""
+    near = length < 1e-12
+    ratio = np.where(near, ratio_at_zero, new_length / np.where(near, 1.0, length))
+    return direction * ratio[:, None]
+
+
+def _first_root(coefficients: list[float]) -> float:
+    """The smallest positive real root of a polynomial, constant term first; infinite where there is none."""
+    roots = np.polynomial.Polynomial(coefficients).roots()
+    positive = roots.real[(np.abs(roots.imag) < 1e-9 * (1.0 + np.abs(roots.real))) & (roots.real > 0.0)]
+    return float(positive.min(initial=np.inf))
+
+
+def _solve_increasing(
+    function: Callable[[Array], Array], slope: Callable[[Array], Array], upper: Array, iterations: int = 60
+) -> Array:
+    """Roots in [0, upper] of increasing functions, one per element, by Newton's method kept inside a bracket.
+
+    Elements whose ``upper`` is NaN are NaN.
+    """
+    low, high = np.zeros_like(upper), upper.copy()
+    root = 0.5 * upper
+    for _ in range(iterations):
+        value = function(root)
+        low, high = np.where(value < 0.0, root, low), np.where(value >= 0.0, root, high)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            step = root - value / slope(root)
+        following = np.where((step >= low) & (step <= high), step, 0.5 * (low + high))
+        moved = np.abs(following - root)
+        root = following
+        if not np.any(moved > 1e-14 * (1.0 + upper)):
+            break
+    return root

@@ -1,0 +1,40 @@
+"""How far the rendered colours are from the picture."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from jaxtyping import Float
+from torch import Tensor
+
+from coliags_plugin.contracts import Loss, LossSettings
+from coliags_plugin.gaussians import RenderOutput
+from coliags_plugin.masked import masked_mean, zero_outside
+from coliags_plugin.scenes import Frame
+from coliags_plugin.ssim import ssim_map
+
+
+class L1Loss(Loss):
+    """Mean absolute difference over valid pixels and channels (the paper's L_1; methods.md 1.6)."""
+
+    Settings: ClassVar[type[LossSettings]] = LossSettings
+
+    def __call__(self, output: RenderOutput, frame: Frame) -> Float[Tensor, ""]:
+        """The unweighted term, in units of full scale; 0 where no pixel is valid."""
+        truth = frame.rgb.to(output.rgb.dtype)
+        difference = zero_outside(output.rgb, frame.mask) - zero_outside(truth, frame.mask)
+        return masked_mean(difference.abs(), frame.mask)
+
+
+class DSSIMLoss(Loss):
+    """1 - SSIM over valid pixels (the paper's L_D-SSIM; methods.md 0.4, 1.6).
+
+    Ignored pixels are kept out of the windows too, see :func:`coliags_plugin.ssim.ssim_map`.
+    """
+
+    Settings: ClassVar[type[LossSettings]] = LossSettings
+
+    def __call__(self, output: RenderOutput, frame: Frame) -> Float[Tensor, ""]:
+        """The unweighted term, from 0 (equal) to 2; 0 where no pixel is valid."""
+        similarity = ssim_map(output.rgb, frame.rgb.to(output.rgb.dtype), frame.mask)
+        return masked_mean(1.0 - similarity, frame.mask)

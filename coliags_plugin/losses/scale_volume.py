@@ -1,0 +1,26 @@
+"""A price on large Gaussians."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from jaxtyping import Float
+from torch import Tensor
+
+from coliags_plugin.contracts import Loss, LossSettings
+from coliags_plugin.gaussians import RenderOutput
+from coliags_plugin.scenes import Frame
+
+
+class ScaleVolumeLoss(Loss):
+    """Mean product of the scales of the Gaussians drawn (the paper's L_scale; methods.md 1.6).
+
+    In scene units cubed (mm^3; squared for surfels), so its weight depends on the unit of length (methods.md 13.4).
+    """
+
+    Settings: ClassVar[type[LossSettings]] = LossSettings
+
+    def __call__(self, output: RenderOutput, frame: Frame) -> Float[Tensor, ""]:
+        """The unweighted term; 0 where the view has no Gaussians."""
+        scales = output.gaussians.scales
+        return scales.prod(dim=-1).sum() / max(len(scales), 1)

@@ -1,0 +1,37 @@
+"""Leaving pixels out: of values, of means, and of the gradients of both."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+def zero_outside(values: Float[Tensor, "H W *C"], mask: Bool[Tensor, "H W"] | None) -> Float[Tensor, "H W *C"]:
+    """The values where the mask is True, 0 elsewhere.
+
+    A choice, not a product: what lies outside may be NaN or infinite and still yields 0, and a gradient of exactly 0.
+
+    Args:
+        values: An image or a map. [H, W] or [H, W, C]
+        mask: False where a pixel is to be ignored; None keeps every pixel. [H, W]
+    """
+    if mask is None:
+        return values
+    inside = mask if values.dim() == mask.dim() else mask[..., None]
+    return torch.where(inside, values, torch.zeros((), dtype=values.dtype, device=values.device))
+
+
+def masked_mean(values: Float[Tensor, "H W *C"], mask: Bool[Tensor, "H W"] | None) -> Float[Tensor, ""]:
+    """Mean over the pixels (and channels) where the mask is True; 0, still part of the graph, where there are none.
+
+    A full mask gives the plain mean to the bit.
+
+    Args:
+        values: An image or a map. [H, W] or [H, W, C]
+        mask: False where a pixel is to be ignored; None counts every pixel. [H, W]
+    """
+    if mask is None:
+        return values.sum() / max(values.numel(), 1)
+    per_pixel = values.shape[2] if values.dim() > mask.dim() else 1
+    return zero_outside(values, mask).sum() / (mask.sum() * per_pixel).clamp_min(1)

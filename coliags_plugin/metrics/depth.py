@@ -1,0 +1,139 @@
+"""How far the rendered depth is from the true one, mm.
+
+All figures are over the pixels of ``Comparison.depth_valid`` in float64, without aligning scale or shift.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import ClassVar
+
+import torch
+from jaxtyping import Bool, Float
+from pydantic import Field
+from torch import Tensor
+
+from coliags_plugin.contracts import Comparison, Metric
+from coliags_plugin.errors import UnavailableError
+from coliags_plugin.metrics.depth_steps import depth_steps, near
+from coliags_plugin.settings import Settings
+
+
+class DepthSettings(Settings):
+    """No options."""
+
+
+class DepthMetric(Metric):
+    """What all depth metrics share: which pixels count, and what makes the figure unavailable."""
+
+    Settings: ClassVar[type[Settings]] = DepthSettings
+    higher_is_better: ClassVar[bool] = False
+    unit: ClassVar[str] = "mm"
+
+    def __call__(self, comparison: Comparison) -> float:
+        """The figure of one frame.
+
+        Raises:
+            UnavailableError: The frame has no true depth, no pixel counts, or the rendered depth is not finite.
+        """
+        rendered, truth, counts = comparison.depth, comparison.true_depth, comparison.depth_valid
+        if rendered is None or truth is None or counts is None:
+            raise UnavailableError("this frame has no ground-truth depth")
+        if not counts.any():
+            raise UnavailableError("no pixel of this frame has a valid ground-truth depth")
+        counts = self.select(truth, counts)
+        rendered, truth = rendered[counts].double(), truth[counts].double()
+        broken = torch.isfinite(rendered).logical_not().sum()
+        if broken:
+            raise UnavailableError(f"the rendered depth is not finite at {int(broken)} pixels")
+        return float(self.figure(rendered, truth))
+
+    def select(self, truth: Float[Tensor, "H W"], counts: Bool[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
+        """Which of the pixels that count this metric looks at: all, unless overridden. At least one."""
+        return counts
+
+    @abstractmethod
+    def figure(self, rendered: Float[Tensor, "P"], truth: Float[Tensor, "P"]) -> Float[Tensor, ""]:
+        """The figure from the chosen pixels' depths, mm."""
+
+
+class DepthMSE(DepthMetric):
+    """Mean squared error, the paper's Depth MSE.
+
+    An edge metric: most of it comes from the few pixels beside depth steps. Read it beside the other depth figures.
+    """
+
+    unit: ClassVar[str] = "mm^2"
+
+    def figure(self, rendered: Float[Tensor, "P"], truth: Float[Tensor, "P"]) -> Float[Tensor, ""]:
+        """Mean of (D - D_true)^2, mm^2."""
+        return (rendered - truth).square().mean()
+
+
+class DepthMSEInnerSettings(Settings):
+    """What counts as a depth step, and how far its influence reaches."""
+
+    relative_step: float = Field(default=0.12, gt=0.0, description="(max - min) / min of a 3x3 window of true depth.")
+    margin: int = Field(
+        default=2, ge=0, description="Pixels up to this many rows and columns from a step are left out."
+    )
+
+
+class DepthMSEInner(DepthMSE):
+    """Mean squared error away from depth steps: how good the surfaces are, silhouettes left aside."""
+
+    Settings: ClassVar[type[Settings]] = DepthMSEInnerSettings
+
+    def select(self, truth: Float[Tensor, "H W"], counts: Bool[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
+        """The pixels that count and lie further than ``margin`` from any step.
+
+        Raises:
+            UnavailableError: There are none.
+        """
+        steps = depth_steps(truth, counts, self.settings.relative_step)
+        inner = counts & ~near(steps, self.settings.margin)
+        if not inner.any():
+            raise UnavailableError("no pixel of this frame lies away from depth steps")
+        return inner
+
+
+class DepthRMSE(DepthMetric):
+    """Root of the mean squared error."""
+
+    def figure(self, rendered: Float[Tensor, "P"], truth: Float[Tensor, "P"]) -> Float[Tensor, ""]:
+        """Square root of the mean of (D - D_true)^2, mm."""
+        return (rendered - truth).square().mean().sqrt()
+
+
+class DepthMAE(DepthMetric):
+    """Mean absolute error."""
+
+    def figure(self, rendered: Float[Tensor, "P"], truth: Float[Tensor, "P"]) -> Float[Tensor, ""]:
+        """Mean of |D - D_true|, mm."""
+        return (rendered - truth).abs().mean()
+
+
+class DepthMedianError(DepthMetric):
+    """Median absolute error: hardly moved by silhouettes and floaters."""
+
+    def figure(self, rendered: Float[Tensor, "P"], truth: Float[Tensor, "P"]) -> Float[Tensor, ""]:
+        """Median of |D - D_true|, the mean of the middle two where their number is even, mm."""
+        errors = (rendered - truth).abs().sort().values
+        middle = len(errors) // 2
+        return errors[middle] if len(errors) % 2 else (errors[middle - 1] + errors[middle]) / 2
+
+
+class DepthAbsRel(DepthMetric):
+    """Mean error relative to the true depth."""
+
+    unit: ClassVar[str] = ""
+
+    def figure(self, rendered: Float[Tensor, "P"], truth: Float[Tensor, "P"]) -> Float[Tensor, ""]:
+        """Mean of |D - D_true| / D_true.
+
+        Raises:
+            UnavailableError: A true depth is not positive.
+        """
+        if (truth <= 0).any():
+            raise UnavailableError("a true depth of 0 mm makes the relative error infinite")
+        return ((rendered - truth).abs() / truth).mean()

@@ -1,0 +1,33 @@
+"""Where the true depth jumps: silhouettes of folds against the lumen behind them."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+
+def depth_steps(depth: Float[Tensor, "H W"], known: Bool[Tensor, "H W"], relative_step: float) -> Bool[Tensor, "H W"]:
+    """Pixels whose 3x3 window holds a depth step: (max - min) / min of its known depths beyond a threshold.
+
+    Unknown pixels make no step themselves; two known surfaces on either side of one do.
+
+    Args:
+        depth: z-depth, mm. [H, W]
+        known: Where the depth counts. [H, W]
+        relative_step: Threshold, for instance 0.12.
+    """
+    farthest = _window_max(torch.where(known, depth, -torch.inf), 1)
+    nearest = -_window_max(torch.where(known, -depth, -torch.inf), 1)
+    return farthest - nearest > relative_step * nearest
+
+
+def near(marked: Bool[Tensor, "H W"], reach: int) -> Bool[Tensor, "H W"]:
+    """Pixels within ``reach`` rows and columns of a marked one, itself included."""
+    return _window_max(marked.to(torch.float32), reach) > 0
+
+
+def _window_max(values: Float[Tensor, "H W"], reach: int) -> Float[Tensor, "H W"]:
+    """Maximum of the square window around every pixel; what lies outside the image counts as -infinity."""
+    return max_pool2d(values[None, None], kernel_size=2 * reach + 1, stride=1, padding=reach)[0, 0]

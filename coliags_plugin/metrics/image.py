@@ -1,0 +1,79 @@
+"""How alike two pictures are, pixel by pixel and window by window."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from coliags_plugin.contracts import Comparison, Metric
+from coliags_plugin.errors import UnavailableError
+from coliags_plugin.settings import Settings
+from coliags_plugin.ssim import ssim
+
+
+class PSNRSettings(Settings):
+    """No options."""
+
+
+class PSNR(Metric):
+    """Peak signal-to-noise ratio, 10 log10(1 / mse), the error taken over all channels of the valid pixels together.
+
+    (The authors' in-training report averages one figure per channel instead; methods.md 0.4.)
+    """
+
+    Settings: ClassVar[type[Settings]] = PSNRSettings
+    higher_is_better: ClassVar[bool] = True
+    unit: ClassVar[str] = "dB"
+
+    def __call__(self, comparison: Comparison) -> float:
+        """The figure of one frame, dB.
+
+        Raises:
+            UnavailableError: No pixel is valid, the rendered image is not finite, or the images are identical.
+        """
+        require_image(comparison)
+        difference = comparison.rgb.double() - comparison.true_rgb.double()
+        squared_error = difference[comparison.valid].square().mean()
+        if squared_error == 0:
+            raise UnavailableError("the images are identical, so the PSNR is infinite")
+        return float(-10.0 * torch.log10(squared_error))
+
+
+class SSIMSettings(Settings):
+    """No options."""
+
+
+class SSIM(Metric):
+    """Structural similarity of :func:`coliags_plugin.ssim.ssim`, ignored pixels kept out of the windows."""
+
+    Settings: ClassVar[type[Settings]] = SSIMSettings
+    higher_is_better: ClassVar[bool] = True
+    unit: ClassVar[str] = ""
+
+    def __call__(self, comparison: Comparison) -> float:
+        """The figure of one frame, at most 1.
+
+        Raises:
+            UnavailableError: No pixel is valid, or the rendered image is not finite.
+        """
+        require_image(comparison)
+        return float(ssim(comparison.rgb.double(), comparison.true_rgb.double(), comparison.valid))
+
+
+def require_image(comparison: Comparison) -> None:
+    """Refuse what no image metric can score.
+
+    Raises:
+        UnavailableError: No pixel is valid, or a valid pixel of the rendered image is not finite.
+    """
+    if not comparison.valid.any():
+        raise UnavailableError("the mask leaves no pixel")
+    broken = _not_finite(comparison.rgb).logical_and(comparison.valid).sum()
+    if broken:
+        raise UnavailableError(f"the rendered image is not finite at {int(broken)} pixels")
+
+
+def _not_finite(rgb: Tensor) -> Tensor:
+    return torch.isfinite(rgb).all(dim=-1).logical_not()

@@ -1,0 +1,112 @@
+"""Finding and reading the weights of LPIPS on this machine. Nothing is ever downloaded."""
+
+from __future__ import annotations
+
+import os
+import pickle
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from coliags_plugin.errors import UnavailableError
+from coliags_plugin.metrics.lpips_network import TAPS, LPIPSNetwork
+
+WEIGHTS_VARIABLE = "COLIAGS_LPIPS_WEIGHTS"
+
+#: What torchvision's weights are called where torch keeps its downloads; the second names are older copies of the same.
+BACKBONE_FILES: dict[str, tuple[str, ...]] = {
+    "vgg": ("vgg16-397923af.pth",),
+    "alex": ("alexnet-owt-7be5be79.pth", "alexnet-owt-4df8aa71.pth"),
+    "squeeze": ("squeezenet1_1-b8a52dc0.pth", "squeezenet1_1-f364aa15.pth"),
+}
+
+
+def find_weights(net: str, folder: str | None = None) -> tuple[Path, Path]:
+    """The files of backbone and linear heads.
+
+    Looked for in ``folder``, then in the folder that ``COLIAGS_LPIPS_WEIGHTS`` names, then where ``torch.hub`` keeps
+    downloads, and the heads also in an installed ``lpips`` package. A backbone is a file under torchvision's name, or
+    any ``.pth`` with the net's name and "backbone" in its own; heads are ``{net}.pth`` or ``lpips_{net}.pth``, directly
+    or in ``v0.1/``.
+
+    Raises:
+        UnavailableError: One is missing; says what was looked for and where.
+    """
+    folders = list(_folders(folder))
+    backbone = next((file for place in folders for file in _backbones(net, place)), None)
+    heads = next((file for place in [*folders, *_package_folders()] for file in _heads(net, place)), None)
+    if backbone is None or heads is None:
+        missing = [
+            f"{what} ({name})"
+            for what, name, found in (
+                ("backbone", BACKBONE_FILES[net][0], backbone),
+                ("linear heads", f"v0.1/{net}.pth", heads),
+            )
+            if found is None
+        ]
+        raise UnavailableError(
+            f"LPIPS {net} weights not found: {' and '.join(missing)}. Looked in {', '.join(map(str, folders))}; "
+            f"{WEIGHTS_VARIABLE} can name a folder that has them"
+        )
+    return backbone, heads
+
+
+def load_network(net: str, backbone: Path, heads: Path) -> LPIPSNetwork:
+    """The network with these weights.
+
+    Raises:
+        UnavailableError: A file cannot be read or holds something else.
+    """
+    state = _read(backbone)
+    prefix = "features."
+    if any(key.startswith(prefix) for key in state):
+        state = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
+    linear = _read(heads)
+    try:
+        weights = [linear[f"lin{index}.model.1.weight"] for index in range(len(TAPS[net]))]
+    except KeyError as error:
+        raise UnavailableError(f"{heads} has no {error}: it does not hold the linear heads of LPIPS {net}") from error
+    for weight, channels in zip(weights, TAPS[net].values(), strict=True):
+        if weight.shape != (1, channels, 1, 1) or bool((weight < 0).any()):
+            raise UnavailableError(f"{heads} does not hold the linear heads of LPIPS {net}")
+    try:
+        return LPIPSNetwork(net, state, weights)
+    except RuntimeError as error:
+        raise UnavailableError(f"{backbone} does not hold the backbone of LPIPS {net}") from error
+
+
+def _folders(folder: str | None) -> Iterator[Path]:
+    for named in (folder, os.environ.get(WEIGHTS_VARIABLE)):
+        if named:
+            yield Path(named).expanduser()
+    yield Path(torch.hub.get_dir()) / "checkpoints"
+
+
+def _package_folders() -> Iterator[Path]:
+    spec = find_spec("lpips")
+    for location in (spec.submodule_search_locations or ()) if spec else ():
+        yield Path(location) / "weights"
+
+
+def _backbones(net: str, folder: Path) -> Iterator[Path]:
+    exact = (folder / name for name in BACKBONE_FILES[net])
+    alike = (file for file in sorted(folder.glob("*backbone*.pth")) if net in file.name)
+    yield from (file for file in (*exact, *alike) if file.is_file())
+
+
+def _heads(net: str, folder: Path) -> Iterator[Path]:
+    names = (f"{net}.pth", f"v0.1/{net}.pth", f"lpips_{net}.pth", f"v0.1/lpips_{net}.pth")
+    yield from (file for file in (folder / name for name in names) if file.is_file())
+
+
+def _read(file: Path) -> dict[str, Tensor]:
+    try:
+        state = torch.load(file, map_location="cpu", weights_only=True)
+    except (OSError, EOFError, RuntimeError, ValueError, LookupError, pickle.UnpicklingError) as error:
+        raise UnavailableError(f"{file} cannot be read as torch weights") from error
+    if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
+        raise UnavailableError(f"{file} does not hold a table of tensors")
+    return state

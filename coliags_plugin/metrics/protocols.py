@@ -1,0 +1,117 @@
+"""Evaluation protocols: everything that decides what a figure means, under one name and version.
+
+A protocol's name and version are written into every result; results whose name or version differ are not comparable.
+``docs/protocols.md`` sets the protocols side by side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, ClassVar
+
+import torch
+
+from coliags_plugin.contracts import Comparison, Protocol
+from coliags_plugin.gaussians import RenderOutput
+from coliags_plugin.metrics.roundtrips import through_8_bit, through_16_bit
+from coliags_plugin.scenes import Frame
+
+MetricTable = Mapping[str, tuple[str, Mapping[str, Any]]]
+
+# The splatting papers' flavour: VGG fed [0, 1] unmapped (methods.md 0.4).
+_LPIPS_OF_THE_PAPERS = {"net": "vgg", "input_range": "zero-one"}
+
+
+class PaperProtocol(Protocol):
+    """The quantities the paper defines, measured without rounding and where there is something to measure.
+
+    Depth is Eq. 2's sum of w z; it is scored where the truth is known.
+    """
+
+    name: ClassVar[str] = "paper"
+    version: ClassVar[int] = 1
+    description: ClassVar[str] = (
+        "Float images and depth_accumulated (sum w z), no quantisation; masked pixels and unknown depths count for "
+        "nothing. SSIM 11x11 sigma 1.5; LPIPS VGG fed [0, 1]."
+    )
+    wants: ClassVar[frozenset[str]] = frozenset({"depth_accumulated"})
+    metrics: ClassVar[MetricTable] = MappingProxyType(
+        {
+            "psnr": ("psnr", {}),
+            "ssim": ("ssim", {}),
+            "lpips": ("lpips", _LPIPS_OF_THE_PAPERS),
+            # Not in the paper: its weights are small enough to come by where VGG's are not.
+            "lpips_squeeze": ("lpips", {"net": "squeeze", "input_range": "zero-one"}),
+            "depth_mse": ("depth_mse", {}),
+            "depth_mse_inner": ("depth_mse_inner", {}),
+            "depth_median_error": ("depth_median_error", {}),
+            "depth_rmse": ("depth_rmse", {}),
+            "depth_mae": ("depth_mae", {}),
+            "depth_abs_rel": ("depth_abs_rel", {}),
+        }
+    )
+
+    def compare(self, output: RenderOutput, frame: Frame) -> Comparison:
+        """The rendered image clamped to [0, 1] and the rendered depth as it is, beside the frame."""
+        image = Comparison(rgb=output.rgb.detach().clamp(0.0, 1.0), true_rgb=frame.rgb, valid=frame.valid)
+        if frame.depth is None:
+            return image
+        return Comparison(
+            image.rgb,
+            image.true_rgb,
+            image.valid,
+            depth=output["depth_accumulated"].detach(),
+            true_depth=frame.depth,
+            depth_valid=torch.isfinite(frame.depth) & frame.valid,
+        )
+
+
+class AuthorsCodeProtocol(Protocol):
+    """The figures the authors' released code prints (methods.md 1.10): through PNG files, and without any mask.
+
+    The rendered depth is 1 / (sum w/z), 100 mm where nothing was drawn, through 16 bit over 150 mm; the true depth goes
+    through 16 bit over 100 mm with unknown pixels at 0, against which the rendered ones are scored. Both wrap around
+    beyond their full scale. A sensor's clipped pixels, which the released code scores against 100 mm, are among the
+    unknown ones here if the data manager has made them so.
+    """
+
+    name: ClassVar[str] = "authors-code"
+    version: ClassVar[int] = 1
+    description: ClassVar[str] = (
+        "8-bit images; depth 1/(sum w/z) as 16 bit over 150 mm against truth as 16 bit over 100 mm, both wrapping "
+        "around; no mask, unknown true depth counts as 0. SSIM 11x11 sigma 1.5; LPIPS VGG fed [0, 1]."
+    )
+    wants: ClassVar[frozenset[str]] = frozenset({"inverse_depth_accumulated"})
+    metrics: ClassVar[MetricTable] = MappingProxyType(
+        {
+            "psnr": ("psnr", {}),
+            "ssim": ("ssim", {}),
+            "lpips": ("lpips", _LPIPS_OF_THE_PAPERS),
+            "depth_mse": ("depth_mse", {}),
+        }
+    )
+
+    #: Depth of a pixel nothing was drawn on, mm.
+    empty_depth: ClassVar[float] = 100.0
+    #: Depths of level 65535 in the files of rendered and true depth, mm.
+    rendered_full_scale: ClassVar[float] = 150.0
+    true_full_scale: ClassVar[float] = 100.0
+
+    def compare(self, output: RenderOutput, frame: Frame) -> Comparison:
+        """Rendered and true image and depth as they come back from the files; every pixel counts."""
+        everywhere = torch.ones_like(frame.valid)
+        image = Comparison(rgb=through_8_bit(output.rgb.detach()), true_rgb=through_8_bit(frame.rgb), valid=everywhere)
+        if frame.depth is None:
+            return image
+        inverse = output["inverse_depth_accumulated"].detach()
+        rendered = torch.where(inverse != 0, 1.0 / inverse, self.empty_depth)
+        known = torch.where(torch.isfinite(frame.depth), frame.depth, 0.0)
+        return Comparison(
+            image.rgb,
+            image.true_rgb,
+            image.valid,
+            depth=through_16_bit(rendered, self.rendered_full_scale),
+            true_depth=through_16_bit(known, self.true_full_scale),
+            depth_valid=everywhere,
+        )

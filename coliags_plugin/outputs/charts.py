@@ -1,0 +1,231 @@
+"""Line charts and colour bars as inline SVG, for a page that styles them.
+
+The SVG names CSS classes and never a colour, so one chart is readable on a light and on a dark page. The page defines
+``.chart .frame``, ``.grid``, ``.tick``, ``.axis`` and, for each series style, ``.s0`` to ``.s7`` with a ``color``;
+line, band and marker take the current colour. A ninth series takes the first colour again, dashed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+from coliags_plugin.outputs.figures import ColorMap, color_table
+from coliags_plugin.outputs.scales import linear_ticks, log_ticks, tick_label
+
+COLORS = 8
+
+_WIDTH, _HEIGHT = 600, 300
+_LEFT, _RIGHT, _TOP, _BOTTOM = 68, 14, 12, 50
+_STOPS = 16
+#: Room for one tick label of the x axis, in the units of the view box.
+_LABEL_ROOM = 7.5
+
+
+@dataclass(frozen=True)
+class Series:
+    """One line of a chart.
+
+    Attributes:
+        name: What a reader calls it.
+        style: Number of its colour, the same for one method in every chart of a page.
+        x: Increasing.
+        y: As many; what is not finite (or not positive on a logarithmic axis) interrupts the line.
+        low: Lower edge of a band around the line, or empty.
+        high: Upper edge of the band.
+    """
+
+    name: str
+    style: int
+    x: Sequence[float]
+    y: Sequence[float]
+    low: Sequence[float] = ()
+    high: Sequence[float] = ()
+
+
+def style_classes(style: int) -> str:
+    """CSS classes of a series style."""
+    return f"s{style % COLORS}" + (f" dash{style // COLORS}" if style >= COLORS else "")
+
+
+def line_chart(
+    series: Sequence[Series],
+    x_label: str,
+    y_label: str,
+    *,
+    log_y: bool = False,
+    x_names: Sequence[str] | None = None,
+    markers: bool = False,
+) -> str:
+    """A line chart with labelled axes, or an empty string where no series has a point to draw.
+
+    Args:
+        series: Lines over one x axis.
+        x_label: Quantity and unit of the x axis.
+        y_label: Quantity and unit of the y axis.
+        log_y: Logarithmic y axis.
+        x_names: For a categorical x axis: the names of x = 0, 1, ...
+        markers: A dot at every point, with its value as a tooltip.
+    """
+    points = [
+        (x, y)
+        for line in series
+        for x, y in zip(line.x, line.y, strict=True)
+        if math.isfinite(x) and _drawable(y, log_y)
+    ]
+    if not points:
+        return ""
+    edges = [value for line in series for value in (*line.low, *line.high) if _drawable(value, log_y)]
+    axes = _Axes.around([x for x, _ in points], [y for _, y in points] + edges, log_y, x_names)
+    caption = escape(f"{y_label} over {x_label}", quote=True)
+    parts = [f'<svg class="chart" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{caption}">']
+    parts += axes.drawn(x_label, y_label)
+    for line in series:
+        parts.append(f'<g class="series {style_classes(line.style)}"><title>{escape(line.name)}</title>')
+        if line.low:
+            parts += [f'<path class="band" d="{path}"/>' for path in axes.bands(line)]
+        parts += [f'<path class="line" d="{path}"/>' for path in axes.paths(line)]
+        if markers:
+            parts += [
+                f'<circle class="dot" cx="{axes.x(x):.1f}" cy="{axes.y(y):.1f}" r="3"><title>{escape(line.name)}, '
+                f"{escape(x_names[int(x)] if x_names else tick_label(x))}: {y:.4g}</title></circle>"
+                for x, y in zip(line.x, line.y, strict=True)
+                if _drawable(y, log_y)
+            ]
+        parts.append("</g>")
+    parts.append("</svg>")
+    return "".join(parts)
+
+
+def color_bar_svg(limits: tuple[float, float], unit: str, color_map: ColorMap, label: str, name: str) -> str:
+    """A horizontal colour scale with ticks and its unit.
+
+    Args:
+        limits: Values of the first and the last colour.
+        unit: For instance ``"mm"``.
+        color_map: Which map it explains.
+        label: The quantity.
+        name: Identifier of its gradient, unique on the page.
+    """
+    low, high = limits
+    left, width, top, height = 14, 312, 20, 12
+    table = color_table(color_map)
+    stops = "".join(
+        f'<stop offset="{index / _STOPS:.4f}" stop-color="#{bytes(table[round(index / _STOPS * 255)]).hex()}"/>'
+        for index in range(_STOPS + 1)
+    )
+    parts = [
+        f'<svg class="bar" viewBox="0 0 340 50" role="img" aria-label="{escape(f"{label}, {unit}", quote=True)}">',
+        f'<defs><linearGradient id="{escape(name, quote=True)}">{stops}</linearGradient></defs>',
+        f'<text class="axis" x="{left}" y="13">{escape(label)} <tspan class="unit">[{escape(unit)}]</tspan></text>',
+        f'<rect x="{left}" y="{top}" width="{width}" height="{height}" fill="url(#{escape(name, quote=True)})"/>',
+    ]
+    for tick in linear_ticks(low, high):
+        x = left + (tick - low) / (high - low) * width
+        parts.append(f'<path class="frame" d="M{x:.1f} {top + height}v4"/>')
+        parts.append(
+            f'<text class="tick" x="{x:.1f}" y="{top + height + 16}" text-anchor="middle">{tick_label(tick)}</text>'
+        )
+    return "".join([*parts, "</svg>"])
+
+
+def _drawable(value: float, log_y: bool) -> bool:
+    return math.isfinite(value) and (value > 0.0 or not log_y)
+
+
+@dataclass(frozen=True)
+class _Axes:
+    """Where values fall inside the view box."""
+
+    x_low: float
+    x_high: float
+    y_low: float
+    y_high: float
+    log_y: bool
+    x_names: Sequence[str] | None
+
+    @classmethod
+    def around(cls, xs: Sequence[float], ys: Sequence[float], log_y: bool, x_names: Sequence[str] | None) -> _Axes:
+        x_low, x_high = (-0.5, len(x_names) - 0.5) if x_names is not None else (min(xs), max(xs))
+        if x_low == x_high:
+            x_low, x_high = x_low - 0.5, x_high + 0.5
+        y_low, y_high = min(ys), max(ys)
+        if log_y:
+            # Half a decade at least, so that there are ticks to read.
+            margin = max(1.1, math.sqrt(10.0**0.5 / min(y_high / y_low, 10.0**0.5)))
+            return cls(x_low, x_high, y_low / margin, y_high * margin, log_y, x_names)
+        margin = 0.06 * (y_high - y_low) or max(abs(y_high), 1.0) * 0.05
+        return cls(x_low, x_high, y_low - margin, y_high + margin, log_y, x_names)
+
+    def x(self, value: float) -> float:
+        return _LEFT + (value - self.x_low) / (self.x_high - self.x_low) * (_WIDTH - _LEFT - _RIGHT)
+
+    def y(self, value: float) -> float:
+        if self.log_y:
+            fraction = math.log(value / self.y_low) / math.log(self.y_high / self.y_low)
+        else:
+            fraction = (value - self.y_low) / (self.y_high - self.y_low)
+        return _HEIGHT - _BOTTOM - fraction * (_HEIGHT - _TOP - _BOTTOM)
+
+    def drawn(self, x_label: str, y_label: str) -> list[str]:
+        """Grid, ticks and labels."""
+        right, bottom = _WIDTH - _RIGHT, _HEIGHT - _BOTTOM
+        parts = []
+        for tick in (log_ticks if self.log_y else linear_ticks)(self.y_low, self.y_high):
+            y = self.y(tick)
+            parts.append(f'<path class="grid" d="M{_LEFT} {y:.1f}H{right}"/>')
+            parts.append(
+                f'<text class="tick" x="{_LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{tick_label(tick)}</text>'
+            )
+        for position, name in self._x_ticks():
+            x = self.x(position)
+            parts.append(f'<path class="frame" d="M{x:.1f} {bottom}v4"/>')
+            parts.append(f'<text class="tick" x="{x:.1f}" y="{bottom + 18}" text-anchor="middle">{escape(name)}</text>')
+        parts.append(f'<path class="frame" d="M{_LEFT} {_TOP}V{bottom}H{right}"/>')
+        middle = (_LEFT + right) / 2
+        parts.append(f'<text class="axis" x="{middle}" y="{_HEIGHT - 8}" text-anchor="middle">{escape(x_label)}</text>')
+        middle = (_TOP + bottom) / 2
+        parts.append(
+            f'<text class="axis" transform="translate(15 {middle}) rotate(-90)" text-anchor="middle">'
+            f"{escape(y_label)}</text>"
+        )
+        return parts
+
+    def _x_ticks(self) -> list[tuple[float, str]]:
+        if self.x_names is None:
+            return [(tick, tick_label(tick)) for tick in linear_ticks(self.x_low, self.x_high)]
+        longest = max(len(name) for name in self.x_names) + 2
+        room = max(1, int((_WIDTH - _LEFT - _RIGHT) / (longest * _LABEL_ROOM)))
+        stride = math.ceil(len(self.x_names) / room)
+        return [(float(index), self.x_names[index]) for index in range(0, len(self.x_names), stride)]
+
+    def paths(self, line: Series) -> list[str]:
+        """One path for each uninterrupted stretch of a line."""
+        stretches: list[list[str]] = [[]]
+        for x, y in zip(line.x, line.y, strict=True):
+            if math.isfinite(x) and _drawable(y, self.log_y):
+                stretches[-1].append(f"{self.x(x):.1f} {self.y(y):.1f}")
+            else:
+                stretches.append([])
+        # A stretch of one point still shows: round caps draw a line of no length as a dot.
+        return ["M" + "L".join(s if len(s) > 1 else s * 2) for s in stretches if s]
+
+    def bands(self, line: Series) -> list[str]:
+        """One closed path for each uninterrupted stretch of a band."""
+        stretches: list[list[tuple[float, float, float]]] = [[]]
+        for x, low, high in zip(line.x, line.low, line.high, strict=True):
+            if _drawable(low, self.log_y) and _drawable(high, self.log_y):
+                stretches[-1].append((self.x(x), self.y(low), self.y(high)))
+            else:
+                stretches.append([])
+        return [
+            "M"
+            + "L".join(f"{x:.1f} {high:.1f}" for x, _, high in s)
+            + "L"
+            + "L".join(f"{x:.1f} {low:.1f}" for x, low, _ in reversed(s))
+            + "Z"
+            for s in stretches
+            if len(s) > 1
+        ]

@@ -1,0 +1,281 @@
+"""Pictures of numbers: depth, errors, colour bars and contact sheets. Arrays in, 8-bit RGB out.
+
+Depth is drawn with viridis and errors with inferno, both perceptually uniform: equal steps of the quantity are equal
+steps to the eye, and neither can be taken for the other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cache
+from typing import TYPE_CHECKING, Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from coliags_plugin.errors import InputError
+from coliags_plugin.outputs.pictures import as_array
+from coliags_plugin.outputs.scales import linear_ticks, tick_label
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+ColorMap = Literal["depth", "error"]
+
+#: Pixels of a depth picture that hold no depth.
+UNKNOWN_GREY = 128
+#: The two greys of the hatch over error pixels that have no truth.
+HATCH_GREYS = (150, 108)
+
+_HATCH_PERIOD = 8
+_HATCH_WIDTH = 2
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+_INK = (32, 32, 32)
+
+
+@cache
+def color_table(color_map: ColorMap) -> UInt8[np.ndarray, "256 3"]:
+    """The 256 RGB colours of a map, from the lowest value to the highest. [256, 3]"""
+    code = cv2.COLORMAP_VIRIDIS if color_map == "depth" else cv2.COLORMAP_INFERNO
+    table: np.ndarray = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[None], code)[0, :, ::-1].copy()
+    table.setflags(write=False)
+    return table
+
+
+def depth_picture(
+    depth_mm: Float[np.ndarray, "H W"] | Tensor, limits: tuple[float, float]
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Depth by colour; near is dark, far is bright, unknown is grey.
+
+    Args:
+        depth_mm: Depth of any kind, mm; NaN and infinities are unknown. [H, W]
+        limits: The depths of the first and the last colour, mm; values beyond them are clipped.
+
+    Raises:
+        InputError: ``depth_mm`` is not [H, W], or the limits are not an interval.
+    """
+    depth = _map(depth_mm, "depth_mm")
+    low, high = _interval(limits)
+    known = np.isfinite(depth)
+    picture = _colored((np.where(known, depth, low) - low) / (high - low), "depth")
+    picture[~known] = UNKNOWN_GREY
+    return picture
+
+
+def depth_error_picture(
+    rendered_mm: Float[np.ndarray, "H W"] | Tensor,
+    true_mm: Float[np.ndarray, "H W"] | Tensor,
+    valid: Bool[np.ndarray, "H W"] | Tensor | None,
+    limit_mm: float,
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Absolute depth error on one fixed scale; pixels without truth are hatched in grey.
+
+    A pixel where truth is known and the rendering is not finite takes the last colour: a method is not excused by
+    rendering nothing.
+
+    Args:
+        rendered_mm: Rendered depth, mm. [H, W]
+        true_mm: True depth of the same kind, mm; NaN is unknown. [H, W]
+        valid: Pixels that count; None means wherever the truth is known. [H, W]
+        limit_mm: The error of the last colour, mm; larger errors take it too.
+
+    Raises:
+        InputError: The shapes differ, or the limit is not positive.
+    """
+    error, known = depth_error(rendered_mm, true_mm, valid)
+    return _error_colors(error, known, limit_mm)
+
+
+def depth_error(
+    rendered_mm: Float[np.ndarray, "H W"] | Tensor,
+    true_mm: Float[np.ndarray, "H W"] | Tensor,
+    valid: Bool[np.ndarray, "H W"] | Tensor | None = None,
+) -> tuple[Float[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
+    """What :func:`depth_error_picture` draws.
+
+    Returns:
+        |rendered - true| in mm, infinite where the truth is known and the rendering is not finite, 0 where the truth is
+        unknown [H, W]; and where the truth is known [H, W].
+
+    Raises:
+        InputError: The shapes differ.
+    """
+    rendered, true = _map(rendered_mm, "rendered_mm"), _map(true_mm, "true_mm")
+    known = np.isfinite(true)
+    if valid is not None:
+        mask = as_array(valid).astype(bool)
+        _same_shape(mask, true, "valid")
+        known = known & mask
+    _same_shape(rendered, true, "rendered_mm")
+    error = np.zeros_like(true)
+    error[known] = np.abs(rendered[known] - true[known])
+    error[known & ~np.isfinite(rendered)] = np.inf
+    return error, known
+
+
+def rgb_error_picture(
+    rendered: np.ndarray | Tensor,
+    true: np.ndarray | Tensor,
+    valid: Bool[np.ndarray, "H W"] | Tensor | None = None,
+    limit: float = 0.2,
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Absolute colour error, the mean of the three channels, on one fixed scale; ignored pixels are hatched in grey.
+
+    Args:
+        rendered: uint8, or floating point in [0, 1]. [H, W, 3]
+        true: The same kind. [H, W, 3]
+        valid: Pixels that count; None means all. [H, W]
+        limit: The error of the last colour, as a part of full scale; larger errors take it too.
+
+    Raises:
+        InputError: The shapes differ, or the limit is not positive.
+    """
+    error = rgb_error(rendered, true)
+    known = np.ones(error.shape, dtype=bool) if valid is None else as_array(valid).astype(bool)
+    _same_shape(known, error, "valid")
+    return _error_colors(error, known, limit)
+
+
+def rgb_error(rendered: np.ndarray | Tensor, true: np.ndarray | Tensor) -> Float[np.ndarray, "H W"]:
+    """Mean over the channels of |rendered - true|, as a part of full scale. [H, W]
+
+    Raises:
+        InputError: The shapes differ.
+    """
+    first, second = _unit_rgb(rendered, "rendered"), _unit_rgb(true, "true")
+    _same_shape(first, second, "rendered")
+    error: np.ndarray = np.abs(first - second).mean(axis=2)
+    return error
+
+
+def color_bar(
+    limits: tuple[float, float], unit: str, color_map: ColorMap = "error", width: int = 480
+) -> UInt8[np.ndarray, "H W 3"]:
+    """A horizontal scale with ticks and its unit, on white.
+
+    Args:
+        limits: Values of the first and the last colour.
+        unit: For instance ``"mm"``; ASCII, as OpenCV's font draws nothing else.
+        color_map: Which map it explains.
+        width: px.
+
+    Raises:
+        InputError: The limits are not an interval, or there is no room.
+    """
+    low, high = _interval(limits)
+    if width < 120:
+        raise InputError(f"a colour bar {width} px wide", "at least 120 px")
+    size, thickness, scale = 18, 1, 0.45
+    (unit_width, _), _ = cv2.getTextSize(unit, _FONT, scale, thickness)
+    left, right, top = 24, width - unit_width - 32, 8
+    picture = np.full((top + size + 26, width, 3), 255, np.uint8)
+    picture[top : top + size, left:right] = _colored(np.linspace(0.0, 1.0, right - left)[None], color_map)
+    for tick in linear_ticks(low, high):
+        x = left + round((tick - low) / (high - low) * (right - left - 1))
+        cv2.line(picture, (x, top + size), (x, top + size + 4), _INK, 1)
+        label = tick_label(tick)
+        (text_width, _), _ = cv2.getTextSize(label, _FONT, scale, thickness)
+        _text(picture, label, (x - text_width // 2, top + size + 20), scale)
+    _text(picture, unit, (right + 20, top + size - 4), scale)
+    return picture
+
+
+def side_by_side(
+    pictures: Sequence[UInt8[np.ndarray, "H W 3"] | Tensor], labels: Sequence[str], gap: int = 8
+) -> UInt8[np.ndarray, "Hs Ws 3"]:
+    """Pictures of one height in a row on white, each under its label.
+
+    Args:
+        pictures: uint8 RGB. [H, W, 3] each
+        labels: One each; ASCII; shortened where it is wider than its picture.
+        gap: White pixels between the pictures.
+
+    Raises:
+        InputError: No picture, another number of labels, or heights that differ.
+    """
+    arrays = [as_array(picture) for picture in pictures]
+    if not arrays or len(arrays) != len(labels):
+        raise InputError(f"{len(arrays)} pictures with {len(labels)} labels", "one label for each picture")
+    for label, array in zip(labels, arrays, strict=True):
+        if array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] != 3:
+            raise InputError(f"picture '{label}' is {array.dtype} {list(array.shape)}", "uint8 RGB [H, W, 3]")
+        if array.shape[0] != arrays[0].shape[0]:
+            raise InputError(
+                f"picture '{label}' is {array.shape[0]} px high, '{labels[0]}' {arrays[0].shape[0]} px",
+                "pictures of one height",
+            )
+    band, scale = 24, 0.5
+    height = band + arrays[0].shape[0]
+    width = sum(array.shape[1] for array in arrays) + gap * (len(arrays) - 1)
+    sheet = np.full((height, width, 3), 255, np.uint8)
+    x = 0
+    for label, array in zip(labels, arrays, strict=True):
+        column = sheet[:, x : x + array.shape[1]]
+        column[band:] = array
+        # A column is written into on its own, so that a label cannot run into its neighbour's.
+        strip = np.ascontiguousarray(column[:band])
+        _text(strip, _shortened(label, array.shape[1] - 4, scale), (2, 16), scale)
+        column[:band] = strip
+        x += array.shape[1] + gap
+    return sheet
+
+
+def hatch(height: int, width: int) -> UInt8[np.ndarray, "H W 3"]:
+    """Diagonal stripes of two greys: "nothing is known here". [H, W, 3]"""
+    rows, columns = np.indices((height, width))
+    stripe = (rows + columns) % _HATCH_PERIOD < _HATCH_WIDTH
+    grey = np.where(stripe, HATCH_GREYS[1], HATCH_GREYS[0]).astype(np.uint8)
+    return np.repeat(grey[:, :, None], 3, axis=2)
+
+
+def _error_colors(error: np.ndarray, known: np.ndarray, limit: float) -> np.ndarray:
+    if not (math.isfinite(limit) and limit > 0.0):
+        raise InputError(f"an error scale that ends at {limit}", "a positive number")
+    picture = _colored(error / limit, "error")
+    picture[~known] = hatch(*known.shape)[~known]
+    return picture
+
+
+def _colored(fraction: np.ndarray, color_map: ColorMap) -> np.ndarray:
+    index = np.rint(np.clip(fraction, 0.0, 1.0) * 255.0).astype(np.uint8)
+    picture: np.ndarray = color_table(color_map)[index]
+    return picture
+
+
+def _map(values: np.ndarray | Tensor, name: str) -> np.ndarray:
+    array = as_array(values)
+    if array.ndim != 2:
+        raise InputError(f"{name} has the shape {list(array.shape)}", "[H, W]")
+    return array.astype(np.float64)
+
+
+def _unit_rgb(values: np.ndarray | Tensor, name: str) -> np.ndarray:
+    array = as_array(values)
+    if array.ndim != 3 or array.shape[2] != 3:
+        raise InputError(f"{name} has the shape {list(array.shape)}", "[H, W, 3]")
+    return array.astype(np.float64) / (255.0 if array.dtype == np.uint8 else 1.0)
+
+
+def _interval(limits: tuple[float, float]) -> tuple[float, float]:
+    low, high = limits
+    if not (math.isfinite(low) and math.isfinite(high) and low < high):
+        raise InputError(f"colour limits {low} to {high}", "two finite numbers, the lower first")
+    return low, high
+
+
+def _same_shape(array: np.ndarray, like: np.ndarray, name: str) -> None:
+    if array.shape != like.shape:
+        raise InputError(f"{name} has the shape {list(array.shape)}", f"{list(like.shape)}, as the truth")
+
+
+def _text(picture: np.ndarray, text: str, origin: tuple[int, int], scale: float) -> None:
+    cv2.putText(picture, text, origin, _FONT, scale, _INK, 1, cv2.LINE_AA)
+
+
+def _shortened(label: str, width: int, scale: float) -> str:
+    text = label
+    while text and cv2.getTextSize(text, _FONT, scale, 1)[0][0] > width:
+        text = text[:-4] + "..." if len(text) > 4 else ""
+    return text

@@ -1,0 +1,62 @@
+"""Round numbers for axes and colour bars."""
+
+from __future__ import annotations
+
+import math
+
+_STEPS = (1.0, 2.0, 5.0, 10.0)
+#: Rounding errors must not push 0.2 up to 0.5.
+_SLACK = 1e-9
+
+
+def round_up(value: float) -> float:
+    """The smallest 1, 2 or 5 times a power of ten that is not below ``value``.
+
+    Args:
+        value: Positive and finite.
+
+    Raises:
+        ValueError: ``value`` is not positive and finite.
+    """
+    if not (math.isfinite(value) and value > 0.0):
+        raise ValueError(f"round_up({value}): expected a positive, finite number")
+    exponent = math.floor(math.log10(value))
+    power = 10.0**exponent if exponent >= 0 else 1.0 / 10.0**-exponent
+    for step in _STEPS:
+        if value <= step * power * (1.0 + _SLACK):
+            return step * power
+    return 10.0 * power
+
+
+def linear_ticks(low: float, high: float, count: int = 5) -> list[float]:
+    """At most ``count + 1`` multiples of one 1-2-5 step inside [low, high].
+
+    Raises:
+        ValueError: The interval is empty or not finite.
+    """
+    if not (math.isfinite(low) and math.isfinite(high) and low < high):
+        raise ValueError(f"linear_ticks({low}, {high}): expected low < high, both finite")
+    step = round_up((high - low) / count)
+    first = math.ceil(low / step - _SLACK)
+    last = math.floor(high / step + _SLACK)
+    return [index * step for index in range(first, last + 1)]
+
+
+def log_ticks(low: float, high: float) -> list[float]:
+    """The 1-2-5 numbers inside [low, high], thinned to powers of ten over three decades and more.
+
+    Raises:
+        ValueError: The interval is empty or reaches zero.
+    """
+    if not (0.0 < low < high and math.isfinite(high)):
+        raise ValueError(f"log_ticks({low}, {high}): expected 0 < low < high")
+    exponents = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    digits = (1.0,) if math.log10(high / low) >= 3.0 else (1.0, 2.0, 5.0)
+    candidates = [digit * 10.0**exponent for exponent in exponents for digit in digits]
+    return [tick for tick in candidates if low * (1.0 - _SLACK) <= tick <= high * (1.0 + _SLACK)]
+
+
+def tick_label(value: float) -> str:
+    """A tick's text: as short as the number allows, without an exponent between 0.0001 and 999 999."""
+    text = f"{value:.6g}"
+    return "0" if text == "-0" else text

@@ -1,0 +1,105 @@
+"""Frames -> an MP4 file, with whichever codec OpenCV's wheel brings."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from coliags_plugin.errors import InputError
+from coliags_plugin.files import make_folder, not_writable
+from coliags_plugin.outputs.pictures import as_array
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+_LOG = logging.getLogger(__name__)
+
+#: By preference. OpenCV's wheels have no H.264 encoder; VP9 plays in every browser, MPEG-4 part 2 in players only.
+CODECS = ("vp09", "mp4v")
+
+
+def write_video(frames: Iterable[UInt8[np.ndarray, "H W 3"] | Tensor], path: Path, fps: float) -> None:
+    """Write a video, whole or not at all.
+
+    An odd width or height is made even by repeating the last column or row: the codecs halve the chroma planes, and
+    OpenCV would cut a line off instead.
+
+    Args:
+        frames: uint8 RGB, all of one size; taken one at a time, so a generator may render them. [H, W, 3] each
+        path: Ends in ``.mp4``; its folder is made.
+        fps: Frames a second.
+
+    Raises:
+        InputError: No frames, frames that differ in size or are not 8-bit RGB, another suffix, no codec, or a folder
+            that cannot be written.
+    """
+    if path.suffix.lower() != ".mp4":
+        raise InputError(f"video file {path}", "a name that ends in .mp4")
+    if not (math.isfinite(fps) and fps > 0.0):
+        raise InputError(f"{fps} frames a second", "a positive number")
+    make_folder(path.parent)
+    try:
+        # The suffix has to stay: FFmpeg chooses the container by it.
+        handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=".mp4", dir=path.parent)
+        os.close(handle)
+    except OSError as error:
+        raise not_writable(path.parent, error) from error
+    scratch = Path(name)
+    try:
+        count = _encode(frames, scratch, fps)
+        if count == 0:
+            raise InputError(f"no frames for {path}", "at least one")
+        scratch.chmod(0o644)
+        scratch.replace(path)
+    finally:
+        scratch.unlink(missing_ok=True)
+    _LOG.info("wrote %s: %d frames at %g a second", path, count, fps)
+
+
+def _encode(frames: Iterable[np.ndarray | Tensor], scratch: Path, fps: float) -> int:
+    writer: Any = None
+    shape: tuple[int, ...] = ()
+    count = 0
+    try:
+        for frame in frames:
+            picture = as_array(frame)
+            if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or picture.size == 0:
+                raise InputError(f"frame {count} is {picture.dtype} {list(picture.shape)}", "uint8 RGB [H, W, 3]")
+            if writer is None:
+                shape = picture.shape
+                writer = _writer(scratch, fps, shape[1] + shape[1] % 2, shape[0] + shape[0] % 2)
+            elif picture.shape != shape:
+                raise InputError(
+                    f"frame {count} is {picture.shape[1]} x {picture.shape[0]} px",
+                    f"{shape[1]} x {shape[0]} px as frame 0",
+                )
+            even = np.pad(picture, ((0, shape[0] % 2), (0, shape[1] % 2), (0, 0)), mode="edge")
+            writer.write(np.ascontiguousarray(even[:, :, ::-1]))
+            count += 1
+    finally:
+        if writer is not None:
+            writer.release()
+    return count
+
+
+def _writer(scratch: Path, fps: float, width: int, height: int) -> Any:
+    for codec in CODECS:
+        writer = cv2.VideoWriter(
+            str(scratch), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), float(fps), (width, height)
+        )
+        if writer.isOpened():
+            return writer
+    raise InputError(
+        f"OpenCV {cv2.__version__} opens none of the codecs {', '.join(CODECS)} for {width} x {height} px",
+        "an OpenCV built with FFmpeg",
+        "Install opencv-contrib-python-headless from PyPI, or write the frames as PNG",
+    )

@@ -1,0 +1,125 @@
+"""3D Gaussians -> 2D Gaussians on the image plane: the affine (EWA) approximation of perspective.
+
+The formulas are written out in ``docs/rendering.md``, section "Projection".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from coliags_plugin.cameras import Camera
+from coliags_plugin.errors import InputError
+from coliags_plugin.gaussians import Gaussians
+
+#: Share of the half field of view by which a centre may leave the image before the Jacobian stops following it.
+JACOBIAN_MARGIN = 0.3
+
+
+@dataclass(frozen=True)
+class ProjectedGaussians:
+    """What is left of N Gaussians on the image plane.
+
+    Every entry is finite; those of Gaussians not ``in_front`` mean nothing and pass no gradient on.
+
+    Attributes:
+        means_camera: Centres, camera axes, scene units. [N, 3]
+        rotations: Local axes (columns) in camera axes. [N, 3, 3]
+        means2d: Projected centres, pixels. [N, 2]
+        depths: z-depths of the centres, scene units; 1 where not ``in_front``. [N]
+        covariances: xx, xy, yy of the 2D covariance with its low-pass term, square pixels. [N, 3]
+        whitenings: u_xx, u_yx, u_yy of the lower triangular U with U^T U the inverse of the covariance, so that the
+            Mahalanobis distance of an offset d is |U d|. 1 / pixels. [N, 3]
+        in_front: Beyond the near plane. [N]
+    """
+
+    means_camera: Float[Tensor, "N 3"]
+    rotations: Float[Tensor, "N 3 3"]
+    means2d: Float[Tensor, "N 2"]
+    depths: Float[Tensor, "N"]
+    covariances: Float[Tensor, "N 3"]
+    whitenings: Float[Tensor, "N 3"]
+    in_front: Bool[Tensor, "N"]
+
+
+def project_gaussians(gaussians: Gaussians, camera: Camera, near: float, low_pass: float) -> ProjectedGaussians:
+    """Project Gaussians; differentiable in all of them and in ``camera.camera_to_world``.
+
+    Args:
+        gaussians: With three scales each. Their dtype and device are those of the result.
+        camera: Where from.
+        near: Gaussians whose centre has z <= near are not drawn. Scene units.
+        low_pass: Added to both diagonal terms of the 2D covariance. Square pixels.
+
+    Raises:
+        InputError: The Gaussians are surfels.
+    """
+    if gaussians.scales.shape[-1] != 3:
+        raise InputError(
+            f"Gaussians with scales of shape {list(gaussians.scales.shape)}",
+            "three scales each, [N, 3]",
+            "Choose a renderer that serves surfels",
+        )
+    camera = camera.to(gaussians.means.device, gaussians.means.dtype)
+    camera_axes = camera.camera_to_world[:3, :3]
+    # Subtracting the centre before rotating keeps float32 accurate far from the world's origin.
+    local = (gaussians.means - camera.center) @ camera_axes
+    in_front = local[:, 2] > near
+    # A stand-in depth keeps 0 * inf out of the backward pass of what is not drawn.
+    x, y, z = torch.where(in_front[:, None], local, local.new_tensor([0.0, 0.0, 1.0])).unbind(-1)
+    means2d = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=-1)
+
+    rotations = camera_axes.T @ rotation_matrices(gaussians.quats_wxyz)
+    # The 2D covariance is V V^T with V = J (W R S): one row of V per image axis.
+    slope_x = (x / z).clamp(*_slope_limits(camera.fx, camera.cx, camera.width))
+    slope_y = (y / z).clamp(*_slope_limits(camera.fy, camera.cy, camera.height))
+    axes = rotations * gaussians.scales[:, None, :]
+    row_x = (camera.fx / z)[:, None] * (axes[:, 0] - slope_x[:, None] * axes[:, 2])
+    row_y = (camera.fy / z)[:, None] * (axes[:, 1] - slope_y[:, None] * axes[:, 2])
+    sharp_xx, sharp_yy = row_x.square().sum(-1), row_y.square().sum(-1)
+    xx, xy, yy = sharp_xx + low_pass, (row_x * row_y).sum(-1), sharp_yy + low_pass
+    # xx yy - xy^2 cancels for needles; this sum of squares is the same number (Cauchy-Binet) and does not.
+    determinant = (
+        torch.linalg.cross(row_x, row_y).square().sum(-1) + low_pass * (sharp_xx + sharp_yy) + low_pass * low_pass
+    )
+    u_xx, u_yy = xx.rsqrt(), (xx / determinant).sqrt()
+    return ProjectedGaussians(
+        means_camera=local,
+        rotations=rotations,
+        means2d=means2d,
+        depths=z,
+        covariances=torch.stack([xx, xy, yy], dim=-1),
+        whitenings=torch.stack([u_xx, -u_yy * xy / xx, u_yy], dim=-1),
+        in_front=in_front,
+    )
+
+
+def rotation_matrices(quats_wxyz: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
+    """Rotation matrices of quaternions of any length; the zero quaternion is the identity. [N, 3, 3]"""
+    w, x, y, z = torch.nn.functional.normalize(quats_wxyz, dim=-1).unbind(-1)
+    rows = [
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    ]
+    return torch.stack(rows, dim=-1).view(-1, 3, 3)
+
+
+def facing_normals(projected: ProjectedGaussians, scales: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    """The shortest axis of each Gaussian, camera axes, turned so that it looks at the camera. [N, 3]
+
+    Differentiable in the rotations; which axis is shortest, and which way it is turned, are not.
+    """
+    shortest = scales.argmin(-1)
+    normals = projected.rotations.gather(2, shortest[:, None, None].expand(-1, 3, 1)).squeeze(-1)
+    away = (normals * projected.means_camera).sum(-1, keepdim=True) > 0
+    return torch.where(away, -normals, normals)
+
+
+def _slope_limits(focal: float, principal: float, size: int) -> tuple[float, float]:
+    """The range of x/z (or y/z) the Jacobian is taken in: the image's own, widened on both sides."""
+    margin = JACOBIAN_MARGIN * 0.5 * size / focal
+    return -principal / focal - margin, (size - principal) / focal + margin

@@ -1,0 +1,174 @@
+"""Which Gaussians touch which tile of the image, front to back.
+
+Tiles only save work: they change no result, because the pairs kept here are a superset of the (pixel, Gaussian) pairs
+with alpha >= alpha_min, and compositing decides about each of those again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from coliags_plugin.renderers.projection import ProjectedGaussians
+
+#: Slack on the squared Mahalanobis radius, so that rounding here never drops a pixel that compositing would draw.
+_RADIUS_SLACK = 1e-2
+
+
+@dataclass(frozen=True)
+class TileGrid:
+    """An image cut into square tiles; the last column and row may hang over its edge.
+
+    Attributes:
+        width, height: Image size, pixels.
+        size: Edge of a tile, pixels.
+    """
+
+    width: int
+    height: int
+    size: int
+
+    @property
+    def columns(self) -> int:
+        """Tiles side by side."""
+        return -(-self.width // self.size)
+
+    @property
+    def rows(self) -> int:
+        """Tiles one above the other."""
+        return -(-self.height // self.size)
+
+    @property
+    def count(self) -> int:
+        """All tiles, counted row by row."""
+        return self.columns * self.rows
+
+    @property
+    def pixels(self) -> int:
+        """Pixels of one tile."""
+        return self.size * self.size
+
+    def centers(self, tiles: Int[Tensor, "M"], dtype: torch.dtype) -> Float[Tensor, "M 2"]:
+        """Midpoints of tiles, pixels. [M, 2]"""
+        corner = torch.stack([tiles % self.columns, tiles // self.columns], dim=-1)
+        return corner.to(dtype) * self.size + 0.5 * self.size
+
+    def offsets(self, like: Tensor) -> Float[Tensor, "P 2"]:
+        """Pixel centres of a tile, row by row, from its midpoint; dtype and device as ``like``. [P, 2]"""
+        axis = torch.arange(self.size, dtype=like.dtype, device=like.device) + 0.5 - 0.5 * self.size
+        return torch.stack([axis.repeat(self.size), axis.repeat_interleave(self.size)], dim=-1)
+
+    def to_image(self, values: Float[Tensor, "tiles F P"]) -> Float[Tensor, "H W F"]:
+        """Put tiles together and cut off what hangs over. [H, W, F]"""
+        split = values.view(self.rows, self.columns, -1, self.size, self.size)
+        whole = split.permute(0, 3, 1, 4, 2).reshape(self.rows * self.size, self.columns * self.size, -1)
+        return whole[: self.height, : self.width]
+
+
+@dataclass(frozen=True)
+class TilePairs:
+    """The M pairs of a tile and a Gaussian that may touch it, by tile and within a tile front to back.
+
+    Attributes:
+        gaussian: Index of the Gaussian. [M]
+        tile: Number of the tile, ascending. [M]
+        starts: First pair of each tile, and the number of pairs at the end. [tiles + 1]
+    """
+
+    gaussian: Int[Tensor, "M"]
+    tile: Int[Tensor, "M"]
+    starts: Int[Tensor, "tiles+1"]
+
+
+@dataclass(frozen=True)
+class Extents:
+    """How far the Gaussians reach: exactly to where alpha falls to alpha_min.
+
+    Attributes:
+        squared_radii: tau: the squared Mahalanobis distance at which alpha = alpha_min; negative where it never
+            reaches it. [N]
+        halves: Half-extents of the ellipse along x and y, pixels. [N, 2]
+        drawn: In front of the camera and reaching at least as far as the rectangle of pixel centres. [N]
+    """
+
+    squared_radii: Float[Tensor, "N"]
+    halves: Float[Tensor, "N 2"]
+    drawn: Bool[Tensor, "N"]
+
+
+@torch.no_grad()
+def gaussian_extents(
+    projected: ProjectedGaussians, opacities: Float[Tensor, "N"], grid: TileGrid, alpha_min: float
+) -> Extents:
+    """Where each Gaussian ends, and whether that is inside the image."""
+    tau = 2 * torch.log(opacities / alpha_min)
+    halves = (tau.clamp_min(0)[:, None] * projected.covariances[:, ::2]).sqrt()
+    low = torch.full_like(projected.means2d, 0.5)
+    high = low.new_tensor([grid.width - 0.5, grid.height - 0.5]).expand_as(low)
+    nearest = _squared_distance_to_box(projected.means2d, projected.covariances, projected.whitenings, low, high)
+    return Extents(tau, halves, projected.in_front & (tau >= 0) & (nearest <= tau))
+
+
+@torch.no_grad()
+def bin_gaussians(projected: ProjectedGaussians, extents: Extents, grid: TileGrid) -> TilePairs:
+    """Pair the drawn Gaussians with the tiles their ellipses touch."""
+    drawn = extents.drawn.nonzero().squeeze(-1)
+    # Sorting once by depth and stably by tile afterwards leaves every tile's list front to back; Gaussians of equal
+    # depth keep the order they came in.
+    drawn = drawn[torch.argsort(projected.depths[drawn], stable=True)]
+    tau = extents.squared_radii[drawn] + _RADIUS_SLACK
+    means2d, covariances = projected.means2d[drawn], projected.covariances[drawn]
+    halves = (tau[:, None] * covariances[:, ::2]).sqrt()
+    last = means2d.new_tensor([grid.columns - 1, grid.rows - 1])
+    first_tile = ((means2d - halves) / grid.size).floor().clamp_min(0).minimum(last).long()
+    last_tile = ((means2d + halves) / grid.size).floor().clamp_min(0).minimum(last).long()
+    across, down = (last_tile - first_tile + 1).unbind(-1)
+
+    counts = across * down
+    owner = torch.repeat_interleave(counts)
+    place = torch.arange(len(owner), device=owner.device) - (counts.cumsum(0) - counts)[owner]
+    # Narrow integers: the division and the sort below are several times as fast on them.
+    place, across_of_owner = place.int(), across.int()[owner]
+    row = torch.div(place, across_of_owner, rounding_mode="floor")
+    column = place - row * across_of_owner + first_tile[:, 0].int()[owner]
+    row = row + first_tile[:, 1].int()[owner]
+
+    low = torch.stack([column, row], dim=-1).to(means2d.dtype) * grid.size + 0.5
+    high = low + (grid.size - 1)
+    table = torch.cat([means2d, covariances, projected.whitenings[drawn], tau[:, None]], dim=-1).index_select(0, owner)
+    nearest = _squared_distance_to_box(table[:, :2], table[:, 2:5], table[:, 5:8], low, high)
+    kept = (nearest <= table[:, 8]).nonzero().squeeze(-1)
+
+    tile, by_tile = torch.sort((row * grid.columns + column)[kept], stable=True)
+    starts = torch.searchsorted(tile, torch.arange(grid.count + 1, dtype=tile.dtype, device=tile.device))
+    return TilePairs(gaussian=drawn[owner[kept[by_tile]]], tile=tile.long(), starts=starts)
+
+
+def _squared_distance_to_box(
+    means2d: Float[Tensor, "M 2"],
+    covariances: Float[Tensor, "M 3"],
+    whitenings: Float[Tensor, "M 3"],
+    low: Float[Tensor, "M 2"],
+    high: Float[Tensor, "M 2"],
+) -> Float[Tensor, "M"]:
+    """Smallest squared Mahalanobis distance from a Gaussian's centre to an axis-aligned box, exactly. [M]
+
+    A convex quadratic has its minimum over a box at the centre if that is inside, else on an edge that faces it; along
+    the edge of given dx the best dy is dx * cov_xy / cov_xx, clamped to the edge's ends (and likewise with x and y
+    exchanged).
+    """
+    below, above = (low - means2d).unbind(-1), (high - means2d).unbind(-1)
+    xx, xy, yy = covariances.unbind(-1)
+    u_xx, u_yx, u_yy = whitenings.unbind(-1)
+
+    def squared(dx: Tensor, dy: Tensor) -> Tensor:
+        return (u_xx * dx).square() + (u_yx * dx + u_yy * dy).square()
+
+    facing_x = below[0].clamp_min(0) + above[0].clamp_max(0)
+    facing_y = below[1].clamp_min(0) + above[1].clamp_max(0)
+    along_y = (facing_x * xy / xx).clamp(below[1], above[1])
+    along_x = (facing_y * xy / yy).clamp(below[0], above[0])
+    return torch.minimum(squared(facing_x, along_y), squared(along_x, facing_y))

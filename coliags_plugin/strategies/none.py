@@ -1,0 +1,28 @@
+"""The strategy that leaves the field as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import torch
+
+from coliags_plugin.contracts import Strategy
+from coliags_plugin.gaussians import RenderOutput
+from coliags_plugin.settings import Settings
+
+
+class NoStrategySettings(Settings):
+    """No options."""
+
+
+class NoStrategy(Strategy):
+    """Neither grows nor prunes."""
+
+    Settings: ClassVar[type[Settings]] = NoStrategySettings
+
+    def after_backward(
+        self, step: int, field: Any, optimizers: Mapping[str, torch.optim.Optimizer], output: RenderOutput
+    ) -> dict[str, int]:
+        """Do nothing."""
+        return {}

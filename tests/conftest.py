@@ -1,0 +1,24 @@
+"""Fixtures shared by every room's tests."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.fixture(autouse=True)
+def two_threads():
+    """The same number of torch threads everywhere, so that sums are taken in the same order."""
+    torch.set_num_threads(2)
+
+
+@pytest.fixture
+def shared_data():
+    """Real data that is not part of the repository; the test skips by name where it is absent."""
+    if not SHARED_DATA.is_dir():
+        pytest.skip(f"no real data at {SHARED_DATA.name} beside the checkout")
+    return SHARED_DATA

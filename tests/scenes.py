@@ -1,0 +1,45 @@
+"""Small scenes with closed-form truth."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from coliags_plugin.cameras import Camera
+from coliags_plugin.scenes import Frame, PointCloud, Scene
+
+
+def camera_at(x: float, y: float, z: float, width: int = 32, height: int = 24, yaw: float = 0.0) -> Camera:
+    """Looks along +z turned by ``yaw``; off-centre principal point, non-square pixels."""
+    c2w = torch.eye(4, dtype=torch.float64)
+    c2w[0, 0] = c2w[2, 2] = math.cos(yaw)
+    c2w[0, 2], c2w[2, 0] = math.sin(yaw), -math.sin(yaw)
+    c2w[:3, 3] = torch.tensor([x, y, z])
+    return Camera(0.9 * width, 0.85 * width, 0.52 * width, 0.47 * height, width, height, c2w)
+
+
+def wall_color(points: torch.Tensor) -> torch.Tensor:
+    """A smooth pattern on the wall z = 20, RGB in (0, 1)."""
+    x, y = points[..., 0], points[..., 1]
+    pattern = [0.6 + 0.3 * torch.sin(0.5 * x), 0.4 + 0.2 * torch.cos(0.7 * y), 0.3 + 0.1 * torch.sin(0.4 * (x + y))]
+    return torch.stack(pattern, dim=-1)
+
+
+def wall_scene(frames: int = 9, width: int = 32, height: int = 24, depth: bool = True) -> Scene:
+    """The wall z = 20 mm, lit by a lamp on the camera (1/d^2 in linear light), filmed along a short path."""
+    made = []
+    for index in range(frames):
+        camera = camera_at(0.4 * index, 0.1 * index, 0.5 * index, width, height)
+        rays = camera.rays()
+        z = (20.0 - camera.center[2]) / rays[..., 2]
+        points = camera.center + z[..., None] * rays
+        distance = (points - camera.center).norm(dim=-1, keepdim=True)
+        rgb = wall_color(points) * (18.0 / distance) ** (2 / 2.2)
+        image = (rgb.clamp(0, 1) * 255).round().to(torch.uint8)
+        made.append(Frame(f"{index:04d}", index, image, camera, z.float() if depth else None))
+    test = [frame for frame in made if frame.index % 8 == 0]
+    train = [frame for frame in made if frame.index % 8]
+    grid = torch.stack(torch.meshgrid(torch.arange(-12.0, 16, 0.5), torch.arange(-10.0, 12, 0.5), indexing="ij"), -1)
+    points = torch.cat([grid.reshape(-1, 2), torch.full((grid[..., 0].numel(), 1), 20.0)], dim=1)
+    return Scene("wall", train, {"test": test}, PointCloud(points), {"fingerprint": f"wall-{frames}-{depth}"})
