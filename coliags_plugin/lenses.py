@@ -4,8 +4,8 @@ Everything here is float64 and counts pixel centres at INTEGERS, as OpenCV and C
 Directions are in camera axes: x right, y down, z forward.
 
 Three calibrations of one colonoscope are in use for the same 1350 x 1080 frames (data_layouts.md 1, methods.md 9.3).
-``fisheye`` agrees with ``omnidirectional``, which rendered the ground truth, to 0.02 degrees; ``legacy-pinhole``,
-behind most published numbers, is off by up to 2.3 degrees.
+``omnidirectional`` rendered the ground truth. ``fisheye`` sees every pixel within 0.2 degrees of it;
+``legacy-pinhole``, behind most published numbers, is off by up to 3.4 degrees (2.3 of them along the radius).
 """
 
 from __future__ import annotations

@@ -31,6 +31,8 @@ def masked_mean(values: Float[Tensor, "H W *C"], mask: Bool[Tensor, "H W"] | Non
         values: An image or a map. [H, W] or [H, W, C]
         mask: False where a pixel is to be ignored; None counts every pixel. [H, W]
     """
+    # Sums run in the order of memory, and a choice may lay its result out differently from its input.
+    values = values.contiguous()
     if mask is None:
         return values.sum() / max(values.numel(), 1)
     per_pixel = values.shape[2] if values.dim() > mask.dim() else 1

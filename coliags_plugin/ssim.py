@@ -107,8 +107,8 @@ class _Blur(torch.autograd.Function):
 def _blur_rows(images: Float[Tensor, "H C W"]) -> Float[Tensor, "H C W"]:
     """Along the first dimension, as a product with a banded matrix, tile of rows by tile of rows.
 
-    Matrix products cost the same on every thread count and dtype. A depth-wise ``conv2d`` is as quick at its best, but
-    falls off by a factor of fifty with two threads or in float64.
+    Products cost much the same on every thread count and dtype: 12 ms for one SSIM of 338x270 with its gradient. A
+    depth-wise ``conv2d`` took from 16 ms to over a second on the same machine, depending on both.
     """
     height, channels, width = images.shape
     tiles = -(-height // _TILE)

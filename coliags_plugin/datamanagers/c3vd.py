@@ -39,7 +39,7 @@ class C3VDSettings(Settings):
     lens: Literal["omnidirectional", "legacy-pinhole", "fisheye"] = Field(
         "omnidirectional",
         description="How raw frames are undistorted (pinhole frames need none): 'omnidirectional' rendered the ground "
-        "truth; 'legacy-pinhole' is behind most published numbers and up to 2.3 degrees off; 'fisheye' is REIM-NeRF's.",
+        "truth; 'legacy-pinhole' is behind most published numbers and up to 3.4 degrees off; 'fisheye' is REIM-NeRF's.",
     )
     focal_scale: float = Field(
         1.0,

@@ -275,7 +275,7 @@ def _view(runs: Sequence[EvaluatedRun], view: View, error_kind: str) -> str:
     ]
     if view.depth is not None:
         parts.append(_img(view.depth, f"{where}, true depth"))
-        parts.append("<figcaption><span>above: camera picture</span> · <span>below: true depth</span></figcaption>")
+        parts.append("<figcaption><span>above: camera picture</span><span>below: true depth</span></figcaption>")
     elif error_kind == "depth":
         parts.append(_missing(view.truth, "no true depth"))
     parts.append("</figure>")
@@ -302,7 +302,7 @@ def _view_figures(run: EvaluatedRun, part: RunView) -> str:
         texts.append(
             f"<span>{escape(f'{metric_title(metric)} {column.text(value)} {unit_text(unit)}'.rstrip())}</span>"
         )
-    return " · ".join(texts) or "no figures for this frame"
+    return "".join(texts) or "no figures for this frame"
 
 
 def _img(picture: Picture, alt: str) -> str:
@@ -402,9 +402,13 @@ def _costs(run: EvaluatedRun) -> list[str]:
     return [
         steps,
         _DASH if seconds is None else duration(seconds),
-        _DASH if seconds is None or not logged else f"{1000.0 * seconds / logged:.3g} ms",
+        _DASH if seconds is None or not logged else _pace(seconds / logged),
         *(_DASH if count is None else f"{count:,.0f}" for count in counts),
     ]
+
+
+def _pace(seconds: float) -> str:
+    return f"{seconds:.2f} s" if seconds >= 1.0 else f"{1000.0 * seconds:.3g} ms"
 
 
 def duration(seconds: float) -> str:
@@ -444,16 +448,17 @@ def _per_frame(runs: Sequence[EvaluatedRun]) -> str:
 
 def _provenance(runs: Sequence[EvaluatedRun]) -> str:
     parts = ["<section><h2>Provenance</h2>"]
-    data = _recorded_scenes(runs)
-    if len(data) > 1 and all(_leaves(scene) == _leaves(next(iter(data.values()))) for scene in data.values()):
-        data = {"": next(iter(data.values()))}
-    for label, scene in data.items():
-        parts.append(_record(f"Data of {label}" if len(data) > 1 else "Data", scene))
+    scenes = _recorded_scenes(runs)
+    first = next(iter(scenes.values()), {})
+    if all(_leaves(scene) == _leaves(first) for scene in scenes.values()):
+        parts.append(_record("Data", first))
+    else:
+        parts += [_record(f"Data of {label}", scene) for label, scene in scenes.items()]
     for run in runs:
         own = {key: value for key, value in run.provenance.items() if key != "scene"}
         # The stamp names the run without saying where this machine keeps it.
         stamp = run.folder.resolve().name
-        title = run.label if run.label.endswith(stamp) else f"{run.label} · {stamp}"
+        title = run.label if stamp in run.label else f"{run.label} · {stamp}"
         parts.append(_record(title, own))
     return "\n".join([*parts, "</section>"])
 

@@ -116,12 +116,17 @@ def read_runs(folders: Sequence[Path], protocol: str) -> list[EvaluatedRun]:
     runs = [_read_run(folder, protocol) for folder in folders]
     for run in runs[1:]:
         _refuse_mismatch(runs[0], run)
-    methods = [run.record.method for run in runs]
+    labels = _labels([(run.record.method, run.folder.resolve().name) for run in runs])
+    return [replace(run, label=label) for run, label in zip(runs, labels, strict=True)]
+
+
+def _labels(names: Sequence[tuple[str, str]]) -> list[str]:
+    """Methods, told apart by their stamps where two are alike, and by number where the stamps are alike too."""
+    methods = [method for method, _ in names]
+    labels = [f"{method} · {stamp}" if methods.count(method) > 1 else method for method, stamp in names]
     return [
-        replace(run, label=f"{run.record.method} · {run.folder.resolve().name}")
-        if methods.count(run.record.method) > 1
-        else run
-        for run in runs
+        f"{label} ({labels[: index + 1].count(label)})" if labels.count(label) > 1 else label
+        for index, label in enumerate(labels)
     ]
 
 

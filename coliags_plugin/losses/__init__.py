@@ -1,0 +1,1 @@
+"""Losses: scalar terms that training makes small."""

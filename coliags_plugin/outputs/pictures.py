@@ -15,6 +15,10 @@ from coliags_plugin.files import atomic_write
 if TYPE_CHECKING:
     from torch import Tensor
 
+# Tag values of the TIFF 6.0 specification and its supplement.
+_TIFF_DEFLATE = 8
+_TIFF_NO_PREDICTOR = 1
+
 
 def as_array(values: np.ndarray | Tensor) -> np.ndarray:
     """A NumPy view or copy of an array or tensor, whatever device it is on and whether or not it has a gradient."""
@@ -88,8 +92,8 @@ def write_depth_tiff(path: Path, depth_mm: Float32[np.ndarray, "H W"] | Tensor) 
     depth = as_array(depth_mm)
     if depth.ndim != 2 or depth.size == 0 or not np.issubdtype(depth.dtype, np.floating):
         raise InputError(f"{path} was to hold {_kind(depth)}", "a depth map: floating point, [H, W]")
-    # Deflate is read everywhere; cv2's own default, LZW, is not (tifffile needs a plug-in for it).
-    options = [cv2.IMWRITE_TIFF_COMPRESSION, 8]
+    # cv2's own choice, LZW with a floating-point predictor, is beyond many readers (tifffile needs a plug-in for it).
+    options = [cv2.IMWRITE_TIFF_COMPRESSION, _TIFF_DEFLATE, cv2.IMWRITE_TIFF_PREDICTOR, _TIFF_NO_PREDICTOR]
     atomic_write(path, _encode(".tiff", np.ascontiguousarray(depth, dtype=np.float32), options))
 
 

@@ -1,0 +1,1 @@
+"""Renderers: a field, seen by a camera."""

@@ -91,7 +91,7 @@ def composite(
         pixels: :func:`monomials` of the pixel centres of a tile. [6, P]
         cuts: What is drawn at all.
     """
-    composited: Tensor = _Composite.apply(polynomials, features, starts, pixels, cuts)
+    composited: Tensor = _Composite.apply(polynomials, features, starts, pixels, cuts)  # type: ignore[no-untyped-call]
     return composited
 
 
@@ -140,9 +140,7 @@ class _Chunk(NamedTuple):
 def _sweep(padded: Tensor, starts: Tensor, pixels: Tensor, cuts: Cuts) -> Iterator[_Chunk]:
     """Walk through every tile's pairs front to back until they end or no pixel lets light through any more.
 
-    Args:
-        padded: Polynomials with one more row whose alpha is 0. [M + 1, 6]
-        starts, pixels, cuts: As for :func:`composite`.
+    The arguments are those of :func:`composite`, the polynomials :func:`_padded`. [M + 1, 6], [tiles + 1], [6, P]
     """
     budget = _CHUNK_ELEMENTS.get(padded.device.type, _CHUNK_ELEMENTS["cuda"]) // pixels.shape[1]
     alpha_below = _just_below(cuts.alpha_min, padded)
@@ -150,7 +148,8 @@ def _sweep(padded: Tensor, starts: Tensor, pixels: Tensor, cuts: Cuts) -> Iterat
     # Tiles of like length go together, so that few rows are padding.
     counts, occupied = starts.diff().sort(descending=True, stable=True)
     occupied = occupied[: int((counts > 0).sum())]
-    for tiles in occupied.split(max(1, budget // _MIN_RANKS)):
+    for group in torch.split(occupied, max(1, budget // _MIN_RANKS)):
+        tiles = group
         first, end = starts[tiles], starts[tiles + 1]
         before = padded.new_ones(len(tiles), pixels.shape[1])
         while len(tiles):
@@ -160,13 +159,13 @@ def _sweep(padded: Tensor, starts: Tensor, pixels: Tensor, cuts: Cuts) -> Iterat
             rows = torch.where(rows < end[:, None], rows, len(padded) - 1).flatten()
             alphas = (padded.index_select(0, rows) @ pixels).view(len(tiles), ranks, -1)
             alphas.exp_().clamp_(max=cuts.alpha_max)
-            torch.nn.functional.threshold_(alphas, alpha_below, 0.0)
+            torch.threshold_(alphas, alpha_below, 0.0)
             through = 1 - alphas
             ratios = alphas / through
             through[:, 0] *= before
-            transmittances = torch.cumprod(through, 1, out=through)
+            transmittances = through.cumprod_(1)
             # It only falls, so what is below the bound stays below: zero from there on is the stop.
-            torch.nn.functional.threshold_(transmittances, transmittance_below, 0.0)
+            torch.threshold_(transmittances, transmittance_below, 0.0)
             # alpha T in front = alpha / (1 - alpha) T behind, which is 0 for the pair that would cross the bound.
             yield _Chunk(tiles, rows, before, transmittances, alphas, ratios, ratios * transmittances)
             before = transmittances[:, -1].clone()
@@ -178,9 +177,7 @@ def _sweep(padded: Tensor, starts: Tensor, pixels: Tensor, cuts: Cuts) -> Iterat
 
 class _Composite(torch.autograd.Function):
     @staticmethod
-    def forward(  # type: ignore[override]
-        ctx: Any, polynomials: Tensor, features: Tensor, starts: Tensor, pixels: Tensor, cuts: Cuts
-    ) -> Tensor:
+    def forward(ctx: Any, polynomials: Tensor, features: Tensor, starts: Tensor, pixels: Tensor, cuts: Cuts) -> Tensor:
         padded, padded_features = _padded(polynomials), torch.nn.functional.pad(features, (0, 0, 0, 1))
         composited = features.new_zeros(len(starts) - 1, features.shape[1], pixels.shape[1])
         for chunk in _sweep(padded, starts, pixels, cuts):
@@ -192,7 +189,7 @@ class _Composite(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         padded, padded_features, starts, pixels, composited = ctx.saved_tensors
         of_polynomials, of_features = torch.zeros_like(padded), torch.zeros_like(padded_features)
         # What all pairs behind a point add to the loss; at the start of the sweep, everything.
@@ -221,6 +218,6 @@ def _padded(polynomials: Tensor) -> Tensor:
 
 
 def _just_below(value: float, like: Tensor) -> float:
-    """The largest number under ``value``: what is equal to a cut is kept, but ``threshold`` drops what equals its own."""
+    """The largest number under ``value``; ``threshold`` drops what equals its bound, and a cut keeps it."""
     number = torch.tensor(value, dtype=like.dtype)
     return float(torch.nextafter(number, torch.zeros_like(number)))

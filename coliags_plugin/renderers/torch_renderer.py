@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import ClassVar
 
+import pydantic
 import torch
 from jaxtyping import Float
-from pydantic import Field as Option
 from torch import Tensor
 
 from coliags_plugin.cameras import Camera
@@ -31,19 +31,19 @@ _SUMMED = {
 class TorchRendererSettings(Settings):
     """Options of :class:`TorchRenderer`. The defaults are the lineage's constants (methods.md 0.1, 0.2)."""
 
-    near: float = Option(0.2, gt=0)
+    near: float = pydantic.Field(default=0.2, ge=0)
     """Gaussians with a centre at z <= near are not drawn. Scene units."""
-    low_pass: float = Option(0.3, gt=0)
+    low_pass: float = pydantic.Field(default=0.3, gt=0)
     """Added to the diagonal of every 2D covariance, so that nothing is thinner than a pixel. Square pixels."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """RGB behind everything."""
-    tile_size: int = Option(8, ge=1)
+    tile_size: int = pydantic.Field(default=8, ge=1)
     """Edge of a tile, pixels. Changes the speed, and the result by rounding only."""
-    alpha_max: float = Option(0.99, gt=0, lt=1)
+    alpha_max: float = pydantic.Field(default=0.99, gt=0, lt=1)
     """No Gaussian is more opaque than this at any pixel."""
-    alpha_min: float = Option(1 / 255, gt=0, lt=1)
+    alpha_min: float = pydantic.Field(default=1 / 255, gt=0, lt=1)
     """Fainter contributions are skipped."""
-    transmittance_min: float = Option(1e-4, ge=0, lt=1)
+    transmittance_min: float = pydantic.Field(default=1e-4, ge=0, lt=1)
     """Compositing stops before the Gaussian that would leave less light than this."""
 
 

@@ -27,11 +27,11 @@ def splat(gaussians, camera, background=(0.0, 0.0, 0.0), near=0.2, low_pass=0.3)
 
     homogeneous = torch.cat([means, torch.ones(len(means), 1, dtype=torch.float64)], dim=1)
     in_camera = homogeneous @ world_to_camera.T
-    order = sorted(range(len(means)), key=lambda i: float(in_camera[i, 2]))
+    order = sorted(range(len(means)), key=lambda i: in_camera[i, 2].item())
     centers = {}
     for i in order:
         x, y, z = in_camera[i]
-        if z <= near:
+        if z.item() <= near:
             continue
         w, axis = (quats[i] / quats[i].norm()).split([1, 3])
         zero = torch.zeros((), dtype=torch.float64)
@@ -66,7 +66,7 @@ def splat(gaussians, camera, background=(0.0, 0.0, 0.0), near=0.2, low_pass=0.3)
         running = running & (behind >= 1e-4)
         weight = torch.where(running, alpha * transmittance, torch.zeros_like(alpha))
         normal = world_to_camera[:, :3] @ rotation[:, int(scales[i].argmin())]
-        if float(normal @ in_camera[i]) > 0:
+        if (normal @ in_camera[i]).item() > 0:
             normal = -normal
         sums["rgb"] = sums["rgb"] + weight[..., None] * colors[i]
         sums["alpha"] = sums["alpha"] + weight

@@ -16,6 +16,7 @@ from coliags_plugin import registry
 from coliags_plugin.cameras import Camera
 from coliags_plugin.errors import InputError
 from coliags_plugin.gaussians import OUTPUTS, Gaussians
+from coliags_plugin.renderers import compositing
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings, render_gaussians
 
 INPUTS = ("means", "quats_wxyz", "scales", "opacities", "colors")
@@ -111,7 +112,7 @@ def scene(name):
     elif name == "around the camera":
         gaussians = random_gaussians(150, 3, depth=(-2.0, 1.5), scale=(0.005, 0.2), spread=1.5)
     elif name == "crowd in one tile":
-        gaussians = random_gaussians(1500, 4, depth=(2.0, 3.0), scale=(0.01, 0.05), opacity=(0.004, 0.03), spread=0.05)
+        gaussians = random_gaussians(400, 4, depth=(2.0, 3.0), scale=(0.01, 0.05), opacity=(0.004, 0.08), spread=0.05)
         camera = pinhole(12, 11, 31.0, 27.0)
     elif name == "opaque":
         gaussians = random_gaussians(150, 5, scale=(0.1, 0.6), opacity=(0.9, 1.0))
@@ -120,8 +121,8 @@ def scene(name):
     elif name == "one pixel":
         gaussians, camera = random_gaussians(60, 6), pinhole(1, 1, 31.0, 27.0)
     elif name == "off centre":
-        gaussians = random_gaussians(120, 7, spread=2.5)
-        camera = pinhole(33, 21, 12.0, 30.0, -6.5, 30.25)
+        gaussians = random_gaussians(120, 7, spread=1.5)
+        camera = pinhole(33, 21, 12.0, 30.0, -6.5, 30.25)  # the axis misses the image
     transform, quat = rigid(11)
     return moved(gaussians, transform, quat), dataclasses.replace(camera, camera_to_world=transform)
 
@@ -187,7 +188,9 @@ def test_normals_are_the_shortest_axes_facing_the_camera():
     quats = torch.tensor([[1.0, 0, 0, 0], [half, half, 0, 0]])
     scales = torch.tensor([[0.5, 0.4, 0.1], [0.5, 0.4, 0.1]])
     gaussians = make([[0, 0, 4.0], [0.0, 1.0, 4.0]], scales, 0.9, quats=quats)
-    first, second = (dataclasses.replace(gaussians, **{k: getattr(gaussians, k)[i] for k in INPUTS}) for i in ([0], [1]))
+    first, second = (
+        dataclasses.replace(gaussians, **{k: getattr(gaussians, k)[i] for k in INPUTS}) for i in ([0], [1])
+    )
     seen = render_gaussians(first, pinhole(), ("normals",))["normals"][3, 4]
     torch.testing.assert_close(seen, 0.9 * torch.tensor([0, 0, -1.0], dtype=torch.float64))
     output = render_gaussians(second, pinhole(9, 31), ("normals",))
@@ -273,7 +276,8 @@ def test_no_gaussians_leave_the_background_and_a_graph(size, dtype):
 
 
 def relative(ours, true):
-    return float((ours.double() - true).norm() / true.norm().clamp_min(1e-300))
+    difference, size = (ours.detach().double() - true.detach()).norm(), true.detach().norm()
+    return float(difference / size.clamp_min(1e-300))
 
 
 def with_gradients(draw, gaussians, camera, cotangents):
@@ -296,28 +300,326 @@ def ours(**options):
 @pytest.mark.parametrize("name", SCENES)
 def test_agrees_with_the_naive_renderer(name):
     gaussians, camera = scene(name)
-    gaussians = cast(gaussians, torch.float32)  # numbers that float32 holds exactly, so that both precisions see the same
+    gaussians = cast(
+        gaussians, torch.float32
+    )  # numbers that float32 holds exactly, so that both precisions see the same
     camera = camera.to(dtype=torch.float32)
     background = (0.3, 0.1, 0.9)
     generator = torch.Generator().manual_seed(1)
     shape = (camera.height, camera.width)
     cotangents = {k: torch.randn(*shape, *([3] * (k in ("rgb", "normals"))), generator=generator) for k in SUMS}
 
-    def draw(gaussians, camera):
+    def book(gaussians, camera):
         return splat(gaussians, camera, background)
 
     true, centers, true_gradients = with_gradients(
-        draw, cast(gaussians, torch.float64), camera.to(dtype=torch.float64), cotangents
+        book, cast(gaussians, torch.float64), camera.to(dtype=torch.float64), cotangents
     )
     for dtype, bound in ((torch.float64, 1e-9), (torch.float32, 1e-5)):
         for tile_size in (5, 8, 16) if dtype == torch.float64 else (8,):
             outputs, output, gradients = with_gradients(
-                ours(background=background, tile_size=tile_size), cast(gaussians, dtype), camera.to(dtype=dtype), cotangents
+                ours(background=background, tile_size=tile_size),
+                cast(gaussians, dtype),
+                camera.to(dtype=dtype),
+                cotangents,
             )
             for key in OUTPUTS:
                 assert outputs[key].dtype == dtype
                 assert relative(outputs[key], true[key]) <= bound, (dtype, tile_size, key)
             for key, gradient in gradients.items():
-                assert relative(gradient, true_gradients[key]) <= bound, (dtype, tile_size, key)
+                allowed = 10 * bound if key == "pose" and dtype == torch.float32 else bound  # a sum that cancels
+                assert relative(gradient, true_gradients[key]) <= allowed, (dtype, tile_size, key)
             for i, center in centers.items():
                 torch.testing.assert_close(output.means2d[i].double(), center, rtol=1e-5, atol=1e-5, check_dtype=False)
+
+
+# --- derivatives ------------------------------------------------------------------------------------------------------
+
+
+def smooth_scene():
+    """Far from every cut-off: wide, faint, well inside the field of view, no two depths or shortest axes alike."""
+    generator = torch.Generator().manual_seed(3)
+    n = 4
+    means = torch.randn(n, 3, generator=generator, dtype=torch.float64) * 0.2
+    means[:, 2] = torch.tensor([4.0, 2.0, 5.0, 3.0])
+    scales = torch.tensor([0.6, 0.8, 1.1]) * (1 + 0.2 * torch.rand(n, 1, generator=generator))
+    opacities = torch.tensor([0.3, 0.5, 0.4, 0.6])
+    quats = torch.randn(n, 4, generator=generator)
+    return make(means, scales, opacities, torch.rand(n, 3, generator=generator), quats), pinhole(
+        6, 5, 7.0, 8.0, 2.8, 2.6
+    )
+
+
+def test_gradcheck_of_everything_in_the_gaussians_and_the_pose():
+    gaussians, camera = smooth_scene()
+    generator = torch.Generator().manual_seed(4)
+    shapes = {name: (5, 6, 3) if name in ("rgb", "normals") else (5, 6) for name in SUMS}
+    cotangents = {k: torch.randn(*shape, generator=generator, dtype=torch.float64) for k, shape in shapes.items()}
+
+    def render(pose, *values):
+        replaced = dataclasses.replace(gaussians, **dict(zip(INPUTS, values, strict=True)))
+        posed = dataclasses.replace(camera, camera_to_world=pose)
+        output = render_gaussians(replaced, posed, OUTPUTS, TorchRendererSettings(background=(0.2, 0.3, 0.4)))
+        assert output.alpha.min() > 0.3
+        return tuple((output[name] * cotangents[name]).sum() for name in SUMS)  # 6 numbers instead of 300: seconds less
+
+    pose, quat = rigid(5)
+    gaussians = moved(gaussians, pose, quat)
+    inputs = [pose, *(getattr(gaussians, name) for name in INPUTS)]
+    assert torch.autograd.gradcheck(render, [value.clone().requires_grad_() for value in inputs])
+
+
+def test_gradcheck_holds_where_cuts_and_clamps_act():
+    # Opacity above alpha_max on some pixels, alpha below alpha_min on others, the stop reached on some.
+    depths = torch.tensor([2.0, 3.0, 4.0, 5.0], dtype=torch.float64)
+    means = depths[:, None] * torch.tensor([[0.001, 0.002, 1], [0.03, -0.02, 1], [-0.02, 0.01, 1], [0, 0.05, 1]])
+    gaussians, camera = make(means, depths[:, None].expand(4, 3) * 0.09, [1.0, 0.995, 0.999, 0.9]), pinhole(17, 3)
+    names = ("means", "opacities", "colors")
+    cotangent = torch.randn(3, 17, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    def render(*values, **options):
+        replaced = dataclasses.replace(gaussians, **dict(zip(names, values, strict=True)))
+        return render_gaussians(replaced, camera, settings=TorchRendererSettings(**options))
+
+    def loss(*values):
+        output = render(*values)
+        return (torch.cat([output.rgb, output.alpha[..., None]], dim=-1) * cotangent).sum()
+
+    values = [getattr(gaussians, k).clone().requires_grad_() for k in names]
+    alpha = render(*values).alpha
+    assert (alpha == 0).any() and (alpha < render(*values, transmittance_min=0.0).alpha).any()
+    alone = dataclasses.replace(gaussians, **{k: getattr(gaussians, k)[:1] for k in INPUTS})
+    assert (render_gaussians(alone, camera).alpha == 0.99).any()
+    assert torch.autograd.gradcheck(loss, values)
+
+
+def test_gradient_of_means2d_is_that_of_moving_the_projection():
+    gaussians, camera = smooth_scene()
+    gaussians = cast(gaussians, grad=True)
+    cotangent = torch.randn(5, 6, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    def loss(camera):
+        output = render_gaussians(gaussians, camera)
+        return (output.rgb * cotangent).sum(), output
+
+    value, output = loss(camera)
+    value.backward()
+    step = 1e-5
+    for axis, name in enumerate(("cx", "cy")):
+        ahead, behind = (
+            loss(dataclasses.replace(camera, **{name: getattr(camera, name) + sign * step}))[0] for sign in (1, -1)
+        )
+        torch.testing.assert_close(
+            output.means2d.grad[:, axis].sum(), (ahead - behind) / (2 * step), rtol=1e-6, atol=1e-8
+        )
+    assert (output.means2d.grad.norm(dim=1) > 0).all()
+
+
+def test_without_gradients_nothing_is_retained():
+    gaussians, camera = smooth_scene()
+    assert not render_gaussians(gaussians, camera).means2d.requires_grad
+    with torch.no_grad():
+        output = render_gaussians(cast(gaussians, grad=True), camera, OUTPUTS)
+    assert not output.rgb.requires_grad and not output.means2d.requires_grad
+
+
+def test_median_depth_and_radii_carry_no_gradient():
+    gaussians, camera = smooth_scene()
+    output = render_gaussians(cast(gaussians, grad=True), camera, OUTPUTS)
+    assert output["depth_median"].any()
+    assert not output["depth_median"].requires_grad and not output.radii.requires_grad
+
+
+# --- symmetries -------------------------------------------------------------------------------------------------------
+
+
+def test_centres_land_where_the_camera_projects_them():
+    gaussians, camera = scene("off centre")
+    output = render_gaussians(gaussians, camera)
+    drawn = output.radii > 0
+    assert 0 < drawn.sum() < len(gaussians)
+    torch.testing.assert_close(output.means2d[drawn], camera.project(gaussians.means)[0][drawn])
+
+
+def test_an_off_centre_view_is_a_window_of_a_larger_one():
+    # Moving the principal point by whole pixels moves the picture; only the Jacobian's margin knows the image's edge.
+    gaussians = random_gaussians(60, 8, scale=(0.02, 0.1), spread=0.3)
+    whole = render_gaussians(gaussians, pinhole(40, 30, 30.0, 30.0), OUTPUTS)
+    window = render_gaussians(gaussians, pinhole(25, 20, 30.0, 30.0, 20.0 - 9, 15.0 - 6), OUTPUTS)
+    for name in OUTPUTS:
+        torch.testing.assert_close(window[name], whole[name][6:26, 9:34], rtol=1e-9, atol=1e-9)
+
+
+def test_moving_world_and_camera_together_changes_nothing():
+    gaussians = random_gaussians(100, 9)
+    still = render_gaussians(gaussians, pinhole(24, 18), OUTPUTS)
+    transform, quat = rigid(21)
+    together = render_gaussians(moved(gaussians, transform, quat), pinhole(24, 18, pose=transform), OUTPUTS)
+    for name in OUTPUTS:
+        torch.testing.assert_close(together[name], still[name], rtol=1e-9, atol=1e-9)
+
+
+def test_quaternions_of_any_length_or_sign_are_the_same_rotation():
+    gaussians = random_gaussians(50, 10)
+    scaled = dataclasses.replace(gaussians, quats_wxyz=-7.5 * gaussians.quats_wxyz)
+    for name in ("rgb", "depth_accumulated"):
+        torch.testing.assert_close(
+            render_gaussians(scaled, pinhole(), (name,))[name], render_gaussians(gaussians, pinhole(), (name,))[name]
+        )
+
+
+@pytest.mark.parametrize("name", ["random", "opaque", "crowd in one tile"])
+def test_the_order_of_the_input_does_not_matter(name):
+    gaussians, camera = scene(name)
+    order = torch.randperm(len(gaussians), generator=torch.Generator().manual_seed(0))
+    shuffled = dataclasses.replace(gaussians, **{k: getattr(gaussians, k)[order] for k in INPUTS})
+    plain, other = (render_gaussians(g, camera, OUTPUTS) for g in (gaussians, shuffled))
+    for key in OUTPUTS:
+        torch.testing.assert_close(other[key], plain[key], rtol=1e-12, atol=1e-12)
+    assert torch.equal(other.radii, plain.radii[order])
+
+
+def test_gaussians_of_equal_depth_keep_the_order_they_came_in():
+    gaussians = make([[0, 0, 4.0], [0, 0, 4.0]], 0.3, 0.8, [[1.0, 0, 0], [0, 1.0, 0]])
+    output = render_gaussians(gaussians, pinhole())
+    torch.testing.assert_close(output.rgb[3, 4], torch.tensor([0.8, 0.16, 0.0], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("tile_size", [1, 3, 4, 16, 64])
+def test_the_tile_size_changes_nothing(tile_size):
+    gaussians, camera = scene("random")
+    plain = render_gaussians(gaussians, camera, OUTPUTS)
+    other = render_gaussians(gaussians, camera, OUTPUTS, TorchRendererSettings(tile_size=tile_size))
+    for key in OUTPUTS:
+        torch.testing.assert_close(other[key], plain[key], rtol=1e-10, atol=1e-10)
+    assert torch.equal(other.radii, plain.radii)
+
+
+@pytest.mark.parametrize("elements", [1, 2000, 2**22])
+def test_the_size_of_the_working_set_changes_nothing(elements, monkeypatch):
+    gaussians, camera = scene("crowd in one tile")
+    cotangents = {k: torch.ones(11, 12, *([3] * (k in ("rgb", "normals")))) for k in SUMS}
+    plain, _, gradients = with_gradients(ours(), gaussians, camera, cotangents)
+    monkeypatch.setitem(compositing._CHUNK_ELEMENTS, "cpu", elements)
+    other, _, other_gradients = with_gradients(ours(), gaussians, camera, cotangents)
+    for key in OUTPUTS:
+        torch.testing.assert_close(other[key], plain[key], rtol=1e-10, atol=1e-10)
+    for key, gradient in gradients.items():
+        torch.testing.assert_close(other_gradients[key], gradient, rtol=1e-8, atol=1e-8)
+
+
+def test_two_calls_agree_to_the_bit():
+    gaussians = cast(random_gaussians(6000, 12, scale=(0.01, 0.08)), torch.float32)
+    camera = pinhole(64, 48, 55.0, 55.0, dtype=torch.float32)
+    cotangents = {k: torch.ones(48, 64, *([3] * (k in ("rgb", "normals")))) for k in SUMS}
+    first, _, first_gradients = with_gradients(ours(), gaussians, camera, cotangents)
+    second, _, second_gradients = with_gradients(ours(), gaussians, camera, cotangents)
+    assert all(torch.equal(first[k], second[k]) for k in OUTPUTS)
+    assert all(torch.equal(first_gradients[k], second_gradients[k]) for k in first_gradients)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    n=st.integers(0, 12),
+    width=st.integers(1, 20),
+    height=st.integers(1, 20),
+    tile_size=st.integers(1, 17),
+    wants=st.lists(st.sampled_from(OUTPUTS), unique=True),
+    dtype=st.sampled_from([torch.float32, torch.float64]),
+    seed=st.integers(0, 99),
+)
+def test_shapes_and_ranges(n, width, height, tile_size, wants, dtype, seed):
+    gaussians = cast(random_gaussians(n, seed, depth=(-1.0, 4.0)), dtype, grad=True)
+    camera = pinhole(width, height, dtype=dtype)
+    output = render_gaussians(gaussians, camera, wants, TorchRendererSettings(tile_size=tile_size))
+    assert output.rgb.shape == (height, width, 3) and output.alpha.shape == (height, width)
+    assert output.means2d.shape == (n, 2) and output.radii.shape == (n,)
+    assert set(output.maps) == set(wants) - {"rgb", "alpha"}
+    for name in wants:
+        assert output[name].shape == ((height, width, 3) if name in ("rgb", "normals") else (height, width))
+        assert output[name].dtype == dtype and output[name].isfinite().all()
+    assert (
+        output.alpha.min() >= 0 and output.alpha.max() <= 1 and output.rgb.min() >= 0 and output.rgb.max() <= 1 + 1e-5
+    )
+    sum(output[name].sum() for name in ("rgb", *wants) if name != "depth_median").backward()
+    for name in INPUTS:
+        assert getattr(gaussians, name).grad.isfinite().all(), name
+    behind = gaussians.means[:, 2] <= 0.2
+    assert not output.radii[behind].any() and not output.means2d.grad[behind].any()
+
+
+# --- the component ----------------------------------------------------------------------------------------------------
+
+
+class FieldOf:
+    primitive = "gaussians3d"
+
+    def __init__(self, gaussians):
+        self._gaussians = gaussians
+
+    def gaussians(self, camera):
+        return self._gaussians
+
+
+def test_the_registered_component_renders_a_field():
+    renderer_class = registry.renderers.get("torch")
+    assert renderer_class is TorchRenderer
+    assert renderer_class.availability().ok
+    assert renderer_class.outputs == set(OUTPUTS) and renderer_class.primitives == {"gaussians3d"}
+    gaussians, camera = smooth_scene()
+    output = renderer_class(renderer_class.Settings()).render(FieldOf(gaussians), camera, ("rgb", "depth_expected"))
+    assert output.gaussians is gaussians
+    expected = render_gaussians(gaussians, camera, OUTPUTS)["depth_expected"]
+    torch.testing.assert_close(output["depth_expected"], expected)
+    with pytest.raises(KeyError):
+        output["depth_median"]
+
+
+def test_what_cannot_be_rendered_says_so():
+    gaussians, camera = smooth_scene()
+    renderer, field = TorchRenderer(TorchRendererSettings()), FieldOf(gaussians)
+    with pytest.raises(InputError, match="whole images"):
+        renderer.render(field, camera, pixels=torch.zeros(3, 2))
+    with pytest.raises(InputError, match="Did you mean 'depth_median'"):
+        renderer.render(field, camera, ("depth_medain",))
+    field.primitive = "surfels"
+    with pytest.raises(InputError, match="surfels"):
+        renderer.render(field, camera)
+    with pytest.raises(InputError, match="three scales"):
+        render_gaussians(dataclasses.replace(gaussians, scales=gaussians.scales[:, :2]), camera)
+
+
+@pytest.mark.parametrize(
+    "options", [{"tile_size": 0}, {"near": -1.0}, {"low_pass": 0.0}, {"alpha_max": 1.0}, {"tile": 8}]
+)
+def test_settings_are_checked(options):
+    with pytest.raises(ValidationError):
+        TorchRendererSettings(**options)
+
+
+def test_a_pose_of_another_precision_is_cast():
+    gaussians, camera = smooth_scene()
+    output = render_gaussians(cast(gaussians, torch.float32), camera)
+    assert output.rgb.dtype == torch.float32
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", SCENES)
+def test_cuda_gives_the_numbers_of_the_cpu(name):
+    gaussians, camera = scene(name)
+    shape = (camera.height, camera.width)
+    generator = torch.Generator().manual_seed(1)
+    cotangents = {k: torch.randn(*shape, *([3] * (k in ("rgb", "normals"))), generator=generator) for k in SUMS}
+    for dtype, bound in ((torch.float64, 1e-9), (torch.float32, 1e-4)):
+        results = []
+        for device in ("cpu", "cuda"):
+            moved_cotangents = {k: v.to(device) for k, v in cotangents.items()}
+            results.append(
+                with_gradients(ours(), cast(gaussians, dtype, device), camera.to(device, dtype), moved_cotangents)
+            )
+        (on_cpu, _, cpu_gradients), (on_cuda, _, cuda_gradients) = results
+        for key in OUTPUTS:
+            assert on_cuda[key].device.type == "cuda"
+            assert relative(on_cuda[key].cpu(), on_cpu[key].double()) <= bound, (dtype, key)
+        for key, gradient in cpu_gradients.items():
+            assert relative(cuda_gradients[key].cpu(), gradient.double()) <= bound, (dtype, key)

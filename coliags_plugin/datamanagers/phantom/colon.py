@@ -14,14 +14,14 @@ from jaxtyping import Float, Int
 
 from coliags_plugin.datamanagers.phantom.centreline import LENGTH, CentreLine, grow_centre_line
 from coliags_plugin.datamanagers.phantom.settings import PhantomSettings
-from coliags_plugin.datamanagers.phantom.streams import Purpose, smooth_noise, smoothstep, stream
+from coliags_plugin.datamanagers.phantom.streams import Purpose, SolidNoise, smoothstep, stream
 
 RADIUS = 20.0
 #: Length over which the far end rounds off into a closed dome.
 _DOME = 18.0
 _TAENIAE = 2.0 * np.pi / 3.0 * np.arange(3)
-#: Correlation length and standard deviation of the wall's unevenness, mm.
-_RELIEF = ((4.0, 0.35), (1.5, 0.12), (0.6, 0.03))
+#: Size and standard deviation of the wall's unevenness, mm.
+_RELIEF = ((4.0, 0.2), (1.5, 0.05), (0.6, 0.015))
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class Anatomy:
         calibre *= 1.0 - 0.15 * smoothstep((arc - 110.0) / 50.0)
         bands = np.exp(-0.5 * (self.taenia_distance(arc, clock) / 0.2) ** 2).sum(axis=0)
         lobes = np.cos(3.0 * (clock - self.taenia_clock - self.taenia_twist * arc))
-        wall = calibre * (1.0 - 0.045 * lobes - 0.03 * bands)
+        wall = calibre * (1.0 - 0.055 * lobes - 0.04 * bands)
         # A fourth-power sum keeps crossing crescents from piling up, and is smooth.
         rise = np.zeros_like(wall)
         for fold in self.folds:
@@ -218,17 +218,15 @@ def build_surface(anatomy: Anatomy, settings: PhantomSettings) -> ColonSurface:
     clock = np.arange(columns) * (2.0 * np.pi / columns)
     row_length = wall_length / (len(arc) - 1)
     radius = anatomy.radius(arc, clock)
-    generator = stream(settings.seed, Purpose.RELIEF)
-    column_length = 2.0 * np.pi * RADIUS / columns
-    fade = np.clip(radius / RADIUS, 0.0, 1.0)
-    for scale, height in _RELIEF:
-        sigma = scale / 2.5
-        # Drawn whatever the spacing, so that a coarse mesh and a fine one differ in nothing else.
-        noise = smooth_noise(radius.shape, (sigma / row_length, sigma / column_length), generator)
-        if sigma > 0.5 * settings.mesh_spacing:
-            radius -= height * fade * noise
     centres, frames = anatomy.centre_line.at(arc)
     around = np.cos(clock)[None, :, None] * frames[:, None, :, 0] + np.sin(clock)[None, :, None] * frames[:, None, :, 1]
+    noise = SolidNoise(stream(settings.seed, Purpose.RELIEF))
+    smooth = (centres[:, None, :] + radius[:, :, None] * around).astype(np.float32)
+    for scale, height in _RELIEF:
+        bumps = noise.layer(smooth, scale)
+        # A mesh too coarse for a layer would only alias it.
+        if scale > settings.mesh_spacing:
+            radius -= height * np.clip(radius / RADIUS, 0.0, 1.0) * bumps
     grid = centres[:, None, :] + radius[:, :, None] * around
     along = np.gradient(grid, axis=0)
     across = 0.5 * (np.roll(grid, -1, axis=1) - np.roll(grid, 1, axis=1))

@@ -6,21 +6,22 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import scipy.fft
 from jaxtyping import Float, UInt8
 
 from coliags_plugin.datamanagers.phantom.colon import RADIUS, Anatomy, ColonSurface
 from coliags_plugin.datamanagers.phantom.settings import PhantomSettings
-from coliags_plugin.datamanagers.phantom.streams import Purpose, smooth_noise, smoothstep, stream
+from coliags_plugin.datamanagers.phantom.streams import Purpose, SolidNoise, smoothstep, stream
 
 #: Size and relative strength of the mottling of brightness, mm.
-_MOTTLING = ((6.0, 0.07), (1.6, 0.055), (0.4, 0.05), (0.18, 0.05))
+_MOTTLING = ((6.0, 0.06), (1.6, 0.045), (0.4, 0.045), (0.18, 0.045))
 #: Size, mm, and strength of changes in blood content, which take green and blue but spare red.
 _REDDENING = ((9.0, 0.12), (2.5, 0.11), (0.9, 0.06))
 #: Absorption of a vessel's blood at full strength, per RGB channel (optical depth).
 _BLOOD = (0.30, 0.95, 0.85)
 #: Correlation length, mm, and slope (standard deviation, each direction) of the relief too small for the mesh.
-_MICRO_RELIEF = ((0.9, 0.10), (0.32, 0.16))
+_MICRO_RELIEF = ((0.9, 0.05), (0.3, 0.09))
+#: Share of that, per RGB channel (optical depth).
+_REDDENED = (0.12, 1.0, 0.95)
 _VESSELS = 120
 _LEVELS = 6
 
@@ -98,24 +99,27 @@ def paint_mucosa(anatomy: Anatomy, surface: ColonSurface, settings: PhantomSetti
     generator = stream(settings.seed, Purpose.MUCOSA)
     length = surface.row_length * (surface.rows - 1)
     around = 2.0 * np.pi * RADIUS
-    # Sizes that a Fourier transform likes and that halve _LEVELS - 1 times.
+    # Sizes that halve _LEVELS - 1 times.
     multiple = 2 ** (_LEVELS - 1)
-    height = multiple * scipy.fft.next_fast_len(round(length / settings.texture_spacing / multiple) + 1, real=True)
-    width = multiple * scipy.fft.next_fast_len(round(around / settings.texture_spacing / multiple) + 1, real=True)
-    texel = length / height
-    shape = (height, width)
-    sizes = (texel, around / width)
+    height = multiple * (round(length / settings.texture_spacing / multiple) + 1)
+    width = multiple * (round(around / settings.texture_spacing / multiple) + 1)
+    solid = SolidNoise(generator)
+    positions = _texel_positions(surface, (height, width))
+    # Broad layers are worked out on every fourth texel.
+    sparse = _texel_positions(surface, (height // 4, width // 4))
 
     def noise(scale: float) -> Float[np.ndarray, "H W"]:
-        sigma = scale / 2.5
-        return smooth_noise(shape, (sigma / sizes[0], sigma / sizes[1]), generator)
+        if scale < 1.4:
+            return solid.layer(positions, scale)
+        broad = np.pad(solid.layer(sparse, scale), ((0, 0), (1, 1)), mode="wrap")
+        return np.asarray(cv2.resize(broad, (width + 8, height), interpolation=cv2.INTER_LINEAR)[:, 4:-4])
 
     arc = np.interp((np.arange(height) + 0.5) / height * (surface.rows - 1), np.arange(surface.rows), surface.arc)
     clock = (np.arange(width) + 0.5) * (2.0 * np.pi / width)
-    brightness = np.zeros(shape, np.float32)
+    brightness = np.zeros((height, width), np.float32)
     for scale, strength in _MOTTLING:
         brightness += np.float32(strength) * noise(scale)
-    blood = np.zeros(shape, np.float32)
+    blood = np.zeros((height, width), np.float32)
     for scale, strength in _REDDENING:
         blood += np.float32(strength) * noise(scale)
     # Small red spots where the noise peaks; lymphoid tissue and scars are the pale opposite.
@@ -124,29 +128,39 @@ def paint_mucosa(anatomy: Anatomy, surface: ColonSurface, settings: PhantomSetti
     for polyp in anatomy.polyps:
         rows = slice(*np.searchsorted(arc, [polyp.arc - polyp.width, polyp.arc + polyp.width]))
         blood[rows] += 0.30 * np.sqrt(polyp.nearness(arc[rows, None], clock[None, :])).astype(np.float32)
-    vessels = _draw_vessels(shape, sizes, generator)
-    albedo = np.empty((*shape, 4), np.float32)
-    base = np.asarray(settings.albedo, np.float32)
-    for channel, (absorbed, share) in enumerate(zip(_BLOOD, (0.12, 1.0, 0.95), strict=True)):
-        depth = share * blood + absorbed * vessels
-        albedo[..., channel] = np.clip(base[channel] * np.exp(brightness - depth), 0.02, 0.95)
-    albedo[..., 3] = 0.25 + 0.75 * smoothstep((noise(7.0) + 0.35 * noise(1.2) + 1.0) / 1.6)
+    vessels = _draw_vessels((height, width), (length / height, around / width), generator)
+    color = np.empty((height, width, 4), np.float32)
+    for channel, base in enumerate(settings.albedo):
+        depth = _REDDENED[channel] * blood + _BLOOD[channel] * vessels
+        color[..., channel] = np.clip(base * np.exp(brightness - depth), 0.02, 0.95)
+    color[..., 3] = 0.25 + 0.75 * smoothstep((noise(7.0) + 0.35 * noise(1.2) + 1.0) / 1.6)
 
-    relief = np.zeros((*shape, 3), np.float32)
+    along = np.linalg.norm(np.gradient(positions, axis=0), axis=-1)
+    across = np.linalg.norm(np.gradient(positions, axis=1), axis=-1)
+    relief = np.zeros((height, width, 3), np.float32)
     for scale, slope in _MICRO_RELIEF:
         bumps = noise(scale)
-        along, across = (np.gradient(bumps, axis=0) / sizes[0], np.gradient(bumps, axis=1) / sizes[1])
-        factor = slope / max(float(np.sqrt(0.5 * (along.var() + across.var()))), 1e-9)
-        relief[..., 0] += factor * along
-        relief[..., 1] += factor * across
+        # A Gaussian process of kernel sigma has slopes of 1 / (sqrt(2) sigma); this keeps them alike everywhere.
+        rise = slope * np.sqrt(2.0) * scale / 2.5
+        relief[..., 0] += rise * np.gradient(bumps, axis=0) / np.maximum(along, 1e-3)
+        relief[..., 1] += rise * np.gradient(bumps, axis=1) / np.maximum(across, 1e-3)
     relief[..., 2] = relief[..., 0] ** 2 + relief[..., 1] ** 2
     return Mucosa(
-        color=_pyramid(albedo),
+        color=_pyramid(color),
         relief=_pyramid(relief),
-        texel=texel,
+        texel=length / height,
         rows_per_row=height / (surface.rows - 1),
         columns_per_column=width / surface.columns,
     )
+
+
+def _texel_positions(surface: ColonSurface, shape: tuple[int, int]) -> Float[np.ndarray, "H W 3"]:
+    """Where texel centres lie in the world, mm. [H, W, 3]"""
+    grid = surface.vertices.reshape(surface.rows, surface.columns, 3)
+    grid = np.concatenate([grid, grid[:, :1]], axis=1)
+    row = (np.arange(shape[0], dtype=np.float32) + 0.5) * ((surface.rows - 1) / shape[0])
+    column = (np.arange(shape[1], dtype=np.float32) + 0.5) * (surface.columns / shape[1])
+    return np.asarray(cv2.remap(grid, *np.meshgrid(column, row), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
 def _draw_vessels(
@@ -184,40 +198,41 @@ def _draw_branch(
     strength: int,
     generator: np.random.Generator,
 ) -> None:
-    """Draw one vessel (row, column in mm) and, recursively, what branches off it, down to 0.2 mm."""
+    """Draw one vessel (row, column in mm) and, recursively, what branches off it; all taper to 0.15 mm."""
     place, step = start.copy(), 0.6
-    wander = generator.normal(0.0, 0.05)
+    wander = 0.0
     around = (canvas.shape[1] - 2 * pad) * sizes[1]
     place[1] %= around
-    left, length = 0.0, generator.uniform(16.0, 34.0) * width / 0.45
-    while left < length and width >= 0.18:
-        heading += wander + generator.normal(0.0, 0.14)
-        wander = 0.9 * wander + generator.normal(0.0, 0.035)
+    taper = np.exp(-step / generator.uniform(22.0, 40.0))
+    while width >= 0.15:
+        wander = 0.8 * wander + generator.normal(0.0, 0.05)
+        heading += wander + generator.normal(0.0, 0.10)
         following = place + step * np.array([np.cos(heading), np.sin(heading)])
         ends = [
-            (int(round((point[1] / sizes[1] + pad) * 16)), int(round(point[0] / sizes[0] * 16)))
-            for point in (place, following)
+            (round((point[1] / sizes[1] + pad) * 16), round(point[0] / sizes[0] * 16)) for point in (place, following)
         ]
-        cv2.line(canvas, ends[0], ends[1], strength, max(round(width / sizes[0]), 1), cv2.LINE_AA, 4)
-        place, left = following, left + step
-        width *= 0.991
+        # What is thinner than a texel shows as a fainter one.
+        thickness = max(round(width / sizes[0]), 1)
+        shown = round(strength * min(width / sizes[0], 1.0) * min(1.0, width / 0.3))
+        cv2.line(canvas, ends[0], ends[1], shown, thickness, cv2.LINE_AA, 4)
+        place = following
+        width *= taper
         if not -0.4 * pad * sizes[1] < place[1] < around + 0.4 * pad * sizes[1]:
             place[1] %= around
-        if generator.uniform() < 0.045 and width > 0.24:
-            side = generator.choice([-1.0, 1.0]) * generator.uniform(0.45, 0.95)
-            _draw_branch(canvas, sizes, pad, place, heading + side, 0.72 * width, int(0.9 * strength), generator)
-            heading -= 0.25 * side
-            width *= 0.93
+        if generator.uniform() < 0.05 and width > 0.22:
+            side = generator.choice([-1.0, 1.0]) * generator.uniform(0.4, 0.9)
+            _draw_branch(canvas, sizes, pad, place, heading + side, 0.75 * width, int(0.9 * strength), generator)
+            heading -= 0.3 * side
+            width *= 0.9
 
 
 def _pyramid(texture: Float[np.ndarray, "H W K"]) -> tuple[Float[np.ndarray, "H W K"], ...]:
     """The texture, then each level the 2 x 2 means of the last, with one column repeated at either edge."""
-    levels = []
-    for _ in range(_LEVELS):
-        levels.append(np.ascontiguousarray(np.concatenate([texture[:, -1:], texture, texture[:, :1]], axis=1)))
-        height, width, channels = texture.shape
-        texture = texture.reshape(height // 2, 2, width // 2, 2, channels).mean(axis=(1, 3), dtype=np.float32)
-    return tuple(levels)
+    levels = [texture]
+    for _ in range(_LEVELS - 1):
+        height, width, _ = levels[-1].shape
+        levels.append(cv2.resize(levels[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA))
+    return tuple(np.concatenate([level[:, -1:], level, level[:, :1]], axis=1) for level in levels)
 
 
 def _look_up(

@@ -145,11 +145,11 @@ class PhantomSettings(Settings):
     )
     f0: float = Field(0.028, ge=0.0, le=0.08, description="Normal reflectance of the film; .028 is an index of 1.40.")
     albedo: tuple[float, float, float] = Field(
-        (0.78, 0.31, 0.21), description="Mean albedo of the mucosa, linear RGB, each between 0.02 and 0.9 (trial.md 8)."
+        (0.78, 0.29, 0.22), description="Mean albedo of the mucosa, linear RGB, each between 0.02 and 0.9 (trial.md 8)."
     )
 
     target_grey: float = Field(
-        0.42,
+        0.45,
         ge=0.1,
         le=0.8,
         description="Mean of the encoded picture that the exposure aims at; C3VD has .19 to .59 (light_and_beyond.md 1.6).",

@@ -6,6 +6,7 @@ from enum import IntEnum
 
 import numpy as np
 import scipy.fft
+import scipy.ndimage
 from jaxtyping import Float
 
 
@@ -27,26 +28,41 @@ def stream(seed: int, purpose: Purpose, *key: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(int(purpose), *key)))
 
 
-def smooth_noise(
-    shape: tuple[int, int], sigma: tuple[float, float], generator: np.random.Generator
-) -> Float[np.ndarray, "H W"]:
-    """Gaussian noise of unit standard deviation and zero mean with a Gaussian correlation, periodic in both axes.
+class SolidNoise:
+    """Smooth noise that fills space: a function of where a point lies, so it knows no seam, stretching or mesh.
 
-    Args:
-        shape: Rows, columns.
-        sigma: Standard deviation of the smoothing kernel along rows and columns, cells.
-        generator: Where the white noise comes from.
-
-    Returns:
-        Float32. [H, W]
+    It repeats only after 64 times its scale, in a direction that has nothing to do with the colon's.
     """
-    spectrum = scipy.fft.rfft2(generator.standard_normal(shape, dtype=np.float32))
-    rows = np.exp(-2.0 * (np.pi * sigma[0] * np.fft.fftfreq(shape[0])) ** 2).astype(np.float32)
-    columns = np.exp(-2.0 * (np.pi * sigma[1] * np.fft.rfftfreq(shape[1])) ** 2).astype(np.float32)
-    spectrum *= rows[:, None] * columns[None, :]
-    spectrum[0, 0] = 0.0
-    noise = scipy.fft.irfft2(spectrum, s=shape)
-    return np.asarray(noise / max(float(noise.std()), 1e-12), dtype=np.float32)
+
+    _SIZE = 128
+    #: Voxels a standard deviation of the smoothing kernel spans, for linear interpolation to be smooth enough.
+    _SIGMA = 2.0
+
+    def __init__(self, generator: np.random.Generator) -> None:
+        spectrum = scipy.fft.rfftn(generator.standard_normal((self._SIZE,) * 3, dtype=np.float32))
+        full, half = np.fft.fftfreq(self._SIZE), np.fft.rfftfreq(self._SIZE)
+        for axis, frequency in enumerate((full, full, half)):
+            kernel = np.exp(-2.0 * (np.pi * self._SIGMA * frequency) ** 2).astype(np.float32)
+            spectrum *= kernel.reshape([-1 if axis == other else 1 for other in range(3)])
+        spectrum[0, 0, 0] = 0.0
+        volume = scipy.fft.irfftn(spectrum, s=(self._SIZE,) * 3)
+        self._volume = np.asarray(volume / volume.std(), dtype=np.float32)
+        self._generator = generator
+
+    def layer(self, points: Float[np.ndarray, "... 3"], scale: float) -> Float[np.ndarray, "..."]:
+        """Noise of zero mean and unit standard deviation at points; every call draws an independent layer.
+
+        Args:
+            points: mm. [..., 3]
+            scale: Size of its blobs, about 2.5 standard deviations of its kernel, mm.
+        """
+        turn, _ = np.linalg.qr(self._generator.standard_normal((3, 3)))
+        shift = self._generator.uniform(0.0, self._SIZE, 3)
+        turn = (turn * (2.5 * self._SIGMA / scale)).astype(np.float32)
+        # One row per coordinate is what map_coordinates wants; as a matrix product this takes eight times as long.
+        place = np.einsum("nc,cd->dn", points.reshape(-1, 3), turn) + shift.astype(np.float32)[:, None]
+        noise = scipy.ndimage.map_coordinates(self._volume, place, order=1, mode="grid-wrap", output=np.float32)
+        return np.asarray(noise.reshape(points.shape[:-1]))
 
 
 def smoothstep(x: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:

@@ -1,0 +1,493 @@
+"""The c3vd data manager, from files to scene."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from pydantic import ValidationError
+from wall_scenes import PINHOLE, colors, off_wall, poses, write_raw, write_undistorted
+
+from coliags_plugin.datamanagers.c3vd import C3VDDataManager, C3VDSettings
+from coliags_plugin.datamanagers.c3vd_layouts import read_intrinsics
+from coliags_plugin.errors import InputError
+from coliags_plugin.lenses import LENSES
+from coliags_plugin.registry import datamanagers
+from coliags_plugin.scenes import Frame, PointCloud, Scene
+
+LENS_NAMES = sorted(LENSES)
+
+
+def load(folder: Path, **options) -> Scene:
+    return C3VDDataManager(C3VDSettings(**options)).load(folder)
+
+
+def small(folder: Path, **options) -> Scene:
+    return load(folder, **{"width": 64, "height": 48, **options})
+
+
+@pytest.fixture(scope="module")
+def undistorted(tmp_path_factory):
+    return write_undistorted(tmp_path_factory.mktemp("undistorted") / "wall")
+
+
+@pytest.fixture(scope="module")
+def raw(tmp_path_factory):
+    return write_raw(tmp_path_factory.mktemp("raw") / "wall")
+
+
+@pytest.fixture
+def mine(undistorted, tmp_path):
+    """A copy to spoil."""
+    return Path(shutil.copytree(undistorted, tmp_path / "wall"))
+
+
+@pytest.fixture
+def my_raw(raw, tmp_path):
+    return Path(shutil.copytree(raw, tmp_path / "raw_wall"))
+
+
+def names(frames):
+    return [frame.name for frame in frames]
+
+
+def worst_off_wall(frame: Frame) -> float:
+    points = frame.camera.unproject(frame.depth).reshape(-1, 3).double().numpy()
+    return off_wall(points[np.isfinite(points).all(1)]).max()
+
+
+def color_errors(frame: Frame) -> np.ndarray:
+    """How far the image is from the wall's pattern at the points that its depth gives."""
+    points = frame.camera.unproject(frame.depth).double().numpy()
+    keep = np.isfinite(points).all(-1)
+    return np.abs(frame.image.numpy()[keep].astype(int) - colors(points)[keep])
+
+
+def worst_color(frame: Frame) -> int:
+    return int(color_errors(frame).max())
+
+
+def mean_color_error(frame: Frame) -> float:
+    return float(color_errors(frame).mean())
+
+
+class TestScene:
+    def test_is_registered(self):
+        assert datamanagers.get("c3vd") is C3VDDataManager
+
+    def test_frames_are_what_was_written(self, undistorted):
+        scene = small(undistorted)
+        assert scene.name == "wall"
+        assert names(scene.test_sets["test"]) == ["0000_color", "0008_color"]
+        assert names(scene.train) == [f"{index:04d}_color" for index in range(1, 8)]
+        frame = scene.train[2]
+        assert frame.index == 3
+        camera = frame.camera
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (61.0, 55.0, 33.5, 21.5)
+        np.testing.assert_allclose(camera.camera_to_world, poses(9)[3], atol=1e-6)
+        assert frame.image.dtype == torch.uint8
+        assert frame.depth.dtype == torch.float32
+        assert frame.mask is None
+        assert frame.seen is None
+        assert worst_off_wall(frame) < 0.002
+        assert worst_color(frame) <= 1
+
+    def test_initial_points_lie_on_the_wall_and_carry_its_colours(self, undistorted):
+        points = small(undistorted).points
+        assert len(points) == 7 * 64 * 48
+        assert off_wall(points.positions.double().numpy()).max() < 0.002
+        assert np.abs(points.colors.numpy().astype(int) - colors(points.positions.double().numpy())).max() <= 1
+
+    def test_test_frames_leave_no_points(self, undistorted, tmp_path):
+        folder = Path(shutil.copytree(undistorted, tmp_path / "wall"))
+        for index in range(9):
+            if index % 8:
+                cv2.imwrite(str(folder / f"depths/{index:04d}_depth.png"), np.zeros((48, 64), np.uint16))
+        with pytest.raises(InputError, match="none of the 7 training frames has a valid depth"):
+            small(folder)
+
+    def test_points_count_and_seed(self, undistorted):
+        first, again = (small(undistorted, points_count=500).points.positions for _ in range(2))
+        assert len(first) == 500
+        assert torch.equal(first, again)
+        assert not torch.equal(first, small(undistorted, points_count=500, seed=1).points.positions)
+
+    @pytest.mark.parametrize("size", [(32, 24), (50, 30), (128, 96)])
+    def test_other_sizes_keep_the_geometry(self, undistorted, size):
+        scene = load(undistorted, width=size[0], height=size[1])
+        frame = scene.train[4]
+        assert frame.image.shape == (size[1], size[0], 3)
+        assert frame.depth.shape == (size[1], size[0])
+        assert frame.camera.cx == pytest.approx(33.5 * size[0] / 64)
+        # Nearest depth lies up to half a stored pixel beside its ray: on this slope a few tenths of a millimetre.
+        assert worst_off_wall(frame) < 0.3
+        assert worst_color(frame) < 12
+
+    def test_dataset_is_not_written_into(self, undistorted):
+        before = sorted((path, path.stat().st_mtime_ns) for path in undistorted.rglob("*"))
+        small(undistorted)
+        assert sorted((path, path.stat().st_mtime_ns) for path in undistorted.rglob("*")) == before
+
+    @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="counts open files through /proc")
+    def test_no_file_stays_open(self, undistorted):
+        small(undistorted)
+        before = len(os.listdir("/proc/self/fd"))
+        small(undistorted)
+        assert len(os.listdir("/proc/self/fd")) <= before
+
+
+class TestRaw:
+    @pytest.mark.parametrize("name", LENS_NAMES)
+    def test_undistorted_geometry_is_right_through_every_lens(self, tmp_path, name):
+        folder = write_raw(tmp_path / "wall", LENSES[name].scaled(270, 216), count=2)
+        scene = load(folder, width=90, height=72, lens=name)
+        frame = scene.train[0]
+        k = LENSES[name].scaled(90, 72).pinhole
+        camera = frame.camera
+        assert (camera.fx, camera.fy) == pytest.approx((k.fx, k.fy))
+        assert (camera.cx, camera.cy) == pytest.approx((k.cx + 0.5, k.cy + 0.5))
+        assert worst_off_wall(frame) < 0.2
+        assert worst_color(frame) < 12
+        assert off_wall(scene.points.positions.double().numpy()).max() < 0.2
+        assert scene.provenance["lens"] == name
+
+    def test_the_wrong_lens_shows(self, tmp_path):
+        folder = write_raw(tmp_path / "wall", LENSES["omnidirectional"].scaled(270, 216), count=2)
+        assert worst_off_wall(load(folder, width=90, height=72, lens="legacy-pinhole").train[0]) > 0.3
+
+    def test_the_wide_view_has_a_mask(self, raw):
+        frame = load(raw, width=90, height=72, focal_scale=0.4).train[0]
+        assert 0.5 < frame.mask.float().mean() < 0.99
+        assert torch.isnan(frame.depth[~frame.mask]).all()
+        assert frame.image[frame.mask].amax(dim=-1).min() > 0
+        assert mean_color_error(frame) < 3.0
+        assert load(raw, width=90, height=72).train[0].mask is None
+
+    def test_the_octagon_can_be_left_in(self, raw):
+        masked, whole = (load(raw, width=90, height=72, focal_scale=0.4, mask=mask).train[0] for mask in (True, False))
+        assert whole.mask.sum() > masked.mask.sum()
+
+    def test_unpadded_names_are_sorted_by_number(self, tmp_path):
+        folder = write_raw(tmp_path / "wall", count=12, padded=False)
+        scene = load(folder, width=45, height=36, split="all-train")
+        assert names(scene.train) == [f"{index}_color" for index in range(12)]
+        assert [frame.index for frame in scene.train] == list(range(12))
+        assert worst_color(scene.train[10]) < 25
+
+    @pytest.mark.parametrize("row_major", [True, False])
+    def test_both_pose_orders(self, tmp_path, row_major):
+        scene = load(write_raw(tmp_path / "wall", row_major=row_major, count=3), width=45, height=36)
+        assert scene.provenance["pose_convention"]["order"] == ("row-major" if row_major else "column-major")
+        np.testing.assert_allclose(scene.train[0].camera.camera_to_world, poses(3)[1], atol=1e-5)
+
+    def test_depth_beyond_its_range_is_unknown(self, my_raw):
+        steps = np.full((216, 270), 65535, np.uint16)
+        steps[:, :135] = 30000
+        cv2.imwrite(str(my_raw / "0001_depth.tiff"), steps)
+        depth = load(my_raw, width=90, height=72).train[0].depth
+        assert torch.isnan(depth[:, 60:]).all()
+        torch.testing.assert_close(depth[:, :30], torch.full((72, 30), 30000 * 100 / 65535))
+
+    def test_other_files_of_the_release_are_left_alone(self, my_raw):
+        for name in ("0001_flow.tiff", "0000_normals.tiff", "0000_occlusion.png", "coverage_mesh.obj", "color.png"):
+            (my_raw / name).write_bytes(b"")
+        assert len(load(my_raw, width=45, height=36).train) == 7
+
+
+class TestSplit:
+    def test_endogslam(self, undistorted):
+        assert [frame.index for frame in small(undistorted, split="endogslam").test_sets["test"]] == [7]
+
+    def test_block(self, undistorted):
+        scene = small(undistorted, split="block", block=(0.5, 0.8))
+        assert [frame.index for frame in scene.test_sets["test"]] == [4, 5, 6]
+        assert scene.provenance["split"]["block"] == [0.5, 0.8]
+
+    def test_all_train(self, undistorted):
+        scene = small(undistorted, split="all-train")
+        assert len(scene.train) == 9
+        assert scene.test_sets == {}
+
+    def test_subsampling_comes_before_the_split(self, undistorted):
+        scene = small(undistorted, frame_step=2, max_frames=4)
+        assert [frame.index for frame in scene.test_sets["test"]] == [0]
+        assert [frame.index for frame in scene.train] == [2, 4, 6]
+
+    def test_no_training_frame_left(self, undistorted):
+        with pytest.raises(InputError, match=r"split 'every-8th' of 1 frames .* leaves none to train on"):
+            small(undistorted, max_frames=1)
+
+    @pytest.mark.parametrize("options", [{"block": (0.6, 0.4)}, {"block": (0.5, 1.5)}, {"split": "7:1"}, {"width": 0}])
+    def test_settings_that_make_no_sense(self, options):
+        with pytest.raises(ValidationError):
+            C3VDSettings(**options)
+
+
+class TestExtras:
+    @pytest.fixture
+    def with_rotation(self, mine):
+        write_undistorted(mine / "rotation", count=3)
+        (mine / "rotation" / "seen").mkdir()
+        seen = np.zeros((48, 64), np.uint8)
+        seen[:, 32:] = 255
+        cv2.imwrite(str(mine / "rotation" / "seen" / "0001_seen.png"), seen)
+        (mine / "truth" / "seen").mkdir(parents=True)
+        for index in (0, 1, 8):
+            cv2.imwrite(str(mine / "truth" / "seen" / f"{index:04d}_seen.png"), seen)
+        return mine
+
+    def test_rotation_is_a_test_set(self, with_rotation):
+        scene = load(with_rotation, width=32, height=24)
+        rotation = scene.test_sets["rotation"]
+        assert names(rotation) == ["rotation-0000_color", "rotation-0001_color", "rotation-0002_color"]
+        assert rotation[0].seen is None
+        assert rotation[1].seen[:, 16:].all()
+        assert not rotation[1].seen[:, :16].any()
+        everything = [frame for frames in (scene.train, *scene.test_sets.values()) for frame in frames]
+        assert len(set(names(everything))) == len(everything)
+        assert scene.provenance["frames"] == {"in_sequence": 9, "train": 7, "test": 2, "rotation": 3}
+        assert scene.provenance["rotation"]["layout"] == "undistorted"
+
+    def test_what_training_sees_belongs_to_the_papers_split(self, with_rotation):
+        scene = small(with_rotation)
+        assert all(frame.seen is not None for frame in scene.test_sets["test"])
+        assert all(frame.seen is None for frame in scene.train)
+        for options in ({"split": "block"}, {"frame_step": 2}, {"split": "all-train"}):
+            scene = small(with_rotation, **options)
+            assert all(frame.seen is None for frame in scene.train + scene.test_sets.get("test", []))
+
+    def test_marks_of_frames_that_do_not_exist(self, with_rotation):
+        shutil.copy(with_rotation / "rotation/seen/0001_seen.png", with_rotation / "rotation/seen/0007_seen.png")
+        with pytest.raises(InputError, match=r"0007_seen.png, but there are 3 frames"):
+            small(with_rotation)
+
+    def test_a_spoilt_rotation_set_is_an_error_of_its_own(self, with_rotation):
+        (with_rotation / "rotation" / "camera.json").unlink()
+        with pytest.raises(InputError, match=r"rotation has pictures but no camera.json"):
+            small(with_rotation)
+
+
+class TestWithoutDepth:
+    @pytest.fixture
+    def points(self):
+        return PointCloud(torch.rand(50, 3), torch.randint(0, 256, (50, 3), dtype=torch.uint8))
+
+    def test_points_come_from_the_scenes_ply(self, tmp_path, points):
+        scene = small(write_undistorted(tmp_path / "wall", depths=None, points=points))
+        assert all(frame.depth is None for frame in scene.train)
+        torch.testing.assert_close(scene.points.positions, points.positions)
+        assert torch.equal(scene.points.colors, points.colors)
+        assert scene.provenance["points"]["source"].endswith("points3D.ply")
+        assert scene.provenance["invalid_depth_share"] is None
+
+    def test_points_without_colour(self, tmp_path):
+        folder = write_undistorted(tmp_path / "wall", depths=None, points=PointCloud(torch.rand(5, 3)))
+        assert small(folder).points.colors is None
+
+    def test_neither_depth_nor_points(self, tmp_path):
+        with pytest.raises(InputError, match=r"neither depth files nor points3D.ply.*points_file"):
+            small(write_undistorted(tmp_path / "wall", depths=None))
+
+    def test_points_from_a_named_file(self, mine, points):
+        np.savez(mine / "cloud.npz", positions=points.positions.numpy())
+        scene = small(mine, initial_points="file", points_file="cloud.npz")
+        torch.testing.assert_close(scene.points.positions, points.positions)
+        assert scene.train[0].depth is not None
+        other = small(mine, initial_points="file", points_file=str(mine / "cloud.npz"), points_count=7)
+        assert len(other.points) == 7
+
+    def test_a_missing_file(self, mine):
+        with pytest.raises(InputError, match=r"no file .*nothing.ply"):
+            small(mine, initial_points="file", points_file="nothing.ply")
+
+
+class TestProvenance:
+    def test_says_where_everything_came_from(self, raw):
+        scene = load(raw, width=90, height=72)
+        said = scene.provenance
+        json.dumps(said, allow_nan=False)
+        assert said["dataset"] == "c3vd"
+        assert said["layout"] == "raw"
+        assert said["lens"] == "omnidirectional"
+        assert said["stored_size"] == [270, 216]
+        assert said["split"]["name"] == "every-8th"
+        assert said["split"]["train"] == names(scene.train)
+        assert said["split"]["test_sets"] == {"test": ["0000_color", "0008_color"]}
+        assert said["frames"] == {"in_sequence": 9, "train": 7, "test": 2}
+        assert said["intrinsics"]["cx"] == scene.train[0].camera.cx
+        assert said["points"] == {"source": "depth of the training frames", "count": len(scene.points), "seed": 0}
+        assert said["invalid_depth_share"] == 0.0
+
+    def test_share_of_unknown_depth(self, mine):
+        for index in range(9):
+            steps = np.full((48, 64), 30000, np.uint16)
+            steps[:12] = 65535
+            cv2.imwrite(str(mine / f"depths/{index:04d}_depth.png"), steps)
+        assert small(mine).provenance["invalid_depth_share"] == pytest.approx(0.25)
+
+    def test_fingerprint_changes_with_the_data_only(self, undistorted, mine):
+        def fingerprint(folder):
+            return small(folder).provenance["fingerprint"]
+
+        original = fingerprint(undistorted)
+        assert fingerprint(mine) == original
+        (mine / "notes.txt").write_text("hello")
+        assert fingerprint(mine) == original
+        cv2.imwrite(str(mine / "images/0003_color.png"), np.zeros((48, 64, 3), np.uint8))
+        changed = fingerprint(mine)
+        assert changed != original
+        text = (mine / "camera_pose.txt").read_text()
+        (mine / "camera_pose.txt").write_text(text + "\n")
+        assert fingerprint(mine) not in (original, changed)
+
+
+def remove(pattern):
+    def spoil(folder):
+        for path in folder.glob(pattern):
+            path.unlink()
+
+    return spoil
+
+
+def truncate(name):
+    def spoil(folder):
+        data = (folder / name).read_bytes()
+        (folder / name).write_bytes(data[: len(data) // 2])
+
+    return spoil
+
+
+def picture(name, pixels):
+    return lambda folder: cv2.imwrite(str(folder / name), pixels)
+
+
+def camera_json(**changes):
+    def spoil(folder):
+        data = json.loads((folder / "camera.json").read_text()) | changes
+        (folder / "camera.json").write_text(json.dumps({k: v for k, v in data.items() if v is not ...}))
+
+    return spoil
+
+
+def drop_last_pose(folder):
+    path = next(folder.glob("*pose.txt"))
+    path.write_text("\n".join(path.read_text().splitlines()[:-1]))
+
+
+def nan_pose(folder):
+    path = next(folder.glob("*pose.txt"))
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:4], ",".join(["nan"] * 16), *lines[5:]]))
+
+
+def shift_up(folder):
+    for what in ("images", "depths"):
+        for path in sorted((folder / what).iterdir(), reverse=True):
+            path.rename(path.with_name(f"{int(path.name[:4]) + 1:04d}{path.name[4:]}"))
+
+
+BLACK = np.zeros((48, 64, 3), np.uint8)
+UNDISTORTED_FAULTS = {
+    "empty folder": (
+        lambda folder: [shutil.rmtree(p) if p.is_dir() else p.unlink() for p in folder.iterdir()],
+        "wall holds nothing.*raw release",
+    ),
+    "no pictures": (remove("images/*"), "images holds nothing.*_color.png"),
+    "pictures of other names": (
+        lambda folder: [p.rename(p.with_name(f"frame{p.name[:4]}.png")) for p in list((folder / "images").iterdir())],
+        "images holds frame0000.png",
+    ),
+    "no poses": (remove("camera_pose.txt"), "pictures but no camera_pose.txt"),
+    "no camera.json": (remove("camera.json"), "pictures but no camera.json"),
+    "both layouts": (picture("0000_color.png", BLACK), "holds both 0000_color.png and images/"),
+    "gap": (remove("*/0003_*"), "8 pictures, numbers 0 to 8, but none is 3"),
+    "numbers from one": (shift_up, "numbers 1 to 9, but none is 0"),
+    "fewer depths": (remove("depths/0008*"), "9 pictures and 8 depth files; frame 8 has only one"),
+    "fewer pictures": (remove("images/0008*"), "8 pictures and 9 depth files; frame 8"),
+    "fewer poses": (drop_last_pose, "camera_pose.txt has 8 poses for 9 pictures"),
+    "same number twice": (picture("images/3_color.png", BLACK), "have the same number"),
+    "cut picture": (truncate("images/0005_color.png"), "0005_color.png .* cannot be decoded"),
+    "cut depth": (truncate("depths/0005_depth.png"), "0005_depth.png .* cannot be decoded"),
+    "nan pose": (nan_pose, "camera_pose.txt, line 5"),
+    "8-bit depth": (
+        picture("depths/0002_depth.png", BLACK[..., 0]),
+        "0002_depth.png is a picture of 1 channel of uint8",
+    ),
+    "colour depth": (
+        picture("depths/0002_depth.png", BLACK.astype(np.uint16)),
+        "0002_depth.png is a picture of 3 channels",
+    ),
+    "grey picture": (picture("images/0002_color.png", BLACK[..., 0]), "0002_color.png is a picture of 1 channel"),
+    "other size than camera.json": (camera_json(w=65), "0000_color.png is 64 x 48, but .*camera.json says 65 x 48"),
+    "a frame of another size": (picture("images/0004_color.png", BLACK[:-1]), "0004_color.png is 64 x 47, but"),
+    "a depth of another size": (picture("depths/0004_depth.png", BLACK[:, 1:, 0].astype(np.uint16)), "is 63 x 48, but"),
+    "missing keys": (camera_json(fx=..., cy=...), "camera.json has no fx, cy"),
+    "words for numbers": (camera_json(fx="wide"), "camera.json: .*'wide'"),
+    "no focal length": (camera_json(fy=0), "camera.json: .*above 0"),
+    "half pixels": (camera_json(w=64.5), "whole pixels"),
+    "not JSON": (lambda folder: (folder / "camera.json").write_text("{"), "cannot read .*camera.json"),
+    "a list": (lambda folder: (folder / "camera.json").write_text("[]"), "camera.json has no fx, fy"),
+}
+
+
+@pytest.mark.parametrize("fault", UNDISTORTED_FAULTS)
+def test_a_spoilt_undistorted_scene_is_one_clear_error(mine, fault):
+    spoil, message = UNDISTORTED_FAULTS[fault]
+    spoil(mine)
+    with pytest.raises(InputError, match=message) as caught:
+        small(mine)
+    assert caught.value.expected
+    assert "\n" not in str(caught.value)
+
+
+RAW_FAULTS = {
+    "no poses": (remove("pose.txt"), "pictures but no pose.txt"),
+    "cut depth": (truncate("0005_depth.tiff"), "0005_depth.tiff .* cannot be decoded"),
+    "gap": (remove("0003_*"), "none is 3"),
+    "fewer depths": (remove("0003_depth.tiff"), "9 pictures and 8 depth files; frame 3"),
+    "fewer poses": (drop_last_pose, "8 poses for 9 pictures"),
+    "a frame of another size": (picture("0004_color.png", BLACK), "0004_color.png is 64 x 48, but .*0000_color.png"),
+    "a crop": (lambda folder: [cv2.imwrite(str(path), np.zeros((200, 200, 3), np.uint8)) for path in
+                               folder.glob("*_color.png")], "is 200 x 200.*undistorted layout"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", RAW_FAULTS)
+def test_a_spoilt_raw_scene_is_one_clear_error(my_raw, fault):
+    spoil, message = RAW_FAULTS[fault]
+    spoil(my_raw)
+    with pytest.raises(InputError, match=message):
+        load(my_raw, width=45, height=36)
+
+
+def test_no_folder(tmp_path):
+    with pytest.raises(InputError, match="no folder"):
+        small(tmp_path / "nothing")
+
+
+def test_a_folder_of_something_else(tmp_path):
+    for index in range(9):
+        (tmp_path / f"{index}.txt").touch()
+    with pytest.raises(InputError, match=r"holds 0.txt, 1.txt, 2.txt, 3.txt, 4.txt and 4 more"):
+        small(tmp_path)
+
+
+def test_what_the_writer_refuses(tmp_path):
+    with pytest.raises(InputError, match="9 images, 9 poses and 1 depths"):
+        write_undistorted(tmp_path / "wall", depths=[np.ones((48, 64))])
+    assert not (tmp_path / "wall").exists()
+    write_undistorted(tmp_path / "wall", count=2)
+    with pytest.raises(InputError, match="already exists"):
+        write_undistorted(tmp_path / "wall", count=2)
+    write_undistorted(tmp_path / "wall", count=3, overwrite=True)
+    assert len(list((tmp_path / "wall" / "images").iterdir())) == 3
+
+
+def test_the_writers_intrinsics_are_opencvs(undistorted):
+    assert read_intrinsics(undistorted / "camera.json") == (PINHOLE, 64, 48)

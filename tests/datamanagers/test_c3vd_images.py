@@ -1,0 +1,99 @@
+"""Reading and resizing pictures."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from coliags_plugin.datamanagers.c3vd_writer import depth_steps
+from coliags_plugin.datamanagers.images import (
+    millimetres,
+    read_depth_steps,
+    read_mask,
+    read_rgb,
+    resize_nearest,
+    resize_rgb,
+)
+from coliags_plugin.errors import InputError
+
+
+def test_millimetres():
+    steps = np.array([[0, 1, 32768, 65534, 65535]], np.uint16)
+    depth = millimetres(steps)
+    assert depth.dtype == np.float32
+    np.testing.assert_array_equal(np.isnan(depth), [[True, False, False, False, True]])
+    np.testing.assert_allclose(depth[0, 1:4], [100 / 65535, 32768 * 100 / 65535, 65534 * 100 / 65535], rtol=1e-6)
+
+
+def test_depth_survives_writing_and_reading():
+    depth = np.array([[1e-6, 0.5, 42.0, 99.999]])
+    np.testing.assert_allclose(millimetres(depth_steps(depth)), depth, atol=100 / 65535)
+    unknown = np.array([[np.nan, 0.0, -3.0, 100.0, np.inf, 250.0]])
+    assert np.isnan(millimetres(depth_steps(unknown))).all()
+
+
+def test_simcol_depth_is_read_whole(shared_data):
+    steps = read_depth_steps(shared_data / "simcol3d_frames" / "Depth_0000.png")
+    assert steps.shape == (475, 475)
+    assert (steps.min(), steps.max()) == (2048, 43520)
+
+
+def test_colour_order_and_alpha(tmp_path):
+    bgra = np.zeros((2, 3, 4), np.uint8)
+    bgra[..., 0], bgra[..., 2], bgra[..., 3] = 10, 30, 99
+    cv2.imwrite(str(tmp_path / "a.png"), bgra)
+    cv2.imwrite(str(tmp_path / "b.png"), bgra[..., :3])
+    for name in ("a.png", "b.png"):
+        np.testing.assert_array_equal(read_rgb(tmp_path / name)[0, 0], [30, 0, 10])
+
+
+@pytest.mark.parametrize(
+    ("reader", "pixels", "message"),
+    [
+        (read_rgb, np.zeros((4, 4), np.uint8), "1 channel of uint8.*8-bit RGB"),
+        (read_rgb, np.zeros((4, 4, 3), np.uint16), "3 channels of uint16"),
+        (read_depth_steps, np.zeros((4, 4), np.uint8), "1 channel of uint8.*16-bit"),
+        (read_depth_steps, np.zeros((4, 4, 3), np.uint16), "3 channels of uint16"),
+        (read_mask, np.zeros((4, 4, 3), np.uint8), "3 channels of uint8"),
+    ],
+)
+def test_the_wrong_kind_of_picture(tmp_path, reader, pixels, message):
+    cv2.imwrite(str(tmp_path / "x.png"), pixels)
+    with pytest.raises(InputError, match=message):
+        reader(tmp_path / "x.png")
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tiff", ".jpg"])
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.98])
+def test_half_a_file_is_refused_by_name(tmp_path, suffix, share):
+    pixels = np.random.default_rng(0).integers(0, 256, (64, 64), dtype=np.uint8)
+    data = cv2.imencode(suffix, pixels)[1].tobytes()
+    path = tmp_path / f"0003_color{suffix}"
+    path.write_bytes(data[: int(len(data) * share)])
+    with pytest.raises(InputError, match=r"0003_color.*cannot be decoded.*cut short"):
+        read_mask(path)
+
+
+def test_a_missing_picture(tmp_path):
+    with pytest.raises(InputError, match="cannot read"):
+        read_rgb(tmp_path / "x.png")
+
+
+def test_shrinking_averages_and_growing_interpolates():
+    image = np.random.default_rng(0).integers(0, 256, (8, 12, 3), dtype=np.uint8)
+    small = resize_rgb(image, 6, 4)
+    np.testing.assert_allclose(small, image.reshape(4, 2, 6, 2, 3).mean(axis=(1, 3)), atol=0.51)
+    assert resize_rgb(image, 12, 8) is image
+    ramp = np.arange(0, 240, 20, dtype=np.uint8)[None, :, None].repeat(4, 0).repeat(3, 2)
+    grown = resize_rgb(ramp, 24, 4)[0, 1:-1, 0].astype(int)
+    np.testing.assert_allclose(np.diff(grown), 10, atol=1)
+
+
+@pytest.mark.parametrize("size", [(4, 3), (12, 8), (16, 16)])
+def test_nearest_takes_the_pixel_under_the_centre(size):
+    values = np.arange(96, dtype=np.uint16).reshape(8, 12)
+    result = resize_nearest(values, *size)
+    assert result.dtype == np.uint16
+    reference = cv2.resize(values, size, interpolation=cv2.INTER_NEAREST_EXACT)
+    np.testing.assert_array_equal(result, reference)

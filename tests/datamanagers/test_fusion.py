@@ -1,0 +1,106 @@
+"""Initial points."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from coliags_plugin.cameras import Camera
+from coliags_plugin.datamanagers.fusion import fuse_depth, read_points
+from coliags_plugin.errors import InputError
+from coliags_plugin.scenes import Frame
+
+
+def frame(depth, index=0, mask=None):
+    height, width = depth.shape
+    c2w = torch.eye(4)
+    c2w[:3, 3] = torch.tensor([5.0, -3.0, float(index)])
+    camera = Camera(9.0, 7.0, 2.25, 4.5, width, height, c2w)
+    image = torch.arange(height * width * 3).remainder(256).to(torch.uint8).reshape(height, width, 3)
+    return Frame(f"{index:04d}", index, image, camera, torch.as_tensor(depth, dtype=torch.float32), mask)
+
+
+def rng(seed=0):
+    return np.random.default_rng(seed)
+
+
+def test_all_pixels_are_taken_where_there_are_few_and_the_true_centre_is_used():
+    depth = torch.rand(6, 5) * 10 + 3
+    view = frame(depth)
+    points = fuse_depth([view], 1000, rng())
+    torch.testing.assert_close(points.positions, view.camera.unproject(view.depth).reshape(-1, 3))
+    torch.testing.assert_close(points.colors, view.image.reshape(-1, 3))
+    pixels, z = view.camera.project(points.positions)
+    torch.testing.assert_close(pixels[7], torch.tensor([2.5, 1.5]))
+    torch.testing.assert_close(z, depth.ravel())
+
+
+def test_unknown_depth_and_masked_pixels_are_left_out():
+    depth = torch.full((6, 5), 4.0)
+    depth[0] = torch.nan
+    mask = torch.ones(6, 5, dtype=torch.bool)
+    mask[:, 0] = False
+    assert len(fuse_depth([frame(depth, mask=mask)], 1000, rng())) == 5 * 4
+
+
+def test_a_draw_is_without_replacement_repeatable_and_fair():
+    near, far = torch.full((40, 50), 5.0), torch.full((40, 50), 9.0)
+    far[:20] = torch.nan
+    frames = [frame(near, 0), frame(far, 1)]
+    points = fuse_depth(frames, 1500, rng())
+    assert len(points) == 1500
+    assert len(torch.unique(points.positions, dim=0)) == 1500
+    again, other = fuse_depth(frames, 1500, rng()), fuse_depth(frames, 1500, rng(1))
+    assert torch.equal(points.positions, again.positions)
+    assert not torch.equal(points.positions, other.positions)
+    # 2000 and 1000 pixels: hypergeometric, standard deviation 13.
+    share = int((points.positions[:, 2] < 7).sum())
+    assert abs(share - 1000) < 60
+
+
+def test_no_valid_depth_at_all():
+    with pytest.raises(InputError, match="none of the 1 training frames has a valid depth"):
+        fuse_depth([frame(torch.full((3, 3), torch.nan))], 10, rng())
+
+
+@pytest.mark.parametrize("colored", [True, False])
+def test_npz(tmp_path, colored):
+    positions = np.arange(30.0).reshape(10, 3)
+    colors = {"colors": np.arange(30, dtype=np.uint8).reshape(10, 3)} if colored else {}
+    np.savez(tmp_path / "p.npz", positions=positions, **colors)
+    points = read_points(tmp_path / "p.npz", 100, rng())
+    np.testing.assert_array_equal(points.positions, positions)
+    assert (points.colors is not None) == colored
+    assert len(read_points(tmp_path / "p.npz", 4, rng())) == 4
+
+
+def test_points_that_are_not_finite_are_left_out(tmp_path, caplog):
+    positions = np.ones((4, 3))
+    positions[2, 1] = np.nan
+    np.savez(tmp_path / "p.npz", positions=positions)
+    assert len(read_points(tmp_path / "p.npz", 100, rng())) == 3
+    assert "1 of 4 points" in caplog.text
+
+
+def test_files_that_hold_no_points(tmp_path):
+    with pytest.raises(InputError, match="no file"):
+        read_points(tmp_path / "none.ply", 10, rng())
+    (tmp_path / "bad.ply").write_text("not a ply")
+    with pytest.raises(InputError, match="holds no points"):
+        read_points(tmp_path / "bad.ply", 10, rng())
+    (tmp_path / "bad.npz").write_text("not an npz")
+    with pytest.raises(InputError, match="cannot read"):
+        read_points(tmp_path / "bad.npz", 10, rng())
+    np.savez(tmp_path / "other.npz", xyz=np.ones((2, 3)))
+    with pytest.raises(InputError, match="positions"):
+        read_points(tmp_path / "other.npz", 10, rng())
+    np.savez(tmp_path / "flat.npz", positions=np.ones((2, 2)))
+    with pytest.raises(InputError, match="shape"):
+        read_points(tmp_path / "flat.npz", 10, rng())
+    np.savez(tmp_path / "float.npz", positions=np.ones((2, 3)), colors=np.ones((2, 3)))
+    with pytest.raises(InputError, match="uint8"):
+        read_points(tmp_path / "float.npz", 10, rng())
+    (tmp_path / "p.obj").write_text("v 0 0 0")
+    with pytest.raises(InputError, match="neither"):
+        read_points(tmp_path / "p.obj", 10, rng())

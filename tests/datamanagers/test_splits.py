@@ -1,0 +1,43 @@
+"""Which frames are held out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from coliags_plugin.datamanagers.splits import held_out
+
+
+def test_every_8th_begins_with_the_first():
+    assert np.flatnonzero(held_out("every-8th", 25)).tolist() == [0, 8, 16, 24]
+
+
+def test_endogslam_begins_with_the_eighth():
+    assert np.flatnonzero(held_out("endogslam", 25)).tolist() == [7, 15, 23]
+
+
+def test_block_is_the_middle_fifth():
+    assert np.flatnonzero(held_out("block", 20)).tolist() == [8, 9, 10, 11]
+    assert np.flatnonzero(held_out("block", 10, (0.0, 0.3))).tolist() == [0, 1, 2]
+
+
+def test_all_train_holds_none_out():
+    assert not held_out("all-train", 5).any()
+
+
+@pytest.mark.parametrize(
+    # methods.md 9.1: frames and test frames of the official sequences
+    ("frames", "test"),
+    [(276, 35), (765, 96), (370, 47), (1142, 143), (595, 75), (730, 92), (61, 8), (194, 25), (103, 13), (597, 75)],
+)
+def test_counts_of_the_official_sequences(frames, test):
+    assert held_out("every-8th", frames).sum() == test
+
+
+@given(count=st.integers(1, 300), start=st.floats(0, 0.9), length=st.floats(0.05, 0.5))
+def test_a_block_is_one_stretch_of_about_its_share(count, start, length):
+    held = held_out("block", count, (start, min(start + length, 1.0)))
+    assert (np.diff(np.flatnonzero(held)) == 1).all()
+    assert abs(held.sum() - (min(start + length, 1.0) - start) * count) <= 1.0

@@ -1,0 +1,234 @@
+"""The anchor field: initialisation, decoding, the frustum, and its two kinds of heads."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
+
+from coliags_plugin.components import make_component
+from coliags_plugin.errors import InputError
+from coliags_plugin.fields.anchor_points import neighbour_log_scales, voxelize
+from coliags_plugin.fields.frustum import spheres_in_frustum
+from coliags_plugin.scenes import PointCloud
+from tests.scenes import camera_at, wall_scene
+
+COLIAGS = {"name": "anchors", "geometry_head": "imve", "appearance_head": "imia"}
+SCAFFOLD = {"name": "anchors", "geometry_head": "plain", "appearance_head": "plain"}
+
+
+def make_field(node, seed=0, **options):
+    component = make_component("fields", {**node, **options})
+    field = component.target.from_scene(wall_scene(), component.settings, torch.Generator().manual_seed(seed))
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        field.offsets.uniform_(-1, 1, generator=generator)
+        field.features.uniform_(-1, 1, generator=generator)
+    return field
+
+
+def test_perceptron_sizes_are_the_papers():
+    field = make_field(COLIAGS)
+    sizes = {name: [tuple(p.shape) for p in group if p.ndim == 2] for name, group in field.parameter_groups().items()}
+    assert sizes["opacity_mlp"] == [(32, 95), (10, 32)]
+    assert sizes["covariance_mlp"] == [(32, 95), (70, 32)]
+    assert sizes["color_mlp"] == [(32, 47), (30, 32)]
+
+
+def test_scaffold_perceptron_sizes():
+    field = make_field(SCAFFOLD)
+    assert field.geometry_head.opacity_mlp[0].in_features == 35
+    assert field.appearance_head.color_mlp[0].in_features == 35
+    with_distance = make_field(SCAFFOLD, appearance_head={"name": "plain", "distance": True})
+    assert with_distance.appearance_head.color_mlp[0].in_features == 36
+
+
+def test_coliags_with_plain_heads_is_scaffold_to_the_bit():
+    plain = {"geometry_head": {"name": "plain"}, "appearance_head": {"name": "plain"}}
+    ours, theirs = make_field({**COLIAGS, **plain}), make_field(SCAFFOLD)
+    camera = camera_at(1.0, 0.5, 2.0)
+    first, second = ours.gaussians(camera), theirs.gaussians(camera)
+    for name in ("means", "quats_wxyz", "scales", "opacities", "colors", "source_index", "visible_sources"):
+        assert torch.equal(getattr(first, name), getattr(second, name))
+
+
+def test_imve_without_frequencies_decodes_as_the_plain_head():
+    first = make_field(SCAFFOLD, geometry_head={"name": "imve", "frequencies": 0})
+    second = make_field(SCAFFOLD)
+    camera = camera_at(0.0, 0.0, 0.0)
+    assert torch.equal(first.gaussians(camera).scales, second.gaussians(camera).scales)
+
+
+def test_decoding_step_by_step():
+    """An independent walk through methods.md 13.2, anchor by anchor."""
+    field = make_field(COLIAGS)
+    camera = camera_at(1.0, 0.5, 2.0, yaw=0.1)
+    drawn = field.gaussians(camera)
+    center, axis = camera.center.float(), camera.optical_axis.float()
+    expected = []
+    with torch.no_grad():
+        for anchor in drawn.visible_sources.tolist():
+            sight = field.anchors[anchor] - center
+            distance = sight.norm()
+            v = sight / distance
+            cosine = (v @ axis).clamp(0, 1)
+            gamma = lambda x, n: torch.cat([x] + [f(2**k * x) for k in range(n) for f in (torch.sin, torch.cos)])  # noqa: E731
+            geometry = torch.cat([field.features[anchor], gamma(v, 10)])
+            opacity = torch.tanh(field.geometry_head.opacity_mlp(geometry))
+            shape = field.geometry_head.covariance_mlp(geometry).view(10, 7)
+            seen = torch.cat([field.features[anchor], v, distance[None], gamma(cosine[None], 5)])
+            color = torch.sigmoid(field.appearance_head.color_mlp(seen)).view(10, 3)
+            scale = field.scalings[anchor].exp()
+            for child in range(10):
+                if opacity[child] > 0:
+                    mean = field.anchors[anchor] + field.offsets[anchor, child] * scale[:3]
+                    size = scale[3:] * torch.sigmoid(shape[child, :3])
+                    quat = shape[child, 3:] / shape[child, 3:].norm()
+                    expected.append(torch.cat([mean, size, quat, opacity[child][None], color[child]]))
+    found = torch.cat(
+        [drawn.means, drawn.scales, drawn.quats_wxyz, drawn.opacities[:, None], drawn.colors], dim=1
+    ).detach()
+    torch.testing.assert_close(found, torch.stack(expected), rtol=1e-4, atol=1e-5)
+
+
+def test_sources_name_anchor_and_child():
+    field = make_field(COLIAGS)
+    drawn = field.gaussians(camera_at(0.0, 0.0, 0.0))
+    positions = field.child_positions().reshape(-1, 3)
+    torch.testing.assert_close(drawn.means, positions[drawn.source_index])
+    assert set((drawn.source_index // 10).tolist()) <= set(drawn.visible_sources.tolist())
+
+
+def test_initial_anchors_lie_on_the_grid_once():
+    points = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) * 10 - 5
+    anchors = voxelize(points, 0.8)
+    cells = anchors / 0.8
+    torch.testing.assert_close(cells, cells.round(), rtol=0, atol=1e-5)
+    assert len(torch.unique(cells.round(), dim=0)) == len(anchors)
+    nearest = torch.cdist(points, anchors).amin(dim=1)
+    assert nearest.max() <= 0.8 * math.sqrt(3) / 2 + 1e-5
+
+
+@settings(max_examples=20, deadline=None)
+@given(size=st.floats(0.3, 5.0), seed=st.integers(0, 1000))
+def test_voxels_really_merge_and_do_not_depend_on_order(size, seed):
+    generator = torch.Generator().manual_seed(seed)
+    points = torch.rand(200, 3, generator=generator) * 4
+    anchors = voxelize(points, size)
+    assert 1 <= len(anchors) <= (4 / size + 2) ** 3
+    assert torch.equal(anchors, voxelize(points[torch.randperm(200, generator=generator)], size))
+
+
+def test_initial_scales_are_root_mean_square_neighbour_distances():
+    points = torch.rand(40, 3, generator=torch.Generator().manual_seed(0))
+    distances = np.sort(np.linalg.norm(points[:, None].numpy() - points[None].numpy(), axis=2), axis=1)[:, 1:4]
+    expected = np.log(np.sqrt((distances**2).mean(axis=1)))
+    np.testing.assert_allclose(neighbour_log_scales(points).numpy(), expected, rtol=1e-5)
+    assert cKDTree(points.numpy()).n == 40
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_few_points_get_finite_scales(count):
+    points = torch.arange(3.0 * count).reshape(count, 3)
+    assert torch.isfinite(neighbour_log_scales(points)).all()
+
+
+def test_default_voxel_is_six_pixels_on_the_surface():
+    scene = wall_scene()
+    component = make_component("fields", COLIAGS)
+    field = component.target.from_scene(scene, component.settings, torch.Generator().manual_seed(0))
+    assert float(field.voxel_size) == pytest.approx(6 * scene.pixel_footprint)
+    camera = scene.train[0].camera
+    size = 20.0 / math.sqrt(camera.fx * camera.fy)
+    assert scene.pixel_footprint == pytest.approx(size, rel=0.15)  # the camera comes up to 4 mm nearer
+    assert len(field.anchors) < len(scene.points) / 3
+
+
+def test_useless_voxels_are_warned_of(caplog):
+    scene = wall_scene()
+    component = make_component("fields", {**COLIAGS, "voxel_size": 0.001})
+    with caplog.at_level("WARNING"):
+        component.target.from_scene(scene, component.settings, torch.Generator())
+    assert "merge almost nothing" in caplog.text
+
+
+def test_no_points_are_an_input_error():
+    scene = replace(wall_scene(), points=PointCloud(torch.zeros(0, 3)))
+    component = make_component("fields", {**COLIAGS, "voxel_size": 1.0})
+    with pytest.raises(InputError, match="no initial points"):
+        component.target.from_scene(scene, component.settings, torch.Generator())
+
+
+def test_frustum_filter_changes_no_drawn_gaussian():
+    """Every child whose ellipse can touch the image belongs to a visible anchor; a turned camera decodes fewer."""
+    field = make_field(COLIAGS, voxel_size=1.0)
+    camera = camera_at(0.0, 0.0, 10.0, yaw=0.9)
+    visible = set(field.visible_anchors(camera).tolist())
+    assert 0 < len(visible) < len(field.anchors)
+    positions = field.child_positions().detach().double()
+    for anchor in range(len(field.anchors)):
+        pixels, depth = camera.project(positions[anchor])
+        inside = (depth > 0.2) & ((pixels >= 0) & (pixels < torch.tensor([32.0, 24.0]))).all(dim=1)
+        assert anchor in visible or not inside.any()
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    x=st.floats(-30, 30), y=st.floats(-30, 30), z=st.floats(-30, 30), radius=st.floats(0.01, 5), yaw=st.floats(-3, 3)
+)
+def test_spheres_that_touch_the_pyramid_are_kept(x, y, z, radius, yaw):
+    camera = camera_at(0.0, 0.0, 0.0, yaw=yaw)
+    center = torch.tensor([[x, y, z]], dtype=torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(200, 3, generator=generator, dtype=torch.float64), dim=1)
+    pixels, depth = camera.project(center + radius * directions)
+    touches = ((depth > 0.2) & ((pixels >= 0) & (pixels <= torch.tensor([32.0, 24.0]))).all(dim=1)).any()
+    assert not touches or bool(spheres_in_frustum(center, torch.tensor([radius]), camera, 0.2))
+
+
+def test_anchors_behind_the_camera_have_cosine_zero():
+    field = make_field(COLIAGS, near=0.0)
+    seen = {}
+    head = field.appearance_head
+    embed = head.embed
+    head.embed = lambda v, d, c: seen.setdefault("cosines", c) is None or embed(v, d, c)
+    with torch.no_grad():
+        field.anchors[:, 2] = 0.05  # abeam, some of them behind, but large enough to reach the image
+        field.scalings.fill_(3.0)
+    field.gaussians(camera_at(0.0, 0.0, 0.1))
+    assert seen["cosines"].min() == 0.0
+    assert seen["cosines"].max() <= 1.0
+
+
+def test_every_parameter_gets_a_gradient():
+    field = make_field(COLIAGS)
+    drawn = field.gaussians(camera_at(0.0, 0.0, 0.0))
+    total = sum(t.square().sum() for t in (drawn.means, drawn.scales, drawn.quats_wxyz, drawn.opacities, drawn.colors))
+    total.backward()
+    for name, group in field.parameter_groups().items():
+        assert all(parameter.grad is not None for parameter in group), name
+    assert {id(p) for group in field.parameter_groups().values() for p in group} == {id(p) for p in field.parameters()}
+
+
+def test_state_restores_a_grown_field():
+    field = make_field(COLIAGS)
+    with torch.no_grad():
+        field.anchors = field.anchors[:17]
+        for name in field.anchor_parameters:
+            setattr(field, name, torch.nn.Parameter(getattr(field, name)[:17].clone()))
+    again = type(field).from_state(field.state_dict(), field.settings)
+    camera = camera_at(0.0, 0.0, 0.0)
+    assert torch.equal(again.gaussians(camera).means, field.gaussians(camera).means)
+
+
+def test_same_seed_same_field():
+    first, second = make_field(COLIAGS, seed=3), make_field(COLIAGS, seed=3)
+    assert all(torch.equal(a, b) for a, b in zip(first.parameters(), second.parameters(), strict=True))
+    other = make_field(COLIAGS, seed=4)
+    assert not torch.equal(first.geometry_head.opacity_mlp[0].weight, other.geometry_head.opacity_mlp[0].weight)

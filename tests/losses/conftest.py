@@ -1,0 +1,38 @@
+"""Hand-made renders and frames for the losses."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from coliags_plugin.cameras import Camera
+from coliags_plugin.gaussians import Gaussians, RenderOutput
+from coliags_plugin.scenes import Frame
+
+
+def _output(rgb, scales=None, **maps):
+    scales = torch.zeros(0, 3) if scales is None else scales
+    count = len(scales)
+    gaussians = Gaussians(
+        torch.zeros(count, 3), torch.zeros(count, 4), scales, torch.ones(count), torch.zeros(count, 3),
+        torch.arange(count), torch.arange(count),
+    )  # fmt: skip
+    return RenderOutput(rgb, torch.ones(rgb.shape[:2]), torch.zeros(count, 2), torch.zeros(count), gaussians, maps)
+
+
+def _frame(image, depth=None, mask=None):
+    height, width = image.shape[:2]
+    camera = Camera(100.0, 100.0, width / 2, height / 2, width, height, torch.eye(4))
+    return Frame("0007", 7, image, camera, depth, mask)
+
+
+@pytest.fixture
+def make_output():
+    """A RenderOutput of these colours, scales and maps."""
+    return _output
+
+
+@pytest.fixture
+def make_frame():
+    """A Frame of this image, depth and mask."""
+    return _frame

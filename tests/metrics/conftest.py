@@ -1,0 +1,72 @@
+"""Hand-made comparisons, renders and frames for metrics and protocols."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from coliags_plugin import registry
+from coliags_plugin.cameras import Camera
+from coliags_plugin.contracts import Comparison
+from coliags_plugin.gaussians import Gaussians, RenderOutput
+from coliags_plugin.scenes import Frame
+
+
+def _make(name, **options):
+    metric = registry.metrics.get(name)
+    return metric(metric.Settings(**options))
+
+
+def _pictures(rgb, true_rgb, valid=None):
+    valid = torch.ones(rgb.shape[:2], dtype=torch.bool) if valid is None else valid
+    return Comparison(rgb, true_rgb, valid)
+
+
+def _depths(depth, true_depth, valid=None):
+    grey = torch.zeros(*depth.shape, 3)
+    everywhere = torch.ones(depth.shape, dtype=torch.bool)
+    return Comparison(grey, grey, everywhere, depth, true_depth, torch.isfinite(true_depth) if valid is None else valid)
+
+
+def _output(rgb, **maps):
+    none = torch.zeros(0, dtype=torch.int64)
+    gaussians = Gaussians(
+        torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 3), none, none
+    )
+    return RenderOutput(rgb, torch.ones(rgb.shape[:2]), torch.zeros(0, 2), torch.zeros(0), gaussians, maps)
+
+
+def _frame(image, depth=None, mask=None):
+    height, width = image.shape[:2]
+    camera = Camera(100.0, 100.0, width / 2, height / 2, width, height, torch.eye(4))
+    return Frame("0007", 7, image, camera, depth, mask)
+
+
+@pytest.fixture
+def make():
+    """A metric by name and options."""
+    return _make
+
+
+@pytest.fixture
+def pictures():
+    """A Comparison of two pictures."""
+    return _pictures
+
+
+@pytest.fixture
+def depths():
+    """A Comparison of two depth maps."""
+    return _depths
+
+
+@pytest.fixture
+def make_output():
+    """A RenderOutput of these colours and maps."""
+    return _output
+
+
+@pytest.fixture
+def make_frame():
+    """A Frame of this image, depth and mask."""
+    return _frame

@@ -1,0 +1,140 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.ndimage import maximum_filter, minimum_filter
+from skimage.metrics import mean_squared_error
+
+from coliags_plugin.errors import UnavailableError
+from coliags_plugin.metrics.depth_steps import depth_steps, near
+
+ALL = ["depth_mse", "depth_mse_inner", "depth_rmse", "depth_mae", "depth_median_error", "depth_abs_rel"]
+
+
+@pytest.fixture
+def truth():
+    return 20 + 0.5 * torch.rand(25, 30, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.fixture
+def errors():
+    return torch.randn(25, 30, generator=torch.Generator().manual_seed(1))
+
+
+def test_closed_forms(make, depths):
+    truth = torch.tensor([[10.0, 20.0], [40.0, 50.0]])
+    case = depths(truth + torch.tensor([[1.0, -2.0], [3.0, -6.0]]), truth)
+    assert make("depth_mse")(case) == 50 / 4
+    assert make("depth_rmse")(case) == math.sqrt(50 / 4)
+    assert make("depth_mae")(case) == 3.0
+    assert make("depth_median_error")(case) == 2.5
+    assert make("depth_abs_rel")(case) == pytest.approx((0.1 + 0.1 + 0.075 + 0.12) / 4, abs=1e-12)
+
+
+def test_against_numpy_and_scikit_image(make, depths, truth, errors):
+    rendered = truth + errors
+    case = depths(rendered, truth)
+    a, b = rendered.double().numpy(), truth.double().numpy()
+    assert make("depth_mse")(case) == pytest.approx(mean_squared_error(b, a), rel=1e-12)
+    assert make("depth_median_error")(case) == pytest.approx(np.median(np.abs(a - b)), rel=1e-12)
+    assert make("depth_abs_rel")(case) == pytest.approx(np.mean(np.abs(a - b) / b), rel=1e-12)
+
+
+def test_the_median_of_an_odd_number_is_the_middle_one(make, depths):
+    truth = torch.full((1, 3), 10.0)
+    assert make("depth_median_error")(depths(truth + torch.tensor([[5.0, 1.0, -2.0]]), truth)) == 2.0
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_only_the_pixels_that_count_count(name, make, depths, truth, errors):
+    counts = torch.rand(25, 30, generator=torch.Generator().manual_seed(2)) < 0.5
+    rendered, unknown = truth + errors, truth.clone()
+    broken = rendered.clone()
+    unknown[~counts], broken[~counts] = torch.nan, torch.inf
+    assert make(name)(depths(broken, unknown, counts)) == make(name)(depths(rendered, truth, counts))
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_what_makes_a_figure_unavailable(name, make, depths, pictures, truth):
+    with pytest.raises(UnavailableError, match="this frame has no ground-truth depth"):
+        make(name)(pictures(torch.zeros(4, 4, 3), torch.zeros(4, 4, 3)))
+    with pytest.raises(UnavailableError, match="no pixel of this frame has a valid ground-truth depth"):
+        make(name)(depths(truth, torch.full_like(truth, torch.nan)))
+    broken = truth.clone()
+    broken[10, 10] = torch.inf
+    with pytest.raises(UnavailableError, match="not finite at 1 pixels"):
+        make(name)(depths(broken, truth))
+
+
+def test_relative_error_of_a_depth_of_zero(make, depths):
+    with pytest.raises(UnavailableError, match="0 mm"):
+        make("depth_abs_rel")(depths(torch.ones(2, 2), torch.zeros(2, 2)))
+
+
+# ------------------------------------------------------------------------------------------------------ inner pixels
+
+
+def two_walls(near_mm=20.0, far_mm=30.0):
+    truth = torch.full((9, 20), near_mm)
+    truth[:, 10:] = far_mm
+    return truth
+
+
+def test_a_step_marks_both_sides_and_the_margin_two_more(make, depths):
+    truth = two_walls()
+    steps = depth_steps(truth, torch.isfinite(truth), 0.12)
+    assert steps.all(0).nonzero().flatten().tolist() == [9, 10]
+    assert near(steps, 2).all(0).nonzero().flatten().tolist() == [7, 8, 9, 10, 11, 12]
+    rendered = truth.clone()
+    rendered[:, 7:13] += 100.0
+    assert make("depth_mse_inner")(depths(rendered, truth)) == 0.0
+    rendered[:, 6] += 1.0
+    assert make("depth_mse_inner")(depths(rendered, truth)) == pytest.approx(1 / 14)
+
+
+@pytest.mark.parametrize(("far", "is_step"), [(22.3, False), (22.5, True)])
+def test_the_step_is_relative_to_the_nearer_side(far, is_step):
+    truth = two_walls(20.0, far)
+    assert bool(depth_steps(truth, torch.isfinite(truth), 0.12).any()) is is_step
+
+
+def test_the_numbers_are_settings(make, depths):
+    truth = two_walls()
+    rendered = truth.clone()
+    rendered[:, 9:11] += 3.0
+    assert make("depth_mse_inner", relative_step=0.6)(depths(rendered, truth)) == pytest.approx(0.9)
+    rendered[:, 8] += 1.0
+    assert make("depth_mse_inner", margin=0)(depths(rendered, truth)) == pytest.approx(1 / 18)
+
+
+def test_unknown_pixels_make_no_step_but_hide_none(make, depths):
+    smooth = torch.full((9, 20), 20.0)
+    smooth[4, 4] = torch.nan
+    assert not depth_steps(smooth, torch.isfinite(smooth), 0.12).any()
+    across = two_walls()
+    across[:, 10] = torch.nan
+    assert depth_steps(across, torch.isfinite(across), 0.12).all(0).nonzero().flatten().tolist() == [10]
+
+
+def test_nothing_but_steps_has_no_inner_figure(make, depths):
+    board = 20 + 10 * ((torch.arange(8)[:, None] + torch.arange(8)) % 2).float()
+    with pytest.raises(UnavailableError, match="away from depth steps"):
+        make("depth_mse_inner")(depths(board, board))
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 999), step=st.floats(0.02, 0.5), reach=st.integers(0, 3))
+def test_steps_and_margin_against_scipy(seed, step, reach):
+    generator = torch.Generator().manual_seed(seed)
+    depth = 20 + 5 * torch.rand(11, 13, generator=generator, dtype=torch.float64)
+    known = torch.rand(11, 13, generator=generator) < 0.8
+    far = maximum_filter(np.where(known, depth, -np.inf), 3, mode="constant", cval=-np.inf)
+    close = minimum_filter(np.where(known, depth, np.inf), 3, mode="constant", cval=np.inf)
+    expected = far - close > step * close
+    steps = depth_steps(torch.where(known, depth, torch.nan), known, step)
+    np.testing.assert_array_equal(steps.numpy(), expected)
+    grown = maximum_filter(expected.astype(np.uint8), 2 * reach + 1, mode="constant")
+    np.testing.assert_array_equal(near(steps, reach).numpy(), grown > 0)

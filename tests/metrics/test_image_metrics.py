@@ -1,0 +1,81 @@
+import math
+
+import pytest
+import torch
+from skimage.metrics import peak_signal_noise_ratio
+
+from coliags_plugin import registry
+from coliags_plugin.errors import UnavailableError
+from coliags_plugin.ssim import ssim
+
+
+@pytest.fixture
+def pair():
+    generator = torch.Generator().manual_seed(0)
+    truth = torch.rand(30, 41, 3, generator=generator)
+    return (truth + 0.1 * torch.randn(30, 41, 3, generator=generator)).clamp(0, 1), truth
+
+
+@pytest.fixture
+def mask():
+    return torch.rand(30, 41, generator=torch.Generator().manual_seed(1)) < 0.7
+
+
+def test_psnr_against_scikit_image(make, pictures, pair):
+    a, b = pair
+    expected = peak_signal_noise_ratio(b.double().numpy(), a.double().numpy(), data_range=1.0)
+    assert make("psnr")(pictures(a, b)) == pytest.approx(expected, abs=1e-9)
+
+
+def test_psnr_of_a_known_error(make, pictures):
+    black = torch.zeros(4, 4, 3)
+    assert make("psnr")(pictures(black, black + 0.1)) == pytest.approx(20.0, abs=1e-5)
+
+
+def test_psnr_pools_the_channels_before_the_logarithm(make, pictures):
+    truth = torch.zeros(2, 2, 3)
+    rendered = truth.clone()
+    rendered[..., 0] = 0.3
+    assert make("psnr")(pictures(rendered, truth)) == pytest.approx(-10 * math.log10(0.09 / 3), abs=1e-6)
+
+
+def test_ssim_is_the_masked_flavour_in_double_precision(make, pictures, pair, mask):
+    a, b = pair
+    assert make("ssim")(pictures(a, b, mask)) == ssim(a.double(), b.double(), mask).item()
+    assert make("ssim")(pictures(b, b, mask)) == pytest.approx(1.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("name", ["psnr", "ssim"])
+def test_what_the_mask_hides_cannot_move_a_figure(name, make, pictures, pair, mask):
+    a, b = pair
+    hidden = a.clone()
+    hidden[~mask] = torch.nan
+    assert make(name)(pictures(hidden, b, mask)) == make(name)(pictures(a, b, mask))
+    assert make(name)(pictures(a, b, torch.ones_like(mask))) != make(name)(pictures(a, b, mask))
+
+
+@pytest.mark.parametrize("name", ["psnr", "ssim", "lpips"])
+def test_no_pixel_or_a_broken_render_has_no_figure(name, make, pictures, pair, mask):
+    a, b = pair
+    with pytest.raises(UnavailableError, match="the mask leaves no pixel"):
+        make(name)(pictures(a, b, torch.zeros_like(mask)))
+    a[3, 4, 1] = torch.nan
+    with pytest.raises(UnavailableError, match="not finite at 1 pixels"):
+        make(name)(pictures(a, b))
+
+
+def test_identical_images_have_no_psnr(make, pictures, pair):
+    with pytest.raises(UnavailableError, match="images are identical"):
+        make("psnr")(pictures(pair[1], pair[1]))
+
+
+def test_every_metric_says_its_direction_and_unit():
+    said = {name: (registry.metrics.get(name).higher_is_better, registry.metrics.get(name).unit) for name in (
+        "psnr", "ssim", "lpips", "depth_mse", "depth_mse_inner", "depth_rmse", "depth_mae", "depth_median_error",
+        "depth_abs_rel",
+    )}  # fmt: skip
+    assert said == {
+        "psnr": (True, "dB"), "ssim": (True, ""), "lpips": (False, ""), "depth_mse": (False, "mm^2"),
+        "depth_mse_inner": (False, "mm^2"), "depth_rmse": (False, "mm"), "depth_mae": (False, "mm"),
+        "depth_median_error": (False, "mm"), "depth_abs_rel": (False, ""),
+    }  # fmt: skip

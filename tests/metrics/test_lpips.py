@@ -1,0 +1,292 @@
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from coliags_plugin.errors import InputError, UnavailableError
+from coliags_plugin.metrics import lpips_weights
+from coliags_plugin.metrics.lpips_network import TAPS, LPIPSNetwork, features
+
+NETS = ["vgg", "alex", "squeeze"]
+
+# Keys and shapes of the convolutions in torchvision's models, from its documentation of the architectures.
+TORCHVISION = {
+    "vgg": {
+        "0": (64, 3, 3), "2": (64, 64, 3), "5": (128, 64, 3), "7": (128, 128, 3), "10": (256, 128, 3),
+        "12": (256, 256, 3), "14": (256, 256, 3), "17": (512, 256, 3), "19": (512, 512, 3), "21": (512, 512, 3),
+        "24": (512, 512, 3), "26": (512, 512, 3), "28": (512, 512, 3),
+    },
+    "alex": {"0": (64, 3, 11), "3": (192, 64, 5), "6": (384, 192, 3), "8": (256, 384, 3), "10": (256, 256, 3)},
+    "squeeze": {
+        "0": (64, 3, 3),
+        **{
+            f"{layer}.{part}": shape
+            for layer, inputs, squeezed, expanded in (
+                (3, 64, 16, 64), (4, 128, 16, 64), (6, 128, 32, 128), (7, 256, 32, 128), (9, 256, 48, 192),
+                (10, 384, 48, 192), (11, 384, 64, 256), (12, 512, 64, 256),
+            )
+            for part, shape in (
+                ("squeeze", (squeezed, inputs, 1)), ("expand1x1", (expanded, squeezed, 1)),
+                ("expand3x3", (expanded, squeezed, 3)),
+            )
+        },
+    },
+}  # fmt: skip
+
+
+def random_backbone(net, prefix=""):
+    generator = torch.Generator().manual_seed(0)
+    state = {}
+    for key, (outputs, inputs, size) in TORCHVISION[net].items():
+        spread = (2 / (inputs * size * size)) ** 0.5
+        state[f"{prefix}{key}.weight"] = spread * torch.randn(outputs, inputs, size, size, generator=generator)
+        state[f"{prefix}{key}.bias"] = torch.zeros(outputs)
+    return state
+
+
+def random_heads(net):
+    generator = torch.Generator().manual_seed(1)
+    return {
+        f"lin{index}.model.1.weight": torch.rand(1, channels, 1, 1, generator=generator)
+        for index, channels in enumerate(TAPS[net].values())
+    }
+
+
+@pytest.fixture
+def nowhere(monkeypatch, tmp_path):
+    """A machine without any LPIPS weights."""
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    monkeypatch.delenv(lpips_weights.WEIGHTS_VARIABLE, raising=False)
+    monkeypatch.setattr(lpips_weights, "find_spec", lambda name: None)
+    return tmp_path
+
+
+@pytest.fixture
+def pair(pictures):
+    generator = torch.Generator().manual_seed(3)
+    truth = torch.rand(48, 40, 3, generator=generator)
+    return pictures((truth + 0.1 * torch.randn(48, 40, 3, generator=generator)).clamp(0, 1), truth)
+
+
+def read(path):
+    return torch.from_numpy(cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)).float() / 255
+
+
+@pytest.fixture
+def examples(shared_data):
+    return {name: read(shared_data / "lpips" / "test_images" / f"ex_{name}.png") for name in ("ref", "p0", "p1")}
+
+
+# --------------------------------------------------------------------------------------------------- the real weights
+
+
+@pytest.fixture
+def squeeze(shared_data, make, nowhere):
+    def options(**more):
+        return make("lpips", net="squeeze", weights=str(shared_data / "lpips"), **more)
+
+    return options
+
+
+def test_the_example_pictures_score_as_the_lpips_package_scores_them(squeeze, pictures, examples):
+    """0.7110476 and 0.1479016: lpips 0.1.4 (net="squeeze") on the same weights and pictures, run once."""
+    metric = squeeze(input_range="minus-one-one")
+    assert metric(pictures(examples["p0"], examples["ref"])) == pytest.approx(0.7110476, abs=2e-6)
+    assert metric(pictures(examples["p1"], examples["ref"])) == pytest.approx(0.1479016, abs=2e-6)
+
+
+def test_unmapped_pictures_give_other_figures_in_the_same_order(squeeze, pictures, examples):
+    blurred, warped = (squeeze()(pictures(examples[name], examples["ref"])) for name in ("p0", "p1"))
+    assert 0 < warped < blurred
+    mapped = squeeze(input_range="minus-one-one")(pictures(examples["p0"], examples["ref"]))
+    assert abs(blurred - mapped) > 0.001
+
+
+def test_equal_pictures_are_at_zero_and_distance_has_no_direction(squeeze, pictures, examples):
+    assert squeeze()(pictures(examples["ref"], examples["ref"])) == 0.0
+    there = squeeze()(pictures(examples["p0"], examples["ref"]))
+    assert squeeze()(pictures(examples["ref"], examples["p0"])) == there
+
+
+def test_what_the_mask_hides_cannot_move_the_figure(squeeze, pictures, examples):
+    mask = torch.ones(64, 64, dtype=torch.bool)
+    mask[:, 40:] = False
+    hidden, truth = examples["p1"].clone(), examples["ref"].clone()
+    hidden[~mask], truth[~mask] = torch.nan, 7.0
+    masked = squeeze()(pictures(examples["p1"], examples["ref"], mask))
+    assert squeeze()(pictures(hidden, truth, mask)) == masked
+    assert masked != squeeze()(pictures(examples["p1"], examples["ref"]))
+
+
+def test_the_mask_chooses_where_the_distance_is_averaged(squeeze, pictures, examples):
+    """Only the left half differs, so leaving out the right half raises the mean."""
+    rendered = examples["ref"].clone()
+    rendered[:, :32] = examples["p0"][:, :32]
+    left = torch.zeros(64, 64, dtype=torch.bool)
+    left[:, :32] = True
+    everywhere = squeeze()(pictures(rendered, examples["ref"]))
+    assert squeeze()(pictures(rendered, examples["ref"], left)) > 1.2 * everywhere
+
+
+def test_the_published_heads_fit_all_three_nets(shared_data):
+    for net in NETS:
+        heads = lpips_weights._read(shared_data / "lpips" / "v0.1" / f"{net}.pth")
+        assert [heads[f"lin{index}.model.1.weight"].shape[1] for index in range(len(heads))] == list(TAPS[net].values())
+
+
+# ------------------------------------------------------------------------------------------------------ architectures
+
+
+@pytest.mark.parametrize("net", NETS)
+def test_layers_are_numbered_and_shaped_as_torchvision_s(net):
+    with torch.device("meta"):
+        state = features(net).state_dict()
+    expected = {}
+    for key, (outputs, inputs, size) in TORCHVISION[net].items():
+        expected |= {f"{key}.weight": (outputs, inputs, size, size), f"{key}.bias": (outputs,)}
+    assert {key: tuple(value.shape) for key, value in state.items()} == expected
+
+
+@pytest.mark.parametrize(
+    ("net", "sizes"),
+    [("vgg", [96, 48, 24, 12, 6]), ("alex", [23, 11, 5, 5, 5]), ("squeeze", [47, 23, 11, 5, 5, 5, 5])],
+)
+def test_every_tap_is_a_relu_of_the_right_width_and_size(net, sizes):
+    x, taps = torch.rand(1, 3, 96, 96, generator=torch.Generator().manual_seed(0)), []
+    with torch.device("meta"):
+        layers = features(net)
+    layers.load_state_dict(random_backbone(net), assign=True)
+    for index, layer in enumerate(layers):
+        x = layer(x)
+        if index in TAPS[net]:
+            taps.append((x.shape[1], x.shape[2]))
+            assert x.min() == 0
+    assert taps == list(zip(TAPS[net].values(), sizes, strict=True))
+
+
+def test_the_first_tap_against_numpy():
+    """Standardise, convolve with stride 2, rectify, normalise, square, weigh, average: by hand."""
+    state, heads = random_backbone("squeeze"), [head * 0 for head in random_heads("squeeze").values()]
+    heads[0] = random_heads("squeeze")["lin0.model.1.weight"]
+    network = LPIPSNetwork("squeeze", state, heads)
+    generator = torch.Generator().manual_seed(2)
+    a, b = torch.rand(1, 3, 33, 37, generator=generator), torch.rand(1, 3, 33, 37, generator=generator)
+
+    def tap(image):
+        x = (image[0].double().numpy() - np.array([-0.030, -0.088, -0.188])[:, None, None]) / np.array(
+            [0.458, 0.448, 0.450]
+        )[:, None, None]
+        patches = np.lib.stride_tricks.sliding_window_view(x, (3, 3), axis=(1, 2))[:, ::2, ::2]
+        y = np.maximum(np.einsum("chwij,ocij->ohw", patches, state["0.weight"].double().numpy()), 0)
+        return y / (np.sqrt((y * y).sum(0)) + 1e-10)
+
+    squared = (tap(a) - tap(b)) ** 2
+    expected = (heads[0].double().numpy()[0] * squared).sum(0).mean()
+    distance = network(a, b, torch.ones(33, 37, dtype=torch.bool))
+    assert distance.item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_building_a_network_draws_no_random_numbers():
+    state = torch.random.get_rng_state()
+    LPIPSNetwork("alex", random_backbone("alex"), list(random_heads("alex").values()))
+    assert torch.equal(torch.random.get_rng_state(), state)
+
+
+# ------------------------------------------------------------------------------------------------- finding the weights
+
+
+def lay_out(folder, net, heads="v0.1/{}.pth"):
+    """As torchvision's downloads lie: the classifier too, under its published name."""
+    (folder / heads.format(net)).parent.mkdir(parents=True, exist_ok=True)
+    state = random_backbone(net, "features.") | {"classifier.0.weight": torch.zeros(2, 2)}
+    torch.save(state, folder / lpips_weights.BACKBONE_FILES[net][0])
+    torch.save(random_heads(net), folder / heads.format(net))
+
+
+@pytest.mark.parametrize("net", NETS)
+def test_torch_hub_s_folder_is_found(net, nowhere, make, pair):
+    checkpoints = nowhere / "torch" / "hub" / "checkpoints"
+    checkpoints.mkdir(parents=True)
+    lay_out(checkpoints, net, "{}.pth")
+    distance = make("lpips", net=net)(pair)
+    assert 0 < distance < 100
+    plain = LPIPSNetwork(net, random_backbone(net), list(random_heads(net).values()))
+    image, truth = (x.permute(2, 0, 1)[None] for x in (pair.rgb, pair.true_rgb))
+    assert distance == pytest.approx(plain(image, truth, pair.valid).item(), rel=1e-6)
+
+
+@pytest.mark.parametrize("heads", ["{}.pth", "v0.1/{}.pth", "lpips_{}.pth"])
+def test_a_named_folder_comes_before_the_environment_s(heads, nowhere, monkeypatch):
+    lay_out(nowhere / "first", "alex", heads)
+    lay_out(nowhere / "second", "alex", heads)
+    monkeypatch.setenv(lpips_weights.WEIGHTS_VARIABLE, str(nowhere / "second"))
+    assert {file.parents[heads.count("/")] for file in lpips_weights.find_weights("alex")[1:]} == {nowhere / "second"}
+    backbone, linear = lpips_weights.find_weights("alex", str(nowhere / "first"))
+    assert backbone.parent == nowhere / "first"
+    assert linear == nowhere / "first" / heads.format("alex")
+
+
+def test_an_installed_lpips_package_lends_its_heads_without_being_imported(nowhere, monkeypatch, tmp_path):
+    package = tmp_path / "site" / "lpips"
+    lay_out(package / "weights", "alex")
+    (package / "__init__.py").write_text("raise RuntimeError('imported')")
+    (package / "weights" / lpips_weights.BACKBONE_FILES["alex"][0]).rename(tmp_path / "my-alex-backbone.pth")
+    monkeypatch.undo()
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    monkeypatch.delenv(lpips_weights.WEIGHTS_VARIABLE, raising=False)
+    monkeypatch.syspath_prepend(str(tmp_path / "site"))
+    backbone, heads = lpips_weights.find_weights("alex", str(tmp_path))
+    assert backbone == tmp_path / "my-alex-backbone.pth"
+    assert heads == package / "weights" / "v0.1" / "alex.pth"
+
+
+def test_missing_weights_say_what_and_where(nowhere, make, pair):
+    with pytest.raises(UnavailableError) as caught:
+        make("lpips", net="vgg")(pair)
+    text = str(caught.value)
+    for part in ("vgg16-397923af.pth", "v0.1/vgg.pth", str(nowhere / "torch" / "hub"), "COLIAGS_LPIPS_WEIGHTS"):
+        assert part in text
+    torch.save(random_heads("vgg"), nowhere / "vgg.pth")
+    with pytest.raises(UnavailableError, match="backbone") as caught:
+        make("lpips", net="vgg", weights=str(nowhere))(pair)
+    assert "linear heads" not in str(caught.value)
+
+
+@pytest.mark.parametrize("damage", ["truncated", "other net", "not tensors", "wrong heads", "negative heads"])
+def test_weights_that_do_not_fit_name_the_file(damage, nowhere, make, pair):
+    folder = nowhere / damage.replace(" ", "-")
+    lay_out(folder, "squeeze")
+    backbone, heads = folder / lpips_weights.BACKBONE_FILES["squeeze"][0], folder / "v0.1" / "squeeze.pth"
+    culprit = heads if "heads" in damage else backbone
+    if damage == "truncated":
+        backbone.write_bytes(backbone.read_bytes()[:1000])
+    elif damage == "other net":
+        torch.save(random_backbone("alex"), backbone)
+    elif damage == "not tensors":
+        torch.save([1, 2], backbone)
+    elif damage == "wrong heads":
+        torch.save(random_heads("alex"), heads)
+    else:
+        torch.save({key: -value for key, value in random_heads("squeeze").items()}, heads)
+    with pytest.raises(UnavailableError) as caught:
+        make("lpips", net="squeeze", weights=str(folder))(pair)
+    assert str(culprit) in str(caught.value)
+
+
+def test_a_folder_that_is_none_is_the_user_s_mistake(make, tmp_path):
+    with pytest.raises(InputError, match="is not a folder"):
+        make("lpips", weights=str(tmp_path / "nothing"))
+
+
+def test_a_picture_too_small_has_no_figure(make, pictures, nowhere):
+    with pytest.raises(UnavailableError, match="40x31"):
+        make("lpips")(pictures(torch.zeros(31, 40, 3), torch.ones(31, 40, 3)))
+
+
+def test_the_network_is_read_once(nowhere, make, pair):
+    lay_out(nowhere / "kept", "alex")
+    metric = make("lpips", net="alex", weights=str(nowhere / "kept"))
+    with torch.inference_mode():
+        first = metric(pair)
+    (nowhere / "kept" / "v0.1" / "alex.pth").write_bytes(b"no longer read")
+    assert metric(pair) == first

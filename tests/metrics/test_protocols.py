@@ -1,0 +1,155 @@
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from coliags_plugin import registry
+from coliags_plugin.errors import UnavailableError
+from coliags_plugin.gaussians import OUTPUTS
+
+HEIGHT, WIDTH = 12, 15
+NAMES = ["paper", "authors-code"]
+
+
+def protocol(name):
+    return registry.protocols.get(name)()
+
+
+def score(name, metric, comparison):
+    kind, options = protocol(name).metrics[metric]
+    scorer = registry.metrics.get(kind)
+    return scorer(scorer.Settings(**options))(comparison)
+
+
+@pytest.fixture
+def scene(make_output, make_frame):
+    """A render and a frame: true depth 20 mm all over, drawn 1 mm too far; one pixel unknown, one masked."""
+    generator = torch.Generator().manual_seed(0)
+    image = torch.randint(0, 256, (HEIGHT, WIDTH, 3), generator=generator, dtype=torch.uint8)
+    depth = torch.full((HEIGHT, WIDTH), 20.0)
+    depth[2, 3] = torch.nan
+    mask = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+    mask[5, 6] = False
+    rgb = torch.rand(HEIGHT, WIDTH, 3, generator=generator).requires_grad_()
+    drawn = torch.full((HEIGHT, WIDTH), 21.0)
+    output = make_output(rgb, depth_accumulated=drawn, inverse_depth_accumulated=1 / drawn)
+    return output, make_frame(image, depth, mask)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_a_protocol_promises(name):
+    made = protocol(name)
+    assert made.name == name
+    assert made.version == 1
+    assert made.description
+    assert made.wants <= set(OUTPUTS)
+    for metric, options in made.metrics.values():
+        scorer = registry.metrics.get(metric)
+        scorer(scorer.Settings(**options))
+
+
+def test_the_metrics_of_each():
+    assert list(protocol("authors-code").metrics) == ["psnr", "ssim", "lpips", "depth_mse"]
+    assert list(protocol("paper").metrics) == [
+        "psnr", "ssim", "lpips", "lpips_squeeze", "depth_mse", "depth_mse_inner", "depth_median_error", "depth_rmse",
+        "depth_mae", "depth_abs_rel",
+    ]  # fmt: skip
+    for name in NAMES:
+        assert protocol(name).metrics["lpips"] == ("lpips", {"net": "vgg", "input_range": "zero-one"})
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_nothing_compared_carries_a_graph(name, scene):
+    comparison = protocol(name).compare(*scene)
+    for field in dataclasses.fields(comparison):
+        assert not getattr(comparison, field.name).requires_grad
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_frame_without_depth_has_pictures_only(name, scene):
+    output, frame = scene
+    comparison = protocol(name).compare(output, dataclasses.replace(frame, depth=None))
+    assert comparison.depth is None
+    assert comparison.true_depth is None
+    assert comparison.depth_valid is None
+    assert score(name, "psnr", comparison) > 0
+    with pytest.raises(UnavailableError, match="no ground-truth depth"):
+        score(name, "depth_mse", comparison)
+
+
+# -------------------------------------------------------------------------------------------------------------- paper
+
+
+def test_paper_compares_floats_where_truth_is_known(scene):
+    output, frame = scene
+    comparison = protocol("paper").compare(output, frame)
+    assert torch.equal(comparison.rgb, output.rgb.detach())
+    assert torch.equal(comparison.valid, frame.mask)
+    assert torch.equal(comparison.depth, output["depth_accumulated"])
+    assert (~comparison.depth_valid).nonzero().tolist() == [[2, 3], [5, 6]]
+    assert score("paper", "depth_mse", comparison) == 1.0
+    assert score("paper", "depth_mse_inner", comparison) == 1.0
+    assert score("paper", "depth_abs_rel", comparison) == pytest.approx(0.05)
+
+
+def test_paper_clamps_the_render(make_output, scene):
+    _, frame = scene
+    rgb = torch.full((HEIGHT, WIDTH, 3), 1.5)
+    rgb[0] = -0.5
+    output = make_output(rgb, depth_accumulated=torch.zeros(HEIGHT, WIDTH))
+    assert protocol("paper").compare(output, frame).rgb.unique().tolist() == [0.0, 1.0]
+
+
+def test_paper_counts_every_pixel_where_there_is_no_mask(scene):
+    output, frame = scene
+    assert protocol("paper").compare(output, dataclasses.replace(frame, mask=None)).valid.all()
+
+
+# ------------------------------------------------------------------------------------------------------- authors' code
+
+
+def test_authors_code_ignores_the_mask_and_scores_unknown_depth_against_zero(scene):
+    comparison = protocol("authors-code").compare(*scene)
+    assert comparison.valid.all()
+    assert comparison.depth_valid.all()
+    assert comparison.true_depth[2, 3] == 0.0
+    # 21 mm over 150 is level 9174 (20.998 mm), 20 mm over 100 is level 13107 (20 mm) or, truncated in float32, one less
+    drawn, truth = 9174 / 65535 * 150, comparison.true_depth[0, 0].item()
+    assert truth == pytest.approx(20.0, abs=0.0016)
+    pixels = HEIGHT * WIDTH
+    expected = ((pixels - 1) * (drawn - truth) ** 2 + drawn**2) / pixels
+    assert score("authors-code", "depth_mse", comparison) == pytest.approx(expected, rel=1e-5)
+
+
+def test_authors_code_rounds_pictures_to_eight_bits(scene):
+    output, frame = scene
+    comparison = protocol("authors-code").compare(output, frame)
+    levels = comparison.rgb.numpy() * 255
+    np.testing.assert_allclose(levels, np.round(output.rgb.detach().numpy() * 255), atol=1e-4)
+    assert torch.equal(comparison.true_rgb, frame.rgb)
+
+
+def test_authors_code_draws_nothing_at_a_hundred_millimetres(make_output, scene):
+    _, frame = scene
+    empty = make_output(torch.zeros(HEIGHT, WIDTH, 3), inverse_depth_accumulated=torch.zeros(HEIGHT, WIDTH))
+    depth = protocol("authors-code").compare(empty, frame).depth
+    assert depth.unique().tolist() == pytest.approx([100.0], abs=0.0023)
+
+
+def test_authors_code_wraps_a_surface_beyond_150_mm_to_the_camera(make_output, scene):
+    _, frame = scene
+    far = torch.full((HEIGHT, WIDTH), 1 / 160.0)
+    output = make_output(torch.zeros(HEIGHT, WIDTH, 3), inverse_depth_accumulated=far)
+    comparison = protocol("authors-code").compare(output, frame)
+    # 160 / 150 * 65535 = 69904, less 65536
+    assert comparison.depth[0, 0].item() == pytest.approx(4368 / 65535 * 150, abs=0.0024)
+
+
+def test_authors_code_wraps_true_depth_beyond_100_mm_too(scene):
+    output, frame = scene
+    beyond = dataclasses.replace(frame, depth=torch.full((HEIGHT, WIDTH), 101.0))
+    # 101 / 100 * 65535 = 66190.35, less 65536
+    assert protocol("authors-code").compare(output, beyond).true_depth[0, 0].item() == pytest.approx(
+        654 / 65535 * 100, abs=1e-5
+    )

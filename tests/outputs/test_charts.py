@@ -1,0 +1,99 @@
+import math
+import re
+import xml.etree.ElementTree as ET
+
+import pytest
+
+from coliags_plugin.outputs.charts import Series, color_bar_svg, line_chart, style_classes
+from coliags_plugin.outputs.figures import color_table
+
+
+def texts(svg):
+    return ["".join(element.itertext()) for element in ET.fromstring(svg).iter("text")]
+
+
+def points(path):
+    return [tuple(map(float, pair.split())) for pair in re.split("[ML]", path.get("d"))[1:]]
+
+
+def lines(svg):
+    return [element for element in ET.fromstring(svg).iter("path") if element.get("class") == "line"]
+
+
+def test_axes_are_labelled_and_names_escaped():
+    svg = line_chart([Series("<b> & co", 0, [1, 2], [3.0, 4.0])], "step", "PSNR [dB]")
+    assert {"step", "PSNR [dB]"} <= set(texts(svg))
+    assert "&lt;b&gt; &amp; co" in svg
+    assert "http" not in svg
+
+
+def test_larger_values_stand_higher_and_to_the_right():
+    (line,) = lines(line_chart([Series("a", 0, [1, 2, 3], [5.0, 6.0, 8.0])], "x", "y"))
+    (x0, y0), (x1, y1), (x2, y2) = points(line)
+    assert x0 < x1 < x2
+    assert y0 - y1 == pytest.approx((y1 - y2) / 2, abs=0.2)
+    assert x1 - x0 == pytest.approx(x2 - x1, abs=0.2)
+
+
+def test_logarithmic_axis_spaces_decades_evenly():
+    (line,) = lines(line_chart([Series("a", 0, [1, 2, 3], [0.01, 0.1, 1.0])], "x", "y", log_y=True))
+    (_, y0), (_, y1), (_, y2) = points(line)
+    assert y0 - y1 == pytest.approx(y1 - y2, abs=0.2)
+
+
+def test_gaps_interrupt_the_line():
+    svg = line_chart([Series("a", 0, [1, 2, 3, 4, 5], [1.0, 2.0, math.nan, 3.0, 4.0])], "x", "y")
+    assert [len(points(line)) for line in lines(svg)] == [2, 2]
+    log = line_chart([Series("a", 0, [1, 2, 3], [1.0, 0.0, 2.0])], "x", "y", log_y=True)
+    assert len(lines(log)) == 2
+
+
+def test_nothing_to_draw_is_no_chart():
+    assert line_chart([], "x", "y") == ""
+    assert line_chart([Series("a", 0, [1], [math.nan])], "x", "y") == ""
+
+
+@pytest.mark.parametrize("log", [False, True])
+def test_constant_and_single_values(log):
+    for y in ([2.0], [2.0, 2.0]):
+        svg = line_chart([Series("a", 0, list(range(len(y))), y)], "x", "y", log_y=log)
+        assert "nan" not in svg
+        assert len(texts(svg)) > 3
+
+
+def test_everything_drawn_lies_within_the_view_box():
+    svg = line_chart(
+        [Series("a", 0, [0, 1, 2], [1.0, 9.0, 4.0], [0.5, 7.0, 2.0], [2.0, 20.0, 5.0])],
+        "frame",
+        "y",
+        x_names=["a", "b", "c"],
+    )
+    root = ET.fromstring(svg)
+    width, height = map(float, root.get("viewBox").split()[2:])
+    band = next(element for element in root.iter("path") if element.get("class") == "band")
+    drawn = re.findall(r"([\d.]+) ([\d.]+)", band.get("d"))
+    assert len(drawn) == 6
+    assert all(0 <= float(x) <= width and 0 <= float(y) <= height for x, y in drawn)
+    assert {"a", "b", "c"} <= set(texts(svg))
+
+
+def test_many_names_are_thinned_but_every_point_tells_its_own():
+    names = [f"frame_{index:04d}" for index in range(60)]
+    svg = line_chart(
+        [Series("m", 0, list(range(60)), [1.0 + i for i in range(60)])], "frame", "y", x_names=names, markers=True
+    )
+    assert 2 <= sum(text in names for text in texts(svg)) <= 10
+    assert "m, frame_0059: 60" in svg
+
+
+def test_styles_repeat_with_dashes():
+    assert [style_classes(index) for index in (0, 7, 8, 17)] == ["s0", "s7", "s0 dash1", "s1 dash2"]
+
+
+def test_color_bar():
+    svg = color_bar_svg((0.0, 5.0), "mm", "error", "|depth error|", "scale")
+    assert texts(svg) == ["|depth error| [mm]", "0", "1", "2", "3", "4", "5"]
+    stops = [element.get("stop-color") for element in ET.fromstring(svg).iter("stop")]
+    table = color_table("error")
+    assert stops[0] == "#" + bytes(table[0]).hex()
+    assert stops[-1] == "#" + bytes(table[255]).hex()

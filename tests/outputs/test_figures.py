@@ -1,0 +1,149 @@
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from coliags_plugin.errors import InputError
+from coliags_plugin.outputs.figures import (
+    HATCH_GREYS,
+    UNKNOWN_GREY,
+    color_bar,
+    color_table,
+    depth_error,
+    depth_error_picture,
+    depth_picture,
+    hatch,
+    rgb_error_picture,
+    side_by_side,
+)
+
+
+def test_color_tables_are_opencvs_and_read_only():
+    ramp = np.arange(256, dtype=np.uint8).reshape(1, -1)
+    for name, code in (("depth", cv2.COLORMAP_VIRIDIS), ("error", cv2.COLORMAP_INFERNO)):
+        np.testing.assert_array_equal(color_table(name), cv2.applyColorMap(ramp, code)[0, :, ::-1])
+        with pytest.raises(ValueError, match="read-only"):
+            color_table(name)[0] = 0
+
+
+@pytest.mark.parametrize("name", ["depth", "error"])
+def test_greys_of_the_unknown_are_far_from_every_color_of_a_map(name):
+    for grey in (UNKNOWN_GREY, *HATCH_GREYS):
+        assert np.linalg.norm(color_table(name).astype(float) - grey, axis=1).min() > 25
+
+
+def test_maps_grow_brighter_throughout():
+    for name in ("depth", "error"):
+        lab = cv2.cvtColor((color_table(name) / 255.0).astype(np.float32)[None], cv2.COLOR_RGB2LAB)[0, :, 0]
+        assert np.all(np.diff(lab) > -0.5)
+        assert lab[-1] - lab[0] > 70
+
+
+def test_depth_picture():
+    table = color_table("depth")
+    depth = torch.tensor([[10.0, 60.0, 35.0], [-5.0, 99.0, torch.nan]])
+    picture = depth_picture(depth, (10.0, 60.0))
+    assert picture.dtype == np.uint8
+    np.testing.assert_array_equal(picture[0, 0], table[0])
+    np.testing.assert_array_equal(picture[0, 1], table[255])
+    np.testing.assert_array_equal(picture[0, 2], table[128])
+    np.testing.assert_array_equal(picture[1, 0], table[0])
+    np.testing.assert_array_equal(picture[1, 1], table[255])
+    assert (picture[1, 2] == UNKNOWN_GREY).all()
+
+
+def test_infinite_depth_is_unknown():
+    assert (depth_picture(np.array([[np.inf, -np.inf]]), (0.0, 1.0)) == UNKNOWN_GREY).all()
+
+
+@pytest.mark.parametrize("limits", [(1.0, 1.0), (2.0, 1.0), (0.0, np.nan), (0.0, np.inf)])
+def test_depth_picture_refuses_limits(limits):
+    with pytest.raises(InputError, match="limits"):
+        depth_picture(np.zeros((2, 2)), limits)
+
+
+def test_depth_error_picture():
+    table = color_table("error")
+    true = np.full((2, 4), 30.0, np.float32)
+    rendered = true + np.array([[0.0, 1.0, -2.0, 7.0], [np.nan, 0.0, 0.0, 0.0]], np.float32)
+    true[1, 1] = np.nan
+    valid = np.ones((2, 4), bool)
+    valid[1, 2] = False
+    picture = depth_error_picture(torch.from_numpy(rendered), true, valid, limit_mm=2.0)
+    np.testing.assert_array_equal(picture[0], table[[0, 128, 255, 255]])
+    np.testing.assert_array_equal(picture[1, 0], table[255])  # nothing rendered where there is a truth
+    np.testing.assert_array_equal(picture[1, 1:3], hatch(2, 4)[1, 1:3])
+    np.testing.assert_array_equal(picture[1, 3], table[0])
+
+
+def test_depth_error_is_zero_where_unknown_and_infinite_where_nothing_was_rendered():
+    error, known = depth_error(np.array([[1.0, np.nan, np.inf]]), np.array([[np.nan, 2.0, 2.0]]))
+    np.testing.assert_array_equal(error, [[0.0, np.inf, np.inf]])
+    np.testing.assert_array_equal(known, [[False, True, True]])
+
+
+def test_depth_error_picture_refuses():
+    map_ = np.zeros((2, 3))
+    for limit in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(InputError, match="error scale"):
+            depth_error_picture(map_, map_, None, limit)
+    with pytest.raises(InputError, match="rendered_mm"):
+        depth_error_picture(np.zeros((3, 2)), map_, None, 1.0)
+    with pytest.raises(InputError, match="valid"):
+        depth_error_picture(map_, map_, np.ones((3, 2), bool), 1.0)
+    with pytest.raises(InputError, match=r"\[H, W\]"):
+        depth_error_picture(map_[None], map_, None, 1.0)
+
+
+def test_rgb_error_picture():
+    table = color_table("error")
+    true = np.zeros((1, 3, 3), np.uint8)
+    rendered = true.copy()
+    rendered[0, 1] = (51, 0, 0)  # a mean of 17 levels: one third of 0.2
+    rendered[0, 2] = 255
+    expected = table[[0, 85, 255]]
+    np.testing.assert_array_equal(rgb_error_picture(rendered, true)[0], expected)
+    np.testing.assert_array_equal(rgb_error_picture(torch.from_numpy(rendered / 255.0), true)[0], expected)
+    masked = rgb_error_picture(rendered, true, np.array([[True, True, False]]))
+    np.testing.assert_array_equal(masked[0, 2], hatch(1, 3)[0, 2])
+
+
+def test_color_bar_runs_through_the_map_and_is_labelled():
+    bar = color_bar((0.0, 2.0), "mm", "error", width=480)
+    assert bar.shape[1] == 480
+    row = bar[16].astype(int)
+    colored = np.flatnonzero((row != 255).any(1))
+    table = color_table("error")
+    np.testing.assert_array_equal(row[colored[0]], table[0])
+    assert (bar[16] == table[128]).all(1).any()
+    assert (bar[34:] < 128).any(), "no tick labels"
+    assert not np.array_equal(bar, color_bar((0.0, 2.0), "cm", "error", width=480)), "the unit is not drawn"
+    assert not np.array_equal(bar, color_bar((0.0, 5.0), "mm", "error", width=480)), "the limits are not drawn"
+    with pytest.raises(InputError, match="wide"):
+        color_bar((0.0, 1.0), "mm", width=50)
+
+
+def test_side_by_side():
+    first, second = np.full((10, 40, 3), 9, np.uint8), np.full((10, 60, 3), 200, np.uint8)
+    sheet = side_by_side([first, torch.from_numpy(second)], ["a", "b"], gap=6)
+    assert sheet.shape[1] == 40 + 6 + 60
+    np.testing.assert_array_equal(sheet[-10:, :40], first)
+    np.testing.assert_array_equal(sheet[-10:, 46:], second)
+    assert (sheet[:, 40:46] == 255).all()
+    assert (sheet[:-10, :40] < 128).any()
+    assert (sheet[:-10, 46:] < 128).any()
+
+
+def test_a_long_label_stays_over_its_picture():
+    picture = np.zeros((4, 60, 3), np.uint8)
+    sheet = side_by_side([picture, picture], ["a label much longer than its picture", ""])
+    assert (sheet[:-4, 60:] == 255).all()
+
+
+def test_side_by_side_refuses():
+    picture = np.zeros((4, 4, 3), np.uint8)
+    for pictures, labels in (([], []), ([picture], ["a", "b"]), ([picture, picture[:2]], ["a", "b"])):
+        with pytest.raises(InputError):
+            side_by_side(pictures, labels)
+    with pytest.raises(InputError, match="uint8"):
+        side_by_side([picture.astype(float)], ["a"])

@@ -1,0 +1,96 @@
+import struct
+
+import cv2
+import numpy as np
+import pytest
+import skimage.io
+import tifffile
+import torch
+
+from coliags_plugin.errors import InputError
+from coliags_plugin.outputs.pictures import (
+    encode_jpeg,
+    encode_png,
+    read_depth_tiff,
+    read_rgb,
+    write_depth_tiff,
+    write_png,
+)
+
+
+@pytest.fixture
+def rgb():
+    return np.random.default_rng(0).integers(0, 256, (7, 5, 3), dtype=np.uint8)
+
+
+def test_png_round_trip_and_channel_order(tmp_path, rgb):
+    path = tmp_path / "new" / "folder" / "é.png"
+    write_png(path, torch.from_numpy(rgb))
+    np.testing.assert_array_equal(read_rgb(path), rgb)
+    np.testing.assert_array_equal(skimage.io.imread(path), rgb)
+    assert [file.name for file in path.parent.iterdir()] == [path.name]
+
+
+def test_jpeg_keeps_full_chroma(rgb):
+    data = encode_jpeg(rgb)
+    frame = data.index(b"\xff\xc0")
+    assert data[frame + 11] == 0x11  # sampling of the luma component: 1 x 1, as the chroma's
+    flat = np.full((8, 8, 3), (200, 60, 30), np.uint8)
+    decoded = cv2.imdecode(np.frombuffer(encode_jpeg(flat), np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1]
+    assert np.abs(decoded.astype(int) - flat).max() <= 3
+
+
+def test_tiff_keeps_float32_nan_and_infinity(tmp_path):
+    depth = np.random.default_rng(0).normal(50, 20, (6, 9)).astype(np.float32)
+    depth[0, 0], depth[1, 1], depth[2, 2] = np.nan, np.inf, np.float32(1e-30)
+    path = tmp_path / "d.tiff"
+    write_depth_tiff(path, torch.from_numpy(depth).requires_grad_())
+    for found in (read_depth_tiff(path), tifffile.imread(path)):
+        assert found.dtype == np.float32
+        np.testing.assert_array_equal(found, depth)
+
+
+def test_tiff_rounds_float64(tmp_path):
+    write_depth_tiff(tmp_path / "d.tiff", np.full((2, 3), 0.1))
+    np.testing.assert_array_equal(read_depth_tiff(tmp_path / "d.tiff"), np.full((2, 3), np.float32(0.1)))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [np.zeros((4, 4), np.uint8), np.zeros((4, 4, 4), np.uint8), np.zeros((4, 4, 3)), np.zeros((0, 4, 3), np.uint8)],
+)
+def test_what_is_no_picture_is_refused(wrong):
+    with pytest.raises(InputError, match="uint8"):
+        encode_png(wrong)
+
+
+@pytest.mark.parametrize("wrong", [np.zeros((3, 3), int), np.zeros((3, 3, 1)), np.zeros((0, 3))])
+def test_what_is_no_depth_is_refused(tmp_path, wrong):
+    with pytest.raises(InputError, match="depth map"):
+        write_depth_tiff(tmp_path / "d.tiff", wrong)
+    assert not list(tmp_path.iterdir())
+
+
+def test_reading_names_the_file(tmp_path, rgb):
+    with pytest.raises(InputError, match=r"none\.png cannot be read"):
+        read_rgb(tmp_path / "none.png")
+    for name, data in (("empty.png", b""), ("torn.png", encode_png(rgb)[:20]), ("text.png", b"hello")):
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(InputError, match=f"{name} cannot be decoded"):
+            read_rgb(tmp_path / name)
+
+
+def test_nothing_is_converted_on_reading(tmp_path, rgb):
+    cv2.imwrite(str(tmp_path / "grey.png"), rgb[:, :, 0])
+    cv2.imwrite(str(tmp_path / "deep.png"), rgb.astype(np.uint16))
+    cv2.imwrite(str(tmp_path / "deep.tiff"), rgb[:, :, 0].astype(np.uint16))
+    for name in ("grey.png", "deep.png"):
+        with pytest.raises(InputError, match="8-bit RGB"):
+            read_rgb(tmp_path / name)
+    with pytest.raises(InputError, match="float32"):
+        read_depth_tiff(tmp_path / "deep.tiff")
+
+
+def test_png_is_eight_bit_rgb(rgb):
+    width, height, bits, kind = struct.unpack(">IIBB", encode_png(rgb)[16:26])
+    assert (width, height, bits, kind) == (5, 7, 8, 2)

@@ -1,0 +1,81 @@
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from coliags_plugin.errors import InputError
+from coliags_plugin.outputs import video
+from coliags_plugin.outputs.video import write_video
+
+
+def ramp(count, height, width):
+    """Frames of one colour each; the red channel counts."""
+    return [np.full((height, width, 3), (20 * index, 80, 30), np.uint8) for index in range(count)]
+
+
+def read_back(path):
+    capture = cv2.VideoCapture(str(path))
+    frames = []
+    while True:
+        ok, frame = capture.read()
+        if not ok:
+            return capture.get(cv2.CAP_PROP_FPS), frames
+        frames.append(frame[:, :, ::-1])
+
+
+@pytest.mark.parametrize("codec", video.CODECS)
+def test_frames_come_back_in_order_and_color(tmp_path, monkeypatch, codec):
+    monkeypatch.setattr(video, "CODECS", (codec,))
+    frames = ramp(9, 48, 64)
+    write_video(iter(frames), tmp_path / "new" / "v.mp4", fps=12.5)
+    fps, found = read_back(tmp_path / "new" / "v.mp4")
+    assert fps == pytest.approx(12.5, rel=1e-3)
+    assert len(found) == 9
+    for wrote, read in zip(frames, found, strict=True):
+        assert np.abs(wrote.astype(float) - read).mean() < 6
+    assert [file.name for file in (tmp_path / "new").iterdir()] == ["v.mp4"]
+
+
+def test_odd_sizes_lose_no_line(tmp_path):
+    frames = [torch.from_numpy(frame) for frame in ramp(3, 47, 63)]
+    write_video(frames, tmp_path / "v.mp4", fps=10)
+    _, found = read_back(tmp_path / "v.mp4")
+    assert [frame.shape for frame in found] == [(48, 64, 3)] * 3
+    assert np.abs(found[2][-1].astype(float) - found[2][20]).mean() < 6
+
+
+def test_an_existing_video_stays_when_frames_fail(tmp_path):
+    path = tmp_path / "v.mp4"
+    write_video(ramp(2, 48, 64), path, fps=10)
+    before = path.read_bytes()
+
+    def failing():
+        yield from ramp(2, 48, 64)
+        raise RuntimeError("renderer")
+
+    with pytest.raises(RuntimeError, match="renderer"):
+        write_video(failing(), path, fps=10)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_refusals(tmp_path):
+    frames = ramp(2, 48, 64)
+    cases = [
+        ("v.avi", frames, 10, "ends in .mp4"),
+        ("v.mp4", frames, 0, "frames a second"),
+        ("v.mp4", [], 10, "no frames"),
+        ("v.mp4", [frames[0], frames[1][:40]], 10, "frame 1 is 64 x 40 px"),
+        ("v.mp4", [frames[0] / 255.0], 10, "frame 0 is float64"),
+    ]
+    for name, given, fps, message in cases:
+        with pytest.raises(InputError, match=message):
+            write_video(given, tmp_path / name, fps)
+    assert not list(tmp_path.iterdir())
+
+
+def test_no_codec(tmp_path, monkeypatch):
+    monkeypatch.setattr(video, "CODECS", ())
+    with pytest.raises(InputError, match="PNG"):
+        write_video(ramp(1, 48, 64), tmp_path / "v.mp4", fps=10)
+    assert not list(tmp_path.iterdir())
