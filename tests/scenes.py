@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import torch
 
 from coliags_plugin.cameras import Camera
+from coliags_plugin.datamanagers.c3vd_writer import write_c3vd_scene
+from coliags_plugin.lenses import Pinhole
 from coliags_plugin.scenes import Frame, PointCloud, Scene
 
 
@@ -43,3 +46,29 @@ def wall_scene(frames: int = 9, width: int = 32, height: int = 24, depth: bool =
     grid = torch.stack(torch.meshgrid(torch.arange(-12.0, 16, 0.5), torch.arange(-10.0, 12, 0.5), indexing="ij"), -1)
     points = torch.cat([grid.reshape(-1, 2), torch.full((grid[..., 0].numel(), 1), 20.0)], dim=1)
     return Scene("wall", train, {"test": test}, PointCloud(points), {"fingerprint": f"wall-{frames}-{depth}"})
+
+
+def write_wall(folder: Path, frames: int = 9, width: int = 32, height: int = 24, depth: bool = True) -> Path:
+    """:func:`wall_scene` on disk, in C3VD's undistorted layout; without depth, its points stand in a file."""
+    scene = wall_scene(frames, width, height, depth)
+    ordered = sorted([*scene.train, *scene.test_sets["test"]], key=lambda frame: frame.index)
+    camera = ordered[0].camera
+    write_c3vd_scene(
+        folder,
+        [frame.image.numpy() for frame in ordered],
+        torch.stack([frame.camera.camera_to_world for frame in ordered]).numpy(),
+        Pinhole(camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5),
+        depths=[frame.depth.numpy() for frame in ordered] if depth else None,
+        points=None if depth else scene.points,
+    )
+    return folder
+
+
+#: Overrides that make a shipped method small enough for a test.
+SMALL = (
+    "datamanager.width=32",
+    "datamanager.height=24",
+    "datamanager.points_count=2000",
+    "field.voxel_size=2.0",
+    "schedule.log_every=1",
+)

@@ -93,7 +93,7 @@ def grow_once(gradient, voxel=2.0, **options):
 
 
 def test_growth_adds_one_anchor_with_the_parents_feature():
-    field, adam, before, done = grow_once(1.0, levels=1, coarsest_cell=1)
+    field, adam, before, done = grow_once(1.0, levels=1, coarsest_cell=1, max_log_scale=None)
     assert done == {"grown": 1, "pruned": 0}
     assert len(field.anchors) == before + 1
     torch.testing.assert_close(field.features[-1], field.features[3])
@@ -112,7 +112,7 @@ def test_growth_adds_one_anchor_with_the_parents_feature():
 
 
 def test_small_gradients_grow_nothing():
-    _, _, before, done = grow_once(0.0001, levels=1, coarsest_cell=1)
+    *_, done = grow_once(0.0001, levels=1, coarsest_cell=1)
     assert done["grown"] == 0
 
 
@@ -200,7 +200,7 @@ def test_rows_without_an_optimizer_change_too():
 
 
 def test_after_growth_adam_steps_on():
-    field, adam, _, _ = grow_once(1.0, levels=1, coarsest_cell=1)
+    field, adam, _, _ = grow_once(1.0, levels=1, coarsest_cell=1, max_log_scale=None)
     for name in field.anchor_parameters:
         getattr(field, name).grad = torch.ones_like(getattr(field, name))
         adam[name].step()

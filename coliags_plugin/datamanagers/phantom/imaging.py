@@ -13,11 +13,11 @@ from coliags_plugin.datamanagers.phantom.colon import ColonSurface
 from coliags_plugin.datamanagers.phantom.interreflection import IndirectLight
 from coliags_plugin.datamanagers.phantom.light import Lamp
 from coliags_plugin.datamanagers.phantom.mucosa import Mucosa
-from coliags_plugin.datamanagers.phantom.tracing import Hits, Tracer
+from coliags_plugin.datamanagers.phantom.tracing import Hits, Tracer, turned
 from coliags_plugin.lenses import Pinhole
 
 #: Samples shaded at a time: bounds memory, and keeps the working set in the cache.
-_CHUNK = 1 << 16
+_CHUNK = 1 << 15
 
 
 class Optics(Protocol):
@@ -145,24 +145,24 @@ def expose(
     """Take one picture. Colour is the mean of a pixel's samples; z-depth and normal are those of its centre alone."""
     pixels, per_pixel = sensor.samples.shape[:2]
     radiance = np.empty((pixels, 3), np.float32)
-    met: list[Int[np.ndarray, "T"]] = []
+    met = np.zeros(len(world.surface.triangles), bool)
     # Distance between neighbouring samples per mm of depth.
     spacing = float(np.sqrt(_pixel_solid_angle(sensor) / per_pixel))
     step = max(_CHUNK // per_pixel, 1)
     for start in range(0, pixels, step):
         directions = sensor.samples[start : start + step].reshape(-1, 3)
         hits = world.tracer.cast(camera_to_world, directions)
-        met.append(np.unique(hits.triangle[hits.found]))
+        met[hits.triangle[hits.found]] = True
         light = np.zeros((len(directions), 3), np.float32)
         light[hits.found] = shade(world, camera_to_world, directions[hits.found], hits.kept(), spacing, indirect)
         radiance[start : start + step] = light.reshape(-1, per_pixel, 3).mean(axis=1)
     hits = world.tracer.cast(camera_to_world, sensor.centers)
-    met.append(np.unique(hits.triangle[hits.found]))
+    met[hits.triangle[hits.found]] = True
     z_depth = np.where(hits.found, hits.z_depth, np.float32(0.0))
     normals = np.zeros((pixels, 3), np.float32)
     facing = _unit(world.tracer.interpolate(world.surface.normals, hits.kept()))
-    normals[hits.found] = facing @ camera_to_world[:3, :3].astype(np.float32)
-    return Exposure(radiance, z_depth, normals, np.unique(np.concatenate(met)))
+    normals[hits.found] = turned(facing, camera_to_world[:3, :3].T)
+    return Exposure(radiance, z_depth, normals, np.flatnonzero(met))
 
 
 def meter(
@@ -196,10 +196,9 @@ def shade(
         spacing: Distance between neighbouring samples at z-depth 1.
         indirect: Light that the wall throws onto the wall, or none.
     """
-    rotation = camera_to_world[:3, :3].astype(np.float32)
     length = np.sqrt(np.einsum("nc,nc->n", directions, directions))
     cos_theta = 1.0 / length
-    to_eye = -(directions @ rotation.T) * cos_theta[:, None]
+    to_eye = turned(directions, camera_to_world[:3, :3]) * -cos_theta[:, None]
     points = camera_to_world[:3, 3].astype(np.float32) - to_eye * (hits.z_depth * length)[:, None]
 
     normals = _unit(world.tracer.interpolate(world.surface.normals, hits))

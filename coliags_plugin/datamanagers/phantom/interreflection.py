@@ -45,11 +45,13 @@ class IndirectLight:
         y = np.clip(row * self.rows_per_row - 0.5, 0.0, rows - 1.001)
         x = column * self.columns_per_column - 0.5
         top, left = y.astype(np.int64), np.floor(x).astype(np.int64)
-        down, right = (y - top)[:, None], (x - left)[:, None]
+        down, right = (y - top).astype(np.float32)[:, None], (x - left).astype(np.float32)[:, None]
         a, b = left % columns, (left + 1) % columns
-        upper = self.irradiance[top, a] * (1.0 - right) + self.irradiance[top, b] * right
-        lower = self.irradiance[top + 1, a] * (1.0 - right) + self.irradiance[top + 1, b] * right
-        return np.asarray(upper * (1.0 - down) + lower * down, dtype=np.float32)
+        flat, upper = self.irradiance.reshape(-1, 3), top * columns
+        lower = upper + columns
+        above = flat[upper + a] * (1.0 - right) + flat[upper + b] * right
+        below = flat[lower + a] * (1.0 - right) + flat[lower + b] * right
+        return np.asarray(above * (1.0 - down) + below * down)
 
 
 @dataclass(frozen=True)

@@ -94,7 +94,7 @@ class Lamp:
         to_lamp = lamp - points
         square = np.einsum("nc,nc->n", to_lamp, to_lamp)
         to_lamp /= np.sqrt(square)[:, None]
-        return self.beam(-(to_lamp @ axis)) * (UNIT_DISTANCE**2 / square), to_lamp
+        return self.beam(-np.einsum("nc,c->n", to_lamp, axis)) * (UNIT_DISTANCE**2 / square), to_lamp
 
     def gloss(
         self,

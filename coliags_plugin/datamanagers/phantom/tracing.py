@@ -34,6 +34,11 @@ class Hits:
         return Hits(keep[keep], self.z_depth[keep], self.triangle[keep], self.barycentric[keep])
 
 
+def turned(vectors: Float[np.ndarray, "N 3"], rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "N 3"]:
+    """``rotation @ vector`` for many vectors, in their precision; a matrix product this thin takes several times as long."""
+    return np.einsum("nc,dc->nd", vectors, rotation.astype(vectors.dtype))
+
+
 class Tracer:
     """The mesh, prepared for rays.
 
@@ -66,7 +71,7 @@ class Tracer:
         """
         rays = np.empty((len(directions), 6), np.float32)
         rays[:, :3] = camera_to_world[:3, 3]
-        rays[:, 3:] = directions @ camera_to_world[:3, :3].T.astype(np.float32)
+        rays[:, 3:] = turned(directions, camera_to_world[:3, :3])
         answer = self._scene.cast_rays(self._open3d.core.Tensor(rays))
         z_depth = answer["t_hit"].numpy()
         found = np.isfinite(z_depth)

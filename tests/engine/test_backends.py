@@ -1,0 +1,46 @@
+"""Impossible pairs are refused before training; auto says why."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from coliags_plugin import registry
+from coliags_plugin.components import make_component
+from coliags_plugin.contracts import Availability
+from coliags_plugin.engine.backends import choose_device, choose_renderer
+from coliags_plugin.errors import InputError
+
+CPU = torch.device("cpu")
+
+
+def test_auto_chooses_torch_and_says_why():
+    chosen = choose_renderer(make_component("renderers", "auto"), "gaussians3d", CPU)
+    assert chosen.name == "torch"
+    assert "auto chose torch" in chosen.reason
+
+
+def test_auto_passes_its_options_on():
+    chosen = choose_renderer(make_component("renderers", {"name": "auto", "near": 1.5}), "gaussians3d", CPU)
+    assert chosen.renderer.settings.near == 1.5
+
+
+def test_an_impossible_pair_names_both_sides():
+    with pytest.raises(InputError, match=r"draws gaussians3d, the field is made of radiance"):
+        choose_renderer(make_component("renderers", "torch"), "radiance", CPU)
+    with pytest.raises(InputError, match="no renderer can serve"):
+        choose_renderer(make_component("renderers", "auto"), "radiance", CPU)
+
+
+def test_an_unavailable_renderer_says_why(monkeypatch):
+    renderer = registry.renderers.get("torch")
+    monkeypatch.setattr(renderer, "availability", classmethod(lambda cls: Availability(False, "the moon is full")))
+    with pytest.raises(InputError, match="the moon is full"):
+        choose_renderer(make_component("renderers", "torch"), "gaussians3d", CPU)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
+def test_missing_cuda_is_named():
+    with pytest.raises(InputError, match="torch sees none"):
+        choose_device("cuda")
+    assert choose_device("auto") == CPU

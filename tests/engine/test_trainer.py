@@ -1,0 +1,270 @@
+"""Training: determinism, bit-exact resume, and stopping cleanly."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+
+import pytest
+import torch
+
+from coliags_plugin.config import load_method
+from coliags_plugin.engine import trainer as trainer_module
+from coliags_plugin.engine.checkpoints import latest_checkpoint, read_checkpoint
+from coliags_plugin.engine.run_folder import RunFolder
+from coliags_plugin.engine.trainer import Trainer
+from coliags_plugin.errors import InputError, InterruptedRunError, NotFiniteError
+from tests.scenes import SMALL, wall_scene
+
+CPU = torch.device("cpu")
+
+#: A window so early that growing and pruning happen within a test.
+EARLY_GROWTH = (
+    "strategy.statistics_from=0",
+    "strategy.growth_from=2",
+    "strategy.every=4",
+    "strategy.min_opacity=0.5",
+    "strategy.gradient_threshold=1e-7",
+    "strategy.coarsest_cell=1",
+    "strategy.levels=1",
+    "field.voxel_size=1.0",
+    "optimizers.offsets.lr=0.3",
+)
+
+
+def make_trainer(path, method="coliags", steps=6, scene=None, seed=0, overrides=()):
+    overrides = [*SMALL, f"schedule.steps={steps}", *overrides]
+    return Trainer(load_method(method, overrides), scene or wall_scene(), "wall", RunFolder(path), seed, CPU)
+
+
+def train(path, **options):
+    trainer = make_trainer(path, **options)
+    trainer.start()
+    trainer.train()
+    return trainer
+
+
+def final_state(trainer):
+    return read_checkpoint(latest_checkpoint(trainer.run.checkpoints), trainer.method.name, CPU)
+
+
+def assert_same(first, second):
+    assert first.step == second.step
+    assert first.queue == second.queue
+    assert first.tensors.keys() == second.tensors.keys()
+    for name, tensor in first.tensors.items():
+        assert torch.equal(tensor, second.tensors[name]), name
+
+
+def log_rows(trainer):
+    return [json.loads(line) for line in trainer.run.log_file.read_text().splitlines()]
+
+
+def without_clock(rows):
+    return [{key: value for key, value in row.items() if key != "seconds"} for row in rows]
+
+
+def test_training_lowers_the_loss_and_logs_every_term(tmp_path):
+    trainer = train(tmp_path / "run", steps=30)
+    rows = log_rows(trainer)
+    assert [row["step"] for row in rows] == list(range(1, 31))
+    assert set(rows[0]["terms"]) == {"l1", "d-ssim", "scale-volume", "depth"}
+    assert sum(r["loss"] for r in rows[-5:]) < 0.7 * sum(r["loss"] for r in rows[:5])
+    assert rows[-1]["psnr"] > rows[0]["psnr"]
+
+
+def test_same_seed_same_bits(tmp_path):
+    first, second = train(tmp_path / "a"), train(tmp_path / "b")
+    assert_same(final_state(first), final_state(second))
+    assert without_clock(log_rows(first)) == without_clock(log_rows(second))
+    other = train(tmp_path / "c", seed=1)
+    assert not torch.equal(final_state(first).tensors["field/features"], final_state(other).tensors["field/features"])
+
+
+@pytest.mark.parametrize("overrides", [(), EARLY_GROWTH], ids=["plain", "growing"])
+def test_resume_is_bit_exact(tmp_path, overrides):
+    """Interrupted in the middle of a round, resumed by a fresh trainer: the same bits as never interrupted."""
+    whole = train(tmp_path / "whole", steps=13, overrides=overrides)
+    cut = make_trainer(tmp_path / "cut", steps=13, overrides=overrides)
+    cut.start()
+    _stop_after(cut, 7)
+    with pytest.raises(InterruptedRunError, match="stopped after step 7"):
+        cut.train()
+    resumed = make_trainer(tmp_path / "cut", steps=13, overrides=overrides)
+    resumed.resume()
+    assert resumed.step == 7
+    resumed.train()
+    assert_same(final_state(whole), final_state(resumed))
+    assert without_clock(log_rows(whole)) == without_clock(log_rows(resumed))
+    if overrides:
+        assert sum(row.get("grown", 0) for row in log_rows(resumed)) > 0
+        assert sum(row.get("pruned", 0) for row in log_rows(resumed)) > 0
+
+
+def test_resume_forgets_rows_after_the_checkpoint(tmp_path):
+    trainer = train(tmp_path / "run", steps=4)
+    with trainer.run.log_file.open("a") as log:
+        log.write('{"step": 5, "loss": 1.0}\n{"step": 6, "lo')
+    longer = make_trainer(tmp_path / "run", steps=6)
+    longer.resume()
+    longer.train()
+    assert [row["step"] for row in log_rows(longer)] == [1, 2, 3, 4, 5, 6]
+
+
+def _stop_after(trainer, steps):
+    """A real SIGINT while a step is in hand."""
+    take = trainer._train_step
+
+    def step():
+        row = take()
+        if row["step"] == steps:
+            os.kill(os.getpid(), signal.SIGINT)
+        return row
+
+    trainer._train_step = step
+
+
+def test_a_second_interrupt_does_not_wait(tmp_path):
+    trainer = make_trainer(tmp_path / "run")
+    trainer.start()
+    take = trainer._train_step
+
+    def step():
+        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGINT)
+        return take()
+
+    trainer._train_step = step
+    with pytest.raises(KeyboardInterrupt):
+        trainer.train()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_loss_that_is_not_finite_names_step_frame_and_term(tmp_path):
+    trainer = make_trainer(tmp_path / "run")
+    trainer.start()
+    calls = {"count": 0}
+    honest = trainer.losses["d-ssim"]
+
+    class Poisoned:
+        settings = honest.settings
+
+        def __call__(self, output, frame):
+            calls["count"] += 1
+            return honest(output, frame) * (float("nan") if calls["count"] == 3 else 1.0)
+
+    trainer.losses["d-ssim"] = Poisoned()
+    with pytest.raises(NotFiniteError, match=r"step 3, frame 000\d: loss term 'd-ssim' is nan"):
+        trainer.train()
+
+
+def test_plain_heads_train_to_scaffolds_bits(tmp_path):
+    """ColIAGS with plain heads is Scaffold-GS, trained and all."""
+    plain = ("field.geometry_head.name=plain", "field.appearance_head.name=plain")
+    ours = train(tmp_path / "a", method="coliags", overrides=plain)
+    theirs = train(tmp_path / "b", method="scaffold-gs-depth")
+    first, second = final_state(ours).tensors, final_state(theirs).tensors
+    assert first.keys() == second.keys()
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_depth_loss_without_depth_is_refused_before_anything_is_written(tmp_path):
+    with pytest.raises(InputError, match=r"--set losses\.depth=null"):
+        make_trainer(tmp_path / "run", scene=wall_scene(depth=False))
+    assert not (tmp_path / "run").exists()
+
+
+def test_training_without_depth_works_without_the_term(tmp_path):
+    trainer = train(tmp_path / "run", scene=wall_scene(depth=False), overrides=["losses.depth=null"], steps=2)
+    assert "depth" not in log_rows(trainer)[0]["terms"]
+
+
+def test_existing_run_is_not_overwritten(tmp_path):
+    trainer = train(tmp_path / "run", steps=1)
+    with pytest.raises(InputError, match="already exists"):
+        make_trainer(tmp_path / "run").start()
+    again = make_trainer(tmp_path / "run", steps=1)
+    again.start(overwrite=True)
+    assert not trainer.run.checkpoints.exists()
+
+
+def test_overwrite_spares_folders_that_are_no_runs(tmp_path):
+    (tmp_path / "precious").mkdir()
+    (tmp_path / "precious" / "thesis.tex").write_text("x")
+    with pytest.raises(InputError, match="not a run folder"):
+        make_trainer(tmp_path / "precious").start(overwrite=True)
+
+
+def test_checkpoint_of_another_method_is_refused(tmp_path):
+    train(tmp_path / "run", method="scaffold-gs-depth", steps=1)
+    with pytest.raises(InputError, match="run of method 'scaffold-gs-depth'"):
+        make_trainer(tmp_path / "run", method="coliags").resume()
+
+
+def test_resume_with_other_settings_is_refused(tmp_path):
+    train(tmp_path / "run", steps=1)
+    with pytest.raises(InputError, match="other settings of field"):
+        make_trainer(tmp_path / "run", overrides=["field.features=16"]).resume()
+
+
+def test_resume_on_other_data_is_refused(tmp_path):
+    train(tmp_path / "run", steps=1)
+    with pytest.raises(InputError, match="not the data"):
+        make_trainer(tmp_path / "run", scene=wall_scene(frames=12)).resume()
+
+
+@pytest.mark.parametrize("damage", ["truncate", "remove", "json", "format"])
+def test_damaged_checkpoint_is_refused(tmp_path, damage):
+    trainer = train(tmp_path / "run", steps=1)
+    checkpoint = latest_checkpoint(trainer.run.checkpoints)
+    tensors, state = checkpoint / "state.safetensors", checkpoint / "state.json"
+    if damage == "truncate":
+        tensors.write_bytes(tensors.read_bytes()[:1000])
+    elif damage == "remove":
+        tensors.unlink()
+    elif damage == "json":
+        state.write_text("{")
+    else:
+        state.write_text(json.dumps({**json.loads(state.read_text()), "format": 99}))
+    with pytest.raises(InputError, match="checkpoint"):
+        make_trainer(tmp_path / "run", steps=1).resume()
+
+
+def test_run_without_checkpoint_is_refused(tmp_path):
+    make_trainer(tmp_path / "run").start()
+    with pytest.raises(InputError, match="no checkpoint"):
+        make_trainer(tmp_path / "run").resume()
+
+
+def test_optimizer_groups_must_be_the_fields(tmp_path):
+    with pytest.raises(InputError, match="exactly the field's"):
+        make_trainer(tmp_path / "run", overrides=["optimizers.features=null"])
+
+
+def test_learning_rates_follow_the_papers_schedules(tmp_path):
+    trainer = make_trainer(tmp_path / "run", steps=30_000)
+    optimizers, extent = trainer.optimizers, trainer.scene.extent
+    assert optimizers.rate("offsets", 1) == pytest.approx(0.01 * extent, rel=1e-3)
+    assert optimizers.rate("offsets", 15_000) == pytest.approx(0.001 * extent)
+    assert optimizers.rate("offsets", 30_000) == pytest.approx(0.0001 * extent)
+    assert optimizers.rate("opacity_mlp", 15_000) == pytest.approx(0.0002)
+    assert optimizers.rate("color_mlp", 30_000) == pytest.approx(0.00005)
+    assert optimizers.rate("features", 1) == optimizers.rate("features", 30_000) == 0.0075
+
+
+def test_frames_are_drawn_without_replacement(tmp_path):
+    order = make_trainer(tmp_path / "run").order
+    rounds = [[order.next() for _ in range(order.count)] for _ in range(3)]
+    assert all(sorted(drawn) == list(range(order.count)) for drawn in rounds)
+    assert rounds[0] != rounds[1] or rounds[1] != rounds[2]
+
+
+def test_provenance_says_where_the_run_came_from(tmp_path):
+    trainer = train(tmp_path / "run", steps=1, seed=5)
+    found = json.loads(trainer.run.provenance_file.read_text())
+    assert found["seed"] == 5
+    assert found["renderer"] == "torch"
+    assert "auto" in found["renderer_reason"]
+    assert found["scene"]["provenance"]["fingerprint"] == "wall-9-True"
+    assert trainer_module.software().items() <= found.items()
