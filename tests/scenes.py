@@ -66,8 +66,6 @@ def write_wall(folder: Path, frames: int = 9, width: int = 32, height: int = 24,
 
 #: Overrides that make a shipped method small enough for a test.
 SMALL = (
-    "datamanager.width=32",
-    "datamanager.height=24",
     "datamanager.points_count=2000",
     "field.voxel_size=2.0",
     "schedule.log_every=1",

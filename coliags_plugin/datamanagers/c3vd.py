@@ -32,10 +32,10 @@ Share = Annotated[float, Field(ge=0.0, le=1.0)]
 class C3VDSettings(Settings):
     """Options of the ``c3vd`` data manager."""
 
-    width: int = Field(
-        338, gt=0, description="Working width, pixels; the paper's 338 x 270 is a quarter of the raw frame."
+    width: int | None = Field(
+        None, gt=0, description="Working width, pixels. None: what fits 338 x 270, the paper's quarter of a raw frame."
     )
-    height: int = Field(270, gt=0, description="Working height, pixels.")
+    height: int | None = Field(None, gt=0, description="Working height, pixels; goes with width.")
     lens: Literal["omnidirectional", "legacy-pinhole", "fisheye"] = Field(
         "omnidirectional",
         description="How raw frames are undistorted (pinhole frames need none): 'omnidirectional' rendered the ground "
@@ -71,6 +71,12 @@ class C3VDSettings(Settings):
     )
     points_count: int = Field(200_000, ge=1, description="At most so many initial points, drawn without replacement.")
     seed: int = Field(0, ge=0, description="Of the draw of initial points.")
+
+    @model_validator(mode="after")
+    def _both_sides_or_none(self) -> Self:
+        if (self.width is None) != (self.height is None):
+            raise ValueError(f"width = {self.width} and height = {self.height}: give both or neither")
+        return self
 
     @model_validator(mode="after")
     def _block_is_a_stretch(self) -> Self:
@@ -152,8 +158,7 @@ class C3VDDataManager(DataManager):
         return SequenceReader(
             find_layout(folder),
             LENSES[settings.lens],
-            width=settings.width,
-            height=settings.height,
+            size=None if settings.width is None or settings.height is None else (settings.width, settings.height),
             focal_scale=settings.focal_scale,
             mask=settings.mask,
         )

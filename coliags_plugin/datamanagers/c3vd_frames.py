@@ -31,6 +31,19 @@ from coliags_plugin.undistortion import Undistortion
 #: How far a raw frame's aspect ratio may be from the lens's: rounding to whole pixels, but no cropping.
 ASPECT_TOLERANCE = 0.02
 
+#: The paper's working size, a quarter of C3VD's raw frame.
+PAPER_SIZE = (338, 270)
+
+
+def default_size(width: int, height: int) -> tuple[int, int]:
+    """The largest size that fits the paper's 338 x 270, keeps the aspect ratio and enlarges nothing, pixels."""
+    scale = min(1.0, PAPER_SIZE[0] / width, PAPER_SIZE[1] / height)
+    if scale == 1.0:
+        return width, height
+    # Halves are rounded up: the paper's 338 is a quarter of 1350.
+    fitted = int(width * scale + 0.5), int(height * scale + 0.5)
+    return max(1, fitted[0]), max(1, fitted[1])
+
 
 @dataclass(frozen=True)
 class View:
@@ -51,8 +64,15 @@ class View:
     undistortion: Undistortion | None = None
 
     @classmethod
-    def of_raw(cls, image: Path, lens: Lens, width: int, height: int, focal_scale: float, mask: bool) -> View:
+    def of_raw(cls, image: Path, lens: Lens, size: tuple[int, int] | None, focal_scale: float, mask: bool) -> View:
         """The view of distorted pictures like ``image``, undistorted to the lens's nominal pinhole.
+
+        Args:
+            image: One of the pictures.
+            lens: Theirs.
+            size: Working width and height, pixels; None: :func:`default_size`.
+            focal_scale: Factor on the nominal focal length.
+            mask: Leave out what lies outside the octagon.
 
         Raises:
             InputError: The picture is a crop, so that the lens's calibration does not apply to it.
@@ -65,6 +85,7 @@ class View:
                 "Undistort cropped pictures yourself and give them in the undistorted layout",
             )
         source = lens.scaled(source_width, source_height)
+        width, height = size or default_size(source_width, source_height)
         nominal = lens.scaled(width, height).pinhole
         pinhole = nominal._replace(fx=nominal.fx * focal_scale, fy=nominal.fy * focal_scale)
         octagon = octagon_mask(source_width, source_height) if mask else None
@@ -73,9 +94,10 @@ class View:
         )
 
     @classmethod
-    def of_undistorted(cls, camera_json: Path, width: int, height: int) -> View:
-        """The view of pinhole pictures whose intrinsics stand in ``camera.json``."""
+    def of_undistorted(cls, camera_json: Path, size: tuple[int, int] | None) -> View:
+        """The view of pinhole pictures whose intrinsics stand in ``camera.json``; ``size`` as for :meth:`of_raw`."""
         pinhole, source_width, source_height = read_intrinsics(camera_json)
+        width, height = size or default_size(source_width, source_height)
         scaled = pinhole.scaled(width / source_width, height / source_height)
         return cls(source_width, source_height, width, height, scaled)
 
@@ -111,8 +133,7 @@ class SequenceReader:
     Args:
         layout: Its files.
         lens: Of raw pictures.
-        width: Working width, pixels.
-        height: Working height, pixels.
+        size: Working width and height, pixels; None: :func:`default_size`.
         focal_scale: Factor on the nominal focal length of undistorted raw pictures.
         mask: Leave out what lies outside raw pictures' octagon.
 
@@ -121,7 +142,13 @@ class SequenceReader:
     """
 
     def __init__(
-        self, layout: Layout, lens: Lens, *, width: int, height: int, focal_scale: float = 1.0, mask: bool = True
+        self,
+        layout: Layout,
+        lens: Lens,
+        *,
+        size: tuple[int, int] | None = None,
+        focal_scale: float = 1.0,
+        mask: bool = True,
     ) -> None:
         self.layout = layout
         self.poses: Poses = read_poses(layout.poses)
@@ -132,9 +159,9 @@ class SequenceReader:
                 "Restore the missing ones, or remove the surplus at the end",
             )
         if layout.camera is None:
-            self.view = View.of_raw(layout.images[0], lens, width, height, focal_scale, mask)
+            self.view = View.of_raw(layout.images[0], lens, size, focal_scale, mask)
         else:
-            self.view = View.of_undistorted(layout.camera, width, height)
+            self.view = View.of_undistorted(layout.camera, size)
 
     def read(self, index: int, prefix: str = "", seen: Path | None = None) -> Frame:
         """One frame.

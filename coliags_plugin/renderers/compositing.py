@@ -192,7 +192,8 @@ class _Composite(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         padded, padded_features, starts, pixels, composited = ctx.saved_tensors
         of_polynomials, of_features = torch.zeros_like(padded), torch.zeros_like(padded_features)
-        # What all pairs behind a point add to the loss; at the start of the sweep, everything.
+        gradient = gradient.contiguous()
+        # What the pairs not yet swept add to the loss, to first order.
         behind = (composited * gradient).sum(1)
         for chunk in _sweep(padded, starts, pixels, ctx.cuts):
             tile_gradient = gradient[chunk.tiles]

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from coliags_plugin.datamanagers.c3vd_frames import default_size
 from coliags_plugin.datamanagers.c3vd_writer import depth_steps
 from coliags_plugin.datamanagers.images import (
     millimetres,
@@ -97,3 +98,18 @@ def test_nearest_takes_the_pixel_under_the_centre(size):
     assert result.dtype == np.uint16
     reference = cv2.resize(values, size, interpolation=cv2.INTER_NEAREST_EXACT)
     np.testing.assert_array_equal(result, reference)
+
+
+@pytest.mark.parametrize(
+    ("stored", "size"),
+    [
+        ((1350, 1080), (338, 270)),
+        ((675, 540), (338, 270)),
+        ((338, 270), (338, 270)),
+        ((169, 135), (169, 135)),
+        ((800, 800), (270, 270)),
+        ((3000, 10), (338, 1)),
+    ],
+)
+def test_default_size_fits_the_papers_and_enlarges_nothing(stored, size):
+    assert default_size(*stored) == size

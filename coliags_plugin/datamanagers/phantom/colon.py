@@ -8,6 +8,7 @@ about every 25 mm. Lengths are mm, angles radians.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -148,7 +149,7 @@ def grow_anatomy(settings: PhantomSettings) -> Anatomy:
 
 def _draw_polyp(generator: np.random.Generator, stations: list[float]) -> Polyp:
     """A polyp between two folds, on the stretch the camera looks at."""
-    between = [0.5 * (a + b) for a, b in zip(stations[:-1], stations[1:], strict=True)]
+    between = [0.5 * (a + b) for a, b in pairwise(stations)]
     places = [arc for arc in between if 30.0 < arc < 125.0]
     arc = float(generator.choice(places)) + generator.uniform(-4.0, 4.0)
     width = generator.uniform(3.0, 10.0)

@@ -20,7 +20,7 @@ from coliags_plugin.datamanagers.phantom.interreflection import IndirectLight, i
 from coliags_plugin.datamanagers.phantom.light import Lamp
 from coliags_plugin.datamanagers.phantom.mucosa import Mucosa, paint_mucosa
 from coliags_plugin.datamanagers.phantom.response import KNEE, develop, exposure_for, exposures, white_balances
-from coliags_plugin.datamanagers.phantom.settings import PhantomSettings
+from coliags_plugin.datamanagers.phantom.settings import PhantomSettings, either
 from coliags_plugin.datamanagers.phantom.streams import Purpose, stream
 from coliags_plugin.datamanagers.phantom.tracing import Tracer
 from coliags_plugin.datamanagers.phantom.trajectory import TEST_EVERY, RotationView, travel, turn_away
@@ -99,8 +99,7 @@ def prepare(settings: PhantomSettings, progress: Progress | None = None) -> Phan
     """Grow the colon, choose the path, and solve for indirect light and exposure.
 
     Raises:
-        InputError: The seed's colon has no room for the path.
-        UnavailableError: open3d is missing.
+        InputError: The seed's colon has no room for the path, or open3d is missing.
     """
     tell = progress or _silent
     settings = settings.resolved()
@@ -112,7 +111,7 @@ def prepare(settings: PhantomSettings, progress: Progress | None = None) -> Phan
     tell("colon", 2, 4)
     tracer = Tracer(surface)
     lamp = Lamp.of(settings)
-    world = World(surface, mucosa, tracer, lamp, float(settings.vignetting or 0.0))
+    world = World(surface, mucosa, tracer, lamp, either(settings.vignetting, settings.preset.vignetting))
     poses = list(travel(anatomy.centre_line, settings, tracer.clearance))
     views = turn_away(np.stack(poses), settings)
     everywhere = [*poses, *(view.camera_to_world for view in views)]
@@ -157,8 +156,8 @@ def generate(
         progress: Called with a stage's name, how much of it is done and how much there is.
 
     Raises:
-        InputError: The folder exists or cannot be written, or the seed's colon has no room for the path.
-        UnavailableError: open3d is missing.
+        InputError: The folder exists or cannot be written, the seed's colon has no room for the path, or open3d is
+            missing.
     """
     tell = progress or _silent
     try:
@@ -238,7 +237,7 @@ def _write_truth(
     layouts.write_ply(folder / "mesh.ply", surface, albedo)
     vertices = surface.vertices.astype(np.float64)
     seen = seen_from(
-        vertices, phantom.training_poses[::1], phantom.sensor.optics, phantom.sensor.mask, phantom.world.tracer
+        vertices, phantom.training_poses, phantom.sensor.optics, phantom.sensor.mask, phantom.world.tracer
     )
     np.savez(folder / "mesh_seen.npz", vertex_seen=seen, face_seen=trained_on, face_seen_by_any_frame=observed)
     np.savez(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -72,7 +72,7 @@ class Sensor:
 
     Attributes:
         optics: The lens.
-        mask: Pixels that are lit at all. [H, W]
+        mask: Pixels that the lens lights. [H, W]
         centers: Direction through each such pixel's centre. [P, 3]
         samples: Directions of its K colour samples. [P, K, 3]
     """
@@ -87,6 +87,10 @@ class Sensor:
         """A sensor with ``supersampling`` x ``supersampling`` colour samples a pixel."""
         row, column = np.nonzero(mask)
         pixels = np.stack([column, row], axis=1).astype(np.float64)
+        reached = ~np.isnan(optics.unproject(pixels)[:, 0])
+        mask = mask.copy()
+        mask[row, column] = reached
+        pixels = pixels[reached]
         offsets = (np.arange(supersampling) + 0.5) / supersampling - 0.5
         sub = np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(-1, 2)
         centers = optics.unproject(pixels)
@@ -232,9 +236,8 @@ def shade(
 
 def _pixel_solid_angle(sensor: Sensor) -> float:
     """Mean area that a pixel covers at z-depth 1, seen near the middle of the image."""
-    optics: Any = sensor.optics
-    middle = np.array([[0.5 * optics.width, 0.5 * optics.height]])
-    corner = optics.unproject(np.concatenate([middle, middle + [1.0, 0.0], middle + [0.0, 1.0]]))
+    middle = np.array([0.5 * sensor.optics.width, 0.5 * sensor.optics.height])
+    corner = sensor.optics.unproject(middle + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
     return float(np.linalg.norm(np.cross(corner[1] - corner[0], corner[2] - corner[0])))
 
 

@@ -34,7 +34,7 @@ class Layout(ABC):
         """The lens of frames of this size, and which of their pixels are lit. The mask is [H, W]."""
 
     @abstractmethod
-    def write_frame(  # noqa: PLR0917 (one argument per picture)
+    def write_frame(
         self,
         folder: Path,
         index: int,
@@ -66,7 +66,7 @@ class C3vdLayout(Layout):
         )
         return PinholeOptics(pinhole, width, height), np.ones((height, width), bool)
 
-    def write_frame(  # noqa: PLR0917
+    def write_frame(
         self,
         folder: Path,
         index: int,
@@ -97,7 +97,7 @@ class C3vdRawLayout(Layout):
         """C3VD's omnidirectional lens behind its octagonal mask."""
         return LENSES["omnidirectional"].scaled(width, height), octagon_mask(width, height)
 
-    def write_frame(  # noqa: PLR0917
+    def write_frame(
         self,
         folder: Path,
         index: int,
@@ -185,7 +185,7 @@ def write_ply(path: Path, surface: ColonSurface, vertex_albedo: Float[np.ndarray
 
 
 def write_coverage_obj(path: Path, surface: ColonSurface, observed: Bool[np.ndarray, "F"]) -> None:
-    """The wall as C3VD's coverage mesh: face corners ``v/vt`` with vt 1 for observed triangles and 2 for missed ones."""
+    """The wall as C3VD's coverage mesh: face corners ``v/vt`` with vt 1 for triangles observed and 2 for those missed."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w") as file:
         file.write("# millimetres; vt 1 = observed, vt 2 = not observed\n")

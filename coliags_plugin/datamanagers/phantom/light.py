@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from coliags_plugin.datamanagers.phantom.settings import PhantomSettings, SpreadLaw
+from coliags_plugin.datamanagers.phantom.settings import PhantomSettings, SpreadLaw, either
 from coliags_plugin.datamanagers.phantom.streams import smoothstep
 
 #: Distance at which radiance is 1, mm.
@@ -46,14 +46,14 @@ class Lamp:
 
     @classmethod
     def of(cls, settings: PhantomSettings) -> Lamp:
-        """The lamp that resolved settings describe; it is tilted downwards in the image."""
-        settings = settings.resolved()
-        tilt = np.radians(settings.tilt)
+        """The lamp that settings describe; it is tilted downwards in the image."""
+        preset = settings.preset
+        tilt = np.radians(either(settings.tilt, preset.tilt))
         return cls(
-            offset=settings.light_offset,
+            offset=either(settings.light_offset, preset.light_offset),
             axis=(0.0, float(np.sin(tilt)), float(np.cos(tilt))),
-            spread_law=settings.spread_law,
-            spread=settings.spread,
+            spread_law=either(settings.spread_law, preset.spread_law),
+            spread=either(settings.spread, preset.spread),
             specular=settings.specular,
             roughness=settings.roughness,
             f0=settings.f0,
@@ -103,7 +103,7 @@ class Lamp:
         to_eye: Float[np.ndarray, "N 3"],
         slope_variance: Float[np.ndarray, "N"],
     ) -> Float[np.ndarray, "N"]:
-        """pi times the GGX reflection of the film times n.l: radiance per unit of :meth:`irradiance`. [N]
+        """Pi times the GGX reflection of the film times n.l: radiance per unit of :meth:`irradiance`. [N]
 
         Smith's height-correlated masking and Schlick's Fresnel term.
 

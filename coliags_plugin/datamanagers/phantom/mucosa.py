@@ -15,13 +15,15 @@ from coliags_plugin.datamanagers.phantom.streams import Purpose, SolidNoise, smo
 #: Size and relative strength of the mottling of brightness, mm.
 _MOTTLING = ((6.0, 0.06), (1.6, 0.045), (0.4, 0.045), (0.18, 0.045))
 #: Size, mm, and strength of changes in blood content, which take green and blue but spare red.
-_REDDENING = ((9.0, 0.12), (2.5, 0.11), (0.9, 0.06))
+_REDDENING = ((9.0, 0.09), (2.5, 0.10), (0.9, 0.06))
 #: Absorption of a vessel's blood at full strength, per RGB channel (optical depth).
 _BLOOD = (0.30, 0.95, 0.85)
 #: Correlation length, mm, and slope (standard deviation, each direction) of the relief too small for the mesh.
-_MICRO_RELIEF = ((0.9, 0.05), (0.3, 0.09))
-#: Share of that, per RGB channel (optical depth).
+_MICRO_RELIEF = ((0.8, 0.04), (0.24, 0.085))
+#: Share of reddening that each RGB channel shows.
 _REDDENED = (0.12, 1.0, 0.95)
+#: Share of the mottling: what is darker is darker because it holds more blood, so it is redder too.
+_MOTTLED = (0.7, 1.2, 1.15)
 _VESSELS = 120
 _LEVELS = 6
 
@@ -124,15 +126,15 @@ def paint_mucosa(anatomy: Anatomy, surface: ColonSurface, settings: PhantomSetti
         blood += np.float32(strength) * noise(scale)
     # Small red spots where the noise peaks; lymphoid tissue and scars are the pale opposite.
     blood += 0.45 * smoothstep((noise(1.5) - 2.1) / 1.2).astype(np.float32)
-    blood -= 0.16 * smoothstep((noise(5.0) - 1.0) / 1.2).astype(np.float32)
+    blood -= 0.14 * smoothstep((noise(5.0) - 1.0) / 1.2).astype(np.float32)
     for polyp in anatomy.polyps:
         rows = slice(*np.searchsorted(arc, [polyp.arc - polyp.width, polyp.arc + polyp.width]))
         blood[rows] += 0.30 * np.sqrt(polyp.nearness(arc[rows, None], clock[None, :])).astype(np.float32)
     vessels = _draw_vessels((height, width), (length / height, around / width), generator)
     color = np.empty((height, width, 4), np.float32)
     for channel, base in enumerate(settings.albedo):
-        depth = _REDDENED[channel] * blood + _BLOOD[channel] * vessels
-        color[..., channel] = np.clip(base * np.exp(brightness - depth), 0.02, 0.95)
+        depth = _REDDENED[channel] * blood + _BLOOD[channel] * vessels - _MOTTLED[channel] * brightness
+        color[..., channel] = np.clip(base * np.exp(-depth), 0.02, 0.95)
     color[..., 3] = 0.25 + 0.75 * smoothstep((noise(7.0) + 0.35 * noise(1.2) + 1.0) / 1.6)
 
     along = np.linalg.norm(np.gradient(positions, axis=0), axis=-1)
@@ -160,7 +162,8 @@ def _texel_positions(surface: ColonSurface, shape: tuple[int, int]) -> Float[np.
     grid = np.concatenate([grid, grid[:, :1]], axis=1)
     row = (np.arange(shape[0], dtype=np.float32) + 0.5) * ((surface.rows - 1) / shape[0])
     column = (np.arange(shape[1], dtype=np.float32) + 0.5) * (surface.columns / shape[1])
-    return np.asarray(cv2.remap(grid, *np.meshgrid(column, row), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+    columns, rows = np.meshgrid(column, row)
+    return np.asarray(cv2.remap(grid, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
 def _draw_vessels(
@@ -178,7 +181,8 @@ def _draw_vessels(
             start = generator.uniform([0.0, 0.0], [shape[0] * sizes[0], shape[1] * sizes[1]])
             heading = generator.uniform(0.0, 2.0 * np.pi)
             strength = int(generator.integers(weakest, strongest))
-            _draw_branch(canvas, sizes, pad, start, heading, generator.uniform(0.35, 0.6), strength, generator)
+            width = generator.uniform(0.35, 0.6)
+            _draw_branch(canvas, sizes, pad, start, heading, width, strength, generator, surfacing=5.0)
         folded = canvas[:, pad:-pad]
         folded[:, :pad] = np.maximum(folded[:, :pad], canvas[:, -pad:])
         folded[:, -pad:] = np.maximum(folded[:, -pad:], canvas[:, :pad])
@@ -197,9 +201,13 @@ def _draw_branch(
     width: float,
     strength: int,
     generator: np.random.Generator,
+    surfacing: float = 0.0,
 ) -> None:
-    """Draw one vessel (row, column in mm) and, recursively, what branches off it; all taper to 0.15 mm."""
-    place, step = start.copy(), 0.6
+    """Draw one vessel (row, column in mm) and, recursively, what branches off it; all taper to 0.15 mm.
+
+    Over its first ``surfacing`` mm a vessel rises out of the depth of the wall.
+    """
+    place, step, walked = start.copy(), 0.6, 0.0
     wander = 0.0
     around = (canvas.shape[1] - 2 * pad) * sizes[1]
     place[1] %= around
@@ -213,9 +221,10 @@ def _draw_branch(
         ]
         # What is thinner than a texel shows as a fainter one.
         thickness = max(round(width / sizes[0]), 1)
-        shown = round(strength * min(width / sizes[0], 1.0) * min(1.0, width / 0.3))
+        risen = min(walked / surfacing, 1.0) if surfacing else 1.0
+        shown = round(strength * risen * min(width / sizes[0], 1.0) * min(1.0, width / 0.3))
         cv2.line(canvas, ends[0], ends[1], shown, thickness, cv2.LINE_AA, 4)
-        place = following
+        place, walked = following, walked + step
         width *= taper
         if not -0.4 * pad * sizes[1] < place[1] < around + 0.4 * pad * sizes[1]:
             place[1] %= around

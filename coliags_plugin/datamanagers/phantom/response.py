@@ -8,7 +8,7 @@ import numpy as np
 import scipy.ndimage
 from jaxtyping import Float, UInt8
 
-from coliags_plugin.datamanagers.phantom.settings import PhantomSettings
+from coliags_plugin.datamanagers.phantom.settings import PhantomSettings, either
 from coliags_plugin.datamanagers.phantom.streams import Purpose, stream
 
 #: Linear level above which the shoulder bends, and softly nears 1.
@@ -26,7 +26,7 @@ def encode(linear: Float[np.ndarray, "..."], gamma: float) -> Float[np.ndarray, 
 
 
 def exposure_for(radiance: Float[np.ndarray, "N 3"], target: float, gamma: float) -> float:
-    """The gain under which the encoded samples have mean ``target``, within a factor 1e6 of 1; 1 for a black picture."""
+    """The gain, within a factor 1e6 of 1, that gives the encoded samples mean ``target``; 1 for a black picture."""
     if not np.any(radiance > 0.0):
         return 1.0
     low, high = np.log(1e-6), np.log(1e6)
@@ -47,11 +47,11 @@ def exposures(ideal: Sequence[float], settings: PhantomSettings) -> Float[np.nda
 
     Args:
         ideal: For each frame, the gain that would bring it to the target grey. [T]
-        settings: Resolved.
+        settings: Gain and its lag and span.
     """
     wanted = np.log(np.asarray(ideal, np.float64))
     reference = float(np.median(wanted))
-    if settings.gain == "fixed":
+    if either(settings.gain, settings.preset.gain) == "fixed":
         return np.full(len(wanted), np.exp(reference))
     half_span = 0.5 * np.log(settings.gain_span)
     wanted = np.clip(wanted, reference - half_span, reference + half_span)
@@ -66,12 +66,13 @@ def exposures(ideal: Sequence[float], settings: PhantomSettings) -> Float[np.nda
 
 def white_balances(settings: PhantomSettings) -> Float[np.ndarray, "T 3"]:
     """Smooth gains of red and blue against green, of log standard deviation ``white_balance_drift``. [T, 3]"""
-    settings = settings.resolved()
     generator = stream(settings.seed, Purpose.WHITE_BALANCE)
     drift = generator.standard_normal((settings.frames + 8 * int(_DRIFT_LENGTH), 2))
     drift = scipy.ndimage.gaussian_filter1d(drift, _DRIFT_LENGTH, axis=0)[4 * int(_DRIFT_LENGTH) :][: settings.frames]
     # Scaled by the filter's known gain, not by the sample: a short sequence sees only a piece of the drift.
-    drift *= np.sqrt(2.0 * np.sqrt(np.pi) * _DRIFT_LENGTH) * settings.white_balance_drift
+    drift *= np.sqrt(2.0 * np.sqrt(np.pi) * _DRIFT_LENGTH) * either(
+        settings.white_balance_drift, settings.preset.white_balance_drift
+    )
     return np.exp(np.stack([drift[:, 0], np.zeros(settings.frames), drift[:, 1]], axis=1))
 
 

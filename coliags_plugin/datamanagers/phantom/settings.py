@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from pydantic import Field, ValidationError, field_validator
 
 from coliags_plugin.errors import InputError
 from coliags_plugin.settings import Settings
+
+_T = TypeVar("_T")
 
 SpreadLaw = Literal["exponential", "cosine"]
 GainMode = Literal["auto", "fixed"]
@@ -88,6 +90,11 @@ PRESETS: dict[str, Preset] = {
 }
 
 
+def either(value: _T | None, otherwise: _T) -> _T:
+    """The value, unless it is None."""
+    return otherwise if value is None else value
+
+
 class PhantomSettings(Settings):
     """A phantom: the colon, the scope that films it, and the folder layout.
 
@@ -98,8 +105,8 @@ class PhantomSettings(Settings):
     seed: int = Field(0, ge=0, description="The whole phantom follows from it.")
     layout: Literal["c3vd", "c3vd-raw"] = Field(
         "c3vd",
-        description="c3vd: undistorted pinhole frames as ColIAGS reads them. c3vd-raw: the release's own files, through "
-        "C3VD's omnidirectional lens.",
+        description="c3vd: undistorted pinhole frames as ColIAGS reads them. c3vd-raw: the release's own files, "
+        "through C3VD's omnidirectional lens.",
     )
     trajectory: Literal["pullback", "rotation"] = Field(
         "pullback", description="pullback: withdrawal along the lumen. rotation: the camera mostly turns on the spot."
@@ -152,7 +159,7 @@ class PhantomSettings(Settings):
         0.45,
         ge=0.1,
         le=0.8,
-        description="Mean of the encoded picture that the exposure aims at; C3VD has .19 to .59 (light_and_beyond.md 1.6).",
+        description="Mean of the encoded picture that the exposure aims at; C3VD has .19 to .59 (ibid. 1.6).",
     )
     gain_lag: float = Field(
         2.0, ge=0.0, le=100.0, description="Time constant of the automatic exposure, frames; 0 follows at once."
@@ -197,15 +204,14 @@ class PhantomSettings(Settings):
     def size(self) -> tuple[int, int]:
         """Image width and height, pixels."""
         width, height = LAYOUT_SIZES[self.layout]
-        return self.width or width, self.height or height
+        return either(self.width, width), either(self.height, height)
 
     def resolved(self) -> PhantomSettings:
         """The same settings with every None replaced by what it stands for."""
         width, height = self.size
         chosen: dict[str, Any] = {"width": width, "height": height}
         for name in ("light_offset", "spread_law", "spread", "vignetting", "tilt", "gain", "white_balance_drift"):
-            value = getattr(self, name)
-            chosen[name] = getattr(self.preset, name) if value is None else value
+            chosen[name] = either(getattr(self, name), getattr(self.preset, name))
         return self.model_copy(update=chosen)
 
 

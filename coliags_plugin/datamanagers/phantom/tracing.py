@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from coliags_plugin.datamanagers.phantom.colon import ColonSurface
-from coliags_plugin.errors import UnavailableError
+from coliags_plugin.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Hits:
 
 
 def turned(vectors: Float[np.ndarray, "N 3"], rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "N 3"]:
-    """``rotation @ vector`` for many vectors, in their precision; a matrix product this thin takes several times as long."""
+    """``rotation @ vector`` for many vectors, in their precision; as a matrix product it takes several times as long."""
     return np.einsum("nc,dc->nd", vectors, rotation.astype(vectors.dtype))
 
 
@@ -43,23 +43,25 @@ class Tracer:
     """The mesh, prepared for rays.
 
     Raises:
-        UnavailableError: open3d cannot be imported.
+        InputError: open3d cannot be imported.
     """
 
     def __init__(self, surface: ColonSurface) -> None:
         try:
             import open3d
         except (ImportError, OSError) as error:
-            raise UnavailableError(
-                f"a phantom needs open3d, which does not import here ({error}). "
-                "Install open3d, and on Debian or Ubuntu the package libusb-1.0-0"
+            raise InputError(
+                f"open3d does not import here ({error})",
+                "open3d, which traces a phantom's rays",
+                "Install it with `pip install open3d`; on Debian and Ubuntu it also needs the package libusb-1.0-0",
             ) from error
+        # Its stubs know only some of its constructors.
         self._open3d: Any = open3d
         self._surface = surface
         self._scene = open3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(
-            open3d.core.Tensor(np.ascontiguousarray(surface.vertices, np.float32)),
-            open3d.core.Tensor(np.ascontiguousarray(surface.triangles, np.uint32)),
+            self._open3d.core.Tensor(np.ascontiguousarray(surface.vertices, np.float32)),
+            self._open3d.core.Tensor(np.ascontiguousarray(surface.triangles, np.uint32)),
         )
 
     def cast(self, camera_to_world: Float[np.ndarray, "4 4"], directions: Float[np.ndarray, "N 3"]) -> Hits:

@@ -98,7 +98,10 @@ def travel(centre_line: CentreLine, settings: PhantomSettings, clearance: Cleara
 
 
 def turn_away(poses: Float[np.ndarray, "T 4 4"], settings: PhantomSettings) -> list[RotationView]:
-    """Test views at places of training frames, their look direction 15 to 30 degrees off, all round the clock."""
+    """Test views at places of training frames, their look direction 15 to 30 degrees off.
+
+    On a pullback they turn all round the clock; where the camera scans, they go on outwards from where it looked.
+    """
     generator = stream(settings.seed, Purpose.ROTATION_VIEWS)
     training = [index for index in range(len(poses)) if index % TEST_EVERY]
     views = []
@@ -109,7 +112,11 @@ def turn_away(poses: Float[np.ndarray, "T 4 4"], settings: PhantomSettings) -> l
         # The golden angle spreads directions evenly over the clock however many views there are.
         clock += np.pi * (3.0 - np.sqrt(5.0))
         turn = generator.uniform(*_ROTATION_TURN)
-        axis = np.array([-np.sin(clock), np.cos(clock), 0.0])
+        direction = clock
+        if settings.trajectory == "rotation":
+            middle = poses[frame, :3, :3].T @ poses[:, :3, 2].mean(axis=0)
+            direction = float(np.arctan2(-middle[1], -middle[0]))
+        axis = np.array([-np.sin(direction), np.cos(direction), 0.0])
         pose = poses[frame].copy()
         pose[:3, :3] = pose[:3, :3] @ about(axis, np.radians(turn))
         views.append(RotationView(frame, float(turn), pose))

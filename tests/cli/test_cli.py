@@ -1,0 +1,347 @@
+"""The command line as a user meets it: whole small jobs, and every kind of bad input."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from coliags_plugin.cli import main
+from coliags_plugin.outputs.pictures import read_depth_tiff, read_rgb
+from tests.scenes import SMALL, write_wall
+
+SETS = [part for override in SMALL for part in ("--set", override)]
+
+
+def run(*argv):
+    """Exit status of a command run in this process."""
+    with pytest.raises(SystemExit) as stopped:
+        main([str(arg) for arg in argv])
+    return stopped.value.code
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_wall(tmp_path_factory.mktemp("data") / "wall", frames=17)
+
+
+@pytest.fixture(scope="module")
+def trained(scene, tmp_path_factory):
+    """A short run, evaluated under both protocols."""
+    path = tmp_path_factory.mktemp("runs") / "coliags"
+    assert run("train", "coliags", "--data", scene, "--output", path, "--steps", 60, *SETS) == 0
+    assert run("eval", path) == 0
+    assert run("eval", path, "--protocol", "authors-code") == 0
+    return path
+
+
+def refused(capsys, *argv):
+    """The one-line message of a command that must fail with status 2, without a traceback."""
+    assert run(*argv) == 2
+    message = capsys.readouterr().err
+    assert "Traceback" not in message
+    assert message.startswith("coliags: ") or "\ncoliags: " in message
+    return message
+
+
+def test_train_prints_the_run_and_leaves_everything(trained):
+    found = {path.name for path in trained.iterdir()}
+    assert found == {"config.yaml", "provenance.json", "metrics.jsonl", "checkpoints", "eval"}
+    assert [path.name for path in (trained / "checkpoints").iterdir()] == ["step-000060"]
+
+
+def test_eval_writes_numbers_or_null_with_a_reason(trained):
+    summary = json.loads((trained / "eval/paper/metrics.json").read_text())
+    assert summary["protocol"] == {**summary["protocol"], "name": "paper", "version": 1}
+    assert summary["psnr"] > 15
+    assert 0 < summary["ssim"] < 1
+    for name in ("psnr", "ssim", "lpips", "depth_mse", "depth_rmse", "depth_mae", "depth_abs_rel"):
+        value = summary[name]
+        assert (isinstance(value, float) and math.isfinite(value)) or (value is None and summary["reasons"][name])
+    assert summary["depth_mae"] <= summary["depth_rmse"] <= math.sqrt(summary["depth_mse"])  # Jensen, over frames
+    assert summary["sets"]["test"]["frames"] == 3
+
+
+def test_eval_means_are_the_means_of_the_per_frame_table(trained):
+    summary = json.loads((trained / "eval/paper/metrics.json").read_text())
+    with (trained / "eval/paper/per_frame.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["frame"] for row in rows] == ["0000_color", "0008_color", "0016_color"]
+    for name in ("psnr", "depth_mse"):
+        assert np.mean([float(row[name]) for row in rows]) == pytest.approx(summary[name])
+
+
+def test_eval_figures_agree_with_its_pictures(trained):
+    """PSNR and depth MSE taken again from the files, the former through 8 bits."""
+    folder = trained / "eval/paper"
+    with (folder / "per_frame.csv").open() as file:
+        row = next(csv.DictReader(file))
+    names = [folder / kind / "test" / f"{row['frame']}.png" for kind in ("renders", "truth")]
+    rendered, truth = (read_rgb(name).astype(float) / 255 for name in names)
+    assert -10 * math.log10(((rendered - truth) ** 2).mean()) == pytest.approx(float(row["psnr"]), abs=0.05)
+    depths = [read_depth_tiff(folder / kind / "test" / f"{row['frame']}.tiff") for kind in ("depth", "true_depth")]
+    known = np.isfinite(depths[1])
+    assert ((depths[0] - depths[1])[known] ** 2).mean() == pytest.approx(float(row["depth_mse"]), rel=1e-4)
+
+
+def test_protocols_disagree_and_say_so(trained):
+    paper, authors = (
+        json.loads((trained / f"eval/{name}/metrics.json").read_text()) for name in ("paper", "authors-code")
+    )
+    assert authors["protocol"]["name"] == "authors-code"
+    assert paper["depth_mse"] != authors["depth_mse"]
+
+
+def test_render_writes_pictures_scales_and_a_video(trained, tmp_path):
+    assert run("render", trained, "--output", tmp_path / "out") == 0
+    for kind in ("rgb", "depth", "rgb_error", "depth_error"):
+        pictures = sorted((tmp_path / "out" / kind).iterdir())
+        assert [path.name for path in pictures] == ["0000_color.png", "0008_color.png", "0016_color.png"]
+        assert read_rgb(pictures[0]).shape == (24, 32, 3)
+    assert (tmp_path / "out" / "trajectory.mp4").stat().st_size > 0
+    assert (tmp_path / "out" / "depth_scale.png").is_file()
+
+
+def test_report_of_two_methods(trained, scene, tmp_path):
+    other = tmp_path / "rival"
+    assert run("train", "scaffold-gs-depth", "--data", scene, "--output", other, "--steps", 5, *SETS) == 0
+    assert run("eval", other) == 0
+    assert run("report", trained, other, "--output", tmp_path / "report.html", "--note", "A <small> test") == 0
+    text = (tmp_path / "report.html").read_text()
+    assert "scaffold-gs-depth" in text
+    assert "A &lt;small&gt; test" in text
+
+
+def test_moved_data_are_found_by_option(trained, scene, tmp_path, capsys):
+    moved = tmp_path / "elsewhere"
+    shutil.copytree(scene, moved)
+    assert run("eval", trained, "--data", moved) == 0
+    other = write_wall(tmp_path / "other", frames=18)
+    assert "not the data" in refused(capsys, "eval", trained, "--data", other)
+
+
+def test_resume_from_the_command_line(scene, tmp_path):
+    path = tmp_path / "run"
+    assert run("train", "coliags", "--data", scene, "--output", path, "--steps", 2, *SETS) == 0
+    assert run("train", "coliags", "--data", scene, "--output", path, "--steps", 4, "--resume", *SETS) == 0
+    assert len((path / "metrics.jsonl").read_text().splitlines()) == 4
+
+
+def test_default_run_folder_and_resume_of_the_newest(scene, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert run("train", "ablations/depth", "--data", scene, "--steps", 1, *SETS) == 0
+    printed = Path(capsys.readouterr().out.strip())
+    assert printed.parts[:3] == ("runs", "wall", "depth")
+    assert run("train", "ablations/depth", "--data", scene, "--steps", 2, "--resume", *SETS) == 0
+    assert (printed / "checkpoints" / "step-000002").is_dir()
+
+
+def test_overwrite_from_the_command_line(scene, tmp_path, capsys):
+    argv = ("train", "coliags", "--data", scene, "--output", tmp_path / "run", "--steps", 1, *SETS)
+    assert run(*argv) == 0
+    assert "already exists" in refused(capsys, *argv)
+    assert run(*argv, "--overwrite") == 0
+
+
+def test_list_and_config_and_doctor(capsys):
+    assert run("list", "methods") == 0
+    assert "scaffold-gs-depth" in capsys.readouterr().out
+    assert run("list") == 0
+    assert "renderers:" in capsys.readouterr().out
+    assert run("config", "show", "coliags", "--origin") == 0
+    assert "frequencies: 10  # coliags.yaml:" in capsys.readouterr().out
+    assert run("doctor") == 0
+    assert "would use torch" in capsys.readouterr().out
+
+
+def test_phantom_trains(tmp_path):
+    coarse = [part for s in ("mesh_spacing=3.0", "texture_spacing=1.0") for part in ("--set", s)]
+    argv = ("phantom", tmp_path / "p", "--size", "48x38", "--frames", 9, "--rotation-views", 2, *coarse)
+    assert run(*argv) == 0
+    assert run("train", "coliags", "--data", tmp_path / "p", "--output", tmp_path / "r", "--steps", 2) == 0
+    assert run("eval", tmp_path / "r") == 0
+    summary = json.loads((tmp_path / "r/eval/paper/metrics.json").read_text())
+    assert summary["sets"]["rotation"]["frames"] == 2
+    assert summary["sets"]["rotation"]["psnr_seen"] is not None
+
+
+# Bad input
+
+
+def test_missing_data(capsys, tmp_path):
+    assert "gone" in refused(capsys, "train", "coliags", "--data", tmp_path / "gone", "--output", tmp_path / "r")
+    assert not (tmp_path / "r").exists()
+
+
+def test_unknown_method(capsys, scene):
+    assert "Did you mean 'coliags'" in refused(capsys, "train", "colliags", "--data", scene)
+
+
+@pytest.mark.parametrize(
+    ("assignment", "part"),
+    [
+        ("field.geometry_head.frequences=3", "frequencies"),
+        ("schedule.steps=many", "'many'"),
+        ("losses.l1.weight=heavy", "heavy"),
+        ("nonsense", "key.path=value"),
+        ("renderer.name=cuda-magic", "cuda-magic"),
+    ],
+)
+def test_bad_settings(capsys, scene, tmp_path, assignment, part):
+    argv = ("train", "coliags", "--data", scene, "--output", tmp_path / "r", "--set", assignment)
+    assert part in refused(capsys, *argv)
+    assert not (tmp_path / "r").exists()
+
+
+def test_unknown_renderer(capsys, scene):
+    assert "no renderers component 'magic'" in refused(
+        capsys, "train", "coliags", "--data", scene, "--renderer", "magic"
+    )
+
+
+def test_unknown_protocol(capsys, trained):
+    assert "Did you mean 'paper'" in refused(capsys, "eval", trained, "--protocol", "papper")
+
+
+def test_output_that_is_a_file(capsys, scene, tmp_path):
+    (tmp_path / "file").write_text("x")
+    argv = ("train", "coliags", "--data", scene, "--output", tmp_path / "file" / "run", "--steps", 1, *SETS)
+    assert "cannot write" in refused(capsys, *argv)
+    assert "cannot write" in refused(capsys, "phantom", tmp_path / "file" / "phantom", "--frames", 9)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_read_only_output(capsys, scene, tmp_path):
+    (tmp_path / "locked").mkdir(mode=0o555)
+    argv = ("train", "coliags", "--data", scene, "--output", tmp_path / "locked" / "run", "--steps", 1, *SETS)
+    assert "cannot write" in refused(capsys, *argv)
+
+
+def test_checkpoint_of_another_method(capsys, scene, trained):
+    argv = ("train", "scaffold-gs-depth", "--data", scene, "--output", trained, "--resume", *SETS)
+    assert "run of method 'coliags'" in refused(capsys, *argv)
+
+
+def test_checkpoint_moved_under_another_method(capsys, scene, trained, tmp_path):
+    other = tmp_path / "other"
+    assert run("train", "scaffold-gs-depth", "--data", scene, "--output", other, "--steps", 1, *SETS) == 0
+    shutil.rmtree(other / "checkpoints")
+    shutil.copytree(trained / "checkpoints", other / "checkpoints")
+    assert "is of method 'coliags'" in refused(capsys, "eval", other)
+
+
+def test_folders_that_are_no_runs(capsys, tmp_path):
+    for command in ("eval", "render"):
+        assert "not a run folder" in refused(capsys, command, tmp_path)
+    assert "not a run folder" in refused(
+        capsys, "train", "coliags", "--data", tmp_path, "--output", tmp_path / "gone", "--resume"
+    )
+
+
+def test_nothing_to_resume(capsys, scene, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert "no run under" in refused(capsys, "train", "coliags", "--data", scene, "--resume", *SETS)
+
+
+def test_damaged_provenance(capsys, trained, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(trained, copy)
+    (copy / "provenance.json").write_text("{")
+    assert "provenance.json" in refused(capsys, "eval", copy)
+    (copy / "provenance.json").write_text("{}")
+    assert "provenance.json" in refused(capsys, "eval", copy)
+
+
+def test_no_test_frames(capsys, scene, tmp_path):
+    sets = (*SETS, "--set", "datamanager.split=all-train")
+    assert run("train", "coliags", "--data", scene, "--output", tmp_path / "r", "--steps", 1, *sets) == 0
+    assert "no test frames" in refused(capsys, "eval", tmp_path / "r")
+
+
+def test_no_frames_of_that_name(capsys, trained):
+    assert "one of train, test, all" in refused(capsys, "render", trained, "--frames", "rotation")
+
+
+def test_report_before_eval(capsys, trained, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(trained, copy)
+    shutil.rmtree(copy / "eval")
+    assert "coliags eval" in refused(capsys, "report", copy, "--output", tmp_path / "x.html")
+    assert not (tmp_path / "x.html").exists()
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ("--size", "big"),
+        ("--size", "0x0"),
+        ("--light-offset", "1,2"),
+        ("--light-offset", "0,0,-50"),
+        ("--frames", "3"),
+        ("--set", "roughnes=0.3"),
+        ("--set", "roughness"),
+        ("--set", "roughness=9"),
+    ],
+)
+def test_bad_phantoms(capsys, tmp_path, argv):
+    refused(capsys, "phantom", tmp_path / "p", *argv)
+    assert not any(tmp_path.iterdir())
+
+
+def test_unknown_kind(capsys):
+    assert "Did you mean 'renderers'" in refused(capsys, "list", "renderer")
+
+
+def test_argument_errors_exit_with_2(capsys):
+    assert run("train") == 2
+    assert run("no-such-command") == 2
+
+
+# Processes
+
+
+def python(*argv, **options):
+    return subprocess.run([sys.executable, *argv], check=False, capture_output=True, text=True, timeout=120, **options)
+
+
+def test_help_imports_nothing_heavy():
+    code = "import sys; sys.argv = ['coliags', '--help']\nfrom coliags_plugin.cli import main\n"
+    code += "try: main()\nexcept SystemExit: print('\\n' + ' '.join(sys.modules))"
+    shown = python("-c", code)
+    assert "reconstruct, compare" in shown.stdout
+    loaded = {name.partition(".")[0] for name in shown.stdout.splitlines()[-1].split()}
+    heavy = {"torch", "numpy", "scipy", "cv2", "open3d", "pycolmap", "kornia", "skimage"}
+    assert not loaded & (heavy | {"viser", "gsplat", "nerfstudio"})
+
+
+def test_importing_the_package_imports_nothing_heavy():
+    shown = python("-c", "import sys, coliags_plugin; print(' '.join(sys.modules))")
+    assert not {"torch", "numpy", "open3d", "pycolmap", "cv2"} & set(shown.stdout.split())
+
+
+def test_ctrl_c_saves_and_exits_cleanly(scene, tmp_path):
+    argv = ["train", "coliags", "--data", scene, "--output", tmp_path / "run", "--steps", 100_000, *SETS]
+    command = [sys.executable, "-c", "from coliags_plugin.cli import main; main()", *map(str, argv)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    log = tmp_path / "run" / "metrics.jsonl"
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and not (log.is_file() and log.read_text().count("\n") >= 3):
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, message = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "go on with" in message
+    assert "Traceback" not in message
+    steps = [path.name for path in (tmp_path / "run" / "checkpoints").iterdir()]
+    assert len(steps) == 1
+    assert int(steps[0].split("-")[1]) == len(log.read_text().splitlines())
