@@ -236,9 +236,7 @@ def _write_truth(
     albedo = phantom.vertex_albedo
     layouts.write_ply(folder / "mesh.ply", surface, albedo)
     vertices = surface.vertices.astype(np.float64)
-    seen = seen_from(
-        vertices, phantom.training_poses, phantom.sensor.optics, phantom.sensor.mask, phantom.world.tracer
-    )
+    seen = seen_from(vertices, phantom.training_poses, phantom.sensor.optics, phantom.sensor.mask, phantom.world.tracer)
     np.savez(folder / "mesh_seen.npz", vertex_seen=seen, face_seen=trained_on, face_seen_by_any_frame=observed)
     np.savez(
         folder / "albedo.npz",

@@ -153,10 +153,10 @@ def write_poses(path: Path, poses: Sequence[Float[np.ndarray, "4 4"]]) -> None:
 def write_ply(path: Path, surface: ColonSurface, vertex_albedo: Float[np.ndarray, "V 3"]) -> None:
     """The wall as a binary PLY; vertex colours are the albedo, encoded with gamma 2.2."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    kinds = {name: "float" for name in ("x", "y", "z", "nx", "ny", "nz")}
+    kinds |= {name: "uchar" for name in ("red", "green", "blue")}
     vertices = np.empty(
-        len(surface.vertices),
-        [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
-        + [(name, "u1") for name in ("red", "green", "blue")],
+        len(surface.vertices), [(name, "<f4" if kind == "float" else "u1") for name, kind in kinds.items()]
     )
     for axis, name in enumerate("xyz"):
         vertices[name] = surface.vertices[:, axis]
@@ -166,17 +166,12 @@ def write_ply(path: Path, surface: ColonSurface, vertex_albedo: Float[np.ndarray
         vertices[name] = colors[:, channel]
     faces = np.empty(len(surface.triangles), [("count", "u1"), ("vertices", "<i4", (3,))])
     faces["count"], faces["vertices"] = 3, surface.triangles
-    properties = [
-        f"property {'uchar' if kind == '|u1' else 'float'} {name}"
-        for name, kind in vertices.dtype.descr
-        if isinstance(kind, str)
-    ]
     header = [
         "ply",
         "format binary_little_endian 1.0",
         "comment millimetres; colour = albedo ^ (1 / 2.2)",
         f"element vertex {len(vertices)}",
-        *properties,
+        *(f"property {kind} {name}" for name, kind in kinds.items()),
         f"element face {len(faces)}",
         "property list uchar int vertex_indices",
         "end_header",
@@ -185,7 +180,7 @@ def write_ply(path: Path, surface: ColonSurface, vertex_albedo: Float[np.ndarray
 
 
 def write_coverage_obj(path: Path, surface: ColonSurface, observed: Bool[np.ndarray, "F"]) -> None:
-    """The wall as C3VD's coverage mesh: face corners ``v/vt`` with vt 1 for triangles observed and 2 for those missed."""
+    """The wall as C3VD's coverage mesh: face corners ``v/vt`` with vt 1 for observed triangles and 2 for others."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w") as file:
         file.write("# millimetres; vt 1 = observed, vt 2 = not observed\n")

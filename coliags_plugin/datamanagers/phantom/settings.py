@@ -159,7 +159,8 @@ class PhantomSettings(Settings):
         0.45,
         ge=0.1,
         le=0.8,
-        description="Mean of the encoded picture that the exposure aims at; C3VD has .19 to .59 (ibid. 1.6).",
+        description="Mean of the encoded picture that the exposure aims at; C3VD has .19 to .59 "
+        "(light_and_beyond.md 1.6).",
     )
     gain_lag: float = Field(
         2.0, ge=0.0, le=100.0, description="Time constant of the automatic exposure, frames; 0 follows at once."

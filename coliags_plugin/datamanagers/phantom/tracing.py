@@ -35,7 +35,7 @@ class Hits:
 
 
 def turned(vectors: Float[np.ndarray, "N 3"], rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "N 3"]:
-    """``rotation @ vector`` for many vectors, in their precision; as a matrix product it takes several times as long."""
+    """``rotation @ vector`` for many vectors, in their precision; a matrix product takes several times as long."""
     return np.einsum("nc,dc->nd", vectors, rotation.astype(vectors.dtype))
 
 

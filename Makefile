@@ -1,0 +1,53 @@
+# `make demo` and `make test` are all a newcomer needs. Each makes its own virtual environment first.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+DEMO ?= demo
+DEMO_STEPS ?= 1000
+DEMO_FLAGS := --data $(DEMO)/phantom --steps $(DEMO_STEPS) --overwrite
+
+.PHONY: demo test test-slow lint install system clean
+
+demo: install
+	$(BIN)/coliags phantom $(DEMO)/phantom --seed 0 --size 169x135 --overwrite
+	$(BIN)/coliags train coliags --output $(DEMO)/coliags $(DEMO_FLAGS)
+	$(BIN)/coliags train scaffold-gs-depth --output $(DEMO)/scaffold-gs-depth $(DEMO_FLAGS)
+	$(BIN)/coliags eval $(DEMO)/coliags
+	$(BIN)/coliags eval $(DEMO)/scaffold-gs-depth
+	$(BIN)/coliags report $(DEMO)/coliags $(DEMO)/scaffold-gs-depth --output $(DEMO)/report.html \
+	  --title "ColIAGS and Scaffold-GS on a synthetic colon" \
+	  --note "A demonstration: $(DEMO_STEPS) steps at 169x135 on a CPU, where the paper trains 30,000 at 338x270."
+
+test: install
+	$(BIN)/python -m pytest -q
+
+test-slow: install
+	$(BIN)/python -m pytest -q -m slow
+
+lint: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+install: system $(VENV)/installed
+
+$(VENV)/installed: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit("Python 3.10 or newer is needed, not " + sys.version.split()[0] + "; try make PYTHON=python3.11" if sys.version_info < (3, 10) else 0)'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+# open3d loads the system's libusb; no Python package brings it.
+system:
+	@if [ "$$(uname)" = Linux ] && ! $(PYTHON) -c 'import ctypes; ctypes.CDLL("libusb-1.0.so.0")' 2>/dev/null; then \
+	  if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+	    echo "installing libusb-1.0-0, which open3d needs"; \
+	    apt-get update -qq && apt-get install -y -qq --no-install-recommends libusb-1.0-0 >/dev/null; \
+	  else \
+	    echo "open3d needs libusb-1.0, and it is not here. Install it first:  sudo apt-get install libusb-1.0-0" >&2; \
+	    exit 1; \
+	  fi; \
+	fi
+
+clean:
+	rm -rf $(VENV) $(DEMO) build dist
