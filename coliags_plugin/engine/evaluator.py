@@ -19,8 +19,8 @@ from coliags_plugin.engine.provenance import software
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.errors import InputError, UnavailableError
 from coliags_plugin.files import atomic_folder, atomic_write, write_json
-from coliags_plugin.outputs.figures import depth_error_picture
-from coliags_plugin.outputs.pictures import write_depth_tiff, write_png
+from coliags_plugin.outputs.figures import DEPTH_ERROR_LIMIT_MM, depth_error_picture
+from coliags_plugin.outputs.pictures import eight_bit, write_depth_tiff, write_png
 from coliags_plugin.scenes import Frame
 
 #: The main test set: its figures stand at the top of metrics.json.
@@ -28,8 +28,6 @@ MAIN_SET = "test"
 #: Figures that are also taken over only what a training frame saw, where the data tell.
 SEEN_METRICS = ("psnr", "ssim", "depth_mse", "depth_median_error")
 SEEN_SUFFIX = "_seen"
-#: Full scale of the depth error pictures, mm.
-ERROR_LIMIT_MM = 2.0
 
 
 @dataclass
@@ -121,19 +119,15 @@ def _take_figures(figures: _Figures, frame: Frame, metrics: Mapping[str, Metric]
 
 def _write_pictures(folder: Path, set_name: str, frame: Frame, comparison: Comparison) -> None:
     name = f"{set_name}/{frame.name}"
-    write_png(folder / "renders" / f"{name}.png", _eight_bit(comparison.rgb))
+    write_png(folder / "renders" / f"{name}.png", eight_bit(comparison.rgb))
     write_png(folder / "truth" / f"{name}.png", frame.image)
     if comparison.depth is None or comparison.true_depth is None or comparison.depth_valid is None:
         return
     known = torch.where(comparison.depth_valid, comparison.true_depth, torch.nan)
     write_depth_tiff(folder / "depth" / f"{name}.tiff", comparison.depth)
     write_depth_tiff(folder / "true_depth" / f"{name}.tiff", known)
-    picture = depth_error_picture(comparison.depth, known, comparison.depth_valid, ERROR_LIMIT_MM)
+    picture = depth_error_picture(comparison.depth, known, comparison.depth_valid, DEPTH_ERROR_LIMIT_MM)
     write_png(folder / "errors" / f"{name}.png", picture)
-
-
-def _eight_bit(rgb: torch.Tensor) -> torch.Tensor:
-    return (rgb.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
 
 
 def _columns(metrics: Mapping[str, Metric], figures: Mapping[str, _Figures]) -> list[str]:

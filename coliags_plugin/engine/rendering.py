@@ -13,13 +13,18 @@ from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.errors import InputError
 from coliags_plugin.files import atomic_folder
 from coliags_plugin.gaussians import RenderOutput
-from coliags_plugin.outputs.figures import color_bar, depth_error_picture, depth_picture, rgb_error_picture
-from coliags_plugin.outputs.pictures import write_png
+from coliags_plugin.outputs.figures import (
+    DEPTH_ERROR_LIMIT_MM,
+    color_bar,
+    depth_error_picture,
+    depth_picture,
+    rgb_error_picture,
+)
+from coliags_plugin.outputs.pictures import eight_bit, write_png
 from coliags_plugin.outputs.video import write_video
 from coliags_plugin.scenes import Frame
 
-#: Full scale of the depth error pictures, mm, and of the colour error pictures, parts of full scale.
-DEPTH_ERROR_LIMIT_MM = 2.0
+#: Full scale of the colour error pictures, parts of full scale.
 RGB_ERROR_LIMIT = 0.2
 
 
@@ -80,7 +85,7 @@ def _depth_limits(trained: TrainedRun, frames: list[Frame]) -> tuple[float, floa
 def _write_frame(folder: Path, frame: Frame, output: RenderOutput, limits: tuple[float, float]) -> None:
     name = f"{frame.name}.png"
     depth = output["depth_accumulated"]
-    write_png(folder / "rgb" / name, _eight_bit(output.rgb))
+    write_png(folder / "rgb" / name, eight_bit(output.rgb))
     write_png(folder / "depth" / name, depth_picture(depth, limits))
     valid = frame.valid.cpu()
     write_png(folder / "rgb_error" / name, rgb_error_picture(output.rgb.cpu(), frame.image, valid, RGB_ERROR_LIMIT))
@@ -94,10 +99,6 @@ def _film(
 ) -> Iterator[np.ndarray]:
     for count, frame in enumerate(path, start=1):
         output = _render(trained, frame)
-        rgb = _eight_bit(output.rgb).cpu().numpy()
+        rgb = eight_bit(output.rgb).cpu().numpy()
         yield np.concatenate([rgb, depth_picture(output["depth_accumulated"], limits)], axis=1)
         progress.update(done + count)
-
-
-def _eight_bit(rgb: torch.Tensor) -> torch.Tensor:
-    return (rgb.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)

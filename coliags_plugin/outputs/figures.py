@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 ColorMap = Literal["depth", "error"]
 
+#: Full scale of depth error pictures that stand alone, mm: one for all, so that any two can be compared.
+DEPTH_ERROR_LIMIT_MM = 2.0
 #: Pixels of a depth picture that hold no depth.
 UNKNOWN_GREY = 128
 #: The two greys of the hatch over error pixels that have no truth.

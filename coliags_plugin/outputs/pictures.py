@@ -27,6 +27,11 @@ def as_array(values: np.ndarray | Tensor) -> np.ndarray:
     return np.asarray(values.detach().cpu().numpy())
 
 
+def eight_bit(rgb: Tensor) -> Tensor:
+    """Colours in [0, 1] as uint8, clamped and rounded. [H, W, 3]"""
+    return (rgb.clamp(0.0, 1.0) * 255.0).round().byte()
+
+
 def encode_png(rgb: UInt8[np.ndarray, "H W 3"] | Tensor) -> bytes:
     """A lossless 8-bit RGB PNG.
 

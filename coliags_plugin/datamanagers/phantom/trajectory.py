@@ -66,12 +66,13 @@ def travel(centre_line: CentreLine, settings: PhantomSettings, clearance: Cleara
     points, frames = centre_line.at(arc)
 
     waver = np.stack([_sway(time, generator) for _ in range(5)], axis=1)
-    low, high = preset.wobble
+    on_the_spot = settings.trajectory == "rotation"
+    low, high = (0.3 * excursion if on_the_spot else excursion for excursion in preset.wobble)
     clock = generator.uniform(0.0, 2.0 * np.pi) + 2.2 * waver[:, 0] + 4.0 * time
     amount = 0.5 * (low + high) + 0.5 * (high - low) * waver[:, 1]
     sideways = amount[:, None] * np.stack([np.cos(clock), np.sin(clock)], axis=1)
     sideways = _kept_off(sideways, points, frames, clearance, NEAREST + 0.5)
-    for approach in range(preset.approaches):
+    for approach in range(0 if on_the_spot else preset.approaches):
         sideways = _approached(sideways, points, frames, clearance, preset.closest, approach, time, generator)
     centers = points + np.einsum("nck,nk->nc", frames[:, :, :2], sideways)
     nearest = float(clearance(centers).min())
@@ -84,7 +85,7 @@ def travel(centre_line: CentreLine, settings: PhantomSettings, clearance: Cleara
 
     ahead, _ = centre_line.at(arc + _LOOK_AHEAD)
     poses = _looking(centers, ahead, frames)
-    if settings.trajectory == "pullback":
+    if not on_the_spot:
         yaw, pitch, roll = (np.radians(limit) * waver[:, 2 + axis] for axis, limit in enumerate(preset.turn))
     else:
         # Round and round, outwards: the look direction goes over a whole disc.
