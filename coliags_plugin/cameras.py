@@ -62,9 +62,9 @@ class Camera:
 
         A point at z-depth ``z`` is ``center + z * rays()``. [H, W, 3]
         """
-        options = {"dtype": self.camera_to_world.dtype, "device": self.camera_to_world.device}
-        x = (torch.arange(self.width, **options) + 0.5 - self.cx) / self.fx
-        y = (torch.arange(self.height, **options) + 0.5 - self.cy) / self.fy
+        like = self.camera_to_world
+        x = (torch.arange(self.width, dtype=like.dtype, device=like.device) + 0.5 - self.cx) / self.fx
+        y = (torch.arange(self.height, dtype=like.dtype, device=like.device) + 0.5 - self.cy) / self.fy
         directions = torch.stack(
             [x.expand(self.height, -1), y[:, None].expand(-1, self.width), torch.ones_like(x).expand(self.height, -1)],
             dim=-1,
