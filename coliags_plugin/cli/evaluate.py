@@ -39,6 +39,7 @@ class Evaluate:
         folder = evaluate(trained, self.protocol or trained.config.protocol)
         summary = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
         Console().print(figures_table(summary))
-        for name, reason in summary["reasons"].items():
-            print(f"{name}: {reason}")
+        for reason in dict.fromkeys(summary["reasons"].values()):
+            names = [name for name, text in summary["reasons"].items() if text == reason]
+            print(f"{', '.join(names)}: {reason}")
         print(folder / "metrics.json")

@@ -13,6 +13,7 @@ _NAMES = {
     "psnr": "PSNR",
     "ssim": "SSIM",
     "lpips": "LPIPS",
+    "lpips_squeeze": "LPIPS, SqueezeNet",
     "depth_mse": "Depth MSE",
     "depth_mse_inner": "Depth MSE, inner",
     "depth_rmse": "Depth RMSE",

@@ -129,7 +129,7 @@ def test_occupied_cells_grow_nothing():
 
 
 def test_coarse_cells_first_then_finer_ones():
-    """Many eager children far away: the coarse level opens the way for the finer ones; births have their cell's size."""
+    """Many eager children far away: the coarse level opens the way, births have their cell's size."""
     field, adam = make_field()
     with torch.no_grad():
         field.offsets.copy_(torch.rand(field.offsets.shape, generator=torch.Generator().manual_seed(3)) * 60)
