@@ -22,7 +22,7 @@ class OptimizerSettings(Settings):
 
     lr: float = Field(ge=0)
     final_lr: float | None = Field(default=None, ge=0)
-    times_extent: bool = False  # multiply both rates by the scene's extent (methods.md 0.1)
+    times_extent: bool = False  # multiply both rates by the scene's extent (docs/methods.md 2.1)
 
 
 class ScheduleSettings(Settings):

@@ -167,7 +167,7 @@ class LossSettings(Settings):
 
 
 def log_linear(start: float, end: float, progress: float) -> float:
-    """``start`` to ``end`` on a straight line in the logarithm; progress is clipped to [0, 1] (methods.md 0.3).
+    """``start`` to ``end`` on a straight line in the logarithm; progress is clipped to [0, 1] (docs/methods.md 2.3).
 
     Zero ends give zero (a frozen group).
     """

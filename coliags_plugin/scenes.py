@@ -91,7 +91,7 @@ class Scene:
 
     @property
     def extent(self) -> float:
-        """1.1 times the largest distance of a training camera from their mean, scene units (methods.md 0.1)."""
+        """1.1 times the largest distance of a training camera from their mean, scene units (docs/methods.md 2.1)."""
         centers = torch.stack([frame.camera.center for frame in self.train])
         return 1.1 * float((centers - centers.mean(0)).norm(dim=1).max())
 

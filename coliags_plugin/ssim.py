@@ -1,7 +1,7 @@
 """Structural similarity as the splatting papers compute it, with a mask that reaches inside the windows.
 
 An 11x11 Gaussian window of sigma 1.5 with zero padding, C1 = 0.01^2, C2 = 0.03^2, data range 1, per channel
-(methods.md 0.4). Away from the border this is Wang et al. 2004, and scikit-image's ``structural_similarity`` with
+(docs/methods.md 2.4). Away from the border this is Wang et al. 2004, and scikit-image's ``structural_similarity`` with
 ``gaussian_weights=True, sigma=1.5, use_sample_covariance=False``.
 """
 

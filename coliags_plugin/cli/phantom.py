@@ -38,7 +38,7 @@ class Phantom:
     rotation_views: int = 12
     """Extra test views turned 15 to 30 degrees beyond the path."""
     set: Assignments = ()
-    """Any other phantom setting, for instance roughness=0.4 (docs/data.md lists them)."""
+    """Any other phantom setting, for instance roughness=0.4 (docs/phantom.md 6 lists them)."""
     overwrite: bool = False
     """Replace the output folder where it exists."""
 

@@ -39,7 +39,7 @@ class C3VDSettings(Settings):
     lens: Literal["omnidirectional", "legacy-pinhole", "fisheye"] = Field(
         "omnidirectional",
         description="How raw frames are undistorted (pinhole frames need none): 'omnidirectional' rendered the ground "
-        "truth; 'legacy-pinhole' is behind most published numbers and up to 3.4 degrees off; 'fisheye' is REIM-NeRF's.",
+        "truth; 'legacy-pinhole' is behind most published numbers and off by degrees (docs/data.md 2); 'fisheye' is REIM-NeRF's.",
     )
     focal_scale: float = Field(
         1.0,
@@ -86,7 +86,7 @@ class C3VDSettings(Settings):
 
 
 class C3VDDataManager(DataManager):
-    """Reads a C3VD sequence: the raw release or the undistorted layout, told apart by the files (data_layouts.md 1, 3).
+    """Reads a C3VD sequence: the raw release or the undistorted layout, told apart by the files (docs/data.md 1, 3).
 
     A sub-folder ``rotation`` in either layout becomes the test set of that name. ``seen/NNNN_seen.png`` in it, and
     ``truth/seen/NNNN_seen.png`` beside the sequence (valid for the split every-8th of all frames), mark what training

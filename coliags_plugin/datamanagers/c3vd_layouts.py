@@ -1,4 +1,4 @@
-"""Which of C3VD's two layouts a folder has, told by the files in it and never by its name (data_layouts.md 1, 3)."""
+"""Which of C3VD's two layouts a folder has, told by the files in it and never by its name (docs/data.md 1, 3)."""
 
 from __future__ import annotations
 

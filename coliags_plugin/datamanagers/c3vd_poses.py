@@ -34,7 +34,7 @@ class Poses:
 def read_poses(path: Path) -> Poses:
     """Read ``pose.txt`` or ``camera_pose.txt``: sixteen numbers a line, separated by commas or blanks.
 
-    The web page calls the files row-major; the numbers are columns (data_layouts.md 1). So the order is found, not
+    The web page calls the files row-major; the numbers are columns (docs/data.md 4). So the order is found, not
     believed: read row by row, a rigid transform has its translation in the last column and (0, 0, 0, 1) in the last
     row.
 

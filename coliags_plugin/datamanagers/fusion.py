@@ -19,7 +19,7 @@ def fuse_depth(frames: Sequence[Frame], count: int, generator: np.random.Generat
     """Points on the surface that the frames' depth shows.
 
     Every valid pixel of every frame is equally likely, and none is drawn twice; all are taken where there are no more
-    than ``count``. Rays go through the true principal point (the authors' code uses the image centre, methods.md 1.2).
+    than ``count``. Rays go through the true principal point (the authors' code: the image centre, docs/methods.md 6).
 
     Args:
         frames: With z-depth, mm, NaN where unknown.

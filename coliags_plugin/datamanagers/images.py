@@ -56,7 +56,7 @@ def read_mask(path: Path) -> Shaped[np.ndarray, "H W"]:
 
 
 def millimetres(steps: UInt16[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
-    """z-depth, mm, of C3VD's 16-bit depth; NaN where unknown (data_layouts.md 1). [H, W]"""
+    """z-depth, mm, of C3VD's 16-bit depth; NaN where unknown (docs/data.md 1). [H, W]"""
     depth = (steps * DEPTH_MM_PER_STEP).astype(np.float32)
     depth[np.isin(steps, DEPTH_INVALID)] = np.nan
     return depth

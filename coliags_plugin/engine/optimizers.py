@@ -10,7 +10,7 @@ from coliags_plugin.config import OptimizerSettings
 from coliags_plugin.contracts import Field, log_linear
 from coliags_plugin.errors import InputError
 
-#: Everywhere in the splatting lineage (methods.md 0.3).
+#: Everywhere in the splatting lineage (docs/methods.md 2.3).
 ADAM_EPSILON = 1e-15
 
 

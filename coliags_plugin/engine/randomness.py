@@ -21,7 +21,7 @@ def generators(seed: int) -> dict[str, torch.Generator]:
 
 @dataclass
 class FrameOrder:
-    """Training frames in random order, each once per round (methods.md 1.7).
+    """Training frames in random order, each once per round (docs/methods.md 4).
 
     Attributes:
         count: How many frames there are.

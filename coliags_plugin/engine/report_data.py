@@ -253,7 +253,7 @@ def _first_difference(one: dict[str, list[str]], two: dict[str, list[str]]) -> s
 
 
 def _again(folder: Path, protocol: str) -> str:
-    return f"Run `coliags eval {folder} --protocol {protocol} --overwrite` again"
+    return f"Run `coliags eval {folder} --protocol {protocol}` again"
 
 
 def _number(value: Any) -> float | None:

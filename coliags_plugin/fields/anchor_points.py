@@ -8,12 +8,12 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-#: Floor of the mean squared neighbour distance, scene units squared (methods.md 1.2).
+#: Floor of the mean squared neighbour distance, scene units squared (docs/methods.md 2.2).
 MIN_SQUARED_DISTANCE = 1e-7
 
 
 def voxelize(points: Float[Tensor, "N 3"], size: float) -> Float[Tensor, "M 3"]:
-    """One point at the centre of every voxel that holds any, sorted (methods.md 1.2).
+    """One point at the centre of every voxel that holds any, sorted (docs/methods.md 3.1).
 
     Args:
         points: Scene units. [N, 3]
@@ -26,7 +26,7 @@ def voxelize(points: Float[Tensor, "N 3"], size: float) -> Float[Tensor, "M 3"]:
 
 
 def neighbour_log_scales(points: Float[Tensor, "M 3"]) -> Float[Tensor, "M"]:
-    """Log of the root mean squared distance to the three nearest neighbours (methods.md 0.2, 1.2).
+    """Log of the root mean squared distance to the three nearest neighbours (docs/methods.md 2.2, 3.1).
 
     With fewer than four points, those that there are; a lone point gets the floor.
     """

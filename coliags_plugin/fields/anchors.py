@@ -30,7 +30,7 @@ DRAWN_SIGMAS = math.sqrt(2.0 * math.log(255.0))
 
 
 class AnchorFieldSettings(Settings):
-    """Options of the anchor field. Constants: methods.md 1.2 and 1.5."""
+    """Options of the anchor field. Constants: docs/methods.md 3.1 and 3.4."""
 
     geometry_head: GeometryHeadNode
     appearance_head: AppearanceHeadNode
@@ -46,7 +46,7 @@ class AnchorFieldSettings(Settings):
 class AnchorField(Field):
     """Anchors with features; two heads decode each visible one into its children (paper, II-A2 and II-C).
 
-    Differs from the released ColIAGS code where that is defective (methods.md 1.2 and 1.5): voxels are of a size that
+    Differs from the released ColIAGS code where that is defective (docs/methods.md 6): voxels are of a size that
     merges points (that code's 0.001 is a micron in a scene in mm), and only anchors in the viewing frustum are decoded.
 
     Attributes:
@@ -137,14 +137,14 @@ class AnchorField(Field):
         return inside.nonzero().squeeze(1)
 
     def gaussians(self, camera: Camera) -> Gaussians:
-        """Decode the visible anchors (methods.md 13.2)."""
+        """Decode the visible anchors (docs/methods.md 3.5)."""
         camera = camera.to(self.anchors.device, self.anchors.dtype)
         visible = self.visible_anchors(camera)
         features, offsets, scalings = self.features[visible], self.offsets[visible], self.scalings[visible]
         sight = self.anchors[visible] - camera.center
         distances = sight.norm(dim=1, keepdim=True)
         directions = sight / distances
-        # Anchors behind the lens would have negative cosines; the lamp does not shine there (methods.md 1.4).
+        # Anchors behind the lens would have negative cosines; the lamp does not shine there (docs/methods.md 3.3).
         cosines = (directions @ camera.optical_axis).clamp(0.0, 1.0)[:, None]
 
         opacities, covariances = self.geometry_head(features, directions)

@@ -22,7 +22,7 @@ class PlainAppearanceSettings(Settings):
 
 
 class PlainAppearanceHead(nn.Module):
-    """Scaffold-GS's: colour from feature and viewing direction, optionally the distance (methods.md 2)."""
+    """Scaffold-GS's: colour from feature and viewing direction, optionally the distance (docs/methods.md 3.6)."""
 
     Settings: ClassVar[type[Settings]] = PlainAppearanceSettings
 
@@ -69,7 +69,7 @@ class IMIAAppearanceSettings(Settings):
 
 
 class IMIAAppearanceHead(PlainAppearanceHead):
-    """Improved appearance Modelling with Illumination Attenuation (paper, Eq. 7; methods.md 1.5).
+    """Improved appearance Modelling with Illumination Attenuation (paper, Eq. 8; docs/methods.md 3.4).
 
     The perceptron sees v, the distance d to the lamp and gamma(cos theta), the angle to the optical axis in which light
     spread and vignetting merge.

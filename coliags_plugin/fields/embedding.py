@@ -11,7 +11,7 @@ def cosine_embedding(x: Float[Tensor, "... D"], frequencies: int) -> Float[Tenso
     """``[x, sin(x), cos(x), sin(2x), cos(2x), ..., sin(2^(L-1) x), cos(2^(L-1) x)]``.
 
     Frequency-major, sine before cosine, no factor pi: the paper's "dimension" is the number of frequencies L
-    (methods.md 1.3), so ten on a direction make 63 numbers and five on an angle make 11.
+    (docs/methods.md 3.2), so ten on a direction make 63 numbers and five on an angle make 11.
 
     Args:
         x: Anything bounded. [..., D]

@@ -21,7 +21,7 @@ class PlainGeometrySettings(Settings):
 
 
 class PlainGeometryHead(nn.Module):
-    """Scaffold-GS's: both perceptrons see the viewing direction as it is (methods.md 2)."""
+    """Scaffold-GS's: both perceptrons see the viewing direction as it is (docs/methods.md 3.6)."""
 
     Settings: ClassVar[type[Settings]] = PlainGeometrySettings
 
@@ -62,7 +62,7 @@ class IMVEGeometrySettings(PlainGeometrySettings):
 
 
 class IMVEGeometryHead(PlainGeometryHead):
-    """Improved geometry Modelling with View Embedding: gamma(v) in place of v (paper, Eq. 6; methods.md 1.3)."""
+    """Improved geometry Modelling with View Embedding: gamma(v) in place of v (paper, Eq. 7; docs/methods.md 3.4)."""
 
     Settings: ClassVar[type[Settings]] = IMVEGeometrySettings
 

@@ -11,7 +11,7 @@ from torch import nn
 def perceptron(inputs: int, hidden: int, outputs: int, generator: torch.Generator) -> nn.Sequential:
     """Linear -> ReLU -> Linear, initialised as torch does by default but from an explicit generator.
 
-    Weights and biases are uniform within 1/sqrt(inputs) (methods.md 1.5).
+    Weights and biases are uniform within 1/sqrt(inputs) (docs/methods.md 3.4).
     """
     layers = nn.Linear(inputs, hidden), nn.Linear(hidden, outputs)
     with torch.no_grad():

@@ -31,7 +31,7 @@ class DepthL1Settings(LossSettings):
 
 
 class DepthL1Loss(Loss):
-    """Mean |D - D_true| in mm over the valid pixels whose true depth is known (the paper's L_depth; methods.md 1.6).
+    """Mean |D - D_true| in mm over the valid pixels of known true depth (the paper's L_depth; docs/methods.md 4.1).
 
     The paper writes a sum over pixels and the authors' code takes the mean; this is the mean. The authors' code also
     pulls pixels of unknown depth towards 0; here they count for nothing.

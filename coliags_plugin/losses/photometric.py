@@ -15,7 +15,7 @@ from coliags_plugin.ssim import ssim_map
 
 
 class L1Loss(Loss):
-    """Mean absolute difference over valid pixels and channels (the paper's L_1; methods.md 1.6)."""
+    """Mean absolute difference over valid pixels and channels (the paper's L_1; docs/methods.md 4.1)."""
 
     Settings: ClassVar[type[LossSettings]] = LossSettings
 
@@ -27,7 +27,7 @@ class L1Loss(Loss):
 
 
 class DSSIMLoss(Loss):
-    """1 - SSIM over valid pixels (the paper's L_D-SSIM; methods.md 0.4, 1.6).
+    """1 - SSIM over valid pixels (the paper's L_D-SSIM; docs/methods.md 2.4, 4.1).
 
     Ignored pixels are kept out of the windows too, see :func:`coliags_plugin.ssim.ssim_map`.
     """

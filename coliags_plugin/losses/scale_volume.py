@@ -13,9 +13,9 @@ from coliags_plugin.scenes import Frame
 
 
 class ScaleVolumeLoss(Loss):
-    """Mean product of the scales of the Gaussians drawn (the paper's L_scale; methods.md 1.6).
+    """Mean product of the scales of the Gaussians drawn (the paper's L_scale; docs/methods.md 4.1).
 
-    In scene units cubed (mm^3; squared for surfels), so its weight depends on the unit of length (methods.md 13.4).
+    In scene units cubed (mm^3; squared for surfels), so its weight depends on the unit of length (docs/methods.md 4.4).
     """
 
     Settings: ClassVar[type[LossSettings]] = LossSettings

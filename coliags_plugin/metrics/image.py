@@ -20,7 +20,7 @@ class PSNRSettings(Settings):
 class PSNR(Metric):
     """Peak signal-to-noise ratio, 10 log10(1 / mse), the error taken over all channels of the valid pixels together.
 
-    (The authors' in-training report averages one figure per channel instead; methods.md 0.4.)
+    (The authors' in-training report averages one figure per channel instead; docs/methods.md 2.4.)
     """
 
     Settings: ClassVar[type[Settings]] = PSNRSettings

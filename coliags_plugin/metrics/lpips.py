@@ -39,7 +39,7 @@ class LPIPSSettings(Settings):
 
 
 class LPIPS(Metric):
-    """LPIPS v0.1 (Zhang et al. 2018; methods.md 0.4) without torchvision.
+    """LPIPS v0.1 (Zhang et al. 2018; docs/methods.md 2.4) without torchvision.
 
     Ignored pixels are black in both pictures, as outside an endoscope's aperture, and the distance is averaged over
     what is left, so that nothing at an ignored pixel can move the figure.

@@ -19,7 +19,7 @@ from coliags_plugin.scenes import Frame
 
 MetricTable = Mapping[str, tuple[str, Mapping[str, Any]]]
 
-# The splatting papers' flavour: VGG fed [0, 1] unmapped (methods.md 0.4).
+# The splatting papers' flavour: VGG fed [0, 1] unmapped (docs/methods.md 2.4).
 _LPIPS_OF_THE_PAPERS = {"net": "vgg", "input_range": "zero-one"}
 
 
@@ -68,7 +68,7 @@ class PaperProtocol(Protocol):
 
 
 class AuthorsCodeProtocol(Protocol):
-    """The figures the authors' released code prints (methods.md 1.10): through PNG files, and without any mask.
+    """The figures the authors' released code prints (docs/methods.md 5.4): through PNG files, and without any mask.
 
     The rendered depth is 1 / (sum w/z), 100 mm where nothing was drawn, through 16 bit over 150 mm; the true depth goes
     through 16 bit over 100 mm with unknown pixels at 0, against which the rendered ones are scored. Both wrap around

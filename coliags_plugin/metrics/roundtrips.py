@@ -1,4 +1,4 @@
-"""What becomes of a picture and of a depth map that go through the authors' PNG files and back (methods.md 1.10)."""
+"""What becomes of a picture and of a depth map that pass through the authors' PNG files (docs/methods.md 5.4)."""
 
 from __future__ import annotations
 

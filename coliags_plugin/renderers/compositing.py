@@ -27,7 +27,7 @@ _LOG_ZERO = -1e4
 
 @dataclass(frozen=True)
 class Cuts:
-    """Constants of the splatting lineage (methods.md 0.2).
+    """Constants of the splatting lineage (docs/methods.md 2.2).
 
     Attributes:
         alpha_max: No Gaussian is more opaque than this.

@@ -29,7 +29,7 @@ _SUMMED = {
 
 
 class TorchRendererSettings(Settings):
-    """Options of :class:`TorchRenderer`. The defaults are the lineage's constants (methods.md 0.1, 0.2)."""
+    """Options of :class:`TorchRenderer`. The defaults are the lineage's constants (docs/methods.md 2.1, 2.2)."""
 
     near: float = pydantic.Field(default=0.2, ge=0)
     """Gaussians with a centre at z <= near are not drawn. Scene units."""

@@ -16,7 +16,7 @@ from coliags_plugin.strategies.parameter_rows import append_rows, keep_rows
 
 
 class AnchorGrowthSettings(Settings):
-    """Options of anchor growth; the defaults are Scaffold-GS's and ColIAGS's (methods.md 1.8)."""
+    """Options of anchor growth; the defaults are Scaffold-GS's and ColIAGS's (docs/methods.md 4.3)."""
 
     statistics_from: int = Field(default=500, ge=0)  # steps; first and last are themselves left out
     growth_from: int = Field(default=1500, ge=0)
@@ -31,7 +31,7 @@ class AnchorGrowthSettings(Settings):
 
 
 class AnchorGrowth(Strategy):
-    """New anchors where children's image gradients stay large, none where they stay transparent (methods.md 1.8).
+    """New anchors where children's image gradients stay large, none where they stay transparent (docs/methods.md 4.3).
 
     Counts only anchors that the view can see, as Scaffold-GS does; ColIAGS's released code counts all of them, so that
     its pruning test is an average over views that never saw the anchor.
@@ -86,7 +86,7 @@ class AnchorGrowth(Strategy):
         if gradient is None:
             return
         height, width = output.alpha.shape
-        # In units of half the image, as the thresholds of the lineage are (methods.md 1.8).
+        # In units of half the image, as the thresholds of the lineage are (docs/methods.md 4.3).
         lengths = (gradient * gradient.new_tensor([0.5 * width, 0.5 * height])).norm(dim=1)
         drawn = output.radii > 0
         self.gradient_sum.index_add_(0, gaussians.source_index[drawn], lengths[drawn])
@@ -103,7 +103,7 @@ class AnchorGrowth(Strategy):
             draw = torch.rand(len(chosen), generator=self.generator).to(chosen.device)
             chosen &= draw > 0.5 ** (level + 1)
             if level > 0 and len(field.anchors) == first_count:
-                continue  # finer levels follow only where a coarser one found something (methods.md 1.8)
+                continue  # finer levels follow only where a coarser one found something (docs/methods.md 4.3)
             cell = float(field.voxel_size) * max(1, options.coarsest_cell // 4**level)
             slots = chosen.nonzero().squeeze(1)
             self._add_anchors(field, optimizers, positions[slots], slots // children, cell)

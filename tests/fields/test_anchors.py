@@ -66,7 +66,7 @@ def test_imve_without_frequencies_decodes_as_the_plain_head():
 
 
 def test_decoding_step_by_step():
-    """An independent walk through methods.md 13.2, anchor by anchor."""
+    """An independent walk through docs/methods.md 3.5, anchor by anchor."""
     field = make_field(COLIAGS)
     camera = camera_at(1.0, 0.5, 2.0, yaw=0.1)
     drawn = field.gaussians(camera)

@@ -1,6 +1,6 @@
 """The colon's wall: anatomy as a radius over arc length and clock angle, and the triangle mesh made of it.
 
-The wall lies at ``centre(s) + radius(s, phi) (cos phi n + sin phi b)``. Sizes follow light_and_beyond.md 1.9: radius
+The wall lies at ``centre(s) + radius(s, phi) (cos phi n + sin phi b)``. Sizes follow docs/phantom.md 1: radius
 20 mm, three taeniae that make the lumen three-lobed, and between them haustral folds - thin crescents 5 to 8 mm high
 about every 25 mm. Lengths are mm, angles radians.
 """

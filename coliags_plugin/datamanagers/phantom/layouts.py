@@ -1,4 +1,4 @@
-"""The two folder layouts a phantom can be written in (data_layouts.md 1 and 3), and the truth beside them."""
+"""The two folder layouts a phantom can be written in (docs/data.md 1 and 3), and the truth beside them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from coliags_plugin.lenses import LENSES, Pinhole, octagon_mask
 
 #: z-depth that the largest 16-bit value stands for, mm; whatever is farther is clipped there.
 DEPTH_RANGE = 100.0
-#: Intrinsics of C3VD's undistorted frames at 338 x 270, centres at integers (data_layouts.md 1).
+#: Intrinsics of C3VD's undistorted frames at 338 x 270, centres at integers (docs/phantom.md 3).
 _C3VD_PINHOLE = Pinhole(200.8769, 200.4713, 167.3190, 136.9333)
 
 

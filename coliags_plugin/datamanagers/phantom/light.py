@@ -1,11 +1,11 @@
-"""The lamp and the wall's reflection, in linear light (light_and_beyond.md 1.1, 1.7, 1.8).
+"""The lamp and the wall's reflection, in linear light (docs/phantom.md 2, 2.2).
 
 Radiance is counted in units of what a white Lambertian wall sends back that the lamp's axis strikes squarely at
 20 mm, so exposures are of the order of 1.
 
 No cast shadows are drawn for a lamp on the optical axis. Exactly at the lens it casts none that the lens could see.
-Behind the lens it stands for a ring of light guides around it (the fall-off of such a ring is 1/(d + z0)^2,
-light_and_beyond.md 1.4), and what the lens sees, the ring as a whole lights. A lamp beside the lens does cast shadows.
+Behind the lens it stands for a ring of light guides around it (such a ring, too, gains less than 1/d^2 on close walls,
+docs/phantom.md 2.1), and what the lens sees, the ring as a whole lights. A lamp beside the lens does cast shadows.
 """
 
 from __future__ import annotations

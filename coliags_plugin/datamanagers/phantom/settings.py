@@ -55,8 +55,8 @@ class Preset:
 
 
 #: ``c3vd`` is the fair default. Its fall-off towards the rim adds up to the cos^1.25 that a free fit of real C3VD
-#: pixels gave, its look direction stays within C3VD's 7 degrees, and its exposure is automatic
-#: (light_and_beyond.md 1.5, 1.6). ``strong`` is the stress case, variant A of trial.md 1: the lamp at the lens,
+#: pixels gave, its look direction stays near C3VD's median of 7 degrees, and its exposure is automatic
+#: (docs/phantom.md 3, 4). ``strong`` is the stress case (docs/phantom.md 4): the lamp at the lens,
 #: cos^1.5 spread under cos^2.5 vignetting, a fixed exposure, large rotations and two approaches to 9 mm.
 PRESETS: dict[str, Preset] = {
     "c3vd": Preset(
@@ -98,7 +98,7 @@ def either(value: _T | None, otherwise: _T) -> _T:
 class PhantomSettings(Settings):
     """A phantom: the colon, the scope that films it, and the folder layout.
 
-    Ranges bracket what is published about colons and endoscopes (light_and_beyond.md 1.8, 1.9). A setting left at None
+    Ranges bracket what is published about colons and endoscopes (docs/phantom.md 1, 2, 3). A setting left at None
     takes the value of the preset ``light`` names.
     """
 
@@ -152,15 +152,15 @@ class PhantomSettings(Settings):
     )
     f0: float = Field(0.028, ge=0.0, le=0.08, description="Normal reflectance of the film; .028 is an index of 1.40.")
     albedo: tuple[float, float, float] = Field(
-        (0.78, 0.29, 0.22), description="Mean albedo of the mucosa, linear RGB, each between 0.02 and 0.9 (trial.md 8)."
+        (0.78, 0.29, 0.22),
+        description="Mean albedo of the mucosa, linear RGB, each between 0.02 and 0.9 (docs/phantom.md 1).",
     )
 
     target_grey: float = Field(
         0.45,
         ge=0.1,
         le=0.8,
-        description="Mean of the encoded picture that the exposure aims at; C3VD has .19 to .59 "
-        "(light_and_beyond.md 1.6).",
+        description="Mean of the encoded picture that the exposure aims at; C3VD has .19 to .59 (docs/phantom.md 3).",
     )
     gain_lag: float = Field(
         2.0, ge=0.0, le=100.0, description="Time constant of the automatic exposure, frames; 0 follows at once."
@@ -229,5 +229,5 @@ def phantom_settings(options: Mapping[str, Any]) -> PhantomSettings:
         where = ".".join(str(part) for part in first["loc"]) or "options"
         raise InputError(
             f"phantom setting {where}: {first['msg']} (got {first['input']!r})",
-            do="See `coliags phantom --help` for every setting, its unit and its range",
+            do="docs/phantom.md lists every setting with its unit and range",
         ) from error

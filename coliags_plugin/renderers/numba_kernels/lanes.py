@@ -1,12 +1,13 @@
 """Sixteen float32 numbers side by side, as a type that numba kernels compute with.
 
-A loop that is written for one number is at the mercy of the vectoriser, which gives up without a word. Here the vector is
-spelled out: every operation below becomes the LLVM instruction for ``<16 x float>``, which LLVM maps to one AVX-512
+A loop that is written for one number is at the mercy of the vectoriser, which gives up without a word. Here the vector
+is spelled out: every operation below becomes the LLVM instruction for ``<16 x float>``, which LLVM maps to one AVX-512
 register, two AVX registers or four NEON ones. Nothing is reassociated and nothing assumes finite numbers; ``fma`` is
 fused where the machine can.
 
-``Lanes`` holds numbers and ``LaneMask`` truth values. Wherever lanes are expected a scalar will do: it is repeated.
-Arrays are flat, contiguous and float32, and are not bounds checked.
+``Lanes`` holds numbers and ``LaneMask`` truth values. A scalar operand is repeated in all lanes. Operands of arithmetic
+may also be tuples of lanes of one length; the operation then goes through the tuple. Lengths are part of numba's types,
+so what is compiled has no loop over them. Tables are flat, contiguous float32 arrays, without bounds checks.
 """
 
 from __future__ import annotations
@@ -59,32 +60,43 @@ class _LaneMaskModel(models.PrimitiveModel):
         super().__init__(dmm, fe_type, _MASK)
 
 
-# --- helpers that build instructions ----------------------------------------------------------------------------------
+# --- building instructions --------------------------------------------------------------------------------------------
 
 
-def _vector(values: Sequence[float], kind: ir.VectorType = _LANES) -> ir.Constant:
+def _constant(values: Sequence[float], kind: Any = _LANES) -> Any:
     return ir.Constant(kind, [ir.Constant(kind.element, value) for value in values])
 
 
-def _repeat(builder: ir.IRBuilder, scalar: Any) -> Any:
-    """One scalar in all lanes."""
-    first = builder.insert_element(ir.Constant(ir.VectorType(scalar.type, WIDTH), ir.Undefined), scalar, _index(0))
-    return _shuffle(builder, first, first, [0] * WIDTH)
-
-
-def _index(value: int) -> ir.Constant:
-    return ir.Constant(_INT, value)
+def _call(builder: ir.IRBuilder, name: str, *arguments: Any) -> Any:
+    """Call an LLVM intrinsic whose operands and result are all vectors of one type."""
+    kind = arguments[0].type
+    function = builder.module.globals.get(name)
+    if function is None:
+        function = ir.Function(builder.module, ir.FunctionType(kind, [kind] * len(arguments)), name)
+    return builder.call(function, arguments)
 
 
 def _shuffle(builder: ir.IRBuilder, a: Any, b: Any, picks: Sequence[int | None]) -> Any:
-    """Lanes of ``a`` (counted from 0) and ``b`` (counted on from there); None for a lane that does not matter."""
-    kind = ir.VectorType(_INT, len(picks))
+    """Lanes of ``a``, counted from 0, and of ``b``, counted on from there; None for a lane that does not matter."""
     elements = [ir.Constant(_INT, ir.Undefined if pick is None else pick) for pick in picks]
-    return builder.shuffle_vector(a, b, ir.Constant(kind, elements))
+    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_INT, len(picks)), elements))
+
+
+def _repeat(builder: ir.IRBuilder, scalar: Any) -> Any:
+    first = builder.insert_element(ir.Constant(_LANES, ir.Undefined), scalar, ir.Constant(_INT, 0))
+    return _shuffle(builder, first, first, [0] * WIDTH)
+
+
+def _is_scalar(numba_type: types.Type) -> bool:
+    return isinstance(numba_type, (types.Integer, types.Float))
+
+
+def _is_numeric(numba_type: types.Type) -> bool:
+    return isinstance(numba_type, Lanes) or _is_scalar(numba_type)
 
 
 def _as_lanes(builder: ir.IRBuilder, value: Any, numba_type: types.Type) -> Any:
-    """A value of a type that :func:`_is_numeric` admits, as a vector."""
+    """A number or lanes, as lanes."""
     if isinstance(numba_type, Lanes):
         return value
     if isinstance(numba_type, types.Integer):
@@ -94,152 +106,169 @@ def _as_lanes(builder: ir.IRBuilder, value: Any, numba_type: types.Type) -> Any:
     return _repeat(builder, value)
 
 
-def _is_numeric(numba_type: types.Type) -> bool:
-    return isinstance(numba_type, (Lanes, types.Integer, types.Float))
-
-
 def _is_table(numba_type: types.Type) -> bool:
-    return (
-        isinstance(numba_type, types.Array)
-        and numba_type.ndim == 1
-        and numba_type.layout == "C"
-        and numba_type.dtype == types.float32
-    )
+    kind = (types.float32, 1, "C")
+    return isinstance(numba_type, types.Array) and (numba_type.dtype, numba_type.ndim, numba_type.layout) == kind
 
 
-def _call(builder: ir.IRBuilder, name: str, arguments: Sequence[Any], result: Any = _LANES) -> Any:
-    """Call an LLVM intrinsic."""
-    kind = ir.FunctionType(result, [argument.type for argument in arguments])
-    module = builder.module
-    function = module.globals.get(name) or ir.Function(module, kind, name)
-    return builder.call(function, arguments)
+def _tuple_length(operands: Sequence[types.Type]) -> int | None:
+    """The common length of those operands that are tuples; None where none is, or they do not fit together."""
+    lengths = {len(operand) for operand in operands if isinstance(operand, types.BaseTuple)}
+    return lengths.pop() if len(lengths) == 1 else None
 
 
-def _lanewise(emit: Callable[..., Any], arity: int, result: types.Type = lanes) -> Any:
+def _element(builder: ir.IRBuilder, value: Any, numba_type: types.Type, index: int) -> Any:
+    """One element of a tuple, or what stands for all of them, as lanes."""
+    if isinstance(numba_type, types.BaseTuple):
+        return _as_lanes(builder, builder.extract_value(value, index), numba_type[index])
+    return _as_lanes(builder, value, numba_type)
+
+
+def _pack(builder: ir.IRBuilder, vectors: Sequence[Any]) -> Any:
+    """LLVM's form of numba's tuple of lanes."""
+    packed = ir.Constant(ir.ArrayType(_LANES, len(vectors)), ir.Undefined)
+    for index, vector in enumerate(vectors):
+        packed = builder.insert_value(packed, vector, index)
+    return packed
+
+
+def _tuple_of_lanes(length: int) -> types.Type:
+    return types.UniTuple(lanes, length)
+
+
+def _address(context: Any, builder: ir.IRBuilder, table_type: Any, table: Any, index: Any, kind: Any = _LANES) -> Any:
+    data = context.make_array(table_type)(context, builder, table).data
+    return builder.bitcast(builder.gep(data, [index]), kind.as_pointer())
+
+
+def _read(builder: ir.IRBuilder, address: Any) -> Any:
+    value = builder.load(address)
+    value.align = 4
+    return value
+
+
+def _write(builder: ir.IRBuilder, value: Any, address: Any) -> None:
+    builder.store(value, address).align = 4
+
+
+def _lanewise(name: str, arity: int, emit: Callable[..., Any], result: types.Type = lanes) -> Any:
     """An operation on numbers, lane by lane.
 
     Args:
-        emit: Gets the builder and one vector for each operand, and gives the vector of the result.
+        name: For error messages.
         arity: How many operands.
-        result: Type of the result.
+        emit: Gets the builder and one vector for each operand, and gives the vector of the result.
+        result: Type of the result, of one element where operands are tuples.
     """
 
-    def typed(operands: tuple[types.Type, ...]) -> Any:
-        if not all(_is_numeric(operand) for operand in operands):
+    def typed(*operands: types.Type) -> Any:
+        length = _tuple_length(operands)
+        elements = [
+            kind
+            for operand in operands
+            for kind in (operand if length is not None and isinstance(operand, types.BaseTuple) else [operand])
+        ]
+        if not all(_is_numeric(kind) for kind in elements):
             return None
 
         def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
-            vectors = (_as_lanes(builder, *pair) for pair in zip(arguments, signature.args, strict=True))
-            return emit(builder, *vectors)
+            pairs = list(zip(arguments, signature.args, strict=True))
+            if length is None:
+                return emit(builder, *(_as_lanes(builder, *pair) for pair in pairs))
+            vectors = [emit(builder, *(_element(builder, *pair, index) for pair in pairs)) for index in range(length)]
+            return _pack(builder, vectors)
 
-        return result(*operands), generate
+        return (result if length is None else types.UniTuple(result, length))(*operands), generate
 
-    # numba reads the operands from the signature, so each arity needs its own.
-    if arity == 1:
-        return intrinsic(lambda typing_context, a: typed((a,)))
-    if arity == 2:
-        return intrinsic(lambda typing_context, a, b: typed((a, b)))
-    return intrinsic(lambda typing_context, a, b, c: typed((a, b, c)))
-
-
-def _compare(comparison: str) -> Any:
-    return _lanewise(lambda builder, a, b: builder.fcmp_ordered(comparison, a, b), 2, lane_mask)
+    # numba reads the number of operands from the signature.
+    by_arity: dict[int, Callable[..., Any]] = {
+        1: lambda typingctx, a: typed(a),
+        2: lambda typingctx, a, b: typed(a, b),
+        3: lambda typingctx, a, b, c: typed(a, b, c),
+    }
+    by_arity[arity].__name__ = name
+    return intrinsic(by_arity[arity])
 
 
-def _combine(emit: Callable[..., Any]) -> Any:
-    """An operation on two masks."""
+def _comparison(name: str, symbol: str) -> Any:
+    return _lanewise(name, 2, lambda builder, a, b: builder.fcmp_ordered(symbol, a, b), lane_mask)
 
-    def typed(typing_context: Any, a: types.Type, b: types.Type) -> Any:
+
+def _of_masks(name: str, emit: Callable[..., Any]) -> Any:
+    def typed(typingctx: Any, a: types.Type, b: types.Type) -> Any:
         if not (isinstance(a, LaneMask) and isinstance(b, LaneMask)):
             return None
         return lane_mask(a, b), lambda context, builder, signature, arguments: emit(builder, *arguments)
 
+    typed.__name__ = name
     return intrinsic(typed)
 
 
 # --- arithmetic -------------------------------------------------------------------------------------------------------
 
 #: a + b
-add = _lanewise(ir.IRBuilder.fadd, 2)
+add = _lanewise("add", 2, lambda builder, a, b: builder.fadd(a, b))
 #: a - b
-sub = _lanewise(ir.IRBuilder.fsub, 2)
+sub = _lanewise("sub", 2, lambda builder, a, b: builder.fsub(a, b))
 #: a b
-mul = _lanewise(ir.IRBuilder.fmul, 2)
-#: a / b, correctly rounded
-div = _lanewise(ir.IRBuilder.fdiv, 2)
-#: a / b to about a bit less, by estimating the reciprocal where that is quicker
-quick_div = _lanewise(lambda builder, a, b: builder.fdiv(a, b, flags=("fast",)), 2)
+mul = _lanewise("mul", 2, lambda builder, a, b: builder.fmul(a, b))
 #: a b + c
-fma = _lanewise(lambda builder, a, b, c: _call(builder, "llvm.fmuladd.v16f32", (a, b, c)), 3)
+fma = _lanewise("fma", 3, lambda builder, a, b, c: _call(builder, "llvm.fmuladd.v16f32", a, b, c))
+#: a / b, rounded correctly
+div = _lanewise("div", 2, lambda builder, a, b: builder.fdiv(a, b))
+#: a / b to a unit or two in the last place, for ordinary numbers
+quick_div = _lanewise("quick_div", 2, lambda builder, a, b: builder.fdiv(a, b, flags=("arcp", "afn", "contract")))
 #: -a
-neg = _lanewise(ir.IRBuilder.fneg, 1)
+neg = _lanewise("neg", 1, lambda builder, a: builder.fneg(a))
 #: Square root
-sqrt = _lanewise(lambda builder, a: _call(builder, "llvm.sqrt.v16f32", (a,)), 1)
-#: Logarithm to base 2, by sixteen calls of the C library: not for inner loops
-log2 = _lanewise(lambda builder, a: _call(builder, "llvm.log2.v16f32", (a,)), 1)
-#: Smallest integer that is not below
-ceil = _lanewise(lambda builder, a: _call(builder, "llvm.ceil.v16f32", (a,)), 1)
-#: Largest integer that is not above
-floor = _lanewise(lambda builder, a: _call(builder, "llvm.floor.v16f32", (a,)), 1)
-#: A scalar in all lanes
-splat = _lanewise(lambda builder, a: a, 1)
+sqrt = _lanewise("sqrt", 1, lambda builder, a: _call(builder, "llvm.sqrt.v16f32", a))
+#: Logarithm to base 2, by the C library one number at a time: not for inner loops
+log2 = _lanewise("log2", 1, lambda builder, a: _call(builder, "llvm.log2.v16f32", a))
+#: The integer at or above
+ceil = _lanewise("ceil", 1, lambda builder, a: _call(builder, "llvm.ceil.v16f32", a))
+#: The integer at or below
+floor = _lanewise("floor", 1, lambda builder, a: _call(builder, "llvm.floor.v16f32", a))
+#: A number in all lanes
+splat = _lanewise("splat", 1, lambda builder, a: a)
 #: The smaller; b where either is not a number
-smaller = _lanewise(lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b), 2)
+smaller = _lanewise("smaller", 2, lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))
 #: The larger; b where either is not a number
-larger = _lanewise(lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b), 2)
+larger = _lanewise("larger", 2, lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))
 
-#: Comparisons; False where either is not a number
-less = _compare("<")
-at_most = _compare("<=")
-greater = _compare(">")
-at_least = _compare(">=")
+# Comparisons are False where either is not a number.
+less = _comparison("less", "<")
+at_most = _comparison("at_most", "<=")
+greater = _comparison("greater", ">")
+at_least = _comparison("at_least", ">=")
 
-both = _combine(ir.IRBuilder.and_)
-either = _combine(ir.IRBuilder.or_)
-
-_EXP2_MAGIC = 1.5 * 2.0**23
-#: Minimax polynomial of 2^f on [-1/2, 1/2], lowest order first: relative error below 1e-7 with float32 rounding.
-_EXP2_POLYNOMIAL = (
-    1.0000000716546679,
-    0.6931474804878235,
-    0.24022107481956482,
-    0.05550713092088699,
-    0.009675540961325169,
-    0.0013276471774429083,
-)
-
-
-def _emit_exp2(builder: ir.IRBuilder, power: Any) -> Any:
-    # Adding 1.5 * 2^23 rounds to the nearest integer and leaves it in the lowest bits.
-    magic = _vector([_EXP2_MAGIC] * WIDTH)
-    shifted = builder.fadd(power, magic)
-    fraction = builder.fsub(power, builder.fsub(shifted, magic))
-    value = _vector([_EXP2_POLYNOMIAL[-1]] * WIDTH)
-    for coefficient in _EXP2_POLYNOMIAL[-2::-1]:
-        value = _call(builder, "llvm.fmuladd.v16f32", (value, fraction, _vector([coefficient] * WIDTH)))
-    exponent = builder.shl(builder.bitcast(shifted, _INTS), _vector([23] * WIDTH, _INTS))
-    return builder.bitcast(builder.add(builder.bitcast(value, _INTS), exponent), _LANES)
-
-
-#: 2^a for a in [-126, 127]; any bits at all outside
-exp2 = _lanewise(_emit_exp2, 1)
+both = _of_masks("both", lambda builder, a, b: builder.and_(a, b))
+either = _of_masks("either", lambda builder, a, b: builder.or_(a, b))
 
 
 @intrinsic
-def select(typing_context, mask, chosen, other):  # type: ignore[no-untyped-def]
+def select(typingctx: Any, mask: Any, chosen: Any, other: Any) -> Any:
     """``chosen`` where the mask holds, else ``other``."""
-    if not (isinstance(mask, LaneMask) and _is_numeric(chosen) and _is_numeric(other)):
+    length = _tuple_length((chosen, other))
+    if not isinstance(mask, LaneMask):
         return None
 
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
-        pairs = zip(arguments[1:], signature.args[1:], strict=True)
-        return builder.select(arguments[0], *(_as_lanes(builder, *pair) for pair in pairs))
+        pairs = list(zip(arguments[1:], signature.args[1:], strict=True))
+        if length is None:
+            return builder.select(arguments[0], *(_as_lanes(builder, *pair) for pair in pairs))
+        return _pack(
+            builder,
+            [
+                builder.select(arguments[0], *(_element(builder, *pair, index) for pair in pairs))
+                for index in range(length)
+            ],
+        )
 
-    return lanes(mask, chosen, other), generate
+    return (lanes if length is None else _tuple_of_lanes(length))(mask, chosen, other), generate
 
 
 @intrinsic
-def bits(typing_context, mask):  # type: ignore[no-untyped-def]
+def bits(typingctx: Any, mask: Any) -> Any:
     """The mask as an integer, lane 0 in the lowest bit."""
     if not isinstance(mask, LaneMask):
         return None
@@ -248,3 +277,253 @@ def bits(typing_context, mask):  # type: ignore[no-untyped-def]
         return builder.zext(builder.bitcast(arguments[0], ir.IntType(WIDTH)), ir.IntType(64))
 
     return types.int64(mask), generate
+
+
+# --- 2^x --------------------------------------------------------------------------------------------------------------
+
+#: Adding it to a float32 rounds that to an integer, which is then found in the lowest bits.
+_ROUNDING_BIAS = 1.5 * 2.0**23
+#: Minimax polynomial of 2^f on [-1/2, 1/2] in relative error (7.5e-8), constant term first.
+_EXP2_COEFFICIENTS = (
+    1.0000000716546822,
+    0.6931469670647334,
+    0.24022119723848698,
+    0.05550713273542824,
+    0.009675541334206542,
+    0.001327647197931638,
+)
+
+
+def _emit_exp2(builder: ir.IRBuilder, power: Any) -> Any:
+    bias = _constant([_ROUNDING_BIAS] * WIDTH)
+    biased = builder.fadd(power, bias)
+    fraction = builder.fsub(power, builder.fsub(biased, bias))
+    value = _constant([_EXP2_COEFFICIENTS[-1]] * WIDTH)
+    for coefficient in _EXP2_COEFFICIENTS[-2::-1]:
+        value = _call(builder, "llvm.fmuladd.v16f32", value, fraction, _constant([coefficient] * WIDTH))
+    # Shifted to the exponent's place, the integer adds to it.
+    exponent = builder.shl(builder.bitcast(biased, _INTS), _constant([23] * WIDTH, _INTS))
+    return builder.bitcast(builder.add(builder.bitcast(value, _INTS), exponent), _LANES)
+
+
+#: 2^a to a relative error of 2e-7 for a in [-126, 127]; any bits at all elsewhere
+exp2 = _lanewise("exp2", 1, _emit_exp2)
+
+
+# --- memory -----------------------------------------------------------------------------------------------------------
+
+
+@intrinsic
+def load(typingctx: Any, table: Any, index: Any) -> Any:
+    """Sixteen numbers from ``table[index]`` on."""
+    if not _is_table(table):
+        return None
+
+    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+        return _read(builder, _address(context, builder, signature.args[0], *arguments))
+
+    return lanes(table, types.intp), generate
+
+
+@intrinsic
+def store(typingctx: Any, table: Any, index: Any, value: Any) -> Any:
+    """Sixteen numbers to ``table[index]`` and on."""
+    if not (_is_table(table) and _is_numeric(value)):
+        return None
+
+    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+        address = _address(context, builder, signature.args[0], *arguments[:2])
+        _write(builder, _as_lanes(builder, arguments[2], signature.args[2]), address)
+        return context.get_dummy_value()
+
+    return types.none(table, types.intp, value), generate
+
+
+@intrinsic
+def broadcast(typingctx: Any, table: Any, index: Any) -> Any:
+    """``table[index]`` in all lanes."""
+    if not _is_table(table):
+        return None
+
+    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+        return _repeat(builder, _read(builder, _address(context, builder, signature.args[0], *arguments, _FLOAT)))
+
+    return lanes(table, types.intp), generate
+
+
+@intrinsic
+def load_all(typingctx: Any, table: Any, index: Any, like: Any) -> Any:
+    """As many vectors, one behind the other from ``table[index]`` on, as the tuple ``like`` is long."""
+    if not (_is_table(table) and isinstance(like, types.BaseTuple)):
+        return None
+
+    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+        address = _address(context, builder, signature.args[0], *arguments[:2])
+        places = [builder.gep(address, [ir.Constant(_INT, place)]) for place in range(len(like))]
+        return _pack(builder, [_read(builder, place) for place in places])
+
+    return _tuple_of_lanes(len(like))(table, types.intp, like), generate
+
+
+@intrinsic
+def store_all(typingctx: Any, table: Any, index: Any, values: Any) -> Any:
+    """A tuple of vectors, one behind the other, to ``table[index]`` and on."""
+    if not (_is_table(table) and isinstance(values, types.BaseTuple)):
+        return None
+
+    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+        address = _address(context, builder, signature.args[0], *arguments[:2])
+        for place in range(len(values)):
+            vector = _element(builder, arguments[2], signature.args[2], place)
+            _write(builder, vector, builder.gep(address, [ir.Constant(_INT, place)]))
+        return context.get_dummy_value()
+
+    return types.none(table, types.intp, values), generate
+
+
+@intrinsic
+def broadcast_all(typingctx: Any, table: Any, index: Any, like: Any) -> Any:
+    """Consecutive numbers from ``table[index]`` on, each in all lanes of its vector; as many as ``like`` is long."""
+    if not (_is_table(table) and isinstance(like, types.BaseTuple)):
+        return None
+
+    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+        address = _address(context, builder, signature.args[0], *arguments[:2], _FLOAT)
+        places = [builder.gep(address, [ir.Constant(_INT, place)]) for place in range(len(like))]
+        return _pack(builder, [_repeat(builder, _read(builder, place)) for place in places])
+
+    return _tuple_of_lanes(len(like))(table, types.intp, like), generate
+
+
+@intrinsic
+def load_columns(typingctx: Any, table: Any, index: Any, like: Any) -> Any:
+    """The columns of a matrix with sixteen rows, as many columns as ``like`` is long, which starts at ``index``."""
+    if not (_is_table(table) and isinstance(like, types.BaseTuple)):
+        return None
+    columns = len(like)
+
+    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+        address = _address(context, builder, signature.args[0], *arguments[:2])
+        places = [builder.gep(address, [ir.Constant(_INT, place)]) for place in range(columns)]
+        if columns == WIDTH:
+            return _pack(builder, _transposed(builder, [_read(builder, place) for place in places]))
+        kind = ir.VectorType(_FLOAT, WIDTH * columns)
+        flat = _read(builder, builder.bitcast(address, kind.as_pointer()))
+        picks = [[row * columns + column for row in range(WIDTH)] for column in range(columns)]
+        return _pack(builder, [_shuffle(builder, flat, flat, picked) for picked in picks])
+
+    return _tuple_of_lanes(columns)(table, types.intp, like), generate
+
+
+@intrinsic
+def store_columns(typingctx: Any, table: Any, index: Any, values: Any) -> Any:
+    """The columns of a matrix with sixteen rows, written row by row from ``table[index]`` on."""
+    if not (_is_table(table) and isinstance(values, types.BaseTuple)):
+        return None
+    columns = len(values)
+
+    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+        address = _address(context, builder, signature.args[0], *arguments[:2])
+        vectors = [_element(builder, arguments[2], signature.args[2], column) for column in range(columns)]
+        if columns == WIDTH:
+            for row, vector in enumerate(_transposed(builder, vectors)):
+                _write(builder, vector, builder.gep(address, [ir.Constant(_INT, row)]))
+            return context.get_dummy_value()
+        while len(vectors) & (len(vectors) - 1):
+            vectors.append(ir.Constant(_LANES, ir.Undefined))
+        whole = vectors
+        while len(whole) > 1:
+            width = 2 * whole[0].type.count
+            whole = [_shuffle(builder, a, b, list(range(width))) for a, b in zip(whole[::2], whole[1::2], strict=True)]
+        picks = [column * WIDTH + row for row in range(WIDTH) for column in range(columns)]
+        flat = _shuffle(builder, whole[0], whole[0], picks)
+        _write(builder, flat, builder.bitcast(address, flat.type.as_pointer()))
+        return context.get_dummy_value()
+
+    return types.none(table, types.intp, values), generate
+
+
+def _transposed(builder: ir.IRBuilder, rows: Sequence[Any]) -> list[Any]:
+    """The columns of a 16 x 16 matrix from its rows, or the rows from its columns."""
+    low = [lane for pair in range(8) for lane in (pair, WIDTH + pair)]
+    high = [lane for pair in range(8, 16) for lane in (pair, WIDTH + pair)]
+    vectors = list(rows)
+    # Interleaving the first half of the rows with the second rotates the bits of an element's place; after four times
+    # row and column have changed roles.
+    for _ in range(4):
+        halves = zip(vectors[:8], vectors[8:], strict=True)
+        vectors = [_shuffle(builder, a, b, picks) for a, b in halves for picks in (low, high)]
+    return vectors
+
+
+# --- across lanes -----------------------------------------------------------------------------------------------------
+
+
+@intrinsic
+def dot(typingctx: Any, a: Any, b: Any, start: Any) -> Any:
+    """``start`` plus the sum of the products of two tuples of lanes of one length."""
+    length = _tuple_length((a, b))
+    if length is None or not _is_numeric(start):
+        return None
+
+    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+        total = _as_lanes(builder, arguments[2], signature.args[2])
+        for index in range(length):
+            factors = (_element(builder, arguments[k], signature.args[k], index) for k in range(2))
+            total = _call(builder, "llvm.fmuladd.v16f32", *factors, total)
+        return total
+
+    return lanes(a, b, start), generate
+
+
+@intrinsic
+def lane_sums(typingctx: Any, vectors: Any) -> Any:
+    """Lane i of the result is the sum of all lanes of vector i of a tuple of at most sixteen; the rest is anything."""
+    if not (isinstance(vectors, types.BaseTuple) and len(vectors) <= WIDTH):
+        return None
+
+    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+        parts = [_element(builder, arguments[0], signature.args[0], index) for index in range(len(vectors))]
+        undefined = ir.Constant(_LANES, ir.Undefined)
+        run = WIDTH
+        # Each vector is made of 16 / run runs, and each run adds up to one of the sums. Two vectors become one with
+        # twice as many runs of half the length.
+        while run > 1:
+            parts += [undefined] * (len(parts) % 2)
+            half = run // 2
+            low = [lane for start in range(0, 2 * WIDTH, run) for lane in range(start, start + half)]
+            pairs = zip(parts[::2], parts[1::2], strict=True)
+            parts = [
+                builder.fadd(_shuffle(builder, a, b, low), _shuffle(builder, a, b, [lane + half for lane in low]))
+                for a, b in pairs
+            ]
+            run = half
+        return parts[0]
+
+    return lanes(vectors), generate
+
+
+@intrinsic
+def lane_columns(typingctx: Any) -> Any:
+    """0, 1, 2, 3 four times over: column of a lane's pixel in a block of 4 x 4. Also the column of a block in a tile."""
+    values = [float(lane % 4) for lane in range(WIDTH)]
+    return lanes(), lambda context, builder, signature, arguments: _constant(values)
+
+
+@intrinsic
+def lane_rows(typingctx: Any) -> Any:
+    """Each of 0, 1, 2, 3 four times: row of a lane's pixel in a block of 4 x 4. Also the row of a block in a tile."""
+    values = [float(lane // 4) for lane in range(WIDTH)]
+    return lanes(), lambda context, builder, signature, arguments: _constant(values)
+
+
+@intrinsic
+def lane(typingctx: Any, vector: Any, index: Any) -> Any:
+    """One of the sixteen numbers."""
+    if not isinstance(vector, Lanes):
+        return None
+
+    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+        return builder.extract_element(*arguments)
+
+    return types.float32(vector, types.intp), generate

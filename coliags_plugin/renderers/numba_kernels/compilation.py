@@ -1,0 +1,84 @@
+"""How the kernels are compiled, kept and announced."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import pickle
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+from numba.core.caching import FunctionCache
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
+_logger = logging.getLogger(__name__)
+#: What a cache may raise when its folder is full, unreadable or holds damaged files.
+_CACHE_ERRORS = (OSError, EOFError, pickle.PickleError, ValueError, AttributeError, ImportError, IndexError, TypeError)
+_OPTIONS = {"nogil": True, "error_model": "numpy", "boundscheck": False}
+
+
+def inline(function: _Function) -> _Function:
+    """A piece of a kernel that is compiled into its callers."""
+    return numba.njit(function, forceinline=True, **_OPTIONS)  # type: ignore[no-any-return]
+
+
+def part(function: _Function) -> _Function:
+    """What one thread does of a kernel."""
+    return numba.njit(function, **_OPTIONS)  # type: ignore[no-any-return]
+
+
+def kernel(function: _Function) -> _Function:
+    """A function that Python calls: runs on several threads, and is kept on disk once compiled."""
+    dispatcher = numba.njit(function, parallel=True, **_OPTIONS)
+    try:
+        dispatcher._cache = _KernelCache(function)
+    except RuntimeError:  # numba: no folder to keep it in
+        _announce("nowhere to keep them: no folder for numba's cache can be written, set NUMBA_CACHE_DIR to one")
+    return dispatcher  # type: ignore[no-any-return]
+
+
+class _KernelCache(FunctionCache):
+    """numba's cache on disk, except that
+
+    - it knows that a kernel changes when any file of this folder does (numba looks at the kernel's own file only),
+    - a cache that cannot be read or written costs a compilation, never the run,
+    - it says so when compilation is about to begin.
+    """
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        try:
+            found = super().load_overload(sig, target_context)
+        except _CACHE_ERRORS as error:
+            _logger.warning("kernel cache in %s cannot be read (%s)", self.cache_path, error)
+            found = None
+        if found is None:
+            _announce(f"kept in {self.cache_path}")
+        return found
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        try:
+            super().save_overload(sig, data)
+        except _CACHE_ERRORS as error:
+            _logger.warning("kernel cache in %s cannot be written (%s)", self.cache_path, error)
+
+    def _index_key(self, sig: Any, codegen: Any) -> Any:
+        return (*super()._index_key(sig, codegen), _fingerprint())
+
+
+@cache
+def _announce(where: str) -> None:
+    """Say once for each place that kernels are being compiled."""
+    _logger.info("cpu renderer: compiling kernels for this machine, about half a minute, once (%s)", where)
+
+
+@cache
+def _fingerprint() -> str:
+    """Of the sources of all kernels."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()

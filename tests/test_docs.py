@@ -1,0 +1,339 @@
+"""The documentation is true: examples run, commands parse, tables are the code's, citations lead somewhere."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from coliags_plugin import cli
+from coliags_plugin.cli.config import Config
+from coliags_plugin.cli.phantom import Phantom
+from coliags_plugin.cli.train import Train
+from coliags_plugin.config import MethodConfig, OptimizerSettings, ScheduleSettings, load_method
+from coliags_plugin.datamanagers.c3vd import C3VDSettings
+from coliags_plugin.datamanagers.phantom.settings import PRESETS, PhantomSettings
+from coliags_plugin.datamanagers.splits import held_out
+from coliags_plugin.engine.randomness import PURPOSES
+from coliags_plugin.gaussians import OUTPUTS
+from coliags_plugin.registry import REGISTRIES
+from tests.scenes import SMALL, write_wall
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
+SOURCES = sorted(
+    path
+    for folder in ("coliags_plugin", "tests", "method_configs", "benchmarks", "docs")
+    for path in (ROOT / folder).rglob("*")
+    if path.suffix in (".py", ".yaml", ".md") and path != Path(__file__)
+)
+
+
+def name_of(path: Path) -> str:
+    return str(path.relative_to(ROOT))
+
+
+def fenced(page: Path, language: str) -> list[str]:
+    """The page's code blocks of one language, indented ones included."""
+    blocks = re.findall(rf"^( *)```{language}\n(.*?)^\1```$", page.read_text(), re.DOTALL | re.MULTILINE)
+    return [re.sub(rf"^{indent}", "", block, flags=re.MULTILINE) for indent, block in blocks]
+
+
+def table_rows(page: str, header: str) -> list[list[str]]:
+    """Cells of the table whose first line is ``header``, without code marks."""
+    lines = (DOCS / page).read_text().splitlines()
+    start = lines.index(header) + 2
+    rows = []
+    for line in lines[start:]:
+        if not line.startswith("|"):
+            break
+        rows.append([cell.strip().replace("`", "") for cell in line.strip("|").split("|")])
+    return rows
+
+
+# Citations
+
+
+def headings(page: Path) -> list[str]:
+    prose = re.sub(r"^ *```.*?^ *```$", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    return re.findall(r"^#+ (.+)$", prose, re.MULTILINE)
+
+
+def sections(page: Path) -> set[str]:
+    """Numbers that head a section."""
+    return {found.group() for title in headings(page) if (found := re.match(r"\d+(\.\d+)*(?= )", title))}
+
+
+def cited(text: str) -> list[tuple[str, list[str]]]:
+    """Pages named in a text, each with the section numbers that follow it, over the ends of commented lines too."""
+    text = re.sub(r"\s*\n\s*(?:#:?|\|)?\s*", " ", text)
+    number = r"\d+(?:\.\d+)*(?!\w)"
+    pattern = rf"(?<![\w-])((?:docs/)?\w+\.md)(?:`*,? +({number}(?:(?:, | and ){number})*))?"
+    return [(page, re.findall(number, numbers or "")) for page, numbers in re.findall(pattern, text)]
+
+
+@pytest.mark.parametrize("path", [path for path in SOURCES if path.suffix != ".md"], ids=name_of)
+def test_citations_lead_to_a_section(path):
+    for page, numbers in cited(path.read_text()):
+        target = ROOT / page
+        assert page.startswith("docs/") and target.is_file(), f"{page} is no page of the documentation"
+        assert set(numbers) <= sections(target), f"{page} has no section {', '.join(numbers)}"
+
+
+@pytest.mark.parametrize("path", PAGES, ids=name_of)
+def test_pages_cite_one_another_rightly(path):
+    for page, numbers in cited(path.read_text()):
+        known = [ROOT / page, path.parent / page]
+        target = next((found for found in known if found.is_file()), None)
+        assert target is not None, f"{page} is not there"
+        assert set(numbers) <= sections(target), f"{page} has no section {', '.join(numbers)}"
+    for target in re.findall(r"\]\(([^)#:]+)\)", path.read_text()):
+        assert (path.parent / target).exists(), f"the link to {target} is broken"
+
+
+def test_sections_cited_by_name_are_there():
+    for path in SOURCES:
+        for page, title in re.findall(r"docs/(\w+\.md)`*, section \"([^\"]+)\"", path.read_text()):
+            assert title in headings(DOCS / page), f"{name_of(path)}: {page} has no section {title}"
+
+
+@pytest.mark.parametrize("page", sorted(DOCS.glob("*.md")), ids=name_of)
+def test_sections_are_numbered_once_and_in_order(page):
+    numbers = [
+        tuple(map(int, found.group().split(".")))
+        for title in headings(page)
+        if (found := re.match(r"\d+(\.\d+)*(?= )", title))
+    ]
+    assert numbers == sorted(set(numbers))
+
+
+@pytest.mark.parametrize("page", [page for page in sorted(DOCS.glob("*.md")) if sections(page)], ids=name_of)
+def test_references_within_a_page_lead_to_a_section(page):
+    referred = re.findall(r"(?<!\w)\((\d(?:\.\d)?)\)", page.read_text())
+    assert set(referred) <= sections(page)
+
+
+def test_the_citation_pattern_sees_what_it_should():
+    text = (
+        "A (docs/methods.md 2.4, 4.1) b\n    #: docs/data.md\n    # 3 and 7). ``docs/rendering.md``, section; x.md 1a"
+    )
+    assert cited(text) == [
+        ("docs/methods.md", ["2.4", "4.1"]),
+        ("docs/data.md", ["3", "7"]),
+        ("docs/rendering.md", []),
+        ("x.md", []),
+    ]
+
+
+def test_the_project_speaks_of_itself_alone():
+    elsewhere = re.compile(r"/work\b|\.\./shared|\bspec/|/tmp/", re.IGNORECASE)
+    for page in PAGES:
+        assert not elsewhere.search(page.read_text()), name_of(page)
+
+
+# Commands
+
+
+def commands() -> list[tuple[str, str]]:
+    """Every ``coliags`` command of README and docs: lines of shell blocks, and code in running text."""
+    found = []
+    for page in PAGES:
+        lines = [line for block in fenced(page, "sh") for line in block.splitlines()]
+        prose = re.sub(r"^ *```.*?^ *```$", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+        lines += re.findall(r"`(coliags [^`]+)`", prose)
+        found += [(name_of(page), line.strip()) for line in lines if re.match(r"(\w+=\S+ +)*coliags ", line.strip())]
+    return found
+
+
+def parsed(argv: list[str], monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The command that the command line would run, or None where it only shows help."""
+    caught = []
+    monkeypatch.setattr(cli, "run_command", lambda command: caught.append(command) or 0)
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(argv)
+    assert stopped.value.code == 0
+    return caught[0] if caught else None
+
+
+@pytest.mark.parametrize(("page", "command"), commands(), ids=lambda value: value.replace("/", "."))
+def test_commands_parse(page, command, monkeypatch, capsys):
+    words = shlex.split(command, comments=True)
+    argv = words[words.index("coliags") + 1 :]
+    if len(argv) == 1 and argv[0] in ("train", "eval", "render", "report", "phantom", "config"):
+        argv.append("--help")  # the subcommand's name alone, in running text
+    found = parsed(argv, monkeypatch)
+    if isinstance(found, (Train, Config)) and not found.method.endswith(".yaml"):
+        overrides = list(found.set)
+        assert load_method(found.method, overrides).config
+    if isinstance(found, Phantom):
+        made = []
+        monkeypatch.setattr("coliags_plugin.datamanagers.phantom.generate.generate", lambda *a, **k: made.append(a))
+        found.run()
+        assert made
+
+
+def test_there_are_commands_to_check():
+    assert {page for page, _ in commands()} >= {"README.md", "docs/data.md", "docs/phantom.md", "docs/configs.md"}
+    assert len(commands()) > 30
+
+
+# The tutorial
+
+
+def titled(language: str, name: str) -> str:
+    """The block of docs/configs.md that begins with ``# name``."""
+    (block,) = [block for block in fenced(DOCS / "configs.md", language) if block.startswith(f"# {name}\n")]
+    return block
+
+
+def test_the_tutorial_runs_as_written(tmp_path):
+    scene = write_wall(tmp_path / "SCENE")
+    for language, name in (("python", "opaque.py"), ("yaml", "coliags-opaque.yaml")):
+        (tmp_path / name).write_text(titled(language, name))
+    (shell,) = [block for block in fenced(DOCS / "configs.md", "sh") if "coliags-opaque.yaml" in block]
+    environment = dict(os.environ)
+    shown = []
+    for line in shell.splitlines():
+        words = shlex.split(line)
+        if words[0] == "export":
+            environment.update([words[1].split("=", maxsplit=1)])
+            continue
+        assert words.pop(0) == "coliags"
+        if words[0] == "train":
+            words += [part for override in SMALL for part in ("--set", override)]
+        run = [sys.executable, "-c", "from coliags_plugin.cli import main; main()", *words]
+        done = subprocess.run(
+            run, cwd=tmp_path, env=environment, check=False, capture_output=True, text=True, timeout=120
+        )
+        assert done.returncode == 0, done.stderr
+        shown.append(done.stdout)
+    assert "opaque" in shown[0]
+    last = json.loads((tmp_path / "RUN" / "metrics.jsonl").read_text().splitlines()[-1])
+    assert last["step"] == 2
+    assert 0.0 < last["terms"]["opaque"] < 0.99
+    assert yaml.safe_load((tmp_path / "RUN" / "config.yaml").read_text())["losses"]["opaque"]["floor"] == 0.99
+    assert (tmp_path / "RUN" / "eval" / "paper" / "metrics.json").is_file()
+    assert scene.is_dir()
+
+
+def test_yaml_examples_are_valid_methods(tmp_path):
+    examples = [block for block in fenced(DOCS / "configs.md", "yaml") if "opaque" not in block]
+    assert len(examples) == 2
+    for number, block in enumerate(examples):
+        (tmp_path / f"{number}.yaml").write_text(block)
+        assert load_method(str(tmp_path / f"{number}.yaml")).config
+
+
+# Tables
+
+
+def as_written(value: Any) -> str:
+    """A default as the tables write it."""
+    if isinstance(value, tuple):
+        value = list(value)
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+@pytest.mark.parametrize(
+    ("settings", "page", "header"),
+    [
+        (C3VDSettings, "data.md", "| option | default | values | what |"),
+        (PhantomSettings, "phantom.md", "| setting | default | range | what |"),
+    ],
+)
+def test_tables_of_options_are_complete_and_their_defaults_right(settings, page, header):
+    told = [(row[0], row[1]) for row in table_rows(page, header)]
+    assert told == [(name, as_written(field.default)) for name, field in settings.model_fields.items()]
+
+
+@pytest.mark.parametrize(
+    ("settings", "page", "header"),
+    [
+        (C3VDSettings, "data.md", "| option | default | values | what |"),
+        (PhantomSettings, "phantom.md", "| setting | default | range | what |"),
+    ],
+)
+def test_tables_of_options_tell_their_ranges(settings, page, header):
+    limits = {"ge", "le", "gt", "lt"}
+    for name, _, values, *_ in table_rows(page, header):
+        told = {float(number) for number in re.findall(r"\d+(?:\.\d+)?", values)}
+        metadata = settings.model_fields[name].metadata
+        for limit in metadata:
+            bounds = {getattr(limit, side) for side in limits if hasattr(limit, side)}
+            assert bounds <= told, f"{name}: {values} leaves out {bounds - told}"
+
+
+def test_the_table_of_presets_is_the_presets():
+    told = {row[0]: row[1:] for row in table_rows("phantom.md", "| | `c3vd`, the default | `strong` |")}
+    for column, name in enumerate(("c3vd", "strong")):
+        preset = PRESETS[name]
+        assert told["light_offset, mm"][column] == f"({', '.join(f'{value:g}' for value in preset.light_offset)})"
+        assert told["spread_law, spread"][column] == f"{preset.spread_law}, {preset.spread:g}"
+        for setting in ("vignetting", "white_balance_drift", "gain"):
+            assert told[setting][column] == f"{getattr(preset, setting)}".removesuffix(".0")
+        assert told["tilt, degrees"][column] == f"{preset.tilt:g}"
+        turns = ", ".join(f"{value:g}" for value in preset.turn)
+        assert told["yaw, pitch, roll of the pullback, degrees"][column] == turns
+        assert told["turn of the rotation path, degrees"][column] == f"{preset.scan:g}"
+        assert told["sideways, mm"][column] == f"{preset.wobble[0]:g} to {preset.wobble[1]:g}"
+
+
+def test_every_component_is_named_in_the_table_of_kinds():
+    told = {row[0]: set(row[1].split(", ")) for row in table_rows("configs.md", "| kind | names |")}
+    assert told.pop("renderers") == {"auto and what it may choose from"}
+    builtin = {
+        kind: {name for name in registry if registry.source(name) == "built in"}
+        for kind, registry in REGISTRIES.items()
+        if kind != "renderers"
+    }
+    assert told == builtin
+
+
+def test_every_key_of_a_method_is_in_the_table():
+    told = [row[0] for row in table_rows("configs.md", "| key | what |")]
+    assert sorted(told) == sorted(["base", *MethodConfig.model_fields])
+    options = [(row[0], row[1]) for row in table_rows("configs.md", "| option | default | what |")]
+    fields = OptimizerSettings.model_fields
+    assert options == [(key, "" if field.is_required() else as_written(field.default)) for key, field in fields.items()]
+    said = (DOCS / "configs.md").read_text()
+    for key, field in ScheduleSettings.model_fields.items():
+        assert re.search(rf"`{key}`\s+\({field.default}\b", said), key
+
+
+def test_rates_in_the_table_are_coliags():
+    told = table_rows("methods.md", "| group | rate | final rate | |")
+    rates = load_method("coliags").config.optimizers
+    assert [row[0] for row in told] == list(rates)
+    for name, rate, final, _ in told:
+        assert float(rate) == rates[name].lr
+        assert (float(final) if final else None) == rates[name].final_lr
+
+
+def test_outputs_purposes_and_exit_statuses_are_all_told():
+    assert [row[0] for row in table_rows("conventions.md", "| output | what |")] == list(OUTPUTS)
+    assert [row[0] for row in table_rows("conventions.md", "| purpose | decides |")] == list(PURPOSES)
+    assert [row[0] for row in table_rows("conventions.md", "| status | meaning |")] == ["0", "1", "2", "130"]
+
+
+def test_test_frames_of_the_sequences_are_counted_rightly():
+    rows = table_rows("data.md", "| sequence | frames | test | sequence | frames | test |")
+    counts = [tuple(map(int, row[at + 1 : at + 3])) for row in rows for at in (0, 3)]
+    assert len(counts) == 22
+    assert sum(frames for frames, _ in counts) == 10_015
+    for frames, test in counts:
+        assert held_out("every-8th", frames).sum() == test
+
+
+def test_protocols_page_names_every_protocol_metric_and_version():
+    page = (DOCS / "protocols.md").read_text()
+    for name in REGISTRIES["protocols"]:
+        assert f"`{name}` (version {REGISTRIES['protocols'].get(name).version})" in page
