@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -24,6 +24,8 @@ class Frame:
         depth: z-depth, mm; NaN where unknown. None where the dataset has none. [H, W]
         mask: False where a pixel is to be ignored. None means every pixel counts. [H, W]
         seen: For test views with ground-truth geometry: True where a training frame sees the same surface. [H, W]
+        depth_at_least: Where the depth sensor clipped, the z-depth it clipped at, mm: the surface lies there or beyond
+            and ``depth`` is NaN. NaN elsewhere; None where nothing is clipped. [H, W]
     """
 
     name: str
@@ -33,6 +35,7 @@ class Frame:
     depth: Float[Tensor, "H W"] | None = None
     mask: Bool[Tensor, "H W"] | None = None
     seen: Bool[Tensor, "H W"] | None = None
+    depth_at_least: Float[Tensor, "H W"] | None = None
 
     @property
     def rgb(self) -> Float[Tensor, "H W 3"]:
@@ -48,10 +51,9 @@ class Frame:
 
     def to(self, device: torch.device | str) -> Frame:
         """The same frame on another device."""
-        moved = [None if t is None else t.to(device) for t in (self.image, self.depth, self.mask, self.seen)]
-        image, depth, mask, seen = moved
-        assert image is not None  # for the type checker: the image is never None
-        return Frame(self.name, self.index, image, self.camera.to(device), depth, mask, seen)
+        tensors = {name: getattr(self, name) for name in ("depth", "depth_at_least", "mask", "seen")}
+        moved = {name: tensor.to(device) for name, tensor in tensors.items() if tensor is not None}
+        return replace(self, image=self.image.to(device), camera=self.camera.to(device), **moved)
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,8 @@ class C3VDSettings(Settings):
     lens: Literal["omnidirectional", "legacy-pinhole", "fisheye"] = Field(
         "omnidirectional",
         description="How raw frames are undistorted (pinhole frames need none): 'omnidirectional' rendered the ground "
-        "truth; 'legacy-pinhole' is behind most published numbers and off by degrees (docs/data.md 2); 'fisheye' is REIM-NeRF's.",
+        "truth; 'legacy-pinhole' is behind most published numbers and off by degrees (docs/data.md 2); "
+        "'fisheye' is REIM-NeRF's.",
     )
     focal_scale: float = Field(
         1.0,

@@ -16,6 +16,7 @@ from coliags_plugin.cameras import Camera
 from coliags_plugin.datamanagers.c3vd_layouts import Layout, read_intrinsics
 from coliags_plugin.datamanagers.c3vd_poses import Poses, read_poses
 from coliags_plugin.datamanagers.images import (
+    clipped_at,
     millimetres,
     read_depth_steps,
     read_mask,
@@ -177,12 +178,13 @@ class SequenceReader:
         path = self.layout.images[index]
         image = self._of_right_size(path, read_rgb(path))
         valid = self.view.valid
-        depth = None
+        depth = bound = None
         if self.layout.depths is not None:
             steps = self._of_right_size(self.layout.depths[index], read_depth_steps(self.layout.depths[index]))
-            depth = millimetres(self.view.nearest(steps))
+            steps = self.view.nearest(steps)
             if valid is not None:
-                depth[~valid] = np.nan
+                steps = np.where(valid, steps, 0).astype(steps.dtype)
+            depth, bound = millimetres(steps), clipped_at(steps)
         seen_mask = None if seen is None else self.view.nearest(self._of_right_size(seen, read_mask(seen)))
         return Frame(
             name=prefix + path.stem,
@@ -190,6 +192,7 @@ class SequenceReader:
             image=torch.from_numpy(self.view.image(image)),
             camera=self.view.camera(self.poses.camera_to_world[index]),
             depth=None if depth is None else torch.from_numpy(depth),
+            depth_at_least=None if bound is None else torch.from_numpy(bound),
             mask=None if valid is None else torch.from_numpy(valid),
             seen=None if seen_mask is None else torch.from_numpy(seen_mask),
         )

@@ -62,6 +62,13 @@ def millimetres(steps: UInt16[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
     return depth
 
 
+def clipped_at(steps: UInt16[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"] | None:
+    """The z-depth at which C3VD's 16 bits end, mm, where they do; NaN elsewhere. None where none did. [H, W]"""
+    _, far = DEPTH_INVALID
+    clipped = steps == far
+    return np.where(clipped, np.float32(far * DEPTH_MM_PER_STEP), np.float32(np.nan)) if clipped.any() else None
+
+
 def resize_rgb(image: UInt8[np.ndarray, "H W 3"], width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
     """A colour picture at another size: averaged over areas when it shrinks, bilinear when it grows."""
     if image.shape[:2] == (height, width):

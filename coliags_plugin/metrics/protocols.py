@@ -71,16 +71,15 @@ class AuthorsCodeProtocol(Protocol):
     """The figures the authors' released code prints (docs/methods.md 5.4): through PNG files, and without any mask.
 
     The rendered depth is 1 / (sum w/z), 100 mm where nothing was drawn, through 16 bit over 150 mm; the true depth goes
-    through 16 bit over 100 mm with unknown pixels at 0, against which the rendered ones are scored. Both wrap around
-    beyond their full scale. A sensor's clipped pixels, which the released code scores against 100 mm, are among the
-    unknown ones here if the data manager has made them so.
+    through 16 bit over 100 mm with unknown pixels at 0 and the sensor's clipped ones at its limit, against which the
+    rendered ones are scored. Both wrap around beyond their full scale.
     """
 
     name: ClassVar[str] = "authors-code"
     version: ClassVar[int] = 1
     description: ClassVar[str] = (
         "8-bit images; depth 1/(sum w/z) as 16 bit over 150 mm against truth as 16 bit over 100 mm, both wrapping "
-        "around; no mask, unknown true depth counts as 0. SSIM 11x11 sigma 1.5; LPIPS VGG fed [0, 1]."
+        "around; no mask, unknown true depth counts as 0, clipped true depth as its limit. SSIM 11x11 sigma 1.5; LPIPS VGG fed [0, 1]."
     )
     wants: ClassVar[frozenset[str]] = frozenset({"inverse_depth_accumulated"})
     metrics: ClassVar[MetricTable] = MappingProxyType(
@@ -106,7 +105,10 @@ class AuthorsCodeProtocol(Protocol):
             return image
         inverse = output["inverse_depth_accumulated"].detach()
         rendered = torch.where(inverse != 0, 1.0 / inverse, self.empty_depth)
-        known = torch.where(torch.isfinite(frame.depth), frame.depth, 0.0)
+        known = frame.depth
+        if frame.depth_at_least is not None:
+            known = torch.where(torch.isfinite(frame.depth_at_least), frame.depth_at_least, known)
+        known = torch.where(torch.isfinite(known), known, 0.0)
         return Comparison(
             image.rgb,
             image.true_rgb,

@@ -190,8 +190,11 @@ class TestRaw:
         steps = np.full((216, 270), 65535, np.uint16)
         steps[:, :135] = 30000
         cv2.imwrite(str(my_raw / "0001_depth.tiff"), steps)
-        depth = load(my_raw, width=90, height=72).train[0].depth
+        frame = load(my_raw, width=90, height=72).train[0]
+        depth, bound = frame.depth, frame.depth_at_least
         assert torch.isnan(depth[:, 60:]).all()
+        assert torch.isnan(bound[:, :30]).all()
+        torch.testing.assert_close(bound[:, 60:], torch.full((72, 30), 100.0))
         torch.testing.assert_close(depth[:, :30], torch.full((72, 30), 30000 * 100 / 65535))
 
     def test_other_files_of_the_release_are_left_alone(self, my_raw):

@@ -1,4 +1,5 @@
 import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -120,6 +121,15 @@ def test_authors_code_ignores_the_mask_and_scores_unknown_depth_against_zero(sce
     pixels = HEIGHT * WIDTH
     expected = ((pixels - 1) * (drawn - truth) ** 2 + drawn**2) / pixels
     assert score("authors-code", "depth_mse", comparison) == pytest.approx(expected, rel=1e-5)
+
+
+def test_authors_code_scores_clipped_depth_against_the_sensors_limit(scene):
+    output, frame = scene
+    bound = torch.full((HEIGHT, WIDTH), torch.nan)
+    bound[2, 3] = 100.0
+    comparison = protocol("authors-code").compare(output, replace(frame, depth_at_least=bound))
+    assert comparison.true_depth[2, 3] == 100.0
+    assert comparison.true_depth[0, 0] == pytest.approx(20.0, abs=0.0016)
 
 
 def test_authors_code_rounds_pictures_to_eight_bits(scene):

@@ -352,6 +352,18 @@ def broadcast(typingctx: Any, table: Any, index: Any) -> Any:
 
 
 @intrinsic
+def number(typingctx: Any, table: Any, index: Any) -> Any:
+    """``table[index]``, without asking whether the index counts from the end."""
+    if not _is_table(table):
+        return None
+
+    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+        return _read(builder, _address(context, builder, signature.args[0], *arguments, _FLOAT))
+
+    return types.float32(table, types.intp), generate
+
+
+@intrinsic
 def load_all(typingctx: Any, table: Any, index: Any, like: Any) -> Any:
     """As many vectors, one behind the other from ``table[index]`` on, as the tuple ``like`` is long."""
     if not (_is_table(table) and isinstance(like, types.BaseTuple)):
@@ -527,3 +539,15 @@ def lane(typingctx: Any, vector: Any, index: Any) -> Any:
         return builder.extract_element(*arguments)
 
     return types.float32(vector, types.intp), generate
+
+
+@intrinsic
+def lowest_bit(typingctx: Any, flags: Any) -> Any:
+    """Place of the lowest bit set in an integer that is not 0."""
+    if not isinstance(flags, types.Integer):
+        return None
+
+    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+        return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
+
+    return types.int64(types.int64), generate

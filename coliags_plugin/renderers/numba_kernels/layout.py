@@ -34,10 +34,8 @@ U_YY = 2
 MEAN_X = 3
 MEAN_Y = 4
 LOG2_OPACITY = 5
-COLOR = 6
-DEPTH = 9
-INVERSE_DEPTH = 10
-NORMAL = 11
+#: Colour, then as many of depth, inverse depth and the three components of the normal as are composited.
+CHANNELS = 6
 #: cov_xy / cov_xx and cov_xy / cov_yy: how the nearest point moves along an edge that is upright, or level.
 SLOPE_UPRIGHT = 14
 SLOPE_LEVEL = 15

@@ -65,6 +65,8 @@ def project(
     tail_opacities,
     tail_colors,
     view,
+    with_depth,
+    with_inverse_depth,
     with_normals,
     records,
     means2d,
@@ -84,7 +86,7 @@ def project(
         tail_means, tail_quats, tail_scales, tail_opacities, tail_colors: Those Gaussians that do not fill a group of
             sixteen, filled up with ones that are not drawn.
         view: See ``layout``.
-        with_normals: Whether normals are composited.
+        with_depth, with_inverse_depth, with_normals: What is composited besides colour.
         records: Out, see ``layout``. [16 rows for each group]
         means2d: Out, pixels. [2 for each Gaussian, groups filled up, like all that follow]
         depths: Out.
@@ -106,13 +108,13 @@ def project(
             first = parcel * per_parcel
             last = min(first + per_parcel, whole_groups)
             drawn_count, tile_count = _project_groups(
-                first, last, first, means, quats, scales, opacities, colors, view, with_normals, records, means2d,
-                depths, radii, bounds, drawn,
+                first, last, first, means, quats, scales, opacities, colors, view, with_depth, with_inverse_depth,
+                with_normals, records, means2d, depths, radii, bounds, drawn,
             )  # fmt: skip
             if last < min(first + per_parcel, groups) and drawn_count >= 0:
                 more, more_tiles = _project_groups(
                     last, last + 1, 0, tail_means, tail_quats, tail_scales, tail_opacities, tail_colors, view,
-                    with_normals, records, means2d, depths, radii, bounds, drawn,
+                    with_depth, with_inverse_depth, with_normals, records, means2d, depths, radii, bounds, drawn,
                 )  # fmt: skip
                 drawn_count = drawn_count + more if more >= 0 else -1
                 tile_count = tile_count + more_tiles
@@ -131,6 +133,8 @@ def _project_groups(
     opacities,
     colors,
     view,
+    with_depth,
+    with_inverse_depth,
     with_normals,
     records,
     means2d,
@@ -151,12 +155,12 @@ def _project_groups(
     last_row = floor(mul(bottom_edge, 1.0 / layout.TILE))
     low_pass = broadcast(view, layout.VIEW_LOW_PASS)
     for group in range(first, last):
-        row = 16 * (group - first + source)
-        mean = load_columns(means, 3 * row, three)
-        quat = load_columns(quats, 4 * row, (0, 0, 0, 0))
-        scale = load_columns(scales, 3 * row, three)
-        opacity = load(opacities, row)
-        color = load_columns(colors, 3 * row, three)
+        from_row = 16 * (group - first + source)
+        mean = load_columns(means, 3 * from_row, three)
+        quat = load_columns(quats, 4 * from_row, (0, 0, 0, 0))
+        scale = load_columns(scales, 3 * from_row, three)
+        opacity = load(opacities, from_row)
+        color = load_columns(colors, 3 * from_row, three)
         at = project_axes(mean, quat, view)
 
         # Zero times anything but a finite number is not a number.
@@ -208,14 +212,9 @@ def _project_groups(
         store(depths, 16 * group, at.z)
         drawn[group] = bits(shown)
         facing = _facing_normals(at, scale, view) if with_normals else (splat(0.0), splat(0.0), splat(0.0))
-        store_columns(
-            records,
-            16 * layout.ROW * group,
-            (
-                u_xx, u_yx, u_yy, mean_x, mean_y, log2_opacity, color[0], color[1], color[2], at.z, at.inverse_z,
-                facing[0], facing[1], facing[2], slope_upright, slope_level,
-            ),
-        )  # fmt: skip
+        channels = color + _extra_channels(at.z, at.inverse_z, facing, with_depth, with_inverse_depth)
+        row = (u_xx, u_yx, u_yy, mean_x, mean_y, log2_opacity) + channels + (slope_upright, slope_level)
+        store_columns(records, 16 * layout.ROW * group, row)
     return (drawn_count if usable else -1), tile_count
 
 
@@ -223,6 +222,18 @@ def _project_groups(
 def _tile(position, last):  # type: ignore[no-untyped-def]
     """Column or row of the tile at a position, clamped to those there are; finite whatever the position."""
     return larger(smaller(floor(mul(position, 1.0 / layout.TILE)), last), 0.0)
+
+
+@inline
+def _extra_channels(depth, inverse_depth, normal, with_depth, with_inverse_depth):  # type: ignore[no-untyped-def]
+    """What is composited besides colour, without gaps; what is behind that does not matter."""
+    if with_depth:
+        if with_inverse_depth:
+            return depth, inverse_depth, normal[0], normal[1], normal[2]
+        return depth, normal[0], normal[1], normal[2], splat(0.0)
+    if with_inverse_depth:
+        return inverse_depth, normal[0], normal[1], normal[2], splat(0.0)
+    return normal[0], normal[1], normal[2], splat(0.0), splat(0.0)
 
 
 @inline

@@ -37,7 +37,6 @@ from coliags_plugin.renderers.numba_kernels.lanes import (
 )
 from coliags_plugin.renderers.numba_kernels.threads import take
 from coliags_plugin.renderers.numba_kernels.tiles import (
-    CHANNELS,
     CHUNK,
     MEDIAN_DEPTH,
     OFFSET_E,
@@ -58,10 +57,11 @@ def sweep_forward(
     workers,
     counters,
     records,
+    depths,
     cells,
     starts,
     order,
-    channel_columns,
+    reached,
     channels,
     median,
     cuts,
@@ -82,10 +82,10 @@ def sweep_forward(
     Args:
         workers: Threads to share the work.
         counters: For sharing; entry 0 must be 0.
-        records, cells, starts: See ``layout`` and ``binning``.
+        records, depths, cells, starts: See ``layout`` and ``binning``.
         order: Tiles in the order they are begun in.
-        channel_columns: Which columns of ``records`` are composited, colour first.
-        channels: Any tuple of that length.
+        reached: Out: end of the entries of each tile that any pixel gets to see. [tiles]
+        channels: Any tuple as long as there are channels.
         median: A tuple with one element where the median depth is wanted, an empty one where it is not.
         cuts: log2(alpha_min), alpha_max, transmittance_min.
         background: RGB.
@@ -106,8 +106,8 @@ def sweep_forward(
             if place >= tiles:
                 break
             tile = order[place]
-            _sweep_tile(
-                tile, records, cells, starts[tile], starts[tile + 1], channel_columns, channels, median, cuts, columns,
+            reached[tile] = _sweep_tile(
+                tile, records, depths, cells, starts[tile], starts[tile + 1], channels, median, cuts, columns,
                 alpha.shape[1], alpha.shape[0], rows, state, blocks, listed,
             )  # fmt: skip
             _write_tile(
@@ -119,10 +119,10 @@ def sweep_forward(
 def _sweep_tile(
     tile,
     records,
+    depths,
     cells,
     first,
     last,
-    channel_columns,
     channels,
     median,
     cuts,
@@ -134,7 +134,11 @@ def _sweep_tile(
     blocks,
     listed,
 ):  # type: ignore[no-untyped-def]
-    """Sweep through one tile's entries ``first`` to ``last``; leaves its pixels in ``state``."""
+    """Sweep through one tile's entries ``first`` to ``last``; leaves its pixels in ``state``.
+
+    Returns:
+        Where it stopped.
+    """
     corner_x, corner_y = tile_corner(tile, columns)
     alive = 0
     for block in range(layout.BLOCKS):
@@ -151,8 +155,8 @@ def _sweep_tile(
     while first < last and alive:
         end = min(first + CHUNK, last)
         touched = fetch_chunk(
-            first, end, alive, cells, records, channel_columns, np.float32(corner_x + half),
-            np.float32(corner_y + half), 0, rows, blocks,
+            first, end, alive, cells, records, depths, np.float32(corner_x + half),
+            np.float32(corner_y + half), rows, blocks,
         )  # fmt: skip
         for block in range(layout.BLOCKS):
             if touched >> block & 1:
@@ -163,6 +167,7 @@ def _sweep_tile(
                 if not _sweep_block(block, count, listed, rows, channels, median, cuts, state):
                     alive &= ~(1 << block)
         first = end
+    return first
 
 
 @part
@@ -193,7 +198,7 @@ def _sweep_block(block, count, listed, rows, channels, median, cuts, state):  # 
         drawn = at_least(behind, transmittance_min)
         weight = select(drawn, mul(alpha, transmittance), 0.0)
         alpha_sum = add(alpha_sum, weight)
-        sums = fma(weight, broadcast_all(rows, row + CHANNELS, channels), sums)
+        sums = fma(weight, broadcast_all(rows, row + layout.CHANNELS, channels), sums)
         if len(median) > 0:
             crosses = both(both(drawn, greater(transmittance, 0.5)), at_most(behind, 0.5))
             medians = select(crosses, broadcast_all(rows, row + MEDIAN_DEPTH, median), medians)

@@ -4,34 +4,32 @@ from __future__ import annotations
 
 from coliags_plugin.renderers.numba_kernels import layout
 from coliags_plugin.renderers.numba_kernels.compilation import inline, part
+from coliags_plugin.renderers.numba_kernels.lanes import load, number, store
 
 #: Entries of a tile fetched at a time: their rows fit into the first-level cache beside the blocks' state.
 CHUNK = 128
 
-# Columns of a fetched row: the whitening and log2(opacity) where ``records`` has them, and with (x, y) counted from the
-# middle of the tile e = U_XX x + OFFSET_E and f = U_YX x + U_YY y + OFFSET_F.
+# A fetched row is one of ``records`` with other columns where those hold the centre, and the slopes: with (x, y) counted
+# from the middle of the tile e = U_XX x + OFFSET_E and f = U_YX x + U_YY y + OFFSET_F.
 OFFSET_E = layout.MEAN_X
 OFFSET_F = layout.MEAN_Y
-CHANNELS = layout.COLOR
-MEDIAN_DEPTH = CHANNELS + layout.MAX_CHANNELS
+MEDIAN_DEPTH = layout.SLOPE_UPRIGHT
 
 
 @part
-def fetch_chunk(first, last, alive, cells, records, channel_columns, middle_x, middle_y, at, rows, blocks):  # type: ignore[no-untyped-def]
+def fetch_chunk(first, last, alive, cells, records, depths, middle_x, middle_y, rows, blocks):  # type: ignore[no-untyped-def]
     """Fetch entries ``first`` to ``last`` of a tile.
 
     Args:
         first, last: Among ``cells``.
         alive: Blocks that still let light through, one bit each.
-        cells, records: See ``layout``.
-        channel_columns: Which columns of ``records`` are composited.
+        cells, records, depths: See ``layout``.
         middle_x, middle_y: Middle of the tile, pixels.
-        at: Where to write in ``rows``.
         rows: Out. [16 for each entry]
         blocks: Out: those of the alive blocks that the entry touches.
 
     Returns:
-        Whether there are any.
+        All blocks that any of the entries touches.
     """
     touched = 0
     for entry in range(first, last):
@@ -39,19 +37,14 @@ def fetch_chunk(first, last, alive, cells, records, channel_columns, middle_x, m
         blocks[entry - first] = mine
         touched |= mine
         if mine:
-            source = layout.ROW * cells[2 * entry]
-            target = at + layout.ROW * (entry - first)
-            u_xx, u_yx, u_yy = records[source], records[source + 1], records[source + 2]
-            x, y = records[source + layout.MEAN_X] - middle_x, records[source + layout.MEAN_Y] - middle_y
-            rows[target] = u_xx
-            rows[target + 1] = u_yx
-            rows[target + 2] = u_yy
-            rows[target + OFFSET_E] = -u_xx * x
-            rows[target + OFFSET_F] = -(u_yx * x + u_yy * y)
-            rows[target + layout.LOG2_OPACITY] = records[source + layout.LOG2_OPACITY]
-            for channel in range(len(channel_columns)):
-                rows[target + CHANNELS + channel] = records[source + channel_columns[channel]]
-            rows[target + MEDIAN_DEPTH] = records[source + layout.DEPTH]
+            index = cells[2 * entry]
+            source, target = layout.ROW * index, layout.ROW * (entry - first)
+            store(rows, target, load(records, source))
+            x, y = number(records, source + layout.MEAN_X) - middle_x, number(records, source + layout.MEAN_Y) - middle_y
+            turned = number(records, source + layout.U_YX) * x + number(records, source + layout.U_YY) * y
+            rows[target + OFFSET_E] = -number(records, source + layout.U_XX) * x
+            rows[target + OFFSET_F] = -turned
+            rows[target + MEDIAN_DEPTH] = number(depths, index)
     return touched
 
 
