@@ -113,7 +113,7 @@ class Trainer:
             self.run.log_file.open("a", encoding="utf-8") as log,
         ):
             while self.step < self.steps:
-                row = self._train_step()
+                row = self.take_step()
                 self.seconds = time.monotonic() - began
                 if self.step % schedule.log_every == 0 or self.step == self.steps:
                     log.write(json.dumps({**row, "seconds": round(self.seconds, 3)}, allow_nan=False) + "\n")
@@ -125,6 +125,37 @@ class Trainer:
                 if stop and self.step < self.steps:
                     where = f"--output {self.run.path} --resume"
                     raise InterruptedRunError(f"stopped after step {self.step}, which is saved; go on with {where}")
+
+    def take_step(self) -> dict[str, Any]:
+        """Train on the next frame.
+
+        Returns:
+            The row of the log: step, loss, terms, PSNR of this view in dB, what was drawn, what the strategy did.
+
+        Raises:
+            NotFiniteError: A loss term is NaN or infinite.
+        """
+        step = self.step + 1
+        frame = self.scene.train[self.order.next()].to(self.device)
+        output = self.chosen.renderer.render(self.field, frame.camera, self.wants)
+        terms = {key: loss(output, frame) for key, loss in self.losses.items()}
+        weights = {key: loss.settings.weight_at(step, self.steps) for key, loss in self.losses.items()}
+        self._check_finite(terms, step, frame)
+        total = torch.stack([weights[key] * term for key, term in terms.items()]).sum()
+        if total.requires_grad:
+            torch.autograd.backward(total)
+        done = self.strategy.after_backward(step, self.field, self.optimizers.adam, output)
+        self.optimizers.step(step)
+        self.step = step
+        return {
+            "step": step,
+            "loss": total.item(),
+            "terms": {key: term.item() for key, term in terms.items()},
+            "psnr": _psnr(output, frame),
+            "gaussians": len(output.gaussians),
+            "visible": len(output.gaussians.visible_sources),
+            **done,
+        }
 
     def save(self) -> None:
         """Write a checkpoint of the current step."""
@@ -157,29 +188,6 @@ class Trainer:
                 "points": len(self.scene.points),
                 "provenance": self.scene.provenance,
             },
-        }
-
-    def _train_step(self) -> dict[str, Any]:
-        step = self.step + 1
-        frame = self.scene.train[self.order.next()].to(self.device)
-        output = self.chosen.renderer.render(self.field, frame.camera, self.wants)
-        terms = {key: loss(output, frame) for key, loss in self.losses.items()}
-        weights = {key: loss.settings.weight_at(step, self.steps) for key, loss in self.losses.items()}
-        self._check_finite(terms, step, frame)
-        total = torch.stack([weights[key] * term for key, term in terms.items()]).sum()
-        if total.requires_grad:
-            torch.autograd.backward(total)
-        done = self.strategy.after_backward(step, self.field, self.optimizers.adam, output)
-        self.optimizers.step(step)
-        self.step = step
-        return {
-            "step": step,
-            "loss": total.item(),
-            "terms": {key: term.item() for key, term in terms.items()},
-            "psnr": _psnr(output, frame),
-            "gaussians": len(output.gaussians),
-            "visible": len(output.gaussians.visible_sources),
-            **done,
         }
 
     def _check_finite(self, terms: dict[str, Tensor], step: int, frame: Frame) -> None:

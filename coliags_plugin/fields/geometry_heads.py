@@ -51,8 +51,12 @@ class PlainGeometryHead(nn.Module):
             quaternion components (w first) per child [V, K, 7].
         """
         seen = torch.cat([features, self.embed(directions)], dim=1)
-        covariances = self.covariance_mlp(seen).view(len(seen), self.children_per_anchor, 7)
-        return self.opacity_mlp(seen).tanh(), covariances
+        # Both perceptrons read the same input: one product for both first layers.
+        first: list[Any] = [self.opacity_mlp[0], self.covariance_mlp[0]]
+        weight, bias = torch.cat([layer.weight for layer in first]), torch.cat([layer.bias for layer in first])
+        opacity_hidden, covariance_hidden = nn.functional.linear(seen, weight, bias).relu().chunk(2, dim=1)
+        covariances = self.covariance_mlp[2](covariance_hidden).view(len(seen), self.children_per_anchor, 7)
+        return self.opacity_mlp[2](opacity_hidden).tanh(), covariances
 
 
 class IMVEGeometrySettings(PlainGeometrySettings):

@@ -114,7 +114,7 @@ def test_resume_forgets_rows_after_the_checkpoint(tmp_path):
 
 def _stop_after(trainer, steps):
     """A real SIGINT while a step is in hand."""
-    take = trainer._train_step
+    take = trainer.take_step
 
     def step():
         row = take()
@@ -122,20 +122,20 @@ def _stop_after(trainer, steps):
             os.kill(os.getpid(), signal.SIGINT)
         return row
 
-    trainer._train_step = step
+    trainer.take_step = step
 
 
 def test_a_second_interrupt_does_not_wait(tmp_path):
     trainer = make_trainer(tmp_path / "run")
     trainer.start()
-    take = trainer._train_step
+    take = trainer.take_step
 
     def step():
         os.kill(os.getpid(), signal.SIGINT)
         os.kill(os.getpid(), signal.SIGINT)
         return take()
 
-    trainer._train_step = step
+    trainer.take_step = step
     with pytest.raises(KeyboardInterrupt):
         trainer.train()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -1,0 +1,77 @@
+"""Peak memory of training, each case in a process of its own.
+
+python benchmarks/memory.py --anchors 20000,100000 --renderers torch,cpu --json FILE
+"""
+
+from __future__ import annotations
+
+import resource
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+import tyro
+from machine import describe_machine, markdown_table, write_results
+
+MIB = 1024.0
+
+
+@dataclass(frozen=True)
+class Options:
+    """Measure the peak memory of a few training steps."""
+
+    anchors: str = "20000,100000"
+    """Numbers of anchors, comma separated."""
+    renderers: str = "torch"
+    """Renderers by name, comma separated."""
+    steps: int = 4
+    """Training steps."""
+    size: str = "338x270"
+    """Image size WxH, pixels."""
+    json: Path | None = None
+    """Also write the rows here."""
+    child: bool = False
+    """Measure one case in this process and print it; what the benchmark starts itself."""
+
+
+def train(options: Options) -> tuple[float, float]:
+    """Resident memory before the first step and at the peak, MiB."""
+    from tube import tube_scene
+
+    from coliags_plugin.config import load_method
+    from coliags_plugin.engine.run_folder import RunFolder
+    from coliags_plugin.engine.trainer import Trainer
+
+    width, height = (int(part) for part in options.size.split("x"))
+    scene = tube_scene(int(options.anchors), frames=4, width=width, height=height)
+    method = load_method("coliags", [f"renderer.name={options.renderers}", "field.voxel_size=0.01"])
+    trainer = Trainer(method, scene, "tube", RunFolder(Path(tempfile.gettempdir())), 0, torch.device("cpu"))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / MIB
+    for _ in range(options.steps):
+        trainer.take_step()
+    return before, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / MIB
+
+
+def main(options: Options) -> None:
+    """Run, print a table, and write JSON where asked."""
+    if options.child:
+        print(*train(options))
+        return
+    rows = []
+    for anchors in options.anchors.split(","):
+        for renderer in options.renderers.split(","):
+            case = ["--anchors", anchors, "--renderers", renderer, "--steps", str(options.steps)]
+            command = [sys.executable, __file__, "--child", *case, "--size", options.size]
+            printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
+            before, peak = map(float, printed[-2:])
+            rows.append({"renderer": renderer, "anchors": int(anchors), "before_mib": before, "peak_mib": peak})
+    print(", ".join(f"{key}: {value}" for key, value in describe_machine().items()), end="\n\n")
+    print(markdown_table(rows))
+    write_results(options.json, rows)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
