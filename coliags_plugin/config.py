@@ -41,7 +41,7 @@ class MethodConfig(Settings):
     field: FieldNode
     renderer: RendererNode
     strategy: StrategyNode
-    losses: dict[str, LossNode]
+    losses: dict[str, LossNode] = Field(min_length=1)
     optimizers: dict[str, OptimizerSettings]
     schedule: ScheduleSettings = ScheduleSettings()
     protocol: str = "paper"

@@ -126,6 +126,7 @@ def test_bases_may_be_paths_beside_the_file(method_file):
         ("base: mine.yaml\n", ["inherit from each other"]),
         ("base: 3\n", ["mine.yaml:1", "base is 3"]),
         ("description: lonely\n", ["datamanager: is missing"]),
+        ("base: scaffold-gs\nlosses: {l1: null, d-ssim: null, scale-volume: null}\n", ["losses", "at least 1 item"]),
         ("base: coliags\nlosses: 3\n", ["mine.yaml:2", "losses"]),
     ],
 )

@@ -65,11 +65,10 @@ def choose_renderer(component: Component, primitive: str, device: torch.device) 
 def _obstacle(component: Component, primitive: str, device: torch.device) -> str:
     """Why a renderer cannot serve, or an empty string."""
     renderer = component.target
-    available = renderer.availability()
-    if not available.ok:
-        return f"cannot run here: {available.reason}"
     if primitive not in renderer.primitives:
         return f"draws {', '.join(sorted(renderer.primitives))}, the field is made of {primitive}"
     if device.type not in renderer.devices:
         return f"runs on {', '.join(sorted(renderer.devices))}, the device is {device.type}"
-    return ""
+    # Last, because finding out may compile something.
+    available = renderer.availability()
+    return "" if available.ok else f"cannot run here: {available.reason}"

@@ -26,9 +26,13 @@ from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.errors import InputError, InterruptedRunError, NotFiniteError
 from coliags_plugin.files import atomic_write
 from coliags_plugin.gaussians import RenderOutput
+from coliags_plugin.masked import masked_mean
 from coliags_plugin.scenes import Frame, Scene
 
 logger = logging.getLogger(__name__)
+
+#: So that the PSNR of a perfect view stays a number, dB.
+MAX_PSNR = 100.0
 
 
 class Trainer:
@@ -58,6 +62,7 @@ class Trainer:
         self.wants = self._wanted_outputs()
         self._check_depth()
         self.generators = generators(seed)
+        self.frames = _resident(scene.train, device)
         self.order = FrameOrder(len(scene.train), self.generators["frame_order"])
         self.strategy = config.strategy.target(config.strategy.settings, self.generators["densification"])
         self.field: Field = config.field.target.from_scene(
@@ -136,12 +141,14 @@ class Trainer:
             NotFiniteError: A loss term is NaN or infinite.
         """
         step = self.step + 1
-        frame = self.scene.train[self.order.next()].to(self.device)
+        frame = self.frames[self.order.next()].to(self.device)
         output = self.chosen.renderer.render(self.field, frame.camera, self.wants)
         terms = {key: loss(output, frame) for key, loss in self.losses.items()}
         weights = {key: loss.settings.weight_at(step, self.steps) for key, loss in self.losses.items()}
-        self._check_finite(terms, step, frame)
         total = torch.stack([weights[key] * term for key, term in terms.items()]).sum()
+        # Everything the log and the check need, in one wait for the device.
+        loss, error, *values = torch.stack([total, _squared_error(output, frame), *terms.values()]).tolist()
+        self._check_finite(dict(zip(terms, values, strict=True)), step, frame)
         if total.requires_grad:
             torch.autograd.backward(total)
         done = self.strategy.after_backward(step, self.field, self.optimizers.adam, output)
@@ -149,9 +156,9 @@ class Trainer:
         self.step = step
         return {
             "step": step,
-            "loss": total.item(),
-            "terms": {key: term.item() for key, term in terms.items()},
-            "psnr": _psnr(output, frame),
+            "loss": loss,
+            "terms": dict(zip(terms, values, strict=True)),
+            "psnr": min(MAX_PSNR, -10.0 * math.log10(max(error, 1e-30))),
             "gaussians": len(output.gaussians),
             "visible": len(output.gaussians.visible_sources),
             **done,
@@ -190,11 +197,11 @@ class Trainer:
             },
         }
 
-    def _check_finite(self, terms: dict[str, Tensor], step: int, frame: Frame) -> None:
+    def _check_finite(self, terms: dict[str, float], step: int, frame: Frame) -> None:
         for key, term in terms.items():
-            if not bool(torch.isfinite(term)):
+            if not math.isfinite(term):
                 raise NotFiniteError(
-                    f"step {step}, frame {frame.name}: loss term '{key}' is {term.item()}. "
+                    f"step {step}, frame {frame.name}: loss term '{key}' is {term}. "
                     "The last checkpoint is whole; look for too large a learning rate or damaged data in that frame."
                 )
 
@@ -258,10 +265,21 @@ def _logged_step(row: str) -> float:
 
 
 @torch.no_grad()
-def _psnr(output: RenderOutput, frame: Frame) -> float:
-    """Of this training view, dB; capped at 100 so that a perfect view stays a number."""
-    error = (output.rgb - frame.rgb)[frame.valid].square().mean()
-    return min(100.0, -10.0 * math.log10(max(float(error), 1e-10)))
+def _squared_error(output: RenderOutput, frame: Frame) -> Tensor:
+    """Mean squared colour error of this training view. []"""
+    return masked_mean((output.rgb - frame.rgb).square(), frame.mask)
+
+
+def _resident(frames: list[Frame], device: torch.device) -> list[Frame]:
+    """The frames on the device where they fill at most half of its free memory; else where they are.
+
+    Images stay uint8 there too.
+    """
+    if device.type != "cuda":
+        return frames
+    tensors = [(f.image, f.depth, f.depth_at_least, f.mask, f.seen) for f in frames]
+    size = sum(tensor.nbytes for group in tensors for tensor in group if tensor is not None)
+    return [frame.to(device) for frame in frames] if size < torch.cuda.mem_get_info(device)[0] / 2 else frames
 
 
 @contextmanager

@@ -79,7 +79,8 @@ class AuthorsCodeProtocol(Protocol):
     version: ClassVar[int] = 1
     description: ClassVar[str] = (
         "8-bit images; depth 1/(sum w/z) as 16 bit over 150 mm against truth as 16 bit over 100 mm, both wrapping "
-        "around; no mask, unknown true depth counts as 0, clipped true depth as its limit. SSIM 11x11 sigma 1.5; LPIPS VGG fed [0, 1]."
+        "around; no mask, unknown true depth counts as 0, clipped true depth as its limit. SSIM 11x11 sigma 1.5; "
+        "LPIPS VGG fed [0, 1]."
     )
     wants: ClassVar[frozenset[str]] = frozenset({"inverse_depth_accumulated"})
     metrics: ClassVar[MetricTable] = MappingProxyType(

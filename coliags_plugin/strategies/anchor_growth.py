@@ -76,6 +76,9 @@ class AnchorGrowth(Strategy):
         """Make room for anchors that have no counters yet."""
         for name, per_anchor in (("opacity_sum", 1), ("seen", 1), ("gradient_sum", children), ("drawn", children)):
             old = getattr(self, name).to(device)
+            if len(old) == anchors * per_anchor:
+                setattr(self, name, old)
+                continue
             setattr(self, name, torch.cat([old, old.new_zeros(anchors * per_anchor - len(old))]))
 
     def _count(self, output: RenderOutput, children: int) -> None:
@@ -87,10 +90,11 @@ class AnchorGrowth(Strategy):
             return
         height, width = output.alpha.shape
         # In units of half the image, as the thresholds of the lineage are (docs/methods.md 4.3).
-        lengths = (gradient * gradient.new_tensor([0.5 * width, 0.5 * height])).norm(dim=1)
+        lengths = torch.hypot(0.5 * width * gradient[:, 0], 0.5 * height * gradient[:, 1])
         drawn = output.radii > 0
-        self.gradient_sum.index_add_(0, gaussians.source_index[drawn], lengths[drawn])
-        self.drawn[gaussians.source_index[drawn]] += 1
+        # Masks rather than selections: a selection's size would have to come back from a GPU first.
+        self.gradient_sum.index_add_(0, gaussians.source_index, torch.where(drawn, lengths, 0.0))
+        self.drawn.index_add_(0, gaussians.source_index, drawn.to(self.drawn.dtype))
 
     def _grow(self, field: Any, optimizers: Mapping[str, torch.optim.Optimizer], children: int) -> int:
         options = self.settings

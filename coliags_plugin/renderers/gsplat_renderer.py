@@ -1,0 +1,367 @@
+"""The torch renderer's contract through the CUDA kernels of gsplat (Apache-2.0).
+
+What differs from the definition is listed in ``docs/rendering.md``, section "The gsplat backend".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import ModuleType
+from typing import ClassVar
+
+import pydantic
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from coliags_plugin.cameras import Camera
+from coliags_plugin.contracts import Availability, Field, Renderer
+from coliags_plugin.errors import InputError, did_you_mean
+from coliags_plugin.gaussians import OUTPUTS, Gaussians, RenderOutput
+from coliags_plugin.renderers import gsplat_library
+from coliags_plugin.renderers.projection import rotation_matrices
+from coliags_plugin.renderers.torch_renderer import TorchRendererSettings, render_gaussians
+from coliags_plugin.settings import Settings
+
+#: Edge of gsplat's tiles, pixels: the one size it is tested with.
+_TILE_SIZE = 16
+#: What each output beyond rgb and alpha needs composited or read off.
+_NEEDS = {
+    "depth_accumulated": "depth",
+    "depth_expected": "depth",
+    "depth_median": "median",
+    "inverse_depth_accumulated": "inverse_depth",
+    "normals": "normal",
+}
+
+
+class GsplatRendererSettings(Settings):
+    """Options of :class:`GsplatRenderer`. gsplat's other constants are fixed (docs/rendering.md)."""
+
+    near: float = pydantic.Field(default=0.2, ge=0)
+    """Gaussians with a centre at z < near are not drawn. Scene units."""
+    low_pass: float = pydantic.Field(default=0.3, gt=0)
+    """Added to the diagonal of every 2D covariance. Square pixels. Surfels have gsplat's own filter instead."""
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """RGB behind everything."""
+
+
+class GsplatRenderer(Renderer):
+    """Splats 3D Gaussians and surfels on CUDA, in float32. See ``docs/rendering.md``."""
+
+    Settings = GsplatRendererSettings
+    primitives: ClassVar[frozenset[str]] = frozenset({"gaussians3d", "surfels"})
+    outputs: ClassVar[frozenset[str]] = frozenset(OUTPUTS)
+    devices: ClassVar[frozenset[str]] = frozenset({"cuda"})
+
+    settings: GsplatRendererSettings
+
+    @classmethod
+    def availability(cls) -> Availability:
+        """Where there is a CUDA device and gsplat's kernels work on it, tried once per process."""
+        return gsplat_library.availability()
+
+    def render(
+        self,
+        field: Field,
+        camera: Camera,
+        wants: Sequence[str] = ("rgb", "alpha"),
+        pixels: Tensor | None = None,
+    ) -> RenderOutput:
+        """Render one view.
+
+        Args:
+            field: A field of 3D Gaussians or surfels, float32 on a CUDA device.
+            camera: Where from.
+            wants: Names from :data:`coliags_plugin.gaussians.OUTPUTS`; rgb and alpha always come.
+            pixels: Must be None: a splatting renderer draws whole images.
+
+        Raises:
+            InputError: ``pixels`` is given, an output is unknown, the field holds neither 3D Gaussians nor surfels, or
+                is not float32 on a CUDA device; or gsplat cannot be used here.
+        """
+        if pixels is not None:
+            raise InputError(
+                "the gsplat renderer was asked for single pixels",
+                "whole images: it splats",
+                "Leave pixels out, or choose a renderer of radiance fields",
+            )
+        if field.primitive not in self.primitives:
+            raise InputError(
+                f"a field of '{field.primitive}' for the gsplat renderer",
+                f"one of {', '.join(sorted(self.primitives))}",
+                "Choose another renderer or another field",
+            )
+        gaussians = field.gaussians(camera)
+        if gaussians.means.device.type not in self.devices:
+            raise InputError(
+                f"Gaussians on {gaussians.means.device.type} for the gsplat renderer",
+                f"Gaussians on {', '.join(sorted(self.devices))}",
+                "Move the field there, or choose renderer 'auto'",
+            )
+        return render_with_gsplat(gaussians, camera, wants, self.settings)
+
+
+def render_with_gsplat(
+    gaussians: Gaussians,
+    camera: Camera,
+    wants: Sequence[str] = ("rgb", "alpha"),
+    settings: GsplatRendererSettings | None = None,
+) -> RenderOutput:
+    """Render Gaussians, or surfels where they have two scales, as the camera sees them.
+
+    Everything but ``depth_median`` and ``radii`` is differentiable, once, in the Gaussians and in
+    ``camera.camera_to_world``; ``means2d.grad`` is there after ``backward``.
+
+    Args:
+        gaussians: float32, on a CUDA device.
+        camera: Where from; its pose is cast to the Gaussians' dtype and device.
+        wants: Names from :data:`coliags_plugin.gaussians.OUTPUTS`; rgb and alpha always come.
+        settings: The defaults where None.
+
+    Raises:
+        InputError: An output is unknown, the Gaussians are not float32, or gsplat cannot be used here.
+    """
+    settings = settings or GsplatRendererSettings()
+    for name in wants:
+        if name not in OUTPUTS:
+            raise InputError(
+                f"no renderer output '{name}'", f"some of {', '.join(OUTPUTS)}", did_you_mean(name, OUTPUTS)
+            )
+    if gaussians.means.dtype != torch.float32:
+        raise InputError(
+            f"Gaussians of {gaussians.means.dtype} for the gsplat renderer",
+            "float32: its kernels know nothing else",
+            "Convert the field, or choose renderer 'torch'",
+        )
+    needs = {_NEEDS[name] for name in wants if name in _NEEDS}
+    camera = camera.to(gaussians.means.device, gaussians.means.dtype)
+    # gsplat 1.5 divides by the number of Gaussians, and the process dies of it.
+    draw = _draw_nothing if len(gaussians) == 0 else _draw_surfels if _are_surfels(gaussians) else _draw_gaussians
+    drawn = draw(gaussians, camera, needs, settings)
+    maps = {}
+    for name in wants:
+        if name == "depth_expected":
+            covered = drawn.alpha > 0
+            depth = drawn.sums["depth"] / torch.where(covered, drawn.alpha, 1.0)
+            maps[name] = torch.where(covered, depth, 0.0)
+        elif name in _NEEDS:
+            maps[name] = drawn.sums[_NEEDS[name]]
+    return RenderOutput(drawn.rgb, drawn.alpha, drawn.means2d, drawn.radii, gaussians, maps)
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """One view, before it is sorted into outputs.
+
+    Attributes:
+        rgb: Over the background. [H, W, 3]
+        alpha: [H, W]
+        sums: At least what was needed beyond those, by the names in ``_NEEDS``. [H, W] or [H, W, 3]
+        means2d: Retains its gradient; 0 where not drawn. [N, 2]
+        radii: [N]
+    """
+
+    rgb: Float[Tensor, "H W 3"]
+    alpha: Float[Tensor, "H W"]
+    sums: dict[str, Tensor]
+    means2d: Float[Tensor, "N 2"]
+    radii: Float[Tensor, "N"]
+
+
+def _draw_gaussians(gaussians: Gaussians, camera: Camera, needs: set[str], settings: GsplatRendererSettings) -> _Drawn:
+    """3D Gaussians: one projection, one pass of compositing for all outputs."""
+    library = gsplat_library.load()
+    sight, view, intrinsics = _view(gaussians, camera)
+    size = (camera.width, camera.height)
+    radii, means2d, depths, conics, _ = library.fully_fused_projection(
+        sight,
+        None,
+        gaussians.quats_wxyz,
+        gaussians.scales,
+        view[None],
+        intrinsics[None],
+        *size,
+        eps2d=settings.low_pass,
+        near_plane=settings.near,
+        opacities=gaussians.opacities,
+    )
+    # Of what is not drawn gsplat leaves everything but the radii uninitialised.
+    visible = (radii[0] > 0).all(-1)
+    means2d = _retaining(torch.where(visible[:, None], means2d[0], 0.0))
+    depths = torch.where(visible, depths[0], 1.0)
+    parts = {"color": gaussians.colors}
+    if "depth" in needs:
+        parts["depth"] = depths[:, None]
+    if "inverse_depth" in needs:
+        parts["inverse_depth"] = depths.reciprocal()[:, None]
+    if "normal" in needs:
+        parts["normal"] = _facing_normals(gaussians, sight, camera)
+    features = torch.cat(list(parts.values()), dim=-1)
+    image, alpha = library.rasterize_to_pixels(
+        means2d[None],
+        conics,
+        features[None],
+        gaussians.opacities[None],
+        *size,
+        _TILE_SIZE,
+        *_tiles(library, means2d, radii, depths, size),
+        backgrounds=_backgrounds(features, settings),
+    )
+    sums = _split(image[0], parts)
+    if "median" in needs:
+        sums["median"] = _median_by_definition(gaussians, camera, settings)
+    return _Drawn(sums["color"], alpha[0, ..., 0], sums, means2d, _largest(radii[0], visible, means2d))
+
+
+def _draw_surfels(gaussians: Gaussians, camera: Camera, needs: set[str], settings: GsplatRendererSettings) -> _Drawn:
+    """Surfels, by gsplat's rendition of 2D Gaussian splatting."""
+    library = gsplat_library.load()
+    sight, view, intrinsics = _view(gaussians, camera)
+    size = (camera.width, camera.height)
+    thickness = torch.ones_like(gaussians.scales[:, :1])  # asked for, and not used
+    radii, boxes, depths, transforms, normals = library.fully_fused_projection_2dgs(
+        sight,
+        gaussians.quats_wxyz,
+        torch.cat([gaussians.scales, thickness], dim=-1),
+        view[None],
+        intrinsics[None],
+        *size,
+        near_plane=settings.near,
+    )
+    # Of what is not drawn gsplat leaves everything but the radii uninitialised.
+    visible = (radii[0] > 0).all(-1)
+    depths = torch.where(visible, depths[0], 1.0)
+    means2d, boxes, transforms = _pass_through_centers(
+        torch.where(visible[:, None], boxes[0], 0.0), torch.where(visible[:, None, None], transforms[0], 1.0)
+    )
+    parts = {"color": gaussians.colors}
+    if "inverse_depth" in needs:
+        parts["inverse_depth"] = depths.reciprocal()[:, None]
+    if needs & {"depth", "median"}:
+        if "inverse_depth" in needs:
+            # gsplat would fill five channels up to eight with uninitialised memory, of which a NaN would spread into
+            # the gradients.
+            parts["filling"] = depths.new_zeros(len(depths), 3)
+        parts["depth"] = depths[:, None]  # the last channel: gsplat reads the median off it
+    features = torch.cat(list(parts.values()), dim=-1)
+    image, alpha, normals, _, medians = library.rasterize_to_pixels_2dgs(
+        boxes[None],
+        transforms[None],
+        features[None],
+        gaussians.opacities[None],
+        normals,
+        torch.zeros_like(boxes)[None],
+        *size,
+        _TILE_SIZE,
+        *_tiles(library, boxes, radii, depths, size),
+        backgrounds=_backgrounds(features, settings),
+    )
+    alpha = alpha[0, ..., 0]
+    sums = _split(image[0], parts)
+    sums["normal"] = normals[0]
+    # Where more than half of the light is left at the end, gsplat's median is the last surfel's depth.
+    sums["median"] = torch.where(alpha >= 0.5, medians[0, ..., 0], 0.0).detach()
+    return _Drawn(sums["color"], alpha, sums, means2d, _largest(radii[0], visible, means2d))
+
+
+def _draw_nothing(gaussians: Gaussians, camera: Camera, needs: set[str], settings: GsplatRendererSettings) -> _Drawn:
+    """The background, in a graph that ``backward`` accepts."""
+    means2d = _retaining(gaussians.means[:, :2].clone())
+    others = (gaussians.quats_wxyz, gaussians.scales, gaussians.opacities, gaussians.colors, camera.camera_to_world)
+    zero = 0.0 * torch.stack([value.sum() for value in (means2d, *others)]).sum()
+    alpha = zero.expand(camera.height, camera.width)
+    sums = {name: alpha[..., None].expand(-1, -1, 3) if name == "normal" else alpha for name in needs}
+    if "median" in sums:
+        sums["median"] = alpha.detach()
+    rgb = alpha[..., None] + alpha.new_tensor(settings.background)
+    return _Drawn(rgb, alpha, sums, means2d, gaussians.opacities.detach())
+
+
+def _are_surfels(gaussians: Gaussians) -> bool:
+    return gaussians.scales.shape[-1] == 2
+
+
+def _view(
+    gaussians: Gaussians, camera: Camera
+) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "4 4"], Float[Tensor, "3 3"]]:
+    """Centres as seen from the camera, in world axes; the matrix that turns these into camera axes; K.
+
+    Subtracting the camera's centre before gsplat rotates keeps float32, and the pose's gradient, accurate far from the
+    world's origin.
+    """
+    view = torch.eye(4, dtype=gaussians.means.dtype, device=gaussians.means.device)
+    view[:3, :3] = camera.camera_to_world[:3, :3].T
+    return gaussians.means - camera.center, view, camera.intrinsics
+
+
+def _tiles(
+    library: ModuleType, centers: Tensor, radii: Tensor, depths: Tensor, size: tuple[int, int]
+) -> tuple[Tensor, Tensor]:
+    """Where each tile's list begins, and the lists: Gaussians by tile, front to back. [1, rows, columns], [M]"""
+    columns, rows = (-(-pixels // _TILE_SIZE) for pixels in size)
+    _, keys, lists = library.isect_tiles(centers[None], radii, depths[None], _TILE_SIZE, columns, rows)
+    return library.isect_offset_encode(keys, 1, columns, rows), lists
+
+
+def _pass_through_centers(
+    boxes: Float[Tensor, "N 2"], transforms: Float[Tensor, "N 3 3"]
+) -> tuple[Float[Tensor, "N 2"], Float[Tensor, "N 2"], Float[Tensor, "N 3 3"]]:
+    """The surfels' projected centres, put into the graph so that they receive its gradient. [N, 2]
+
+    gsplat has no such tensor: the image of a surfel's plane is ``transforms``, whose last column is the centre's, and
+    ``boxes`` are the middles of the surfels' boxes, which its low-pass filter is drawn around. Both come back
+    unchanged, but made from the centres.
+    """
+    place = transforms[:, :, 2]
+    centers = place[:, :2] / place[:, 2:]
+    means2d = _retaining(centers.clone())
+    column = torch.cat([means2d * place[:, 2:], place[:, 2:]], dim=-1)
+    # This difference is zero and takes the centres' own share of the boxes' gradient back again.
+    boxes = boxes + (means2d - centers)
+    return means2d, boxes, torch.cat([transforms[:, :, :2], column[:, :, None]], dim=-1)
+
+
+def _facing_normals(gaussians: Gaussians, sight: Float[Tensor, "N 3"], camera: Camera) -> Float[Tensor, "N 3"]:
+    """The shortest axis of each Gaussian, camera axes, turned so that it looks at the camera. [N, 3]"""
+    shortest = gaussians.scales.argmin(-1)
+    axes = rotation_matrices(gaussians.quats_wxyz)
+    normals = axes.gather(2, shortest[:, None, None].expand(-1, 3, 1)).squeeze(-1)
+    away = (normals * sight).sum(-1, keepdim=True) > 0
+    return torch.where(away, -normals, normals) @ camera.camera_to_world[:3, :3]
+
+
+@torch.no_grad()
+def _median_by_definition(
+    gaussians: Gaussians, camera: Camera, settings: GsplatRendererSettings
+) -> Float[Tensor, "H W"]:
+    """The definition's own: gsplat has none of 3D Gaussians, and no gradient goes through it. [H, W]"""
+    options = TorchRendererSettings(near=settings.near, low_pass=settings.low_pass)
+    return render_gaussians(gaussians, camera, ("depth_median",), options)["depth_median"]
+
+
+def _backgrounds(features: Float[Tensor, "N F"], settings: GsplatRendererSettings) -> Float[Tensor, "1 F"] | None:
+    """The background behind the colours, nothing behind the other channels. [1, F]"""
+    if not any(settings.background):
+        return None
+    return features.new_tensor([[*settings.background, *[0.0] * (features.shape[-1] - 3)]])
+
+
+def _split(image: Float[Tensor, "H W F"], parts: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Composited channels by the names of what they were composited from; single ones without a last dimension."""
+    channels = torch.split(image, [part.shape[-1] for part in parts.values()], dim=-1)
+    return {
+        name: channel[..., 0] if channel.shape[-1] == 1 else channel
+        for name, channel in zip(parts, channels, strict=True)
+    }
+
+
+def _largest(radii: Tensor, visible: Tensor, like: Tensor) -> Float[Tensor, "N"]:
+    return torch.where(visible, radii.amax(-1), 0).to(like.dtype)
+
+
+def _retaining(means2d: Tensor) -> Tensor:
+    if means2d.requires_grad:
+        means2d.retain_grad()
+    return means2d

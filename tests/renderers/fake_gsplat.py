@@ -1,0 +1,350 @@
+"""gsplat 1.5.3's public functions, without a GPU: its kernels' arithmetic in plain PyTorch, gradients by autograd.
+
+Signatures, argument orders, shapes and assertions are those of gsplat 1.5.3 (Apache-2.0), read in its sources, and so
+are the constants and the habits that its callers must know: only radii are written of what is not drawn (here the rest
+is NaN), no Gaussians at all end the process (here an exception), and rasterize_to_pixels_2dgs fills up odd numbers of
+channels with uninitialised memory (here NaN). Shares no code with the package.
+"""
+
+from __future__ import annotations
+
+import importlib.machinery
+import math
+import types
+
+import torch
+
+ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN = 0.999, 1 / 255, 1e-4
+#: What the arithmetic is done in. float64 leaves only the inputs' rounding; float32 is what the kernels do.
+PRECISION = torch.float64
+
+CHANNELS_3D = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32, 33, 64, 65, 128, 129, 256, 257, 512, 513)
+CHANNELS_2D = (1, 2, 3, 4, 8, 16, 32, 64, 128, 256, 512)
+
+
+def module(calls=None):
+    """A stand-in for ``import gsplat``. ``calls`` collects (name, arguments) of what is called."""
+
+    def recorded(function):
+        def call(*args, **kwargs):
+            if calls is not None:
+                calls.append((function.__name__, args, kwargs))
+            return function(*args, **kwargs)
+
+        return call
+
+    fake = types.ModuleType("gsplat")
+    fake.__spec__ = importlib.machinery.ModuleSpec("gsplat", None)
+    fake.__version__ = "1.5.3"
+    for function in (
+        fully_fused_projection,
+        fully_fused_projection_2dgs,
+        isect_tiles,
+        isect_offset_encode,
+        rasterize_to_pixels,
+        rasterize_to_pixels_2dgs,
+    ):
+        setattr(fake, function.__name__, recorded(function))
+    return fake
+
+
+def _check_inputs(means, quats, scales, viewmats, Ks):
+    n, c = means.shape[-2], viewmats.shape[-3]
+    assert means.shape == (n, 3) and quats.shape == (n, 4) and scales.shape == (n, 3)
+    assert viewmats.shape == (c, 4, 4) and Ks.shape == (c, 3, 3) and c == 1
+    assert all(value.dtype == torch.float32 for value in (means, quats, scales, viewmats, Ks))
+    if n == 0:
+        raise ZeroDivisionError("means.numel() / (N * 3): the process dies of SIGFPE")
+
+
+def _rotations(quats):
+    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
+    rows = [
+        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+        torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+        torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+    ]
+    return torch.stack(rows, dim=-2)
+
+
+def _placed(means, viewmats):
+    """Rotation, and centres in camera axes: rotated first and moved then, as the kernels do."""
+    turn = viewmats[0, :3, :3].to(PRECISION)
+    return turn, means.to(PRECISION) @ turn.T + viewmats[0, :3, 3].to(PRECISION)
+
+
+def _outside(center, radius_x, radius_y, width, height):
+    x, y = center.unbind(-1)
+    return (x + radius_x <= 0) | (x - radius_x >= width) | (y + radius_y <= 0) | (y - radius_y >= height)
+
+
+def _undrawn(values, drawn):
+    """[1, N, ...] float32, with NaN where gsplat writes nothing."""
+    shape = (-1, *[1] * (values.dim() - 1))
+    return torch.where(drawn.view(shape), values, torch.nan).float()[None]
+
+
+def fully_fused_projection(
+    means,
+    covars,
+    quats,
+    scales,
+    viewmats,
+    Ks,
+    width,
+    height,
+    eps2d=0.3,
+    near_plane=0.01,
+    far_plane=1e10,
+    radius_clip=0.0,
+    packed=False,
+    sparse_grad=False,
+    calc_compensations=False,
+    camera_model="pinhole",
+    opacities=None,
+):
+    assert covars is None and not packed and not sparse_grad and not calc_compensations and camera_model == "pinhole"
+    _check_inputs(means, quats, scales, viewmats, Ks)
+    assert opacities is None or opacities.shape == means.shape[:1]
+    turn, local = _placed(means, viewmats)
+    inside = ((local[:, 2] >= near_plane) & (local[:, 2] <= far_plane)).detach()
+    x, y, z = torch.where(inside[:, None], local, local.new_tensor([0.0, 0.0, 1.0])).unbind(-1)
+    fx, fy, cx, cy = Ks[0, 0, 0].item(), Ks[0, 1, 1].item(), Ks[0, 0, 2].item(), Ks[0, 1, 2].item()
+    spread = _rotations(quats.to(PRECISION)) * scales.to(PRECISION)[:, None, :]
+    covariance = turn @ (spread @ spread.transpose(1, 2)) @ turn.T
+    slope_x = (x / z).clamp(-cx / fx - 0.15 * width / fx, (width - cx) / fx + 0.15 * width / fx)
+    slope_y = (y / z).clamp(-cy / fy - 0.15 * height / fy, (height - cy) / fy + 0.15 * height / fy)
+    zero = torch.zeros_like(z)
+    row_x = torch.stack([fx / z, zero, -fx * slope_x / z], dim=-1)
+    row_y = torch.stack([zero, fy / z, -fy * slope_y / z], dim=-1)
+    jacobian = torch.stack([row_x, row_y], dim=1)
+    flat = jacobian @ covariance @ jacobian.transpose(1, 2)
+    xx, xy, yy = flat[:, 0, 0] + eps2d, flat[:, 0, 1], flat[:, 1, 1] + eps2d
+    determinant = xx * yy - xy * xy
+    conics = torch.stack([yy, -xy, xx], dim=-1) / determinant[:, None]
+    centers = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
+    with torch.no_grad():
+        extend = torch.full_like(z, 3.33)
+        bright = torch.ones_like(inside)
+        if opacities is not None:
+            bright = opacities >= ALPHA_MIN
+            extend = extend.minimum((2 * (opacities.to(PRECISION) / ALPHA_MIN).log().clamp_min(0)).sqrt())
+        radius_x, radius_y = (extend * xx.sqrt()).ceil(), (extend * yy.sqrt()).ceil()
+        drawn = inside & bright & (determinant > 0) & ((radius_x > radius_clip) | (radius_y > radius_clip))
+        drawn &= ~_outside(centers, radius_x, radius_y, width, height)
+        radii = torch.where(drawn[:, None], torch.stack([radius_x, radius_y], dim=-1), 0).int()[None]
+    return radii, _undrawn(centers, drawn), _undrawn(z, drawn), _undrawn(conics, drawn), None
+
+
+def fully_fused_projection_2dgs(
+    means,
+    quats,
+    scales,
+    viewmats,
+    Ks,
+    width,
+    height,
+    eps2d=0.3,
+    near_plane=0.01,
+    far_plane=1e10,
+    radius_clip=0.0,
+    packed=False,
+    sparse_grad=False,
+):
+    assert not packed and not sparse_grad
+    _check_inputs(means, quats, scales, viewmats, Ks)
+    turn, local = _placed(means, viewmats)
+    inside = ((local[:, 2] > near_plane) & (local[:, 2] < far_plane)).detach()
+    center = torch.where(inside[:, None], local, local.new_tensor([0.0, 0.0, 1.0]))
+    axes = turn @ _rotations(quats.to(PRECISION))
+    first, second = (axes[:, :, k] * scales[:, k, None].to(PRECISION) for k in (0, 1))
+    transforms = Ks[0].to(PRECISION) @ torch.stack([first, second, center], dim=-1)  # [N, 3, 3], rows u, v, w
+    row_u, row_v, row_w = transforms.unbind(1)
+    corner = transforms.new_tensor([1.0, 1.0, -1.0])
+    scaled = corner / (corner * row_w * row_w).sum(-1, keepdim=True)
+    boxes = torch.stack([(scaled * row_u * row_w).sum(-1), (scaled * row_v * row_w).sum(-1)], dim=-1)
+    normals = axes[:, :, 2]
+    normals = torch.where(((-normals * center).sum(-1, keepdim=True) > 0).detach(), normals, -normals)
+    with torch.no_grad():
+        squares = torch.stack([(scaled * row_u * row_u).sum(-1), (scaled * row_v * row_v).sum(-1)], dim=-1)
+        radius_x, radius_y = (3.33 * (boxes * boxes - squares).clamp_min(1e-4).sqrt()).ceil().unbind(-1)
+        drawn = inside & ((radius_x > radius_clip) | (radius_y > radius_clip))
+        drawn &= ~_outside(boxes, radius_x, radius_y, width, height)
+        radii = torch.where(drawn[:, None], torch.stack([radius_x, radius_y], dim=-1), 0).int()[None]
+    written = (_undrawn(value, drawn) for value in (boxes, center[:, 2], transforms, normals))
+    return (radii, *written)
+
+
+@torch.no_grad()
+def isect_tiles(
+    means2d,
+    radii,
+    depths,
+    tile_size,
+    tile_width,
+    tile_height,
+    sort=True,
+    segmented=False,
+    packed=False,
+    n_images=None,
+    image_ids=None,
+    gaussian_ids=None,
+):
+    n = means2d.shape[-2]
+    assert means2d.shape == (1, n, 2) and radii.shape == (1, n, 2) and depths.shape == (1, n) and sort and not packed
+    assert radii.dtype == torch.int32 and means2d.dtype == depths.dtype == torch.float32
+    counts, keys, owners = [], [], []
+    bits = depths[0].contiguous().view(torch.int32).long() & 0xFFFFFFFF
+    for i in range(n):
+        radius_x, radius_y = radii[0, i].tolist()
+        if radius_x <= 0 or radius_y <= 0:
+            counts.append(0)
+            continue
+        x, y = means2d[0, i].tolist()
+        columns = [
+            min(max(0, math.floor((x - radius_x) / tile_size)), tile_width),
+            min(max(0, math.ceil((x + radius_x) / tile_size)), tile_width),
+        ]
+        rows = [
+            min(max(0, math.floor((y - radius_y) / tile_size)), tile_height),
+            min(max(0, math.ceil((y + radius_y) / tile_size)), tile_height),
+        ]
+        tiles = [row * tile_width + column for row in range(*rows) for column in range(*columns)]
+        counts.append(len(tiles))
+        keys += [(tile << 32) | bits[i].item() for tile in tiles]
+        owners += [i] * len(tiles)
+    keys, order = torch.sort(torch.tensor(keys, dtype=torch.int64), stable=True)
+    owners = torch.tensor(owners, dtype=torch.int32)[order]
+    return torch.tensor(counts, dtype=torch.int32)[None], keys, owners
+
+
+@torch.no_grad()
+def isect_offset_encode(isect_ids, n_images, tile_width, tile_height):
+    tiles = torch.arange(tile_width * tile_height)
+    return torch.searchsorted(isect_ids >> 32, tiles).int().view(n_images, tile_height, tile_width)
+
+
+def rasterize_to_pixels(
+    means2d,
+    conics,
+    colors,
+    opacities,
+    image_width,
+    image_height,
+    tile_size,
+    isect_offsets,
+    flatten_ids,
+    backgrounds=None,
+    masks=None,
+    packed=False,
+    absgrad=False,
+):
+    n, channels = means2d.shape[-2], colors.shape[-1]
+    assert means2d.shape == (1, n, 2) and conics.shape == (1, n, 3) and colors.shape == (1, n, channels)
+    assert opacities.shape == (1, n) and masks is None and not packed and not absgrad
+    assert backgrounds is None or backgrounds.shape == (1, channels)
+    assert all(value.dtype == torch.float32 for value in (means2d, conics, colors, opacities))
+    padded, backgrounds = _padded(colors, backgrounds, CHANNELS_3D, 0.0)
+    conics, centers = conics[0].to(PRECISION), means2d[0].to(PRECISION)
+
+    def power(ids, pixels):
+        dx, dy = (centers[ids, None] - pixels).unbind(-1)
+        a, b, c = (conics[ids, k, None] for k in range(3))
+        return 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+
+    size = (image_width, image_height, tile_size)
+    image, alpha, _ = _composite(power, padded[0], opacities[0], size, isect_offsets, flatten_ids, backgrounds)
+    return image[..., :channels].float()[None], alpha.float()[None]
+
+
+def rasterize_to_pixels_2dgs(
+    means2d,
+    ray_transforms,
+    colors,
+    opacities,
+    normals,
+    densify,
+    image_width,
+    image_height,
+    tile_size,
+    isect_offsets,
+    flatten_ids,
+    backgrounds=None,
+    masks=None,
+    packed=False,
+    absgrad=False,
+    distloss=False,
+):
+    n, channels = means2d.shape[-2], colors.shape[-1]
+    assert means2d.shape == densify.shape == (1, n, 2) and ray_transforms.shape == (1, n, 3, 3)
+    assert colors.shape == (1, n, channels) and normals.shape == (1, n, 3) and opacities.shape == (1, n)
+    assert masks is None and not packed and not absgrad and not distloss
+    assert backgrounds is None or backgrounds.shape == (1, channels)
+    # The kernel's last channel stays the last, and what fills the gap is whatever was in memory.
+    padded, backgrounds = _padded(colors, backgrounds, CHANNELS_2D, torch.nan, before_last=True)
+    transforms, boxes = ray_transforms[0].to(PRECISION), means2d[0].to(PRECISION)
+
+    def power(ids, pixels):
+        row_u, row_v, row_w = (transforms[ids, k, None] for k in range(3))
+        plane_u = pixels[:, :1] * row_w - row_u
+        plane_v = pixels[:, 1:] * row_w - row_v
+        hit = torch.linalg.cross(plane_u, plane_v)
+        in_units = (hit[..., :2] / hit[..., 2:]).square().sum(-1)
+        filtered = 2.0 * (boxes[ids, None] - pixels).square().sum(-1)
+        return 0.5 * torch.minimum(in_units, filtered)
+
+    size = (image_width, image_height, tile_size)
+    features = torch.cat([padded[0], normals[0].to(padded.dtype)], dim=-1)
+    if backgrounds is not None:
+        backgrounds = torch.cat([backgrounds, backgrounds.new_zeros(1, 3)], dim=-1)
+    image, alpha, median = _composite(power, features, opacities[0], size, isect_offsets, flatten_ids, backgrounds)
+    kept = [*range(channels - 1), padded.shape[-1] - 1]
+    image, normal, median = image[..., kept], image[..., -3:], median[..., padded.shape[-1] - 1 :][..., :1]
+    return tuple(value.float()[None] for value in (image, alpha, normal, torch.zeros_like(alpha), median))
+
+
+def _padded(colors, backgrounds, supported, filling, before_last=False):
+    channels = colors.shape[-1]
+    missing = 0 if channels in supported else (1 << (channels - 1).bit_length()) - channels
+    fill = colors.new_full((*colors.shape[:-1], missing), filling)
+    at = channels - 1 if before_last else channels
+    colors = torch.cat([colors[..., :at], fill, colors[..., at:]], dim=-1)
+    if backgrounds is not None:
+        backgrounds = torch.cat([backgrounds, backgrounds.new_zeros(len(backgrounds), missing)], dim=-1)
+    return colors.to(PRECISION), None if backgrounds is None else backgrounds.to(PRECISION)
+
+
+def _composite(power, features, opacities, size, offsets, lists, backgrounds):
+    """Image, alpha [H, W, 1] and the features of the last drawn with more than half of the light before it."""
+    width, height, tile_size = size
+    starts = [*offsets.flatten().tolist(), len(lists)]
+    image = features.new_zeros(height, width, features.shape[-1])
+    alphas, median = features.new_zeros(height, width, 1), torch.zeros_like(image)
+    for tile in range(offsets.numel()):
+        row, column = divmod(tile, offsets.shape[-1])
+        ids = lists[starts[tile] : starts[tile + 1]].long()
+        across = torch.arange(column * tile_size, min((column + 1) * tile_size, width))
+        down = torch.arange(row * tile_size, min((row + 1) * tile_size, height))
+        v, u = torch.meshgrid(down, across, indexing="ij")
+        pixels = torch.stack([u, v], dim=-1).reshape(-1, 2).to(PRECISION) + 0.5
+        sigma = power(ids, pixels)
+        alpha = (opacities[ids, None].to(PRECISION) * (-sigma).exp()).clamp(max=ALPHA_MAX)
+        alpha = torch.where((sigma < 0) | (alpha < ALPHA_MIN), torch.zeros_like(alpha), alpha)
+        after = (1 - alpha).cumprod(0)
+        before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
+        # After the stop the light left only falls, so what lies behind fails the same test.
+        weights = torch.where(after > TRANSMITTANCE_MIN, alpha * before, torch.zeros_like(alpha))
+        light = 1 - weights.sum(0)
+        # Features of undrawn Gaussians may be NaN; the lists hold drawn ones only.
+        sums = torch.einsum("kp,kf->pf", weights, features[ids])
+        if backgrounds is not None:
+            sums = sums + light[:, None] * backgrounds
+        place = (v.flatten(), u.flatten())
+        image = image.index_put(place, sums)
+        alphas = alphas.index_put(place, 1 - light[:, None])
+        if len(ids):
+            number = torch.arange(1, len(ids) + 1)[:, None]
+            last = torch.where((weights > 0) & (before > 0.5), number, 0).amax(0)
+            of_last = torch.where((last > 0)[:, None], features[ids[last.clamp_min(1) - 1]], torch.zeros_like(sums))
+            median = median.index_put(place, of_last)
+    return image, alphas, median

@@ -1,0 +1,662 @@
+"""The gsplat renderer: its use of gsplat against a stand-in without a GPU, and gsplat itself where there is one."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import importlib.util
+import math
+import sys
+import types
+
+import fake_gsplat
+import pytest
+import torch
+from pydantic import ValidationError
+from test_torch_renderer import (
+    INPUTS,
+    SCENES,
+    SUMS,
+    FieldOf,
+    cast,
+    make,
+    ours,
+    pinhole,
+    relative,
+    rigid,
+    scene,
+    with_gradients,
+)
+
+from coliags_plugin import registry
+from coliags_plugin.components import make_component
+from coliags_plugin.engine.backends import choose_renderer
+from coliags_plugin.engine.doctor import examine
+from coliags_plugin.errors import InputError
+from coliags_plugin.gaussians import OUTPUTS
+from coliags_plugin.renderers import gsplat_library
+from coliags_plugin.renderers.gsplat_renderer import GsplatRenderer, GsplatRendererSettings, render_with_gsplat
+from coliags_plugin.renderers.torch_renderer import render_gaussians
+
+BACKGROUND = (0.3, 0.1, 0.9)
+#: gsplat's cap on alpha, as the definition's setting; with it both draw the same picture.
+SAME_CAP = {"alpha_max": 0.999}
+
+
+def forget():
+    gsplat_library.load.cache_clear()
+    gsplat_library._trial.cache_clear()
+
+
+@pytest.fixture
+def device(monkeypatch):
+    """A machine that seems to have a CUDA device and, so far, no gsplat."""
+    forget()
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda *_: "a stand-in")
+    monkeypatch.setattr(gsplat_library, "PROBE_DEVICE", "cpu")
+    monkeypatch.setattr(GsplatRenderer, "devices", frozenset({"cpu"}))
+    yield
+    forget()
+
+
+@pytest.fixture
+def calls(device, monkeypatch):
+    """The stand-in for gsplat is installed; what is called of it, from now on, with which arguments."""
+    found = []
+    monkeypatch.setitem(sys.modules, "gsplat", fake_gsplat.module(found))
+    gsplat_library.load()
+    found.clear()
+    return found
+
+
+def theirs(**options):
+    def draw(gaussians, camera):
+        output = render_with_gsplat(gaussians, camera, OUTPUTS, GsplatRendererSettings(**options))
+        return {name: output[name] for name in OUTPUTS}, output
+
+    return draw
+
+
+def random_cotangents(camera, seed=1):
+    generator = torch.Generator().manual_seed(seed)
+    shape = (camera.height, camera.width)
+    return {k: torch.randn(*shape, *([3] * (k in ("rgb", "normals"))), generator=generator) for k in SUMS}
+
+
+def single(name):
+    gaussians, camera = scene(name)
+    return cast(gaussians, torch.float32), camera.to(dtype=torch.float32)
+
+
+def as_surfels(gaussians):
+    return dataclasses.replace(gaussians, scales=gaussians.scales[:, :2].contiguous())
+
+
+# --- availability -----------------------------------------------------------------------------------------------------
+
+
+def install(monkeypatch, library=None, error=None):
+    """What ``import gsplat`` gives, or raises."""
+    monkeypatch.delitem(sys.modules, "gsplat", raising=False)
+    find, load = importlib.util.find_spec, importlib.import_module
+
+    def import_module(name, *rest):
+        if name != "gsplat":
+            return load(name, *rest)
+        if error:
+            raise error
+        return library
+
+    def find_spec(name, *rest):
+        return object() if name == "gsplat" else find(name, *rest)
+
+    monkeypatch.setattr(importlib, "import_module", import_module)
+    monkeypatch.setattr(importlib.util, "find_spec", find_spec)
+
+
+def test_without_a_device_gsplat_is_not_even_looked_for(monkeypatch):
+    forget()
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    install(monkeypatch, error=AssertionError("gsplat was imported"))
+    for build, reason in ((None, "no CUDA device, as this PyTorch is built without CUDA"), ("12.8", "no CUDA device")):
+        monkeypatch.setattr(torch.version, "cuda", build)
+        found = GsplatRenderer.availability()
+        assert not found.ok and found.reason == reason
+
+
+def test_without_gsplat_it_says_how_to_install_it(device, monkeypatch):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "gsplat" else find(name))
+    found = GsplatRenderer.availability()
+    assert not found.ok and found.reason == "gsplat is not installed: pip install coliags_plugin[cuda]"
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (ImportError("libcudart.so.12: not found"), "gsplat does not load: ImportError: libcudart.so.12: not found"),
+        (
+            RuntimeError("\nError building 'gsplat_cuda'\n" + "log\n" * 999),
+            "RuntimeError: Error building 'gsplat_cuda'",
+        ),
+        (KeyError(), "gsplat does not load: KeyError"),
+    ],
+)
+def test_a_gsplat_that_does_not_load_says_why(device, monkeypatch, error, reason):
+    install(monkeypatch, error=error)
+    found = GsplatRenderer.availability()
+    assert not found.ok and found.reason.endswith(reason)
+
+
+def test_an_old_gsplat_is_named(device, monkeypatch):
+    library = fake_gsplat.module()
+    library.__version__ = "1.4.0+pt24cu121"
+    install(monkeypatch, library)
+    found = GsplatRenderer.availability()
+    assert not found.ok
+    assert found.reason == "gsplat 1.4.0+pt24cu121 is too old, 1.5 is needed: pip install coliags_plugin[cuda]"
+
+
+def failing(message):
+    def fully_fused_projection(*args, **kwargs):
+        raise RuntimeError(message) if message else AttributeError("'NoneType' object has no attribute 'projection'")
+
+    library = fake_gsplat.module()
+    library.fully_fused_projection = fully_fused_projection
+    return library
+
+
+def test_kernels_that_were_never_built_are_no_attribute_of_none(device, monkeypatch):
+    install(monkeypatch, failing(None))
+    monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", types.SimpleNamespace(_C=None))
+    found = GsplatRenderer.availability()
+    assert not found.ok
+    assert found.reason == "gsplat 1.5.3 has no CUDA kernels, and found no CUDA toolkit (nvcc) to build them"
+
+
+def test_kernels_that_fail_say_how(device, monkeypatch):
+    install(monkeypatch, failing("no kernel image is available for execution on the device"))
+    found = GsplatRenderer.availability()
+    assert not found.ok and "gsplat 1.5.3 does not work on this device: RuntimeError: no kernel image" in found.reason
+
+
+def test_kernels_that_answer_nonsense_are_not_used(device, monkeypatch):
+    library = fake_gsplat.module()
+    library.fully_fused_projection = lambda *args, **kwargs: (torch.ones(1, 1, 2), torch.full((1, 1, 2), 3.5))
+    install(monkeypatch, library)
+    found = GsplatRenderer.availability()
+    assert not found.ok and "belongs at pixel (4, 4) is put at [3.5, 3.5]" in found.reason
+
+
+def test_a_working_gsplat_is_tried_once(device, monkeypatch):
+    found = []
+    install(monkeypatch, fake_gsplat.module(found))
+    for _ in range(3):
+        assert GsplatRenderer.availability() == gsplat_library.Availability(True, "gsplat 1.5.3 on a stand-in")
+    assert len(found) == 1
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
+def test_on_this_machine_it_declines_and_rendering_says_so():
+    forget()
+    assert "no CUDA device" in GsplatRenderer.availability().reason
+    assert "gsplat" not in sys.modules
+    gaussians, camera = single("random")
+    with pytest.raises(InputError, match=r"renderer 'gsplat' cannot run here: no CUDA device"):
+        render_with_gsplat(gaussians, camera)
+
+
+def test_auto_and_the_doctor_give_the_reason(monkeypatch):
+    forget()
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.version, "cuda", None)
+    reason = "gsplat runs on cuda, the device is cpu; "
+    chosen = choose_renderer(make_component("renderers", "auto"), "gaussians3d", torch.device("cpu"))
+    assert chosen.reason.startswith(reason)
+    told = {finding.subject: finding for finding in examine()}
+    missing = "cannot run here: no CUDA device, as this PyTorch is built without CUDA"
+    assert told["renderer gsplat"].text == missing
+    assert told["renderer gsplat"].ok
+    assert f"would use {chosen.name} ({reason}" in told["renderer auto"].text
+
+
+def test_auto_takes_gsplat_where_it_works(calls):
+    # The renderer seems to run on the CPU here, which is where the stand-in is.
+    component = make_component("renderers", {"name": "auto", "near": 0.7, "background": BACKGROUND})
+    for primitive in ("gaussians3d", "surfels"):
+        chosen = choose_renderer(component, primitive, torch.device("cpu"))
+        assert chosen.name == "gsplat" and chosen.reason == "auto chose gsplat: gsplat 1.5.3 on a stand-in"
+        assert chosen.renderer.settings == GsplatRendererSettings(near=0.7, background=BACKGROUND)
+
+
+# --- against the definition -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_the_stand_in_gives_the_definition_s_numbers(calls, name):
+    gaussians, camera = single(name)
+    cotangents = random_cotangents(camera)
+    found, output, gradients = with_gradients(theirs(background=BACKGROUND), gaussians, camera, cotangents)
+    true, expected, true_gradients = with_gradients(
+        ours(background=BACKGROUND, **SAME_CAP),
+        cast(gaussians, torch.float64),
+        camera.to(dtype=torch.float64),
+        cotangents,
+    )
+    for key in OUTPUTS:
+        assert found[key].dtype == torch.float32
+        assert relative(found[key], true[key]) <= 5e-6, key
+    for key, gradient in true_gradients.items():
+        assert relative(gradients[key], gradient) <= 2e-5, key
+    assert relative(output.means2d.grad, expected.means2d.grad) <= 1e-5
+    drawn = expected.radii > 0
+    assert relative(output.means2d[drawn], expected.means2d[drawn]) <= 1e-6
+    # gsplat's box of a Gaussian may touch the image where its ellipse does not: such ones are drawn on no pixel.
+    assert torch.equal(output.radii[drawn], expected.radii[drawn].float())
+    assert not output.means2d.grad[~drawn].any()
+    assert output.means2d.isfinite().all() and output.means2d.grad.isfinite().all()
+
+
+def test_one_projection_and_one_pass_serve_all_outputs(calls):
+    gaussians, camera = single("off centre")
+    render_with_gsplat(gaussians, camera, [name for name in OUTPUTS if name != "depth_median"])
+    assert [name for name, _, _ in calls] == [
+        "fully_fused_projection",
+        "isect_tiles",
+        "isect_offset_encode",
+        "rasterize_to_pixels",
+    ]
+    assert calls[-1][1][2].shape == (1, len(gaussians), 8)
+
+
+@pytest.mark.parametrize(
+    ("wants", "channels", "surfel_channels"),
+    [
+        ((), 3, 3),
+        (("rgb", "alpha"), 3, 3),
+        (("depth_median",), 3, 4),
+        (("depth_expected", "depth_accumulated"), 4, 4),
+        (("inverse_depth_accumulated",), 4, 4),
+        (("depth_expected", "inverse_depth_accumulated"), 5, 8),
+        (("normals",), 6, 3),
+    ],
+)
+def test_nothing_is_composited_that_is_not_wanted(calls, wants, channels, surfel_channels):
+    gaussians, camera = single("one pixel wide")
+    for drawn, expected in ((gaussians, channels), (as_surfels(gaussians), surfel_channels)):
+        output = render_with_gsplat(drawn, camera, wants)
+        (features,) = (args[2] for name, args, _ in calls if name.startswith("rasterize"))
+        assert features.shape[-1] == expected
+        assert set(output.maps) == set(wants) - {"rgb", "alpha"}
+        for name in wants:
+            assert output[name].shape == (23, 1, *([3] if name in ("rgb", "normals") else []))
+        calls.clear()
+
+
+def test_gsplat_is_told_the_camera_and_the_settings(calls):
+    gaussians, camera = single("off centre")
+    settings = GsplatRendererSettings(near=0.7, low_pass=0.1, background=BACKGROUND)
+    render_with_gsplat(gaussians, camera, ("depth_expected",), settings)
+    (_, projection, options), *_, (_, rasterization, backgrounds) = calls
+    means, _, _, _, view, intrinsics, width, height = projection
+    assert (width, height) == (33, 21) and options["eps2d"] == 0.1 and options["near_plane"] == 0.7
+    torch.testing.assert_close(intrinsics[0], torch.tensor([[12.0, 0, -6.5], [0, 30.0, 30.25], [0, 0, 1]]))
+    # gsplat sees the world moved to the camera's centre.
+    homogeneous = torch.cat([means, torch.ones(len(means), 1)], dim=1)
+    world = torch.cat([gaussians.means, torch.ones(len(means), 1)], dim=1)
+    torch.testing.assert_close(homogeneous @ view[0].T, world @ camera.world_to_camera.T, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(backgrounds["backgrounds"], torch.tensor([[*BACKGROUND, 0.0]]))
+    assert rasterization[4:7] == (33, 21, 16)
+
+
+def test_the_pose_s_gradient_is_accurate_far_from_the_world_s_origin(calls):
+    gaussians, camera = single("random")
+    offset = torch.tensor([3e3, -2e3, 1e3])
+    pose = camera.camera_to_world.clone()
+    pose[:3, 3] += offset
+    far = dataclasses.replace(gaussians, means=gaussians.means + offset)
+    camera = dataclasses.replace(camera, camera_to_world=pose)
+    cotangents = random_cotangents(camera)
+    _, _, gradients = with_gradients(theirs(), far, camera, cotangents)
+    _, _, expected = with_gradients(ours(), cast(far, torch.float64), camera.to(dtype=torch.float64), cotangents)
+    assert relative(gradients["pose"], expected["pose"]) <= 1e-5
+
+
+def test_opaque_gaussians_are_capped_later_than_the_definition_says(calls):
+    gaussians, camera = cast(make([[0, 0, 5.0]], 0.2, 1.0), torch.float32), pinhole(dtype=torch.float32)
+    assert render_with_gsplat(gaussians, camera).alpha[3, 4].item() == pytest.approx(0.999)
+    assert render_gaussians(gaussians, camera).alpha[3, 4].item() == pytest.approx(0.99)
+
+
+# --- emptiness and refusals -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("surfels", [False, True])
+@pytest.mark.parametrize("what", ["none", "behind", "beside"])
+def test_an_empty_view_is_the_background_and_a_graph(calls, what, surfels):
+    means = {"none": torch.zeros(0, 3), "behind": [[0, 0, -2.0]], "beside": [[50.0, 0, 4.0]]}[what]
+    n = len(means)
+    gaussians = make(means, torch.full((n, 3), 0.1), torch.full((n,), 0.5))
+    gaussians = as_surfels(gaussians) if surfels else gaussians
+    for background in (BACKGROUND, (0.0, 0.0, 0.0)):
+        drawn, pose = cast(gaussians, torch.float32, grad=True), torch.eye(4).requires_grad_()
+        output = render_with_gsplat(drawn, pinhole(pose=pose), OUTPUTS, GsplatRendererSettings(background=background))
+        assert torch.equal(output.rgb, torch.tensor(background).expand(7, 9, 3))
+        assert output.radii.tolist() == [0] * n
+        assert not any(output[name].any() for name in OUTPUTS if name != "rgb")
+        assert not output["depth_median"].requires_grad
+        sum(output[name].sum() for name in OUTPUTS).backward()
+        for name in INPUTS:
+            assert not getattr(drawn, name).grad.any(), name
+        assert output.means2d.grad.shape == (n, 2) and not output.means2d.grad.any()
+        assert pose.grad is None or not pose.grad.any()
+
+
+def test_without_gradients_nothing_is_retained(calls):
+    gaussians, camera = single("random")
+    for drawn in (gaussians, as_surfels(gaussians)):
+        output = render_with_gsplat(drawn, camera, OUTPUTS)
+        assert not output.rgb.requires_grad and not output.means2d.requires_grad
+        with torch.no_grad():
+            output = render_with_gsplat(cast(drawn, grad=True), camera, OUTPUTS)
+        assert not output.rgb.requires_grad and not output.means2d.requires_grad
+
+
+def test_the_registered_component_renders_a_field(calls):
+    assert registry.renderers.get("gsplat") is GsplatRenderer
+    assert GsplatRenderer.outputs == set(OUTPUTS) and GsplatRenderer.primitives == {"gaussians3d", "surfels"}
+    gaussians, camera = single("random")
+    output = GsplatRenderer(GsplatRendererSettings()).render(FieldOf(gaussians), camera, ("rgb", "depth_expected"))
+    assert output.gaussians is gaussians
+    with pytest.raises(KeyError):
+        output["depth_median"]
+
+
+def test_what_cannot_be_rendered_says_so(calls, monkeypatch):
+    gaussians, camera = single("random")
+    renderer, field = GsplatRenderer(GsplatRendererSettings()), FieldOf(gaussians)
+    with pytest.raises(InputError, match="whole images"):
+        renderer.render(field, camera, pixels=torch.zeros(3, 2))
+    with pytest.raises(InputError, match="Did you mean 'depth_median'"):
+        renderer.render(field, camera, ("depth_medain",))
+    with pytest.raises(InputError, match=r"torch\.float64.*float32"):
+        renderer.render(FieldOf(cast(gaussians, torch.float64)), camera)
+    monkeypatch.setattr(GsplatRenderer, "devices", frozenset({"cuda"}))
+    with pytest.raises(InputError, match="Gaussians on cpu"):
+        renderer.render(field, camera)
+    field.primitive = "radiance"
+    with pytest.raises(InputError, match="radiance"):
+        renderer.render(field, camera)
+
+
+def test_a_pose_of_another_precision_is_cast(calls):
+    gaussians, camera = single("random")
+    assert render_with_gsplat(gaussians, camera.to(dtype=torch.float64)).rgb.dtype == torch.float32
+
+
+@pytest.mark.parametrize("options", [{"near": -1.0}, {"low_pass": 0.0}, {"tile_size": 8}, {"alpha_max": 0.99}])
+def test_settings_are_checked(options):
+    with pytest.raises(ValidationError):
+        GsplatRendererSettings(**options)
+
+
+# --- surfels ----------------------------------------------------------------------------------------------------------
+
+
+def pixel_centers(camera):
+    v, u = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
+    return u.double(), v.double()
+
+
+def disc_alpha(mean, axes, scales, opacity, camera, box_middle):
+    """Alpha of a disc at every pixel, by meeting each ray with its plane; camera axes, float64."""
+    u, v = pixel_centers(camera)
+    rays = torch.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, torch.ones_like(u)], dim=-1)
+    hits = rays * ((mean @ axes[:, 2]) / (rays @ axes[:, 2]))[..., None]
+    distance = (((hits - mean) @ axes[:, :2]) / scales).square().sum(-1)
+    filtered = 2 * ((u - box_middle[0]).square() + (v - box_middle[1]).square())
+    alpha = (opacity * (-0.5 * torch.minimum(distance, filtered)).exp()).clamp(max=0.999)
+    return torch.where(alpha < 1 / 255, 0.0, alpha)
+
+
+def frontal_disc(device="cpu"):
+    """A disc that faces the camera, and what must be seen of it."""
+    mean, scales, opacity = torch.tensor([0.3, -0.2, 5.0]).double(), torch.tensor([0.9, 0.5]).double(), 0.8
+    camera = pinhole(21, 17, 20.0, 24.0, 9.7, 8.4, dtype=torch.float32)
+    center = torch.stack([camera.fx * mean[0] / mean[2] + camera.cx, camera.fy * mean[1] / mean[2] + camera.cy])
+    alpha = disc_alpha(mean, torch.eye(3).double(), scales, opacity, camera, center)
+    disc = make(mean, torch.zeros(1, 3), opacity, [[0.2, 0.5, 1.0]])
+    disc = cast(dataclasses.replace(disc, scales=scales[None]), torch.float32, device)
+    return disc, camera.to(device), alpha, center
+
+
+def check_frontal_disc(device, atol):
+    disc, camera, alpha, center = frontal_disc(device)
+    background = torch.tensor(BACKGROUND).double()
+    output = render_with_gsplat(disc, camera, OUTPUTS, GsplatRendererSettings(background=BACKGROUND))
+    normal = torch.tensor([0.0, 0.0, -1.0]).double()
+    color = torch.tensor([0.2, 0.5, 1.0]).double()
+    expected = {
+        "rgb": alpha[..., None] * color + (1 - alpha)[..., None] * background,
+        "alpha": alpha,
+        "depth_accumulated": 5.0 * alpha,
+        "depth_expected": torch.where(alpha > 0, 5.0, 0.0).double(),
+        "depth_median": torch.where(alpha >= 0.5, 5.0, 0.0).double(),
+        "inverse_depth_accumulated": alpha / 5.0,
+        "normals": alpha[..., None] * normal,
+    }
+    assert (alpha == 0).any() and (alpha > 0.5).any()
+    for name in OUTPUTS:
+        torch.testing.assert_close(output[name].cpu().double(), expected[name], rtol=0, atol=5 * atol, msg=name)
+    torch.testing.assert_close(output.means2d[0].cpu().double(), center, rtol=0, atol=1e-5)
+    assert output.radii.tolist() == [math.ceil(3.33 * max(0.9 * 20 / 5, 0.5 * 24 / 5))]
+
+
+def test_a_disc_that_faces_the_camera(calls):
+    check_frontal_disc("cpu", 1e-6)
+
+
+def product(p, q):
+    """Of two quaternions, wxyz."""
+    return torch.cat(
+        [(p[0] * q[0] - p[1:] @ q[1:])[None], p[0] * q[1:] + q[0] * p[1:] + torch.linalg.cross(p[1:], q[1:])]
+    )
+
+
+def test_a_tilted_disc_is_met_where_the_rays_meet_it(calls):
+    angle = math.radians(40)  # about the camera's x axis
+    tilt = torch.tensor([math.cos(angle / 2), math.sin(angle / 2), 0, 0]).double()
+    axes = torch.tensor([[1, 0, 0], [0, math.cos(angle), -math.sin(angle)], [0, math.sin(angle), math.cos(angle)]])
+    axes, mean, scales = axes.double(), torch.tensor([0.2, 0.1, 4.0]).double(), torch.tensor([0.5, 0.8]).double()
+    pose, quat = rigid(4)
+    camera = pinhole(21, 17, 20.0, 24.0, 9.7, 8.4, pose, dtype=torch.float32)
+    disc = make(pose[:3, :3] @ mean + pose[:3, 3], torch.zeros(1, 3), 0.9, quats=product(quat, tilt)[None])
+    disc = cast(dataclasses.replace(disc, scales=scales[None]), torch.float32)
+    output = render_with_gsplat(disc, camera, ("normals",))
+    # Three pixels from the box's middle the low-pass filter adds nothing, wherever near the centre that middle is.
+    center = camera.fx * 0.05 + camera.cx, camera.fy * 0.025 + camera.cy
+    u, v = pixel_centers(camera)
+    away = (u - center[0]).square() + (v - center[1]).square() > 9
+    alpha = disc_alpha(mean, axes, scales, 0.9, camera, center)
+    assert (alpha[away] > 0.1).any() and (alpha[away] == 0).any()
+    torch.testing.assert_close(output.alpha.double()[away], alpha[away], rtol=0, atol=1e-5)
+    normal = axes[:, 2] * (-1 if axes[:, 2] @ mean > 0 else 1)
+    torch.testing.assert_close(output["normals"].double(), output.alpha[..., None] * normal, rtol=0, atol=1e-5)
+
+
+def frontal_discs(n=6):
+    """Discs that face the camera, the last too small for anything but the low-pass filter."""
+    generator = torch.Generator().manual_seed(2)
+    means = torch.randn(n, 3, generator=generator, dtype=torch.float64) * 0.3
+    means[:, 2] = torch.linspace(3, 5, n, dtype=torch.float64)
+    scales = 0.3 + torch.rand(n, 3, generator=generator, dtype=torch.float64)
+    scales[-1] = 1e-4
+    opacities = 0.3 + 0.4 * torch.rand(n, generator=generator, dtype=torch.float64)
+    discs = make(means, scales, opacities, torch.rand(n, 3, generator=generator))
+    return as_surfels(cast(discs, torch.float32)), pinhole(12, 10, 14.0, 16.0, 5.6, 5.2, dtype=torch.float32)
+
+
+def test_discs_gradients_are_those_of_the_closed_form(calls):
+    discs, camera = frontal_discs()
+    cotangents = random_cotangents(camera)
+    found, _, _ = with_gradients(theirs(), discs, camera, cotangents)
+    true = {name: getattr(discs, name).double().requires_grad_() for name in INPUTS}
+    means, scales = true["means"], true["scales"]
+    slopes = means[:, :2] / means[:, 2:]
+    middles = slopes * torch.tensor([camera.fx, camera.fy]) + torch.tensor([camera.cx, camera.cy])
+    light, sums = torch.ones(10, 12).double(), {"rgb": 0.0, "alpha": 0.0, "depth_accumulated": 0.0}
+    for i in range(len(discs)):  # they are sorted by depth
+        alpha = disc_alpha(means[i], torch.eye(3).double(), scales[i], true["opacities"][i], camera, middles[i])
+        weight, light = light * alpha, light * (1 - alpha)
+        shown = {
+            "rgb": weight[..., None] * true["colors"][i],
+            "alpha": weight,
+            "depth_accumulated": weight * means[i, 2],
+        }
+        sums = {name: total + shown[name] for name, total in sums.items()}
+    sums["depth_expected"] = sums["depth_accumulated"] / sums["alpha"]
+    assert sums["alpha"].min() > 0
+    loss = sum((value * cotangents[name]).sum() for name, value in sums.items())
+    expected = torch.autograd.grad(loss, [true[name] for name in ("means", "scales", "opacities", "colors")])
+    for name, value in sums.items():
+        assert relative(found[name], value) <= 1e-6, name
+    only = {name: value if name in sums else torch.zeros_like(value) for name, value in cotangents.items()}
+    _, _, gradients = with_gradients(theirs(), discs, camera, only)
+    for name, gradient in zip(("means", "scales", "opacities", "colors"), expected, strict=True):
+        assert relative(gradients[name], gradient) <= 1e-5, name
+
+
+def test_the_gradient_of_a_disc_s_centre_is_that_of_moving_its_projection(calls):
+    discs, camera = frontal_discs()
+    cotangent = random_cotangents(camera)["rgb"]
+
+    def loss(discs, camera):
+        output = render_with_gsplat(discs, camera)
+        return (output.rgb.double() * cotangent).sum(), output
+
+    discs = cast(discs, grad=True)
+    value, output = loss(discs, camera)
+    value.backward()
+    # Discs that face the camera move as a whole with the principal point, the filtered one among them.
+    step = 1e-3  # small, lest a pixel crosses the cut at alpha = 1/255
+    for axis, name in enumerate(("cx", "cy")):
+        ahead, behind = (
+            loss(discs, dataclasses.replace(camera, **{name: getattr(camera, name) + sign * step}))[0].item()
+            for sign in (1, -1)
+        )
+        total = output.means2d.grad[:, axis].sum().item()
+        assert total == pytest.approx((ahead - behind) / (2 * step), rel=2e-3, abs=2e-3)
+    assert (output.means2d.grad.norm(dim=1) > 0).all()
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_no_uninitialised_memory_reaches_what_surfels_give(calls, name):
+    gaussians, camera = single(name)
+    cotangents = random_cotangents(camera)
+    found, output, gradients = with_gradients(theirs(background=BACKGROUND), as_surfels(gaussians), camera, cotangents)
+    for key in OUTPUTS:
+        assert found[key].isfinite().all(), key
+    for key, gradient in (*gradients.items(), ("means2d", output.means2d.grad)):
+        assert gradient.isfinite().all(), key
+    assert output.means2d.isfinite().all()
+    assert not output.means2d.grad[output.radii == 0].any()
+
+
+# --- gsplat itself ----------------------------------------------------------------------------------------------------
+
+#: Relative L2 distance of outputs, and of gradients, to the definition: float32's share (covariances are inverted by a
+#: determinant that cancels for needles) and that of approximate exponentials and divisions.
+TOLERANCES = {name: (2e-5, 5e-4) for name in SCENES} | {"needles": (2e-4, 2e-3), "pancakes": (2e-4, 2e-3)}
+POSE = 5  # times as much: a sum that cancels
+#: A pixel on a cut-off (alpha at 1/255, light at 1e-4) may fall either way; so many may, at most.
+FLIPPED_SHARE, FLIPPED_PIXELS = 0.01, 2
+PIXEL_TOLERANCE = 1e-3
+
+
+def definition(gaussians, camera, cotangents):
+    return with_gradients(ours(**SAME_CAP), cast(gaussians, torch.float64), camera.to(dtype=torch.float64), cotangents)
+
+
+def stand_in(gaussians, camera, cotangents):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gsplat_library, "load", fake_gsplat.module)
+        return with_gradients(theirs(), gaussians, camera, cotangents)
+
+
+def check_within_the_table(name, device, surfels=False):
+    """Against the definition, for surfels against the stand-in; pixels on a cut-off are counted and then left out."""
+    gaussians, camera = single(name)
+    draw, reference = theirs(), stand_in if surfels else definition
+    gaussians = as_surfels(gaussians) if surfels else gaussians
+    cotangents = random_cotangents(camera)
+    on_device = cast(gaussians, device=device), camera.to(device)
+    there, _, _ = with_gradients(draw, *on_device, {k: v.to(device) for k, v in cotangents.items()})
+    true, _, _ = reference(gaussians, camera, cotangents)
+    flipped = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    for key in ("alpha", "rgb", "depth_accumulated"):
+        error = (there[key].detach().cpu().double() - true[key].detach()).abs().view(*flipped.shape, -1).amax(-1)
+        flipped |= error > PIXEL_TOLERANCE * true[key].detach().abs().max()
+    few = min(FLIPPED_PIXELS, flipped.numel() // 10)
+    assert flipped.sum() <= max(few, FLIPPED_SHARE * flipped.numel())
+    kept = {k: v * (~flipped).view(*flipped.shape, *[1] * (v.dim() - 2)) for k, v in cotangents.items()}
+    _, output, gradients = with_gradients(draw, *on_device, {k: v.to(device) for k, v in kept.items()})
+    _, expected, true_gradients = reference(gaussians, camera, kept)
+    outputs_bound, gradients_bound = TOLERANCES[name]
+    for key in OUTPUTS:
+        assert there[key].device.type == device
+        if key != "depth_median":  # that one jumps
+            assert relative(there[key].cpu()[~flipped], true[key][~flipped]) <= outputs_bound, key
+    for key, gradient in true_gradients.items():
+        allowed = gradients_bound * (POSE if key == "pose" else 1)
+        assert relative(gradients[key].cpu(), gradient) <= allowed, key
+    drawn = expected.radii > 0
+    assert relative(output.means2d.grad.cpu()[drawn], expected.means2d.grad[drawn]) <= gradients_bound
+    radii = output.radii.cpu()[drawn]
+    assert ((radii - expected.radii[drawn]).abs() <= 1).all()  # rounded up from a hair beside
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_float32_as_gsplat_uses_it_stays_within_the_table(calls, monkeypatch, name):
+    monkeypatch.setattr(fake_gsplat, "PRECISION", torch.float32)
+    check_within_the_table(name, "cpu")
+
+
+@pytest.fixture
+def gsplat():
+    """The real one."""
+    forget()
+    found = GsplatRenderer.availability()
+    if not found.ok:
+        pytest.skip(found.reason)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", SCENES)
+def test_gsplat_gives_the_definition_s_numbers(gsplat, name):
+    check_within_the_table(name, "cuda")
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", SCENES)
+def test_gsplat_draws_surfels_as_the_stand_in_does(gsplat, name):
+    check_within_the_table(name, "cuda", surfels=True)
+
+
+@pytest.mark.gpu
+def test_gsplat_draws_a_disc_that_faces_the_camera(gsplat):
+    check_frontal_disc("cuda", 1e-5)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("surfels", [False, True])
+def test_gsplat_survives_empty_views(gsplat, surfels):
+    for means in (torch.zeros(0, 3), torch.tensor([[0, 0, -2.0]]), torch.tensor([[50.0, 0, 4.0]])):
+        n = len(means)
+        gaussians = make(means, torch.full((n, 3), 0.1), torch.full((n,), 0.5))
+        gaussians = cast(as_surfels(gaussians) if surfels else gaussians, torch.float32, "cuda", grad=True)
+        output = render_with_gsplat(gaussians, pinhole(dtype=torch.float32), OUTPUTS)
+        assert not output.alpha.any() and not output.radii.any()
+        sum(output[name].sum() for name in OUTPUTS).backward()
+        assert not any(getattr(gaussians, name).grad.any() for name in INPUTS)
+        assert output.means2d.grad.shape == (n, 2) and not output.means2d.grad.any()
