@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 # As the command line does, and before torch is imported: tests share their machine.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+os.environ.setdefault("GOMP_SPINCOUNT", "10000")
 
 import pytest
 import torch

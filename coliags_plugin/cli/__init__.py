@@ -35,9 +35,10 @@ DESCRIPTION = "Gaussian splatting for colonoscopy: reconstruct, compare, take th
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of the ``coliags`` script. Exits with 0, 2 (bad input), 1 (failure) or 130 (interrupted)."""
-    # OpenMP threads that spin while they wait stall a busy machine: beside two other jobs on two cores, decoding took
-    # 2000 ms with spinning threads and 90 ms with sleeping ones. It is read when torch is first imported.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    # OpenMP threads spin for milliseconds while they wait, which stalls a busy machine: beside other jobs on two cores,
+    # decoding took up to 2000 ms instead of 40. A short spin keeps the speed of a quiet machine and loses little on a
+    # busy one. It is read when torch is first imported.
+    os.environ.setdefault("GOMP_SPINCOUNT", "10000")
     command = tyro.cli(
         Command,
         prog="coliags",
