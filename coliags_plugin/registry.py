@@ -145,6 +145,7 @@ renderers = Registry(
     "renderers",
     {
         "auto": "coliags_plugin.renderers.auto:AutoRenderer",
+        "cpu": "coliags_plugin.renderers.cpu_renderer:CpuRenderer",
         "gsplat": "coliags_plugin.renderers.gsplat_renderer:GsplatRenderer",
         "torch": "coliags_plugin.renderers.torch_renderer:TorchRenderer",
     },

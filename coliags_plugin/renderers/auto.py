@@ -12,7 +12,7 @@ from coliags_plugin.settings import Settings
 class AutoSettings(Settings):
     """Preferences, and the options every splatting renderer shares."""
 
-    prefer: tuple[str, ...] = ("gsplat", "torch")
+    prefer: tuple[str, ...] = ("gsplat", "cpu", "torch")
     near: float = Field(default=0.2, ge=0)  # scene units
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 

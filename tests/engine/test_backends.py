@@ -14,10 +14,18 @@ from coliags_plugin.errors import InputError
 CPU = torch.device("cpu")
 
 
-def test_auto_chooses_torch_and_says_why():
+def test_auto_chooses_cpu_on_the_cpu_and_says_why():
+    chosen = choose_renderer(make_component("renderers", "auto"), "gaussians3d", CPU)
+    assert chosen.name == "cpu"
+    assert "auto chose cpu" in chosen.reason
+
+
+def test_auto_falls_back_to_torch_and_says_why(monkeypatch):
+    renderer = registry.renderers.get("cpu")
+    monkeypatch.setattr(renderer, "availability", classmethod(lambda cls: Availability(False, "numba is at lunch")))
     chosen = choose_renderer(make_component("renderers", "auto"), "gaussians3d", CPU)
     assert chosen.name == "torch"
-    assert "auto chose torch" in chosen.reason
+    assert "cpu cannot run here: numba is at lunch" in chosen.reason
 
 
 def test_auto_passes_its_options_on():

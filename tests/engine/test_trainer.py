@@ -264,7 +264,7 @@ def test_provenance_says_where_the_run_came_from(tmp_path):
     trainer = train(tmp_path / "run", steps=1, seed=5)
     found = json.loads(trainer.run.provenance_file.read_text())
     assert found["seed"] == 5
-    assert found["renderer"] == "torch"
+    assert found["renderer"] == "cpu"
     assert "auto" in found["renderer_reason"]
     assert found["scene"]["provenance"]["fingerprint"] == "wall-9-True"
     assert trainer_module.software().items() <= found.items()

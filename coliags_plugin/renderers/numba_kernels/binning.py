@@ -9,7 +9,7 @@ from __future__ import annotations
 import numba
 
 from coliags_plugin.renderers.numba_kernels import layout
-from coliags_plugin.renderers.numba_kernels.compilation import kernel, part
+from coliags_plugin.renderers.numba_kernels.compilation import kernel, part, region
 from coliags_plugin.renderers.numba_kernels.geometry import squared_distance_to_box
 from coliags_plugin.renderers.numba_kernels.lanes import (
     add,
@@ -19,17 +19,17 @@ from coliags_plugin.renderers.numba_kernels.lanes import (
     fma,
     lane_columns,
     lane_rows,
+    number,
+    prefetch,
     splat,
     sub,
 )
-from coliags_plugin.renderers.numba_kernels.sorting import (
-    DIGIT_BITS,
-    collect_parcel,
-    count_digits,
-    move_by_digit,
-    turn_counts_into_places,
-)
+from coliags_plugin.renderers.numba_kernels.sorting import NUMBER, sort_by_depth
 from coliags_plugin.renderers.numba_kernels.threads import take
+from coliags_plugin.renderers.numba_kernels.tiles import order_tiles
+
+#: How many Gaussians before its turn a record is asked for.
+_AHEAD = 8
 
 
 @kernel
@@ -54,11 +54,11 @@ def bin_gaussians(
     pair_blocks,
     tile_counts,
     stretch_pairs,
-    entry_first,
-    entry_count,
-    entry_place,
+    stretch_entries,
+    entry_counts,
     cells,
     starts,
+    order,
 ):  # type: ignore[no-untyped-def]
     """List the Gaussians of each tile.
 
@@ -69,56 +69,28 @@ def bin_gaussians(
         records, depth_bits, bounds, drawn, parcels: What projection wrote; the depths as integers.
         log2_alpha_min: Where a Gaussian ends.
         columns, tiles: Tiles side by side, and in all.
-        keys, moved: Scratch. [Gaussians drawn]
-        ranges: Scratch. [2 for each parcel]
-        digits: Scratch. [DIGITS for each worker]
+        keys: Out, see ``sorting``.
+        moved, ranges, digits: Scratch, see ``sorting``.
         pair_gaussian, pair_tile, pair_blocks: Scratch. [tiles within bounds]
         tile_counts: Scratch. [tiles for each stretch]
         stretch_pairs: Scratch. [2 for each stretch]
-        entry_first, entry_count: Out: where in ``entry_place`` the entries of a Gaussian are listed, and how many. Only
-            those of Gaussians drawn are written. [Gaussians]
-        entry_place: Out: place among ``cells``. [tiles within bounds]
-        cells: Out: see ``layout``. [2 for each tile within bounds]
+        stretch_entries: Out: number of the first entry of each stretch, counted by depth, and how many there are.
+            [stretches + 1]
+        entry_counts: Out: entries of each Gaussian, by depth. [Gaussians drawn]
+        cells: Out: see ``layout``. [3 for each tile within bounds]
         starts: Out: first entry of each tile, and how many there are. [tiles + 1]
+        order: Out: tiles, long lists first. [tiles]
     """
-    count = 0
-    parcel_count = len(parcels) // 2
-    for parcel in range(parcel_count):
-        count, parcels[2 * parcel] = count + parcels[2 * parcel], count
-    for worker in numba.prange(workers):
-        for parcel in range(parcel_count * worker // workers, parcel_count * (worker + 1) // workers):
-            collect_parcel(parcel, parcels[2 * parcel], depth_bits, drawn, keys, ranges)
-    lowest, highest = ranges[0], ranges[1]
-    for parcel in range(parcel_count):
-        lowest, highest = min(lowest, ranges[2 * parcel]), max(highest, ranges[2 * parcel + 1])
-    significant = 0
-    while lowest + (1 << significant) <= highest:
-        significant += 1
-    passes = (significant + DIGIT_BITS - 1) // DIGIT_BITS
-    width = (significant + passes - 1) // max(passes, 1)
-    mask = (1 << width) - 1
-    for turn in range(passes):
-        shift = turn * width
-        for worker in numba.prange(workers):
-            first, last = count * worker // workers, count * (worker + 1) // workers
-            count_digits(worker, keys, first, last, lowest, shift, mask, digits)
-        turn_counts_into_places(workers, mask + 1, digits)
-        for worker in numba.prange(workers):
-            first, last = count * worker // workers, count * (worker + 1) // workers
-            move_by_digit(worker, keys, first, last, lowest, shift, mask, digits, moved)
-        keys, moved = moved, keys
-
-    for _ in numba.prange(workers):
-        while True:
-            stretch = take(counters, 1, 1)
-            if stretch >= stretches:
-                break
-            first, last = count * stretch // stretches, count * (stretch + 1) // stretches
-            pairs = _find_pairs(
-                stretch, first, last, keys, records, bounds, log2_alpha_min, columns, tiles, counters, pair_gaussian,
-                pair_tile, pair_blocks, tile_counts, entry_first, entry_count,
-            )  # fmt: skip
-            stretch_pairs[2 * stretch], stretch_pairs[2 * stretch + 1] = pairs
+    count = sort_by_depth(workers, parcels, depth_bits, drawn, keys, moved, ranges, digits)
+    _find_all_pairs(
+        workers, stretches, counters, count, keys, records, bounds, log2_alpha_min, columns, tiles, pair_gaussian,
+        pair_tile, pair_blocks, tile_counts, stretch_pairs, entry_counts,
+    )  # fmt: skip
+    total = 0
+    for stretch in range(stretches):
+        stretch_entries[stretch] = total
+        total += stretch_pairs[2 * stretch + 1] - stretch_pairs[2 * stretch]
+    stretch_entries[stretches] = total
     total = 0
     for tile in range(tiles):
         starts[tile] = total
@@ -126,56 +98,90 @@ def bin_gaussians(
             at = stretch * tiles + tile
             total, tile_counts[at] = total + tile_counts[at], total
     starts[tiles] = total
-    for _ in numba.prange(workers):
-        while True:
-            stretch = take(counters, 3, 1)
-            if stretch >= stretches:
-                break
-            first, last = stretch_pairs[2 * stretch], stretch_pairs[2 * stretch + 1]
-            _sort_pairs(
-                first, last, stretch * tiles, pair_gaussian, pair_tile, pair_blocks, tile_counts, entry_place, cells
-            )
+    order_tiles(starts, order)
+    _sort_all_pairs(
+        workers, stretches, counters, tiles, pair_gaussian, pair_tile, pair_blocks, tile_counts, stretch_pairs,
+        stretch_entries, cells,
+    )  # fmt: skip
 
 
-@part
-def _find_pairs(
-    stretch,
-    first,
-    last,
+@region
+def _find_all_pairs(
+    workers,
+    stretches,
+    counters,
+    count,
     keys,
     records,
     bounds,
     log2_alpha_min,
     columns,
     tiles,
-    counters,
     pair_gaussian,
     pair_tile,
     pair_blocks,
     tile_counts,
-    entry_first,
-    entry_count,
+    stretch_pairs,
+    entry_counts,
+):  # type: ignore[no-untyped-def]
+    for _ in numba.prange(workers):
+        while True:
+            stretch = take(counters, 1, 1)
+            if stretch >= stretches:
+                break
+            first, last = count * stretch // stretches, count * (stretch + 1) // stretches
+            # Where the pairs of a stretch lie does not matter, for they are sorted by stretch.
+            pair_first = take(counters, 2, _tiles_within_bounds(first, last, keys, bounds))
+            pair_last = _find_pairs(
+                first, last, pair_first, stretch * tiles, keys, records, bounds, log2_alpha_min, columns, tiles,
+                pair_gaussian, pair_tile, pair_blocks, tile_counts, entry_counts,
+            )  # fmt: skip
+            stretch_pairs[2 * stretch], stretch_pairs[2 * stretch + 1] = pair_first, pair_last
+
+
+@part
+def _tiles_within_bounds(first, last, keys, bounds):  # type: ignore[no-untyped-def]
+    """How many pairs the Gaussians in places ``first`` to ``last`` can make."""
+    total = 0
+    for place in range(first, last):
+        at = 4 * (keys[place] & NUMBER)
+        across = int(number(bounds, at + 1)) - int(number(bounds, at)) + 1
+        total += across * (int(number(bounds, at + 3)) - int(number(bounds, at + 2)) + 1)
+    return total
+
+
+@part
+def _find_pairs(
+    first,
+    last,
+    pair,
+    counted,
+    keys,
+    records,
+    bounds,
+    log2_alpha_min,
+    columns,
+    tiles,
+    pair_gaussian,
+    pair_tile,
+    pair_blocks,
+    tile_counts,
+    entry_counts,
 ):  # type: ignore[no-untyped-def]
     """Pair the Gaussians in places ``first`` to ``last`` of the sorted list with the tiles they touch.
 
+    Writes the pairs from ``pair`` on, and counts those of each tile in ``tile_counts`` from ``counted`` on.
+
     Returns:
-        First and last place of these pairs in the lists of pairs.
+        Where the pairs end.
     """
-    counted = stretch * tiles
-    for tile in range(tiles):
-        tile_counts[counted + tile] = 0
-    within_bounds = 0
-    for place in range(first, last):
-        at = 4 * (keys[place] & 0xFFFFFFFF)
-        across = int(bounds[at + 1]) - int(bounds[at]) + 1
-        within_bounds += across * (int(bounds[at + 3]) - int(bounds[at + 2]) + 1)
-    # Where the pairs of a stretch lie does not matter, for they are sorted by stretch.
-    pair_first = take(counters, 2, within_bounds)
-    pair = pair_first
+    for tile in range(counted, counted + tiles):
+        tile_counts[tile] = 0
     block_left = fma(lane_columns(), layout.BLOCK, 0.5)
     block_top = fma(lane_rows(), layout.BLOCK, 0.5)
     for place in range(first, last):
-        index = keys[place] & 0xFFFFFFFF
+        prefetch(records, layout.ROW * (keys[min(place + _AHEAD, last - 1)] & NUMBER))
+        index = keys[place] & NUMBER
         row = layout.ROW * index
         u_xx = broadcast(records, row + layout.U_XX)
         u_yx = broadcast(records, row + layout.U_YX)
@@ -184,8 +190,8 @@ def _find_pairs(
         slope_level = broadcast(records, row + layout.SLOPE_LEVEL)
         mean_x, mean_y = records[row + layout.MEAN_X], records[row + layout.MEAN_Y]
         reach = splat(records[row + layout.LOG2_OPACITY] - log2_alpha_min + layout.REACH_SLACK)
-        entry_first[index] = pair
         column_first, column_last = int(bounds[4 * index]), int(bounds[4 * index + 1])
+        pair_start = pair
         for tile_row in range(int(bounds[4 * index + 2]), int(bounds[4 * index + 3]) + 1):
             top = sub(add(block_top, tile_row * layout.TILE), mean_y)
             bottom = add(top, layout.BLOCK - 1)
@@ -202,17 +208,46 @@ def _find_pairs(
                     pair_blocks[pair] = blocks
                     tile_counts[counted + tile] += 1
                     pair += 1
-        entry_count[index] = pair - entry_first[index]
-    return pair_first, pair
+        entry_counts[place] = pair - pair_start
+    return pair
+
+
+@region
+def _sort_all_pairs(
+    workers,
+    stretches,
+    counters,
+    tiles,
+    pair_gaussian,
+    pair_tile,
+    pair_blocks,
+    tile_counts,
+    stretch_pairs,
+    stretch_entries,
+    cells,
+):  # type: ignore[no-untyped-def]
+    for _ in numba.prange(workers):
+        while True:
+            stretch = take(counters, 3, 1)
+            if stretch >= stretches:
+                break
+            _sort_pairs(
+                stretch_pairs[2 * stretch], stretch_pairs[2 * stretch + 1], stretch_entries[stretch], stretch * tiles,
+                pair_gaussian, pair_tile, pair_blocks, tile_counts, cells,
+            )  # fmt: skip
 
 
 @part
-def _sort_pairs(first, last, counted, pair_gaussian, pair_tile, pair_blocks, places, entry_place, cells):  # type: ignore[no-untyped-def]
-    """Put pairs ``first`` to ``last`` where their tile belongs; ``places`` from ``counted`` on say where that is."""
+def _sort_pairs(first, last, entry, counted, pair_gaussian, pair_tile, pair_blocks, places, cells):  # type: ignore[no-untyped-def]
+    """Put pairs ``first`` to ``last``, which become the entries from ``entry`` on, where their tiles belong.
+
+    ``places`` say from ``counted`` on where that is.
+    """
     for pair in range(first, last):
         at = counted + pair_tile[pair]
-        place = places[at]
-        places[at] = place + 1
-        cells[2 * place] = pair_gaussian[pair]
-        cells[2 * place + 1] = pair_blocks[pair]
-        entry_place[pair] = place
+        cell = layout.CELL * places[at]
+        places[at] += 1
+        cells[cell] = pair_gaussian[pair]
+        cells[cell + 1] = pair_blocks[pair]
+        cells[cell + 2] = entry
+        entry += 1

@@ -31,9 +31,26 @@ def part(function: _Function) -> _Function:
     return numba.njit(function, **_OPTIONS)  # type: ignore[no-any-return]
 
 
+def region(function: _Function) -> _Function:
+    """What several threads do at once: a loop over ``numba.prange``, with nothing behind it.
+
+    numba moves whatever it finds behind such a loop in front of it unless it sees the loop write what is read, and it
+    does not look into the functions called.
+    """
+    return numba.njit(function, parallel=True, **_OPTIONS)  # type: ignore[no-any-return]
+
+
 def kernel(function: _Function) -> _Function:
-    """A function that Python calls: runs on several threads, and is kept on disk once compiled."""
-    dispatcher = numba.njit(function, parallel=True, **_OPTIONS)
+    """What Python calls: parts and regions in their order. It is kept on disk once compiled."""
+    return _kept(numba.njit(function, **_OPTIONS), function)
+
+
+def region_kernel(function: _Function) -> _Function:
+    """A region that Python calls. It is kept on disk once compiled."""
+    return _kept(numba.njit(function, parallel=True, **_OPTIONS), function)
+
+
+def _kept(dispatcher: Any, function: _Function) -> _Function:
     try:
         dispatcher._cache = _KernelCache(function)
     except RuntimeError:  # numba: no folder to keep it in

@@ -176,3 +176,10 @@ def squared_distance_to_box(u_xx, u_yx, u_yy, slope_upright, slope_level, left, 
 def shortest_axes(scale):  # type: ignore[no-untyped-def]
     """Whether the second, and whether the third axis is the shortest; where neither is, the first. Ties go forwards."""
     return less(scale[1], scale[0]), less(scale[2], smaller(scale[0], scale[1]))
+
+
+@inline
+def shortest_column(rotation, second, third):  # type: ignore[no-untyped-def]
+    """The column of the rotation that :func:`shortest_axes` chose: the shortest axis in the world."""
+    a, b, c = rotation
+    return select(third, (a[2], b[2], c[2]), select(second, (a[1], b[1], c[1]), (a[0], b[0], c[0])))

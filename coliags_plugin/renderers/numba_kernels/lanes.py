@@ -268,6 +268,18 @@ def select(typingctx: Any, mask: Any, chosen: Any, other: Any) -> Any:
 
 
 @intrinsic
+def from_bits(typingctx: Any, flags: Any) -> Any:
+    """The mask that :func:`bits` turns into this integer."""
+    if not isinstance(flags, types.Integer):
+        return None
+
+    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+        return builder.bitcast(builder.trunc(arguments[0], ir.IntType(WIDTH)), _MASK)
+
+    return lane_mask(types.int64), generate
+
+
+@intrinsic
 def bits(typingctx: Any, mask: Any) -> Any:
     """The mask as an integer, lane 0 in the lowest bit."""
     if not isinstance(mask, LaneMask):
@@ -337,6 +349,31 @@ def store(typingctx: Any, table: Any, index: Any, value: Any) -> Any:
         return context.get_dummy_value()
 
     return types.none(table, types.intp, value), generate
+
+
+def _prefetching(name: str, writes: int) -> Any:
+    def typed(typingctx: Any, table: Any, index: Any) -> Any:
+        if not _is_table(table):
+            return None
+
+        def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+            address = _address(context, builder, signature.args[0], *arguments, ir.IntType(8))
+            kind = ir.FunctionType(ir.VoidType(), [address.type, _INT, _INT, _INT])
+            function = builder.module.declare_intrinsic("llvm.prefetch", [address.type], kind)
+            # Into all levels of the cache for data.
+            builder.call(function, [address, *(ir.Constant(_INT, value) for value in (writes, 3, 1))])
+            return context.get_dummy_value()
+
+        return types.none(table, types.intp), generate
+
+    typed.__name__ = name
+    return intrinsic(typed)
+
+
+#: Have the line of memory with ``table[index]`` brought nearer, without waiting for it
+prefetch = _prefetching("prefetch", 0)
+#: The same where it is to be written
+prefetch_to_write = _prefetching("prefetch_to_write", 1)
 
 
 @intrinsic
@@ -468,6 +505,18 @@ def _transposed(builder: ir.IRBuilder, rows: Sequence[Any]) -> list[Any]:
     return vectors
 
 
+@intrinsic
+def repeat(typingctx: Any, value: Any, like: Any) -> Any:
+    """A number, as many times as the tuple ``like`` is long, each time in all lanes."""
+    if not (_is_scalar(value) and isinstance(like, types.BaseTuple)):
+        return None
+
+    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+        return _pack(builder, [_as_lanes(builder, arguments[0], signature.args[0])] * len(like))
+
+    return _tuple_of_lanes(len(like))(value, like), generate
+
+
 # --- across lanes -----------------------------------------------------------------------------------------------------
 
 
@@ -517,7 +566,7 @@ def lane_sums(typingctx: Any, vectors: Any) -> Any:
 
 @intrinsic
 def lane_columns(typingctx: Any) -> Any:
-    """0, 1, 2, 3 four times over: column of a lane's pixel in a block of 4 x 4. Also the column of a block in a tile."""
+    """0, 1, 2, 3 four times over: column of a lane's pixel in a block of 4 x 4, or of a block in a tile."""
     values = [float(lane % 4) for lane in range(WIDTH)]
     return lanes(), lambda context, builder, signature, arguments: _constant(values)
 
@@ -549,5 +598,17 @@ def lowest_bit(typingctx: Any, flags: Any) -> Any:
 
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
         return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
+
+    return types.int64(types.int64), generate
+
+
+@intrinsic
+def bit_count(typingctx: Any, flags: Any) -> Any:
+    """How many bits are set in an integer."""
+    if not isinstance(flags, types.Integer):
+        return None
+
+    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+        return builder.ctpop(arguments[0])
 
     return types.int64(types.int64), generate

@@ -5,11 +5,12 @@
 The whitening U here is scaled so that log2(alpha) = log2(opacity) - |U d|^2, without further factors:
 U = sqrt(log2(e) / 2) times the U of ``docs/rendering.md``.
 
-``cells``: two integers for each pair of a Gaussian and a tile that it touches, by tile and front to back: the number of
-the Gaussian, and which of the tile's blocks it touches, one bit each.
+``cells``: three integers for each entry, which is a pair of a Gaussian and a tile that it touches, by tile and front
+to back: the number of the Gaussian; which of the tile's blocks it touches, one bit each; and the number of the entry
+when they are counted by Gaussian, nearest first, and by tile.
 
-``entry_sums`` and ``gaussian_sums``: one row of 16 numbers for each entry, or their sum over the entries of a
-Gaussian. With v the derivative of the loss with respect to ln(alpha) and (e, f) = U d they are the sums over pixels of
+``entry_sums`` and ``gaussian_sums``: one row of 16 numbers for each entry, counted by Gaussian and tile, and
+their sum over the entries of a Gaussian. With v the derivative of the loss with respect to ln(alpha) and (e, f) = U d they are the sums over pixels of
 v, v e, v f, v e e, v e f, v f f, and of weight times the derivative with respect to each composited channel.
 """
 
@@ -39,6 +40,9 @@ CHANNELS = 6
 #: cov_xy / cov_xx and cov_xy / cov_yy: how the nearest point moves along an edge that is upright, or level.
 SLOPE_UPRIGHT = 14
 SLOPE_LEVEL = 15
+
+#: Integers in ``cells`` for each entry.
+CELL = 3
 
 # Columns of the sums.
 SUM_V = 0

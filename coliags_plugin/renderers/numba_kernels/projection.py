@@ -8,12 +8,19 @@ from __future__ import annotations
 import numba
 
 from coliags_plugin.renderers.numba_kernels import layout
-from coliags_plugin.renderers.numba_kernels.compilation import inline, kernel, part
-from coliags_plugin.renderers.numba_kernels.geometry import cross, project_axes, shortest_axes, squared_distance_to_box
+from coliags_plugin.renderers.numba_kernels.compilation import inline, part, region_kernel
+from coliags_plugin.renderers.numba_kernels.geometry import (
+    cross,
+    project_axes,
+    shortest_axes,
+    shortest_column,
+    squared_distance_to_box,
+)
 from coliags_plugin.renderers.numba_kernels.lanes import (
     add,
     at_least,
     at_most,
+    bit_count,
     bits,
     both,
     broadcast,
@@ -27,7 +34,6 @@ from coliags_plugin.renderers.numba_kernels.lanes import (
     lane,
     lane_sums,
     larger,
-    less,
     load,
     load_columns,
     log2,
@@ -49,7 +55,7 @@ PARCEL = 1024
 _SMALLEST_SQUARED_NORM = 1e-24
 
 
-@kernel
+@region_kernel
 def project(
     workers,
     counters,
@@ -93,8 +99,8 @@ def project(
         radii: Out, pixels, 0 where not drawn.
         bounds: Out: first and last column, first and last row of the tiles within reach. [4 for each Gaussian]
         drawn: Out: one bit for each Gaussian of a group. [groups]
-        parcels: Out: Gaussians drawn, and tiles within their bounds, of each parcel; both -1 where a Gaussian cannot
-            be used. [2 for each parcel]
+        parcels: Out: of each parcel Gaussians drawn, -1 where one cannot be used, and tiles within their bounds.
+            [2 for each parcel]
     """
     groups = (count + 15) // 16
     whole_groups = count // 16
@@ -117,7 +123,7 @@ def project(
                     with_depth, with_inverse_depth, with_normals, records, means2d, depths, radii, bounds, drawn,
                 )  # fmt: skip
                 drawn_count = drawn_count + more if more >= 0 else -1
-                tile_count = tile_count + more_tiles
+                tile_count += more_tiles
             parcels[2 * parcel] = drawn_count
             parcels[2 * parcel + 1] = tile_count
 
@@ -143,9 +149,12 @@ def _project_groups(
     bounds,
     drawn,
 ):  # type: ignore[no-untyped-def]
-    """Project groups ``first`` to ``last``, reading from group ``source`` of the inputs on."""
-    drawn_count = 0
-    tile_count = 0
+    """Project groups ``first`` to ``last``, reading from group ``source`` of the inputs on.
+
+    Returns:
+        How many are drawn, -1 where one cannot be used; and how many tiles are within their bounds.
+    """
+    drawn_count, tile_count = 0, 0
     usable = True
     three = (0, 0, 0)
     log2_alpha_min = broadcast(view, layout.VIEW_LOG2_ALPHA_MIN)
@@ -204,16 +213,16 @@ def _project_groups(
         row_last = _tile(add(mean_y, half_y), last_row)
         store_columns(bounds, 64 * group, (column_first, column_last, row_first, row_last))
         area = mul(add(sub(column_last, column_first), 1.0), add(sub(row_last, row_first), 1.0))
-        sums = lane_sums((select(shown, area, 0.0), select(shown, splat(1.0), 0.0)))
-        tile_count += int(lane(sums, 0))
-        drawn_count += int(lane(sums, 1))
+        tile_count += int(lane(lane_sums((select(shown, area, 0.0),)), 0))
+        flags = bits(shown)
+        drawn[group] = flags
+        drawn_count += bit_count(flags)
 
         store_columns(means2d, 32 * group, (mean_x, mean_y))
         store(depths, 16 * group, at.z)
-        drawn[group] = bits(shown)
         facing = _facing_normals(at, scale, view) if with_normals else (splat(0.0), splat(0.0), splat(0.0))
         channels = color + _extra_channels(at.z, at.inverse_z, facing, with_depth, with_inverse_depth)
-        row = (u_xx, u_yx, u_yy, mean_x, mean_y, log2_opacity) + channels + (slope_upright, slope_level)
+        row = (u_xx, u_yx, u_yy, mean_x, mean_y, log2_opacity) + channels + (slope_upright, slope_level)  # noqa: RUF005
         store_columns(records, 16 * layout.ROW * group, row)
     return (drawn_count if usable else -1), tile_count
 
@@ -240,8 +249,7 @@ def _extra_channels(depth, inverse_depth, normal, with_depth, with_inverse_depth
 def _facing_normals(at, scale, view):  # type: ignore[no-untyped-def]
     """The shortest axes, camera axes, turned so that they look at the camera."""
     second, third = shortest_axes(scale)
-    a, b, c = at.rotation
-    axis = select(third, (a[2], b[2], c[2]), select(second, (a[1], b[1], c[1]), (a[0], b[0], c[0])))
+    axis = shortest_column(at.rotation, second, third)
     # The line of sight and the axis may be compared in the world as well as in the camera.
     axis = select(greater(dot(axis, at.offset, 0.0), 0.0), neg(axis), axis)
     right = broadcast_all(view, layout.VIEW_RIGHT, (0, 0, 0))

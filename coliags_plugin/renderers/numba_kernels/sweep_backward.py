@@ -1,7 +1,7 @@
 """Derivatives of compositing, tile by tile, front to back once more.
 
-With g the derivative of the loss with respect to a pixel's composited channels, what a Gaussian of weight w and channels
-c shows is w (g . c). A running difference, first the whole pixel's (g . composited), tells what everything behind it
+With g the derivative of the loss with respect to a pixel's composited channels, what a Gaussian of weight w and
+channels c shows is w (g . c). A running difference, first the whole pixel's (g . composited), tells what everything behind it
 still shows; see ``docs/rendering.md``, section "Derivatives". Nothing is kept from the forward pass but its images.
 """
 
@@ -11,7 +11,7 @@ import numba
 import numpy as np
 
 from coliags_plugin.renderers.numba_kernels import layout
-from coliags_plugin.renderers.numba_kernels.compilation import kernel, part
+from coliags_plugin.renderers.numba_kernels.compilation import inline, part, region_kernel
 from coliags_plugin.renderers.numba_kernels.lanes import (
     add,
     at_least,
@@ -31,7 +31,9 @@ from coliags_plugin.renderers.numba_kernels.lanes import (
     lowest_bit,
     mul,
     neg,
+    prefetch_to_write,
     quick_div,
+    repeat,
     select,
     smaller,
     splat,
@@ -48,8 +50,8 @@ from coliags_plugin.renderers.numba_kernels.tiles import (
     tile_corner,
 )
 
-# A block's vectors: x and y of its pixels, transmittance, what is still to be shown, and the derivatives with respect to
-# alpha and to each channel.
+# A block's vectors: x and y of its pixels, transmittance, what is still to be shown, and the derivatives with respect
+# to alpha and to each channel.
 _X = 0
 _Y = 16
 _TRANSMITTANCE = 32
@@ -61,7 +63,7 @@ STATE = _CHANNELS + 16 * layout.MAX_CHANNELS
 SCRATCH = CHUNK * layout.ROW + layout.BLOCKS * STATE
 
 
-@kernel
+@region_kernel
 def sweep_backward(
     workers,
     counters,
@@ -106,7 +108,7 @@ def sweep_backward(
         rgb, alpha, depth, inverse_depth, expected, normals: The images. [H, W, 3] or [H, W], or empty.
         of_rgb, of_alpha, of_depth, of_inverse_depth, of_expected, of_normals: Derivatives with respect to them; empty
             where 0.
-        entry_sums: Out: see ``layout``; rows beyond those reached are left alone. [16 for each entry]
+        entry_sums: Out: see ``layout``. [16 for each entry]
     """
     tiles = len(starts) - 1
     for worker in numba.prange(workers):
@@ -127,6 +129,8 @@ def sweep_backward(
                     tile, alive, records, depths, cells, starts[tile], reached[tile], channels, cuts, columns, rows, state,
                     blocks, entry_sums,
                 )  # fmt: skip
+            for entry in range(reached[tile], starts[tile + 1]):
+                store(entry_sums, layout.ROW * cells[layout.CELL * entry + 2], 0.0)
 
 
 @part
@@ -217,54 +221,51 @@ def _sweep_tile(
             first, end, alive, cells, records, depths, np.float32(corner_x + half), np.float32(corner_y + half), rows,
             blocks,
         )  # fmt: skip
+        for entry in range(first, end):
+            prefetch_to_write(entry_sums, layout.ROW * cells[layout.CELL * entry + 2])
         for entry in range(end - first):
             alive = _sweep_entry(
                 layout.ROW * entry, blocks[entry] & alive, alive, rows, channels, cuts, state,
-                layout.ROW * (first + entry), entry_sums,
+                layout.ROW * cells[layout.CELL * (first + entry) + 2], entry_sums,
             )  # fmt: skip
         first = end
 
 
-@part
+@inline
 def _sweep_entry(row, blocks, alive, rows, channels, cuts, state, target, entry_sums):  # type: ignore[no-untyped-def]
     """Add up one entry's sums over its blocks. Returns which blocks still let light through."""
-    log2_alpha_min, alpha_max, transmittance_min = splat(cuts[0]), splat(cuts[1]), splat(cuts[2])
-    u_xx, offset_e = broadcast(rows, row + layout.U_XX), broadcast(rows, row + OFFSET_E)
-    u_yx, u_yy = broadcast(rows, row + layout.U_YX), broadcast(rows, row + layout.U_YY)
-    offset_f = broadcast(rows, row + OFFSET_F)
-    log2_opacity = broadcast(rows, row + layout.LOG2_OPACITY)
-    own = broadcast_all(rows, row + layout.CHANNELS, channels)
     zero = splat(0.0)
     sum_v, sum_e, sum_f, sum_ee, sum_ef, sum_ff = zero, zero, zero, zero, zero, zero
-    sums = mul(own, 0.0)
+    sums = repeat(0.0, channels)
     while blocks:
         block = lowest_bit(blocks)
         blocks &= blocks - 1
         at = STATE * block
         x, y = load(state, at + _X), load(state, at + _Y)
-        e = fma(u_xx, x, offset_e)
-        f = fma(u_yx, x, fma(u_yy, y, offset_f))
-        log2_alpha = fma(neg(e), e, fma(neg(f), f, log2_opacity))
+        e = fma(broadcast(rows, row + layout.U_XX), x, broadcast(rows, row + OFFSET_E))
+        f = fma(broadcast(rows, row + layout.U_YY), y, broadcast(rows, row + OFFSET_F))
+        f = fma(broadcast(rows, row + layout.U_YX), x, f)
+        log2_alpha = fma(neg(e), e, fma(neg(f), f, broadcast(rows, row + layout.LOG2_OPACITY)))
         free_alpha = exp2(log2_alpha)
-        alpha = select(at_least(log2_alpha, log2_alpha_min), smaller(free_alpha, alpha_max), 0.0)
+        alpha = select(at_least(log2_alpha, broadcast(cuts, 0)), smaller(free_alpha, broadcast(cuts, 1)), 0.0)
         transmittance = load(state, at + _TRANSMITTANCE)
         through = sub(1.0, alpha)
         behind = mul(transmittance, through)
-        drawn = at_least(behind, transmittance_min)
+        drawn = at_least(behind, broadcast(cuts, 2))
         weight = select(drawn, mul(alpha, transmittance), 0.0)
         store(state, at + _TRANSMITTANCE, select(drawn, behind, 0.0))
 
         given = load_all(state, at + _CHANNELS, channels)
-        shown = mul(weight, dot(own, given, load(state, at + _ALPHA)))
+        shown = mul(weight, dot(broadcast_all(rows, row + layout.CHANNELS, channels), given, load(state, at + _ALPHA)))
         hidden = sub(load(state, at + _BEHIND), shown)
         store(state, at + _BEHIND, hidden)
         v = sub(shown, mul(quick_div(alpha, through), hidden))
-        v = select(both(drawn, less(free_alpha, alpha_max)), v, 0.0)
+        v = select(both(drawn, less(free_alpha, broadcast(cuts, 1))), v, 0.0)
         v_e, v_f = mul(v, e), mul(v, f)
         sum_v, sum_e, sum_f = add(sum_v, v), add(sum_e, v_e), add(sum_f, v_f)
         sum_ee, sum_ef, sum_ff = fma(v_e, e, sum_ee), fma(v_e, f, sum_ef), fma(v_f, f, sum_ff)
         sums = fma(weight, given, sums)
         if not bits(drawn):
             alive &= ~(1 << block)
-    store(entry_sums, target, lane_sums((sum_v, sum_e, sum_f, sum_ee, sum_ef, sum_ff) + sums))
+    store(entry_sums, target, lane_sums((sum_v, sum_e, sum_f, sum_ee, sum_ef, sum_ff) + sums))  # noqa: RUF005
     return alive

@@ -10,7 +10,7 @@ import numba
 import numpy as np
 
 from coliags_plugin.renderers.numba_kernels import layout
-from coliags_plugin.renderers.numba_kernels.compilation import kernel, part
+from coliags_plugin.renderers.numba_kernels.compilation import part, region_kernel
 from coliags_plugin.renderers.numba_kernels.lanes import (
     add,
     at_least,
@@ -52,7 +52,7 @@ STATE = 16 * (3 + layout.MAX_CHANNELS)
 SCRATCH = CHUNK * layout.ROW + layout.BLOCKS * STATE
 
 
-@kernel
+@region_kernel
 def sweep_forward(
     workers,
     counters,

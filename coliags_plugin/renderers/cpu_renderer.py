@@ -1,0 +1,218 @@
+"""Gaussian splatting on the CPU with compiled kernels: the numbers of the torch renderer, much sooner."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from importlib.util import find_spec
+from typing import ClassVar
+
+import numpy as np
+import pydantic
+import torch
+from torch import Tensor
+
+from coliags_plugin.cameras import Camera
+from coliags_plugin.contracts import Availability, Field, Renderer
+from coliags_plugin.errors import InputError, did_you_mean
+from coliags_plugin.gaussians import OUTPUTS, Gaussians, RenderOutput
+from coliags_plugin.renderers.projection import JACOBIAN_MARGIN
+from coliags_plugin.settings import Settings
+
+#: Tensors of the Gaussians and the width of their rows; None for none.
+_SHAPES = {"means": 3, "quats_wxyz": 4, "scales": 3, "opacities": None, "colors": 3}
+
+
+class CpuRendererSettings(Settings):
+    """Options of :class:`CpuRenderer`: those of the torch renderer, with its defaults."""
+
+    near: float = pydantic.Field(default=0.2, ge=0)
+    """Gaussians with a centre at z <= near are not drawn. Scene units."""
+    low_pass: float = pydantic.Field(default=0.3, gt=0)
+    """Added to the diagonal of every 2D covariance, so that nothing is thinner than a pixel. Square pixels."""
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """RGB behind everything."""
+    alpha_max: float = pydantic.Field(default=0.99, gt=0, lt=1)
+    """No Gaussian is more opaque than this at any pixel."""
+    alpha_min: float = pydantic.Field(default=1 / 255, gt=0, lt=1)
+    """Fainter contributions are skipped."""
+    transmittance_min: float = pydantic.Field(default=1e-4, ge=0, lt=1)
+    """Compositing stops before the Gaussian that would leave less light than this."""
+
+
+class CpuRenderer(Renderer):
+    """Splats float32 Gaussians on the CPU by numba kernels. See ``docs/rendering.md``, section "The cpu backend"."""
+
+    Settings = CpuRendererSettings
+    primitives: ClassVar[frozenset[str]] = frozenset({"gaussians3d"})
+    outputs: ClassVar[frozenset[str]] = frozenset(OUTPUTS)
+    devices: ClassVar[frozenset[str]] = frozenset({"cpu"})
+
+    settings: CpuRendererSettings
+
+    @classmethod
+    def availability(cls) -> Availability:
+        """Where numba is installed; does not import it."""
+        if find_spec("numba") is None:
+            return Availability(False, "numba is not installed: pip install numba")
+        return Availability(True, f"numba kernels on {torch.get_num_threads()} threads")
+
+    def render(
+        self,
+        field: Field,
+        camera: Camera,
+        wants: Sequence[str] = ("rgb", "alpha"),
+        pixels: Tensor | None = None,
+    ) -> RenderOutput:
+        """Render one view.
+
+        Args:
+            field: A field of 3D Gaussians, float32, on the CPU.
+            camera: Where from.
+            wants: Names from :data:`coliags_plugin.gaussians.OUTPUTS`; rgb and alpha always come.
+            pixels: Must be None: a splatting renderer draws whole images.
+
+        Raises:
+            InputError: ``pixels`` is given, an output is unknown, the field holds no 3D Gaussians, or one of them is
+                unusable.
+        """
+        if pixels is not None:
+            raise InputError(
+                "the cpu renderer was asked for single pixels",
+                "whole images: it splats",
+                "Leave pixels out, or choose a renderer of radiance fields",
+            )
+        if field.primitive not in self.primitives:
+            raise InputError(
+                f"a field of '{field.primitive}' for the cpu renderer",
+                f"one of {', '.join(sorted(self.primitives))}",
+                "Choose another renderer or another field",
+            )
+        return render_gaussians(field.gaussians(camera), camera, wants, self.settings)
+
+
+def render_gaussians(
+    gaussians: Gaussians,
+    camera: Camera,
+    wants: Sequence[str] = ("rgb", "alpha"),
+    settings: CpuRendererSettings | None = None,
+) -> RenderOutput:
+    """Render Gaussians as the camera sees them.
+
+    Everything but ``depth_median`` and ``radii`` is differentiable, once, in the Gaussians and in
+    ``camera.camera_to_world``; ``means2d.grad`` is there after ``backward``. The first call on a machine compiles the
+    kernels, which takes about half a minute.
+
+    Args:
+        gaussians: 3D Gaussians, float32, on the CPU.
+        camera: Where from; its pose is cast to float32.
+        wants: Names from :data:`coliags_plugin.gaussians.OUTPUTS`; rgb and alpha always come.
+        settings: The defaults where None.
+
+    Raises:
+        InputError: An output is unknown; a tensor is of the wrong shape, dtype or device; a Gaussian is not finite, has
+            a quaternion of length 0 or a negative scale; the camera's numbers are unusable.
+    """
+    from coliags_plugin.renderers.numba_kernels import autograd
+
+    settings = settings or CpuRendererSettings()
+    for name in wants:
+        if name not in OUTPUTS:
+            raise InputError(
+                f"no renderer output '{name}'", f"some of {', '.join(OUTPUTS)}", did_you_mean(name, OUTPUTS)
+            )
+    _check_tensors(gaussians)
+    pose = camera.camera_to_world.to(device="cpu", dtype=torch.float32)
+    view = autograd.View(
+        table=_view_table(camera, pose, settings),
+        cuts=np.array([math.log2(settings.alpha_min), settings.alpha_max, settings.transmittance_min], np.float32),
+        background=np.array(settings.background, np.float32),
+        width=camera.width,
+        height=camera.height,
+        wanted=autograd.Wanted(
+            depth="depth_accumulated" in wants or "depth_expected" in wants,
+            inverse_depth="inverse_depth_accumulated" in wants,
+            normals="normals" in wants,
+            expected="depth_expected" in wants,
+            median="depth_median" in wants,
+        ),
+    )
+    shape = (gaussians.means, gaussians.quats_wxyz, gaussians.scales)
+    try:
+        means2d, radii, images = autograd.render(*shape, gaussians.opacities, gaussians.colors, pose, view)
+    except autograd.UnusableGaussianError:
+        raise _unusable(gaussians) from None
+    maps = {name: images[name] for name in wants if name not in ("rgb", "alpha")}
+    return RenderOutput(images["rgb"], images["alpha"], means2d, radii, gaussians, maps)
+
+
+def _view_table(camera: Camera, pose: Tensor, settings: CpuRendererSettings) -> np.ndarray:
+    """Camera and options as the kernels want them (``numba_kernels/layout.py``)."""
+    matrix = pose.detach().double().numpy()
+    if matrix.shape != (4, 4):
+        raise InputError(f"camera_to_world of shape {list(matrix.shape)}", "[4, 4]")
+    if camera.width < 1 or camera.height < 1:
+        raise InputError(f"a camera of {camera.width} x {camera.height} pixels", "at least one pixel each way")
+    limits = []
+    for focal, principal, size in (
+        (camera.fx, camera.cx, camera.width),
+        (camera.fy, camera.cy, camera.height),
+    ):
+        margin = JACOBIAN_MARGIN * 0.5 * size / focal
+        limits += [-principal / focal - margin, (size - principal) / focal + margin]
+    table = [
+        *matrix[:3].T.ravel(),
+        *(camera.fx, camera.fy, camera.cx, camera.cy),
+        *limits,
+        *(settings.near, settings.low_pass, math.log2(settings.alpha_min)),
+        *(camera.width, camera.height),
+    ]
+    if not np.isfinite(table).all():
+        raise InputError(f"a camera with numbers that are not finite: {camera}", "finite intrinsics and pose")
+    return np.array(table, np.float32)
+
+
+def _check_tensors(gaussians: Gaussians) -> None:
+    """Shape, dtype and device; values are checked while they are projected."""
+    count = len(gaussians.means) if gaussians.means.ndim else 0
+    for name, width in _SHAPES.items():
+        tensor = getattr(gaussians, name)
+        shape = (count,) if width is None else (count, width)
+        if tuple(tensor.shape) != shape:
+            raise InputError(
+                f"{name} of shape {list(tensor.shape)}",
+                f"{list(shape)}, for means of shape {list(gaussians.means.shape)}"
+                + ("; three scales each" if name == "scales" else ""),
+                "Choose a renderer that serves surfels" if name == "scales" and tensor.shape[-1:] == (2,) else "",
+            )
+        if tensor.dtype != torch.float32:
+            raise InputError(
+                f"{name} of dtype {str(tensor.dtype).removeprefix('torch.')} for the cpu renderer",
+                "float32",
+                "Cast it, or choose the torch renderer, which computes in float64 too",
+            )
+        if tensor.device.type != "cpu":
+            raise InputError(
+                f"{name} on {tensor.device} for the cpu renderer", "tensors on the cpu", "Choose the torch renderer"
+            )
+
+
+def _unusable(gaussians: Gaussians) -> InputError:
+    """What is wrong with the first Gaussian that has something wrong."""
+    for name in _SHAPES:
+        values = getattr(gaussians, name).detach()
+        wrong = ~values.isfinite().reshape(len(values), -1).all(dim=1)
+        if wrong.any():
+            index = int(wrong.nonzero()[0])
+            return InputError(f"{name}[{index}] is {values[index].tolist()}", "finite numbers")
+    scales, quats = gaussians.scales.detach(), gaussians.quats_wxyz.detach()
+    wrong = (scales < 0).any(dim=1)
+    if wrong.any():
+        index = int(wrong.nonzero()[0])
+        return InputError(f"scales[{index}] is {scales[index].tolist()}", "standard deviations, not below 0")
+    lengths = quats.square().sum(dim=1)
+    index = int((~((lengths >= 1e-24) & lengths.isfinite())).nonzero()[0])
+    return InputError(
+        f"quats_wxyz[{index}] is {quats[index].tolist()}, of squared length {float(lengths[index])}",
+        "a quaternion whose length float32 can hold, and not 0",
+    )

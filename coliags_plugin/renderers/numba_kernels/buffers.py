@@ -1,0 +1,54 @@
+"""Memory that is used again: fresh pages cost more than the kernels that fill them."""
+
+from __future__ import annotations
+
+import weakref
+from collections import deque
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+#: Bytes that buffers begin at a multiple of: a line of the cache.
+_ALIGNMENT = 64
+#: A buffer that has to grow is made this much larger than asked for.
+_GROWTH = 1.25
+#: Arenas kept for later. One graph alive at a time, as in training, needs two: the next is built before the last goes.
+_KEPT = 2
+
+
+class Arena:
+    """Named buffers of one view. What is in them when they are taken is not defined."""
+
+    def __init__(self) -> None:
+        self._bytes: dict[str, npt.NDArray[np.uint8]] = {}
+
+    def take(self, name: str, size: int, dtype: npt.DTypeLike = np.float32) -> npt.NDArray[Any]:
+        """A flat array. It shares its memory with whatever was taken under this name before."""
+        wanted = size * np.dtype(dtype).itemsize
+        buffer = self._bytes.get(name)
+        if buffer is None or len(buffer) < wanted:
+            raw = np.empty(int(wanted * _GROWTH) + 2 * _ALIGNMENT, np.uint8)
+            start = -raw.ctypes.data % _ALIGNMENT
+            buffer = self._bytes[name] = raw[start : len(raw) - len(raw[start:]) % _ALIGNMENT]
+        return buffer[:wanted].view(dtype)
+
+
+class ArenaPool:
+    """Arenas lent to whoever needs one, for as long as that lives.
+
+    Safe to use from several threads, and without a lock: arenas come back whenever Python collects garbage, which may
+    be in the middle of :meth:`lend`.
+    """
+
+    def __init__(self) -> None:
+        self._free: deque[Arena] = deque(maxlen=_KEPT)
+
+    def lend(self, borrower: object) -> Arena:
+        """An arena that comes back when ``borrower`` is collected."""
+        try:
+            arena = self._free.pop()
+        except IndexError:
+            arena = Arena()
+        weakref.finalize(borrower, self._free.append, arena).atexit = False
+        return arena
