@@ -106,13 +106,20 @@ class Renderer(ABC):
 
 
 class Strategy(ABC):
-    """Grows, splits and prunes a field between optimiser steps. Owns its counters."""
+    """Grows, splits and prunes a field between optimiser steps. Owns its counters.
+
+    Args:
+        settings: Its options.
+        generator: For whatever is left to chance.
+        steps: How many steps the run has.
+    """
 
     Settings: ClassVar[type[Settings]]
 
-    def __init__(self, settings: Any, generator: torch.Generator) -> None:
+    def __init__(self, settings: Any, generator: torch.Generator, steps: int) -> None:
         self.settings = settings
         self.generator = generator
+        self.steps = steps
 
     @abstractmethod
     def after_backward(

@@ -64,7 +64,7 @@ class Trainer:
         self.generators = generators(seed)
         self.frames = _resident(scene.train, device)
         self.order = FrameOrder(len(scene.train), self.generators["frame_order"])
-        self.strategy = config.strategy.target(config.strategy.settings, self.generators["densification"])
+        self.strategy = config.strategy.target(config.strategy.settings, self.generators["densification"], self.steps)
         self.field: Field = config.field.target.from_scene(
             scene, config.field.settings, self.generators["initialisation"]
         ).to(device)

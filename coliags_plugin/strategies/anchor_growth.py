@@ -39,8 +39,10 @@ class AnchorGrowth(Strategy):
 
     Settings: ClassVar[type[Settings]] = AnchorGrowthSettings
 
-    def __init__(self, settings: Any, generator: torch.Generator) -> None:
-        super().__init__(settings, generator)
+    def __init__(self, settings: Any, generator: torch.Generator, steps: int) -> None:
+        super().__init__(settings, generator, steps)
+        # The published 15,000 are half of a run. What grows in the end of a shorter one would never be trained.
+        self.until = min(settings.until, steps // 2)
         self.opacity_sum = torch.zeros(0)  # [M]
         self.seen = torch.zeros(0)  # [M]
         self.gradient_sum = torch.zeros(0)  # [M * K]
@@ -61,7 +63,7 @@ class AnchorGrowth(Strategy):
     ) -> dict[str, int]:
         """Count; every so often grow and prune."""
         options = self.settings
-        if not options.statistics_from < step < options.until:
+        if not options.statistics_from < step < self.until:
             return {}
         children = field.offsets.shape[1]
         self._resize(len(field.anchors), children, field.anchors.device)

@@ -23,7 +23,7 @@ CPU = torch.device("cpu")
 EARLY_GROWTH = (
     "strategy.statistics_from=0",
     "strategy.growth_from=2",
-    "strategy.every=4",
+    "strategy.every=3",
     "strategy.min_opacity=0.5",
     "strategy.gradient_threshold=1e-7",
     "strategy.coarsest_cell=1",
@@ -85,13 +85,13 @@ def test_same_seed_same_bits(tmp_path):
 @pytest.mark.parametrize("overrides", [(), EARLY_GROWTH], ids=["plain", "growing"])
 def test_resume_is_bit_exact(tmp_path, overrides):
     """Interrupted in the middle of a round, resumed by a fresh trainer: the same bits as never interrupted."""
-    whole = train(tmp_path / "whole", steps=13, overrides=overrides)
-    cut = make_trainer(tmp_path / "cut", steps=13, overrides=overrides)
+    whole = train(tmp_path / "whole", steps=16, overrides=overrides)
+    cut = make_trainer(tmp_path / "cut", steps=16, overrides=overrides)
     cut.start()
     _stop_after(cut, 7)
     with pytest.raises(InterruptedRunError, match="stopped after step 7"):
         cut.train()
-    resumed = make_trainer(tmp_path / "cut", steps=13, overrides=overrides)
+    resumed = make_trainer(tmp_path / "cut", steps=16, overrides=overrides)
     resumed.resume()
     assert resumed.step == 7
     resumed.train()

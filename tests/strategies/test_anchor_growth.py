@@ -27,9 +27,9 @@ def make_field(voxel=2.0):
     return field, adam
 
 
-def make_strategy(seed=0, **options):
+def make_strategy(seed=0, steps=30_000, **options):
     component = make_component("strategies", {"name": "anchor-growth", **options})
-    return component.target(component.settings, torch.Generator().manual_seed(seed))
+    return component.target(component.settings, torch.Generator().manual_seed(seed), steps)
 
 
 def make_output(slots, gradients, opacity=0.5, visible=None, radii=None, width=200, height=100):
@@ -60,6 +60,15 @@ def test_counts_only_inside_the_window():
     # Pixel gradients times half the width are gradients in normalised image units.
     assert strategy.gradient_sum[[0, 11]].tolist() == pytest.approx([1.0, 2.0])
     assert strategy.drawn[[0, 11]].tolist() == [1.0, 1.0]
+
+
+def test_growth_ends_at_half_of_a_short_run():
+    field, adam = make_field()
+    strategy = make_strategy(steps=1600)
+    strategy.after_backward(799, field, adam, make_output([0], [1.0]))
+    assert strategy.seen[0] == 1
+    strategy.after_backward(800, field, adam, make_output([0], [1.0]))
+    assert strategy.seen[0] == 1
 
 
 def test_undrawn_children_and_childless_anchors():

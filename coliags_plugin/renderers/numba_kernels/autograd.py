@@ -28,6 +28,7 @@ Array = npt.NDArray[Any]
 #: One view at a time: the machine's cores are all taken by one, and not every threading layer of numba bears two.
 _turn = threading.Lock()
 _arenas = ArenaPool()
+_NOTHING = np.empty(0, np.float32)
 #: Pieces of work per thread where pieces differ in cost.
 _PIECES = 8
 
@@ -220,22 +221,28 @@ class _Composite(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, means2d: Tensor, records: Tensor, view: View) -> tuple[Tensor | None, ...]:
-        wanted = view.wanted
-        shape = (view.height, view.width)
-        flags = (wanted.depth, wanted.inverse_depth, wanted.expected, wanted.normals, wanted.median)
-        shapes = [(*shape, 3), shape, *((*shape, 3) if i == 3 else shape for i in range(5))]
-        images = [torch.empty(s) if flag else None for s, flag in zip(shapes, (True, True, *flags), strict=True)]
+        wanted, kept = view.wanted, view.kept
+        images = [
+            torch.empty(view.height, view.width, *more) if flag else None
+            for flag, more in (
+                (True, (3,)),
+                (True, ()),
+                (wanted.depth, ()),
+                (wanted.inverse_depth, ()),
+                (wanted.expected, ()),
+                (wanted.normals, (3,)),
+                (wanted.median, ()),
+            )
+        ]
         with _workers() as workers:
             _bin(view, workers)
-            reached = view.keep("reached", view.tiles, np.int64)
-            kept = view.kept
+            composited = view.keep("composited", layout.TILE**2 * view.tiles * (1 + len(wanted.channels)))
             sweep_forward.sweep_forward(
                 workers, _counters(), kept["records"], kept["depths"], kept["cells"], kept["starts"], kept["order"],
-                reached, wanted.channels, (0,) * wanted.median, view.cuts, view.background, view.columns,
-                view.arena.take("scratch", workers * sweep_forward.SCRATCH),
-                view.arena.take("lists", workers * 2 * CHUNK, np.int32), *_arrays(images, shapes),
+                view.keep("reached", view.tiles, np.int64), wanted.channels, (0,) * wanted.median, view.cuts,
+                view.background, view.width, view.height, view.arena.take("scratch", workers * sweep_forward.SCRATCH),
+                view.arena.take("lists", workers * sweep_forward.LISTS, np.int32), composited, *map(_flat, images),
             )  # fmt: skip
-        ctx.save_for_backward(*images[:6])
         ctx.view = view
         ctx.set_materialize_grads(False)
         if images[6] is not None:
@@ -246,21 +253,18 @@ class _Composite(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *given: Tensor | None) -> tuple[Tensor | None, ...]:
         view: View = ctx.view
-        kept = view.kept
+        wanted, kept = view.wanted, view.kept
         if all(gradient is None for gradient in given):
             return None, None, None
-        shape = (view.height, view.width)
-        shapes = [(*shape, 3), shape, shape, shape, shape, (*shape, 3)]
+        counters = _counters()
         with _workers() as workers:
-            starts, reached = kept["starts"], kept["reached"]
-            entry_sums = view.arena.take("entry_sums", layout.ROW * int(starts[-1]))
-            counters = _counters()
+            entry_sums = view.arena.take("entry_sums", layout.ROW * int(kept["starts"][-1]))
             sweep_backward.sweep_backward(
-                workers, counters, kept["records"], kept["depths"], kept["cells"], starts, kept["order"], reached,
-                view.wanted.channels, view.cuts, view.background, view.columns,
+                workers, counters, kept["records"], kept["depths"], kept["cells"], kept["starts"], kept["order"],
+                kept["reached"], wanted.channels, view.cuts, view.background, view.width, view.height,
                 view.arena.take("scratch", workers * sweep_backward.SCRATCH),
-                view.arena.take("lists", workers * CHUNK, np.int32), *_arrays(ctx.saved_tensors, shapes),
-                *_arrays(given[:6], shapes), entry_sums,
+                view.arena.take("lists", workers * CHUNK, np.int32), kept["composited"], wanted.depth,
+                wanted.inverse_depth, *map(_flat, given[:6]), entry_sums,
             )  # fmt: skip
             gaussian_sums = view.arena.take("gaussian_sums", layout.ROW * view.filled)
             of_means2d = np.empty((view.filled, 2), np.float32)
@@ -313,17 +317,9 @@ def _counters() -> Array:
     return np.zeros(4, np.int64)
 
 
-def _flat(tensor: Tensor) -> Array:
-    return tensor.detach().contiguous().numpy().reshape(-1)
-
-
-def _arrays(tensors: Sequence[Tensor | None], shapes: Sequence[tuple[int, ...]]) -> list[Array]:
-    """What kernels see of images; an empty array for None."""
-    pairs = zip(tensors, shapes, strict=True)
-    return [
-        np.empty((0,) * len(shape), np.float32) if tensor is None else tensor.detach().contiguous().numpy()
-        for tensor, shape in pairs
-    ]
+def _flat(tensor: Tensor | None) -> Array:
+    """A tensor's numbers one after the other; none for None."""
+    return _NOTHING if tensor is None else tensor.detach().contiguous().numpy().reshape(-1)
 
 
 def _tails(flat: Sequence[Array], count: int) -> list[Array]:

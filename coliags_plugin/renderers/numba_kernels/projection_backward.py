@@ -89,7 +89,15 @@ def gather(
                 break
             first, last = count * stretch // stretches, count * (stretch + 1) // stretches
             _gather_stretch(
-                first, last, stretch_entries[stretch], keys, records, entry_counts, entry_sums, gaussian_sums, of_means2d
+                first,
+                last,
+                stretch_entries[stretch],
+                keys,
+                records,
+                entry_counts,
+                entry_sums,
+                gaussian_sums,
+                of_means2d,
             )
 
 
@@ -107,9 +115,7 @@ def _clear_undrawn(first, last, drawn, gaussian_sums, of_means2d):  # type: igno
 
 
 @part
-def _gather_stretch(
-    first, last, entry, keys, records, entry_counts, entry_sums, gaussian_sums, of_means2d
-):  # type: ignore[no-untyped-def]
+def _gather_stretch(first, last, entry, keys, records, entry_counts, entry_sums, gaussian_sums, of_means2d):  # type: ignore[no-untyped-def]
     """Gaussians in places ``first`` to ``last`` of the sorted list, whose entries are those from ``entry`` on."""
     square = np.float32(_PLAIN_SQUARE)
     for place in range(first, last):

@@ -19,9 +19,11 @@ from coliags_plugin.renderers.numba_kernels.lanes import (
     both,
     broadcast,
     broadcast_all,
+    div,
     dot,
     exp2,
     fma,
+    greater,
     lane_columns,
     lane_rows,
     lane_sums,
@@ -31,6 +33,7 @@ from coliags_plugin.renderers.numba_kernels.lanes import (
     lowest_bit,
     mul,
     neg,
+    number,
     prefetch_to_write,
     quick_div,
     repeat,
@@ -38,6 +41,7 @@ from coliags_plugin.renderers.numba_kernels.lanes import (
     smaller,
     splat,
     store,
+    store_all,
     sub,
 )
 from coliags_plugin.renderers.numba_kernels.threads import take
@@ -47,6 +51,7 @@ from coliags_plugin.renderers.numba_kernels.tiles import (
     OFFSET_F,
     block_corner,
     fetch_chunk,
+    place_in_blocks,
     tile_corner,
 )
 
@@ -58,9 +63,11 @@ _TRANSMITTANCE = 32
 _BEHIND = 48
 _ALPHA = 64
 _CHANNELS = 80
-STATE = _CHANNELS + 16 * layout.MAX_CHANNELS
+_STATE = _CHANNELS + 16 * layout.MAX_CHANNELS
 #: Scratch of one thread: rows of a chunk, states of a tile's blocks.
-SCRATCH = CHUNK * layout.ROW + layout.BLOCKS * STATE
+SCRATCH = CHUNK * layout.ROW + layout.BLOCKS * _STATE
+#: How many entries before its turn memory for its sums is asked for.
+_AHEAD = 12
 
 
 @region_kernel
@@ -76,15 +83,13 @@ def sweep_backward(
     channels,
     cuts,
     background,
-    columns,
+    width,
+    height,
     scratch,
     lists,
-    rgb,
-    alpha,
-    depth,
-    inverse_depth,
-    expected,
-    normals,
+    composited,
+    has_depth,
+    has_inverse_depth,
     of_rgb,
     of_alpha,
     of_depth,
@@ -98,19 +103,20 @@ def sweep_backward(
     Args:
         workers: Threads to share the work.
         counters: For sharing; entry 0 must be 0.
-        records, depths, cells, starts, order, reached: As the forward sweep left them.
+        records, depths, cells, starts, order, reached, composited: As the forward sweep left them.
         channels: Any tuple as long as there are channels.
         cuts: log2(alpha_min), alpha_max, transmittance_min.
         background: RGB.
-        columns: Tiles side by side.
+        width, height: Of the image, pixels.
         scratch: Scratch. [SCRATCH for each worker]
         lists: Scratch. [CHUNK for each worker]
-        rgb, alpha, depth, inverse_depth, expected, normals: The images. [H, W, 3] or [H, W], or empty.
-        of_rgb, of_alpha, of_depth, of_inverse_depth, of_expected, of_normals: Derivatives with respect to them; empty
-            where 0.
+        has_depth, has_inverse_depth: Whether they are among the channels.
+        of_rgb, of_alpha, of_depth, of_inverse_depth, of_expected, of_normals: Derivatives with respect to the images,
+            flat; empty where 0.
         entry_sums: Out: see ``layout``. [16 for each entry]
     """
     tiles = len(starts) - 1
+    columns = (width + layout.TILE - 1) // layout.TILE
     for worker in numba.prange(workers):
         rows = scratch[worker * SCRATCH : (worker + 1) * SCRATCH]
         state = rows[CHUNK * layout.ROW :]
@@ -121,109 +127,122 @@ def sweep_backward(
                 break
             tile = order[place]
             if starts[tile] < reached[tile]:
-                alive = _read_tile(
-                    tile, columns, len(channels), state, background, rgb, alpha, depth, inverse_depth, expected, normals, of_rgb,
-                    of_alpha, of_depth, of_inverse_depth, of_expected, of_normals,
-                )  # fmt: skip
+                corner_x, corner_y = tile_corner(tile, columns)
+                across, down = min(layout.TILE, width - corner_x), min(layout.TILE, height - corner_y)
+                _clear_tile(across, down, channels, state)
+                first = corner_y * width + corner_x
+                for channel in range(3):
+                    _copy_from_image(of_rgb, first, width, 3, channel, across, down, _CHANNELS + 16 * channel, state)
+                _copy_from_image(of_alpha, first, width, 1, 0, across, down, _ALPHA, state)
+                at = _CHANNELS + 48
+                if has_depth:
+                    _copy_from_image(of_depth, first, width, 1, 0, across, down, at, state)
+                    _copy_from_image(of_expected, first, width, 1, 0, across, down, _BEHIND, state)
+                    at += 16
+                if has_inverse_depth:
+                    _copy_from_image(of_inverse_depth, first, width, 1, 0, across, down, at, state)
+                    at += 16
+                for axis in range(3):
+                    _copy_from_image(of_normals, first, width, 3, axis, across, down, at + 16 * axis, state)
+                _prepare_tile(tile, channels, background, has_depth, composited, state)
                 _sweep_tile(
-                    tile, alive, records, depths, cells, starts[tile], reached[tile], channels, cuts, columns, rows, state,
-                    blocks, entry_sums,
+                    corner_x, corner_y, across, down, records, depths, cells, starts[tile], reached[tile], channels,
+                    cuts, rows, state, blocks, entry_sums,
                 )  # fmt: skip
             for entry in range(reached[tile], starts[tile + 1]):
                 store(entry_sums, layout.ROW * cells[layout.CELL * entry + 2], 0.0)
 
 
 @part
-def _read_tile(
-    tile,
-    columns,
-    channels,
-    state,
-    background,
-    rgb,
-    alpha,
-    depth,
-    inverse_depth,
-    expected,
-    normals,
-    of_rgb,
-    of_alpha,
-    of_depth,
-    of_inverse_depth,
-    of_expected,
-    of_normals,
-):  # type: ignore[no-untyped-def]
-    """Fill the blocks' states. Returns which blocks have pixels, one bit each."""
-    zero = np.float32(0.0)
-    height, width = alpha.shape
-    corner_x, corner_y = tile_corner(tile, columns)
+def _clear_tile(across, down, channels, state):  # type: ignore[no-untyped-def]
+    """Pixels at their places, transmittance 1 inside the image, and all derivatives 0."""
     half = 0.5 * layout.TILE - 0.5
     for block in range(layout.BLOCKS):
         block_x, block_y = block_corner(block)
-        at = STATE * block
+        at = _STATE * block
+        inside = both(less(lane_columns(), across - block_x), less(lane_rows(), down - block_y))
         store(state, at + _X, add(lane_columns(), block_x - half))
         store(state, at + _Y, add(lane_rows(), block_y - half))
-        for vector in range(_TRANSMITTANCE, _CHANNELS + 16 * channels, 16):
-            store(state, at + vector, 0.0)
-    alive = 0
-    for row in range(corner_y, min(corner_y + layout.TILE, height)):
-        for column in range(corner_x, min(corner_x + layout.TILE, width)):
-            block = (row - corner_y >> 2 << 2) + (column - corner_x >> 2)
-            alive |= 1 << block
-            lane = STATE * block + (row - corner_y & 3) * 4 + (column - corner_x & 3)
-            state[lane + _TRANSMITTANCE] = 1.0
-            alpha_here = alpha[row, column]
-            by_alpha = of_alpha[row, column] if of_alpha.size else zero
-            behind = zero
-            at = lane + _CHANNELS
-            if of_rgb.size:
-                for channel in range(3):
-                    given = of_rgb[row, column, channel]
-                    by_alpha -= given * background[channel]
-                    behind += given * (rgb[row, column, channel] - (np.float32(1.0) - alpha_here) * background[channel])
-                    state[at + 16 * channel] = given
-            at += 48
-            if depth.size:
-                given = of_depth[row, column] if of_depth.size else zero
-                if of_expected.size and alpha_here > 0:
-                    share = of_expected[row, column] / alpha_here
-                    given += share
-                    by_alpha -= share * expected[row, column]
-                behind += given * depth[row, column]
-                state[at] = given
-                at += 16
-            if inverse_depth.size:
-                if of_inverse_depth.size:
-                    given = of_inverse_depth[row, column]
-                    behind += given * inverse_depth[row, column]
-                    state[at] = given
-                at += 16
-            if of_normals.size:
-                for axis in range(3):
-                    given = of_normals[row, column, axis]
-                    behind += given * normals[row, column, axis]
-                    state[at + 16 * axis] = given
-            state[lane + _ALPHA] = by_alpha
-            state[lane + _BEHIND] = behind + by_alpha * alpha_here
-    return alive
+        store(state, at + _TRANSMITTANCE, select(inside, 1.0, 0.0))
+        store(state, at + _BEHIND, 0.0)
+        store(state, at + _ALPHA, 0.0)
+        store_all(state, at + _CHANNELS, repeat(0.0, channels))
+
+
+@part
+def _copy_from_image(image, first, width, depth, channel, across, down, vector, state):  # type: ignore[no-untyped-def]
+    """Copy one channel of a flat image to one vector of a tile's blocks; from an empty one nothing.
+
+    Args:
+        image: The image.
+        first: Number of the tile's first pixel.
+        width: Of the image.
+        depth: Channels of the image.
+        channel: Which.
+        across, down: Pixels of the tile that are inside the image.
+        vector: Which, counted from the start of a block's state.
+        state: Out: the blocks' states.
+    """
+    if image.size:
+        for y in range(down):
+            for x in range(across):
+                value = number(image, (first + y * width + x) * depth + channel)
+                state[vector + place_in_blocks(x, y, _STATE)] = value
+
+
+@part
+def _prepare_tile(tile, channels, background, has_depth, composited, state):  # type: ignore[no-untyped-def]
+    """From derivatives with respect to images to those with respect to what was composited, and what all of it shows.
+
+    The derivative with respect to depth over alpha is where the latter will be.
+    """
+    size = 16 * (1 + len(channels))
+    for block in range(layout.BLOCKS):
+        at = _STATE * block
+        source = size * (layout.BLOCKS * tile + block)
+        alpha, sums = load(composited, source), load_all(composited, source + 16, channels)
+        of_color = load_all(state, at + _CHANNELS, (0, 0, 0))
+        of_alpha = sub(load(state, at + _ALPHA), dot(of_color, broadcast_all(background, 0, (0, 0, 0)), 0.0))
+        if has_depth:
+            covered = greater(alpha, 0.0)
+            share = select(covered, div(load(state, at + _BEHIND), alpha), 0.0)
+            store(state, at + _CHANNELS + 48, add(load(state, at + _CHANNELS + 48), share))
+            of_alpha = sub(of_alpha, select(covered, mul(share, div(sums[3], alpha)), 0.0))
+        store(state, at + _ALPHA, of_alpha)
+        store(state, at + _BEHIND, dot(load_all(state, at + _CHANNELS, channels), sums, mul(of_alpha, alpha)))
 
 
 @part
 def _sweep_tile(
-    tile, alive, records, depths, cells, first, last, channels, cuts, columns, rows, state, blocks, entry_sums
+    corner_x,
+    corner_y,
+    across,
+    down,
+    records,
+    depths,
+    cells,
+    first,
+    last,
+    channels,
+    cuts,
+    rows,
+    state,
+    blocks,
+    entry_sums,
 ):  # type: ignore[no-untyped-def]
     """Sweep through one tile's entries ``first`` to ``last``."""
-    corner_x, corner_y = tile_corner(tile, columns)
-    half = 0.5 * layout.TILE
+    alive = 0
+    for block in range(layout.BLOCKS):
+        block_x, block_y = block_corner(block)
+        if block_x < across and block_y < down:
+            alive |= 1 << block
+    middle_x, middle_y = np.float32(corner_x + 0.5 * layout.TILE), np.float32(corner_y + 0.5 * layout.TILE)
     while first < last:
         end = min(first + CHUNK, last)
-        fetch_chunk(
-            first, end, alive, cells, records, depths, np.float32(corner_x + half), np.float32(corner_y + half), rows,
-            blocks,
-        )  # fmt: skip
-        for entry in range(first, end):
-            prefetch_to_write(entry_sums, layout.ROW * cells[layout.CELL * entry + 2])
+        fetch_chunk(first, end, alive, cells, records, depths, middle_x, middle_y, rows, blocks)
         for entry in range(end - first):
+            ahead = cells[layout.CELL * min(first + entry + _AHEAD, last - 1) + 2]
+            prefetch_to_write(entry_sums, layout.ROW * ahead)
             alive = _sweep_entry(
                 layout.ROW * entry, blocks[entry] & alive, alive, rows, channels, cuts, state,
                 layout.ROW * cells[layout.CELL * (first + entry) + 2], entry_sums,
@@ -240,7 +259,7 @@ def _sweep_entry(row, blocks, alive, rows, channels, cuts, state, target, entry_
     while blocks:
         block = lowest_bit(blocks)
         blocks &= blocks - 1
-        at = STATE * block
+        at = _STATE * block
         x, y = load(state, at + _X), load(state, at + _Y)
         e = fma(broadcast(rows, row + layout.U_XX), x, broadcast(rows, row + OFFSET_E))
         f = fma(broadcast(rows, row + layout.U_YY), y, broadcast(rows, row + OFFSET_F))

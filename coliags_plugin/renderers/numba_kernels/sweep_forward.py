@@ -19,15 +19,20 @@ from coliags_plugin.renderers.numba_kernels.lanes import (
     both,
     broadcast,
     broadcast_all,
+    div,
     exp2,
     fma,
     greater,
     lane_columns,
     lane_rows,
+    less,
     load,
     load_all,
+    lowest_bit,
     mul,
     neg,
+    number,
+    repeat,
     select,
     smaller,
     splat,
@@ -43,13 +48,21 @@ from coliags_plugin.renderers.numba_kernels.tiles import (
     OFFSET_F,
     block_corner,
     fetch_chunk,
+    place_in_blocks,
     tile_corner,
 )
 
-#: A block's vectors: transmittance, alpha, channels, and the median depth.
-STATE = 16 * (3 + layout.MAX_CHANNELS)
+# A block's vectors: transmittance, alpha, channels and, behind them, the median depth.
+_TRANSMITTANCE = 0
+_ALPHA = 16
+_CHANNELS = 32
+#: Depth over alpha takes the place of the transmittance when that has done its work.
+_EXPECTED = _TRANSMITTANCE
+_STATE = _CHANNELS + 16 * (layout.MAX_CHANNELS + 1)
 #: Scratch of one thread: rows of a chunk, states of a tile's blocks.
-SCRATCH = CHUNK * layout.ROW + layout.BLOCKS * STATE
+SCRATCH = CHUNK * layout.ROW + layout.BLOCKS * _STATE
+#: Scratch of one thread, integers: blocks of a chunk's entries, entries of a tile's blocks, and their number.
+LISTS = CHUNK + layout.BLOCKS * CHUNK + layout.BLOCKS
 
 
 @region_kernel
@@ -66,9 +79,11 @@ def sweep_forward(
     median,
     cuts,
     background,
-    columns,
+    width,
+    height,
     scratch,
     lists,
+    composited,
     rgb,
     alpha,
     depth,
@@ -89,35 +104,57 @@ def sweep_forward(
         median: A tuple with one element where the median depth is wanted, an empty one where it is not.
         cuts: log2(alpha_min), alpha_max, transmittance_min.
         background: RGB.
-        columns: Tiles side by side.
+        width, height: Of the image, pixels.
         scratch: Scratch. [SCRATCH for each worker]
-        lists: Scratch. [2 * CHUNK for each worker]
-        rgb, alpha, depth, inverse_depth, expected, normals, median_depth: Out. [H, W, 3] or [H, W]; empty where not
-            wanted, but ``depth`` whenever ``expected`` is.
+        lists: Scratch. [LISTS for each worker]
+        composited: Out: alpha and channels without background, one vector each, by tile and block.
+        rgb, alpha, depth, inverse_depth, expected, normals, median_depth: Out, flat images; empty where not wanted.
     """
     tiles = len(starts) - 1
+    columns = (width + layout.TILE - 1) // layout.TILE
     for worker in numba.prange(workers):
         rows = scratch[worker * SCRATCH : (worker + 1) * SCRATCH]
         state = rows[CHUNK * layout.ROW :]
-        blocks = lists[2 * CHUNK * worker : 2 * CHUNK * worker + CHUNK]
-        listed = lists[2 * CHUNK * worker + CHUNK : 2 * CHUNK * (worker + 1)]
+        blocks = lists[worker * LISTS : (worker + 1) * LISTS]
+        listed = blocks[CHUNK:]
+        counts = listed[layout.BLOCKS * CHUNK :]
         while True:
             place = take(counters, 0, 1)
             if place >= tiles:
                 break
             tile = order[place]
+            corner_x, corner_y = tile_corner(tile, columns)
+            across, down = min(layout.TILE, width - corner_x), min(layout.TILE, height - corner_y)
             reached[tile] = _sweep_tile(
-                tile, records, depths, cells, starts[tile], starts[tile + 1], channels, median, cuts, columns,
-                alpha.shape[1], alpha.shape[0], rows, state, blocks, listed,
+                corner_x, corner_y, across, down, records, depths, cells, starts[tile], starts[tile + 1], channels,
+                median, cuts, rows, state, blocks, listed, counts,
             )  # fmt: skip
-            _write_tile(
-                tile, columns, state, background, rgb, alpha, depth, inverse_depth, expected, normals, median_depth
-            )
+            _finish_tile(tile, channels, state, background, depth.size or expected.size, composited)
+            first = corner_y * width + corner_x
+            for channel in range(3):
+                _copy_to_image(_CHANNELS + 16 * channel, state, across, down, first, width, 3, channel, rgb)
+            _copy_to_image(_ALPHA, state, across, down, first, width, 1, 0, alpha)
+            at = _CHANNELS + 48
+            if depth.size or expected.size:
+                _copy_to_image(at, state, across, down, first, width, 1, 0, depth)
+                _copy_to_image(_EXPECTED, state, across, down, first, width, 1, 0, expected)
+                at += 16
+            if inverse_depth.size:
+                _copy_to_image(at, state, across, down, first, width, 1, 0, inverse_depth)
+                at += 16
+            if normals.size:
+                for axis in range(3):
+                    _copy_to_image(at + 16 * axis, state, across, down, first, width, 3, axis, normals)
+                at += 48
+            _copy_to_image(at, state, across, down, first, width, 1, 0, median_depth)
 
 
 @part
 def _sweep_tile(
-    tile,
+    corner_x,
+    corner_y,
+    across,
+    down,
     records,
     depths,
     cells,
@@ -126,46 +163,46 @@ def _sweep_tile(
     channels,
     median,
     cuts,
-    columns,
-    width,
-    height,
     rows,
     state,
     blocks,
     listed,
+    counts,
 ):  # type: ignore[no-untyped-def]
     """Sweep through one tile's entries ``first`` to ``last``; leaves its pixels in ``state``.
 
     Returns:
         Where it stopped.
     """
-    corner_x, corner_y = tile_corner(tile, columns)
     alive = 0
     for block in range(layout.BLOCKS):
         block_x, block_y = block_corner(block)
-        inside_x = at_most(lane_columns(), width - corner_x - block_x - 1)
-        inside = both(inside_x, at_most(lane_rows(), height - corner_y - block_y - 1))
-        at = STATE * block
-        store(state, at, select(inside, 1.0, 0.0))
-        for vector in range(1, STATE // 16):
-            store(state, at + 16 * vector, 0.0)
+        inside = both(less(lane_columns(), across - block_x), less(lane_rows(), down - block_y))
+        at = _STATE * block
+        store(state, at + _TRANSMITTANCE, select(inside, 1.0, 0.0))
+        store(state, at + _ALPHA, 0.0)
+        store_all(state, at + _CHANNELS, repeat(0.0, channels))
+        store_all(state, at + _CHANNELS + 16 * len(channels), repeat(0.0, median))
         if bits(inside):
             alive |= 1 << block
-    half = 0.5 * layout.TILE
+    middle_x, middle_y = np.float32(corner_x + 0.5 * layout.TILE), np.float32(corner_y + 0.5 * layout.TILE)
     while first < last and alive:
         end = min(first + CHUNK, last)
-        touched = fetch_chunk(
-            first, end, alive, cells, records, depths, np.float32(corner_x + half),
-            np.float32(corner_y + half), rows, blocks,
-        )  # fmt: skip
+        fetch_chunk(first, end, alive, cells, records, depths, middle_x, middle_y, rows, blocks)
         for block in range(layout.BLOCKS):
-            if touched >> block & 1:
-                count = 0
-                for entry in range(end - first):
-                    listed[count] = layout.ROW * entry
-                    count += blocks[entry] >> block & 1
-                if not _sweep_block(block, count, listed, rows, channels, median, cuts, state):
-                    alive &= ~(1 << block)
+            counts[block] = 0
+        for entry in range(end - first):
+            touched = blocks[entry]
+            while touched:
+                block = lowest_bit(touched)
+                touched &= touched - 1
+                listed[CHUNK * block + counts[block]] = layout.ROW * entry
+                counts[block] += 1
+        for block in range(layout.BLOCKS):
+            if counts[block] and not _sweep_block(
+                block, counts[block], listed[CHUNK * block :], rows, channels, median, cuts, state
+            ):
+                alive &= ~(1 << block)
         first = end
     return first
 
@@ -181,10 +218,10 @@ def _sweep_block(block, count, listed, rows, channels, median, cuts, state):  # 
     half = 0.5 * layout.TILE - 0.5
     x, y = add(lane_columns(), block_x - half), add(lane_rows(), block_y - half)
     log2_alpha_min, alpha_max, transmittance_min = splat(cuts[0]), splat(cuts[1]), splat(cuts[2])
-    at = STATE * block
-    transmittance, alpha_sum = load(state, at), load(state, at + 16)
-    sums = load_all(state, at + 32, channels)
-    medians = load_all(state, at + 32 + 16 * len(channels), median)
+    at = _STATE * block
+    transmittance, alpha_sum = load(state, at + _TRANSMITTANCE), load(state, at + _ALPHA)
+    sums = load_all(state, at + _CHANNELS, channels)
+    medians = load_all(state, at + _CHANNELS + 16 * len(channels), median)
     running = 1
     for place in range(count):
         row = listed[place]
@@ -207,39 +244,46 @@ def _sweep_block(block, count, listed, rows, channels, median, cuts, state):  # 
         running = bits(drawn)
         if not running:
             break
-    store(state, at, transmittance)
-    store(state, at + 16, alpha_sum)
-    store_all(state, at + 32, sums)
-    store_all(state, at + 32 + 16 * len(channels), medians)
+    store(state, at + _TRANSMITTANCE, transmittance)
+    store(state, at + _ALPHA, alpha_sum)
+    store_all(state, at + _CHANNELS, sums)
+    store_all(state, at + _CHANNELS + 16 * len(channels), medians)
     return running
 
 
 @part
-def _write_tile(tile, columns, state, background, rgb, alpha, depth, inverse_depth, expected, normals, median_depth):  # type: ignore[no-untyped-def]
-    """Copy a tile's pixels from its blocks to the images."""
-    height, width = alpha.shape
-    corner_x, corner_y = tile_corner(tile, columns)
-    for row in range(corner_y, min(corner_y + layout.TILE, height)):
-        for column in range(corner_x, min(corner_x + layout.TILE, width)):
-            block = (row - corner_y >> 2 << 2) + (column - corner_x >> 2)
-            at = STATE * block + (row - corner_y & 3) * 4 + (column - corner_x & 3) + 16
-            alpha_here = state[at]
-            alpha[row, column] = alpha_here
-            for channel in range(3):
-                at += 16
-                rgb[row, column, channel] = state[at] + (np.float32(1.0) - alpha_here) * background[channel]
-            if depth.size:
-                at += 16
-                depth[row, column] = state[at]
-                if expected.size:
-                    expected[row, column] = state[at] / alpha_here if alpha_here > 0 else np.float32(0.0)
-            if inverse_depth.size:
-                at += 16
-                inverse_depth[row, column] = state[at]
-            if normals.size:
-                for axis in range(3):
-                    at += 16
-                    normals[row, column, axis] = state[at]
-            if median_depth.size:
-                at += 16
-                median_depth[row, column] = state[at]
+def _finish_tile(tile, channels, state, background, has_depth, composited):  # type: ignore[no-untyped-def]
+    """Keep what the blocks have gathered in ``composited``; then add the background, and divide depth by alpha."""
+    size = 16 * (1 + len(channels))
+    for block in range(layout.BLOCKS):
+        at = _STATE * block
+        alpha = load(state, at + _ALPHA)
+        target = size * (layout.BLOCKS * tile + block)
+        store(composited, target, alpha)
+        store_all(composited, target + 16, load_all(state, at + _CHANNELS, channels))
+        if has_depth:
+            expected = div(load(state, at + _CHANNELS + 48), alpha)
+            store(state, at + _EXPECTED, select(greater(alpha, 0.0), expected, 0.0))
+        color = load_all(state, at + _CHANNELS, (0, 0, 0))
+        behind = broadcast_all(background, 0, (0, 0, 0))
+        store_all(state, at + _CHANNELS, fma(sub(1.0, alpha), behind, color))
+
+
+@part
+def _copy_to_image(vector, state, across, down, first, width, depth, channel, image):  # type: ignore[no-untyped-def]
+    """Copy one vector of a tile's blocks to one channel of a flat image; to an empty one nothing.
+
+    Args:
+        vector: Which, counted from the start of a block's state.
+        state: The blocks' states.
+        across, down: Pixels of the tile that are inside the image.
+        first: Number of the tile's first pixel.
+        width: Of the image.
+        depth: Channels of the image.
+        channel: Which.
+        image: Out.
+    """
+    if image.size:
+        for y in range(down):
+            for x in range(across):
+                image[(first + y * width + x) * depth + channel] = number(state, vector + place_in_blocks(x, y, _STATE))
