@@ -3,20 +3,20 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 DEMO ?= demo
-DEMO_STEPS ?= 1500
+DEMO_STEPS ?= 1200
 DEMO_FLAGS := --data $(DEMO)/phantom --steps $(DEMO_STEPS) --overwrite
 
 .PHONY: demo test test-slow lint install system clean
 
 demo: install
-	$(BIN)/coliags phantom $(DEMO)/phantom --seed 0 --size 169x135 --overwrite
+	$(BIN)/coliags phantom $(DEMO)/phantom --seed 0 --overwrite
 	$(BIN)/coliags train coliags --output $(DEMO)/coliags $(DEMO_FLAGS)
 	$(BIN)/coliags train scaffold-gs-depth --output $(DEMO)/scaffold-gs-depth $(DEMO_FLAGS)
 	$(BIN)/coliags eval $(DEMO)/coliags
 	$(BIN)/coliags eval $(DEMO)/scaffold-gs-depth
 	$(BIN)/coliags report $(DEMO)/coliags $(DEMO)/scaffold-gs-depth --output $(DEMO)/report.html \
 	  --title "ColIAGS and Scaffold-GS on a synthetic colon" \
-	  --note "A demonstration: $(DEMO_STEPS) steps at 169x135 on a CPU, where the paper trains 30,000 at 338x270."
+	  --note "A demonstration: $(DEMO_STEPS) steps on a CPU, where the paper trains 30,000."
 
 test: install
 	$(BIN)/python -m pytest -q
