@@ -207,7 +207,9 @@ def _prepare_tile(tile, channels, background, has_depth, composited, state):  # 
             covered = greater(alpha, 0.0)
             share = select(covered, div(load(state, at + _BEHIND), alpha), 0.0)
             store(state, at + _CHANNELS + 48, add(load(state, at + _CHANNELS + 48), share))
-            of_alpha = sub(of_alpha, select(covered, mul(share, div(sums[3], alpha)), 0.0))
+            # Read again rather than taken from sums, which has no fourth place where nothing but colour is composited.
+            depth = load(composited, source + 64)
+            of_alpha = sub(of_alpha, select(covered, mul(share, div(depth, alpha)), 0.0))
         store(state, at + _ALPHA, of_alpha)
         store(state, at + _BEHIND, dot(load_all(state, at + _CHANNELS, channels), sums, mul(of_alpha, alpha)))
 

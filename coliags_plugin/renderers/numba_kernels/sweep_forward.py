@@ -28,7 +28,6 @@ from coliags_plugin.renderers.numba_kernels.lanes import (
     less,
     load,
     load_all,
-    lowest_bit,
     mul,
     neg,
     number,
@@ -189,15 +188,7 @@ def _sweep_tile(
     while first < last and alive:
         end = min(first + CHUNK, last)
         fetch_chunk(first, end, alive, cells, records, depths, middle_x, middle_y, rows, blocks)
-        for block in range(layout.BLOCKS):
-            counts[block] = 0
-        for entry in range(end - first):
-            touched = blocks[entry]
-            while touched:
-                block = lowest_bit(touched)
-                touched &= touched - 1
-                listed[CHUNK * block + counts[block]] = layout.ROW * entry
-                counts[block] += 1
+        _list_by_block(end - first, blocks, listed, counts)
         for block in range(layout.BLOCKS):
             if counts[block] and not _sweep_block(
                 block, counts[block], listed[CHUNK * block :], rows, channels, median, cuts, state
@@ -205,6 +196,32 @@ def _sweep_tile(
                 alive &= ~(1 << block)
         first = end
     return first
+
+
+@part
+def _list_by_block(count, blocks, listed, counts):  # type: ignore[no-untyped-def]
+    """Which rows of a chunk touch each block, front to back.
+
+    Without a branch, for none could be foreseen, and four blocks at a time: every row is written to every list, and
+    stays there where the list grows.
+
+    Args:
+        count: Entries of the chunk.
+        blocks: The blocks that each touches.
+        listed: Out: places of rows. [CHUNK for each block]
+        counts: Out: how many. [blocks]
+    """
+    for block in range(0, layout.BLOCKS, 4):
+        a, b, c, d = CHUNK * block, CHUNK * (block + 1), CHUNK * (block + 2), CHUNK * (block + 3)
+        for entry in range(count):
+            row, touched = layout.ROW * entry, blocks[entry] >> block
+            listed[a], listed[b], listed[c], listed[d] = row, row, row, row
+            a += touched & 1
+            b += touched >> 1 & 1
+            c += touched >> 2 & 1
+            d += touched >> 3 & 1
+        counts[block], counts[block + 1] = a - CHUNK * block, b - CHUNK * (block + 1)
+        counts[block + 2], counts[block + 3] = c - CHUNK * (block + 2), d - CHUNK * (block + 3)
 
 
 @part
