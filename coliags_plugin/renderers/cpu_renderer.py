@@ -21,6 +21,16 @@ from coliags_plugin.settings import Settings
 
 #: Tensors of the Gaussians and the width of their rows; None for none.
 _SHAPES = {"means": 3, "quats_wxyz": 4, "scales": 3, "opacities": None, "colors": 3}
+#: Names of the images in the order of the kernels.
+_IMAGES = (
+    "rgb",
+    "alpha",
+    "depth_accumulated",
+    "inverse_depth_accumulated",
+    "depth_expected",
+    "normals",
+    "depth_median",
+)
 
 
 class CpuRendererSettings(Settings):
@@ -113,7 +123,7 @@ def render_gaussians(
         InputError: An output is unknown; a tensor is of the wrong shape, dtype or device; a Gaussian is not finite, has
             a quaternion of length 0 or a negative scale; the camera's numbers are unusable.
     """
-    from coliags_plugin.renderers.numba_kernels import autograd
+    from coliags_plugin.renderers.numba_kernels import autograd, layout, pipeline
 
     settings = settings or CpuRendererSettings()
     for name in wants:
@@ -123,27 +133,33 @@ def render_gaussians(
             )
     _check_tensors(gaussians)
     pose = camera.camera_to_world.to(device="cpu", dtype=torch.float32)
-    view = autograd.View(
-        table=_view_table(camera, pose, settings),
-        cuts=np.array([math.log2(settings.alpha_min), settings.alpha_max, settings.transmittance_min], np.float32),
-        background=np.array(settings.background, np.float32),
-        width=camera.width,
-        height=camera.height,
-        wanted=autograd.Wanted(
+    view = pipeline.Pipeline(
+        _view_table(camera, pose, settings),
+        camera.width,
+        camera.height,
+        layout.Extras(
             depth="depth_accumulated" in wants or "depth_expected" in wants,
             inverse_depth="inverse_depth_accumulated" in wants,
             normals="normals" in wants,
-            expected="depth_expected" in wants,
-            median="depth_median" in wants,
         ),
+        expected="depth_expected" in wants,
+        median="depth_median" in wants,
     )
-    shape = (gaussians.means, gaussians.quats_wxyz, gaussians.scales)
     try:
-        means2d, radii, images = autograd.render(*shape, gaussians.opacities, gaussians.colors, pose, view)
-    except autograd.UnusableGaussianError:
+        means2d, radii, images = autograd.render(
+            layout.Parameters(*(getattr(gaussians, name) for name in _SHAPES)), pose, view
+        )
+    except pipeline.UnusableGaussianError:
         raise _unusable(gaussians) from None
-    maps = {name: images[name] for name in wants if name not in ("rgb", "alpha")}
-    return RenderOutput(images["rgb"], images["alpha"], means2d, radii, gaussians, maps)
+    except pipeline.TooManyPairsError as error:
+        raise InputError(
+            f"{len(gaussians)} Gaussians that cover {error} tiles of 16 x 16 pixels, counted for each",
+            "less than 2^31",
+            "Check their scales",
+        ) from None
+    by_name = dict(zip(_IMAGES, images, strict=True))
+    maps = {name: by_name[name] for name in wants if name not in ("rgb", "alpha")}
+    return RenderOutput(images.rgb, images.alpha, means2d, radii, gaussians, maps)
 
 
 def _view_table(camera: Camera, pose: Tensor, settings: CpuRendererSettings) -> np.ndarray:
@@ -164,8 +180,9 @@ def _view_table(camera: Camera, pose: Tensor, settings: CpuRendererSettings) -> 
         *matrix[:3].T.ravel(),
         *(camera.fx, camera.fy, camera.cx, camera.cy),
         *limits,
-        *(settings.near, settings.low_pass, math.log2(settings.alpha_min)),
-        *(camera.width, camera.height),
+        *(settings.near, settings.low_pass, camera.width, camera.height),
+        *(math.log2(settings.alpha_min), settings.alpha_max, settings.transmittance_min),
+        *settings.background,
     ]
     if not np.isfinite(table).all():
         raise InputError(f"a camera with numbers that are not finite: {camera}", "finite intrinsics and pose")

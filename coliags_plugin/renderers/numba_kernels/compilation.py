@@ -31,26 +31,15 @@ def part(function: _Function) -> _Function:
     return numba.njit(function, **_OPTIONS)  # type: ignore[no-any-return]
 
 
-def region(function: _Function) -> _Function:
-    """What several threads do at once: a loop over ``numba.prange``, with nothing behind it.
-
-    numba moves whatever it finds behind such a loop in front of it unless it sees the loop write what is read, and it
-    does not look into the functions called.
-    """
-    return numba.njit(function, parallel=True, **_OPTIONS)  # type: ignore[no-any-return]
-
-
 def kernel(function: _Function) -> _Function:
-    """What Python calls: parts and regions in their order. It is kept on disk once compiled."""
-    return _kept(numba.njit(function, **_OPTIONS), function)
+    """What Python calls, from several threads at once where ``threads.Crew`` runs it. It is kept on disk once compiled.
 
-
-def region_kernel(function: _Function) -> _Function:
-    """A region that Python calls. It is kept on disk once compiled."""
-    return _kept(numba.njit(function, parallel=True, **_OPTIONS), function)
-
-
-def _kept(dispatcher: Any, function: _Function) -> _Function:
+    numba's own parallel loops are not used. They wait for every thread at their end, also for those that the system has
+    not let run yet, which on a shared machine costs more than the loop; two of them at once, or one in a forked process,
+    abort the interpreter; and numba moves what stands behind such a loop in front of it when the loop's writes are out
+    of its sight, in a function called.
+    """
+    dispatcher = numba.njit(function, **_OPTIONS)
     try:
         dispatcher._cache = _KernelCache(function)
     except RuntimeError:  # numba: no folder to keep it in

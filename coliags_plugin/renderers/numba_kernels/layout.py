@@ -1,34 +1,29 @@
-"""The tables the stages hand on, and what is in their columns.
+"""What the stages hand on to one another: tables, all of them flat arrays, and what is in their columns.
 
-``records``: one row of 16 numbers for each Gaussian, written by projection, read by binning and by both sweeps.
-
-The whitening U here is scaled so that log2(alpha) = log2(opacity) - |U d|^2, without further factors:
-U = sqrt(log2(e) / 2) times the U of ``docs/rendering.md``.
-
-``cells``: three integers for each entry, which is a pair of a Gaussian and a tile that it touches, by tile and front
-to back: the number of the Gaussian; which of the tile's blocks it touches, one bit each; and the number of the entry
-when they are counted by Gaussian, nearest first, and by tile.
-
-``entry_sums`` and ``gaussian_sums``: one row of 16 numbers for each entry, counted by Gaussian and tile, and
-their sum over the entries of a Gaussian. With v the derivative of the loss with respect to ln(alpha) and (e, f) = U d they are the sums over pixels of
-v, v e, v f, v e e, v e f, v f f, and of weight times the derivative with respect to each composited channel.
+Gaussians are handled in groups of sixteen, one vector; where it says "groups filled up" a table goes on to the end of
+the last group. Tiles are 16 x 16 pixels, blocks 4 x 4: one vector again.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 #: Pixels along the edge of a tile.
 TILE = 16
-#: Pixels along the edge of a block; its 16 pixels are what one vector holds.
+#: Pixels along the edge of a block.
 BLOCK = 4
 #: Blocks of a tile.
 BLOCKS = 16
+#: Gaussians of a group, and of one parcel of work.
+GROUP = 16
+PARCEL = 1024
 
-#: Numbers in a row of any table.
+#: Numbers in a row of ``records`` and of sums.
 ROW = 16
 
-# Columns of ``records``.
+# Columns of ``records``. U is scaled so that log2(alpha) = log2(opacity) - |U d|^2 without further factors: it is
+# sqrt(log2(e) / 2) times the U of docs/rendering.md.
 U_XX = 0
 U_YX = 1
 U_YY = 2
@@ -37,14 +32,19 @@ MEAN_Y = 4
 LOG2_OPACITY = 5
 #: Colour, then as many of depth, inverse depth and the three components of the normal as are composited.
 CHANNELS = 6
+MAX_CHANNELS = 8
 #: cov_xy / cov_xx and cov_xy / cov_yy: how the nearest point moves along an edge that is upright, or level.
 SLOPE_UPRIGHT = 14
 SLOPE_LEVEL = 15
 
-#: Integers in ``cells`` for each entry.
-CELL = 3
+#: The square of the factor in U, and the factor.
+U_FACTOR_SQUARED = 0.5 / math.log(2.0)
+U_FACTOR = math.sqrt(U_FACTOR_SQUARED)
+#: Slack on |U d|^2 in binning, so that rounding never drops a pixel that a sweep would draw.
+REACH_SLACK = 1e-2
 
-# Columns of the sums.
+# Columns of sums. With v the derivative of the loss with respect to ln(alpha) and (e, f) = U d they are, over pixels,
+# the sums of v, v e, v f, v e e, v e f, v f f, and of weight times the derivative with respect to each channel.
 SUM_V = 0
 SUM_E = 1
 SUM_F = 2
@@ -53,11 +53,12 @@ SUM_EF = 4
 SUM_FF = 5
 SUM_CHANNELS = 6
 
-#: Most channels that fit.
-MAX_CHANNELS = 8
+#: Integers for each entry of ``cells``: the number of the Gaussian; which of the tile's blocks it touches, one bit each;
+#: and the number of the entry when they are counted by Gaussian, nearest first.
+CELL = 3
 
-# Entries of ``view``, the camera and the options as float32.
-VIEW_RIGHT = 0  # the camera's axes in the world
+# Places in ``view``, the camera and the options as float32.
+VIEW_RIGHT = 0  # the camera's axes and centre in the world
 VIEW_DOWN = 3
 VIEW_FORWARD = 6
 VIEW_CENTER = 9
@@ -65,19 +66,139 @@ VIEW_FX = 12
 VIEW_FY = 13
 VIEW_CX = 14
 VIEW_CY = 15
-VIEW_SLOPE_X_MIN = 16
+VIEW_SLOPE_X_MIN = 16  # where the Jacobian is clamped
 VIEW_SLOPE_X_MAX = 17
 VIEW_SLOPE_Y_MIN = 18
 VIEW_SLOPE_Y_MAX = 19
 VIEW_NEAR = 20
 VIEW_LOW_PASS = 21
-VIEW_LOG2_ALPHA_MIN = 22
-VIEW_WIDTH = 23
-VIEW_HEIGHT = 24
-VIEW_SIZE = 25
+VIEW_WIDTH = 22
+VIEW_HEIGHT = 23
+VIEW_LOG2_ALPHA_MIN = 24  # the cuts
+VIEW_ALPHA_MAX = 25
+VIEW_TRANSMITTANCE_MIN = 26
+VIEW_BACKGROUND = 27
+VIEW_SIZE = 30
 
-#: The square of the factor in U: half of log2(e).
-U_FACTOR_SQUARED = 0.5 / math.log(2.0)
-U_FACTOR = math.sqrt(U_FACTOR_SQUARED)
-#: Slack on squared distances (in units of log2), so that rounding never drops a pixel that a sweep would draw.
-REACH_SLACK = 1e-2
+
+class Parameters(NamedTuple):
+    """The Gaussians, or the derivatives with respect to them.
+
+    Attributes:
+        means: [3 for each Gaussian]
+        quats: w first. [4 for each Gaussian]
+        scales: [3 for each Gaussian]
+        opacities: [1 for each Gaussian]
+        colors: [3 for each Gaussian]
+    """
+
+    means: Any
+    quats: Any
+    scales: Any
+    opacities: Any
+    colors: Any
+
+
+class Extras(NamedTuple):
+    """What is composited besides colour, in this order."""
+
+    depth: bool
+    inverse_depth: bool
+    normals: bool
+
+
+class Grid(NamedTuple):
+    """The image and its tiles.
+
+    Attributes:
+        width, height: Pixels.
+        columns: Tiles side by side.
+        tiles: All tiles, counted row by row.
+    """
+
+    width: int
+    height: int
+    columns: int
+    tiles: int
+
+
+class Projections(NamedTuple):
+    """What projection leaves, groups filled up.
+
+    Attributes:
+        records: One row for each Gaussian; anything where it is not drawn.
+        depths: z-depths; 1 where not in front of the camera. [1 for each Gaussian]
+        bounds: First and last column, first and last row of the tiles within reach. [4 for each Gaussian]
+        drawn: One bit for each Gaussian of a group. [groups]
+        parcels: Gaussians drawn, -1 where one cannot be used; and tiles within their bounds. [2 for each parcel]
+    """
+
+    records: Any
+    depths: Any
+    bounds: Any
+    drawn: Any
+    parcels: Any
+
+
+class Pairs(NamedTuple):
+    """Pairs of a Gaussian and a tile that it touches, by stretches of the list of Gaussians.
+
+    Attributes:
+        gaussian, tile: Numbers of the two.
+        blocks: Blocks touched, one bit each.
+        begins, ends: Where the pairs of a stretch are. [stretches]
+        tile_counts: How many there are of each stretch and tile. [tiles for each stretch]
+    """
+
+    gaussian: Any
+    tile: Any
+    blocks: Any
+    begins: Any
+    ends: Any
+    tile_counts: Any
+
+
+class Bins(NamedTuple):
+    """The same pairs by tile and front to back; they are called entries there.
+
+    Attributes:
+        keys: Gaussians drawn, nearest first; the number of the Gaussian is in the lower 32 bits.
+        entry_counts: Entries of each of them. [Gaussians drawn]
+        stretch_entries: Number of the first entry of each stretch of ``keys``, and how many there are. [stretches + 1]
+        cells: See ``CELL``. [3 for each entry]
+        starts: First entry of each tile, and how many there are. [tiles + 1]
+        order: Tiles, long lists first. [tiles]
+        reached: End of the entries of each tile that any pixel gets to see; known after the forward sweep. [tiles]
+    """
+
+    keys: Any
+    entry_counts: Any
+    stretch_entries: Any
+    cells: Any
+    starts: Any
+    order: Any
+    reached: Any
+
+
+class Images(NamedTuple):
+    """Images, or the derivatives with respect to them; empty where there are none.
+
+    Attributes:
+        rgb, normals: [3 for each pixel]
+        alpha, depth, inverse_depth, expected, median: [1 for each pixel]; ``expected`` is depth over alpha.
+    """
+
+    rgb: Any
+    alpha: Any
+    depth: Any
+    inverse_depth: Any
+    expected: Any
+    normals: Any
+    median: Any
+
+
+class Scratch(NamedTuple):
+    """Memory of the sweeps, so much for each thread."""
+
+    numbers: Any
+    integers: Any

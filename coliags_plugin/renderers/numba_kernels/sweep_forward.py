@@ -1,16 +1,13 @@
 """Compositing, tile by tile and block by block, front to back.
 
-A block of 4 x 4 pixels is one vector, and everything a block has gathered stays in registers while its Gaussians pass.
-The formulas are those of ``docs/rendering.md``, section "Compositing".
+A block of 4 x 4 pixels is one vector, and what a block has gathered stays in registers while its Gaussians pass. The
+formulas are those of ``docs/rendering.md``, section "Compositing".
 """
 
 from __future__ import annotations
 
-import numba
-import numpy as np
-
 from coliags_plugin.renderers.numba_kernels import layout
-from coliags_plugin.renderers.numba_kernels.compilation import part, region_kernel
+from coliags_plugin.renderers.numba_kernels.compilation import kernel, part
 from coliags_plugin.renderers.numba_kernels.lanes import (
     add,
     at_least,
@@ -25,7 +22,6 @@ from coliags_plugin.renderers.numba_kernels.lanes import (
     greater,
     lane_columns,
     lane_rows,
-    less,
     load,
     load_all,
     mul,
@@ -34,7 +30,6 @@ from coliags_plugin.renderers.numba_kernels.lanes import (
     repeat,
     select,
     smaller,
-    splat,
     store,
     store_all,
     sub,
@@ -47,6 +42,7 @@ from coliags_plugin.renderers.numba_kernels.tiles import (
     OFFSET_F,
     block_corner,
     fetch_chunk,
+    inside,
     place_in_blocks,
     tile_corner,
 )
@@ -55,151 +51,81 @@ from coliags_plugin.renderers.numba_kernels.tiles import (
 _TRANSMITTANCE = 0
 _ALPHA = 16
 _CHANNELS = 32
+_STATE = _CHANNELS + 16 * (layout.MAX_CHANNELS + 1)
 #: Depth over alpha takes the place of the transmittance when that has done its work.
 _EXPECTED = _TRANSMITTANCE
-_STATE = _CHANNELS + 16 * (layout.MAX_CHANNELS + 1)
+
 #: Scratch of one thread: rows of a chunk, states of a tile's blocks.
-SCRATCH = CHUNK * layout.ROW + layout.BLOCKS * _STATE
-#: Scratch of one thread, integers: blocks of a chunk's entries, entries of a tile's blocks, and their number.
-LISTS = CHUNK + layout.BLOCKS * CHUNK + layout.BLOCKS
+NUMBERS = CHUNK * layout.ROW + layout.BLOCKS * _STATE
+#: Scratch of one thread: blocks of a chunk's entries, entries of a tile's blocks, and how many.
+INTEGERS = CHUNK + layout.BLOCKS * CHUNK + layout.BLOCKS
 
 
-@region_kernel
-def sweep_forward(
-    workers,
-    counters,
-    records,
-    depths,
-    cells,
-    starts,
-    order,
-    reached,
-    channels,
-    median,
-    cuts,
-    background,
-    width,
-    height,
-    scratch,
-    lists,
-    composited,
-    rgb,
-    alpha,
-    depth,
-    inverse_depth,
-    expected,
-    normals,
-    median_depth,
-):  # type: ignore[no-untyped-def]
+@kernel
+def sweep_forward(counters, projections, bins, view, grid, extras, channels, median, scratch, composited, images):
     """Composite all tiles.
 
     Args:
-        workers: Threads to share the work.
-        counters: For sharing; entry 0 must be 0.
-        records, depths, cells, starts: See ``layout`` and ``binning``.
-        order: Tiles in the order they are begun in.
-        reached: Out: end of the entries of each tile that any pixel gets to see. [tiles]
+        counters: For sharing; entries 0 and 1 must be 0.
+        projections, bins: What projection and binning wrote; ``bins.reached`` is written here.
+        view: See ``layout``.
+        grid: The image and its tiles.
+        extras: What is composited besides colour.
         channels: Any tuple as long as there are channels.
         median: A tuple with one element where the median depth is wanted, an empty one where it is not.
-        cuts: log2(alpha_min), alpha_max, transmittance_min.
-        background: RGB.
-        width, height: Of the image, pixels.
-        scratch: Scratch. [SCRATCH for each worker]
-        lists: Scratch. [LISTS for each worker]
-        composited: Out: alpha and channels without background, one vector each, by tile and block.
-        rgb, alpha, depth, inverse_depth, expected, normals, median_depth: Out, flat images; empty where not wanted.
+        scratch: NUMBERS and INTEGERS for each thread.
+        composited: Out, for the backward sweep: alpha and channels without background, by tile and block.
+            [16 for each block and alpha or channel]
+        images: Out; those that are empty are not written.
     """
-    tiles = len(starts) - 1
-    columns = (width + layout.TILE - 1) // layout.TILE
-    for worker in numba.prange(workers):
-        rows = scratch[worker * SCRATCH : (worker + 1) * SCRATCH]
-        state = rows[CHUNK * layout.ROW :]
-        blocks = lists[worker * LISTS : (worker + 1) * LISTS]
-        listed = blocks[CHUNK:]
-        counts = listed[layout.BLOCKS * CHUNK :]
-        while True:
-            place = take(counters, 0, 1)
-            if place >= tiles:
-                break
-            tile = order[place]
-            corner_x, corner_y = tile_corner(tile, columns)
-            across, down = min(layout.TILE, width - corner_x), min(layout.TILE, height - corner_y)
-            reached[tile] = _sweep_tile(
-                corner_x, corner_y, across, down, records, depths, cells, starts[tile], starts[tile + 1], channels,
-                median, cuts, rows, state, blocks, listed, counts,
-            )  # fmt: skip
-            _finish_tile(tile, channels, state, background, depth.size or expected.size, composited)
-            first = corner_y * width + corner_x
-            for channel in range(3):
-                _copy_to_image(_CHANNELS + 16 * channel, state, across, down, first, width, 3, channel, rgb)
-            _copy_to_image(_ALPHA, state, across, down, first, width, 1, 0, alpha)
-            at = _CHANNELS + 48
-            if depth.size or expected.size:
-                _copy_to_image(at, state, across, down, first, width, 1, 0, depth)
-                _copy_to_image(_EXPECTED, state, across, down, first, width, 1, 0, expected)
-                at += 16
-            if inverse_depth.size:
-                _copy_to_image(at, state, across, down, first, width, 1, 0, inverse_depth)
-                at += 16
-            if normals.size:
-                for axis in range(3):
-                    _copy_to_image(at + 16 * axis, state, across, down, first, width, 3, axis, normals)
-                at += 48
-            _copy_to_image(at, state, across, down, first, width, 1, 0, median_depth)
+    thread = take(counters, 1, 1)
+    rows = scratch.numbers[thread * NUMBERS : (thread + 1) * NUMBERS]
+    state = rows[CHUNK * layout.ROW :]
+    blocks = scratch.integers[thread * INTEGERS : (thread + 1) * INTEGERS]
+    while True:
+        place = take(counters, 0, 1)
+        if place >= grid.tiles:
+            break
+        tile = bins.order[place]
+        bins.reached[tile] = _sweep_tile(tile, projections, bins, view, grid, channels, median, rows, state, blocks)
+        _finish_tile(tile, channels, view, extras.depth, state, composited)
+        _write_tile(tile, grid, extras, state, images)
 
 
 @part
-def _sweep_tile(
-    corner_x,
-    corner_y,
-    across,
-    down,
-    records,
-    depths,
-    cells,
-    first,
-    last,
-    channels,
-    median,
-    cuts,
-    rows,
-    state,
-    blocks,
-    listed,
-    counts,
-):  # type: ignore[no-untyped-def]
-    """Sweep through one tile's entries ``first`` to ``last``; leaves its pixels in ``state``.
+def _sweep_tile(tile, projections, bins, view, grid, channels, median, rows, state, blocks):
+    """Sweep through one tile's entries; leaves its pixels in ``state``.
 
     Returns:
         Where it stopped.
     """
+    corner_x, corner_y, across, down = tile_corner(tile, grid)
+    listed = blocks[CHUNK:]
+    counts = listed[layout.BLOCKS * CHUNK :]
     alive = 0
     for block in range(layout.BLOCKS):
-        block_x, block_y = block_corner(block)
-        inside = both(less(lane_columns(), across - block_x), less(lane_rows(), down - block_y))
-        at = _STATE * block
-        store(state, at + _TRANSMITTANCE, select(inside, 1.0, 0.0))
+        at, pixels = _STATE * block, inside(block, across, down)
+        store(state, at + _TRANSMITTANCE, select(pixels, 1.0, 0.0))
         store(state, at + _ALPHA, 0.0)
         store_all(state, at + _CHANNELS, repeat(0.0, channels))
         store_all(state, at + _CHANNELS + 16 * len(channels), repeat(0.0, median))
-        if bits(inside):
+        if bits(pixels):
             alive |= 1 << block
-    middle_x, middle_y = np.float32(corner_x + 0.5 * layout.TILE), np.float32(corner_y + 0.5 * layout.TILE)
+    first, last = bins.starts[tile], bins.starts[tile + 1]
     while first < last and alive:
         end = min(first + CHUNK, last)
-        fetch_chunk(first, end, alive, cells, records, depths, middle_x, middle_y, rows, blocks)
+        fetch_chunk(first, end, alive, corner_x, corner_y, projections, bins.cells, rows, blocks)
         _list_by_block(end - first, blocks, listed, counts)
         for block in range(layout.BLOCKS):
-            if counts[block] and not _sweep_block(
-                block, counts[block], listed[CHUNK * block :], rows, channels, median, cuts, state
-            ):
+            count = counts[block]
+            if count and not _sweep_block(block, count, listed[CHUNK * block :], rows, channels, median, view, state):
                 alive &= ~(1 << block)
         first = end
     return first
 
 
 @part
-def _list_by_block(count, blocks, listed, counts):  # type: ignore[no-untyped-def]
+def _list_by_block(count, blocks, listed, counts):
     """Which rows of a chunk touch each block, front to back.
 
     Without a branch, for none could be foreseen, and four blocks at a time: every row is written to every list, and
@@ -225,7 +151,7 @@ def _list_by_block(count, blocks, listed, counts):  # type: ignore[no-untyped-de
 
 
 @part
-def _sweep_block(block, count, listed, rows, channels, median, cuts, state):  # type: ignore[no-untyped-def]
+def _sweep_block(block, count, listed, rows, channels, median, view, state):
     """Composite the first ``count`` rows listed into one block.
 
     Returns:
@@ -234,7 +160,8 @@ def _sweep_block(block, count, listed, rows, channels, median, cuts, state):  # 
     block_x, block_y = block_corner(block)
     half = 0.5 * layout.TILE - 0.5
     x, y = add(lane_columns(), block_x - half), add(lane_rows(), block_y - half)
-    log2_alpha_min, alpha_max, transmittance_min = splat(cuts[0]), splat(cuts[1]), splat(cuts[2])
+    log2_alpha_min, alpha_max = broadcast(view, layout.VIEW_LOG2_ALPHA_MIN), broadcast(view, layout.VIEW_ALPHA_MAX)
+    transmittance_min = broadcast(view, layout.VIEW_TRANSMITTANCE_MIN)
     at = _STATE * block
     transmittance, alpha_sum = load(state, at + _TRANSMITTANCE), load(state, at + _ALPHA)
     sums = load_all(state, at + _CHANNELS, channels)
@@ -269,38 +196,49 @@ def _sweep_block(block, count, listed, rows, channels, median, cuts, state):  # 
 
 
 @part
-def _finish_tile(tile, channels, state, background, has_depth, composited):  # type: ignore[no-untyped-def]
+def _finish_tile(tile, channels, view, has_depth, state, composited):
     """Keep what the blocks have gathered in ``composited``; then add the background, and divide depth by alpha."""
     size = 16 * (1 + len(channels))
+    background = broadcast_all(view, layout.VIEW_BACKGROUND, (0, 0, 0))
     for block in range(layout.BLOCKS):
-        at = _STATE * block
+        at, target = _STATE * block, size * (layout.BLOCKS * tile + block)
         alpha = load(state, at + _ALPHA)
-        target = size * (layout.BLOCKS * tile + block)
         store(composited, target, alpha)
         store_all(composited, target + 16, load_all(state, at + _CHANNELS, channels))
         if has_depth:
             expected = div(load(state, at + _CHANNELS + 48), alpha)
             store(state, at + _EXPECTED, select(greater(alpha, 0.0), expected, 0.0))
         color = load_all(state, at + _CHANNELS, (0, 0, 0))
-        behind = broadcast_all(background, 0, (0, 0, 0))
-        store_all(state, at + _CHANNELS, fma(sub(1.0, alpha), behind, color))
+        store_all(state, at + _CHANNELS, fma(sub(1.0, alpha), background, color))
 
 
 @part
-def _copy_to_image(vector, state, across, down, first, width, depth, channel, image):  # type: ignore[no-untyped-def]
-    """Copy one vector of a tile's blocks to one channel of a flat image; to an empty one nothing.
+def _write_tile(tile, grid, extras, state, images):
+    """Copy a tile's pixels from its blocks to the images."""
+    for channel in range(3):
+        _copy_to_image(_CHANNELS + 16 * channel, state, tile, grid, 3, channel, images.rgb)
+    _copy_to_image(_ALPHA, state, tile, grid, 1, 0, images.alpha)
+    at = _CHANNELS + 48
+    if extras.depth:
+        _copy_to_image(at, state, tile, grid, 1, 0, images.depth)
+        _copy_to_image(_EXPECTED, state, tile, grid, 1, 0, images.expected)
+        at += 16
+    if extras.inverse_depth:
+        _copy_to_image(at, state, tile, grid, 1, 0, images.inverse_depth)
+        at += 16
+    if extras.normals:
+        for axis in range(3):
+            _copy_to_image(at + 16 * axis, state, tile, grid, 3, axis, images.normals)
+        at += 48
+    _copy_to_image(at, state, tile, grid, 1, 0, images.median)
 
-    Args:
-        vector: Which, counted from the start of a block's state.
-        state: The blocks' states.
-        across, down: Pixels of the tile that are inside the image.
-        first: Number of the tile's first pixel.
-        width: Of the image.
-        depth: Channels of the image.
-        channel: Which.
-        image: Out.
-    """
-    if image.size:
+
+@part
+def _copy_to_image(vector, state, tile, grid, depth, channel, image):
+    """Copy one vector of a tile's blocks to one of the ``depth`` channels of an image; to an empty one nothing."""
+    if len(image):
+        corner_x, corner_y, across, down = tile_corner(tile, grid)
         for y in range(down):
+            first = ((corner_y + y) * grid.width + corner_x) * depth + channel
             for x in range(across):
-                image[(first + y * width + x) * depth + channel] = number(state, vector + place_in_blocks(x, y, _STATE))
+                image[first + x * depth] = number(state, vector + place_in_blocks(x, y, _STATE))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from llvmlite import ir
@@ -22,3 +24,23 @@ def take(typingctx: Any, counters: Any, index: Any, amount: Any) -> Any:
         return builder.atomic_rmw("add", builder.gep(data, [place]), amount, "monotonic")
 
     return types.int64(counters, types.intp, types.int64), generate
+
+
+class Crew:
+    """Threads that run one kernel together.
+
+    Every thread calls the kernel with the same arguments, and the kernel takes pieces of work with :func:`take` until
+    none are left. Whoever asks works too and waits only for those who have begun: a thread that the system has not let
+    run by then, or that a fork has left behind, is not needed.
+    """
+
+    def __init__(self) -> None:
+        self._threads = ThreadPoolExecutor(max_workers=max(1, os.cpu_count() or 1), thread_name_prefix="splatting")
+
+    def run(self, size: int, kernel: Callable[..., Any], *arguments: Any) -> None:
+        """Run a kernel on ``size`` threads, this one among them."""
+        helpers = [self._threads.submit(kernel, *arguments) for _ in range(size - 1)]
+        kernel(*arguments)
+        for helper in helpers:
+            if not helper.cancel():
+                helper.result()
