@@ -15,6 +15,7 @@ from typing_extensions import Self
 
 from coliags_plugin.cameras import Camera
 from coliags_plugin.gaussians import Gaussians, RenderOutput
+from coliags_plugin.progress import Progress
 from coliags_plugin.scenes import Frame, Scene
 from coliags_plugin.settings import Settings
 
@@ -27,9 +28,18 @@ class DataManager(ABC):
     def __init__(self, settings: Any) -> None:
         self.settings = settings
 
+    @classmethod
+    def recognise(cls, path: Path) -> str | None:
+        """What in the folder says that it is this manager's to read; None where nothing does. Reads no pixels."""
+        return None
+
     @abstractmethod
-    def load(self, path: Path) -> Scene:
+    def load(self, path: Path, progress: Progress | None = None) -> Scene:
         """Read the scene.
+
+        Args:
+            path: Its folder (or file, where a data set is one).
+            progress: Told ``(what, done, total)`` while pictures are read.
 
         Raises:
             InputError: The folder is missing or is not what this data manager reads.

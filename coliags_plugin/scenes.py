@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -10,6 +10,23 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from coliags_plugin.cameras import Camera
+
+
+@dataclass(frozen=True)
+class SparseDepth:
+    """z-depth known at single points of a picture, as structure from motion finds it.
+
+    Attributes:
+        pixels: (column, row), centres at integers + 0.5; inside the picture. [K, 2]
+        depth: z-depth, scene units. [K]
+    """
+
+    pixels: Float[Tensor, "K 2"]
+    depth: Float[Tensor, "K"]
+
+    def to(self, device: torch.device | str) -> SparseDepth:
+        """The same points on another device."""
+        return SparseDepth(self.pixels.to(device), self.depth.to(device))
 
 
 @dataclass(frozen=True)
@@ -26,6 +43,7 @@ class Frame:
         seen: For test views with ground-truth geometry: True where a training frame sees the same surface. [H, W]
         depth_at_least: Where the depth sensor clipped, the z-depth it clipped at, mm: the surface lies there or beyond
             and ``depth`` is NaN. NaN elsewhere; None where nothing is clipped. [H, W]
+        sparse_depth: Depth at single points; None where the dataset has none.
     """
 
     name: str
@@ -36,6 +54,7 @@ class Frame:
     mask: Bool[Tensor, "H W"] | None = None
     seen: Bool[Tensor, "H W"] | None = None
     depth_at_least: Float[Tensor, "H W"] | None = None
+    sparse_depth: SparseDepth | None = None
 
     @property
     def rgb(self) -> Float[Tensor, "H W 3"]:
@@ -51,9 +70,10 @@ class Frame:
 
     def to(self, device: torch.device | str) -> Frame:
         """The same frame on another device."""
-        tensors = {name: getattr(self, name) for name in ("depth", "depth_at_least", "mask", "seen")}
-        moved = {name: tensor.to(device) for name, tensor in tensors.items() if tensor is not None}
-        return replace(self, image=self.image.to(device), camera=self.camera.to(device), **moved)
+        names = ("image", "camera", "depth", "mask", "seen", "depth_at_least", "sparse_depth")
+        values = {name: getattr(self, name) for name in names}
+        moved: dict[str, Any] = {name: value if value is None else value.to(device) for name, value in values.items()}
+        return Frame(self.name, self.index, **moved)
 
 
 @dataclass(frozen=True)

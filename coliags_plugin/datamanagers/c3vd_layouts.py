@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import re
@@ -41,14 +40,14 @@ class Layout:
     poses: Path
     camera: Path | None = None
 
-    def fingerprint(self) -> str:
-        """SHA-256 over the names and sizes of all files and the content of the small ones."""
-        digest = hashlib.sha256()
-        for path in (*self.images, *(self.depths or ())):
-            digest.update(f"{path.relative_to(self.folder).as_posix()} {path.stat().st_size}\n".encode())
-        for path in filter(None, (self.poses, self.camera)):
-            digest.update(path.read_bytes())
-        return digest.hexdigest()
+
+def recognise(folder: Path) -> str | None:
+    """What in the folder says that it is one of the two layouts; None where nothing does."""
+    if (folder / "camera_pose.txt").is_file() and (folder / "images").is_dir():
+        return "camera_pose.txt beside images/"
+    if (folder / "pose.txt").is_file() and next(folder.glob("*_color.png"), None) is not None:
+        return "pose.txt beside NNNN_color.png"
+    return None
 
 
 def find_layout(folder: Path) -> Layout:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
-from coliags_plugin.datamanagers.images import DEPTH_INVALID, DEPTH_MM_PER_STEP
+from coliags_plugin.datamanagers.depth_formats import C3VD_DEPTH
 from coliags_plugin.errors import InputError
 from coliags_plugin.files import atomic_folder, write_json
 from coliags_plugin.lenses import Pinhole
@@ -64,10 +64,9 @@ def write_c3vd_scene(
 
 def depth_steps(depth: Float[np.ndarray, "H W"]) -> UInt16[np.ndarray, "H W"]:
     """z-depth, mm, as C3VD stores it: 16 bit, 0 where unknown, 65535 from 100 mm on. [H, W]"""
-    unknown, far = DEPTH_INVALID
     known = np.isfinite(depth) & (depth > 0.0)
-    steps = np.rint(np.where(known, depth, 0.0) / DEPTH_MM_PER_STEP)
-    return np.where(known, np.clip(steps, unknown + 1, far), unknown).astype(np.uint16)
+    steps = np.rint(np.where(known, depth, 0.0) / C3VD_DEPTH.size)
+    return np.where(known, np.clip(steps, 1, C3VD_DEPTH.far), 0).astype(np.uint16)
 
 
 def _write_png(path: Path, pixels: np.ndarray) -> None:

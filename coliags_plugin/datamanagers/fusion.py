@@ -32,17 +32,18 @@ def fuse_depth(frames: Sequence[Frame], count: int, generator: np.random.Generat
     Raises:
         InputError: No frame has a valid depth.
     """
-    usable = [np.flatnonzero(_usable(frame)) for frame in frames]
-    available = np.array([len(pixels) for pixels in usable])
+    # One frame after the other, twice: the pixels of a long video do not fit into memory side by side.
+    available = np.array([np.count_nonzero(_usable(frame)) for frame in frames])
     if available.sum() == 0:
         raise InputError(
             f"none of the {len(frames)} training frames has a valid depth",
-            "16-bit depth with values between 0 and 65535, both excluded",
+            "depth files with known depth in them",
             "Check the depth files, or set initial_points: file",
         )
     taken = available if available.sum() <= count else generator.multivariate_hypergeometric(available, count)
     positions, colors = [], []
-    for frame, pixels, number in zip(frames, usable, taken, strict=True):
+    for frame, number in zip(frames, taken, strict=True):
+        pixels = np.flatnonzero(_usable(frame))
         # Sorting keeps the reading order; which pixels are taken is already random.
         chosen = np.sort(generator.choice(pixels, number, replace=False)) if number < len(pixels) else pixels
         positions.append(_back_projected(frame, chosen))
@@ -51,16 +52,17 @@ def fuse_depth(frames: Sequence[Frame], count: int, generator: np.random.Generat
 
 
 def _usable(frame: Frame) -> np.ndarray:
-    if frame.depth is None:
+    depth = frame.depth
+    if depth is None:
         return np.zeros(0, bool)
-    return np.asarray((torch.isfinite(frame.depth) & frame.valid).numpy())
+    return np.asarray((torch.isfinite(depth) & frame.valid).numpy())
 
 
 def _back_projected(frame: Frame, pixels: np.ndarray) -> np.ndarray:
     """World positions of pixels by their flat index, in double precision. [N, 3]"""
-    camera = frame.camera
+    camera, depth = frame.camera, frame.depth
     row, column = np.divmod(pixels, camera.width)
-    z = frame.depth.numpy().ravel()[pixels].astype(np.float64) if frame.depth is not None else np.zeros(0)
+    z = depth.numpy().ravel()[pixels].astype(np.float64) if depth is not None else np.zeros(0)
     x = (column + 0.5 - camera.cx) / camera.fx * z
     y = (row + 0.5 - camera.cy) / camera.fy * z
     camera_to_world = camera.camera_to_world.numpy().astype(np.float64)
@@ -70,34 +72,50 @@ def _back_projected(frame: Frame, pixels: np.ndarray) -> np.ndarray:
 def read_points(path: Path, count: int, generator: np.random.Generator) -> PointCloud:
     """Points from a PLY file, or from an NPZ file with ``positions`` [N, 3] and perhaps ``colors`` uint8 [N, 3].
 
-    At most ``count``, drawn without replacement; points that are not finite are left out.
+    See :func:`thinned` for which.
 
     Raises:
         InputError: The file is missing or holds no points.
     """
+    return thinned(load_points(path), count, generator, path)
+
+
+def load_points(path: Path) -> PointCloud:
+    """All points of a PLY or NPZ file.
+
+    Raises:
+        InputError: The file is missing or is neither.
+    """
     if not path.is_file():
-        raise InputError(
-            f"no file {path}", "a PLY or NPZ file of points in the world of the poses, mm", "Check the path"
-        )
+        raise InputError(f"no file {path}", "a PLY or NPZ file of points in the world of the poses", "Check the path")
     if path.suffix.lower() == ".npz":
         positions, colors = _read_npz(path)
     elif path.suffix.lower() == ".ply":
         positions, colors = _read_ply(path)
     else:
         raise InputError(f"{path} is neither .ply nor .npz", "a PLY or NPZ file of points")
-    finite = np.flatnonzero(np.isfinite(positions).all(axis=1))
-    if len(finite) < len(positions):
+    return PointCloud(
+        torch.from_numpy(np.asarray(positions, np.float32)), None if colors is None else torch.from_numpy(colors)
+    )
+
+
+def thinned(points: PointCloud, count: int, generator: np.random.Generator, source: Path | None) -> PointCloud:
+    """At most ``count`` of the points, drawn without replacement; those that are not finite are left out.
+
+    Raises:
+        InputError: None is finite.
+    """
+    finite = np.flatnonzero(torch.isfinite(points.positions).all(dim=1).numpy())
+    if len(finite) < len(points):
         log.warning(
-            "%s: %d of %d points are not finite and are left out", path, len(positions) - len(finite), len(positions)
+            "%s: %d of %d points are not finite and are left out", source, len(points) - len(finite), len(points)
         )
     if len(finite) == 0:
-        raise InputError(f"{path} holds no points", "positions x, y, z in the world of the poses, mm")
+        raise InputError(f"{source} holds no points", "positions x, y, z in the world of the poses")
     if len(finite) > count:
         finite = np.sort(generator.choice(finite, count, replace=False))
-    return PointCloud(
-        torch.from_numpy(positions[finite].astype(np.float32)),
-        None if colors is None else torch.from_numpy(colors[finite]),
-    )
+    chosen = torch.from_numpy(finite)
+    return PointCloud(points.positions[chosen], None if points.colors is None else points.colors[chosen])
 
 
 def _read_npz(path: Path) -> tuple[np.ndarray, np.ndarray | None]:

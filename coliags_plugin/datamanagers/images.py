@@ -6,13 +6,9 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
-from jaxtyping import Float32, Shaped, UInt8, UInt16
+from jaxtyping import Shaped, UInt8
 
 from coliags_plugin.errors import InputError
-
-#: mm per step of C3VD's 16-bit depth, and the two values that mean "unknown": nothing there, and 100 mm or more.
-DEPTH_MM_PER_STEP = 100.0 / 65535.0
-DEPTH_INVALID = (0, 65535)
 
 
 def read_rgb(path: Path) -> UInt8[np.ndarray, "H W 3"]:
@@ -27,20 +23,26 @@ def read_rgb(path: Path) -> UInt8[np.ndarray, "H W 3"]:
     return np.ascontiguousarray(image[..., 2::-1])
 
 
-def read_depth_steps(path: Path) -> UInt16[np.ndarray, "H W"]:
-    """A 16-bit depth picture as stored; :func:`millimetres` converts it.
+def read_gray(path: Path, bits: int, expected: str) -> Shaped[np.ndarray, "H W"]:
+    """A picture of one channel of 8 or 16 bits, as stored.
+
+    Args:
+        path: The picture.
+        bits: Of a pixel.
+        expected: What it should be, for the error.
 
     Raises:
         InputError: It cannot be read whole, or is something else.
     """
-    depth = _read(path)
-    if depth.dtype != np.uint16 or depth.ndim != 2:
+    picture = _read(path)
+    if picture.dtype != np.dtype(f"uint{bits}") or picture.ndim != 2:
+        lost = picture.dtype == np.uint8 and bits == 16
         raise InputError(
-            f"{path} is {_kind(depth)}",
-            "a one-channel 16-bit depth picture, 65535 being 100 mm",
-            "Take the original file: depth that went through 8 bits has lost 0.4 mm",
+            f"{path} is {_kind(picture)}",
+            expected,
+            "Take the original file: depth that went through 8 bits has lost 0.4 mm" if lost else "Convert it",
         )
-    return depth
+    return picture
 
 
 def read_mask(path: Path) -> Shaped[np.ndarray, "H W"]:
@@ -49,24 +51,7 @@ def read_mask(path: Path) -> Shaped[np.ndarray, "H W"]:
     Raises:
         InputError: It cannot be read whole, or is something else.
     """
-    mask = _read(path)
-    if mask.dtype != np.uint8 or mask.ndim != 2:
-        raise InputError(f"{path} is {_kind(mask)}", "a one-channel 8-bit mask", "Convert it")
-    return mask > 0
-
-
-def millimetres(steps: UInt16[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
-    """z-depth, mm, of C3VD's 16-bit depth; NaN where unknown (docs/data.md 1). [H, W]"""
-    depth = (steps * DEPTH_MM_PER_STEP).astype(np.float32)
-    depth[np.isin(steps, DEPTH_INVALID)] = np.nan
-    return depth
-
-
-def clipped_at(steps: UInt16[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"] | None:
-    """The z-depth at which C3VD's 16 bits end, mm, where they do; NaN elsewhere. None where none did. [H, W]"""
-    _, far = DEPTH_INVALID
-    clipped = steps == far
-    return np.where(clipped, np.float32(far * DEPTH_MM_PER_STEP), np.float32(np.nan)) if clipped.any() else None
+    return read_gray(path, 8, "a one-channel 8-bit mask") > 0
 
 
 def resize_rgb(image: UInt8[np.ndarray, "H W 3"], width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool
 
-Split = Literal["every-8th", "endogslam", "block", "all-train"]
+Split = Literal["every-8th", "endogslam", "block", "all-train", "own"]
 
 EVERY = 8
 
@@ -18,7 +18,7 @@ def held_out(split: Split, count: int, block: tuple[float, float] = (0.4, 0.6)) 
     Args:
         split: ``every-8th``: 0, 8, 16, ... (the paper, Gaussian Pancakes); ``endogslam``: 7, 15, 23, ... (EndoGSLAM,
             PR-Endo; docs/data.md 6); ``block``: one stretch of the video, which no training frame interrupts, so
-            that test views are not merely in-betweens; ``all-train``: none.
+            that test views are not merely in-betweens; ``all-train``: none. ``own`` is not a rule but what data say.
         count: Number of frames.
         block: Where the stretch begins and ends, as shares of the video.
 

@@ -6,22 +6,16 @@ import cv2
 import numpy as np
 import pytest
 
-from coliags_plugin.datamanagers.c3vd_frames import default_size
 from coliags_plugin.datamanagers.c3vd_writer import depth_steps
-from coliags_plugin.datamanagers.images import (
-    millimetres,
-    read_depth_steps,
-    read_mask,
-    read_rgb,
-    resize_nearest,
-    resize_rgb,
-)
+from coliags_plugin.datamanagers.depth_formats import C3VD_DEPTH
+from coliags_plugin.datamanagers.images import read_mask, read_rgb, resize_nearest, resize_rgb
+from coliags_plugin.datamanagers.views import default_size
 from coliags_plugin.errors import InputError
 
 
 def test_millimetres():
     steps = np.array([[0, 1, 32768, 65534, 65535]], np.uint16)
-    depth = millimetres(steps)
+    depth = C3VD_DEPTH.z_depth(steps)
     assert depth.dtype == np.float32
     np.testing.assert_array_equal(np.isnan(depth), [[True, False, False, False, True]])
     np.testing.assert_allclose(depth[0, 1:4], [100 / 65535, 32768 * 100 / 65535, 65534 * 100 / 65535], rtol=1e-6)
@@ -29,13 +23,13 @@ def test_millimetres():
 
 def test_depth_survives_writing_and_reading():
     depth = np.array([[1e-6, 0.5, 42.0, 99.999]])
-    np.testing.assert_allclose(millimetres(depth_steps(depth)), depth, atol=100 / 65535)
+    np.testing.assert_allclose(C3VD_DEPTH.z_depth(depth_steps(depth)), depth, atol=100 / 65535)
     unknown = np.array([[np.nan, 0.0, -3.0, 100.0, np.inf, 250.0]])
-    assert np.isnan(millimetres(depth_steps(unknown))).all()
+    assert np.isnan(C3VD_DEPTH.z_depth(depth_steps(unknown))).all()
 
 
 def test_simcol_depth_is_read_whole(shared_data):
-    steps = read_depth_steps(shared_data / "simcol3d_frames" / "Depth_0000.png")
+    steps = C3VD_DEPTH.read(shared_data / "simcol3d_frames" / "Depth_0000.png")
     assert steps.shape == (475, 475)
     assert (steps.min(), steps.max()) == (2048, 43520)
 
@@ -54,8 +48,8 @@ def test_colour_order_and_alpha(tmp_path):
     [
         (read_rgb, np.zeros((4, 4), np.uint8), "1 channel of uint8.*8-bit RGB"),
         (read_rgb, np.zeros((4, 4, 3), np.uint16), "3 channels of uint16"),
-        (read_depth_steps, np.zeros((4, 4), np.uint8), "1 channel of uint8.*16-bit"),
-        (read_depth_steps, np.zeros((4, 4, 3), np.uint16), "3 channels of uint16"),
+        (C3VD_DEPTH.read, np.zeros((4, 4), np.uint8), "1 channel of uint8.*16-bit"),
+        (C3VD_DEPTH.read, np.zeros((4, 4, 3), np.uint16), "3 channels of uint16"),
         (read_mask, np.zeros((4, 4, 3), np.uint8), "3 channels of uint8"),
     ],
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,11 +27,9 @@ from coliags_plugin.datamanagers.phantom.trajectory import TEST_EVERY, RotationV
 from coliags_plugin.datamanagers.phantom.visibility import likeliest_first, seen_from
 from coliags_plugin.errors import InputError
 from coliags_plugin.files import atomic_folder
+from coliags_plugin.progress import Progress
 
 _LOG = logging.getLogger(__name__)
-
-#: Told the stage's name, how much of it is done, and how much there is.
-Progress = Callable[[str, int, int], None]
 
 #: Pixels an exposure meter looks at.
 _METERED = 2500

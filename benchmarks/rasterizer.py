@@ -1,0 +1,158 @@
+"""Milliseconds of drawing one view and of its gradients, by renderer and number of Gaussians.
+
+    python benchmarks/rasterizer.py --counts 20000,50000,100000,200000 --backends torch,cpu --json FILE
+
+Projection, sorting, compositing of colour, alpha and depth, and, for the second figure, the gradients of means,
+quaternions, scales, opacities and colours. Renderers take turns, so that what else the machine does hits all of them;
+figures are medians. A renderer so slow that all its turns would take longer than --patience skips some.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import statistics
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+# As the command line does, and before torch is imported.
+os.environ.setdefault("GOMP_SPINCOUNT", "10000")
+
+import torch
+import tyro
+from machine import describe_machine, markdown_table, write_results
+from train_step import Handed
+from workload import camera, wall
+
+from coliags_plugin.components import make_component
+from coliags_plugin.contracts import Renderer
+from coliags_plugin.engine.backends import choose_renderer
+from coliags_plugin.errors import InputError
+from coliags_plugin.gaussians import Gaussians
+from coliags_plugin.registry import REGISTRIES
+
+INPUTS = ("means", "quats_wxyz", "scales", "opacities", "colors")
+WANTS = ("rgb", "alpha", "depth_accumulated")
+#: Turns at least, however slow.
+FEWEST = 3
+
+
+@dataclass(frozen=True)
+class Options:
+    """Time renderers on one view."""
+
+    counts: str = "20000,50000,100000,200000"
+    """Numbers of Gaussians, comma separated."""
+    backends: str = "torch,cpu"
+    """Renderers by name, comma separated; gsplat needs a CUDA device. Ratios are to the first."""
+    repeats: int = 25
+    """Timed turns; two more come first to warm up."""
+    threads: int | None = None
+    """Of torch and of the kernels; torch's own choice where left out."""
+    patience: float = 15.0
+    """Seconds that one renderer may take for one count before it skips turns."""
+    json: Path | None = None
+    """Also write the rows here."""
+
+
+class Case:
+    """One renderer with one set of Gaussians, on the device it runs on."""
+
+    def __init__(self, renderer: Renderer, device: torch.device, gaussians: Gaussians) -> None:
+        self.renderer = renderer
+        self.device = device
+        moved = {name: getattr(gaussians, name).to(device).requires_grad_() for name in INPUTS}
+        self.gaussians = replace(gaussians, **moved)
+        self.camera = camera().to(device)
+        generator = torch.Generator().manual_seed(0)
+        shape = (self.camera.height, self.camera.width)
+        self.cotangents = [
+            torch.randn(*shape, *([3] * (name == "rgb")), generator=generator).to(device) for name in WANTS
+        ]
+        self.forward: list[float] = []
+        self.both: list[float] = []
+
+    def draw(self) -> tuple[float, float]:
+        """Draw once and go back once; milliseconds until the image, and until the gradients."""
+        for name in INPUTS:
+            getattr(self.gaussians, name).grad = None
+        began = self._now()
+        output = self.renderer.render(Handed(self.gaussians, "gaussians3d"), self.camera, WANTS)
+        drawn = self._now()
+        torch.autograd.backward([output[name] for name in WANTS], self.cotangents)
+        return 1e3 * (drawn - began), 1e3 * (self._now() - began)
+
+    def take_turn(self) -> None:
+        """Draw once, and remember how long that took."""
+        forward, both = self.draw()
+        self.forward.append(forward)
+        self.both.append(both)
+
+    def medians(self) -> tuple[float, float]:
+        """Of all turns: milliseconds until the image, and until the gradients."""
+        return statistics.median(self.forward), statistics.median(self.both)
+
+    def _now(self) -> float:
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
+        return time.perf_counter()
+
+
+def find_renderers(names: list[str]) -> dict[str, tuple[Renderer, torch.device]]:
+    """Each renderer and where it runs: on the CPU if it can.
+
+    Raises:
+        InputError: One cannot run here.
+    """
+    found = {}
+    for name in names:
+        devices = getattr(REGISTRIES["renderers"].get(name), "devices", {"cpu"})
+        device = torch.device("cpu" if "cpu" in devices else "cuda")
+        found[name] = (choose_renderer(make_component("renderers", name), "gaussians3d", device).renderer, device)
+    return found
+
+
+def measure(cases: dict[str, Case], repeats: int, patience: float) -> None:
+    """Let the cases take turns."""
+    turns: dict[str, int] = {}
+    for name, case in cases.items():
+        case.draw()
+        seconds = case.draw()[1] / 1e3
+        turns[name] = min(repeats, max(FEWEST, math.ceil(patience / seconds)))
+    for turn in range(repeats):
+        for name, case in cases.items():
+            if (turn + 1) * turns[name] // repeats > turn * turns[name] // repeats:
+                case.take_turn()
+
+
+def main(options: Options) -> None:
+    """Run, print a table, and write JSON where asked."""
+    if options.threads is not None:
+        torch.set_num_threads(options.threads)
+    names = options.backends.split(",")
+    renderers = find_renderers(names)
+    rows: list[dict[str, Any]] = []
+    shown: list[dict[str, Any]] = []
+    for count in map(int, options.counts.split(",")):
+        gaussians = wall(count)
+        cases = {name: Case(*renderers[name], gaussians) for name in names}
+        measure(cases, options.repeats, options.patience)
+        medians = {name: case.medians() for name, case in cases.items()}
+        for name, (forward, both) in medians.items():
+            row = {"backend": name, "count": count, "forward_ms": forward, "forward_backward_ms": both}
+            rows.append(row)
+            first_forward, first_both = medians[names[0]]
+            ratios = {"faster, forward": first_forward / forward, "faster, both": first_both / both}
+            shown.append({**row, **ratios, "turns": len(cases[name].both)})
+    print(", ".join(f"{key}: {value}" for key, value in describe_machine().items()), end="\n\n")
+    print(markdown_table(shown))
+    write_results(options.json, rows)
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Options))
+    except InputError as error:
+        raise SystemExit(str(error)) from None

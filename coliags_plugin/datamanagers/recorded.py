@@ -1,0 +1,161 @@
+"""From a recording on disk to a scene: split, read, and given initial points, alike for every data set."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from abc import abstractmethod
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+
+from coliags_plugin.contracts import DataManager
+from coliags_plugin.datamanagers.fusion import fuse_depth, read_points, thinned
+from coliags_plugin.datamanagers.recording import Recording, Shot
+from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
+from coliags_plugin.datamanagers.splits import held_out
+from coliags_plugin.datamanagers.stored_frames import StoredFrame, read_side_by_side
+from coliags_plugin.errors import InputError
+from coliags_plugin.progress import Progress
+from coliags_plugin.scenes import Frame, PointCloud, Scene
+
+log = logging.getLogger(__name__)
+
+
+class RecordedDataManager(DataManager):
+    """A data manager that finds a :class:`Recording`; the rest is the same for all of them."""
+
+    Settings: ClassVar[type[SceneSettings]] = SceneSettings
+
+    settings: SceneSettings
+    #: The name it is registered under.
+    name: ClassVar[str]
+
+    @abstractmethod
+    def open(self, path: Path) -> Recording:
+        """Find out what the folder holds, without reading pixels.
+
+        Raises:
+            InputError: The folder is missing, or its files are not as they should be.
+        """
+
+    def load(self, path: Path, progress: Progress | None = None) -> Scene:
+        """Read the scene.
+
+        Args:
+            path: Its folder.
+            progress: Told ``(what, done, total)`` while pictures are read.
+
+        Returns:
+            Frames of the working size; the world and the units of the data.
+
+        Raises:
+            InputError: The folder is missing, or anything in it is not as it should be.
+        """
+        path, settings = Path(path), self.settings
+        recording = self.open(path)
+        train_places, test_places = self._split(recording, path)
+        train = self._frames(recording.shots, train_places)
+        test_sets = {"test": self._frames(recording.shots, test_places)} if test_places else {}
+        for name, shots in recording.test_sets.items():
+            test_sets[name] = self._frames(shots, range(len(shots)))
+        video = sorted([*train, *(test_sets["test"] if test_places else [])], key=lambda frame: frame.index)
+        if settings.keep_pixels:
+            others = (frame for name in recording.test_sets for frame in test_sets[name])
+            read_side_by_side([*video, *others], progress)
+        points, described = self._initial_points(recording, path, train)
+        split: dict[str, Any] = {
+            "name": settings.split,
+            "frame_step": settings.frame_step,
+            "max_frames": settings.max_frames,
+        }
+        if settings.split == "block":
+            split["block"] = list(settings.block)
+        split["train"] = [frame.name for frame in train]
+        split["test_sets"] = {name: [frame.name for frame in frames] for name, frames in test_sets.items()}
+        provenance = {
+            "dataset": self.name,
+            "path": str(path.resolve()),
+            **recording.facts,
+            "fingerprint": recording.fingerprint,
+            "split": split,
+            "points": described,
+            "frames": {
+                "in_sequence": len(recording.shots),
+                "train": len(train),
+                **{name: len(frames) for name, frames in test_sets.items()},
+            },
+            "invalid_depth_share": _invalid_depth_share(video) if settings.keep_pixels else None,
+        }
+        log.info("%s: %d frames, %s", path, len(recording.shots), recording.kind)
+        return Scene(path.resolve().name, train, test_sets, points, provenance)
+
+    def _frames(self, shots: Sequence[Shot], places: Sequence[int]) -> list[Frame]:
+        return [StoredFrame(shots[place], place, self.settings.keep_pixels) for place in places]
+
+    def _split(self, recording: Recording, path: Path) -> tuple[list[int], list[int]]:
+        """Places of training and of test frames."""
+        settings = self.settings
+        places = list(range(0, len(recording.shots), settings.frame_step))[: settings.max_frames]
+        if settings.split == "own":
+            if recording.own_split is None:
+                raise InputError(
+                    f"{path} does not say which of its frames are for testing", "a split of another name", ""
+                )
+            chosen = set(places)
+            train, test = (
+                [place for place in recording.own_split[part] if place in chosen] for part in ("train", "test")
+            )
+        else:
+            is_test = held_out(settings.split, len(places), settings.block)
+            train = [place for place, held in zip(places, is_test, strict=True) if not held]
+            test = [place for place, held in zip(places, is_test, strict=True) if held]
+        if not train:
+            raise InputError(
+                f"split '{settings.split}' of {len(places)} frames of {path} leaves none to train on",
+                "at least one training frame",
+                "Use more frames, or another split ('all-train' holds none out)",
+            )
+        return train, test
+
+    def _initial_points(
+        self, recording: Recording, path: Path, train: Sequence[Frame]
+    ) -> tuple[PointCloud, dict[str, Any]]:
+        settings = self.settings
+        generator = np.random.default_rng(settings.seed)
+        if settings.initial_points == "file":
+            file = path / settings.points_file
+            points = read_points(file, settings.points_count, generator)
+            return points, self._described_points(file, points)
+        has_depth = any(shot.depth is not None for shot in recording.shots)
+        own = recording.own_points
+        if has_depth and (settings.initial_points == "depth" or own is None):
+            points = fuse_depth(train, settings.points_count, generator)
+            return points, self._described_points("depth of the training frames", points)
+        if own is None or recording.points_source is None:
+            raise InputError(
+                f"{path} has neither depth files nor {POINTS_FILE}",
+                "depth to make initial points from, or the points themselves",
+                f"Put {POINTS_FILE} (world of the poses) there, or set initial_points: file and points_file",
+            )
+        points = thinned(own(), settings.points_count, generator, recording.points_source)
+        return points, self._described_points(recording.points_source, points)
+
+    def _described_points(self, source: Path | str, points: PointCloud) -> dict[str, Any]:
+        facts: dict[str, Any] = {"source": str(source), "count": len(points), "seed": self.settings.seed}
+        if isinstance(source, Path) and source.is_file():
+            facts["sha256"] = hashlib.sha256(source.read_bytes()).hexdigest()
+        return facts
+
+
+def _invalid_depth_share(frames: Sequence[Frame]) -> float | None:
+    """Share of the unmasked pixels whose depth is unknown; None where there is no depth."""
+    shares = []
+    for frame in frames:
+        depth = frame.depth
+        if depth is not None:
+            shares.append(torch.isnan(depth[frame.valid]).double().mean())
+    return float(torch.stack(shares).mean()) if shares else None

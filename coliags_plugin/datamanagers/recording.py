@@ -1,0 +1,90 @@
+"""What a data set says before any pixel is read: which pictures, from where, with what beside them."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from coliags_plugin.datamanagers.depth_formats import DepthFormat
+from coliags_plugin.datamanagers.views import View
+from coliags_plugin.errors import InputError
+from coliags_plugin.scenes import PointCloud, SparseDepth
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One picture as it lies on disk.
+
+    Attributes:
+        name: Unique within the recording.
+        image: The picture.
+        view: How it becomes a working picture; shared by pictures of the same camera.
+        camera_to_world: Rigid, OpenCV axes, scene units. [4, 4]
+        depth: Its depth file.
+        depth_format: How to read that.
+        mask: A picture, not black where a pixel counts, as large as ``image``.
+        seen: A picture, not black where training frames see the same surface, as large as ``image``.
+        sparse_depth: Depth at single points of the working picture.
+    """
+
+    name: str
+    image: Path
+    view: View
+    camera_to_world: Float[np.ndarray, "4 4"]
+    depth: Path | None = None
+    depth_format: DepthFormat | None = None
+    mask: Path | None = None
+    seen: Path | None = None
+    sparse_depth: SparseDepth | None = None
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A posed video as it lies on disk.
+
+    Attributes:
+        kind: Of data set and layout, for the log.
+        shots: In video order.
+        facts: For provenance: layout, lens, sizes, pose convention and whatever else was found out.
+        fingerprint: Of the files; see :func:`fingerprint`.
+        test_sets: Test sets that come with the data, apart from the video, by name.
+        own_split: Places in ``shots`` that the data themselves train and test on, ``{"train": ..., "test": ...}``.
+        own_points: Reads the data's own initial points; None where there are none.
+        points_source: The file or folder these come from.
+    """
+
+    kind: str
+    shots: Sequence[Shot]
+    facts: Mapping[str, Any]
+    fingerprint: str
+    test_sets: Mapping[str, Sequence[Shot]] = field(default_factory=dict)
+    own_split: Mapping[str, Sequence[int]] | None = None
+    own_points: Callable[[], PointCloud] | None = None
+    points_source: Path | None = None
+
+
+def fingerprint(folder: Path, large: Iterable[Path | None], small: Iterable[Path | None]) -> str:
+    """SHA-256 over the names and sizes of large files and the contents of small ones."""
+    digest = hashlib.sha256()
+    for path in filter(None, large):
+        name = path.relative_to(folder) if path.is_relative_to(folder) else path.name
+        digest.update(f"{Path(name).as_posix()} {path.stat().st_size}\n".encode())
+    for path in filter(None, small):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def check_pose_count(file: Path, poses: int, pictures: int) -> None:
+    """Raise InputError where a pose file does not have a pose for every picture."""
+    if poses != pictures:
+        raise InputError(
+            f"{file} has {poses} poses for {pictures} pictures",
+            "a pose for every picture, in order",
+            "Restore the missing ones, or remove the surplus at the end",
+        )

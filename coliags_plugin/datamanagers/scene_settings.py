@@ -1,0 +1,76 @@
+"""The options that all data managers share."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+from typing_extensions import Self
+
+from coliags_plugin.datamanagers.splits import Split
+from coliags_plugin.settings import Settings
+
+POINTS_FILE = "points3D.ply"
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+InitialPoints = Literal["depth", "data", "file"]
+
+
+class SceneSettings(Settings):
+    """Working size, split and initial points."""
+
+    width: int | None = Field(
+        None, gt=0, description="Working width, pixels. None: what fits 338 x 270, the paper's quarter of a raw frame."
+    )
+    height: int | None = Field(None, gt=0, description="Working height, pixels; goes with width.")
+    focal_scale: float = Field(
+        1.0,
+        gt=0.0,
+        le=4.0,
+        description="Factor on the nominal focal length when distorted frames are undistorted; below 1 more of a wide "
+        "view is kept.",
+    )
+    split: Split = Field(
+        "every-8th",
+        description="Test frames: 'every-8th': 0, 8, 16, ... as in the paper; 'endogslam': 7, 15, 23, ...; "
+        "'block': one stretch of the video; 'all-train': none; 'own': as the data say. Counted after frame_step and "
+        "max_frames.",
+    )
+    block: tuple[Share, Share] = Field(
+        (0.4, 0.6), description="Split 'block': where the stretch begins and ends, as shares of the video."
+    )
+    frame_step: int = Field(1, ge=1, description="Use every so-many-th frame of the video.")
+    max_frames: int | None = Field(
+        None, ge=1, description="Use at most so many frames, the first ones after frame_step."
+    )
+    initial_points: InitialPoints = Field(
+        "depth",
+        description="Initial points: 'depth': fused from the training frames' depth, or the data's own where there is "
+        "no depth; 'data': the data's own, or from depth where there are none; 'file': points_file.",
+    )
+    points_file: str = Field(
+        POINTS_FILE, description="PLY or NPZ for initial_points 'file', relative to the scene folder or absolute."
+    )
+    points_count: int = Field(200_000, ge=1, description="At most so many initial points, drawn without replacement.")
+    seed: int = Field(0, ge=0, description="Of the draw of initial points.")
+    keep_pixels: bool = Field(
+        True,
+        description="Whether pictures stay in memory, as small as they were stored; otherwise they are read anew each "
+        "time, which is slow and for videos larger than the memory.",
+    )
+
+    @model_validator(mode="after")
+    def _both_sides_or_none(self) -> Self:
+        if (self.width is None) != (self.height is None):
+            raise ValueError(f"width = {self.width} and height = {self.height}: give both or neither")
+        return self
+
+    @model_validator(mode="after")
+    def _block_is_a_stretch(self) -> Self:
+        if self.block[0] >= self.block[1]:
+            raise ValueError(f"block = {self.block}: it must begin before it ends")
+        return self
+
+    @property
+    def size(self) -> tuple[int, int] | None:
+        """Working width and height where they are set, pixels."""
+        return None if self.width is None or self.height is None else (self.width, self.height)

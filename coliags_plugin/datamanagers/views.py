@@ -1,0 +1,168 @@
+"""How stored pictures become working pictures: another size, and a pinhole camera instead of a lens."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Shaped, UInt8
+
+from coliags_plugin.cameras import Camera
+from coliags_plugin.datamanagers.images import read_rgb, resize_nearest, resize_rgb
+from coliags_plugin.errors import InputError
+from coliags_plugin.lenses import Lens, Pinhole
+from coliags_plugin.undistortion import Undistortion
+
+#: How far a raw frame's aspect ratio may be from the lens's: rounding to whole pixels, but no cropping.
+ASPECT_TOLERANCE = 0.02
+
+#: The paper's working size, a quarter of C3VD's raw frame.
+PAPER_SIZE = (338, 270)
+
+
+def default_size(width: int, height: int) -> tuple[int, int]:
+    """The largest size that fits the paper's 338 x 270, keeps the aspect ratio and enlarges nothing, pixels."""
+    scale = min(1.0, PAPER_SIZE[0] / width, PAPER_SIZE[1] / height)
+    if scale == 1.0:
+        return width, height
+    # Halves are rounded up: the paper's 338 is a quarter of 1350.
+    fitted = int(width * scale + 0.5), int(height * scale + 0.5)
+    return max(1, fitted[0]), max(1, fitted[1])
+
+
+@dataclass(frozen=True)
+class View:
+    """How the stored pictures of one camera become working pictures.
+
+    Attributes:
+        source_width, source_height: Size of the stored pictures, pixels.
+        width, height: Working size, pixels.
+        pinhole: Intrinsics at the working size, pixels, centres at integers.
+        described_by: The file that says how large the stored pictures are, for errors.
+        undistortion: For pictures taken through a lens; None where they are pinhole pictures already.
+    """
+
+    source_width: int
+    source_height: int
+    width: int
+    height: int
+    pinhole: Pinhole
+    described_by: Path
+    undistortion: Undistortion | None = None
+
+    @classmethod
+    def through(
+        cls,
+        lens: Lens,
+        described_by: Path,
+        size: tuple[int, int] | None = None,
+        focal_scale: float = 1.0,
+        shows: Bool[np.ndarray, "H W"] | None = None,
+    ) -> View:
+        """The view of pictures taken through a lens, undistorted to its nominal pinhole.
+
+        Args:
+            lens: Of the stored pictures, at their size.
+            described_by: The file the lens or its size comes from.
+            size: Working width and height, pixels; None: :func:`default_size`.
+            focal_scale: Factor on the nominal focal length.
+            shows: Stored pixels that show something; None for all. [H, W]
+        """
+        width, height = size or default_size(lens.width, lens.height)
+        nominal = lens.scaled(width, height).pinhole
+        pinhole = nominal._replace(fx=nominal.fx * focal_scale, fy=nominal.fy * focal_scale)
+        undistortion = Undistortion(lens, pinhole, width, height, shows)
+        return cls(lens.width, lens.height, width, height, pinhole, described_by, undistortion)
+
+    @classmethod
+    def of_pinhole(
+        cls, pinhole: Pinhole, width: int, height: int, described_by: Path, size: tuple[int, int] | None = None
+    ) -> View:
+        """The view of pinhole pictures of a width and height; ``size`` as for :meth:`through`."""
+        working_width, working_height = size or default_size(width, height)
+        scaled = pinhole.scaled(working_width / width, working_height / height)
+        return cls(width, height, working_width, working_height, scaled, described_by)
+
+    def camera(self, camera_to_world: Float[np.ndarray, "4 4"]) -> Camera:
+        """The working camera, whose pixel centres are at integers + 0.5."""
+        fx, fy, cx, cy = self.pinhole
+        matrix = torch.from_numpy(camera_to_world.astype(np.float32))
+        return Camera(fx, fy, cx + 0.5, cy + 0.5, self.width, self.height, matrix)
+
+    def image(self, rgb: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w 3"]:
+        """A colour picture at the working size."""
+        if self.undistortion is None:
+            return resize_rgb(rgb, self.width, self.height)
+        return self.undistortion.image(rgb)
+
+    def nearest(self, values: Shaped[np.ndarray, "H W"]) -> Shaped[np.ndarray, "h w"]:
+        """Values at the working size, unmixed; 0 where there is no source."""
+        if self.undistortion is None:
+            return resize_nearest(values, self.width, self.height)
+        return self.undistortion.nearest(values, 0)
+
+    def pixels(self, stored: Float[np.ndarray, "K 2"]) -> Float[np.ndarray, "K 2"]:
+        """Where places of the stored picture lie in the working one.
+
+        Args:
+            stored: (column, row), centres at integers. [K, 2]
+
+        Returns:
+            (column, row), centres at integers, inside the picture or not; NaN where the lens does not reach. [K, 2]
+        """
+        if self.undistortion is None:
+            scale = np.array([self.width / self.source_width, self.height / self.source_height])
+            return np.asarray((stored + 0.5) * scale - 0.5)
+        fx, fy, cx, cy = self.pinhole
+        return np.asarray(self.undistortion.lens.unproject(stored)[:, :2] * (fx, fy) + (cx, cy))
+
+    @property
+    def valid(self) -> Bool[np.ndarray, "h w"] | None:
+        """Working pixels that show something; None where all do."""
+        if self.undistortion is None or self.undistortion.valid.all():
+            return None
+        return self.undistortion.valid
+
+    def facts(self) -> dict[str, Any]:
+        """For provenance: sizes, and intrinsics at the working size."""
+        fx, fy, cx, cy = self.pinhole
+        return {
+            "stored_size": [self.source_width, self.source_height],
+            "size": [self.width, self.height],
+            "intrinsics": {"fx": fx, "fy": fy, "cx": cx + 0.5, "cy": cy + 0.5, "pixel_centers": "integers + 0.5"},
+        }
+
+    def checked(self, path: Path, picture: np.ndarray) -> np.ndarray:
+        """A stored picture as it is.
+
+        Raises:
+            InputError: It is of another size.
+        """
+        height, width = picture.shape[:2]
+        if (width, height) != (self.source_width, self.source_height):
+            raise InputError(
+                f"{path} is {width} x {height}, but {self.described_by} says {self.source_width} x "
+                f"{self.source_height}",
+                "pictures of one size, the one their intrinsics are for",
+                "Write that picture again, or mend the size where it is said",
+            )
+        return picture
+
+
+def whole_frame(lens: Lens, image: Path) -> Lens:
+    """The lens at the size of a picture that shows all of what the lens is calibrated for.
+
+    Raises:
+        InputError: The picture is a crop, so that the calibration does not apply to it.
+    """
+    height, width = read_rgb(image).shape[:2]
+    if abs((width / height) / (lens.width / lens.height) - 1.0) > ASPECT_TOLERANCE:
+        raise InputError(
+            f"{image} is {width} x {height}",
+            f"the whole raw frame that the lens is calibrated for, {lens.width} x {lens.height} or scaled from it",
+            "Undistort cropped pictures yourself and give them in the undistorted layout",
+        )
+    return lens.scaled(width, height)
