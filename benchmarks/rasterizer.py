@@ -5,6 +5,8 @@
 Projection, sorting, compositing of colour, alpha and depth, and, for the second figure, the gradients of means,
 quaternions, scales, opacities and colours. Renderers take turns, so that what else the machine does hits all of them;
 figures are medians. A renderer so slow that all its turns would take longer than --patience skips some.
+
+On a machine that is busy with other work, --threads 1 --clock processor counts only the time that it gave to this.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ import statistics
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 # As the command line does, and before torch is imported.
 os.environ.setdefault("GOMP_SPINCOUNT", "10000")
@@ -51,6 +53,8 @@ class Options:
     """Timed turns; two more come first to warm up."""
     threads: int | None = None
     """Of torch and of the kernels; torch's own choice where left out."""
+    clock: Literal["wall", "processor"] = "wall"
+    """Time passed, or what this process got of it, all its threads together."""
     patience: float = 15.0
     """Seconds that one renderer may take for one count before it skips turns."""
     json: Path | None = None
@@ -60,9 +64,10 @@ class Options:
 class Case:
     """One renderer with one set of Gaussians, on the device it runs on."""
 
-    def __init__(self, renderer: Renderer, device: torch.device, gaussians: Gaussians) -> None:
+    def __init__(self, renderer: Renderer, device: torch.device, gaussians: Gaussians, clock: str) -> None:
         self.renderer = renderer
         self.device = device
+        self.clock = time.perf_counter if clock == "wall" else time.process_time
         moved = {name: getattr(gaussians, name).to(device).requires_grad_() for name in INPUTS}
         self.gaussians = replace(gaussians, **moved)
         self.camera = camera().to(device)
@@ -97,7 +102,7 @@ class Case:
     def _now(self) -> float:
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
-        return time.perf_counter()
+        return self.clock()
 
 
 def find_renderers(names: list[str]) -> dict[str, tuple[Renderer, torch.device]]:
@@ -137,7 +142,7 @@ def main(options: Options) -> None:
     shown: list[dict[str, Any]] = []
     for count in map(int, options.counts.split(",")):
         gaussians = wall(count)
-        cases = {name: Case(*renderers[name], gaussians) for name in names}
+        cases = {name: Case(*renderers[name], gaussians, options.clock) for name in names}
         measure(cases, options.repeats, options.patience)
         medians = {name: case.medians() for name, case in cases.items()}
         for name, (forward, both) in medians.items():

@@ -91,15 +91,29 @@ def load_method(method: str, overrides: Iterable[str] = ()) -> LoadedMethod:
     Raises:
         InputError: No such method, or it is not valid; names file, line and key.
     """
-    tree = _resolve(_find(method, Path.cwd()), ())
-    for assignment in overrides:
-        tree = override(tree, assignment)
+    tree = method_tree(method, overrides)
     try:
         config = MethodConfig.model_validate(tree.plain())
     except ValidationError as error:
         raise InputError("\n".join(_describe(error, tree))) from error
-    name = Path(method).stem if _is_path(method) else method
-    return LoadedMethod(name, config, tree)
+    return LoadedMethod(method_name(method), config, tree)
+
+
+def method_name(method: str) -> str:
+    """What a method is called: its name, or its file's without the suffix."""
+    return Path(method).stem if _is_path(method) else method
+
+
+def method_tree(method: str, overrides: Iterable[str] = ()) -> Node:
+    """What :func:`load_method` validates: inherited, merged and overridden, each value with its origin.
+
+    Raises:
+        InputError: No such method, or a file of it is not YAML.
+    """
+    tree = _resolve(_find(method, Path.cwd()), ())
+    for assignment in overrides:
+        tree = override(tree, assignment)
+    return tree
 
 
 def _is_path(method: str) -> bool:

@@ -159,6 +159,8 @@ class Loss(ABC):
 
     #: Whether frames without depth make this term meaningless.
     needs_depth: ClassVar[bool] = False
+    #: Whether frames without depth at single points (:class:`SparseDepth`) make this term meaningless.
+    needs_sparse_depth: ClassVar[bool] = False
 
     @property
     def wants(self) -> frozenset[str]:

@@ -3,7 +3,7 @@
 Everything here is float64 and counts pixel centres at INTEGERS, as OpenCV and C3VD do; :class:`Camera` adds 0.5.
 Directions are in camera axes: x right, y down, z forward.
 
-Three calibrations of one colonoscope are in use for the same 1350 x 1080 frames (docs/data.md 2).
+Three calibrations of one colonoscope are in use for the same 1350 x 1080 frames (docs/layouts/c3vd.md 2).
 ``omnidirectional`` rendered the ground truth. Within 560 pixels of the centre ``fisheye`` is within 0.2 degrees of
 it, and ``legacy-pinhole``, behind most published numbers, off by up to 3.4 degrees (2.3 of them along the radius).
 """
@@ -120,7 +120,7 @@ class Lens(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class OmnidirectionalLens(Lens):
-    """Scaramuzza's polynomial model, with which C3VD's ground truth was rendered (docs/data.md 2).
+    """Scaramuzza's polynomial model, with which C3VD's ground truth was rendered (docs/layouts/c3vd.md 2).
 
     A pixel (u, v) lies at ``A q + (cx, cy)``, and its ray is ``(q_x, q_y, a0 + a2 rho^2 + a3 rho^3 + a4 rho^4)`` with
     ``rho = |q|``.

@@ -125,7 +125,20 @@ def _plugin_files(path_list: str) -> dict[str, dict[str, dict[str, Any]]]:
     return found
 
 
-datamanagers = Registry("datamanagers", {"c3vd": "coliags_plugin.datamanagers.c3vd:C3VDDataManager"})
+datamanagers = Registry(
+    "datamanagers",
+    {
+        "auto": "coliags_plugin.datamanagers.auto:AutoDataManager",
+        "c3vd": "coliags_plugin.datamanagers.c3vd:C3VDDataManager",
+        "c3vd-endogslam": "coliags_plugin.datamanagers.c3vd_endogslam:C3VDEndoGSLAMDataManager",
+        "c3vd-v2": "coliags_plugin.datamanagers.c3vd_v2:C3VDv2DataManager",
+        "colmap": "coliags_plugin.datamanagers.colmap:ColmapDataManager",
+        "nerfstudio": "coliags_plugin.datamanagers.nerfstudio:NerfstudioDataManager",
+        "reim-nerf": "coliags_plugin.datamanagers.reim_nerf:ReimNerfDataManager",
+        "rgbd": "coliags_plugin.datamanagers.rgbd:RGBDDataManager",
+        "rotatecolon": "coliags_plugin.datamanagers.rotatecolon:RotateColonDataManager",
+    },
+)
 fields = Registry("fields", {"anchors": "coliags_plugin.fields.anchors:AnchorField"})
 geometry_heads = Registry(
     "geometry_heads",
@@ -163,6 +176,7 @@ losses = Registry(
         "l1": "coliags_plugin.losses.photometric:L1Loss",
         "d-ssim": "coliags_plugin.losses.photometric:DSSIMLoss",
         "depth-l1": "coliags_plugin.losses.depth:DepthL1Loss",
+        "sparse-depth": "coliags_plugin.losses.sparse_depth:SparseDepthLoss",
         "scale-volume": "coliags_plugin.losses.scale_volume:ScaleVolumeLoss",
     },
 )

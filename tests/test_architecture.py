@@ -12,6 +12,8 @@ PACKAGE = Path(__file__).parents[1] / "coliags_plugin"
 COMPONENT_ROOMS = {"datamanagers", "fields", "renderers", "strategies", "losses", "metrics"}
 UPPER_ROOMS = {"cli", "engine", "outputs"}
 ROOMS = COMPONENT_ROOMS | UPPER_ROOMS
+#: Folders of plain modules: like single ones, they know no room.
+PLAIN = {"poses"}
 #: Loaded when a command or component runs, never when a module is imported.
 LAZY = {"open3d", "pycolmap", "numba", "gsplat", "viser", "nerfstudio"}
 
@@ -80,4 +82,4 @@ def test_habits(path):
 
 
 def test_rooms_are_where_they_should_be():
-    assert {path.name for path in PACKAGE.iterdir() if path.is_dir() and path.name != "__pycache__"} == ROOMS
+    assert {path.name for path in PACKAGE.iterdir() if path.is_dir() and path.name != "__pycache__"} == ROOMS | PLAIN

@@ -19,17 +19,18 @@ from coliags_plugin.cli.config import Config
 from coliags_plugin.cli.phantom import Phantom
 from coliags_plugin.cli.train import Train
 from coliags_plugin.config import MethodConfig, OptimizerSettings, ScheduleSettings, load_method
-from coliags_plugin.datamanagers.c3vd import C3VDSettings
 from coliags_plugin.datamanagers.phantom.settings import PRESETS, PhantomSettings
+from coliags_plugin.datamanagers.scene_settings import SceneSettings
 from coliags_plugin.datamanagers.splits import held_out
 from coliags_plugin.engine.randomness import PURPOSES
 from coliags_plugin.gaussians import OUTPUTS
-from coliags_plugin.registry import REGISTRIES
+from coliags_plugin.registry import REGISTRIES, datamanagers
+from coliags_plugin.settings import Settings
 from tests.scenes import SMALL, write_wall
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 SOURCES = sorted(
     path
     for folder in ("coliags_plugin", "tests", "method_configs", "benchmarks", "docs")
@@ -77,7 +78,7 @@ def cited(text: str) -> list[tuple[str, list[str]]]:
     """Pages named in a text, each with the section numbers that follow it, over the ends of commented lines too."""
     text = re.sub(r"\s*\n\s*(?:#:?|\|)?\s*", " ", text)
     number = r"\d+(?:\.\d+)*(?!\w)"
-    pattern = rf"(?<![\w-])((?:docs/)?\w+\.md)(?:`*,? +({number}(?:(?:, | and ){number})*))?"
+    pattern = rf"(?<![\w/-])((?:docs/)?(?:layouts/)?[\w-]+\.md)(?:`*,? +({number}(?:(?:, | and ){number})*))?"
     return [(page, re.findall(number, numbers or "")) for page, numbers in re.findall(pattern, text)]
 
 
@@ -102,11 +103,11 @@ def test_pages_cite_one_another_rightly(path):
 
 def test_sections_cited_by_name_are_there():
     for path in SOURCES:
-        for page, title in re.findall(r"docs/(\w+\.md)`*, section \"([^\"]+)\"", path.read_text()):
+        for page, title in re.findall(r"docs/([\w/-]+\.md)`*, section \"([^\"]+)\"", path.read_text()):
             assert title in headings(DOCS / page), f"{name_of(path)}: {page} has no section {title}"
 
 
-@pytest.mark.parametrize("page", sorted(DOCS.glob("*.md")), ids=name_of)
+@pytest.mark.parametrize("page", sorted(DOCS.rglob("*.md")), ids=name_of)
 def test_sections_are_numbered_once_and_in_order(page):
     numbers = [
         tuple(map(int, found.group().split(".")))
@@ -116,7 +117,7 @@ def test_sections_are_numbered_once_and_in_order(page):
     assert numbers == sorted(set(numbers))
 
 
-@pytest.mark.parametrize("page", [page for page in sorted(DOCS.glob("*.md")) if sections(page)], ids=name_of)
+@pytest.mark.parametrize("page", [page for page in sorted(DOCS.rglob("*.md")) if sections(page)], ids=name_of)
 def test_references_within_a_page_lead_to_a_section(page):
     referred = re.findall(r"(?<!\w)\((\d(?:\.\d)?)\)", page.read_text())
     assert set(referred) <= sections(page)
@@ -168,11 +169,13 @@ def parsed(argv: list[str], monkeypatch: pytest.MonkeyPatch) -> Any:
 def test_commands_parse(page, command, monkeypatch, capsys):
     words = shlex.split(command, comments=True)
     argv = words[words.index("coliags") + 1 :]
-    if len(argv) == 1 and argv[0] in ("train", "eval", "render", "report", "phantom", "config"):
+    if len(argv) == 1 and argv[0] in ("train", "eval", "render", "report", "phantom", "config", "poses"):
         argv.append("--help")  # the subcommand's name alone, in running text
     found = parsed(argv, monkeypatch)
     if isinstance(found, (Train, Config)) and not found.method.endswith(".yaml"):
-        overrides = list(found.set)
+        # A format's page speaks of scenes in that format.
+        format_of_page = [f"datamanager.name={Path(page).stem}"] if "layouts" in page else []
+        overrides = [*format_of_page, *found.set]
         assert load_method(found.method, overrides).config
     if isinstance(found, Phantom):
         made = []
@@ -243,25 +246,33 @@ def as_written(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-@pytest.mark.parametrize(
-    ("settings", "page", "header"),
-    [
-        (C3VDSettings, "data.md", "| option | default | values | what |"),
-        (PhantomSettings, "phantom.md", "| setting | default | range | what |"),
-    ],
-)
+OPTIONS = "| option | default | values | what |"
+FORMATS = [name for name in datamanagers if datamanagers.source(name) == "built in" and name != "auto"]
+OPTION_TABLES = [
+    (SceneSettings, "data.md", OPTIONS),
+    (PhantomSettings, "phantom.md", "| setting | default | range | what |"),
+    *((datamanagers.get(name).Settings, f"layouts/{name}.md", OPTIONS) for name in FORMATS),
+]
+
+
+def own_fields(settings: type[Settings]) -> dict[str, Any]:
+    """The fields that a page lists: for formats, those not shared with the others, or of another default."""
+    is_format = issubclass(settings, SceneSettings) and settings is not SceneSettings
+    shared = SceneSettings.model_fields if is_format else {}
+    return {
+        name: field
+        for name, field in settings.model_fields.items()
+        if name not in shared or field.default != shared[name].default
+    }
+
+
+@pytest.mark.parametrize(("settings", "page", "header"), OPTION_TABLES, ids=str)
 def test_tables_of_options_are_complete_and_their_defaults_right(settings, page, header):
     told = [(row[0], row[1]) for row in table_rows(page, header)]
-    assert told == [(name, as_written(field.default)) for name, field in settings.model_fields.items()]
+    assert sorted(told) == sorted((name, as_written(field.default)) for name, field in own_fields(settings).items())
 
 
-@pytest.mark.parametrize(
-    ("settings", "page", "header"),
-    [
-        (C3VDSettings, "data.md", "| option | default | values | what |"),
-        (PhantomSettings, "phantom.md", "| setting | default | range | what |"),
-    ],
-)
+@pytest.mark.parametrize(("settings", "page", "header"), OPTION_TABLES, ids=str)
 def test_tables_of_options_tell_their_ranges(settings, page, header):
     limits = {"ge", "le", "gt", "lt"}
     for name, _, values, *_ in table_rows(page, header):
@@ -325,7 +336,7 @@ def test_outputs_purposes_and_exit_statuses_are_all_told():
 
 
 def test_test_frames_of_the_sequences_are_counted_rightly():
-    rows = table_rows("data.md", "| sequence | frames | test | sequence | frames | test |")
+    rows = table_rows("layouts/c3vd.md", "| sequence | frames | test | sequence | frames | test |")
     counts = [tuple(map(int, row[at + 1 : at + 3])) for row in rows for at in (0, 3)]
     assert len(counts) == 22
     assert sum(frames for frames, _ in counts) == 10_015

@@ -88,7 +88,7 @@ def test_omnidirectional_follows_its_written_definition():
 
 
 def test_agreement_of_the_three_lenses_is_the_one_on_record():
-    # docs/data.md 2: undistorted radius, source radius, angle by legacy pinhole, omnidirectional and fisheye
+    # docs/layouts/c3vd.md 2: undistorted radius, source radius, angle by legacy pinhole, omnidirectional and fisheye
     table = [
         (200, 194.8, 14.00, 14.73, 14.73),
         (400, 360.6, 26.50, 28.20, 28.21),
@@ -122,7 +122,7 @@ def test_the_two_readings_of_the_affine_part_differ_by_a_third_of_a_degree():
 
 @pytest.mark.parametrize(
     ("width", "height", "scaled"),
-    # docs/data.md 5: pure scaling, K of the legacy pinhole
+    # docs/data.md 2: pure scaling, K of the legacy pinhole
     [
         (1350, 1080, (802.319, 801.885, 668.286, 547.733)),
         (675, 540, (401.1595, 400.9425, 334.1430, 273.8665)),

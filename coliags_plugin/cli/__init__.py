@@ -10,10 +10,12 @@ from typing import Annotated
 import tyro
 
 from coliags_plugin.cli.config import Config
+from coliags_plugin.cli.data import Data
 from coliags_plugin.cli.doctor import Doctor
 from coliags_plugin.cli.evaluate import Evaluate
 from coliags_plugin.cli.list import List
 from coliags_plugin.cli.phantom import Phantom
+from coliags_plugin.cli.poses import Poses
 from coliags_plugin.cli.render import Render
 from coliags_plugin.cli.report import Report
 from coliags_plugin.cli.run import run_command
@@ -25,8 +27,10 @@ Command = (
     | Annotated[Evaluate, tyro.conf.subcommand("eval")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Report, tyro.conf.subcommand("report")]
+    | Annotated[Poses, tyro.conf.subcommand("poses")]
     | Annotated[List, tyro.conf.subcommand("list")]
     | Annotated[Config, tyro.conf.subcommand("config")]
+    | Annotated[Data, tyro.conf.subcommand("data")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
 )
 
@@ -39,11 +43,15 @@ def main(argv: Sequence[str] | None = None) -> None:
     # decoding took up to 2000 ms instead of 40. A short spin keeps the speed of a quiet machine and loses little on a
     # busy one. It is read when torch is first imported.
     os.environ.setdefault("GOMP_SPINCOUNT", "10000")
-    command = tyro.cli(
-        Command,
-        prog="coliags",
-        description=DESCRIPTION,
-        args=argv,
-        config=(tyro.conf.FlagCreatePairsOff,),
-    )
+    try:
+        command = tyro.cli(
+            Command,
+            prog="coliags",
+            description=DESCRIPTION,
+            args=argv,
+            config=(tyro.conf.FlagCreatePairsOff,),
+        )
+    except BrokenPipeError:  # the reader of the help has gone, as `head` does
+        sys.stderr.close()
+        sys.exit(1)
     sys.exit(run_command(command))

@@ -14,6 +14,8 @@ Assignments = Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="KEY=
 
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH")]
 OptionalText = Annotated[str | None, tyro.conf.arg(metavar="TEXT")]
+#: Name of a data manager; None: found out from the files.
+DataFormat = Annotated[str | None, tyro.conf.arg(name="format", metavar="NAME")]
 OptionalInt = Annotated[int | None, tyro.conf.arg(metavar="INT")]
 
 

@@ -9,24 +9,25 @@ from typing import Any, Literal
 import tyro
 
 from coliags_plugin.cli.arguments import Assignments, OptionalText, parse_size, parse_vector
+from coliags_plugin.datamanagers.phantom.layouts import LayoutName
 
 
 @dataclass(frozen=True)
 class Phantom:
-    """Write a synthetic, physically lit colon with exact truth, in C3VD's own layouts."""
+    """Write a synthetic, physically lit colon with exact truth, in the layout of a data set."""
 
     output: tyro.conf.Positional[Path]
     """Folder to make."""
     seed: int = 0
     """The whole phantom follows from it."""
-    layout: Literal["c3vd", "c3vd-raw"] = "c3vd"
-    """Undistorted pinhole frames, or the release's own files through its omnidirectional lens."""
+    layout: LayoutName = "c3vd"
+    """Files and folders to write; docs/phantom.md 5 lists the layouts."""
     trajectory: Literal["pullback", "rotation"] = "pullback"
     """Withdrawal along the lumen, or mostly turning on the spot."""
     frames: int = 120
     """Frames of the sequence; every 8th is a test frame."""
     size: OptionalText = None
-    """Image size WxH, pixels. Default 338x270, or 1350x1080 for c3vd-raw."""
+    """Image size WxH, pixels; default: the layout's own, 338x270 for most."""
     light: Literal["c3vd", "strong"] = "c3vd"
     """Preset of light and motion: c3vd is the fair default, strong the stress case."""
     gain: Literal["auto", "fixed"] | None = None
@@ -36,7 +37,7 @@ class Phantom:
     polyps: int = 4
     """Sessile polyps, 3 to 10 mm wide."""
     rotation_views: int = 12
-    """Extra test views turned 15 to 30 degrees beyond the path."""
+    """Extra test views turned 15 to 30 degrees beyond the path; none in layouts without a place for them."""
     set: Assignments = ()
     """Any other phantom setting, for instance roughness=0.4 (docs/phantom.md 6 lists them)."""
     overwrite: bool = False

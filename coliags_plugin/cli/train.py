@@ -8,7 +8,7 @@ from typing import Literal
 
 import tyro
 
-from coliags_plugin.cli.arguments import Assignments, OptionalInt, OptionalPath, OptionalText
+from coliags_plugin.cli.arguments import Assignments, DataFormat, OptionalInt, OptionalPath, OptionalText
 
 
 @dataclass(frozen=True)
@@ -19,6 +19,8 @@ class Train:
     """Name of a method (`coliags list methods`) or path of a YAML file."""
     data: Path
     """The scene's folder."""
+    format: DataFormat = None
+    """How the scene is laid out (`coliags list datamanagers`); default: what its files show."""
     output: OptionalPath = None
     """Run folder; default runs/SCENE/METHOD/STAMP."""
     steps: OptionalInt = None
@@ -40,8 +42,9 @@ class Train:
         """Train, and say where the run is."""
         import logging
 
-        from coliags_plugin.config import load_method
+        from coliags_plugin.config import method_name
         from coliags_plugin.engine.backends import choose_device
+        from coliags_plugin.engine.data_formats import load_method_for
         from coliags_plugin.engine.run_folder import RunFolder
         from coliags_plugin.engine.trained import load_scene
         from coliags_plugin.engine.trainer import Trainer
@@ -54,9 +57,8 @@ class Train:
             overrides.append(f"schedule.steps={self.steps}")
         if self.renderer is not None:
             overrides.append(f"renderer.name={self.renderer}")
-        method = load_method(self.method, overrides)
         device = choose_device(self.device)
-        short = method.name.rsplit("/", maxsplit=1)[-1]
+        short = method_name(self.method).rsplit("/", maxsplit=1)[-1]
         scene_name = self.data.resolve().name
         if self.output is not None:
             run = RunFolder(self.output)
@@ -66,6 +68,7 @@ class Train:
             run = RunFolder.existing(run.path)
         else:
             run.check_free(self.overwrite)
+        method = load_method_for(self.data, self.method, overrides, self.format)
         scene = load_scene(method.config, self.data)
         trainer = Trainer(method, scene, str(self.data.resolve()), run, self.seed, device)
         logging.getLogger(__name__).info("renderer %s: %s", trainer.chosen.name, trainer.chosen.reason)

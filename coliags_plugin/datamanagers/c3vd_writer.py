@@ -25,7 +25,7 @@ def write_c3vd_scene(
     points: PointCloud | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write a scene that the ``c3vd`` data manager reads (docs/data.md 3).
+    """Write a scene that the ``c3vd`` data manager reads (docs/layouts/c3vd.md 3).
 
     Args:
         folder: The folder to make.

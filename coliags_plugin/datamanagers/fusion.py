@@ -8,14 +8,22 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from coliags_plugin.datamanagers.ply_vertices import read_vertices
+from coliags_plugin.datamanagers.side_by_side import side_by_side
 from coliags_plugin.errors import InputError
+from coliags_plugin.progress import Progress
 from coliags_plugin.scenes import Frame, PointCloud
 
 log = logging.getLogger(__name__)
 
+_COLORS = ("red", "green", "blue")
 
-def fuse_depth(frames: Sequence[Frame], count: int, generator: np.random.Generator) -> PointCloud:
+
+def fuse_depth(
+    frames: Sequence[Frame], count: int, generator: np.random.Generator, progress: Progress | None = None
+) -> PointCloud:
     """Points on the surface that the frames' depth shows.
 
     Every valid pixel of every frame is equally likely, and none is drawn twice; all are taken where there are no more
@@ -25,6 +33,7 @@ def fuse_depth(frames: Sequence[Frame], count: int, generator: np.random.Generat
         frames: With z-depth, mm, NaN where unknown.
         count: Points to draw.
         generator: Draws them.
+        progress: Told how much is done.
 
     Returns:
         World positions, float32, and the pixels' colours, in frame order.
@@ -32,8 +41,8 @@ def fuse_depth(frames: Sequence[Frame], count: int, generator: np.random.Generat
     Raises:
         InputError: No frame has a valid depth.
     """
-    # One frame after the other, twice: the pixels of a long video do not fit into memory side by side.
-    available = np.array([np.count_nonzero(_usable(frame)) for frame in frames])
+    # Each frame is looked at twice, never all at once: the pixels of a long video may not fit into memory side by side.
+    available = np.array(side_by_side(_count_usable, frames, "look for depth", progress))
     if available.sum() == 0:
         raise InputError(
             f"none of the {len(frames)} training frames has a valid depth",
@@ -41,32 +50,43 @@ def fuse_depth(frames: Sequence[Frame], count: int, generator: np.random.Generat
             "Check the depth files, or set initial_points: file",
         )
     taken = available if available.sum() <= count else generator.multivariate_hypergeometric(available, count)
-    positions, colors = [], []
-    for frame, number in zip(frames, taken, strict=True):
-        pixels = np.flatnonzero(_usable(frame))
-        # Sorting keeps the reading order; which pixels are taken is already random.
-        chosen = np.sort(generator.choice(pixels, number, replace=False)) if number < len(pixels) else pixels
-        positions.append(_back_projected(frame, chosen))
-        colors.append(frame.image.reshape(-1, 3)[torch.from_numpy(chosen)])
-    return PointCloud(torch.from_numpy(np.concatenate(positions).astype(np.float32)), torch.cat(colors))
+    # Sorting keeps the reading order; which pixels are taken is already random.
+    chosen = [
+        np.sort(generator.choice(there, number, replace=False)) if number < there else np.arange(there)
+        for there, number in zip(available, taken, strict=True)
+    ]
+    wanted = [pair for pair in zip(frames, chosen, strict=True) if len(pair[1])]
+    found = side_by_side(_fused, wanted, "fuse depth", progress)
+    positions, colors = zip(*found, strict=True)
+    return PointCloud(torch.from_numpy(np.concatenate(positions)), torch.from_numpy(np.concatenate(colors)))
 
 
-def _usable(frame: Frame) -> np.ndarray:
-    depth = frame.depth
+def _count_usable(frame: Frame) -> int:
+    return len(_usable(frame.depth, frame.mask))
+
+
+def _usable(depth: Tensor | None, mask: Tensor | None) -> np.ndarray:
+    """Flat indices of the pixels that count and whose depth is known. [N]"""
     if depth is None:
-        return np.zeros(0, bool)
-    return np.asarray((torch.isfinite(depth) & frame.valid).numpy())
+        return np.zeros(0, np.int64)
+    known = np.isfinite(depth.numpy())
+    return np.flatnonzero(known if mask is None else known & mask.numpy())
 
 
-def _back_projected(frame: Frame, pixels: np.ndarray) -> np.ndarray:
-    """World positions of pixels by their flat index, in double precision. [N, 3]"""
-    camera, depth = frame.camera, frame.depth
+def _fused(wanted: tuple[Frame, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """World positions, in double precision until they are there, and colours of chosen usable pixels. [N, 3], [N, 3]"""
+    frame, chosen = wanted[0].to("cpu"), wanted[1]
+    if frame.depth is None:
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    pixels = _usable(frame.depth, frame.mask)[chosen]
+    camera = frame.camera
     row, column = np.divmod(pixels, camera.width)
-    z = depth.numpy().ravel()[pixels].astype(np.float64) if depth is not None else np.zeros(0)
+    z = frame.depth.numpy().ravel()[pixels].astype(np.float64)
     x = (column + 0.5 - camera.cx) / camera.fx * z
     y = (row + 0.5 - camera.cy) / camera.fy * z
     camera_to_world = camera.camera_to_world.numpy().astype(np.float64)
-    return np.asarray(np.stack([x, y, z], axis=1) @ camera_to_world[:3, :3].T + camera_to_world[:3, 3])
+    world = np.stack([x, y, z], axis=1) @ camera_to_world[:3, :3].T + camera_to_world[:3, 3]
+    return world.astype(np.float32), frame.image.numpy().reshape(-1, 3)[pixels]
 
 
 def read_points(path: Path, count: int, generator: np.random.Generator) -> PointCloud:
@@ -133,10 +153,13 @@ def _read_npz(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def _read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    import open3d
-
-    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-        cloud = open3d.io.read_point_cloud(path)
-    positions = np.asarray(cloud.points)
-    colors = np.rint(np.asarray(cloud.colors) * 255.0).astype(np.uint8) if cloud.has_colors() else None
+    vertices = read_vertices(path)
+    positions = np.stack([vertices[axis] for axis in "xyz"], axis=1)
+    if any(name not in vertices for name in _COLORS):
+        return positions, None
+    colors = np.stack([vertices[name] for name in _COLORS], axis=1)
+    if colors.dtype != np.uint8:
+        # Floating-point colours are shares; whole ones count to 255 in every kind.
+        share = 255.0 if np.issubdtype(colors.dtype, np.floating) else 1.0
+        colors = np.rint(np.clip(np.nan_to_num(colors) * share, 0.0, 255.0)).astype(np.uint8)
     return positions, colors

@@ -45,6 +45,25 @@ def read_gray(path: Path, bits: int, expected: str) -> Shaped[np.ndarray, "H W"]
     return picture
 
 
+def bits_of(path: Path) -> int:
+    """Bits of a pixel's channel, as stored.
+
+    Raises:
+        InputError: The picture cannot be read whole.
+    """
+    return 8 * _read(path).itemsize
+
+
+def size_of(path: Path) -> tuple[int, int]:
+    """Width and height of a picture, pixels.
+
+    Raises:
+        InputError: It cannot be read whole.
+    """
+    height, width = _read(path).shape[:2]
+    return width, height
+
+
 def read_mask(path: Path) -> Shaped[np.ndarray, "H W"]:
     """An 8-bit one-channel picture as a mask: True where it is not black. [H, W]
 

@@ -25,6 +25,10 @@ from coliags_plugin.scenes import Frame, PointCloud, Scene
 log = logging.getLogger(__name__)
 
 
+class NoPointsError(InputError):
+    """There is nothing to make initial points from."""
+
+
 class RecordedDataManager(DataManager):
     """A data manager that finds a :class:`Recording`; the rest is the same for all of them."""
 
@@ -66,7 +70,7 @@ class RecordedDataManager(DataManager):
         if settings.keep_pixels:
             others = (frame for name in recording.test_sets for frame in test_sets[name])
             read_side_by_side([*video, *others], progress)
-        points, described = self._initial_points(recording, path, train)
+        points, described = self._initial_points(recording, path, train, progress)
         split: dict[str, Any] = {
             "name": settings.split,
             "frame_step": settings.frame_step,
@@ -122,7 +126,7 @@ class RecordedDataManager(DataManager):
         return train, test
 
     def _initial_points(
-        self, recording: Recording, path: Path, train: Sequence[Frame]
+        self, recording: Recording, path: Path, train: Sequence[Frame], progress: Progress | None
     ) -> tuple[PointCloud, dict[str, Any]]:
         settings = self.settings
         generator = np.random.default_rng(settings.seed)
@@ -130,16 +134,19 @@ class RecordedDataManager(DataManager):
             file = path / settings.points_file
             points = read_points(file, settings.points_count, generator)
             return points, self._described_points(file, points)
+        if settings.initial_points == "none":
+            return PointCloud(torch.zeros(0, 3)), {"source": "none", "count": 0}
         has_depth = any(shot.depth is not None for shot in recording.shots)
         own = recording.own_points
         if has_depth and (settings.initial_points == "depth" or own is None):
-            points = fuse_depth(train, settings.points_count, generator)
+            points = fuse_depth(train, settings.points_count, generator, progress)
             return points, self._described_points("depth of the training frames", points)
         if own is None or recording.points_source is None:
-            raise InputError(
-                f"{path} has neither depth files nor {POINTS_FILE}",
+            missing = POINTS_FILE if recording.points_source is None else recording.points_source.name
+            raise NoPointsError(
+                f"{path} has neither depth files nor {missing}",
                 "depth to make initial points from, or the points themselves",
-                f"Put {POINTS_FILE} (world of the poses) there, or set initial_points: file and points_file",
+                f"Put {missing} (world of the poses) there, or set initial_points: file and points_file",
             )
         points = thinned(own(), settings.points_count, generator, recording.points_source)
         return points, self._described_points(recording.points_source, points)
@@ -155,7 +162,8 @@ def _invalid_depth_share(frames: Sequence[Frame]) -> float | None:
     """Share of the unmasked pixels whose depth is unknown; None where there is no depth."""
     shares = []
     for frame in frames:
-        depth = frame.depth
-        if depth is not None:
-            shares.append(torch.isnan(depth[frame.valid]).double().mean())
-    return float(torch.stack(shares).mean()) if shares else None
+        depth, mask = frame.depth, frame.mask
+        if depth is not None and (mask is None or mask.any()):
+            unknown = np.isnan(depth.numpy())
+            shares.append(unknown.mean() if mask is None else unknown[mask.numpy()].mean())
+    return float(np.mean(shares)) if shares else None

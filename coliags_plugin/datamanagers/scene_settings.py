@@ -12,7 +12,7 @@ from coliags_plugin.settings import Settings
 
 POINTS_FILE = "points3D.ply"
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
-InitialPoints = Literal["depth", "data", "file"]
+InitialPoints = Literal["depth", "data", "file", "none"]
 
 
 class SceneSettings(Settings):
@@ -45,7 +45,8 @@ class SceneSettings(Settings):
     initial_points: InitialPoints = Field(
         "depth",
         description="Initial points: 'depth': fused from the training frames' depth, or the data's own where there is "
-        "no depth; 'data': the data's own, or from depth where there are none; 'file': points_file.",
+        "no depth; 'data': the data's own, or from depth where there are none; 'file': points_file; 'none': "
+        "none, for looking at a scene.",
     )
     points_file: str = Field(
         POINTS_FILE, description="PLY or NPZ for initial_points 'file', relative to the scene folder or absolute."

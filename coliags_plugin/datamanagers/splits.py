@@ -17,7 +17,7 @@ def held_out(split: Split, count: int, block: tuple[float, float] = (0.4, 0.6)) 
 
     Args:
         split: ``every-8th``: 0, 8, 16, ... (the paper, Gaussian Pancakes); ``endogslam``: 7, 15, 23, ... (EndoGSLAM,
-            PR-Endo; docs/data.md 6); ``block``: one stretch of the video, which no training frame interrupts, so
+            PR-Endo; docs/data.md 3); ``block``: one stretch of the video, which no training frame interrupts, so
             that test views are not merely in-betweens; ``all-train``: none. ``own`` is not a rule but what data say.
         count: Number of frames.
         block: Where the stretch begins and ends, as shares of the video.

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,32 +12,32 @@ from torch import Tensor
 
 from coliags_plugin.datamanagers.images import read_mask, read_rgb
 from coliags_plugin.datamanagers.recording import Shot
+from coliags_plugin.datamanagers.side_by_side import side_by_side
 from coliags_plugin.progress import Progress
 from coliags_plugin.scenes import Frame
-
-#: Pictures read side by side at most: more threads than this wait for the disk.
-_READERS = 8
 
 
 @dataclass(frozen=True)
 class _Pixels:
     """A working picture and what lies beside it, as small as it was stored."""
 
-    image: UInt8[Tensor, "H W 3"]
+    image: UInt8[np.ndarray, "H W 3"]
     depth: Shaped[np.ndarray, "H W"] | None
-    mask: Bool[Tensor, "H W"] | None
-    seen: Bool[Tensor, "H W"] | None
+    mask: Bool[np.ndarray, "H W"] | None
+    seen: Bool[np.ndarray, "H W"] | None
 
 
 class StoredFrame(Frame):
     """A frame on disk. What is read stays in memory in the type it was stored in: 5 bytes a pixel with 16-bit depth.
 
+    May be used from several threads. The attributes of pixels raise InputError where a file is damaged, of the wrong
+    kind or of the wrong size.
+
     Args:
         shot: The picture.
         index: Place in the video, counted from 0.
-        keep: Whether pixels stay in memory once read; otherwise they are read each time.
-
-    The attributes of pixels raise InputError where a file is damaged, of the wrong kind or of the wrong size.
+        keep: Whether pixels stay in memory once read. Otherwise every attribute reads its own file each time, so that
+            whoever wants several takes them from one :meth:`to`.
     """
 
     def __init__(self, shot: Shot, index: int, keep: bool = True) -> None:
@@ -58,41 +56,74 @@ class StoredFrame(Frame):
     @property
     def image(self) -> UInt8[Tensor, "H W 3"]:
         """See :class:`Frame`."""
-        return self._read().image
+        return torch.from_numpy(self._read().image if self._keep else _image(self._shot))
 
     @property
     def depth(self) -> Float[Tensor, "H W"] | None:
         """See :class:`Frame`; decoded each time."""
-        stored, form = self._read().depth, self._shot.depth_format
-        return None if stored is None or form is None else torch.from_numpy(form.z_depth(stored))
+        return self._z_depth(self._stored_depth())
 
     @property
     def depth_at_least(self) -> Float[Tensor, "H W"] | None:
         """See :class:`Frame`; decoded each time."""
-        stored, form = self._read().depth, self._shot.depth_format
-        bound = None if stored is None or form is None else form.clipped_at(stored)
-        return None if bound is None else torch.from_numpy(bound)
+        return self._bound(self._stored_depth())
 
     @property
     def mask(self) -> Bool[Tensor, "H W"] | None:
         """See :class:`Frame`."""
-        return self._read().mask
+        return _tensor(self._read().mask if self._keep else _mask(self._shot))
+
+    @property
+    def valid(self) -> Bool[Tensor, "H W"]:
+        """See :class:`Frame`."""
+        mask = self.mask
+        return torch.ones(self.camera.height, self.camera.width, dtype=torch.bool) if mask is None else mask
 
     @property
     def seen(self) -> Bool[Tensor, "H W"] | None:
         """See :class:`Frame`."""
-        return self._read().seen
+        return _tensor(self._read().seen if self._keep else _seen(self._shot))
+
+    def to(self, device: torch.device | str) -> Frame:
+        """The frame on a device, read once and decoded."""
+        pixels = self._read()
+        tensors = {
+            "depth": self._z_depth(pixels.depth),
+            "mask": _tensor(pixels.mask),
+            "seen": _tensor(pixels.seen),
+            "depth_at_least": self._bound(pixels.depth),
+        }
+        return Frame(
+            self.name,
+            self.index,
+            torch.from_numpy(pixels.image).to(device),
+            self.camera.to(device),
+            sparse_depth=None if self.sparse_depth is None else self.sparse_depth.to(device),
+            **{name: None if tensor is None else tensor.to(device) for name, tensor in tensors.items()},
+        )
 
     def __repr__(self) -> str:
         return f"StoredFrame({self.name!r}, {str(self._shot.image)!r})"
 
     def _read(self) -> _Pixels:
+        # Two threads may both read, and the second to finish replaces what the first has kept: it is the same.
         if self._pixels is not None:
             return self._pixels
         pixels = _read_pixels(self._shot)
         if self._keep:
             object.__setattr__(self, "_pixels", pixels)
         return pixels
+
+    def _stored_depth(self) -> Shaped[np.ndarray, "H W"] | None:
+        return self._read().depth if self._keep else _depth(self._shot, _mask(self._shot))
+
+    def _z_depth(self, stored: Shaped[np.ndarray, "H W"] | None) -> Float[Tensor, "H W"] | None:
+        form = self._shot.depth_format
+        return None if stored is None or form is None else torch.from_numpy(form.z_depth(stored))
+
+    def _bound(self, stored: Shaped[np.ndarray, "H W"] | None) -> Float[Tensor, "H W"] | None:
+        form = self._shot.depth_format
+        return None if stored is None or form is None else _tensor(form.clipped_at(stored))
 
     _shot: Shot
     _keep: bool
@@ -105,34 +136,36 @@ def read_side_by_side(frames: Sequence[Frame], progress: Progress | None = None)
     Raises:
         InputError: For the first bad frame.
     """
-    with ThreadPoolExecutor(min(_READERS, os.cpu_count() or 1)) as pool:
-        pending = [pool.submit(lambda frame: bool(frame.image.numel()), frame) for frame in frames]
-        try:
-            for done, future in enumerate(pending, start=1):
-                future.result()
-                if progress is not None:
-                    progress("read pictures", done, len(pending))
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+    side_by_side(lambda frame: frame.image.numel(), frames, "read pictures", progress)
 
 
 def _read_pixels(shot: Shot) -> _Pixels:
-    view = shot.view
-    image = view.image(view.checked(shot.image, read_rgb(shot.image)))
-    valid = view.valid
-    if shot.mask is not None:
-        own = view.nearest(view.checked(shot.mask, read_mask(shot.mask)))
-        valid = own if valid is None else own & valid
-    depth = None
-    if shot.depth is not None and shot.depth_format is not None:
-        depth = view.nearest(view.checked(shot.depth, shot.depth_format.read(shot.depth)))
-        if valid is not None:
-            depth = np.where(valid, depth, np.zeros((), depth.dtype))
-    seen = None if shot.seen is None else view.nearest(view.checked(shot.seen, read_mask(shot.seen)))
-    return _Pixels(
-        torch.from_numpy(image),
-        depth,
-        None if valid is None else torch.from_numpy(valid),
-        None if seen is None else torch.from_numpy(seen),
-    )
+    mask = _mask(shot)
+    return _Pixels(_image(shot), _depth(shot, mask), mask, _seen(shot))
+
+
+def _image(shot: Shot) -> UInt8[np.ndarray, "H W 3"]:
+    return shot.view.image(shot.view.checked(shot.image, read_rgb(shot.image)))
+
+
+def _mask(shot: Shot) -> Bool[np.ndarray, "H W"] | None:
+    valid = shot.view.valid
+    if shot.mask is None:
+        return valid
+    own = shot.view.nearest(shot.view.checked(shot.mask, read_mask(shot.mask)))
+    return own if valid is None else own & valid
+
+
+def _depth(shot: Shot, mask: Bool[np.ndarray, "H W"] | None) -> Shaped[np.ndarray, "H W"] | None:
+    if shot.depth is None or shot.depth_format is None:
+        return None
+    depth = shot.view.nearest(shot.view.checked(shot.depth, shot.depth_format.read(shot.depth)))
+    return depth if mask is None else np.where(mask, depth, np.zeros((), depth.dtype))
+
+
+def _seen(shot: Shot) -> Bool[np.ndarray, "H W"] | None:
+    return None if shot.seen is None else shot.view.nearest(shot.view.checked(shot.seen, read_mask(shot.seen)))
+
+
+def _tensor(array: np.ndarray | None) -> Tensor | None:
+    return None if array is None else torch.from_numpy(array)

@@ -71,15 +71,24 @@ class ProgressReport:
 
 
 @contextmanager
-def progress_callback() -> Iterator[Callable[[str, int, int], None]]:
-    """A function ``(title, done, total)`` that shows one report per title, one after the other."""
+def progress_callback(after: float = 0.0) -> Iterator[Callable[[str, int, int], None]]:
+    """A function ``(title, done, total)`` that shows one report per title, one after the other.
+
+    Args:
+        after: Say nothing about what takes less than so many seconds.
+    """
     with ExitStack() as stack:
         current: list[ProgressReport] = []
+        began: dict[str, float] = {}
 
         def report(title: str, done: int, total: int) -> None:
-            if not current or current[-1].title != title:
+            shown = bool(current) and current[-1].title == title
+            now = time.monotonic()
+            if not shown and now - began.setdefault(title, now) < after:
+                return
+            if not shown:
                 stack.close()
-                current.append(stack.enter_context(ProgressReport(title, total)))
+                current.append(stack.enter_context(ProgressReport(title, total, start=done if after else 0)))
             current[-1].update(done)
 
         yield report

@@ -6,28 +6,22 @@ The same runs give the same bytes: nothing of the hour or the machine that write
 from __future__ import annotations
 
 import math
-import re
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import numpy as np
 
-from coliags_plugin import __version__
+from coliags_plugin.engine.page import leaves, plain, record, write_page
 from coliags_plugin.engine.report_data import SEEN_SUFFIX, EvaluatedRun, read_runs
 from coliags_plugin.engine.report_table import Column, columns, metric_title, unit_text
 from coliags_plugin.engine.report_views import SCALE_PERCENTILE, Picture, RunView, View, Views, read_views
-from coliags_plugin.errors import InputError
-from coliags_plugin.files import atomic_write
 from coliags_plugin.outputs.charts import Series, color_bar_svg, line_chart, style_classes
 from coliags_plugin.outputs.figures import hatch
 from coliags_plugin.outputs.pictures import encode_png
-from coliags_plugin.outputs.scales import tick_label
 
-_TEMPLATE = Path(__file__).with_name("report_template.html")
 _SET_TITLES = {"test": "test: held out along the path", "rotation": "rotation: beyond the path"}
 #: Figures under a picture, where the evaluator has them.
 _CAPTION_METRICS = ("psnr", "psnr_seen", "ssim", "ssim_seen", "depth_mae", "depth_mae_seen", "depth_mse")
@@ -38,9 +32,6 @@ _MOST_POINTS = 120
 _MOST_BANDS = 3
 #: A loss that falls by less is easier to read on a linear axis.
 _LOG_FROM = 8.0
-_LONGEST_LIST = 6
-_LARGEST_MAPPING = 12
-_ABSOLUTE_PATH = re.compile(r"^(/|~|[A-Za-z]:[\\/]|\\\\|file:)")
 
 
 def write_report(
@@ -65,19 +56,11 @@ def write_report(
         InputError: A run is missing, not evaluated, damaged, or not comparable with the others; or ``output`` cannot
             be written.
     """
-    if output.is_dir():
-        raise InputError(f"{output} is a folder", "a file", f"Write to {output / 'report.html'}")
     read = read_runs(runs, protocol)
     views = read_views(read, frames)
     heading = title if title is not None else _default_title(read)
     sections = [_results(read), _held_out(read, views), _training(read), _per_frame(read), _provenance(read)]
-    page = Template(_TEMPLATE.read_text(encoding="utf-8")).substitute(
-        title=escape(heading),
-        header=_header(read, views, heading, note),
-        sections="\n".join(filter(None, sections)),
-        footer=f"Written by coliags_plugin {escape(__version__)}.",
-    )
-    atomic_write(output, page)
+    write_page(output, heading, _header(read, views, heading, note), sections)
 
 
 def _default_title(runs: Sequence[EvaluatedRun]) -> str:
@@ -133,7 +116,7 @@ def _cautions(runs: Sequence[EvaluatedRun]) -> list[str]:
     for key, what in (("package_version", "versions of the package"), ("git", "states of the source")):
         if len({str(run.provenance[key]) for run in runs if run.provenance.get(key) is not None}) > 1:
             cautions.append(f"The runs come from different {what}.")
-    data = [dict(_leaves(scene)) for scene in _recorded_scenes(runs).values()]
+    data = [dict(leaves(scene)) for scene in _recorded_scenes(runs).values()]
     keys = dict.fromkeys(key for one in data for key in one)
     differing = [key for key in keys if any(one.get(key) != data[0].get(key) for one in data)]
     if differing:
@@ -386,7 +369,7 @@ def _cost_table(runs: Sequence[EvaluatedRun]) -> str:
         row = f'<th scope="row" class="text">{_swatch(index)}{escape(run.label)}</th>'
         row += "".join(f"<td>{escape(cell)}</td>" for cell in _costs(run))
         for key in ("device", "renderer", "seed"):
-            row += f'<td class="text">{escape(_plain(run.provenance.get(key)) or _DASH)}</td>'
+            row += f'<td class="text">{escape(plain(run.provenance.get(key)) or _DASH)}</td>'
         rows.append(f"<tr>{row}</tr>")
     return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
 
@@ -450,49 +433,17 @@ def _provenance(runs: Sequence[EvaluatedRun]) -> str:
     parts = ["<section><h2>Provenance</h2>"]
     scenes = _recorded_scenes(runs)
     first = next(iter(scenes.values()), {})
-    if all(_leaves(scene) == _leaves(first) for scene in scenes.values()):
-        parts.append(_record("Data", first))
+    if all(leaves(scene) == leaves(first) for scene in scenes.values()):
+        parts.append(record("Data", first))
     else:
-        parts += [_record(f"Data of {label}", scene) for label, scene in scenes.items()]
+        parts += [record(f"Data of {label}", scene) for label, scene in scenes.items()]
     for run in runs:
         own = {key: value for key, value in run.provenance.items() if key != "scene"}
         # The stamp names the run without saying where this machine keeps it.
         stamp = run.folder.resolve().name
         title = run.label if stamp in run.label else f"{run.label} · {stamp}"
-        parts.append(_record(title, own))
+        parts.append(record(title, own))
     return "\n".join([*parts, "</section>"])
-
-
-def _record(title: str, values: Mapping[str, Any]) -> str:
-    texts = ((key, _plain(value)) for key, value in _leaves(values))
-    rows = "".join(f"<dt>{escape(key)}</dt><dd>{escape(text)}</dd>" for key, text in texts if text)
-    body = f'<dl class="record">{rows}</dl>' if rows else '<p class="record">nothing recorded</p>'
-    return f"<details><summary>{escape(title)}</summary>{body}</details>"
-
-
-def _leaves(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    """Values under dotted keys, large mappings kept whole; paths, which say nothing elsewhere, are left out."""
-    found: list[tuple[str, Any]] = []
-    for key, value in values.items():
-        if isinstance(value, Mapping) and len(value) <= _LARGEST_MAPPING:
-            found += _leaves(value, f"{prefix}{key}.")
-        elif key != "path" and not (isinstance(value, str) and _ABSOLUTE_PATH.match(value)):
-            found.append((f"{prefix}{key}", value))
-    return found
-
-
-def _plain(value: Any) -> str:
-    """A JSON value in words; long lists by their ends."""
-    if isinstance(value, Mapping):
-        return f"{len(value)} entries"
-    if isinstance(value, (list, tuple)):
-        words = [_plain(entry) for entry in value]
-        if len(words) > _LONGEST_LIST:
-            return f"{words[0]}, {words[1]}, …, {words[-1]} ({len(words)})"
-        return ", ".join(words)
-    if isinstance(value, float):
-        return tick_label(value)
-    return {None: "", True: "yes", False: "no"}[value] if value is None or isinstance(value, bool) else str(value)
 
 
 # ---------------------------------------------------------------------------------------------------- small parts

@@ -12,9 +12,14 @@ from coliags_plugin.config import MethodConfig
 from coliags_plugin.contracts import Field, Renderer
 from coliags_plugin.engine.backends import choose_renderer
 from coliags_plugin.engine.checkpoints import latest_checkpoint, read_checkpoint
+from coliags_plugin.engine.data_formats import chosen_datamanager
+from coliags_plugin.engine.progress import progress_callback
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.errors import InputError
 from coliags_plugin.scenes import Scene
+
+#: Seconds of reading from which on it is worth saying how far it is.
+READING_IS_LONG = 2.0
 
 
 @dataclass(frozen=True)
@@ -32,12 +37,14 @@ class TrainedRun:
 
 
 def load_scene(config: MethodConfig, path: Path) -> Scene:
-    """Read the data with the method's data manager.
+    """Read the data with the method's data manager; what takes long says how far it is.
 
     Raises:
         InputError: It cannot be read.
     """
-    scene: Scene = config.datamanager.target(config.datamanager.settings).load(path)
+    component = chosen_datamanager(config.datamanager, path)
+    with progress_callback(after=READING_IS_LONG) as progress:
+        scene: Scene = component.target(component.settings).load(path, progress)
     return scene
 
 

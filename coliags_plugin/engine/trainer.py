@@ -216,15 +216,20 @@ class Trainer:
         return tuple(sorted(wants))
 
     def _check_depth(self) -> None:
-        if any(frame.depth is not None for frame in self.scene.train):
-            return
-        for key, loss in self.losses.items():
-            if loss.needs_depth:
-                raise InputError(
-                    f"loss term '{key}' needs depth, and no training frame of scene '{self.scene.name}' has any",
-                    "frames with depth, or no such term",
-                    f"Remove it with --set losses.{key}=null",
-                )
+        """Refuse terms that need a kind of depth of which no training frame has any."""
+        dense = [key for key, loss in self.losses.items() if loss.needs_depth]
+        sparse = [key for key, loss in self.losses.items() if loss.needs_sparse_depth]
+        if dense and all(frame.depth is None for frame in self.scene.train):
+            raise self._missing(dense[0], "depth")
+        if sparse and all(frame.sparse_depth is None for frame in self.scene.train):
+            raise self._missing(sparse[0], "depth at single points")
+
+    def _missing(self, key: str, what: str) -> InputError:
+        return InputError(
+            f"loss term '{key}' needs {what}, and no training frame of scene '{self.scene.name}' has any",
+            f"frames with {what}, or no such term",
+            f"Remove it with --set losses.{key}=null",
+        )
 
     def _optimizers(self) -> Optimizers:
         return Optimizers(self.field, self.method.config.optimizers, self.steps, self.scene.extent)

@@ -87,7 +87,7 @@ def test_files_that_hold_no_points(tmp_path):
     with pytest.raises(InputError, match="no file"):
         read_points(tmp_path / "none.ply", 10, rng())
     (tmp_path / "bad.ply").write_text("not a ply")
-    with pytest.raises(InputError, match="holds no points"):
+    with pytest.raises(InputError, match="no PLY header"):
         read_points(tmp_path / "bad.ply", 10, rng())
     (tmp_path / "bad.npz").write_text("not an npz")
     with pytest.raises(InputError, match="cannot read"):

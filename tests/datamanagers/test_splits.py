@@ -28,7 +28,7 @@ def test_all_train_holds_none_out():
 
 
 @pytest.mark.parametrize(
-    # docs/data.md 6: frames and test frames of the official sequences
+    # docs/layouts/c3vd.md 6: frames and test frames of the official sequences
     ("frames", "test"),
     [(276, 35), (765, 96), (370, 47), (1142, 143), (595, 75), (730, 92), (61, 8), (194, 25), (103, 13), (597, 75)],
 )

@@ -1,4 +1,9 @@
-"""The compiled kernels against the written definition, and what they refuse."""
+"""The compiled kernels against the written definition, and what they refuse.
+
+The definition draws nothing below ``alpha_min`` and stops before ``transmittance_min``. A pixel that float32 rounds to
+the other side of such a cut-off is not wrong, only on the cut-off. These pixels are found by moving both cut-offs a
+little in float64; there may be few of them, and all others, and the gradients through them, are held to the tolerance.
+"""
 
 import dataclasses
 
@@ -6,15 +11,36 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_torch_renderer import INPUTS, SCENES, SUMS, cast, random_gaussians, relative, scene
+from test_torch_renderer import INPUTS, SCENES, SUMS, cast, make, pinhole, random_gaussians, relative, scene
 
 from coliags_plugin.errors import InputError
 from coliags_plugin.gaussians import OUTPUTS
 from coliags_plugin.renderers import cpu_renderer, torch_renderer
+from coliags_plugin.renderers.numba_kernels import pipeline
+
+#: How far the cut-offs are moved, relative to themselves: more than float32 can be off by.
+CUTOFF_MARGIN = 2e-5
 
 
-def drawn(module, gaussians, camera, dtype, wants=OUTPUTS, background=(0.3, 0.1, 0.9)):
-    """Output and gradients of one renderer under random cotangents."""
+def few(pixels):
+    """What may lie on a cut-off out of so many pixels: half a percent, or two."""
+    return max(2, pixels // 200)
+
+
+def on_a_cutoff(gaussians, camera):
+    """Pixels that look different where the cut-offs are moved."""
+    gaussians, camera = cast(gaussians, torch.float64), camera.to(dtype=torch.float64)
+    kind = torch_renderer.TorchRendererSettings
+    plain = kind()
+    alphas = []
+    for factor in (1 - CUTOFF_MARGIN, 1 + CUTOFF_MARGIN):
+        cuts = {name: getattr(plain, name) * factor for name in ("alpha_min", "transmittance_min")}
+        alphas.append(torch_renderer.render_gaussians(gaussians, camera, settings=kind(**cuts)).alpha)
+    return (alphas[1] - alphas[0]).abs() > 1e-9
+
+
+def drawn(module, gaussians, camera, dtype, wants=OUTPUTS, background=(0.3, 0.1, 0.9), ignored=None):
+    """Output and gradients of one renderer under random cotangents, which are 0 at the pixels ignored."""
     gaussians = cast(gaussians, dtype, grad=True)
     pose = camera.camera_to_world.to(dtype).clone().requires_grad_()
     options = {"background": background}
@@ -24,25 +50,52 @@ def drawn(module, gaussians, camera, dtype, wants=OUTPUTS, background=(0.3, 0.1,
     generator = torch.Generator().manual_seed(1)
     shape = (camera.height, camera.width)
     cotangents = {k: torch.randn(*shape, *([3] * (k in ("rgb", "normals"))), generator=generator) for k in SUMS}
+    if ignored is not None:
+        for cotangent in cotangents.values():
+            cotangent[ignored] = 0
     loss = sum((output[k] * cotangents[k].to(dtype)).sum() for k in SUMS if k in ("rgb", "alpha", *wants))
     loss.backward()
     gradients = {key: getattr(gaussians, key).grad for key in INPUTS}
     return output, {**gradients, "pose": pose.grad, "means2d": output.means2d.grad}
 
 
-@pytest.mark.parametrize("name", SCENES)
+def thousands():
+    """Two thousand Gaussians, many of them over the edge of a cut-off at some pixel or other."""
+    gaussians = random_gaussians(2000, 8, depth=(1.0, 12.0), scale=(0.02, 0.2), opacity=(0.02, 1.0))
+    return gaussians, pinhole(90, 70, 70.0, 70.0)
+
+
+@pytest.mark.parametrize("name", [*SCENES, "thousands"])
 def test_agrees_with_the_definition_in_float64(name):
-    gaussians, camera = scene(name)
+    gaussians, camera = thousands() if name == "thousands" else scene(name)
     gaussians, camera = cast(gaussians, torch.float32), camera.to(dtype=torch.float32)
-    ours, gradients = drawn(cpu_renderer, gaussians, camera, torch.float32)
-    true, true_gradients = drawn(torch_renderer, gaussians, camera, torch.float64)
-    for key in OUTPUTS:
-        assert relative(ours[key], true[key]) <= 1e-5, key
+    ignored = on_a_cutoff(gaussians, camera)
+    assert int(ignored.sum()) <= few(ignored.numel())
+    ours, gradients = drawn(cpu_renderer, gaussians, camera, torch.float32, ignored=ignored)
+    true, true_gradients = drawn(torch_renderer, gaussians, camera, torch.float64, ignored=ignored)
+    for key in SUMS:
+        assert relative(ours[key][~ignored], true[key][~ignored]) <= 1e-5, key
+    # Half of the light is one more cut-off, of the median alone.
+    off = (ours["depth_median"] - true["depth_median"]).abs() > 1e-5 * true["depth_median"]
+    assert int((off & ~ignored).sum()) <= few(ignored.numel())
     for key, gradient in gradients.items():
         allowed = 1e-4 if key == "pose" else 2e-5  # the pose's is a sum that cancels
         assert relative(gradient, true_gradients[key]) <= allowed, key
     torch.testing.assert_close(ours.means2d.detach().double(), true.means2d.detach(), rtol=1e-5, atol=1e-4)
-    torch.testing.assert_close(ours.radii.double(), true.radii)
+    assert int((ours.radii.double() != true.radii).sum()) <= len(gaussians) // 1000
+
+
+@pytest.mark.parametrize(
+    ("depths", "opacity"),
+    [
+        ([5.0], (1 + 1e-5) / 255),
+        ([4.0, 5.0], 0.99),  # leave a hundredth of a hundredth
+    ],
+    ids=["alpha", "transmittance"],
+)
+def test_pixels_on_a_cutoff_are_found(depths, opacity):
+    gaussians = make([[0, 0, depth] for depth in depths], 0.2, opacity)
+    assert on_a_cutoff(gaussians, pinhole()).nonzero().tolist() == [[3, 4]]
 
 
 @pytest.mark.parametrize("wants", [("rgb",), ("depth_accumulated",), ("inverse_depth_accumulated", "normals")])
@@ -56,13 +109,19 @@ def test_outputs_do_not_depend_on_what_else_is_asked_for(wants):
     assert all(torch.isfinite(gradient).all() for gradient in few_gradients.values())
 
 
-def test_three_calls_agree_to_the_bit():
-    gaussians, camera = scene("opaque")
+@pytest.mark.parametrize("sort", ["by one thread", "by all"])
+def test_repeats_to_the_bit_with_any_number_of_threads(sort, monkeypatch):
+    if sort == "by all":
+        monkeypatch.setattr(pipeline, "_WORTH_SHARING_SORT", 0)
+    gaussians, camera = thousands()
     camera = camera.to(dtype=torch.float32)
-    first, *others = (drawn(cpu_renderer, gaussians, camera, torch.float32) for _ in range(3))
-    for other in others:
-        assert all(torch.equal(first[0][key], other[0][key]) for key in OUTPUTS)
-        assert all(torch.equal(first[1][key], other[1][key]) for key in first[1])
+    first = None
+    for threads in (2, 2, 1, 1, 3, 3, 5):
+        torch.set_num_threads(threads)
+        output, gradients = drawn(cpu_renderer, gaussians, camera, torch.float32)
+        first = first or (output, gradients)
+        assert all(torch.equal(first[0][key], output[key]) for key in OUTPUTS)
+        assert all(torch.equal(first[1][key], gradients[key]) for key in gradients)
 
 
 @settings(max_examples=25, deadline=None)
@@ -112,6 +171,25 @@ def test_shapes_and_dtypes_are_checked(name):
             cpu_renderer.render_gaussians(dataclasses.replace(gaussians, **{name: broken}), camera)
     with pytest.raises(InputError, match="no renderer output"):
         cpu_renderer.render_gaussians(gaussians, camera, ("depth",))
+
+
+def refused_on(device, name):
+    gaussians, camera = scene("random")
+    gaussians = cast(gaussians, torch.float32)
+    elsewhere = dataclasses.replace(gaussians, **{name: getattr(gaussians, name).to(device)})
+    with pytest.raises(InputError, match=rf"^{name} on {device}.* for the cpu renderer\. Expected tensors on the cpu"):
+        cpu_renderer.render_gaussians(elsewhere, camera.to(dtype=torch.float32))
+
+
+@pytest.mark.parametrize("name", INPUTS)
+def test_tensors_elsewhere_are_refused_by_name(name):
+    refused_on("meta", name)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", INPUTS)
+def test_cuda_tensors_are_refused_by_name(name):
+    refused_on("cuda", name)
 
 
 @settings(max_examples=40, deadline=None)

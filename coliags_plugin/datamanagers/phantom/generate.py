@@ -4,26 +4,28 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from coliags_plugin import __version__
-from coliags_plugin.datamanagers.phantom import layouts
 from coliags_plugin.datamanagers.phantom.colon import ColonSurface, build_surface, grow_anatomy
 from coliags_plugin.datamanagers.phantom.imaging import Exposure, Sensor, World, expose, meter
 from coliags_plugin.datamanagers.phantom.interreflection import IndirectLight, indirect_lights
+from coliags_plugin.datamanagers.phantom.layouts import layout_of, meshes
+from coliags_plugin.datamanagers.phantom.layouts.base import Part, WallPoints
+from coliags_plugin.datamanagers.phantom.layouts.pictures import write_image
 from coliags_plugin.datamanagers.phantom.light import Lamp
 from coliags_plugin.datamanagers.phantom.mucosa import Mucosa, paint_mucosa
 from coliags_plugin.datamanagers.phantom.response import KNEE, develop, exposure_for, exposures, white_balances
 from coliags_plugin.datamanagers.phantom.settings import PhantomSettings, either
 from coliags_plugin.datamanagers.phantom.streams import Purpose, stream
 from coliags_plugin.datamanagers.phantom.tracing import Tracer
-from coliags_plugin.datamanagers.phantom.trajectory import TEST_EVERY, RotationView, travel, turn_away
+from coliags_plugin.datamanagers.phantom.trajectory import RotationView, travel, turn_away
 from coliags_plugin.datamanagers.phantom.visibility import likeliest_first, seen_from
 from coliags_plugin.errors import InputError
 from coliags_plugin.files import atomic_folder
@@ -35,6 +37,8 @@ _LOG = logging.getLogger(__name__)
 _METERED = 2500
 #: Pictures taken side by side; open3d shares the cores anyway, this fills the gaps between its calls.
 _AT_ONCE = 2
+#: Initial points of the layouts that have some: about as many as structure from motion finds in such a video.
+_POINTS = 20_000
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,8 @@ class Phantom:
     @property
     def training_poses(self) -> list[Float[np.ndarray, "4 4"]]:
         """Poses of the frames that are not held out."""
-        return [pose for index, pose in enumerate(self.poses) if index % TEST_EVERY]
+        is_test = layout_of(self.settings.layout).is_test
+        return [pose for index, pose in enumerate(self.poses) if not is_test(index)]
 
     @property
     def vertex_albedo(self) -> Float[np.ndarray, "V 3"]:
@@ -111,7 +116,8 @@ def prepare(settings: PhantomSettings, progress: Progress | None = None) -> Phan
     lamp = Lamp.of(settings)
     world = World(surface, mucosa, tracer, lamp, either(settings.vignetting, settings.preset.vignetting))
     poses = list(travel(anatomy.centre_line, settings, tracer.clearance))
-    views = turn_away(np.stack(poses), settings)
+    layout = layout_of(settings.layout)
+    views = turn_away(np.stack(poses), settings, layout.is_test) if layout.has_rotation else []
     everywhere = [*poses, *(view.camera_to_world for view in views)]
     indirect: list[IndirectLight | None] = [None] * len(everywhere)
     if settings.interreflection > 0.0:
@@ -126,7 +132,7 @@ def prepare(settings: PhantomSettings, progress: Progress | None = None) -> Phan
             generator,
         )
     tell("colon", 3, 4)
-    optics, mask = layouts.LAYOUTS[settings.layout].optics(*settings.size)
+    optics, mask = layout.optics(*settings.size)
     sensor = Sensor.behind(optics, mask, settings.supersampling)
     thin = sensor.thinned(_METERED)
     ideal = []
@@ -142,10 +148,10 @@ def generate(
 ) -> None:
     """Make a phantom and write it.
 
-    The folder holds the sequence in ``settings.layout``; ``rotation/``, the rotation-only test views in the same
-    layout, with masks of what training frames saw in ``rotation/seen/``; ``truth/``, with the mesh, the albedo, the
-    light, every frame's gain, the poses in float64, and the masks of the sequence's own test frames; and
-    ``phantom.json``. The same settings give the same bytes.
+    The folder holds the sequence in ``settings.layout``; the rotation-only test views and masks of what training frames
+    saw of them, where the layout has a place for them; ``truth/``, with the mesh, the albedo, the light, every frame's
+    gain, the poses in float64, and the masks of the sequence's own test frames; and ``phantom.json``. The same settings
+    give the same bytes.
 
     Args:
         settings: What to make.
@@ -172,32 +178,38 @@ def generate(
 
 
 def _write(phantom: Phantom, folder: Path, tell: Progress) -> None:
-    layout = layouts.LAYOUTS[phantom.settings.layout]
-    frames = len(phantom.poses)
+    layout = layout_of(phantom.settings.layout)
+    frames, optics = len(phantom.poses), phantom.sensor.optics
     turned = [view.camera_to_world for view in phantom.rotation_views]
     total = frames + len(turned)
     # Coverage as C3VD counts it: triangles that are the first hit of any pixel ray of any frame.
     observed = np.zeros(len(phantom.world.surface.triangles), bool)
     trained_on = np.zeros_like(observed)
+    drawn = []
     tell("frames", 0, total)
     for number, (exposure, color) in enumerate(_photographs(phantom, total)):
         image = phantom.sensor.image
-        place, index = (folder, number) if number < frames else (folder / "rotation", number - frames)
-        layout.write_frame(place, index, image(color), image(exposure.z_depth), image(exposure.normals))
-        if number < frames:
+        part: Part = "video" if number < frames else "rotation"
+        index = number if part == "video" else number - frames
+        pose = phantom.poses[index] if part == "video" else turned[index]
+        layout.write_frame(folder, part, index, image(color), image(exposure.z_depth), image(exposure.normals))
+        if part == "video":
             observed[exposure.triangles] = True
-            if number % TEST_EVERY:
-                trained_on[exposure.triangles] = True
-        if number >= frames or number % TEST_EVERY == 0:
-            pose = turned[index] if number >= frames else phantom.poses[number]
-            masks = (folder / "rotation" / "seen") if number >= frames else (folder / "truth" / "seen")
-            layouts.write_image(masks / f"{index:04d}_seen.png", image(_seen_mask(phantom, exposure, pose)))
+        if part == "video" and not layout.is_test(index):
+            trained_on[exposure.triangles] = True
+            if layout.has_points:
+                drawn.append(_draw_points(phantom, index, exposure, color))
+        else:
+            seen = image(_seen_mask(phantom, exposure, pose))
+            write_image(layout.seen_mask(folder, part, index), seen)
         tell("frames", number + 1, total)
-    layout.write_sequence(folder, phantom.poses, phantom.sensor.optics)
+    layout.write_sequence(folder, "video", phantom.poses, optics)
     if turned:
-        layout.write_sequence(folder / "rotation", turned, phantom.sensor.optics)
-    if layout.has_normals:
-        layouts.write_coverage_obj(folder / "coverage_mesh.obj", phantom.world.surface, observed)
+        layout.write_sequence(folder, "rotation", turned, optics)
+    if layout.has_points:
+        layout.write_points(folder, _wall_points(phantom, drawn), phantom.poses, optics)
+    if layout.has_coverage_mesh:
+        meshes.write_coverage_obj(folder / "coverage_mesh.obj", phantom.world.surface, observed)
     tell("truth", 0, 1)
     _write_truth(phantom, folder / "truth", trained_on, observed)
     tell("truth", 1, 1)
@@ -218,12 +230,45 @@ def _seen_mask(
     phantom: Phantom, exposure: Exposure, camera_to_world: Float[np.ndarray, "4 4"]
 ) -> UInt8[np.ndarray, "P"]:
     """255 where a pixel's wall is also seen by a training frame; 0 elsewhere, and where there is no wall. [P]"""
-    found = exposure.z_depth > 0.0
-    local = phantom.sensor.centers[found] * exposure.z_depth[found, None]
-    points = local.astype(np.float64) @ camera_to_world[:3, :3].T + camera_to_world[:3, 3]
-    mask = np.zeros(len(found), np.uint8)
+    found = np.flatnonzero(exposure.z_depth > 0.0)
+    points = _wall(phantom, exposure, camera_to_world, found)
+    mask = np.zeros(len(exposure.z_depth), np.uint8)
     mask[found] = np.where(phantom.seen(points, camera_to_world), 255, 0)
     return mask
+
+
+def _wall(
+    phantom: Phantom,
+    exposure: Exposure,
+    camera_to_world: Float[np.ndarray, "4 4"],
+    pixels: Int[np.ndarray, "N"],
+) -> Float[np.ndarray, "N 3"]:
+    """Where on the wall, world frame, lit pixels look. [N, 3]"""
+    local = phantom.sensor.centers[pixels] * exposure.z_depth[pixels, None]
+    return np.asarray(local.astype(np.float64) @ camera_to_world[:3, :3].T + camera_to_world[:3, 3])
+
+
+def _draw_points(
+    phantom: Phantom, index: int, exposure: Exposure, color: UInt8[np.ndarray, "P 3"]
+) -> tuple[Float[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"]]:
+    """This training frame's share of the initial points and their colours."""
+    found = np.flatnonzero(exposure.z_depth > 0.0)
+    share = min(-(-_POINTS // len(phantom.training_poses)), len(found))
+    generator = stream(phantom.settings.seed, Purpose.POINTS, index)
+    chosen = np.sort(generator.choice(found, share, replace=False))
+    return _wall(phantom, exposure, phantom.poses[index], chosen), color[chosen]
+
+
+def _wall_points(
+    phantom: Phantom, drawn: Sequence[tuple[Float[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"]]]
+) -> WallPoints:
+    positions = np.concatenate([positions for positions, _ in drawn])
+
+    def seen_in(index: int) -> Bool[np.ndarray, "N"]:
+        sensor = phantom.sensor
+        return seen_from(positions, [phantom.poses[index]], sensor.optics, sensor.mask, phantom.world.tracer)
+
+    return WallPoints(positions, np.concatenate([colors for _, colors in drawn]), seen_in)
 
 
 def _write_truth(
@@ -232,7 +277,7 @@ def _write_truth(
     surface, settings = phantom.world.surface, phantom.settings
     folder.mkdir(parents=True, exist_ok=True)
     albedo = phantom.vertex_albedo
-    layouts.write_ply(folder / "mesh.ply", surface, albedo)
+    meshes.write_ply(folder / "mesh.ply", surface, albedo)
     vertices = surface.vertices.astype(np.float64)
     seen = seen_from(vertices, phantom.training_poses, phantom.sensor.optics, phantom.sensor.mask, phantom.world.tracer)
     np.savez(folder / "mesh_seen.npz", vertex_seen=seen, face_seen=trained_on, face_seen_by_any_frame=observed)

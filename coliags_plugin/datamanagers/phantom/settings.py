@@ -9,6 +9,7 @@ from typing import Any, Literal, TypeVar
 
 from pydantic import Field, ValidationError, field_validator
 
+from coliags_plugin.datamanagers.phantom.layouts import LayoutName, layout_of
 from coliags_plugin.errors import InputError
 from coliags_plugin.settings import Settings
 
@@ -16,9 +17,6 @@ _T = TypeVar("_T")
 
 SpreadLaw = Literal["exponential", "cosine"]
 GainMode = Literal["auto", "fixed"]
-
-#: Pixels, (width, height), of each layout where none are asked for.
-LAYOUT_SIZES: dict[str, tuple[int, int]] = {"c3vd": (338, 270), "c3vd-raw": (1350, 1080)}
 
 
 @dataclass(frozen=True)
@@ -103,21 +101,19 @@ class PhantomSettings(Settings):
     """
 
     seed: int = Field(0, ge=0, description="The whole phantom follows from it.")
-    layout: Literal["c3vd", "c3vd-raw"] = Field(
-        "c3vd",
-        description="c3vd: undistorted pinhole frames as ColIAGS reads them. c3vd-raw: the release's own files, "
-        "through C3VD's omnidirectional lens.",
-    )
+    layout: LayoutName = Field("c3vd", description="Files and folders to write; docs/phantom.md 5 lists the layouts.")
     trajectory: Literal["pullback", "rotation"] = Field(
         "pullback", description="pullback: withdrawal along the lumen. rotation: the camera mostly turns on the spot."
     )
     frames: int = Field(120, ge=9, le=2000, description="Frames of the sequence; every 8th is a test frame.")
-    width: int | None = Field(None, ge=16, le=4096, description="Image width, pixels. None: 338, or 1350 for c3vd-raw.")
-    height: int | None = Field(
-        None, ge=16, le=4096, description="Image height, pixels. None: 270, or 1080 for c3vd-raw."
-    )
+    width: int | None = Field(None, ge=16, le=4096, description="Image width, pixels. None: the layout's own.")
+    height: int | None = Field(None, ge=16, le=4096, description="Image height, pixels. None: the layout's own.")
     rotation_views: int = Field(
-        12, ge=0, le=500, description="Test views at positions of the path, turned 15 to 30 degrees away from it."
+        12,
+        ge=0,
+        le=500,
+        description="Test views at positions of the path, turned 15 to 30 degrees away from it; none in a layout that "
+        "has no place for them.",
     )
     supersampling: int = Field(2, ge=1, le=4, description="Colour samples per pixel side; depth is never averaged.")
 
@@ -204,13 +200,15 @@ class PhantomSettings(Settings):
     @property
     def size(self) -> tuple[int, int]:
         """Image width and height, pixels."""
-        width, height = LAYOUT_SIZES[self.layout]
+        width, height = layout_of(self.layout).default_size
         return either(self.width, width), either(self.height, height)
 
     def resolved(self) -> PhantomSettings:
         """The same settings with every None replaced by what it stands for."""
         width, height = self.size
         chosen: dict[str, Any] = {"width": width, "height": height}
+        if not layout_of(self.layout).has_rotation:
+            chosen["rotation_views"] = 0
         for name in ("light_offset", "spread_law", "spread", "vignetting", "tilt", "gain", "white_balance_drift"):
             chosen[name] = either(getattr(self, name), getattr(self.preset, name))
         return self.model_copy(update=chosen)

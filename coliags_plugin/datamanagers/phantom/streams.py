@@ -21,6 +21,7 @@ class Purpose(IntEnum):
     WHITE_BALANCE = 5
     SENSOR = 6
     INTERREFLECTION = 7
+    POINTS = 8
 
 
 def stream(seed: int, purpose: Purpose, *key: int) -> np.random.Generator:

@@ -15,7 +15,7 @@ from coliags_plugin.errors import InputError
 
 #: No closer to the wall than this, mm; C3VD's nearest surface of any sequence is 5.9 mm away.
 NEAREST = 6.0
-#: Every how many frames one is held out for testing, from frame 0 on.
+#: Every how many frames one is held out for testing.
 TEST_EVERY = 8
 #: Arc length of the pullback's shallow end, mm. Far enough in that a view turned sideways still ends on the wall.
 _SHALLOW_END = 26.0
@@ -98,13 +98,20 @@ def travel(centre_line: CentreLine, settings: PhantomSettings, clearance: Cleara
     return poses
 
 
-def turn_away(poses: Float[np.ndarray, "T 4 4"], settings: PhantomSettings) -> list[RotationView]:
+def every_8th(index: int) -> bool:
+    """Whether a frame is held out for testing where nothing else is said: 0, 8, 16, ..."""
+    return index % TEST_EVERY == 0
+
+
+def turn_away(
+    poses: Float[np.ndarray, "T 4 4"], settings: PhantomSettings, is_test: Callable[[int], bool] = every_8th
+) -> list[RotationView]:
     """Test views at places of training frames, their look direction 15 to 30 degrees off.
 
     On a pullback they turn all round the clock; where the camera scans, they go on outwards from where it looked.
     """
     generator = stream(settings.seed, Purpose.ROTATION_VIEWS)
-    training = [index for index in range(len(poses)) if index % TEST_EVERY]
+    training = [index for index in range(len(poses)) if not is_test(index)]
     views = []
     clock = generator.uniform(0.0, 2.0 * np.pi)
     for number in range(settings.rotation_views):

@@ -70,7 +70,7 @@ class Projected(NamedTuple):
 
 
 @inline
-def project_axes(mean, quat, view):  # type: ignore[no-untyped-def]
+def project_axes(mean, quat, view):
     """Everything but scales. ``mean`` and ``quat`` are tuples of lanes, ``view`` the table ``layout`` describes."""
     right = broadcast_all(view, layout.VIEW_RIGHT, (0, 0, 0))
     down = broadcast_all(view, layout.VIEW_DOWN, (0, 0, 0))
@@ -123,7 +123,7 @@ def project_axes(mean, quat, view):  # type: ignore[no-untyped-def]
 
 
 @inline
-def rotation_rows(quaternion):  # type: ignore[no-untyped-def]
+def rotation_rows(quaternion):
     """Rows of the rotation matrix of a unit quaternion, w first."""
     w, x, y, z = quaternion
     two_x, two_y, two_z = add(x, x), add(y, y), add(z, z)
@@ -138,14 +138,14 @@ def rotation_rows(quaternion):  # type: ignore[no-untyped-def]
 
 
 @inline
-def rotated_back(rotation, vector):  # type: ignore[no-untyped-def]
+def rotated_back(rotation, vector):
     """The transposed rotation times a vector: world axes -> local axes."""
     a, b, c = rotation
     return fma(vector[2], c, fma(vector[1], b, mul(vector[0], a)))
 
 
 @inline
-def cross(a, b):  # type: ignore[no-untyped-def]
+def cross(a, b):
     """Cross product."""
     return (
         fma(a[1], b[2], neg(mul(a[2], b[1]))),
@@ -155,7 +155,7 @@ def cross(a, b):  # type: ignore[no-untyped-def]
 
 
 @inline
-def squared_distance_to_box(u_xx, u_yx, u_yy, slope_upright, slope_level, left, right, top, bottom):  # type: ignore[no-untyped-def]
+def squared_distance_to_box(u_xx, u_yx, u_yy, slope_upright, slope_level, left, right, top, bottom):
     """Smallest |U d|^2 of an offset d in a box; the box's sides are given as offsets from the Gaussian's centre.
 
     A convex quadratic has its minimum over a box at the centre if that is inside, else on an edge that faces it; along
@@ -173,13 +173,13 @@ def squared_distance_to_box(u_xx, u_yx, u_yy, slope_upright, slope_level, left, 
 
 
 @inline
-def shortest_axes(scale):  # type: ignore[no-untyped-def]
+def shortest_axes(scale):
     """Whether the second, and whether the third axis is the shortest; where neither is, the first. Ties go forwards."""
     return less(scale[1], scale[0]), less(scale[2], smaller(scale[0], scale[1]))
 
 
 @inline
-def shortest_column(rotation, second, third):  # type: ignore[no-untyped-def]
+def shortest_column(rotation, second, third):
     """The column of the rotation that :func:`shortest_axes` chose: the shortest axis in the world."""
     a, b, c = rotation
     return select(third, (a[2], b[2], c[2]), select(second, (a[1], b[1], c[1]), (a[0], b[0], c[0])))

@@ -78,7 +78,6 @@ VIEW_LOG2_ALPHA_MIN = 24  # the cuts
 VIEW_ALPHA_MAX = 25
 VIEW_TRANSMITTANCE_MIN = 26
 VIEW_BACKGROUND = 27
-VIEW_SIZE = 30
 
 
 class Parameters(NamedTuple):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -26,8 +25,6 @@ _WORTH_SHARING_SORT = 1 << 17
 #: What lists of pairs can hold.
 _MOST_PAIRS = 2**31 - 1
 
-#: One view at a time: it takes all cores.
-_turn = threading.Lock()
 _crew = Crew()
 _arenas = ArenaPool()
 _results = Results()
@@ -249,8 +246,8 @@ class _Run:
 
 @contextmanager
 def _workers() -> Iterator[_Run]:
-    """Wait for the turn; then there are as many threads as torch uses."""
-    with _turn:
+    """Wait for the turn, for one view takes all cores; then there are as many threads as torch uses."""
+    with _crew.turn:
         yield _Run(torch.get_num_threads())
 
 

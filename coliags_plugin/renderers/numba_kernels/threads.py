@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -31,16 +32,29 @@ class Crew:
 
     Every thread calls the kernel with the same arguments, and the kernel takes pieces of work with :func:`take` until
     none are left. Whoever asks works too and waits only for those who have begun: a thread that the system has not let
-    run by then, or that a fork has left behind, is not needed.
+    run by then is not needed.
+
+    A fork leaves threads behind, and takes locks along as they are. The forked process begins with a fresh crew.
+
+    Attributes:
+        turn: To be held while the crew is at work for one caller.
     """
 
     def __init__(self) -> None:
+        self._assemble()
+        if hasattr(os, "register_at_fork"):
+            os.register_at_fork(after_in_child=self._assemble)
+
+    def _assemble(self) -> None:
+        self.turn = threading.Lock()
         self._threads = ThreadPoolExecutor(max_workers=max(1, os.cpu_count() or 1), thread_name_prefix="splatting")
 
     def run(self, size: int, kernel: Callable[..., Any], *arguments: Any) -> None:
         """Run a kernel on ``size`` threads, this one among them."""
         helpers = [self._threads.submit(kernel, *arguments) for _ in range(size - 1)]
-        kernel(*arguments)
-        for helper in helpers:
-            if not helper.cancel():
-                helper.result()
+        try:
+            kernel(*arguments)
+        finally:  # also on Ctrl-C: nobody may go on writing to memory that is about to be given away
+            for helper in helpers:
+                if not helper.cancel():
+                    helper.result()

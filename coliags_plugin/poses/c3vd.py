@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,9 +10,10 @@ import numpy as np
 from jaxtyping import Float
 
 from coliags_plugin.errors import InputError
-
-#: How far R^T R may be from the identity. The files carry six digits, which is 1e-6 off.
-RIGID_TOLERANCE = 1e-3
+from coliags_plugin.files import atomic_write
+from coliags_plugin.poses.rigid import RIGID_TOLERANCE, check_rigid
+from coliags_plugin.poses.text import count_first_numbers, read_numbers
+from coliags_plugin.poses.trajectory import Trajectory
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Poses:
 def read_poses(path: Path) -> Poses:
     """Read ``pose.txt`` or ``camera_pose.txt``: sixteen numbers a line, separated by commas or blanks.
 
-    The web page calls the files row-major; the numbers are columns (docs/data.md 4). So the order is found, not
+    The web page calls the files row-major; the numbers are columns (docs/layouts/c3vd.md 4). So the order is found, not
     believed: read row by row, a rigid transform has its translation in the last column and (0, 0, 0, 1) in the last
     row.
 
@@ -42,7 +42,12 @@ def read_poses(path: Path) -> Poses:
         InputError: A line does not hold sixteen finite numbers, or is a rigid transform in neither reading, or is
             left-handed; or the order cannot be told.
     """
-    lines = _numbers(path)
+    lines = read_numbers(
+        path,
+        16,
+        "16 finite numbers, a camera-to-world transform",
+        "Restore the file from the data set, or remove that frame and its line together",
+    )
     matrices = np.array([numbers for _, numbers in lines]).reshape(-1, 4, 4)
     last_column = np.abs(matrices[:, :3, 3]).max(initial=0.0)
     last_row = np.abs(matrices[:, 3, :3]).max(initial=0.0)
@@ -58,8 +63,12 @@ def read_poses(path: Path) -> Poses:
         )
     column_major = is_column.sum() >= is_row.sum()
     camera_to_world = by_columns if column_major else matrices
-    for (number, _), matrix in zip(lines, camera_to_world, strict=True):
-        _check_rigid(matrix, f"{path}, line {number}")
+    check_rigid(
+        camera_to_world,
+        lambda index: f"{path}, line {lines[index][0]}",
+        f"both within {RIGID_TOLERANCE:g}, the translation of every line in the same place",
+        "Restore the file from the data set",
+    )
     rotations, centers = camera_to_world[:, :3, :3], camera_to_world[:, :3, 3]
     steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
     return Poses(
@@ -76,47 +85,27 @@ def read_poses(path: Path) -> Poses:
     )
 
 
-def _numbers(path: Path) -> list[tuple[int, list[float]]]:
-    lines: list[tuple[int, list[float]]] = []
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read {path}: {error}", "a text file of poses") from error
-    for number, line in enumerate(text.splitlines(), start=1):
-        words = [word for word in re.split(r"[,\s]+", line) if word]
-        if not words:
-            continue
-        try:
-            values = [float(word) for word in words]
-        except ValueError:
-            values = []
-        if len(values) != 16 or not np.all(np.isfinite(values)):
-            shown = line.strip() if len(line.strip()) <= 60 else f"{line.strip()[:57]}..."
-            raise InputError(
-                f"{path}, line {number}: '{shown}'",
-                "16 finite numbers, a camera-to-world transform",
-                "Restore the file from the data set, or remove that frame and its line together",
-            )
-        lines.append((number, values))
-    if not lines:
-        raise InputError(f"{path} holds no poses", "one line of 16 numbers per frame")
-    return lines
+def read(path: Path) -> Trajectory:
+    """Read a C3VD pose file, in whichever order its numbers stand.
+
+    Raises:
+        InputError: As :func:`read_poses`.
+    """
+    poses = read_poses(path)
+    return Trajectory(poses.camera_to_world, stored_as=f"camera-to-world matrices, {poses.convention}")
 
 
-def _check_rigid(matrix: Float[np.ndarray, "4 4"], place: str) -> None:
-    rotation = matrix[:3, :3]
-    error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-    border = float(np.abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max())
-    if max(error, border) > RIGID_TOLERANCE:
-        raise InputError(
-            f"{place}: not a rigid transform (R^T R is {error:.2g} from the identity, "
-            f"the fixed part {border:.2g} from 0, 0, 0, 1)",
-            f"both within {RIGID_TOLERANCE:g}, the translation of every line in the same place",
-            "Restore the file from the data set",
-        )
-    if np.linalg.det(rotation) < 0.0:
-        raise InputError(
-            f"{place}: a left-handed transform (det R = -1)",
-            "camera axes x right, y down, z forward in a right-handed world",
-            "Undo the flip of one axis in whatever wrote the file",
-        )
+def write(path: Path, trajectory: Trajectory) -> None:
+    """Write sixteen numbers a line, column by column as the current release has them; nothing is rounded.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    columns = trajectory.camera_to_world.transpose(0, 2, 1).reshape(-1, 16)
+    lines = [",".join(repr(float(number)) for number in line) for line in columns]
+    atomic_write(path, "\n".join(lines) + "\n")
+
+
+def recognise(path: Path) -> bool:
+    """Whether a file's first line holds sixteen numbers."""
+    return count_first_numbers(path) == 16

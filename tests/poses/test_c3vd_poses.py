@@ -6,10 +6,10 @@ import json
 
 import numpy as np
 import pytest
-from wall_scenes import poses
 
-from coliags_plugin.datamanagers.c3vd_poses import read_poses
 from coliags_plugin.errors import InputError
+from coliags_plugin.poses.c3vd import read_poses
+from tests.datamanagers.wall_scenes import poses
 
 
 def write(path, matrices, separator=","):

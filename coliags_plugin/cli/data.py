@@ -1,0 +1,50 @@
+"""``coliags data check``: what a scene is, and whether its parts agree."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from coliags_plugin.cli.arguments import Assignments, DataFormat, OptionalPath
+
+
+@dataclass(frozen=True)
+class Data:
+    """Say what a scene holds and whether pictures, poses, depth and calibration agree; exit status 1 if suspect."""
+
+    action: tyro.conf.Positional[Literal["check"]]
+    """What to do."""
+    scene: tyro.conf.Positional[Path]
+    """The scene's folder."""
+    format: DataFormat = None
+    """How the scene is laid out (`coliags list datamanagers`); default: what its files show."""
+    html: OptionalPath = None
+    """Also write one page with pictures and the trajectory."""
+    json: OptionalPath = None
+    """Also write the same facts for a program."""
+    set: Assignments = ()
+    """An option of the data manager, for instance split=block."""
+
+    def run(self) -> None:
+        """Print what was found."""
+        from coliags_plugin.engine.data_check.check import check_scene
+        from coliags_plugin.engine.data_check.page import write_check_page
+        from coliags_plugin.engine.data_check.text import lines
+        from coliags_plugin.engine.data_formats import open_scene
+        from coliags_plugin.engine.progress import progress_callback
+        from coliags_plugin.files import write_json
+
+        with progress_callback() as progress:
+            check = check_scene(open_scene(self.scene, self.format, self.set, progress), progress)
+        print("\n".join(lines(check)))
+        if self.html is not None:
+            write_check_page(check, self.html)
+            print(self.html.resolve())
+        if self.json is not None:
+            write_json(self.json, check.as_json())
+        if check.findings:
+            sys.exit(1)

@@ -1,0 +1,120 @@
+"""``coliags poses align``: how far an estimated trajectory is from a reference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from coliags_plugin.cli.arguments import OptionalPath, OptionalText
+from coliags_plugin.cli.poses.arguments import OptionalFormat, read_aloud
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from coliags_plugin.poses.alignment import Alignment
+
+
+@dataclass(frozen=True)
+class Align:
+    """Align an estimated trajectory with a reference, and take its absolute and relative errors."""
+
+    estimate: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="ESTIMATE")]
+    """Poses to judge, in any format."""
+    reference: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="REFERENCE")]
+    """Poses to judge them by, in any format."""
+    scale: bool = False
+    """Also find a scale (Sim(3) instead of SE(3)), for an estimate in units of its own."""
+    delta: int = 1
+    """Matched frames between the two poses of a relative error."""
+    match: Literal["auto", "name", "time", "index", "endogslam-train"] = "auto"
+    """Which frames belong together; auto: by name, else by time, else by index."""
+    tolerance: float = 0.02
+    """How far timestamps of one frame may be apart, s."""
+    estimate_format: OptionalFormat = None
+    """Format of the estimate; default: told by its content."""
+    reference_format: OptionalFormat = None
+    """Format of the reference; default: told by its content."""
+    unit: OptionalText = None
+    """What to call the reference's unit of length; default: mm where its format says so."""
+    json: OptionalPath = None
+    """File to write all figures to."""
+    plot: OptionalPath = None
+    """PNG to write: both trajectories from above and from the side, and the errors along the frames."""
+    overwrite: bool = False
+    """Replace the files where they exist."""
+
+    def run(self) -> None:
+        """Align, print a table, and say where the files are."""
+        import logging
+
+        from rich.console import Console
+
+        from coliags_plugin.errors import InputError
+        from coliags_plugin.files import write_json
+        from coliags_plugin.poses.alignment import align, associate
+
+        log = logging.getLogger(__name__)
+        if self.plot is not None and self.plot.suffix.lower() != ".png":
+            raise InputError(f"--plot {self.plot}", "a file name that ends in .png")
+        for path in (self.json, self.plot):
+            if path is not None and path.exists() and not self.overwrite:
+                raise InputError(f"{path} already exists", "a new file", "Choose another, or pass --overwrite")
+            if path is not None and (path.is_dir() or path in (self.estimate, self.reference)):
+                raise InputError(f"{path} is a folder or one of the inputs", "a file of its own")
+        _, estimate = read_aloud(self.estimate, self.estimate_format)
+        kind, reference = read_aloud(self.reference, self.reference_format)
+        unit = self.unit or kind.unit
+        matches = associate(estimate, reference, self.match, self.tolerance)
+        if matches.passed_over:
+            log.warning("matched by %s, though names or times do not (%s)", matches.by, "; ".join(matches.passed_over))
+        result = align(estimate, reference, matches, self.scale, self.delta)
+        print(
+            f"{len(matches)} frames matched by {matches.by}, of {len(estimate)} estimated and {len(reference)} "
+            f"reference ones\n{_described(result, unit)}"
+        )
+        Console().print(_table(result, unit))
+        if result.transform.undetermined:
+            print(f"rotation error: none, {result.transform.undetermined}")
+        if self.json is not None:
+            write_json(self.json, result.to_json(unit))
+            print(self.json)
+        if self.plot is not None:
+            from coliags_plugin.outputs.pictures import write_png
+            from coliags_plugin.outputs.trajectory_plot import trajectory_picture
+
+            write_png(self.plot, trajectory_picture(result, unit))
+            print(self.plot)
+
+
+def _described(result: Alignment, unit: str) -> str:
+    from coliags_plugin.poses.rigid import rotation_angles_deg
+
+    angle = float(rotation_angles_deg(result.transform.rotation[None])[0])
+    x, y, z = result.transform.translation
+    scale = f", scale {result.transform.scale:.6g}" if result.with_scale else ""
+    return (
+        f"{'Sim(3)' if result.with_scale else 'SE(3)'}: rotation {angle:.3f} deg, "
+        f"translation ({x:.4g}, {y:.4g}, {z:.4g}) {unit}{scale}"
+    )
+
+
+def _table(result: Alignment, unit: str) -> Table:
+    from rich.table import Table
+
+    table = Table()
+    table.add_column("error")
+    for name in ("unit", "rmse", "mean", "median", "max"):
+        table.add_column(name, justify="right" if name != "unit" else "left")
+    step = f"{result.delta} frame{'s' if result.delta > 1 else ''}"
+    for name, kind, spread in (
+        ("ATE", unit, result.ate),
+        ("rotation", "deg", result.rotation_deg),
+        (f"RPE over {step}", unit, result.rpe_translation),
+        (f"RPE over {step}", "deg", result.rpe_rotation_deg),
+    ):
+        values = ["-"] * 4 if spread is None else [f"{value:.4g}" for value in vars(spread).values()]
+        table.add_row(name, kind, *values)
+    return table

@@ -1,0 +1,83 @@
+"""``coliags poses convert``: poses from one format to another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from coliags_plugin.cli.arguments import OptionalPath, OptionalText
+from coliags_plugin.cli.poses.arguments import OptionalFormat, parse_intrinsics, read_aloud
+
+
+@dataclass(frozen=True)
+class Convert:
+    """Write poses in another format (c3vd, tum, endogslam, colmap, colmap-text, nerfstudio)."""
+
+    input: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IN")]
+    """File with poses, or the folder of a COLMAP model."""
+    output: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
+    """File to write; for COLMAP, folder to make."""
+    to: Annotated[str, tyro.conf.arg(metavar="FORMAT")]
+    """Format to write."""
+    from_format: Annotated[OptionalFormat, tyro.conf.arg(name="from")] = None
+    """Format of the input; default: told by its content."""
+    intrinsics: Annotated[OptionalText, tyro.conf.arg(metavar="FX,FY,CX,CY")] = None
+    """Pinhole of all pictures, pixels, pixel centres at integers + 0.5; default: the input's."""
+    size: Annotated[OptionalText, tyro.conf.arg(metavar="WxH")] = None
+    """Picture size, pixels; with --intrinsics."""
+    images: OptionalPath = None
+    """Folder whose pictures, in order of number, give the poses their names; default: the input's names."""
+    overwrite: bool = False
+    """Replace the output where it exists."""
+
+    def run(self) -> None:
+        """Convert, and say where."""
+        import logging
+        from dataclasses import replace
+
+        from coliags_plugin.errors import InputError
+        from coliags_plugin.poses.formats import format_named, write_trajectory
+
+        log = logging.getLogger(__name__)
+        target = format_named(self.to)
+        pinhole = parse_intrinsics(self.intrinsics, self.size)
+        _, trajectory = read_aloud(self.input, self.from_format)
+        if self.output.exists() and self.output.samefile(self.input):
+            raise InputError(f"{self.output} is the input itself", "another place for the output")
+        if pinhole is not None:
+            trajectory = replace(trajectory, intrinsics=pinhole)
+        if self.images is not None:
+            trajectory = replace(trajectory, names=_picture_names(self.images, len(trajectory)))
+        lost = [
+            what
+            for what in ("names", "timestamps", "intrinsics")
+            if getattr(trajectory, what) is not None and what not in target.keeps
+        ]
+        write_trajectory(self.output, trajectory, self.to, self.overwrite)
+        if lost:
+            log.info("%s keeps no %s: left behind", self.to, ", ".join(lost))
+        if "names" in target.keeps and trajectory.names is None:
+            log.info("the input names no pictures: called 0000.png, 0001.png, ...; --images takes their real names")
+        if "timestamps" in target.keeps and trajectory.timestamps is None:
+            log.info("the input has no timestamps: frame numbers stand in for them")
+        print(self.output)
+
+
+def _picture_names(folder: Path, count: int) -> tuple[str, ...]:
+    """Names of a folder's pictures as people count, one for each pose."""
+    from coliags_plugin.errors import InputError
+    from coliags_plugin.poses.trajectory import natural_order
+
+    if not folder.is_dir():
+        raise InputError(f"--images {folder}", "a folder of pictures")
+    names = [path.name for path in folder.iterdir() if path.suffix.lower() in (".png", ".jpg", ".jpeg")]
+    if len(names) != count:
+        raise InputError(
+            f"{folder} holds {len(names)} pictures for {count} poses",
+            "one picture (.png, .jpg, .jpeg) for each pose",
+            "Give the folder of exactly these frames",
+        )
+    return tuple(names[index] for index in natural_order(names))

@@ -1,0 +1,47 @@
+"""COLMAP's camera models as lenses, with COLMAP's own arithmetic."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from coliags_plugin.lenses import Array, Pinhole
+from coliags_plugin.mapped_lens import MappedLens
+
+if TYPE_CHECKING:
+    import pycolmap
+
+#: Cameras that took pinhole pictures: nothing to undistort.
+PINHOLES = frozenset({"SIMPLE_PINHOLE", "PINHOLE"})
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColmapLens(MappedLens):
+    """A camera of a COLMAP model.
+
+    Attributes:
+        model: Its name, for instance ``OPENCV_FISHEYE``.
+        params: As COLMAP orders them; pixels, centres at integers + 0.5, which is converted here.
+    """
+
+    model: str
+    params: tuple[float, ...]
+
+    @cached_property
+    def _camera(self) -> pycolmap.Camera:
+        import pycolmap
+
+        return pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
+
+    @property
+    def _calibrated_pinhole(self) -> Pinhole:
+        camera = self._camera
+        center = camera.principal_point_x - 0.5, camera.principal_point_y - 0.5
+        return Pinhole(camera.focal_length_x, camera.focal_length_y, *center)
+
+    def _bent(self, tangents: Array) -> Array:
+        points = np.concatenate([tangents, np.ones((len(tangents), 1))], axis=1)
+        return np.asarray(self._camera.img_from_cam(points), np.float64) - 0.5

@@ -1,0 +1,114 @@
+"""The cameras of a ``transforms.json`` (docs/layouts/nerfstudio.md 3)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from coliags_plugin.errors import InputError
+from coliags_plugin.lenses import FisheyeLens, Lens, Pinhole
+from coliags_plugin.lenses_opencv import OpenCVLens
+
+PixelCenters = Literal["half", "integer"]
+
+#: The models nerfstudio takes pictures with, and the distortion each may have; other terms must be 0 or absent.
+_MODELS: Mapping[str, tuple[str, ...]] = {
+    "OPENCV": ("k1", "k2", "k3", "p1", "p2"),
+    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+    "PINHOLE": (),
+    "SIMPLE_PINHOLE": (),
+}
+_BENDS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+
+
+@dataclass(frozen=True)
+class PinholeCamera:
+    """A camera whose pictures need no undistortion.
+
+    Attributes:
+        pinhole: Pixels, centres at integers.
+        width, height: Of its pictures, pixels.
+    """
+
+    pinhole: Pinhole
+    width: int
+    height: int
+
+
+def camera_of(
+    values: Mapping[str, Any], place: str, pixel_centers: PixelCenters, picture_size: Callable[[], tuple[int, int]]
+) -> Lens | PinholeCamera:
+    """The camera of one frame.
+
+    Args:
+        values: Keys of the file, overlaid with those of the frame.
+        place: What to call the frame in a message.
+        pixel_centers: Where ``cx`` and ``cy`` count pixel centres.
+        picture_size: Width and height of the picture; asked only where the file does not say.
+
+    Raises:
+        InputError: The model is unknown, or a value is missing, no number, or does not go with the model.
+    """
+    model = values.get("camera_model") or ("OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")
+    if model not in _MODELS:
+        raise InputError(f"{place}: camera_model is {model}", f"one of {', '.join(_MODELS)}")
+    width, height = _size(values, place) if "w" in values or "h" in values else picture_size()
+    fx, fy = _focal_lengths(values, place, width, height)
+    # Without a principal point the middle of the picture is meant, however pixels are counted.
+    shift = 0.5 if pixel_centers == "half" else 0.0
+    cx = number(values, "cx", place) - shift if "cx" in values else 0.5 * width - 0.5
+    cy = number(values, "cy", place) - shift if "cy" in values else 0.5 * height - 0.5
+    if min(fx, fy, width, height) <= 0.0:
+        raise InputError(f"{place}: fl_x {fx:g}, fl_y {fy:g}, w {width}, h {height}", "numbers above 0")
+    bends = {key: number(values, key, place) for key in _BENDS if values.get(key)}
+    if wrong := sorted(set(bends) - set(_MODELS[model])):
+        meaning = "nerfstudio and OpenCV mean different things by k4" if wrong == ["k4"] else "it has no such term"
+        raise InputError(
+            f"{place}: {model} with {wrong[0]} = {bends[wrong[0]]:g}; {meaning}",
+            f"{', '.join(_MODELS[model]) or 'no distortion'} alone",
+            "Undistort the pictures, or mend camera_model",
+        )
+    if model == "OPENCV_FISHEYE":
+        k1, k2, k3, k4 = (bends.get(key, 0.0) for key in _MODELS[model])
+        return FisheyeLens(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, k1=k1, k2=k2, k3=k3, k4=k4)
+    if not bends:
+        return PinholeCamera(Pinhole(fx, fy, cx, cy), width, height)
+    k1, k2, k3, p1, p2 = (bends.get(key, 0.0) for key in _MODELS[model])
+    return OpenCVLens(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, k1=k1, k2=k2, p1=p1, p2=p2, k3=k3)
+
+
+def number(values: Mapping[str, Any], key: str, place: str) -> float:
+    """A finite number.
+
+    Raises:
+        InputError: It is missing or something else.
+    """
+    value = values.get(key)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(f"{place}: {key} is {value!r}", "a finite number")
+    return float(value)
+
+
+def _size(values: Mapping[str, Any], place: str) -> tuple[int, int]:
+    width, height = number(values, "w", place), number(values, "h", place)
+    if width != int(width) or height != int(height):
+        raise InputError(f"{place}: w = {width}, h = {height}", "whole pixels")
+    return int(width), int(height)
+
+
+def _focal_lengths(values: Mapping[str, Any], place: str, width: int, height: int) -> tuple[float, float]:
+    """Across and down, pixels; one stands for both where one alone is known, as pixels are square then."""
+    lengths: dict[str, float] = {}
+    for axis, pixels in (("x", width), ("y", height)):
+        if f"fl_{axis}" in values:
+            lengths[axis] = number(values, f"fl_{axis}", place)
+        elif f"camera_angle_{axis}" in values:
+            angle = number(values, f"camera_angle_{axis}", place)
+            if not 0.0 < angle < math.pi:
+                raise InputError(f"{place}: camera_angle_{axis} is {angle:g}", "radians, above 0 and below pi")
+            lengths[axis] = 0.5 * pixels / math.tan(0.5 * angle)
+    if not lengths:
+        raise InputError(f"{place}: neither fl_x nor camera_angle_x", "one of the two", "Add it")
+    return lengths.get("x", lengths.get("y", 0.0)), lengths.get("y", lengths.get("x", 0.0))

@@ -1,0 +1,54 @@
+"""What may be wrong with poses, as changes of them that would set it right."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+Change = Callable[[Float[Tensor, "4 4"]], Float[Tensor, "4 4"]]
+
+#: The poses as they are.
+GIVEN = "given"
+#: No motion at all: what poses must beat to say anything.
+NO_MOTION = "no motion"
+
+
+def _inverse(pose: Tensor) -> Tensor:
+    return torch.linalg.inv(pose)
+
+
+def _transposed(pose: Tensor) -> Tensor:
+    turned = pose.clone()
+    turned[:3, :3] = pose[:3, :3].T
+    return turned
+
+
+def _opposite_translation(pose: Tensor) -> Tensor:
+    moved = pose.clone()
+    moved[:3, 3] = -pose[:3, 3]
+    return moved
+
+
+def _flipped(pose: Tensor) -> Tensor:
+    return pose * pose.new_tensor([1.0, -1.0, -1.0, 1.0])
+
+
+CHANGES: dict[str, Change] = {
+    GIVEN: lambda pose: pose,
+    NO_MOTION: lambda pose: torch.eye(4, dtype=pose.dtype),
+    "world-to-camera": _inverse,
+    "rotation transposed": _transposed,
+    "translation of opposite sign": _opposite_translation,
+    "camera axes y up, z backward": _flipped,
+}
+
+#: What to do where a change sets things right.
+ADVICE = {
+    "world-to-camera": "The poses look like world-to-camera transforms; write camera-to-world, their inverses",
+    "rotation transposed": "The rotations look transposed: rows were taken for columns where the file was written",
+    "translation of opposite sign": "The translations look negated: check the sign in whatever wrote the file",
+    "camera axes y up, z backward": "The camera axes look like OpenGL's; negate the second and third column",
+}

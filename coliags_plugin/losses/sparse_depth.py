@@ -1,0 +1,89 @@
+"""How far the rendered depth is from depth known at single points."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from jaxtyping import Bool, Float
+from pydantic import Field
+from torch import Tensor
+
+from coliags_plugin.contracts import Loss, LossSettings
+from coliags_plugin.gaussians import RenderOutput
+from coliags_plugin.losses.depth import DepthKind
+from coliags_plugin.scenes import Frame, SparseDepth
+
+
+class SparseDepthSettings(LossSettings):
+    """Options of the sparse depth loss."""
+
+    depth: DepthKind = Field(
+        default="depth_expected", description="Which rendered depth is compared; depth_median has no gradient."
+    )
+    huber: float | None = Field(
+        default=None,
+        gt=0.0,
+        description="Differences below this, scene units, count by their square (over twice this), so that noise of "
+        "that size pulls less; null counts all by their length.",
+    )
+
+
+class SparseDepthLoss(Loss):
+    """Mean |D(p) - z| in scene units over the points p of a frame whose z-depth is known (docs/methods.md 4.5).
+
+    The idea is DS-NeRF's (Deng et al., "Depth-supervised NeRF: Fewer Views and Faster Training for Free", CVPR 2022):
+    structure from motion has already found how far its points are. D is interpolated between the four pixels around a
+    point; at the picture's border those that are there stand for those that are not. A point counts where all pixels
+    that enter are valid and show something (alpha > 0).
+    """
+
+    Settings: ClassVar[type[LossSettings]] = SparseDepthSettings
+    needs_sparse_depth: ClassVar[bool] = True
+
+    @property
+    def wants(self) -> frozenset[str]:
+        """The rendered depth that is compared."""
+        return frozenset({self.settings.depth})
+
+    def __call__(self, output: RenderOutput, frame: Frame) -> Float[Tensor, ""]:
+        """The unweighted term, scene units; 0, still part of the graph, where no point counts."""
+        rendered = output[self.settings.depth]
+        if frame.sparse_depth is None or not len(frame.sparse_depth.depth):
+            return rendered.reshape(-1)[:0].sum()
+        drawn = (output.alpha > 0) & frame.valid & torch.isfinite(rendered)
+        if self.settings.depth == "inverse_depth_accumulated":
+            drawn = drawn & (rendered > 0)
+            rendered = 1.0 / torch.where(drawn, rendered, 1.0)
+        sampled, counts = _interpolated(rendered, drawn, frame.sparse_depth)
+        truth = frame.sparse_depth.depth.to(rendered.dtype)
+        difference = torch.where(counts, sampled - truth, 0.0).abs()
+        if (near := self.settings.huber) is not None:
+            difference = torch.where(difference < near, difference.square() / (2.0 * near), difference - 0.5 * near)
+        return difference.sum() / counts.sum().clamp_min(1)
+
+
+def _interpolated(
+    values: Float[Tensor, "H W"], usable: Bool[Tensor, "H W"], points: SparseDepth
+) -> tuple[Float[Tensor, "K"], Bool[Tensor, "K"]]:
+    """A map at points between its pixels, and whether all pixels that enter a point are usable.
+
+    What is not usable may be NaN; it moves no value and no gradient. Points outside the map count as not usable.
+    """
+    height, width = values.shape
+    size = points.pixels.new_tensor([width, height])
+    inside = ((points.pixels >= 0) & (points.pixels <= size)).all(dim=1)
+    # Centres at integers now; beyond the outermost centres the map goes on as it ends.
+    place = torch.minimum((torch.where(inside[:, None], points.pixels, 0.5) - 0.5).clamp_min(0.0), size - 1)
+    corner = torch.minimum(place.floor(), (size - 2).clamp_min(0))
+    share = (place - corner).to(values.dtype)
+    column, row = corner.long().unbind(1)
+    total, counts = values.new_zeros(len(place)), inside
+    for down in (0, 1):
+        for across in (0, 1):
+            weight = (share[:, 0] if across else 1 - share[:, 0]) * (share[:, 1] if down else 1 - share[:, 1])
+            index = ((row + down).clamp_max(height - 1), (column + across).clamp_max(width - 1))
+            fine = usable[index]
+            total = total + weight * torch.where(fine, values[index], 0.0)
+            counts = counts & (fine | (weight == 0))
+    return total, counts

@@ -1,0 +1,269 @@
+"""COLMAP's sparse models, binary and text; here only their poses.
+
+Poses are read without pycolmap: it wants files that poses do not need, names no line, and a binary file cut short makes
+it abort the whole process (4.2.1), which nothing here could turn into a message. Models are written with it.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from coliags_plugin.errors import InputError
+from coliags_plugin.files import atomic_folder
+from coliags_plugin.poses.rigid import inverse, rigid, rotations_from_wxyz, wxyz_from_rotations
+from coliags_plugin.poses.text import placed, read_text, shortened
+from coliags_plugin.poses.trajectory import Intrinsics, Trajectory, natural_order, refuse_repeated
+
+#: Models without distortion by COLMAP's number, with the number of their parameters.
+_PINHOLES = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4)}
+_PARTS = ("cameras", "images", "points3D", "rigs", "frames")
+#: What a folder may hold that a model takes the place of.
+_MODEL_FILES = {f"{part}{suffix}" for part in _PARTS for suffix in (".bin", ".txt")} | {"project.ini"}
+_BINARY_IMAGE = struct.Struct("<I7dI")
+_POINT_BYTES = 24
+
+
+@dataclass(frozen=True)
+class _Image:
+    place: str
+    quat_wxyz: tuple[float, ...]
+    translation: tuple[float, ...]
+    camera: int
+    name: str
+
+
+def read(path: Path) -> Trajectory:
+    """Read the poses of a sparse model, ordered by picture name, 2 before 10.
+
+    Args:
+        path: A folder with ``images`` and ``cameras``, both ``.bin`` or both ``.txt``; binary is preferred.
+
+    Raises:
+        InputError: The files are missing, damaged or empty; or a quaternion is zero or further than 1e-3 from unit
+            length, naming its line or picture; or a picture stands twice.
+    """
+    suffix = _suffix(path)
+    if suffix is None:
+        raise InputError(
+            f"{path} holds no COLMAP model",
+            "a folder with images.bin and cameras.bin, or images.txt and cameras.txt",
+            "Give the folder of the sparse model itself, often sparse/0",
+        )
+    read_images, read_cameras = (
+        (_binary_images, _binary_cameras) if suffix == ".bin" else (_text_images, read_text_cameras)
+    )
+    images = list(read_images(path / f"images{suffix}"))
+    if not images:
+        raise InputError(f"{path / f'images{suffix}'} holds no poses", "at least one registered picture")
+    refuse_repeated([image.name for image in images], str(path / f"images{suffix}"))
+    images = [images[index] for index in natural_order([image.name for image in images])]
+    quats_wxyz = np.array([image.quat_wxyz for image in images])
+    rotations = rotations_from_wxyz(quats_wxyz, lambda index: images[index].place, unit=True)
+    world_to_camera = rigid(rotations, np.array([image.translation for image in images]))
+    intrinsics, remark = _common(read_cameras(path / f"cameras{suffix}"), {image.camera for image in images})
+    return Trajectory(
+        inverse(world_to_camera),
+        names=tuple(image.name for image in images),
+        intrinsics=intrinsics,
+        stored_as=f"world-to-camera translations and quaternions, w first, {'binary' if suffix == '.bin' else 'text'}",
+        remarks=(remark,) if remark else (),
+    )
+
+
+def write(path: Path, trajectory: Trajectory) -> None:
+    """Write a binary model of one PINHOLE camera and no points.
+
+    Raises:
+        InputError: The trajectory has no intrinsics, a name stands twice, the folder holds something other than a
+            COLMAP model, or it cannot be written.
+    """
+    _write(path, trajectory, text=False)
+
+
+def write_text(path: Path, trajectory: Trajectory) -> None:
+    """Write a text model of one PINHOLE camera and no points; as :func:`write`.
+
+    Raises:
+        InputError: As :func:`write`; or a name has blanks, which COLMAP's own reader would cut off.
+    """
+    for name in trajectory.names_or_numbers():
+        if name.split() != [name]:
+            raise InputError(f"the picture name '{name}'", "no blanks in a text model", "Write a binary one: colmap")
+    _write(path, trajectory, text=True)
+
+
+def recognise(path: Path) -> bool:
+    """Whether a folder holds a sparse model."""
+    return _suffix(path) is not None
+
+
+def _suffix(path: Path) -> str | None:
+    for suffix in (".bin", ".txt"):
+        if all((path / f"{part}{suffix}").is_file() for part in ("images", "cameras")):
+            return suffix
+    return None
+
+
+def _write(path: Path, trajectory: Trajectory, text: bool) -> None:
+    if trajectory.intrinsics is None:
+        raise InputError(
+            f"no intrinsics for {path}",
+            "a COLMAP model to hold the camera's intrinsics and picture size",
+            "Pass --intrinsics fx,fy,cx,cy --size WIDTHxHEIGHT",
+        )
+    names = trajectory.names_or_numbers()
+    refuse_repeated(names, str(path))
+    others = sorted(found.name for found in path.iterdir() if found.name not in _MODEL_FILES) if path.is_dir() else []
+    if others:
+        raise InputError(f"{path} holds {others[0]}, which is no part of a COLMAP model", "a folder to itself")
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    pinhole = trajectory.intrinsics
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(
+            camera_id=1,
+            model="PINHOLE",
+            width=pinhole.width,
+            height=pinhole.height,
+            params=[pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy],
+        )
+    )
+    world_to_camera = inverse(trajectory.camera_to_world)
+    quats_wxyz = wxyz_from_rotations(world_to_camera[:, :3, :3])
+    for index, name in enumerate(names):
+        rotation = pycolmap.Rotation3d(quats_wxyz[index, [1, 2, 3, 0]])
+        model.add_image_with_trivial_frame(
+            pycolmap.Image(name=name, camera_id=1, image_id=index + 1),
+            pycolmap.Rigid3d(rotation, world_to_camera[index, :3, 3]),
+        )
+    with atomic_folder(path, overwrite=True) as scratch:
+        (model.write_text if text else model.write_binary)(str(scratch))
+
+
+def _text_images(path: Path) -> Iterator[_Image]:
+    lines = iter(enumerate(read_text(path).splitlines(), start=1))
+    for number, line in lines:
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        place = f"{path}, line {number}"
+        words = line.split(maxsplit=9)
+        try:
+            values = [float(word) for word in words[1:8]]
+            image = _Image(place, tuple(values[:4]), tuple(values[4:]), int(words[8]), words[9].strip())
+            if not np.all(np.isfinite(values)):
+                raise ValueError("not finite")
+        except (ValueError, IndexError) as error:
+            raise InputError(
+                f"{place}: '{shortened(line)}'",
+                "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, all numbers finite",
+                "Each picture has two lines; the second lists its points and may be empty, but must be there",
+            ) from error
+        yield image
+        next(lines, None)  # the picture's points
+
+
+def read_text_cameras(path: Path) -> dict[int, Intrinsics | str]:
+    """The cameras of a ``cameras.txt`` by their number: the pinhole each is, or what it is instead, in words.
+
+    Raises:
+        InputError: The file cannot be read, or a line is no camera; naming the line.
+    """
+    cameras: dict[int, Intrinsics | str] = {}
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            with placed(f"{path}, line {number}"):
+                cameras[int(words[0])] = _camera(words[1], int(words[2]), int(words[3]), [float(w) for w in words[4:]])
+        except (ValueError, IndexError) as error:
+            raise InputError(
+                f"{path}, line {number}: '{shortened(line)}'", "CAMERA_ID MODEL WIDTH HEIGHT PARAMS"
+            ) from error
+    return cameras
+
+
+def _binary_images(path: Path) -> Iterator[_Image]:
+    data = _bytes(path)
+    try:
+        (count,) = struct.unpack_from("<Q", data)
+        at = 8
+        for _ in range(count):
+            number, *values, camera = _BINARY_IMAGE.unpack_from(data, at)
+            end = data.index(b"\0", at + _BINARY_IMAGE.size)
+            name = data[at + _BINARY_IMAGE.size : end].decode()
+            (points,) = struct.unpack_from("<Q", data, end + 1)
+            at = end + 9 + _POINT_BYTES * points
+            if at > len(data) or not np.all(np.isfinite(values)):
+                raise ValueError("out of bounds")
+            yield _Image(f"{path}, picture {number} ({name})", tuple(values[:4]), tuple(values[4:]), camera, name)
+    except (struct.error, ValueError) as error:
+        raise _damaged(path, data) from error
+    if at != len(data):
+        raise _damaged(path, data)
+
+
+def _binary_cameras(path: Path) -> dict[int, Intrinsics | str]:
+    data = _bytes(path)
+    cameras: dict[int, Intrinsics | str] = {}
+    try:
+        (count,) = struct.unpack_from("<Q", data)
+        at = 8
+        for _ in range(count):
+            number, model, width, height = struct.unpack_from("<IiQQ", data, at)
+            if model not in _PINHOLES:
+                # How long its parameters are is not known here, and no pinhole can be common to all pictures any more.
+                cameras[number] = f"camera {number} is COLMAP's model {model}"
+                return cameras
+            name, parameters = _PINHOLES[model]
+            values = struct.unpack_from(f"<{parameters}d", data, at + 24)
+            with placed(f"{path}, camera {number}"):
+                cameras[number] = _camera(name, width, height, list(values))
+            at += 24 + 8 * parameters
+    except struct.error as error:
+        raise _damaged(path, data) from error
+    return cameras
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error}", "a file of a COLMAP model") from error
+
+
+def _damaged(path: Path, data: bytes) -> InputError:
+    return InputError(
+        f"{path} ({len(data)} bytes) is damaged or cut short", "a file written by COLMAP", "Copy it again"
+    )
+
+
+def _camera(model: str, width: int, height: int, parameters: list[float]) -> Intrinsics | str:
+    """The pinhole, or what it is instead."""
+    if model == "PINHOLE":
+        fx, fy, cx, cy = parameters
+    elif model == "SIMPLE_PINHOLE":
+        fx, cx, cy = parameters
+        fy = fx
+    else:
+        return f"the camera is {model}"
+    return Intrinsics(fx, fy, cx, cy, width, height)
+
+
+def _common(cameras: dict[int, Intrinsics | str], used: set[int]) -> tuple[Intrinsics | None, str]:
+    """The pinhole that took every picture; or None, and why there is none."""
+    found = [cameras[number] for number in sorted(used) if number in cameras]
+    others = [camera for camera in cameras.values() if isinstance(camera, str)]
+    if len(found) < len(used) or any(isinstance(camera, str) for camera in found):
+        reason = others[0] if others else "the model lacks a camera that a picture names"
+        return None, f"no intrinsics: {reason}, not an undistorted pinhole"
+    pinholes = {camera for camera in found if isinstance(camera, Intrinsics)}
+    if len(pinholes) > 1:
+        return None, f"no intrinsics: the pictures have {len(pinholes)} different cameras"
+    return pinholes.pop(), ""

@@ -1,0 +1,278 @@
+"""EndoGSLAM's ``params.npz``: estimated poses, true poses and a cloud of isotropic Gaussians in one file.
+
+Its world is the first camera of the sequence, its lengths are mm, its poses world-to-camera.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from coliags_plugin.errors import InputError
+from coliags_plugin.files import atomic_write
+from coliags_plugin.poses.rigid import check_rigid, inverse, rigid, rotations_from_wxyz, wxyz_from_rotations
+from coliags_plugin.poses.text import head, placed
+from coliags_plugin.poses.trajectory import Intrinsics, Trajectory
+
+#: Key -> shapes it may have; a letter is one number throughout the file, F that of the poses.
+SHAPES: dict[str, tuple[tuple[int | str, ...], ...]] = {
+    "cam_unnorm_rots": ((1, 4, "F"),),
+    "cam_trans": ((1, 3, "F"),),
+    "gt_w2c_all_frames": (("F", 4, 4),),
+    "intrinsics": ((3, 3),),
+    "org_width": ((), (1,)),
+    "org_height": ((), (1,)),
+    "means3D": (("N", 3),),
+    "rgb_colors": (("N", 3),),
+    "log_scales": (("N", 1), ("N", 3)),
+    "keyframe_time_indices": (("K",),),
+}
+_POSES = ("cam_unnorm_rots", "cam_trans")
+_PINHOLE = ("intrinsics", "org_width", "org_height")
+#: EndoGSLAM holds out frames 7, 15, 23, ... unless told otherwise.
+_HELD_OUT_EVERY = 8
+
+
+@dataclass(frozen=True, eq=False)
+class EndoGslamParams:
+    """What a ``params.npz`` holds, in this package's conventions.
+
+    Attributes:
+        camera_to_world: Estimated poses, rigid, OpenCV axes; world: the first camera; mm. [F, 4, 4]
+        true_camera_to_world: The data set's poses of the same frames in the same world. [F, 4, 4]
+        intrinsics: K as stored, pixels, pixel centres at INTEGERS. [3, 3]
+        width, height: Picture size, pixels.
+        means: Centres of the Gaussians, world, mm; N may be 0. float64. [N, 3]
+        rgb_colors: Colours, nominally in [0, 1]; may lie a little outside. float64. [N, 3]
+        log_scales: Logarithms of the standard deviations in mm; one column where Gaussians are isotropic.
+            [N, 1] or [N, 3]
+        keyframes: Which of the F frames were keyframes. [K]
+    """
+
+    camera_to_world: Float[np.ndarray, "F 4 4"]
+    true_camera_to_world: Float[np.ndarray, "F 4 4"]
+    intrinsics: Float[np.ndarray, "3 3"]
+    width: int
+    height: int
+    means: Float[np.ndarray, "N 3"]
+    rgb_colors: Float[np.ndarray, "N 3"]
+    log_scales: Float[np.ndarray, "N C"]
+    keyframes: Int[np.ndarray, "K"]
+
+    @property
+    def pinhole(self) -> Intrinsics:
+        """The intrinsics with pixel centres at integers + 0.5.
+
+        Raises:
+            InputError: They are those of no pinhole.
+        """
+        return _pinhole(self.intrinsics, self.width, self.height)
+
+
+def read_params(path: Path) -> EndoGslamParams:
+    """Read a whole ``params.npz``.
+
+    Raises:
+        InputError: It is no NPZ, or keys are missing, misshaped, not numbers or not finite (all of them are named); or
+            a pose is no rigid transform.
+    """
+    arrays = _arrays(path, tuple(SHAPES))
+    return EndoGslamParams(
+        camera_to_world=_estimate(path, arrays),
+        true_camera_to_world=_truth(path, arrays),
+        intrinsics=arrays["intrinsics"],
+        width=int(arrays["org_width"].item()),
+        height=int(arrays["org_height"].item()),
+        means=arrays["means3D"],
+        rgb_colors=arrays["rgb_colors"],
+        log_scales=arrays["log_scales"],
+        keyframes=arrays["keyframe_time_indices"].astype(np.int64),
+    )
+
+
+def read(path: Path) -> Trajectory:
+    """Read the estimated poses, and nothing else but the intrinsics.
+
+    Raises:
+        InputError: As :func:`read_params`, about the keys needed here.
+    """
+    arrays = _arrays(path, _POSES, optional=_PINHOLE)
+    camera_to_world = _estimate(path, arrays)
+    untouched = np.all(arrays["cam_trans"][0] == 0.0, axis=0) & np.all(arrays["cam_unnorm_rots"][0, 1:] == 0.0, axis=0)
+    tail = len(untouched) - 1 - int(np.flatnonzero(~untouched)[-1]) if not untouched.all() else 0
+    remarks = [f"the last {tail} poses are the identity: was the run stopped early?"] if tail > 1 else []
+    return _trajectory(path, arrays, camera_to_world, "world-to-camera translations and quaternions, w first", remarks)
+
+
+def read_truth(path: Path) -> Trajectory:
+    """Read the data set's poses that EndoGSLAM kept beside its own.
+
+    Raises:
+        InputError: As :func:`read_params`, about the keys needed here.
+    """
+    arrays = _arrays(path, ("gt_w2c_all_frames",), optional=_PINHOLE)
+    return _trajectory(path, arrays, _truth(path, arrays), "world-to-camera matrices", [])
+
+
+def write(path: Path, trajectory: Trajectory) -> None:
+    """Write a ``params.npz`` that holds poses and intrinsics, and no Gaussians.
+
+    The world becomes the first camera, as the format has it. Both the estimate and the true poses are the trajectory:
+    readers differ in which of the two they take. Poses are float32, as EndoGSLAM's.
+
+    Raises:
+        InputError: The trajectory has no intrinsics, or the folder cannot be written.
+    """
+    if trajectory.intrinsics is None:
+        raise InputError(
+            f"no intrinsics for {path}",
+            "a params.npz to hold the camera's intrinsics and picture size",
+            "Pass --intrinsics fx,fy,cx,cy --size WIDTHxHEIGHT",
+        )
+    pinhole = trajectory.intrinsics
+    # World to first camera, then first camera to each camera.
+    world_to_camera = inverse(trajectory.camera_to_world) @ trajectory.camera_to_world[0]
+    world_to_camera[0] = np.eye(4)
+    quats_wxyz = wxyz_from_rotations(world_to_camera[:, :3, :3])
+    arrays = {
+        "cam_unnorm_rots": quats_wxyz.T[None].astype(np.float32),
+        "cam_trans": world_to_camera[:, :3, 3].T[None].astype(np.float32),
+        "gt_w2c_all_frames": world_to_camera.astype(np.float32),
+        "w2c": np.eye(4, dtype=np.float32),
+        "intrinsics": np.array(
+            [[pinhole.fx, 0.0, pinhole.cx - 0.5], [0.0, pinhole.fy, pinhole.cy - 0.5], [0.0, 0.0, 1.0]], np.float32
+        ),
+        "org_width": np.array(pinhole.width),
+        "org_height": np.array(pinhole.height),
+        "means3D": np.zeros((0, 3), np.float32),
+        "rgb_colors": np.zeros((0, 3), np.float32),
+        "unnorm_rotations": np.zeros((0, 4), np.float32),
+        "logit_opacities": np.zeros((0, 1), np.float32),
+        "log_scales": np.zeros((0, 1), np.float32),
+        "timestep": np.zeros((0,), np.float32),
+        "keyframe_time_indices": np.zeros((0,), np.int64),
+    }
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **arrays)
+    atomic_write(path, buffer.getvalue())
+
+
+def recognise(path: Path) -> bool:
+    """Whether a file is a ZIP archive, which is what NPZ is."""
+    return head(path).startswith(b"PK\x03\x04")
+
+
+def image_indices(poses: int, images: int) -> Int[np.ndarray, "F"] | None:
+    """Which pictures of a sequence EndoGSLAM's poses belong to.
+
+    Its default config is given only training frames, so that a file may hold 7/8 of the sequence's poses.
+
+    Args:
+        poses: Number of poses in the file.
+        images: Number of pictures of the sequence.
+
+    Returns:
+        The picture of each pose: all of them, or all but 7, 15, 23, ...; None where the numbers fit neither. [F]
+    """
+    every = np.arange(images)
+    if poses == images:
+        return every
+    training = every[every % _HELD_OUT_EVERY != _HELD_OUT_EVERY - 1]
+    return training if poses == len(training) else None
+
+
+def _trajectory(
+    path: Path, arrays: dict[str, np.ndarray], camera_to_world: np.ndarray, stored_as: str, remarks: list[str]
+) -> Trajectory:
+    if missing := [key for key in _PINHOLE if key not in arrays]:
+        intrinsics = None
+        remarks = [*remarks, f"no intrinsics: the file has no {', '.join(missing)}"]
+    else:
+        width, height = (int(arrays[key].item()) for key in ("org_width", "org_height"))
+        with placed(str(path)):
+            intrinsics = _pinhole(arrays["intrinsics"], width, height)
+    return Trajectory(camera_to_world, intrinsics=intrinsics, stored_as=stored_as, remarks=tuple(remarks))
+
+
+def _pinhole(matrix: np.ndarray, width: int, height: int) -> Intrinsics:
+    fx, fy, cx, cy = (float(matrix[row, column]) for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    # EndoGSLAM unprojects pixel u as (u - cx) / fx: its pixel centres are integers.
+    return Intrinsics(fx, fy, cx + 0.5, cy + 0.5, width, height)
+
+
+def _estimate(path: Path, arrays: dict[str, np.ndarray]) -> np.ndarray:
+    quats_wxyz = arrays["cam_unnorm_rots"][0].T
+    rotations = rotations_from_wxyz(quats_wxyz, lambda index: f"{path}, cam_unnorm_rots, frame {index}", unit=False)
+    return inverse(rigid(rotations, arrays["cam_trans"][0].T))
+
+
+def _truth(path: Path, arrays: dict[str, np.ndarray]) -> np.ndarray:
+    world_to_camera = arrays["gt_w2c_all_frames"]
+    check_rigid(world_to_camera, lambda index: f"{path}, gt_w2c_all_frames, frame {index}")
+    return inverse(world_to_camera)
+
+
+def _arrays(path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> dict[str, np.ndarray]:
+    """The named arrays, float64, their shapes and values checked; optional ones where they are there."""
+    arrays: dict[str, np.ndarray] = {}
+    faults: list[str] = []
+    try:
+        loaded = np.load(path, allow_pickle=False)
+        if not isinstance(loaded, np.lib.npyio.NpzFile):
+            raise ValueError("it is a single array")
+        with loaded as archive:
+            for key in (*required, *optional):
+                if key not in archive.files:
+                    faults += [f"no {key}"] if key in required else []
+                    continue
+                try:
+                    arrays[key] = archive[key]
+                except ValueError:
+                    faults.append(f"{key} is no array of numbers")
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(f"cannot read {path}: {error}", "a params.npz written by EndoGSLAM") from error
+    sizes: dict[str, int] = {}
+    for key, array in list(arrays.items()):
+        fault = _fault(key, array, sizes)
+        if fault:
+            faults.append(fault)
+        else:
+            arrays[key] = array.astype(np.float64)
+    if sizes.get("F") == 0:
+        faults.append("no frames")
+    if faults:
+        raise InputError(
+            f"{path}: {'; '.join(faults)}",
+            "a params.npz as EndoGSLAM writes it at the end of a run",
+            "Let EndoGSLAM finish, and give the params.npz of its working folder",
+        )
+    return arrays
+
+
+def _fault(key: str, array: np.ndarray, sizes: dict[str, int]) -> str:
+    """What is wrong with an array, or nothing; remembers the sizes that letters stand for."""
+    if not (np.issubdtype(array.dtype, np.number) and not np.iscomplexobj(array)):
+        return f"{key} holds {array.dtype}, not numbers"
+    for shape in SHAPES[key]:
+        expected = tuple(sizes.get(size, size) if isinstance(size, str) else size for size in shape)
+        fits = len(expected) == array.ndim and all(
+            isinstance(want, str) or want == have for want, have in zip(expected, array.shape, strict=True)
+        )
+        if fits:
+            sizes.update((size, have) for size, have in zip(shape, array.shape, strict=True) if isinstance(size, str))
+            break
+    else:
+        wanted = " or ".join(_shape(shape, sizes) for shape in SHAPES[key])
+        return f"{key} has the shape {list(array.shape)}, not {wanted}"
+    return "" if np.all(np.isfinite(array)) else f"{key} holds numbers that are not finite"
+
+
+def _shape(shape: tuple[int | str, ...], sizes: dict[str, int]) -> str:
+    return f"[{', '.join(str(sizes.get(size, size)) if isinstance(size, str) else str(size) for size in shape)}]"

@@ -1,0 +1,123 @@
+"""The pose formats by name, and which of them a file is in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from coliags_plugin.errors import InputError, did_you_mean
+from coliags_plugin.poses import c3vd, colmap, endogslam, nerfstudio, tum
+from coliags_plugin.poses.text import count_first_numbers
+from coliags_plugin.poses.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class Format:
+    """One kind of pose file.
+
+    Attributes:
+        name: What it is called on the command line.
+        read: Reads a file, or a folder, of the kind.
+        write: Writes one in place of what is there, or None where the kind is only read.
+        recognise: Whether a path is of this kind, by content; None where another format answers for it.
+        unit: Its unit of length, or ``"units"`` where the format fixes none.
+        keeps: What it keeps beside the poses: ``names``, ``timestamps``, ``intrinsics``.
+        folder: Whether it is a folder of files.
+    """
+
+    name: str
+    read: Callable[[Path], Trajectory]
+    write: Callable[[Path, Trajectory], None] | None
+    recognise: Callable[[Path], bool] | None
+    unit: str
+    keeps: frozenset[str]
+    folder: bool = False
+
+
+_PINHOLE = frozenset({"intrinsics"})
+_NAMED = frozenset({"names", "intrinsics"})
+
+FORMATS: dict[str, Format] = {
+    kind.name: kind
+    for kind in (
+        Format("c3vd", c3vd.read, c3vd.write, c3vd.recognise, "mm", frozenset()),
+        Format("tum", tum.read, tum.write, tum.recognise, "units", frozenset({"timestamps"})),
+        Format("endogslam", endogslam.read, endogslam.write, endogslam.recognise, "mm", _PINHOLE),
+        Format("endogslam-truth", endogslam.read_truth, None, None, "mm", _PINHOLE),
+        Format("colmap", colmap.read, colmap.write, colmap.recognise, "units", _NAMED, folder=True),
+        Format("colmap-text", colmap.read, colmap.write_text, None, "units", _NAMED, folder=True),
+        Format("nerfstudio", nerfstudio.read, nerfstudio.write, nerfstudio.recognise, "units", _NAMED),
+    )
+}
+
+
+def format_named(name: str) -> Format:
+    """The format of a name.
+
+    Raises:
+        InputError: There is none.
+    """
+    if name not in FORMATS:
+        raise InputError(f"no pose format '{name}'", f"one of {', '.join(FORMATS)}", did_you_mean(name, FORMATS))
+    return FORMATS[name]
+
+
+def format_of(path: Path, name: str | None = None) -> Format:
+    """The format of a file or folder.
+
+    Args:
+        path: A file or folder that is there.
+        name: The format, where it is known; otherwise content tells.
+
+    Raises:
+        InputError: There is no such path or format; a file is given for a format that is a folder, or the other way
+            round; or the content is none of the formats.
+    """
+    if not path.exists():
+        raise InputError(f"no file or folder {path}", "poses")
+    if name is not None:
+        known = format_named(name)
+        if path.is_dir() and not known.folder:
+            raise InputError(f"{path} is a folder", f"the {known.name} file itself")
+        return known
+    for known in FORMATS.values():
+        if known.recognise is not None and known.recognise(path):
+            return known
+    if path.is_dir():
+        held = sorted(found.name for found in path.iterdir())
+        shown = f"{', '.join(held[:3])}{f' and {len(held) - 3} more' if len(held) > 3 else ''}" if held else "nothing"
+        raise InputError(f"{path} holds {shown}", "the folder of a COLMAP model, or a pose file inside a folder")
+    count = count_first_numbers(path)
+    raise InputError(
+        f"{path} is no pose file known here: its first line holds "
+        + (f"{count} numbers" if count is not None else "no row of numbers"),
+        "16 numbers a line (c3vd), 8 (tum), a params.npz (endogslam) or a transforms.json (nerfstudio)",
+    )
+
+
+def write_trajectory(path: Path, trajectory: Trajectory, name: str, overwrite: bool = False) -> None:
+    """Write a trajectory, whole or not at all.
+
+    Args:
+        path: Where to; its folder is made.
+        trajectory: What to write.
+        name: The format.
+        overwrite: Replace what is there; of folders, nothing but a COLMAP model.
+
+    Raises:
+        InputError: There is no such format or it is only read; the path exists and ``overwrite`` is off; or as the
+            format's writer.
+    """
+    known = format_named(name)
+    if known.write is None:
+        writable = [other.name for other in FORMATS.values() if other.write is not None]
+        raise InputError(f"'{name}' is only read", f"one of {', '.join(writable)}")
+    if path.exists() and path.is_dir() != known.folder:
+        raise InputError(
+            f"{path} is a {'folder' if path.is_dir() else 'file'}",
+            f"a new {'folder' if known.folder else 'file'}, as {name} poses are one",
+        )
+    if path.exists() and not overwrite and not (path.is_dir() and not any(path.iterdir())):
+        raise InputError(f"{path} already exists", "a new place", "Choose another, or pass --overwrite")
+    known.write(path, trajectory)

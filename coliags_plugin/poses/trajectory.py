@@ -1,0 +1,148 @@
+"""A camera trajectory, whatever file it came from."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from coliags_plugin.errors import InputError
+from coliags_plugin.poses.rigid import check_rigid
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """An undistorted pinhole that took every picture of a trajectory.
+
+    Attributes:
+        fx, fy: Focal lengths, pixels.
+        cx, cy: Principal point, pixels, pixel centres at integers + 0.5.
+        width, height: Picture size, pixels.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        """Refuse what is no pinhole.
+
+        Raises:
+            InputError: A number is not finite, or a focal length or size not positive.
+        """
+        numbers = (self.fx, self.fy, self.cx, self.cy)
+        if not all(map(math.isfinite, numbers)) or min(self.fx, self.fy, self.width, self.height) <= 0:
+            raise InputError(
+                f"intrinsics fx {self.fx:g}, fy {self.fy:g}, cx {self.cx:g}, cy {self.cy:g} "
+                f"of a picture {self.width} x {self.height}",
+                "finite numbers in pixels, focal lengths and size positive",
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """The poses of a camera, in the order of the video.
+
+    Attributes:
+        camera_to_world: Rigid, OpenCV axes (x right, y down, z forward); lengths and world as in the file, unless a
+            remark says otherwise. float64. [N, 4, 4]
+        names: The picture of each pose, as the file calls it, or None.
+        timestamps: When each picture was taken, s, or None. float64. [N]
+        intrinsics: The pinhole that took all pictures, or None where it is unknown or there are several.
+        stored_as: How the file stored the poses, for whoever reads along.
+        remarks: What was changed, or left behind, when the file was read.
+    """
+
+    camera_to_world: Float[np.ndarray, "N 4 4"]
+    names: tuple[str, ...] | None = None
+    timestamps: Float[np.ndarray, "N"] | None = None
+    intrinsics: Intrinsics | None = None
+    stored_as: str = ""
+    remarks: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse poses that are none, and names or times that do not belong to them.
+
+        Raises:
+            InputError: There is no pose; one is not rigid, right-handed and finite; or names or timestamps are not one
+                for each pose, or not finite.
+        """
+        matrices = np.asarray(self.camera_to_world, dtype=np.float64)
+        if matrices.ndim != 3 or matrices.shape[1:] != (4, 4) or not len(matrices):
+            raise InputError(f"poses of the shape {list(matrices.shape)}", "[N, 4, 4], at least one")
+        check_rigid(matrices, lambda index: f"pose {index}")
+        object.__setattr__(self, "camera_to_world", matrices)
+        if self.names is not None and len(self.names) != len(matrices):
+            raise InputError(f"{len(self.names)} names for {len(matrices)} poses", "one for each")
+        if self.timestamps is not None:
+            timestamps = np.asarray(self.timestamps, dtype=np.float64)
+            if timestamps.shape != (len(matrices),) or not np.all(np.isfinite(timestamps)):
+                raise InputError(
+                    f"timestamps of the shape {list(timestamps.shape)} for {len(matrices)} poses",
+                    "one finite number for each",
+                )
+            object.__setattr__(self, "timestamps", timestamps)
+
+    def __len__(self) -> int:
+        """Number of poses."""
+        return len(self.camera_to_world)
+
+    @property
+    def centers(self) -> Float[np.ndarray, "N 3"]:
+        """Camera centres in the world. [N, 3]"""
+        return self.camera_to_world[:, :3, 3]
+
+    @property
+    def rotations(self) -> Float[np.ndarray, "N 3 3"]:
+        """Camera-to-world rotations. [N, 3, 3]"""
+        return self.camera_to_world[:, :3, :3]
+
+    def summary(self, unit: str = "units") -> str:
+        """Count, length and looking direction in one line: a wrong convention shows in them first.
+
+        Args:
+            unit: What to call the unit of length.
+        """
+        steps = np.linalg.norm(np.diff(self.centers, axis=0), axis=1)
+        mean_step = float(steps.mean()) if len(steps) else 0.0
+        x, y, z = self.rotations[:, :, 2].mean(axis=0)
+        return (
+            f"{len(self)} poses, path {steps.sum():.4g} {unit}, mean step {mean_step:.3g} {unit}, "
+            f"mean looking direction ({x:.2f}, {y:.2f}, {z:.2f})"
+        )
+
+    def names_or_numbers(self) -> tuple[str, ...]:
+        """The names, or ``0000.png``, ``0001.png``, ... where there are none."""
+        return self.names if self.names is not None else tuple(f"{index:04d}.png" for index in range(len(self)))
+
+
+def natural_order(names: Sequence[str]) -> list[int]:
+    """Indices that sort names as people count: 2 before 10. Equal names keep their order."""
+    return sorted(range(len(names)), key=lambda index: _natural(names[index]))
+
+
+def refuse_repeated(names: Sequence[str], place: str) -> None:
+    """Refuse a name that stands twice.
+
+    Raises:
+        InputError: Naming it, and the two places it has in ``names``.
+    """
+    first: dict[str, int] = {}
+    for index, name in enumerate(names):
+        if first.setdefault(name, index) != index:
+            raise InputError(
+                f"{place}: '{name}' stands twice (poses {first[name]} and {index})", "one pose for each picture"
+            )
+
+
+def _natural(name: str) -> tuple[list[tuple[int, int, str]], str]:
+    # Numbers before words; the name itself last, so that 01 and 1 have an order.
+    parts = [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.findall(r"\d+|\D+", name)]
+    return parts, name

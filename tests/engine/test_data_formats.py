@@ -1,0 +1,82 @@
+"""Which data manager reads a folder."""
+
+from __future__ import annotations
+
+import pytest
+
+from coliags_plugin import registry
+from coliags_plugin.components import make_component
+from coliags_plugin.datamanagers.phantom.generate import generate
+from coliags_plugin.datamanagers.phantom.layouts import LAYOUTS
+from coliags_plugin.datamanagers.phantom.settings import phantom_settings
+from coliags_plugin.engine.data_formats import chosen_datamanager, find_format, load_method_for, open_scene
+from coliags_plugin.errors import InputError
+from tests.scenes import write_wall
+
+#: Layouts of the phantom whose name is not their format's.
+FORMAT_OF = {"c3vd-raw": "c3vd", "endogslam": "c3vd-endogslam", "pr-endo": "c3vd-endogslam"}
+
+
+@pytest.fixture(scope="module")
+def wall(tmp_path_factory):
+    return write_wall(tmp_path_factory.mktemp("data") / "wall", frames=9)
+
+
+@pytest.mark.parametrize("layout", sorted(LAYOUTS))
+def test_every_layout_is_recognised_by_one_format_and_loads(layout, tmp_path):
+    settings = {"layout": layout, "width": 64, "height": 52, "frames": 9, "rotation_views": 2, "path_length": 5.0}
+    output = tmp_path / "colon"
+    generate(phantom_settings(settings), output)
+    folder = next((path for path in output.rglob("color") if layout == "pr-endo"), output / "color").parent
+    assert find_format(folder) == FORMAT_OF.get(layout, layout)
+    scene = open_scene(folder)
+    assert scene.provenance["dataset"] == FORMAT_OF.get(layout, layout)
+    assert scene.train[0].image.shape == (52, 64, 3)
+    assert len(scene.points) > 100
+
+
+def test_every_format_has_a_phantom_layout():
+    formats = {name for name in registry.datamanagers if registry.datamanagers.source(name) == "built in"}
+    assert {FORMAT_OF.get(layout, layout) for layout in LAYOUTS} == formats - {"auto"}
+
+
+def test_nothing_and_two_things_are_refused(wall, tmp_path, monkeypatch):
+    with pytest.raises(InputError, match="no folder"):
+        find_format(tmp_path / "gone")
+    (tmp_path / "holiday.jpg").touch()
+    with pytest.raises(InputError, match=r"holds holiday\.jpg, which none of the formats"):
+        find_format(tmp_path)
+
+    class Claims:
+        @classmethod
+        def recognise(cls, path):
+            return "everything is mine"
+
+    monkeypatch.setitem(registry.datamanagers._targets, "greedy", Claims)
+    with pytest.raises(InputError, match=r"several formats \(c3vd: camera_pose.txt.*greedy: everything is mine"):
+        find_format(wall)
+
+
+def test_auto_passes_on_what_was_set(wall):
+    auto = make_component("datamanagers", {"name": "auto", "points_count": 77})
+    found = chosen_datamanager(auto, wall)
+    assert (found.name, found.settings.points_count) == ("c3vd", 77)
+    assert chosen_datamanager(found, wall) is found
+
+
+def test_options_of_the_folders_own_format_may_be_set(wall):
+    method = load_method_for(wall, "coliags", ["datamanager.lens=fisheye", "datamanager.points_count=5"])
+    assert method.config.datamanager.name == "c3vd"
+    assert method.config.datamanager.settings.lens == "fisheye"
+    assert method.config.datamanager.settings.points_count == 5
+    named = load_method_for(wall / "gone", "coliags", [], "c3vd")
+    assert named.config.datamanager.name == "c3vd"
+    with pytest.raises(InputError, match="Did you mean 'c3vd'"):
+        load_method_for(wall, "coliags", [], "c3dv")
+
+
+def test_options_without_a_method(wall):
+    assert len(open_scene(wall, options=["split=all-train", "max_frames=4"]).train) == 4
+    for options, told in [(["splti=own"], "splti"), (["max_frames=none"], "max_frames"), (["x"], "key.path=value")]:
+        with pytest.raises(InputError, match=told):
+            open_scene(wall, options=options)

@@ -1,0 +1,185 @@
+"""Depth at single points: sampling against torch's own, what counts, and training with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch.nn.functional import grid_sample, huber_loss
+
+from coliags_plugin import registry
+from coliags_plugin.config import load_method
+from coliags_plugin.engine.run_folder import RunFolder
+from coliags_plugin.engine.trainer import Trainer
+from coliags_plugin.errors import InputError
+from coliags_plugin.scenes import SparseDepth
+from tests.scenes import SMALL, wall_scene
+
+HEIGHT, WIDTH = 7, 9
+
+
+def make(**options):
+    loss = registry.losses.get("sparse-depth")
+    return loss(loss.Settings(weight=1.0, **options))
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture
+def rendered(generator):
+    return (20 + 10 * torch.rand(HEIGHT, WIDTH, generator=generator, dtype=torch.float64)).requires_grad_()
+
+
+@pytest.fixture
+def case(make_output, make_frame):
+    """The loss of a rendered depth at points."""
+
+    def term(rendered, pixels, depth, alpha=None, mask=None, kind="depth_expected", **options):
+        height, width = rendered.shape
+        output = make_output(torch.zeros(height, width, 3), **{kind: rendered})
+        if alpha is not None:
+            output = replace(output, alpha=alpha)
+        frame = make_frame(torch.zeros(height, width, 3, dtype=torch.uint8), mask=mask)
+        points = SparseDepth(torch.as_tensor(pixels), torch.as_tensor(depth))
+        return make(depth=kind, **options)(output, replace(frame, sparse_depth=points))
+
+    return term
+
+
+def random_points(generator, count=200):
+    size = torch.tensor([WIDTH, HEIGHT], dtype=torch.float64)
+    return torch.rand(count, 2, generator=generator, dtype=torch.float64) * size, 20 + 10 * torch.rand(
+        count, generator=generator, dtype=torch.float64
+    )
+
+
+def test_sampling_is_torchs_with_pixel_centres_at_one_half(case, rendered, generator):
+    pixels, depth = random_points(generator)
+    size = torch.tensor([WIDTH, HEIGHT])
+    grid = (2 * pixels / size - 1)[None, None]
+    expected = grid_sample(rendered[None, None], grid, padding_mode="border", align_corners=False)[0, 0, 0]
+    term = case(rendered, pixels, depth)
+    assert term.item() == pytest.approx((expected - depth).abs().mean().item(), abs=1e-12)
+    (gradient,) = torch.autograd.grad((expected - depth).abs().mean(), rendered, retain_graph=True)
+    term.backward()
+    torch.testing.assert_close(rendered.grad, gradient)
+
+
+def test_a_point_on_a_pixel_centre_is_that_pixel(case, rendered):
+    term = case(rendered, [[3.5, 2.5]], [0.0])
+    term.backward()
+    assert term.item() == rendered[2, 3].item()
+    assert rendered.grad.nonzero().tolist() == [[2, 3]]
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0), (WIDTH, HEIGHT), (0.2, 6.9), (8.99, 0.0)])
+def test_edges_of_the_picture_take_the_outermost_pixels(case, rendered, place):
+    at = rendered[min(int(place[1]), HEIGHT - 1), min(int(place[0]), WIDTH - 1)]
+    assert case(rendered, [place], [0.0]).item() == pytest.approx(at.item())
+
+
+@pytest.mark.parametrize("outside", [(-0.1, 3.0), (4.0, 7.1), (torch.nan, 2.0)])
+def test_points_outside_do_not_count(case, rendered, outside):
+    inside = case(rendered, [[4.0, 3.0]], [25.0])
+    assert case(rendered, [[4.0, 3.0], outside], [25.0, 1e9]) == inside
+
+
+@pytest.mark.parametrize("spoilt", ["alpha", "mask", "nan"])
+def test_a_point_counts_only_where_all_its_pixels_show_something(case, rendered, spoilt):
+    pixels, depth = [[2.0, 2.0], [6.5, 4.5], [6.5, 5.0]], [0.0, 0.0, 0.0]
+    alpha, mask = torch.ones(HEIGHT, WIDTH), torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+    values = rendered.detach().clone()
+    # One of the four pixels around the first point; and a neighbour of weight 0 of the second.
+    for row, column in ((1, 2), (5, 6)):
+        values[row, column] = torch.nan
+        alpha[row, column] = 0.0 if spoilt == "alpha" else 1.0
+        mask[row, column] = spoilt != "mask"
+    values.requires_grad_()
+    term = case(values, pixels, depth, alpha, mask)
+    term.backward()
+    assert term.item() == pytest.approx(values[4, 6].item())
+    assert values.grad.nonzero().tolist() == [[4, 6]]
+
+
+def test_nothing_to_compare_is_zero_and_keeps_the_graph(case, rendered, make_output, make_frame):
+    frame = make_frame(torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8))
+    output = make_output(torch.zeros(HEIGHT, WIDTH, 3), depth_expected=rendered)
+    empty = SparseDepth(torch.zeros(0, 2), torch.zeros(0))
+    terms = [make()(output, frame), make()(output, replace(frame, sparse_depth=empty))]
+    terms.append(case(rendered, [[3.0, 3.0]], [5.0], alpha=torch.zeros(HEIGHT, WIDTH)))
+    for term in terms:
+        assert term.item() == 0.0
+        assert term.dtype == rendered.dtype
+        (gradient,) = torch.autograd.grad(term, rendered)
+        assert not gradient.any()
+
+
+def test_huber_is_torchs_scaled_to_a_slope_of_one(case, rendered, generator):
+    pixels = torch.stack(torch.meshgrid(torch.arange(WIDTH), torch.arange(HEIGHT), indexing="xy"), -1).reshape(-1, 2)
+    depth = 20 + 10 * torch.rand(len(pixels), generator=generator, dtype=torch.float64)
+    expected = huber_loss(rendered.reshape(-1), depth, delta=2.5) / 2.5
+    assert case(rendered, pixels + 0.5, depth, huber=2.5).item() == pytest.approx(expected.item())
+
+
+def test_inverse_depth_is_inverted_and_emptiness_left_out(case):
+    inverse = torch.tensor([[0.05, 0.0], [0.04, 0.02]], requires_grad=True)
+    term = case(inverse, [[0.5, 0.5], [1.5, 0.5]], [18.0, 18.0], kind="inverse_depth_accumulated")
+    term.backward()
+    assert term.item() == pytest.approx(2.0)
+    assert inverse.grad.tolist() == [[pytest.approx(-400.0), 0.0], [0.0, 0.0]]
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 6), (5, 1)])
+def test_pictures_of_one_row_or_column(case, size):
+    rendered = torch.arange(1.0, 1.0 + size[0] * size[1]).reshape(size)
+    assert case(rendered, [[0.5, 0.5]], [0.0]).item() == 1.0
+    assert case(rendered, [[size[1] - 0.5, size[0] - 0.5]], [0.0]).item() == rendered[-1, -1].item()
+
+
+def test_what_it_asks_for():
+    assert make().wants == {"depth_expected"}
+    assert make(depth="depth_accumulated").wants == {"depth_accumulated"}
+    assert make().needs_sparse_depth
+    assert not make().needs_depth
+
+
+# Training with it
+
+SPARSE = ("losses.depth=null", "losses.sparse_depth={name: sparse-depth, weight: 1.0}")
+
+
+def sparse_scene():
+    """The wall without dense depth, its depth known at a grid of places instead."""
+    scene = wall_scene()
+    for name in ("train", "test"):
+        frames = scene.train if name == "train" else scene.test_sets["test"]
+        for index, frame in enumerate(frames):
+            row, column = torch.meshgrid(torch.arange(1, 24, 3), torch.arange(1, 32, 3), indexing="ij")
+            pixels = torch.stack([column, row], -1).reshape(-1, 2) + 0.5
+            sparse = SparseDepth(pixels, frame.depth[row, column].reshape(-1))
+            frames[index] = replace(frame, depth=None, sparse_depth=sparse)
+    return scene
+
+
+def trainer(folder, scene, overrides=SPARSE, steps=40):
+    method = load_method("coliags", [*SMALL, f"schedule.steps={steps}", *overrides])
+    return Trainer(method, scene, "wall", RunFolder(folder), 0, torch.device("cpu"))
+
+
+def test_any_method_can_be_given_the_term(tmp_path):
+    run = trainer(tmp_path / "run", sparse_scene())
+    rows = [run.take_step() for _ in range(40)]
+    assert set(rows[0]["terms"]) == {"l1", "d-ssim", "scale-volume", "sparse_depth"}
+    errors = [row["terms"]["sparse_depth"] for row in rows]
+    assert sum(errors[-5:]) < 0.5 * sum(errors[:5])
+
+
+def test_a_scene_without_such_depth_is_refused_before_training(tmp_path):
+    with pytest.raises(InputError, match=r"'sparse_depth' needs depth at single points.*losses\.sparse_depth=null"):
+        trainer(tmp_path / "run", wall_scene())
+    with pytest.raises(InputError, match=r"'depth' needs depth, .*losses\.depth=null"):
+        trainer(tmp_path / "run", sparse_scene(), SPARSE[1:])

@@ -1,0 +1,219 @@
+"""What the compiled kernels owe the machine: wide registers, a cache that may fail, threads and forks."""
+
+import dataclasses
+import logging
+import os
+import re
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numba.core.caching
+import pytest
+import torch
+from numba import types
+from numba.core.registry import cpu_target
+from test_torch_renderer import cast, scene
+
+from coliags_plugin.renderers import cpu_renderer
+from coliags_plugin.renderers.numba_kernels import compilation, sweep_backward, sweep_forward
+
+# --- registers --------------------------------------------------------------------------------------------------------
+
+FLOATS, INTS = types.float32[::1], types.int32[::1]
+CHANNELS = 4
+CHANNEL_TUPLE = types.UniTuple(types.int64, CHANNELS)
+NOTHING = types.UniTuple(types.int64, 0)
+
+#: The inner loop of each sweep, the types it is called with, and how many multiply-adds it takes for a block of sixteen
+#: pixels: five for U d and its square, five for 2^x, and those of the channels; backward has these twice, and moments.
+INNER_LOOPS = {
+    "forward": (
+        sweep_forward._sweep_block,
+        (types.int64, types.int32, INTS, FLOATS, CHANNEL_TUPLE, NOTHING, FLOATS, FLOATS),
+        5 + 5 + CHANNELS,
+    ),
+    "backward": (
+        sweep_backward._sweep_entry,
+        (types.int64, types.int64, types.int64, FLOATS, CHANNEL_TUPLE, FLOATS, FLOATS, types.int64, FLOATS),
+        5 + 5 + 2 * CHANNELS + 3,
+    ),
+}
+
+
+def widest_registers():
+    """Name and floats of the widest vector registers that numba compiles for; skips where they are not x86's."""
+    _, cpu, features = cpu_target.target_context.codegen().magic_tuple()
+    found = set(features.split(","))
+    if "+avx512f" in found:
+        return "zmm", 16
+    if {"+avx2", "+fma"} <= found:
+        return "ymm", 8
+    pytest.skip(f"'{cpu}' has no AVX2 with FMA, whose instructions this test looks for")
+
+
+@pytest.mark.parametrize("sweep", INNER_LOOPS)
+def test_inner_loops_fill_the_widest_registers(sweep):
+    register, floats = widest_registers()
+    loop, signature, multiply_adds = INNER_LOOPS[sweep]
+    loop.compile(signature)
+    assembly = loop.inspect_asm(signature)
+    packed = re.findall(rf"^\s*vfn?m\w+ps\s.*%{register}", assembly, re.MULTILINE)
+    # Where a block takes two registers, forward's U_xx x is the same in both and computed once.
+    assert len(packed) > (multiply_adds - 1) * (16 // floats)
+    # One number at a time, or by a function of the C library.
+    assert not re.findall(r"^\s*v?(?:fn?m(?:add|sub)\w*|mul|add|sub)ss\s.*", assembly, re.MULTILINE)
+    assert not re.findall(r"\b(?:exp2?|log2?|pow)f?\b", assembly)
+
+
+# --- cache ------------------------------------------------------------------------------------------------------------
+
+
+def twice(number):
+    return 2 * number
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch, caplog):
+    """The folder that kernels made in this test are kept in."""
+    caplog.set_level(logging.INFO, compilation.__name__)
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def test_compiled_kernels_are_kept(cache, caplog):
+    assert compilation.kernel(twice)(4) == 8
+    again = compilation.kernel(twice)
+    assert again(4) == 8
+    assert sum(again.stats.cache_hits.values()) == 1
+    assert [record.levelname for record in caplog.records] == ["INFO"]
+    assert str(cache) in caplog.text
+
+
+def test_a_cache_folder_that_cannot_be_made_costs_nothing_but_time(cache, caplog, monkeypatch):
+    monkeypatch.setattr(numba.core.caching.CacheImpl, "_locator_classes", [])
+    compilation._announce.cache_clear()
+    kernel = compilation.kernel(twice)
+    assert kernel(4) == 8
+    assert "nowhere to keep them" in caplog.text and "NUMBA_CACHE_DIR" in caplog.text
+
+
+def test_a_cache_folder_that_cannot_be_written_costs_nothing_but_time(cache, caplog):
+    kernel = compilation.kernel(twice)
+    (folder,) = cache.iterdir()
+    folder.rmdir()
+    folder.write_text("a file: whatever is asked of a folder below it fails, even for root")
+    assert kernel(4) == 8
+    assert "cannot be written" in caplog.text
+
+
+def test_a_damaged_cache_costs_nothing_but_time(cache, caplog):
+    compilation.kernel(twice)(4)
+    for file in [path for path in cache.rglob("*") if path.is_file()]:
+        file.write_bytes(file.read_bytes()[:20])
+    assert compilation.kernel(twice)(4) == 8
+    assert "cannot be read" in caplog.text
+
+
+def run_python(code, **environment):
+    """Run code in a fresh interpreter that finds the tests' scenes."""
+    places = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    environment = {**os.environ, "PYTHONPATH": places, **environment}
+    return subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False, timeout=120
+    )
+
+
+def test_all_kernels_load_where_nothing_can_be_kept(tmp_path):
+    (tmp_path / "file").touch()
+    code = """
+import logging, numba.core.caching
+logging.basicConfig(level=logging.INFO)
+numba.core.caching.CacheImpl._locator_classes = numba.core.caching.CacheImpl._locator_classes[:1]
+from coliags_plugin.renderers.numba_kernels import pipeline
+"""
+    done = run_python(code, NUMBA_CACHE_DIR=str(tmp_path / "file" / "cache"))
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("nowhere to keep them") == 1
+
+
+# --- threads and forks ------------------------------------------------------------------------------------------------
+
+
+def view():
+    """A small scene, float32."""
+    gaussians, camera = scene("random")
+    return cast(gaussians, torch.float32), camera.to(dtype=torch.float32)
+
+
+def gradient(gaussians, camera):
+    """Of the means, by a graph of its own."""
+    gaussians = cast(gaussians, grad=True)
+    output = cpu_renderer.render_gaussians(gaussians, camera, ("depth_accumulated",))
+    (output.rgb.sum() + output["depth_accumulated"].sum()).backward()
+    return gaussians.means.grad
+
+
+def test_two_threads_may_draw_at_once():
+    seen = view()
+    true = gradient(*seen)
+    wrong, finished = [], []
+
+    def draw():
+        for _ in range(50):
+            if not torch.equal(gradient(*seen), true):
+                wrong.append(threading.current_thread().name)
+        finished.append(1)
+
+    threads = [threading.Thread(target=draw, daemon=True) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(timeout=60)
+    assert len(finished) == 3
+    assert not wrong
+
+
+def test_views_may_wait_for_their_gradients_in_any_order():
+    gaussians, camera = view()
+    cameras = [camera, dataclasses.replace(camera, fx=2 * camera.fx)]
+    alone = [gradient(gaussians, camera) for camera in cameras]
+    gaussians = cast(gaussians, grad=True)
+    outputs = [cpu_renderer.render_gaussians(gaussians, camera, ("depth_accumulated",)) for camera in cameras]
+    for output, expected in zip(outputs, alone, strict=True):
+        gaussians.means.grad = None
+        (output.rgb.sum() + output["depth_accumulated"].sum()).backward()
+        assert torch.equal(gaussians.means.grad, expected)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+def test_forked_processes_draw_even_where_another_thread_was_drawing():
+    code = """
+import os, signal, threading, torch
+from test_cpu_renderer_machine import gradient, view
+
+torch.set_num_threads(2)
+seen = view()  # before the fork, for torch's own threads do not survive it
+true = gradient(*seen)
+stop = threading.Event()
+
+def draw():
+    while not stop.is_set():
+        gradient(*seen)
+
+other = threading.Thread(target=draw)
+other.start()
+statuses = []
+for _ in range(12):
+    child = os.fork()
+    if child == 0:
+        signal.alarm(20)  # kills what hangs
+        os._exit(0 if torch.equal(gradient(*seen), true) else 1)
+    statuses.append(os.waitpid(child, 0)[1])
+stop.set()
+other.join()
+print(statuses)
+"""
+    done = run_python(code)
+    assert done.stdout.strip() == str([0] * 12), done.stdout + done.stderr
