@@ -33,8 +33,7 @@ def write_page(output: Path, title: str, header: str, sections: Iterable[str]) -
     Raises:
         InputError: ``output`` is a folder, or cannot be written.
     """
-    if output.is_dir():
-        raise InputError(f"{output} is a folder", "a file", f"Write to {output / 'report.html'}")
+    refuse_folder(output)
     page = Template(_TEMPLATE.read_text(encoding="utf-8")).substitute(
         title=escape(title),
         header=header,
@@ -42,6 +41,12 @@ def write_page(output: Path, title: str, header: str, sections: Iterable[str]) -
         footer=f"Written by coliags_plugin {escape(__version__)}.",
     )
     atomic_write(output, page)
+
+
+def refuse_folder(output: Path) -> None:
+    """Raise InputError where a page is to be written over a folder."""
+    if output.is_dir():
+        raise InputError(f"{output} is a folder", "a file", f"Write to {output / 'report.html'}")
 
 
 def fact_list(facts: Mapping[str, str]) -> str:

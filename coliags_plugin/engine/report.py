@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from coliags_plugin.engine.page import leaves, plain, record, write_page
+from coliags_plugin.engine.page import leaves, plain, record, refuse_folder, write_page
 from coliags_plugin.engine.report_data import SEEN_SUFFIX, EvaluatedRun, read_runs
 from coliags_plugin.engine.report_table import Column, columns, metric_title, unit_text
 from coliags_plugin.engine.report_views import SCALE_PERCENTILE, Picture, RunView, View, Views, read_views
@@ -56,6 +56,7 @@ def write_report(
         InputError: A run is missing, not evaluated, damaged, or not comparable with the others; or ``output`` cannot
             be written.
     """
+    refuse_folder(output)
     read = read_runs(runs, protocol)
     views = read_views(read, frames)
     heading = title if title is not None else _default_title(read)
