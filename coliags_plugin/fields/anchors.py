@@ -27,6 +27,8 @@ logger = logging.getLogger(__name__)
 
 #: A Gaussian of opacity one is drawn up to alpha = 1/255, at sqrt(2 ln 255) standard deviations.
 DRAWN_SIGMAS = math.sqrt(2.0 * math.log(255.0))
+#: About so many training cameras, evenly chosen, are asked for the distances that occur.
+_CAMERAS_ASKED = 16
 
 
 class AnchorFieldSettings(Settings):
@@ -86,7 +88,11 @@ class AnchorField(Field):
             InputError: The scene has no points.
         """
         if len(scene.points) == 0:
-            raise InputError("the scene has no initial points", "at least one", "Give the data manager points or depth")
+            raise InputError(
+                "the scene has no initial points",
+                "at least one",
+                "Give the data manager points or depth; coliags poses triangulate makes points from posed pictures",
+            )
         size = settings.voxel_size
         if size is None:
             size = settings.voxel_pixels * scene.pixel_footprint
@@ -103,6 +109,8 @@ class AnchorField(Field):
         field.voxel_size.fill_(size)
         with torch.no_grad():
             field.scalings.copy_(neighbour_log_scales(anchors)[:, None].expand(-1, 6))
+            cameras = [frame.camera for frame in scene.train[:: max(1, len(scene.train) // _CAMERAS_ASKED)]]
+            field.appearance_head.expect(torch.cat([field._distances(camera) for camera in cameras]))
         logger.info("%d points in voxels of %.3g scene units make %d anchors", len(scene.points), size, len(anchors))
         return field
 
@@ -135,6 +143,10 @@ class AnchorField(Field):
         size = DRAWN_SIGMAS * self.scalings[:, 3:].amax(dim=1).exp()
         inside = spheres_in_frustum(self.anchors, reach + size, camera, self.settings.near)
         return inside.nonzero().squeeze(1)
+
+    def _distances(self, camera: Camera) -> Float[Tensor, "V"]:
+        camera = camera.to(self.anchors.device, self.anchors.dtype)
+        return (self.anchors[self.visible_anchors(camera)] - camera.center).norm(dim=1)
 
     def gaussians(self, camera: Camera) -> Gaussians:
         """Decode the visible anchors (docs/methods.md 3.5)."""

@@ -14,10 +14,16 @@ from coliags_plugin.fields.perceptron import perceptron
 from coliags_plugin.settings import Settings
 
 
-class PlainAppearanceSettings(Settings):
-    """Options of the plain appearance head."""
+class AppearanceSettings(Settings):
+    """Options of every appearance head."""
 
     hidden: int = Field(default=32, ge=1)
+    spread_kinks: bool = True  # whether hidden units start over the scene's distances; see PlainAppearanceHead.expect
+
+
+class PlainAppearanceSettings(AppearanceSettings):
+    """Options of the plain appearance head."""
+
     distance: bool = False  # Scaffold-GS's add_color_dist: also show the raw distance
 
 
@@ -30,14 +36,38 @@ class PlainAppearanceHead(nn.Module):
         super().__init__()
         self.settings = settings
         self.children_per_anchor = children
-        inputs = features + self.embed(torch.zeros(1, 3), torch.zeros(1, 1), torch.zeros(1, 1)).shape[1]
-        self.color_mlp = perceptron(inputs, settings.hidden, 3 * children, generator)
+        self.features = features
+        embedded = self.embed(torch.zeros(1, 3), torch.zeros(1, 1), torch.zeros(1, 1)).shape[1]
+        self.color_mlp = perceptron(features + embedded, settings.hidden, 3 * children, generator)
 
     def embed(
         self, directions: Float[Tensor, "V 3"], distances: Float[Tensor, "V 1"], cosines: Float[Tensor, "V 1"]
     ) -> Float[Tensor, "V E"]:
         """What the perceptron sees of where the lamp is."""
-        return torch.cat([directions, distances], dim=1) if self.settings.distance else directions
+        return torch.cat([directions, distances], dim=1) if self.sees_distance else directions
+
+    @property
+    def sees_distance(self) -> bool:
+        """Whether the distance is among the inputs."""
+        return bool(self.settings.distance)
+
+    @torch.no_grad()
+    def expect(self, distances: Float[Tensor, "D"]) -> None:
+        """Move each hidden unit's kink to a distance that occurs (docs/methods.md 3.4), before training.
+
+        Drawn about zero, units see millimetres that outweigh all other inputs: those with a negative weight for the
+        distance, about half, are never active and never learn.
+
+        Args:
+            distances: From cameras to anchors in their view, scene units. [D]
+        """
+        first: Any = self.color_mlp[0]
+        if not (self.sees_distance and self.settings.spread_kinks) or len(distances) == 0:
+            return
+        units = first.out_features
+        places = (torch.arange(units, device=distances.device) * 2 + 1) * len(distances) // (2 * units)
+        kinks = distances.sort().values[places]
+        first.bias -= first.weight[:, self.features + 3] * kinks  # after the direction
 
     def forward(
         self,
@@ -61,10 +91,9 @@ class PlainAppearanceHead(nn.Module):
         return self.color_mlp(seen).view(len(seen), self.children_per_anchor, 3).sigmoid()
 
 
-class IMIAAppearanceSettings(Settings):
+class IMIAAppearanceSettings(AppearanceSettings):
     """Options of IMIA."""
 
-    hidden: int = Field(default=32, ge=1)
     frequencies: int = Field(default=5, ge=0)
 
 
@@ -76,6 +105,11 @@ class IMIAAppearanceHead(PlainAppearanceHead):
     """
 
     Settings: ClassVar[type[Settings]] = IMIAAppearanceSettings
+
+    @property
+    def sees_distance(self) -> bool:
+        """Always."""
+        return True
 
     def embed(
         self, directions: Float[Tensor, "V 3"], distances: Float[Tensor, "V 1"], cosines: Float[Tensor, "V 1"]

@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from coliags_plugin.components import make_component
 from coliags_plugin.errors import InputError
 from coliags_plugin.fields.anchor_points import neighbour_log_scales, voxelize
+from coliags_plugin.fields.appearance_heads import IMIAAppearanceHead, IMIAAppearanceSettings
 from coliags_plugin.fields.frustum import spheres_in_frustum
 from coliags_plugin.scenes import PointCloud
 from tests.scenes import camera_at, wall_scene
@@ -232,3 +233,43 @@ def test_same_seed_same_field():
     assert all(torch.equal(a, b) for a, b in zip(first.parameters(), second.parameters(), strict=True))
     other = make_field(COLIAGS, seed=4)
     assert not torch.equal(first.geometry_head.opacity_mlp[0].weight, other.geometry_head.opacity_mlp[0].weight)
+
+
+@pytest.mark.parametrize("head", [{"name": "imia"}, {"name": "plain", "distance": True}])
+def test_hidden_units_start_over_the_distances_that_occur(head):
+    """Each unit's pre-activation at its own quantile of the distances is what the default start has at distance 0."""
+    default = make_field(COLIAGS, appearance_head={**head, "spread_kinks": False})
+    spread = make_field(COLIAGS, appearance_head=head)
+    cameras = [frame.camera for frame in wall_scene().train]
+    with torch.no_grad():
+        bare = make_component("fields", {**COLIAGS, "appearance_head": head})
+        initial = bare.target.from_scene(wall_scene(), bare.settings, torch.Generator())
+        seen = [initial.anchors[initial.visible_anchors(camera)] - camera.center for camera in cameras]
+    distances = np.sort(np.concatenate([sight.norm(dim=1).numpy() for sight in seen]))
+    kinks = distances[((np.arange(32) + 0.5) / 32 * len(distances)).astype(int)]
+    before, after = default.appearance_head.color_mlp[0], spread.appearance_head.color_mlp[0]
+    assert torch.equal(before.weight, after.weight)
+    on_kink = after.bias + after.weight[:, 32 + 3] * torch.from_numpy(kinks).float()
+    torch.testing.assert_close(on_kink, before.bias, atol=1e-5, rtol=0.0)
+
+
+def test_few_units_start_dead():
+    """Over a colon's distances in mm, features 0; by default more than a third of the units are never active."""
+    distances = torch.linspace(5.0, 100.0, 500)
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(500, 3, generator=generator), dim=1)
+    dead = {}
+    for spread in (True, False):
+        head = IMIAAppearanceHead(IMIAAppearanceSettings(spread_kinks=spread), 32, 10, generator.manual_seed(1))
+        head.expect(distances)
+        inputs = torch.cat(
+            [torch.zeros(500, 32), head.embed(directions, distances[:, None], directions[:, 2:].abs())], dim=1
+        )
+        dead[spread] = int((head.color_mlp[0](inputs) <= 0).all(dim=0).sum())
+    assert dead[True] <= 2
+    assert dead[False] >= 11
+
+
+def test_a_head_that_does_not_see_the_distance_expects_nothing():
+    plain, other = (make_field(SCAFFOLD, appearance_head={"name": "plain", "spread_kinks": s}) for s in (True, False))
+    assert torch.equal(plain.appearance_head.color_mlp[0].bias, other.appearance_head.color_mlp[0].bias)
