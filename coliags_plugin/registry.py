@@ -129,14 +129,14 @@ datamanagers = Registry(
     "datamanagers",
     {
         "auto": "coliags_plugin.datamanagers.auto:AutoDataManager",
-        "c3vd": "coliags_plugin.datamanagers.c3vd:C3VDDataManager",
-        "c3vd-endogslam": "coliags_plugin.datamanagers.c3vd_endogslam:C3VDEndoGSLAMDataManager",
-        "c3vd-v2": "coliags_plugin.datamanagers.c3vd_v2:C3VDv2DataManager",
-        "colmap": "coliags_plugin.datamanagers.colmap:ColmapDataManager",
-        "nerfstudio": "coliags_plugin.datamanagers.nerfstudio:NerfstudioDataManager",
-        "reim-nerf": "coliags_plugin.datamanagers.reim_nerf:ReimNerfDataManager",
-        "rgbd": "coliags_plugin.datamanagers.rgbd:RGBDDataManager",
-        "rotatecolon": "coliags_plugin.datamanagers.rotatecolon:RotateColonDataManager",
+        "c3vd": "coliags_plugin.datamanagers.c3vd.manager:C3VDDataManager",
+        "c3vd-endogslam": "coliags_plugin.datamanagers.c3vd_endogslam.manager:C3VDEndoGSLAMDataManager",
+        "c3vd-v2": "coliags_plugin.datamanagers.c3vd_v2.manager:C3VDv2DataManager",
+        "colmap": "coliags_plugin.datamanagers.colmap.manager:ColmapDataManager",
+        "nerfstudio": "coliags_plugin.datamanagers.nerfstudio.manager:NerfstudioDataManager",
+        "reim-nerf": "coliags_plugin.datamanagers.reim_nerf.manager:ReimNerfDataManager",
+        "rgbd": "coliags_plugin.datamanagers.rgbd.manager:RGBDDataManager",
+        "rotatecolon": "coliags_plugin.datamanagers.rotatecolon.manager:RotateColonDataManager",
     },
 )
 fields = Registry("fields", {"anchors": "coliags_plugin.fields.anchors:AnchorField"})

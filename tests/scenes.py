@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from coliags_plugin.cameras import Camera
-from coliags_plugin.datamanagers.c3vd_writer import write_c3vd_scene
+from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
 from coliags_plugin.lenses import Pinhole
 from coliags_plugin.scenes import Frame, PointCloud, Scene
 

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from coliags_plugin.datamanagers.ply_vertices import read_vertices
-from coliags_plugin.datamanagers.side_by_side import side_by_side
+from coliags_plugin.datamanagers.reading.ply_vertices import read_vertices
+from coliags_plugin.datamanagers.reading.side_by_side import side_by_side
 from coliags_plugin.errors import InputError
 from coliags_plugin.progress import Progress
 from coliags_plugin.scenes import Frame, PointCloud

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import shlex
 from abc import abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
@@ -61,6 +62,9 @@ class RecordedDataManager(DataManager):
         """
         path, settings = Path(path), self.settings
         recording = self.open(path)
+        for doubt in dict.fromkeys(shot.view.doubt() for shot in recording.shots):
+            if doubt is not None:
+                log.warning("%s", doubt)
         train_places, test_places = self._split(recording, path)
         train = self._frames(recording.shots, train_places)
         test_sets = {"test": self._frames(recording.shots, test_places)} if test_places else {}
@@ -146,7 +150,8 @@ class RecordedDataManager(DataManager):
             raise NoPointsError(
                 f"{path} has neither depth files nor {missing}",
                 "depth to make initial points from, or the points themselves",
-                f"Put {missing} (world of the poses) there, or set initial_points: file and points_file",
+                f"Make a scene with points: coliags poses triangulate {shlex.quote(str(path))} --out FOLDER; or put "
+                f"{missing} (world of the poses) there; or set initial_points: file and points_file",
             )
         points = thinned(own(), settings.points_count, generator, recording.points_source)
         return points, self._described_points(recording.points_source, points)

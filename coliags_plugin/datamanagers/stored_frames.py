@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Bool, Float, Shaped, UInt8
 from torch import Tensor
 
-from coliags_plugin.datamanagers.images import read_mask, read_rgb
+from coliags_plugin.datamanagers.reading.images import read_mask, read_rgb
+from coliags_plugin.datamanagers.reading.side_by_side import side_by_side
 from coliags_plugin.datamanagers.recording import Shot
-from coliags_plugin.datamanagers.side_by_side import side_by_side
 from coliags_plugin.progress import Progress
 from coliags_plugin.scenes import Frame
 

@@ -11,13 +11,16 @@ import torch
 from jaxtyping import Bool, Float, Shaped, UInt8
 
 from coliags_plugin.cameras import Camera
-from coliags_plugin.datamanagers.images import read_rgb, resize_nearest, resize_rgb
+from coliags_plugin.datamanagers.reading.images import read_rgb, resize_nearest, resize_rgb
 from coliags_plugin.errors import InputError
 from coliags_plugin.lenses import Lens, Pinhole
 from coliags_plugin.undistortion import Undistortion
 
 #: How far a raw frame's aspect ratio may be from the lens's: rounding to whole pixels, but no cropping.
 ASPECT_TOLERANCE = 0.02
+
+#: How far a principal point may be from the middle of a picture, as a share of it, before that is worth a warning.
+FAR_FROM_MIDDLE = 0.2
 
 #: The paper's working size, a quarter of C3VD's raw frame.
 PAPER_SIZE = (338, 270)
@@ -125,6 +128,17 @@ class View:
         if self.undistortion is None or self.undistortion.valid.all():
             return None
         return self.undistortion.valid
+
+    def doubt(self) -> str | None:
+        """What looks like intrinsics of another resolution; None where nothing does."""
+        _, _, cx, cy = self.pinhole
+        off = max(abs((cx + 0.5) / self.width - 0.5), abs((cy + 0.5) / self.height - 0.5))
+        if off <= FAR_FROM_MIDDLE:
+            return None
+        return (
+            f"{self.described_by}: the principal point is {off:.0%} of the picture ({self.source_width} x "
+            f"{self.source_height}) from its middle: are the intrinsics those of another resolution?"
+        )
 
     def facts(self) -> dict[str, Any]:
         """For provenance: sizes, and intrinsics at the working size."""

@@ -14,6 +14,8 @@ from coliags_plugin import registry
 from coliags_plugin.components import Component, make_component
 from coliags_plugin.config import LoadedMethod, load_method, method_tree
 from coliags_plugin.datamanagers.recorded import NoPointsError
+from coliags_plugin.datamanagers.rgbd.files import lacks_trajectory
+from coliags_plugin.datamanagers.rgbd.unposed import UnposedRGBDDataManager
 from coliags_plugin.errors import InputError
 from coliags_plugin.progress import Progress
 from coliags_plugin.scenes import Scene
@@ -34,8 +36,7 @@ def find_format(path: Path) -> str:
     known = [name for name in registry.datamanagers if name != AUTO]
     if not path.exists():
         raise InputError(f"no folder {path}", f"a scene in one of the formats {', '.join(known)}", "Check the path")
-    reasons = {name: registry.datamanagers.get(name).recognise(path) for name in known}
-    found = {name: reason for name, reason in reasons.items() if reason is not None}
+    found = _recognised(path)
     if not found:
         shown = sorted(item.name + "/" * item.is_dir() for item in path.iterdir()) if path.is_dir() else []
         holds = ", ".join(shown[:6]) + (f" and {len(shown) - 6} more" if len(shown) > 6 else "") or "nothing"
@@ -50,6 +51,13 @@ def find_format(path: Path) -> str:
     ((name, reason),) = found.items()
     log.info("%s: format %s (%s)", path, name, reason)
     return name
+
+
+def _recognised(path: Path) -> dict[str, str]:
+    """Why a folder is of a format, for each that recognises it."""
+    known = (name for name in registry.datamanagers if name != AUTO)
+    reasons = {name: registry.datamanagers.get(name).recognise(path) for name in known}
+    return {name: reason for name, reason in reasons.items() if reason is not None}
 
 
 def chosen_datamanager(component: Component, path: Path) -> Component:
@@ -99,9 +107,7 @@ def open_scene(
         InputError: See :func:`find_format`; an option is unknown; or the scene cannot be read.
     """
     name = find_format(path) if data_format is None else data_format
-    tree = Node({}, "options")
-    for option in options:
-        tree = override(tree, option)
+    tree = _tree(options)
     try:
         return _opened(path, name, tree.plain(), progress)
     except NoPointsError as error:
@@ -109,14 +115,52 @@ def open_scene(
         return _opened(path, name, {**tree.plain(), "initial_points": "none"}, progress)
 
 
+def open_video(
+    path: Path, data_format: str | None = None, options: Sequence[str] = (), progress: Progress | None = None
+) -> tuple[Scene, bool]:
+    """Read all frames of a video as training frames, for whoever finds their poses himself.
+
+    Args:
+        path: Its folder: a scene, or one in the ``rgbd`` format that lacks a trajectory.
+        data_format: See :func:`open_scene`.
+        options: See :func:`open_scene`; the split and initial points are not to be chosen.
+        progress: Told how far reading is.
+
+    Returns:
+        The scene, and whether it has poses; where not, all its cameras are at the origin.
+
+    Raises:
+        InputError: See :func:`open_scene`.
+    """
+    options = (*options, "split=all-train", "initial_points=none")
+    given = _tree(options).plain()
+    unposed = lacks_trajectory(path) and "trajectory" not in given
+    # Other formats have pictures and depth too, and their poses elsewhere.
+    if data_format not in (None, "rgbd") or not unposed or (data_format is None and _recognised(path)):
+        return open_scene(path, data_format, options, progress), True
+    log.info("%s: pictures and depth without a trajectory", path)
+    return UnposedRGBDDataManager(_component("rgbd", given).settings).load(path, progress), False
+
+
+def _tree(options: Sequence[str]) -> Node:
+    tree = Node({}, "options")
+    for option in options:
+        tree = override(tree, option)
+    return tree
+
+
 def _opened(path: Path, name: str, options: Mapping[str, Any], progress: Progress | None) -> Scene:
+    component = _component(name, options)
+    scene: Scene = component.target(component.settings).load(path, progress)
+    return scene
+
+
+def _component(name: str, options: Mapping[str, Any]) -> Component:
     try:
-        component = make_component("datamanagers", {**options, "name": name})
+        return make_component("datamanagers", {**options, "name": name})
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
         raise InputError(f"--set {key}: {first['msg']}", f"an option of the format {name}") from error
     except PydanticCustomError as error:
         raise InputError(error.message()) from error
-    scene: Scene = component.target(component.settings).load(path, progress)
-    return scene

@@ -36,6 +36,8 @@ SHAPES: dict[str, tuple[tuple[int | str, ...], ...]] = {
 }
 _POSES = ("cam_unnorm_rots", "cam_trans")
 _PINHOLE = ("intrinsics", "org_width", "org_height")
+#: What nothing here is made from: tools that rewrite the file leave it out.
+_SPARE = ("log_scales", "keyframe_time_indices")
 #: EndoGSLAM holds out frames 7, 15, 23, ... unless told otherwise.
 _HELD_OUT_EVERY = 8
 
@@ -51,9 +53,9 @@ class EndoGslamParams:
         width, height: Picture size, pixels.
         means: Centres of the Gaussians, world, mm; N may be 0. float64. [N, 3]
         rgb_colors: Colours, nominally in [0, 1]; may lie a little outside. float64. [N, 3]
-        log_scales: Logarithms of the standard deviations in mm; one column where Gaussians are isotropic.
-            [N, 1] or [N, 3]
-        keyframes: Which of the F frames were keyframes. [K]
+        log_scales: Logarithms of the standard deviations in mm; one column where Gaussians are isotropic. None where
+            the file has none. [N, 1] or [N, 3]
+        keyframes: Which of the F frames were keyframes; None where the file does not say. [K]
     """
 
     camera_to_world: Float[np.ndarray, "F 4 4"]
@@ -63,8 +65,8 @@ class EndoGslamParams:
     height: int
     means: Float[np.ndarray, "N 3"]
     rgb_colors: Float[np.ndarray, "N 3"]
-    log_scales: Float[np.ndarray, "N C"]
-    keyframes: Int[np.ndarray, "K"]
+    log_scales: Float[np.ndarray, "N C"] | None
+    keyframes: Int[np.ndarray, "K"] | None
 
     @property
     def pinhole(self) -> Intrinsics:
@@ -81,9 +83,10 @@ def read_params(path: Path) -> EndoGslamParams:
 
     Raises:
         InputError: It is no NPZ, or keys are missing, misshaped, not numbers or not finite (all of them are named); or
-            a pose is no rigid transform.
+            a pose is no rigid transform. ``log_scales`` and ``keyframe_time_indices`` may be missing.
     """
-    arrays = _arrays(path, tuple(SHAPES))
+    arrays = _arrays(path, tuple(key for key in SHAPES if key not in _SPARE), optional=_SPARE)
+    keyframes = arrays.get("keyframe_time_indices")
     return EndoGslamParams(
         camera_to_world=_estimate(path, arrays),
         true_camera_to_world=_truth(path, arrays),
@@ -92,8 +95,8 @@ def read_params(path: Path) -> EndoGslamParams:
         height=int(arrays["org_height"].item()),
         means=arrays["means3D"],
         rgb_colors=arrays["rgb_colors"],
-        log_scales=arrays["log_scales"],
-        keyframes=arrays["keyframe_time_indices"].astype(np.int64),
+        log_scales=arrays.get("log_scales"),
+        keyframes=None if keyframes is None else keyframes.astype(np.int64),
     )
 
 

@@ -14,8 +14,8 @@ import torch
 from pydantic import ValidationError
 from wall_scenes import PINHOLE, colors, off_wall, poses, write_raw, write_undistorted
 
-from coliags_plugin.datamanagers.c3vd import C3VDDataManager, C3VDSettings
-from coliags_plugin.datamanagers.c3vd_layouts import read_intrinsics
+from coliags_plugin.datamanagers.c3vd.manager import C3VDDataManager, C3VDSettings
+from coliags_plugin.datamanagers.reading.camera_json import read_intrinsics
 from coliags_plugin.errors import InputError
 from coliags_plugin.lenses import LENSES
 from coliags_plugin.registry import datamanagers

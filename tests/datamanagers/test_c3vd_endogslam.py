@@ -14,13 +14,13 @@ from phantom_layouts import depth_gap, distance_from_wall, in_video_order, read,
 from scipy.spatial.transform import Rotation
 from wall_scenes import PINHOLE, look, off_wall, poses
 
-from coliags_plugin.datamanagers.c3vd_endogslam import (
+from coliags_plugin.datamanagers.c3vd.writer import depth_steps
+from coliags_plugin.datamanagers.c3vd_endogslam.manager import (
     PREPARED_DEPTH,
     PREPARED_PINHOLE,
     C3VDEndoGSLAMDataManager,
     C3VDEndoGSLAMSettings,
 )
-from coliags_plugin.datamanagers.c3vd_writer import depth_steps
 from coliags_plugin.datamanagers.phantom.layouts.c3vd_raw import write_poses
 from coliags_plugin.errors import InputError
 from coliags_plugin.lenses import Pinhole

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from coliags_plugin.datamanagers.c3vd_writer import depth_steps
-from coliags_plugin.datamanagers.depth_formats import C3VD_DEPTH
-from coliags_plugin.datamanagers.images import read_mask, read_rgb, resize_nearest, resize_rgb
+from coliags_plugin.datamanagers.c3vd.writer import depth_steps
+from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH
+from coliags_plugin.datamanagers.reading.images import read_mask, read_rgb, resize_nearest, resize_rgb
 from coliags_plugin.datamanagers.views import default_size
 from coliags_plugin.errors import InputError
 

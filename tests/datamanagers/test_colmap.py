@@ -15,8 +15,8 @@ from colmap_scenes import CAMERAS, HEIGHT, POINTS, WIDTH, camera, taken, wall_mo
 from phantom_layouts import distance_from_wall, in_video_order, read, true_poses, write_phantom
 from wall_scenes import look, off_wall, poses
 
-from coliags_plugin.datamanagers.colmap import ColmapDataManager, ColmapSettings
-from coliags_plugin.datamanagers.colmap_files import find_models, read_model
+from coliags_plugin.datamanagers.colmap.files import find_models, read_model
+from coliags_plugin.datamanagers.colmap.manager import ColmapDataManager, ColmapSettings
 from coliags_plugin.engine.data_formats import find_format
 from coliags_plugin.errors import InputError
 from coliags_plugin.poses import colmap as colmap_poses
@@ -494,6 +494,29 @@ def test_reprojection_error_is_the_one_colmap_finds(shared_data, place):
     assert mean == pytest.approx(reference.compute_mean_reprojection_error(), rel=1e-9)
     if place == "distorted_sparse":  # the other model keeps the figure from before it was undistorted
         assert mean == pytest.approx(stored, rel=1e-9)
+
+
+@pytest.mark.parametrize(("place", "model"), [("sparse", "PINHOLE"), ("distorted_sparse", "SIMPLE_RADIAL")])
+def test_points_fall_where_they_were_seen_in_the_loaders_undistorted_pictures(shared_data, place, model):
+    """As far from there as COLMAP says, in pixels of the stored picture: scene cameras and views agree."""
+    folder = shared_data / "colmap_23img"
+    data = read_model(folder / place)
+    shots = ColmapDataManager(ColmapSettings(model=place)).open(folder).shots
+    assert {lens.model for lens in data.cameras.values()} == {model}
+    errors, numbers = [], []
+    for shot, picture in zip(shots, data.pictures, strict=True):
+        camera = shot.view.camera(shot.camera_to_world).to(dtype=torch.float64)
+        found, depth = camera.project(torch.from_numpy(data.positions[picture.points]))
+        assert (depth > 0).all()
+        seen = shot.view.pixels(picture.observed - 0.5) + 0.5
+        stored = data.cameras[picture.camera].pinhole.fx / shot.view.pinhole.fx
+        errors.append(stored * np.linalg.norm(found.numpy() - seen, axis=1))
+        numbers.append(picture.points)
+    by_point = np.concatenate(numbers)
+    mean = (np.bincount(by_point, np.concatenate(errors)) / np.bincount(by_point)).mean()
+    reference = pycolmap.Reconstruction(str(folder / place))
+    reference.update_point_3d_errors()
+    assert mean == pytest.approx(reference.compute_mean_reprojection_error(), abs=0.01)
 
 
 def test_undistorting_is_what_colmap_did(shared_data):

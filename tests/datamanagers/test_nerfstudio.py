@@ -16,9 +16,9 @@ from real_frames import real_lens
 from wall_scenes import PINHOLE, look, off_wall, poses
 
 from coliags_plugin.datamanagers.fusion import load_points
-from coliags_plugin.datamanagers.images import read_rgb
-from coliags_plugin.datamanagers.nerfstudio import NerfstudioDataManager, NerfstudioSettings
+from coliags_plugin.datamanagers.nerfstudio.manager import NerfstudioDataManager, NerfstudioSettings
 from coliags_plugin.datamanagers.phantom.layouts.meshes import write_points
+from coliags_plugin.datamanagers.reading.images import read_rgb
 from coliags_plugin.engine.data_formats import find_format
 from coliags_plugin.errors import InputError
 from coliags_plugin.lenses import FisheyeLens, Lens

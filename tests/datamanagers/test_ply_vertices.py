@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from coliags_plugin.datamanagers.fusion import load_points
-from coliags_plugin.datamanagers.ply_vertices import read_vertices
+from coliags_plugin.datamanagers.reading.ply_vertices import read_vertices
 from coliags_plugin.errors import InputError
 
 FIELDS = [("x", "f4"), ("y", "f4"), ("z", "f8"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("label", "i2")]

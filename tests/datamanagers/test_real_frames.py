@@ -8,8 +8,8 @@ import pytest
 import torch
 from real_frames import real_lens, undistort_real_frames
 
-from coliags_plugin.datamanagers.c3vd import C3VDDataManager, C3VDSettings
-from coliags_plugin.datamanagers.images import read_rgb
+from coliags_plugin.datamanagers.c3vd.manager import C3VDDataManager, C3VDSettings
+from coliags_plugin.datamanagers.reading.images import read_rgb
 from coliags_plugin.lenses import LENSES
 
 

@@ -14,8 +14,8 @@ import torch
 from phantom_layouts import depth_gap, distance_from_wall, in_video_order, read, true_poses, write_phantom
 
 from coliags_plugin.datamanagers.phantom.layouts.reim_nerf import SCENE_SCALE
-from coliags_plugin.datamanagers.reim_nerf import ReimNerfDataManager, ReimNerfSettings
-from coliags_plugin.datamanagers.reim_nerf_files import ray_cosines, read_sequence
+from coliags_plugin.datamanagers.reim_nerf.files import ray_cosines, read_sequence
+from coliags_plugin.datamanagers.reim_nerf.manager import ReimNerfDataManager, ReimNerfSettings
 from coliags_plugin.errors import InputError
 from coliags_plugin.lenses import LENSES, undistortion_map
 from coliags_plugin.scenes import Scene
@@ -266,7 +266,7 @@ REFUSED = {
     "no file_path": (_frame(1, lambda frame: frame.pop("file_path"), "train"), r"_train.json, frame 1: no file_path"),
     "no matrix": (
         _frame(1, lambda frame: frame.pop("transform_matrix"), "train"),
-        r"_train.json, frame 1 \(images/0005_color.png\): no transform_matrix",
+        r"_train.json, frame 1 \(images/0005_color.png\): transform_matrix is missing",
     ),
     "left-handed": (
         _frame(1, _matrix(_flip), "train"),

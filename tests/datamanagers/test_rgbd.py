@@ -14,10 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from wall_scenes import PINHOLE, colors, look, off_wall, poses
 
-from coliags_plugin.datamanagers.association import nearest_in_time
 from coliags_plugin.datamanagers.phantom.generate import generate
 from coliags_plugin.datamanagers.phantom.settings import PhantomSettings
-from coliags_plugin.datamanagers.rgbd import RGBDDataManager, RGBDSettings
+from coliags_plugin.datamanagers.rgbd.association import nearest_in_time
+from coliags_plugin.datamanagers.rgbd.manager import RGBDDataManager, RGBDSettings
 from coliags_plugin.engine.data_formats import find_format
 from coliags_plugin.errors import InputError
 from coliags_plugin.poses import tum

@@ -15,8 +15,8 @@ import torch
 from phantom_layouts import depth_gap, distance_from_wall, in_video_order, read, true_poses, write_phantom
 
 from coliags_plugin.config import load_method
-from coliags_plugin.datamanagers.exr_depth import ExrDepth, read_exr_channel
-from coliags_plugin.datamanagers.rotatecolon import RotateColonDataManager, RotateColonSettings
+from coliags_plugin.datamanagers.rotatecolon.exr_depth import ExrDepth, read_exr_channel
+from coliags_plugin.datamanagers.rotatecolon.manager import RotateColonDataManager, RotateColonSettings
 from coliags_plugin.engine.evaluator import evaluate
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trained import load_trained

@@ -14,8 +14,8 @@ import torch
 from wall_scenes import write_undistorted
 
 from coliags_plugin.datamanagers import stored_frames
-from coliags_plugin.datamanagers.c3vd import C3VDDataManager, C3VDSettings
-from coliags_plugin.datamanagers.side_by_side import side_by_side
+from coliags_plugin.datamanagers.c3vd.manager import C3VDDataManager, C3VDSettings
+from coliags_plugin.datamanagers.reading.side_by_side import side_by_side
 from coliags_plugin.datamanagers.stored_frames import StoredFrame
 from coliags_plugin.errors import InputError
 from coliags_plugin.scenes import Frame, Scene
@@ -41,7 +41,7 @@ def reads(monkeypatch):
         read["image"].append(path.name)
         return rgb(path)
 
-    from coliags_plugin.datamanagers.depth_formats import DepthSteps
+    from coliags_plugin.datamanagers.reading.depth_formats import DepthSteps
 
     depth = DepthSteps.read
 

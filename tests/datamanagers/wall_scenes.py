@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from coliags_plugin.datamanagers.c3vd_writer import depth_steps, write_c3vd_scene
+from coliags_plugin.datamanagers.c3vd.writer import depth_steps, write_c3vd_scene
 from coliags_plugin.lenses import LENSES, Lens, Pinhole, octagon_mask
 
 #: The wall is where NORMAL . x = OFFSET (mm).

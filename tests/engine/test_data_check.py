@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from coliags_plugin.cli import main
-from coliags_plugin.datamanagers.c3vd import C3VDDataManager, C3VDSettings
-from coliags_plugin.datamanagers.c3vd_writer import write_c3vd_scene
+from coliags_plugin.datamanagers.c3vd.manager import C3VDDataManager, C3VDSettings
+from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
 from coliags_plugin.datamanagers.phantom.generate import generate
 from coliags_plugin.datamanagers.phantom.settings import phantom_settings
 from coliags_plugin.engine.data_check.check import check_scene

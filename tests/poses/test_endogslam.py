@@ -70,6 +70,18 @@ def test_all_of_it_is_read(tmp_path):
     assert read.pinhole.cx == pytest.approx(334.6)  # pixel centres at integers become integers + 0.5
 
 
+@pytest.mark.parametrize(
+    "missing", [("log_scales",), ("keyframe_time_indices",), ("log_scales", "keyframe_time_indices")]
+)
+def test_what_nothing_is_made_from_may_be_missing(tmp_path, missing):
+    arrays = params()
+    read = endogslam.read_params(saved(tmp_path / "params.npz", **dict.fromkeys(missing)))
+    assert (read.log_scales is None) == ("log_scales" in missing)
+    assert (read.keyframes is None) == ("keyframe_time_indices" in missing)
+    np.testing.assert_array_equal(read.means, arrays["means3D"])
+    assert len(read.camera_to_world) == FRAMES
+
+
 def test_estimate_and_truth_as_trajectories(tmp_path):
     path = saved(tmp_path / "params.npz")
     whole = endogslam.read_params(path)

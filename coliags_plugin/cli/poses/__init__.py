@@ -9,13 +9,22 @@ import tyro
 
 from coliags_plugin.cli.poses.align import Align
 from coliags_plugin.cli.poses.convert import Convert
+from coliags_plugin.cli.poses.sfm import Sfm
+from coliags_plugin.cli.poses.track import Track
+from coliags_plugin.cli.poses.triangulate import Triangulate
 
-Subcommand = Annotated[Convert, tyro.conf.subcommand("convert")] | Annotated[Align, tyro.conf.subcommand("align")]
+Subcommand = (
+    Annotated[Convert, tyro.conf.subcommand("convert")]
+    | Annotated[Align, tyro.conf.subcommand("align")]
+    | Annotated[Triangulate, tyro.conf.subcommand("triangulate")]
+    | Annotated[Sfm, tyro.conf.subcommand("sfm")]
+    | Annotated[Track, tyro.conf.subcommand("track")]
+)
 
 
 @dataclass(frozen=True)
 class Poses:
-    """Bring camera poses from one format to another, and compare trajectories."""
+    """Camera poses: convert and compare them, find surface points under them, or find them from pictures or depth."""
 
     subcommand: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Subcommand]]
     """What to do."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import tyro
 
@@ -13,6 +15,9 @@ from coliags_plugin.errors import InputError
 if TYPE_CHECKING:
     from coliags_plugin.poses.formats import Format
     from coliags_plugin.poses.trajectory import Intrinsics, Trajectory
+    from coliags_plugin.settings import Settings
+
+S = TypeVar("S", bound="Settings")
 
 OptionalFormat = Annotated[str | None, tyro.conf.arg(metavar="FORMAT")]
 
@@ -52,3 +57,56 @@ def parse_intrinsics(intrinsics: str | None, size: str | None) -> Intrinsics | N
         raise InputError(f"--intrinsics {intrinsics}", "four numbers fx,fy,cx,cy in pixels") from error
     with placed("--intrinsics, --size"):
         return Intrinsics(fx, fy, cx, cy, *parse_size(size))
+
+
+def settings_of(kind: type[S], assignments: Sequence[str], prefix: str = "") -> S:
+    """Settings from their defaults and ``--set`` assignments.
+
+    Args:
+        kind: The class.
+        assignments: ``key.path=value``.
+        prefix: What stood before each of the keys, for messages.
+
+    Raises:
+        InputError: An assignment is none, or a key or value is not valid; naming it.
+    """
+    from pydantic import ValidationError
+
+    from coliags_plugin.yaml_tree import Node, override
+
+    tree = Node({}, "options")
+    for assignment in assignments:
+        tree = override(tree, assignment)
+    try:
+        # Upon the defaults, as those of a part may differ from the part's own.
+        return kind.model_validate(_upon(kind().model_dump(), tree.plain()))
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise InputError(f"--set {prefix}{key}: {first['msg']} (got {first['input']!r})") from error
+
+
+def _upon(base: Any, over: Any) -> Any:
+    if not isinstance(base, dict) or not isinstance(over, dict):
+        return over
+    return {**base, **{key: _upon(base.get(key), value) for key, value in over.items()}}
+
+
+def refuse_output(out: Path, source: Path, overwrite: bool) -> None:
+    """Refuse a folder to make before the work rather than after it.
+
+    Raises:
+        InputError: It is the input or around or within it, or holds something and is not to be replaced.
+    """
+    made, read = out.resolve(), source.resolve()
+    if made == read or made in read.parents or read in made.parents:
+        raise InputError(f"--out {out}, and the input is {source}", "a folder apart from the input", "Choose another")
+    if not overwrite and out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out} already exists", "a new or empty folder", "Choose another, or pass --overwrite")
+
+
+def train_command(out: Path, *assignments: str) -> str:
+    """The command that trains on a scene whose only depth is that of its points, for a shell."""
+    losses = "losses.depth={name: sparse-depth, weight: 0.2, final_weight: 0.01}"
+    words = ["coliags", "train", "coliags", "--data", str(out)]
+    return shlex.join([*words, *(word for assignment in (losses, *assignments) for word in ("--set", assignment))])

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from coliags_plugin.datamanagers.c3vd_v2_files import INTRINSICS
-from coliags_plugin.datamanagers.c3vd_v2_lens import CANDIDATE_LENS, ORDER
+from coliags_plugin.datamanagers.c3vd_v2.files import INTRINSICS
+from coliags_plugin.datamanagers.c3vd_v2.lens import CANDIDATE_LENS, ORDER
 from coliags_plugin.datamanagers.phantom.imaging import Optics
 from coliags_plugin.datamanagers.phantom.layouts.base import Layout, Part, place
 from coliags_plugin.datamanagers.phantom.layouts.c3vd_raw import encode_depth, encode_normals, write_poses

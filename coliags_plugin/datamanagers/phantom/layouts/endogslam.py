@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from coliags_plugin.datamanagers.c3vd_endogslam import PREPARED_DEPTH, PREPARED_PINHOLE, PREPARED_SIZE
-from coliags_plugin.datamanagers.endogslam_files import PARAMS
+from coliags_plugin.datamanagers.c3vd_endogslam.files import PARAMS
+from coliags_plugin.datamanagers.c3vd_endogslam.manager import PREPARED_DEPTH, PREPARED_PINHOLE, PREPARED_SIZE
 from coliags_plugin.datamanagers.phantom.imaging import Optics, PinholeOptics
 from coliags_plugin.datamanagers.phantom.layouts.base import Layout, Part, WallPoints, place
 from coliags_plugin.datamanagers.phantom.layouts.c3vd_raw import write_poses

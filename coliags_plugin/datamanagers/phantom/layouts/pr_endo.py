@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from coliags_plugin.datamanagers.endogslam_files import OPTIMIZED, PARAMS
+from coliags_plugin.datamanagers.c3vd_endogslam.files import OPTIMIZED, PARAMS
 from coliags_plugin.datamanagers.phantom.imaging import Optics
 from coliags_plugin.datamanagers.phantom.layouts.base import Layout, Part, WallPoints
 from coliags_plugin.datamanagers.phantom.layouts.endogslam import EndoGslamLayout, write_params, write_prepared_frame

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, UInt8
 from coliags_plugin.datamanagers.phantom.imaging import Optics
 from coliags_plugin.datamanagers.phantom.layouts.base import Layout, Part
 from coliags_plugin.datamanagers.phantom.layouts.pictures import write_image
-from coliags_plugin.datamanagers.reim_nerf_files import C3VD_RANGE, ray_cosines
+from coliags_plugin.datamanagers.reim_nerf.files import C3VD_RANGE, ray_cosines
 from coliags_plugin.lenses import LENSES, FisheyeLens, Lens
 from coliags_plugin.poses.rigid import FLIP_Y_AND_Z
 

@@ -14,7 +14,7 @@ from coliags_plugin.datamanagers.phantom.imaging import Optics, PinholeOptics
 from coliags_plugin.datamanagers.phantom.layouts.base import Layout, Part, WallPoints
 from coliags_plugin.datamanagers.phantom.layouts.meshes import write_points
 from coliags_plugin.datamanagers.phantom.layouts.pictures import write_image
-from coliags_plugin.datamanagers.rotatecolon_files import POINTS, TEST, TRAIN, TRAIN_DEPTH, TRAIN_VIEWS
+from coliags_plugin.datamanagers.rotatecolon.files import POINTS, TEST, TRAIN, TRAIN_DEPTH, TRAIN_VIEWS
 from coliags_plugin.lenses import Pinhole
 from coliags_plugin.poses.rigid import FLIP_Y_AND_Z
 

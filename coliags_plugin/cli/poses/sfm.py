@@ -1,0 +1,61 @@
+"""``coliags poses sfm``: poses and points from pictures alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from coliags_plugin.cli.arguments import Assignments, OptionalInt, OptionalPath, OptionalText
+
+
+@dataclass(frozen=True)
+class Sfm:
+    """Find poses, camera and surface points from a video's pictures alone; write them as a scene."""
+
+    frames: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FRAMES")]
+    """Folder of pictures; their order is that of the numbers in their names."""
+    out: Path
+    """Folder to make, in COLMAP's layout."""
+    camera: OptionalText = None
+    """COLMAP's camera model, for instance PINHOLE or OPENCV_FISHEYE; default SIMPLE_RADIAL."""
+    params: Annotated[OptionalText, tyro.conf.arg(metavar="P1,P2,...")] = None
+    """Its parameters in COLMAP's order, pixel centres at integers + 0.5, taken for exact; default: found out."""
+    mask: OptionalPath = None
+    """Picture that is black where pixels are to be ignored, or a folder with one for each picture."""
+    every: int = 1
+    """Use every so-many-th picture."""
+    max_frames: OptionalInt = None
+    """Use at most so many pictures, the first ones."""
+    set: Assignments = ()
+    """An option of matching or mapping, for instance overlap=12 or features.max_features=2000."""
+    overwrite: bool = False
+    """Replace the output folder where it exists."""
+
+    def run(self) -> None:
+        """Reconstruct, write, and say what came out."""
+        from coliags_plugin.cli.poses.arguments import refuse_output, settings_of, train_command
+        from coliags_plugin.engine.progress import progress_callback
+        from coliags_plugin.errors import InputError
+        from coliags_plugin.poses.structure.pictures import pictures_of
+        from coliags_plugin.poses.structure.sfm import SfmSettings, masks_for, reconstruct, write_sfm_scene
+
+        refuse_output(self.out, self.frames, self.overwrite)
+        if self.every < 1 or (self.max_frames is not None and self.max_frames < 2):
+            raise InputError(f"--every {self.every}, --max-frames {self.max_frames}", "1 or more, and 2 or more")
+        given = [] if self.camera is None else [f"camera.model={self.camera}"]
+        given += [] if self.params is None else [f"camera.params=[{self.params}]"]
+        settings = settings_of(SfmSettings, [*given, *self.set])
+        pictures = pictures_of(self.frames)[:: self.every][: self.max_frames]
+        masks = None if self.mask is None else masks_for(self.mask, pictures)
+        with progress_callback() as progress:
+            found = reconstruct(pictures, settings, masks, progress)
+        write_sfm_scene(self.out, found, masks, self.overwrite)
+        print(
+            f"{found.summary()}\n"
+            f"the unit of length is arbitrary: in the median the points are {found.median_depth:.4g} units away; where "
+            "their distance in mm is known, divide it by that and pass --set datamanager.scale=QUOTIENT\n"
+            f"{self.out}\n{train_command(self.out)}"
+        )

@@ -1,0 +1,125 @@
+"""``coliags poses track``: poses from pictures and depth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from coliags_plugin.cli.arguments import Assignments, DataFormat
+
+if TYPE_CHECKING:
+    from coliags_plugin.poses.odometry.tracking import Tracking
+    from coliags_plugin.scenes import Scene
+
+#: Options of tracking begin with this; all others are the data manager's.
+_OWN = "tracking."
+
+
+@dataclass(frozen=True)
+class Track:
+    """Find the poses of a video from its pictures and depth, whatever poses it comes with; write it as a scene."""
+
+    scene: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCENE")]
+    """A scene, or a folder with colour, depth and intrinsics of which nobody knows the poses."""
+    out: Path
+    """Folder to make, in the layout of `rgbd`."""
+    format: DataFormat = None
+    """How the scene is laid out (`coliags list datamanagers`); default: what its files show."""
+    set: Assignments = ()
+    """An option of the data manager, as width=675, or of tracking, as tracking.method=hybrid."""
+    overwrite: bool = False
+    """Replace the output folder where it exists."""
+
+    def run(self) -> None:
+        """Track, write, and say what came out."""
+        from coliags_plugin.cli.poses.arguments import refuse_output, settings_of
+        from coliags_plugin.datamanagers.rgbd.writer import write_rgbd_scene
+        from coliags_plugin.engine.data_formats import open_video
+        from coliags_plugin.engine.progress import progress_callback
+        from coliags_plugin.poses.odometry.frames import Video
+        from coliags_plugin.poses.odometry.settings import TrackingSettings
+        from coliags_plugin.poses.odometry.tracking import track
+        from coliags_plugin.poses.trajectory import Intrinsics
+
+        refuse_output(self.out, self.scene, self.overwrite)
+        own = [option.removeprefix(_OWN) for option in self.set if option.startswith(_OWN)]
+        settings = settings_of(TrackingSettings, own, _OWN)
+        options = [option for option in self.set if not option.startswith(_OWN)]
+        with progress_callback() as progress:
+            scene, posed = open_video(self.scene, self.format, options, progress)
+            camera = scene.train[0].camera
+            pinhole = Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+            found = track(Video(scene.train), pinhole, settings, progress)
+            trajectory = write_rgbd_scene(
+                self.out, scene.train, found.camera_to_world, overwrite=self.overwrite, progress=progress
+            )
+        _warn_of_losses(found)
+        print("\n".join(_described(found)))
+        if posed:
+            print(_errors(found, scene))
+        print(f"{trajectory}\n{self.out}\ncoliags train coliags --data {_quoted(self.out)}")
+
+
+def _warn_of_losses(found: Tracking) -> None:
+    """Say which poses are guesses."""
+    import logging
+
+    import numpy as np
+
+    log = logging.getLogger(__name__)
+    lost = np.flatnonzero(~found.tracked)
+    if len(lost):
+        shown = ", ".join(map(str, lost[:8])) + (f" and {len(lost) - 8} more" if len(lost) > 8 else "")
+        log.warning("frames %s are lost: their poses are guesses at constant velocity", shown)
+    for before, after in found.jumps:
+        log.warning(
+            "between frames %d and %d nothing was found: how the path behind lies to the path before is a guess",
+            before,
+            after,
+        )
+
+
+def _described(found: Tracking) -> list[str]:
+    lines = [
+        f"{len(found.tracked)} frames, {int(found.tracked.sum())} tracked by {found.term}; lost edges: "
+        f"{len(found.failed)} of {len(found.tracked) - 1}",
+        f"between neighbours: fitness {found.fitness:.3f}, inlier RMSE {found.depth_rmse:.4g} in the unit "
+        f"of the depth (mm in C3VD), "
+        f"correlation of brightness {found.correlation:.3f}",
+    ]
+    if found.further or found.dropped or found.refused:
+        lines.append(
+            f"pose graph: {len(found.further)} further edges, {len(found.dropped)} dropped as contradicted, "
+            f"{found.refused} pairs that could not be laid together"
+        )
+    return lines
+
+
+def _errors(found: Tracking, scene: Scene) -> str:
+    """How far the found path is from the scene's own poses, which had no part in finding it."""
+    import numpy as np
+
+    from coliags_plugin.poses.alignment import FEWEST_MATCHES, align, associate
+    from coliags_plugin.poses.trajectory import Trajectory
+
+    if len(scene.train) < FEWEST_MATCHES:
+        return f"against the scene's own poses: no figures for fewer than {FEWEST_MATCHES} frames"
+    given = Trajectory(np.stack([frame.camera.camera_to_world.double().numpy() for frame in scene.train]))
+    estimate = Trajectory(found.camera_to_world)
+    result = align(estimate, given, associate(estimate, given, "index"))
+    path = float(np.linalg.norm(np.diff(given.centers, axis=0), axis=1).sum())
+    share = f" ({100.0 * result.ate.rmse / path:.3g} % of the path, {path:.4g})" if path > 0.0 else ""
+    rpe, turn = result.rpe_translation, result.rpe_rotation_deg
+    return (
+        f"against the scene's own poses: ATE rmse {result.ate.rmse:.4g}{share}, max {result.ate.max:.4g}; "
+        f"RPE over 1 frame rmse {rpe.rmse:.4g} and {turn.rmse:.4g} deg"
+    )
+
+
+def _quoted(path: Path) -> str:
+    import shlex
+
+    return shlex.quote(str(path))

@@ -1,0 +1,93 @@
+"""``coliags poses triangulate``: surface points of a scene whose poses are known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from coliags_plugin.cli.arguments import Assignments, DataFormat
+
+if TYPE_CHECKING:
+    from coliags_plugin.datamanagers.splits import Split
+    from coliags_plugin.scenes import Frame, Scene
+
+#: Options of triangulation begin with this; all others are the data manager's.
+_OWN = "triangulation."
+
+
+@dataclass(frozen=True)
+class Triangulate:
+    """Find surface points of a posed video; write it as a scene with initial points and sparse depth."""
+
+    scene: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCENE")]
+    """The scene's folder."""
+    out: Path
+    """Folder to make, in COLMAP's layout."""
+    format: DataFormat = None
+    """How the scene is laid out (`coliags list datamanagers`); default: what its files show."""
+    set: Assignments = ()
+    """An option of the data manager, as width=675, or of triangulation, as triangulation.min_angle=1."""
+    overwrite: bool = False
+    """Replace the output folder where it exists."""
+
+    def run(self) -> None:
+        """Triangulate the training frames, write all frames, and say what came out."""
+        import logging
+
+        from coliags_plugin.cli.poses.arguments import refuse_output, settings_of, train_command
+        from coliags_plugin.engine.data_formats import open_scene
+        from coliags_plugin.engine.progress import progress_callback
+        from coliags_plugin.poses.structure.colmap_scene import write_colmap_scene
+        from coliags_plugin.poses.structure.triangulation import TriangulationSettings, triangulate
+
+        refuse_output(self.out, self.scene, self.overwrite)
+        own = [option.removeprefix(_OWN) for option in self.set if option.startswith(_OWN)]
+        settings = settings_of(TriangulationSettings, own, _OWN)
+        options = [option for option in self.set if not option.startswith(_OWN)]
+        with progress_callback() as progress:
+            # Whatever initial points there are is not wanted here, unless it is asked for.
+            scene = open_scene(self.scene, self.format, ["initial_points=none", *options], progress)
+            found = triangulate(scene.train, settings, progress)
+        test, split = _held_out(scene)
+        write_colmap_scene(self.out, scene.train, found, test, self.overwrite)
+        log = logging.getLogger(__name__)
+        if test:
+            log.info(
+                "points come from the %d training frames; the %d test frames see none", len(scene.train), len(test)
+            )
+        print(f"{found.summary()}\n{self.out}\n{train_command(self.out, *split)}")
+
+
+def _held_out(scene: Scene) -> tuple[list[Frame], list[str]]:
+    """Test frames that the written scene keeps, and the options under which they are its test frames again."""
+    import logging
+
+    from coliags_plugin.datamanagers.splits import held_out
+
+    log = logging.getLogger(__name__)
+    test = list(scene.test_sets.get("test", ()))
+    others = {name: len(frames) for name, frames in scene.test_sets.items() if name != "test"}
+    if others:
+        log.warning(
+            "left out: %s, which COLMAP's layout has no place for",
+            ", ".join(f"test set {name} ({count} frames)" for name, count in others.items()),
+        )
+    chosen = scene.provenance.get("split", {})
+    block = tuple(chosen.get("block", (0.4, 0.6)))
+    video = sorted([*scene.train, *test], key=lambda frame: frame.index)
+    places = {frame.index for frame in test}
+    is_test = [frame.index in places for frame in video]
+    options: dict[Split, list[str]] = {
+        "every-8th": [],
+        "endogslam": ["datamanager.split=endogslam"],
+        "all-train": ["datamanager.split=all-train"],
+        "block": ["datamanager.split=block", f"datamanager.block=[{block[0]:g}, {block[1]:g}]"],
+    }
+    for split, assignments in options.items():
+        if held_out(split, len(video), (block[0], block[1])).tolist() == is_test:
+            return test, assignments
+    log.warning("left out: the %d test frames, as COLMAP's layout cannot say which they are", len(test))
+    return [], options["all-train"]

@@ -1,0 +1,1 @@
+"""C3VD: the raw release and the undistorted layout."""

@@ -1,0 +1,62 @@
+"""C3VD: posed colonoscopy of silicone phantoms, with dense depth (Bobrow et al., 2023)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field
+
+from coliags_plugin.datamanagers.c3vd.layouts import find_layout, recognise
+from coliags_plugin.datamanagers.c3vd.sequences import SequenceDataManager, SequenceFiles, octagon_view
+from coliags_plugin.datamanagers.reading.camera_json import read_intrinsics
+from coliags_plugin.datamanagers.scene_settings import SceneSettings
+from coliags_plugin.datamanagers.views import View
+from coliags_plugin.lenses import LENSES
+
+
+class C3VDSettings(SceneSettings):
+    """Options of the ``c3vd`` data manager."""
+
+    lens: Literal["omnidirectional", "legacy-pinhole", "fisheye"] = Field(
+        "omnidirectional",
+        description="How raw frames are undistorted (pinhole frames need none): 'omnidirectional' rendered the ground "
+        "truth; 'legacy-pinhole' is behind most published numbers and off by degrees (docs/layouts/c3vd.md 2); "
+        "'fisheye' is REIM-NeRF's.",
+    )
+    mask: bool = Field(True, description="Ignore what lies outside the octagon of raw frames.")
+
+
+class C3VDDataManager(SequenceDataManager):
+    """Reads a C3VD sequence: the raw release or the undistorted layout, told apart by the files.
+
+    See docs/layouts/c3vd.md 1 and 3, and :class:`SequenceDataManager` for test views beside the sequence.
+    """
+
+    Settings = C3VDSettings
+
+    settings: C3VDSettings
+    name = "c3vd"
+
+    @classmethod
+    def recognise(cls, path: Path) -> str | None:
+        """See :class:`DataManager`."""
+        return recognise(path)
+
+    def find(self, folder: Path) -> SequenceFiles:
+        """See :class:`SequenceDataManager`."""
+        return find_layout(folder)
+
+    def view(self, files: SequenceFiles) -> tuple[View, dict[str, Any]]:
+        """See :class:`SequenceDataManager`."""
+        settings = self.settings
+        raw = files.camera is None
+        facts = {
+            "lens": settings.lens if raw else None,
+            "focal_scale": settings.focal_scale if raw else None,
+            "mask": "octagon" if raw and settings.mask else None,
+        }
+        if files.camera is not None:
+            pinhole, width, height = read_intrinsics(files.camera)
+            return View.of_pinhole(pinhole, width, height, files.camera, settings.size), facts
+        return octagon_view(LENSES[settings.lens], files.images[0], settings, settings.mask), facts

@@ -1,0 +1,120 @@
+"""What C3VD's releases have in common: numbered frames, one pose file, 16-bit depth, and test views beside them."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from coliags_plugin.datamanagers.fusion import load_points
+from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH
+from coliags_plugin.datamanagers.reading.frame_files import marks
+from coliags_plugin.datamanagers.recorded import RecordedDataManager
+from coliags_plugin.datamanagers.recording import Recording, Shot, check_pose_count, fingerprint
+from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
+from coliags_plugin.datamanagers.seen import ROTATION, seen_marks
+from coliags_plugin.datamanagers.views import View, whole_frame
+from coliags_plugin.lenses import Lens, octagon_mask
+from coliags_plugin.poses.c3vd import read_poses
+
+
+@dataclass(frozen=True)
+class SequenceFiles:
+    """The files of one sequence.
+
+    Attributes:
+        kind: Of layout, for provenance.
+        folder: Where the sequence is.
+        images: Colour pictures, frame 0 first.
+        depths: Depth pictures of the same frames; None where there is not one.
+        poses: The pose file.
+        camera: The file that describes the camera, where there is one.
+    """
+
+    kind: str
+    folder: Path
+    images: tuple[Path, ...]
+    depths: tuple[Path, ...] | None
+    poses: Path
+    camera: Path | None = None
+
+    def fingerprint(self) -> str:
+        """See :func:`coliags_plugin.datamanagers.recording.fingerprint`."""
+        return fingerprint(self.folder, (*self.images, *(self.depths or ())), (self.poses, self.camera))
+
+
+class SequenceDataManager(RecordedDataManager):
+    """A data manager of one of the releases, which says where the files are and how they were looked at.
+
+    A sub-folder ``rotation`` in the same layout becomes the test set of that name. ``seen/NNNN_seen.png`` in it, and
+    ``truth/seen/NNNN_seen.png`` beside the sequence (valid for the split every-8th of all frames), mark what training
+    frames see.
+    """
+
+    @abstractmethod
+    def find(self, folder: Path) -> SequenceFiles:
+        """The files of the sequence in a folder.
+
+        Raises:
+            InputError: They are missing or do not pair up.
+        """
+
+    @abstractmethod
+    def view(self, files: SequenceFiles) -> tuple[View, dict[str, Any]]:
+        """How its pictures become working pictures, and what provenance says about that.
+
+        Raises:
+            InputError: The camera's file cannot be read, or the pictures are not of the camera.
+        """
+
+    def open(self, path: Path) -> Recording:
+        """See :class:`RecordedDataManager`."""
+        files = self.find(path)
+        shots, facts = self._shots(files, seen_marks(path, len(files.images), self.settings, "every-8th"))
+        test_sets = {}
+        if (path / ROTATION).is_dir():
+            rotation = self.find(path / ROTATION)
+            seen = marks(path / ROTATION / "seen", "seen", len(rotation.images))
+            test_sets[ROTATION], facts[ROTATION] = self._shots(rotation, seen, f"{ROTATION}-")
+        points = path / POINTS_FILE
+        return Recording(
+            kind=f"{files.kind} layout, {facts['pose_convention']['order']} poses",
+            shots=shots,
+            facts=facts,
+            fingerprint=files.fingerprint(),
+            test_sets=test_sets,
+            own_points=(lambda: load_points(points)) if points.is_file() else None,
+            points_source=points,
+        )
+
+    def _shots(
+        self, files: SequenceFiles, seen: Mapping[int, Path], prefix: str = ""
+    ) -> tuple[list[Shot], dict[str, Any]]:
+        poses = read_poses(files.poses)
+        check_pose_count(files.poses, len(poses.camera_to_world), len(files.images))
+        view, described = self.view(files)
+        depths = files.depths or (None,) * len(files.images)
+        shots = [
+            Shot(prefix + image.stem, image, view, pose, depth, C3VD_DEPTH, seen=seen.get(place))
+            for place, (image, depth, pose) in enumerate(zip(files.images, depths, poses.camera_to_world, strict=True))
+        ]
+        facts: dict[str, Any] = {
+            "layout": files.kind,
+            **described,
+            **view.facts(),
+            "pose_convention": {"order": poses.convention, **poses.evidence},
+        }
+        return shots, facts
+
+
+def octagon_view(lens: Lens, image: Path, settings: SceneSettings, mask: bool) -> View:
+    """The view of raw frames, of which one is ``image``: undistorted, and masked outside the octagon if wanted.
+
+    Raises:
+        InputError: The picture is a crop, so that the lens's calibration does not apply to it.
+    """
+    lens = whole_frame(lens, image)
+    shows = octagon_mask(lens.width, lens.height) if mask else None
+    return View.through(lens, image, settings.size, settings.focal_scale, shows)

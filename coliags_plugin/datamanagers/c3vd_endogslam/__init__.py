@@ -1,0 +1,1 @@
+"""C3VD as EndoGSLAM prepared it, and PR-Endo's release."""

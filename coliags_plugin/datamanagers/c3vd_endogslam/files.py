@@ -1,0 +1,131 @@
+"""Where the files of C3VD as EndoGSLAM and PR-Endo prepared it are (docs/layouts/c3vd-endogslam.md 1, 2)."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from coliags_plugin.datamanagers.reading.frame_files import TIFF_SUFFIXES, inventory, numbered, paired
+from coliags_plugin.datamanagers.recording import fingerprint
+from coliags_plugin.errors import InputError
+from coliags_plugin.poses.c3vd import recognise as has_matrices
+
+LAYOUT = (
+    "EndoGSLAM's C3VD: color/NNNN_color.png and depth/NNNN_depth.tiff with pose.txt, params.npz or both; "
+    "or PR-Endo's: C3VD/<scene> beside C3VD_endogslam_optimized/<scene>"
+)
+PARAMS = "params.npz"
+#: PR-Endo keeps the scenes of the folder X in X, and what EndoGSLAM made of them in X_endogslam_optimized.
+OPTIMIZED = "_endogslam_optimized"
+
+
+@dataclass(frozen=True)
+class PreparedFiles:
+    """The files of one sequence.
+
+    Attributes:
+        folder: Where the sequence is.
+        images: Colour pictures, frame 0 first.
+        depths: Depth pictures of the same frames; None where there is not one.
+        poses: ``pose.txt``; None where there is none.
+        params: EndoGSLAM's result; None where there is none.
+        cloud: The optimised Gaussians of PR-Endo's release; None where there are none.
+    """
+
+    folder: Path
+    images: tuple[Path, ...]
+    depths: tuple[Path, ...] | None
+    poses: Path | None
+    params: Path | None
+    cloud: Path | None
+
+    def fingerprint(self) -> str:
+        """See :func:`coliags_plugin.datamanagers.recording.fingerprint`."""
+        return fingerprint(self.folder, (*self.images, *(self.depths or ()), self.cloud), (self.poses, self.params))
+
+
+def recognise(folder: Path) -> str | None:
+    """What in the folder says that it is such a sequence, or the folder of PR-Endo's release; None otherwise."""
+    pictures = any(re.fullmatch(r"\d+_color", path.stem) for path in folder.glob("color/*.png"))
+    poses = folder / "pose.txt"
+    if pictures and _params(folder, None) is not None:
+        return "color/NNNN_color.png and a params.npz"
+    if pictures and poses.is_file() and has_matrices(poses):
+        return "pose.txt (16 numbers a line) beside color/NNNN_color.png"
+    if not pictures and (beside := _release(folder)):
+        return f"{beside[0].parent.name}{OPTIMIZED}/ beside {beside[0].parent.name}/"
+    return None
+
+
+def scene_folder(path: Path) -> Path:
+    """The sequence's own folder: ``path``, or the one scene of PR-Endo's release in it.
+
+    Raises:
+        InputError: ``path`` is missing, or holds a release of several scenes.
+    """
+    if not path.is_dir():
+        raise InputError(f"no folder {path}", LAYOUT, "Check the path")
+    scenes = [] if (path / "color").is_dir() else _release(path)
+    if len(scenes) > 1:
+        raise InputError(f"{path} holds several scenes", "one scene", f"Name one, for instance {sorted(scenes)[0]}")
+    return scenes[0] if scenes else path
+
+
+def find_sequence(folder: Path, params_file: str | None) -> PreparedFiles:
+    """Look at a sequence's own folder.
+
+    Args:
+        folder: With ``color`` in it.
+        params_file: Where EndoGSLAM's result is, relative to the folder or absolute; None to look in the folder and
+            where PR-Endo's release has it.
+
+    Raises:
+        InputError: It holds something else, its frames do not pair up, or ``params_file`` is not there.
+    """
+    images = numbered(folder / "color", "color", frozenset({".png"})) if (folder / "color").is_dir() else {}
+    if not images:
+        place = folder / "color" if (folder / "color").is_dir() else folder
+        raise InputError(
+            f"{place} holds {inventory(place)}", LAYOUT, "Name the sequence's own folder, for instance C3VD/cecum_t1_b"
+        )
+    depths = numbered(folder / "depth", "depth", TIFF_SUFFIXES) if (folder / "depth").is_dir() else {}
+    params = _params(folder, params_file)
+    poses = folder / "pose.txt"
+    return PreparedFiles(
+        folder,
+        *paired(folder, images, depths),
+        poses if poses.is_file() else None,
+        params,
+        None if params is None else _newest_cloud(params.parent),
+    )
+
+
+def _params(folder: Path, params_file: str | None) -> Path | None:
+    if params_file is not None:
+        if not (folder / params_file).is_file():
+            raise InputError(f"no file {folder / params_file}", "EndoGSLAM's params.npz", "Mend params_file")
+        return folder / params_file
+    here = folder.resolve()
+    beside = here.parent.with_name(here.parent.name + OPTIMIZED) / here.name if here.parent.name else here
+    return next((place / PARAMS for place in (folder, beside) if (place / PARAMS).is_file()), None)
+
+
+def _newest_cloud(folder: Path) -> Path | None:
+    """``point_cloud/iteration_N/point_cloud.ply`` of the largest N."""
+    found = {
+        int(match.group(1)): path
+        for path in folder.glob("point_cloud/iteration_*/point_cloud.ply")
+        if (match := re.fullmatch(r"iteration_(\d+)", path.parent.name))
+    }
+    return found[max(found)] if found else None
+
+
+def _release(folder: Path) -> list[Path]:
+    """The scenes of PR-Endo's release in a folder, for which EndoGSLAM's result is there too."""
+    return [
+        scene
+        for results in folder.glob(f"*{OPTIMIZED}")
+        for scene in (folder / results.name.removesuffix(OPTIMIZED)).glob("*")
+        if (scene / "color").is_dir() and (results / scene.name / PARAMS).is_file()
+    ]

@@ -1,0 +1,192 @@
+"""C3VD as EndoGSLAM prepared it, with the poses and the map EndoGSLAM found; and PR-Endo's release of both."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from pydantic import Field
+
+from coliags_plugin.datamanagers.c3vd_endogslam.files import (
+    PARAMS,
+    PreparedFiles,
+    find_sequence,
+    recognise,
+    scene_folder,
+)
+from coliags_plugin.datamanagers.c3vd_endogslam.poses import Placement, PoseSource, place_sequence
+from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH, DepthFormat, DepthSteps
+from coliags_plugin.datamanagers.reading.frame_files import marks
+from coliags_plugin.datamanagers.reading.images import bits_of, size_of
+from coliags_plugin.datamanagers.reading.ply_vertices import read_vertices
+from coliags_plugin.datamanagers.recorded import RecordedDataManager
+from coliags_plugin.datamanagers.recording import Recording, Shot, check_pose_count
+from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
+from coliags_plugin.datamanagers.seen import ROTATION, seen_marks
+from coliags_plugin.datamanagers.splits import Split
+from coliags_plugin.datamanagers.views import ASPECT_TOLERANCE, View
+from coliags_plugin.errors import InputError
+from coliags_plugin.lenses import Pinhole
+from coliags_plugin.poses.c3vd import read_poses
+from coliags_plugin.poses.endogslam import EndoGslamParams, read_params
+from coliags_plugin.scenes import PointCloud
+
+#: K of the prepared pictures, half of the calibration behind them (docs/layouts/c3vd.md 2), as EndoGSLAM has it.
+PREPARED_PINHOLE = Pinhole(401.1595, 400.9425, 334.1430, 273.8665)
+PREPARED_SIZE = (675, 540)
+#: EndoGSLAM's 8-bit depth: 2.55 steps a mm, cut off below; the last step is where C3VD's range ends.
+PREPARED_DEPTH = DepthSteps(100.0 / 255.0, 8, 255)
+#: How far a principal point may be from the middle, as a share of the picture; prepared pictures have 0.7 %.
+MIDDLE_TOLERANCE = 0.1
+#: Value of the first spherical harmonic: the colour of a 3DGS PLY is this times f_dc, plus a half.
+_SH0 = 0.28209479177387814
+
+
+class C3VDEndoGSLAMSettings(SceneSettings):
+    """Options of the ``c3vd-endogslam`` data manager."""
+
+    poses: PoseSource = Field(
+        "slam",
+        description="'slam': those EndoGSLAM found; 'ground-truth': those of the data set.",
+    )
+    params_file: str | None = Field(
+        None,
+        description="EndoGSLAM's params.npz, relative to the scene folder or absolute. None: params.npz in the scene "
+        "folder, or where PR-Endo's release has it.",
+    )
+    split: Split = Field("endogslam", description="As for all data; EndoGSLAM and PR-Endo test on 7, 15, 23, ...")
+    initial_points: InitialPoints = Field("data", description="As for all data; the map that EndoGSLAM found.")
+
+
+class C3VDEndoGSLAMDataManager(RecordedDataManager):
+    """Reads C3VD with EndoGSLAM's poses and map: EndoGSLAM's own folders, or PR-Endo's release.
+
+    See docs/layouts/c3vd-endogslam.md. A sub-folder ``rotation``, with its own pose.txt, becomes the test set of that
+    name; ``rotation/seen`` and ``truth/seen`` (valid for the split endogslam of all frames) mark what training frames
+    see.
+    """
+
+    Settings = C3VDEndoGSLAMSettings
+
+    settings: C3VDEndoGSLAMSettings
+    name = "c3vd-endogslam"
+
+    @classmethod
+    def recognise(cls, path: Path) -> str | None:
+        """See :class:`DataManager`."""
+        return recognise(path)
+
+    def open(self, path: Path) -> Recording:
+        """See :class:`RecordedDataManager`."""
+        folder = scene_folder(path)
+        files = find_sequence(folder, self.settings.params_file)
+        params = None if files.params is None else read_params(files.params)
+        placement = place_sequence(files, params, self.settings.poses)
+        view = self._view(files, params)
+        depth_format = _depth_format(files)
+        facts: dict[str, Any] = {
+            "layout": "endogslam" if files.cloud is None else "pr-endo",
+            "scene": folder.name,
+            **placement.facts,
+            "intrinsics_from": "EndoGSLAM's table" if files.params is None else str(files.params),
+            "depth_step_mm": None if depth_format is None else depth_format.size,
+            **view.facts(),
+        }
+        count = len(files.images)
+        seen = seen_marks(folder, count, self.settings, "endogslam")
+        shots = _shots(files, view, placement.camera_to_world, depth_format, seen)
+        test_sets = {}
+        if (folder / ROTATION).is_dir():
+            test_sets[ROTATION] = self._rotation(folder / ROTATION, view, placement)
+        points_source = files.cloud or (files.params if params is not None and len(params.means) else None)
+        return Recording(
+            kind=f"{facts['layout']} layout, {self.settings.poses} poses",
+            shots=shots,
+            facts=facts,
+            fingerprint=files.fingerprint(),
+            test_sets=test_sets,
+            own_points=None if points_source is None else lambda: _map_points(files.cloud, params, placement),
+            points_source=points_source or folder / PARAMS,
+        )
+
+    def _view(self, files: PreparedFiles, params: EndoGslamParams | None) -> View:
+        width, height = size_of(files.images[0])
+        pinhole, (calibrated_width, calibrated_height) = PREPARED_PINHOLE, PREPARED_SIZE
+        described_by: Path | str = "EndoGSLAM's calibration"
+        if params is not None and files.params is not None:
+            k = params.pinhole
+            pinhole = Pinhole(k.fx, k.fy, k.cx - 0.5, k.cy - 0.5)
+            calibrated_width, calibrated_height, described_by = k.width, k.height, files.params
+        if abs((width / height) / (calibrated_width / calibrated_height) - 1.0) > ASPECT_TOLERANCE:
+            raise InputError(
+                f"{files.images[0]} is {width} x {height}, but {described_by} is for "
+                f"{calibrated_width} x {calibrated_height}",
+                "pictures of that size, or scaled from it",
+                "Give the params.npz that was made from these pictures",
+            )
+        pinhole = pinhole.scaled(width / calibrated_width, height / calibrated_height)
+        off_middle = max(abs((pinhole.cx + 0.5) / width - 0.5), abs((pinhole.cy + 0.5) / height - 0.5))
+        if off_middle > MIDDLE_TOLERANCE:
+            raise InputError(
+                f"{described_by}: the principal point ({pinhole.cx:g}, {pinhole.cy:g}) is {100 * off_middle:.0f} % of "
+                f"the picture ({width} x {height}) from its middle",
+                "intrinsics of the size that org_width and org_height say",
+                "They are of another resolution: mend org_width and org_height, or the intrinsics",
+            )
+        return View.of_pinhole(pinhole, width, height, files.images[0], self.settings.size)
+
+    def _rotation(self, folder: Path, view: View, placement: Placement) -> list[Shot]:
+        files = find_sequence(folder, None)
+        if files.poses is None or placement.from_file is None:
+            raise InputError(
+                f"{folder} has pictures, but {'the scene' if files.poses else 'it'} has no pose.txt",
+                "pose.txt of the scene and of its rotation views, in one world",
+                f"Add it, or move {folder.name} away",
+            )
+        poses = read_poses(files.poses).camera_to_world
+        check_pose_count(files.poses, len(poses), len(files.images))
+        seen = marks(folder / "seen", "seen", len(files.images))
+        return _shots(files, view, placement.from_file @ poses, _depth_format(files), seen, f"{ROTATION}-")
+
+
+def _shots(
+    files: PreparedFiles,
+    view: View,
+    camera_to_world: Float[np.ndarray, "N 4 4"],
+    depth_format: DepthFormat | None,
+    seen: Mapping[int, Path],
+    prefix: str = "",
+) -> list[Shot]:
+    depths: Sequence[Path | None] = files.depths or (None,) * len(files.images)
+    return [
+        Shot(prefix + image.stem, image, view, pose, depth, depth_format, seen=seen.get(place))
+        for place, (image, depth, pose) in enumerate(zip(files.images, depths, camera_to_world, strict=True))
+    ]
+
+
+def _depth_format(files: PreparedFiles) -> DepthSteps | None:
+    """8 bits as EndoGSLAM's script leaves them, or C3VD's own 16; the first file tells, and all must be alike."""
+    if files.depths is None:
+        return None
+    return PREPARED_DEPTH if bits_of(files.depths[0]) == PREPARED_DEPTH.bits else C3VD_DEPTH
+
+
+def _map_points(cloud: Path | None, params: EndoGslamParams | None, placement: Placement) -> PointCloud:
+    """The map's points in the world of the poses."""
+    if cloud is not None:
+        names = tuple(f"f_dc_{channel}" for channel in range(3))
+        vertices = read_vertices(cloud, ("x", "y", "z", *names))
+        positions = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float64)
+        shares = _SH0 * np.stack([vertices[name] for name in names], axis=1) + 0.5
+    elif params is not None:
+        positions, shares = params.means, params.rgb_colors
+    else:
+        raise TypeError("points of a map that is not there")
+    colors = np.rint(255.0 * np.clip(np.nan_to_num(shares), 0.0, 1.0)).astype(np.uint8)
+    if placement.from_slam is not None:
+        positions = positions @ placement.from_slam[:3, :3].T + placement.from_slam[:3, 3]
+    return PointCloud(torch.from_numpy(positions.astype(np.float32)), torch.from_numpy(colors))

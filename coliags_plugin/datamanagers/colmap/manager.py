@@ -1,0 +1,228 @@
+"""Pictures with a COLMAP sparse model: poses, cameras, points, and depth at those points."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from pydantic import Field
+
+from coliags_plugin.datamanagers.colmap.files import Model, Picture, beside, find_models, read_model
+from coliags_plugin.datamanagers.colmap.lens import PINHOLES, ColmapLens
+from coliags_plugin.datamanagers.lens_views import LensView, undistorter
+from coliags_plugin.datamanagers.reading.depth_arrays import depth_format
+from coliags_plugin.datamanagers.reading.picture_names import first_few, others_beside, short_names, warn_of_others
+from coliags_plugin.datamanagers.recorded import RecordedDataManager
+from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
+from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
+from coliags_plugin.datamanagers.seen import seen_marks
+from coliags_plugin.datamanagers.views import View
+from coliags_plugin.errors import InputError
+from coliags_plugin.scenes import PointCloud, SparseDepth
+
+log = logging.getLogger(__name__)
+
+_DEPTH_SUFFIXES = (".png", ".npy", ".tiff", ".tif")
+
+
+class ColmapSettings(SceneSettings):
+    """Options of the ``colmap`` data manager."""
+
+    initial_points: InitialPoints = Field(
+        "data",
+        description="Initial points: 'data': the model's sparse points; 'depth': fused from depths/ where there is "
+        "one; 'file': points_file.",
+    )
+    model: str | None = Field(
+        None,
+        description="Folder of the sparse model, relative to the scene. None: sparse/0, sparse, colmap/sparse/0, "
+        "colmap/sparse or the scene's folder itself, whichever comes first.",
+    )
+    images_folder: str = Field("images", description="Folder that the model's picture names are relative to.")
+    scale: float = Field(
+        1.0,
+        gt=0.0,
+        description="Millimetres in the model's unit of length, which COLMAP leaves open. Poses, points and what "
+        "depends on them are multiplied by it.",
+    )
+    max_reprojection_error: float = Field(
+        2.0,
+        gt=0.0,
+        description="A picture is given the depth of a point only where the point falls within so many pixels of the "
+        "stored picture of where it was seen.",
+    )
+    min_track_length: int = Field(
+        3,
+        ge=2,
+        description="Points seen in fewer pictures than this give no depth; they are initial points all the same.",
+    )
+    depth_unit: float = Field(
+        1.0, gt=0.0, description="Millimetres that the number 1 in a file of depths/ stands for (after scale)."
+    )
+
+
+class ColmapDataManager(RecordedDataManager):
+    """Reads pictures posed by COLMAP, or by anything that writes its sparse models (docs/layouts/colmap.md)."""
+
+    Settings = ColmapSettings
+
+    settings: ColmapSettings
+    name = "colmap"
+
+    @classmethod
+    def recognise(cls, path: Path) -> str | None:
+        """See :class:`DataManager`."""
+        # nerfstudio keeps the model it was made from; its own poses are in transforms.json.
+        found = [] if (path / "transforms.json").is_file() else find_models(path)
+        return f"a sparse model in {found[0].relative_to(path).as_posix()}" if found else None
+
+    def open(self, path: Path) -> Recording:
+        """See :class:`RecordedDataManager`."""
+        settings = self.settings
+        if not path.is_dir():
+            raise InputError(f"no folder {path}", "a folder with images/ and sparse/0", "Check the path")
+        model = read_model(self._model_folder(path))
+        images = _pictures_on_disk(path / settings.images_folder, model)
+        masks = [beside(path / "masks", picture.name, (".png",)) for picture in model.pictures]
+        depths = _depths(path / "depths", model)
+        views = self._views(model)
+        names = short_names([picture.name for picture in model.pictures])
+        others = others_beside(images, (*masks, *depths))
+        warn_of_others(model.files[1], others)
+        # Seen masks are numbered by picture, so that a picture left out would put them out of step.
+        seen = {} if others else seen_marks(path, len(images), settings, "every-8th")
+        shots, used = [], 0
+        for place, picture in enumerate(model.pictures):
+            camera_to_world = model.camera_to_world[place].copy()
+            camera_to_world[:3, 3] *= settings.scale
+            view, depth = views[picture.camera], depths[place]
+            sparse = self._sparse_depth(model, picture, camera_to_world, view)
+            used += 0 if sparse is None else len(sparse.depth)
+            shots.append(
+                Shot(
+                    names[place],
+                    images[place],
+                    view,
+                    camera_to_world,
+                    depth,
+                    None if depth is None else depth_format(depth, settings.depth_unit),
+                    masks[place],
+                    seen.get(place),
+                    sparse,
+                )
+            )
+        kinds = sorted({lens.model for lens in model.cameras.values()})
+        facts: dict[str, Any] = {
+            "layout": "colmap",
+            "model": str(model.folder),
+            "lens": ", ".join(kinds),
+            "focal_scale": settings.focal_scale if set(kinds) - PINHOLES else None,
+            "cameras": len(views),
+            **next(iter(views.values())).facts(),
+            "scale": settings.scale,
+            "sparse_points": len(model.positions),
+            "observations": sum(len(picture.points) for picture in model.pictures),
+            "sparse_depths": used,
+            "masks": sum(mask is not None for mask in masks),
+        }
+        return Recording(
+            kind=f"COLMAP model {model.folder}, {len(model.positions)} points, cameras {', '.join(kinds)}",
+            shots=shots,
+            facts=facts,
+            fingerprint=fingerprint(path, [*images, *masks, *depths], model.files),
+            own_points=(lambda: self._points(model)) if len(model.positions) else None,
+            points_source=model.files[-1],
+        )
+
+    def _model_folder(self, path: Path) -> Path:
+        if self.settings.model is not None:
+            return path / self.settings.model
+        found = find_models(path)
+        if not found:
+            raise InputError(
+                f"{path} holds no COLMAP model",
+                "cameras, images and points3D, all .bin or all .txt, in sparse/0, sparse, colmap/sparse/0, "
+                "colmap/sparse or the folder itself",
+                "Check the path, or set datamanager.model",
+            )
+        if len(found) > 1:
+            others = ", ".join(folder.relative_to(path).as_posix() for folder in found[1:])
+            log.warning("reading %s; there are further models, which datamanager.model chooses: %s", found[0], others)
+        return found[0]
+
+    def _views(self, model: Model) -> dict[int, View]:
+        settings, undistort = self.settings, undistorter()
+
+        def view(lens: ColmapLens) -> View:
+            if lens.model in PINHOLES:
+                return View.of_pinhole(lens.pinhole, lens.width, lens.height, model.cameras_file, settings.size)
+            return LensView.of(lens, model.cameras_file, settings.size, settings.focal_scale, undistort)
+
+        return {number: view(lens) for number, lens in model.cameras.items()}
+
+    def _sparse_depth(
+        self, model: Model, picture: Picture, camera_to_world: np.ndarray, view: View
+    ) -> SparseDepth | None:
+        """Depth where the points project to, which many pictures agree on, not where this one picture saw them."""
+        settings, lens = self.settings, model.cameras[picture.camera]
+        points = model.positions[picture.points] * settings.scale
+        local = (points - camera_to_world[:3, 3]) @ camera_to_world[:3, :3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            error = np.linalg.norm(lens.project(local) + 0.5 - picture.observed, axis=1)
+            fx, fy, cx, cy = view.pinhole
+            pixels = local[:, :2] / local[:, 2:] * (fx, fy) + (cx + 0.5, cy + 0.5)
+            kept = (error <= settings.max_reprojection_error) & (local[:, 2] > 0.0)
+            kept &= (pixels >= 0.0).all(axis=1) & (pixels[:, 0] < view.width) & (pixels[:, 1] < view.height)
+        kept &= model.track_lengths[picture.points] >= settings.min_track_length
+        # A point that was seen twice in one picture still has one depth there.
+        kept[kept] = _first_of_each(picture.points[kept])
+        if not kept.any():
+            return None
+        return SparseDepth(
+            torch.from_numpy(pixels[kept].astype(np.float32)), torch.from_numpy(local[kept, 2].astype(np.float32))
+        )
+
+    def _points(self, model: Model) -> PointCloud:
+        positions = (model.positions * self.settings.scale).astype(np.float32)
+        return PointCloud(torch.from_numpy(positions), torch.from_numpy(model.colors))
+
+
+def _first_of_each(numbers: np.ndarray) -> np.ndarray:
+    first = np.zeros(len(numbers), bool)
+    first[np.unique(numbers, return_index=True)[1]] = True
+    return first
+
+
+def _pictures_on_disk(folder: Path, model: Model) -> list[Path]:
+    if not folder.is_dir():
+        raise InputError(
+            f"no folder {folder}", "the pictures that the model was made from", "Set datamanager.images_folder"
+        )
+    paths = [folder / picture.name for picture in model.pictures]
+    missing = [path for path in paths if not path.is_file()]
+    if missing:
+        named = first_few([path.name for path in missing])
+        raise InputError(
+            f"{len(missing)} of the {len(paths)} pictures of {model.folder} are not in {folder}: {named}",
+            "every registered picture, under the name the model has for it",
+            "Restore them, or set datamanager.images_folder",
+        )
+    return paths
+
+
+def _depths(folder: Path, model: Model) -> list[Path | None]:
+    """Depth files of all pictures, or of none."""
+    if not folder.is_dir():
+        return [None] * len(model.pictures)
+    depths = [beside(folder, picture.name, _DEPTH_SUFFIXES) for picture in model.pictures]
+    missing = [picture.name for picture, depth in zip(model.pictures, depths, strict=True) if depth is None]
+    if missing:
+        raise InputError(
+            f"{folder} has no file for {len(missing)} of {len(depths)} pictures, the first of them {missing[0]}",
+            f"NAME{', NAME'.join(_DEPTH_SUFFIXES)} for every picture, or no such folder",
+            "Restore the missing files, or move the folder elsewhere",
+        )
+    return depths

@@ -1,0 +1,155 @@
+"""Pictures with a ``transforms.json``, as nerfstudio, instant-ngp and Blender's NeRF scenes have it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from pydantic import Field
+
+from coliags_plugin.datamanagers.fusion import load_points
+from coliags_plugin.datamanagers.lens_views import LensView, undistorter
+from coliags_plugin.datamanagers.nerfstudio.cameras import PinholeCamera, PixelCenters
+from coliags_plugin.datamanagers.nerfstudio.files import FILE, Entry, Transforms
+from coliags_plugin.datamanagers.reading.depth_arrays import depth_format
+from coliags_plugin.datamanagers.reading.picture_names import others_beside, short_names, warn_of_others
+from coliags_plugin.datamanagers.recorded import RecordedDataManager
+from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
+from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
+from coliags_plugin.datamanagers.seen import seen_marks
+from coliags_plugin.datamanagers.views import View
+from coliags_plugin.errors import InputError
+from coliags_plugin.lenses import Lens
+from coliags_plugin.poses import nerfstudio as nerfstudio_poses
+from coliags_plugin.scenes import PointCloud
+
+#: RotateColon's own folders and second file: its pictures are named by number, and its depth is scaled.
+_ROTATECOLON = ("train_views", "transforms_test.json")
+
+
+class NerfstudioSettings(SceneSettings):
+    """Options of the ``nerfstudio`` data manager."""
+
+    scale: float = Field(
+        1.0,
+        gt=0.0,
+        description="Millimetres in the file's unit of length: 1000 for metres. Poses and points are multiplied by it.",
+    )
+    depth_unit_scale_factor: float | None = Field(
+        None,
+        gt=0.0,
+        description="Units of the world before applied_scale that the number 1 in a depth file stands for. None: as "
+        "the file says under this name, or a millimetre.",
+    )
+    pixel_centers: PixelCenters = Field(
+        "half",
+        description="Where the file's cx and cy count pixel centres: 'half': at integers + 0.5, as nerfstudio and "
+        "COLMAP do; 'integer': at integers, as OpenCV's calibration gives them.",
+    )
+
+
+class NerfstudioDataManager(RecordedDataManager):
+    """Reads nerfstudio's data format (docs/layouts/nerfstudio.md)."""
+
+    Settings = NerfstudioSettings
+
+    settings: NerfstudioSettings
+    name = "nerfstudio"
+
+    @classmethod
+    def recognise(cls, path: Path) -> str | None:
+        """See :class:`DataManager`."""
+        if not (path / FILE).is_file() or any((path / name).exists() for name in _ROTATECOLON):
+            return None
+        return FILE
+
+    def open(self, path: Path) -> Recording:
+        """See :class:`RecordedDataManager`."""
+        settings, file = self.settings, path / FILE
+        if not file.is_file():
+            raise InputError(f"no file {file}", "a folder with a transforms.json", "Check the path")
+        trajectory = nerfstudio_poses.read(file)
+        transforms, names = Transforms(file), trajectory.names_or_numbers()
+        entries = transforms.entries(names, settings.pixel_centers)
+        camera_to_world = trajectory.camera_to_world.copy()
+        camera_to_world[:, :3, 3] *= settings.scale
+        depth_unit = self._depth_unit(transforms)
+        views = self._views(entries, file)
+        images = [entry.image for entry in entries]
+        others = [found for entry in entries for found in (entry.depth, entry.mask)]
+        unposed = others_beside(images, others)
+        warn_of_others(file, unposed)
+        # Seen masks are numbered by picture, so that a picture left out would put them out of step.
+        seen = {} if unposed else seen_marks(path, len(images), settings, "every-8th")
+        shots = [
+            Shot(
+                short,
+                entry.image,
+                views[entry.camera],
+                pose,
+                entry.depth,
+                None if entry.depth is None else depth_format(entry.depth, depth_unit),
+                entry.mask,
+                seen.get(place),
+            )
+            for place, (short, entry, pose) in enumerate(zip(short_names(names), entries, camera_to_world, strict=True))
+        ]
+        lenses = sorted({type(camera).__name__ for camera in views})
+        facts: dict[str, Any] = {
+            "layout": "nerfstudio",
+            "lens": ", ".join(lenses),
+            "focal_scale": settings.focal_scale if any(isinstance(camera, Lens) for camera in views) else None,
+            "cameras": len(views),
+            **next(iter(views.values())).facts(),
+            "scale": settings.scale,
+            "depth_unit": depth_unit if shots[0].depth is not None else None,
+            "pixel_centers_in_file": settings.pixel_centers,
+            "pose_convention": {
+                "stored_as": trajectory.stored_as,
+                "remarks": [remark for remark in trajectory.remarks if not remark.startswith("no intrinsics")],
+            },
+            "masks": sum(entry.mask is not None for entry in entries),
+        }
+        own_points, source = self._own_points(path, transforms)
+        return Recording(
+            kind=f"nerfstudio, {trajectory.summary()}",
+            shots=shots,
+            facts=facts,
+            fingerprint=fingerprint(path, [*images, *others], [file]),
+            own_split=transforms.split(names),
+            own_points=own_points,
+            points_source=source,
+        )
+
+    def _depth_unit(self, transforms: Transforms) -> float:
+        """Millimetres that the number 1 in a depth file stands for."""
+        for factor in (self.settings.depth_unit_scale_factor, transforms.depth_unit()):
+            if factor is not None:
+                return factor * self.settings.scale
+        return 1.0
+
+    def _views(self, entries: list[Entry], file: Path) -> dict[Lens | PinholeCamera, View]:
+        settings, undistort = self.settings, undistorter()
+
+        def view(camera: Lens | PinholeCamera) -> View:
+            if isinstance(camera, PinholeCamera):
+                return View.of_pinhole(camera.pinhole, camera.width, camera.height, file, settings.size)
+            return LensView.of(camera, file, settings.size, settings.focal_scale, undistort)
+
+        return {camera: view(camera) for camera in dict.fromkeys(entry.camera for entry in entries)}
+
+    def _own_points(self, path: Path, transforms: Transforms) -> tuple[Callable[[], PointCloud] | None, Path | None]:
+        """The points of ``ply_file_path``, in the file's world, or else of ``points3D.ply``, in the scene's."""
+        file = transforms.points_file()
+        if file is None:
+            beside = path / POINTS_FILE
+            return ((lambda: load_points(beside)), beside) if beside.is_file() else (None, None)
+
+        def points() -> PointCloud:
+            cloud = load_points(file)
+            positions = transforms.undone(cloud.positions.double().numpy()) * self.settings.scale
+            return PointCloud(torch.from_numpy(positions).float(), cloud.colors)
+
+        return points, file

@@ -1,0 +1,47 @@
+"""z-depth in NumPy's own files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Shaped
+
+from coliags_plugin.datamanagers.reading.depth_formats import DepthFormat, DepthSteps
+from coliags_plugin.errors import InputError
+
+
+@dataclass(frozen=True)
+class DepthArray(DepthFormat):
+    """An ``.npy`` array [H, W] or [H, W, 1] of real numbers; 0, negative and not finite mean unknown.
+
+    Attributes:
+        size: Scene units that the number 1 stands for.
+    """
+
+    size: float
+
+    def read(self, path: Path) -> Shaped[np.ndarray, "H W"]:
+        """See :class:`DepthFormat`."""
+        expected = "an .npy array [H, W] of real numbers"
+        try:
+            array = np.load(path, allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            raise InputError(f"cannot read {path}: {error}", expected, "Write it again") from error
+        if array.ndim == 3 and array.shape[2] == 1:
+            array = array[..., 0]
+        if array.ndim != 2 or not (np.issubdtype(array.dtype, np.floating) or np.issubdtype(array.dtype, np.integer)):
+            raise InputError(f"{path} is an array {list(array.shape)} of {array.dtype}", expected)
+        return np.asarray(array)
+
+    def z_depth(self, stored: Shaped[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
+        """See :class:`DepthFormat`."""
+        depth = (stored * self.size).astype(np.float32)
+        depth[~(np.isfinite(depth) & (depth > 0.0))] = np.nan
+        return depth
+
+
+def depth_format(path: Path, size: float) -> DepthFormat:
+    """The format of a depth file by its suffix: ``.npy``, else 16-bit pictures; ``size`` in scene units a number."""
+    return DepthArray(size) if path.suffix.lower() == ".npy" else DepthSteps(size, 16)

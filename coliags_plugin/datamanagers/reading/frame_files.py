@@ -1,0 +1,90 @@
+"""Finding the numbered files of a video, whatever they are called otherwise."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+from coliags_plugin.errors import InputError
+
+IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
+TIFF_SUFFIXES = frozenset({".tiff", ".tif"})
+DEPTH_SUFFIXES = TIFF_SUFFIXES | {".png"}
+
+
+def numbered(folder: Path, what: str, suffixes: frozenset[str]) -> dict[int, Path]:
+    """``<number>_<what>`` files by their number, padded or not; ``<number>`` alone where ``what`` is empty.
+
+    Raises:
+        InputError: Two files have the same number.
+    """
+    found: dict[int, Path] = {}
+    pattern = rf"(\d+)_{what}" if what else r"(\d+)"
+    for path in sorted(folder.iterdir()):
+        match = re.fullmatch(pattern, path.stem)
+        if match is None or path.suffix.lower() not in suffixes:
+            continue
+        index = int(match.group(1))
+        if index in found:
+            raise InputError(f"{found[index]} and {path.name} have the same number", "one file per frame", "Remove one")
+        found[index] = path
+    return found
+
+
+def paired(
+    folder: Path, images: Mapping[int, Path], depths: Mapping[int, Path]
+) -> tuple[tuple[Path, ...], tuple[Path, ...] | None]:
+    """Pictures, and depth files where there are any, frame 0 first.
+
+    Args:
+        folder: Of the sequence, for errors.
+        images: Pictures by number; at least one.
+        depths: Depth files by number; none, or one for every picture.
+
+    Raises:
+        InputError: Numbers do not run from 0 without gaps, or pictures and depth files do not pair up.
+    """
+    count = len(images)
+    gap = next((index for index in range(count) if index not in images), None)
+    if gap is not None:
+        first, last = min(images), max(images)
+        raise InputError(
+            f"{images[first].parent} has {count} pictures, numbers {first} to {last}, but none is {gap}",
+            "numbers from 0 without gaps, for line n of the pose file belongs to picture n",
+            "Restore the missing pictures, or renumber them and drop their poses",
+        )
+    if depths and sorted(depths) != sorted(images):
+        lone = min(set(depths) ^ set(images))
+        raise InputError(
+            f"{folder} has {count} pictures and {len(depths)} depth files; frame {lone} has only one of the two",
+            "a depth file for every picture, or none at all",
+            "Restore the missing files: archives cut short are common",
+        )
+    frames = range(count)
+    return tuple(images[index] for index in frames), tuple(depths[index] for index in frames) if depths else None
+
+
+def marks(folder: Path, what: str, count: int) -> dict[int, Path]:
+    """``<number>_<what>.png`` files by frame, none where the folder is absent.
+
+    Raises:
+        InputError: One belongs to no frame.
+    """
+    found = numbered(folder, what, frozenset({".png"})) if folder.is_dir() else {}
+    for index, path in found.items():
+        if index >= count:
+            raise InputError(
+                f"{path}, but there are {count} frames",
+                f"numbers below {count}",
+                "Restore the missing frames, or remove the file",
+            )
+    return found
+
+
+def inventory(folder: Path) -> str:
+    """What a folder holds, for errors: the first few names."""
+    names = sorted(path.name + "/" * path.is_dir() for path in folder.iterdir())
+    if not names:
+        return "nothing"
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")

@@ -1,0 +1,1 @@
+"""REIM-NeRF's processed C3VD."""

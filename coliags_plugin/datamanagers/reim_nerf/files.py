@@ -1,0 +1,280 @@
+"""REIM-NeRF's preprocessed C3VD: the transforms_*.json files, and depth as normalised distance along the ray."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Shaped
+
+from coliags_plugin.datamanagers.reading.depth_formats import DepthFormat
+from coliags_plugin.datamanagers.reading.frame_files import inventory
+from coliags_plugin.datamanagers.reading.images import read_gray
+from coliags_plugin.errors import InputError
+from coliags_plugin.lenses import FisheyeLens, Lens
+from coliags_plugin.poses.rigid import FLIP_Y_AND_Z, check_rigid
+from coliags_plugin.poses.text import read_text
+from coliags_plugin.poses.trajectory import natural_order, refuse_repeated
+
+#: The parts a sequence is divided into; ``test`` is all of it, ``true_test`` what neither training nor validation saw.
+PARTS = ("train", "val", "test", "true_test")
+EXPECTED = "images/, distmaps/, rgb_mask.png and transforms_train.json as REIM-NeRF's preprocessing writes them"
+#: z-depth that C3VD's depth ends at, mm. The preprocessing keeps pixels clipped there, as if the wall stood there.
+C3VD_RANGE = 100.0
+_LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "w", "h")
+_SHARED = (*_LENS, "p1", "p2", "scene_scale", "distmap_scale", "camera_model")
+
+
+@dataclass(frozen=True)
+class Described:
+    """One frame as the JSON files have it.
+
+    Attributes:
+        image: The picture.
+        distances: Its distance map, where there is one.
+        camera_to_world: OpenCV axes, mm. [4, 4]
+    """
+
+    image: Path
+    distances: Path | None
+    camera_to_world: Float[np.ndarray, "4 4"]
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """What the JSON files of a folder say together.
+
+    Attributes:
+        files: The JSON files, by part.
+        lens: Of the pictures, which are not undistorted.
+        scene_scale: Normalised units per mm.
+        scene_shift: What is added to positions in mm before they are scaled. [3]
+        distmap_scale: Normalised distance of the number 65535.
+        frames: In video order.
+        parts: Places in ``frames``, by part.
+    """
+
+    files: Mapping[str, Path]
+    lens: FisheyeLens
+    scene_scale: float
+    scene_shift: Float[np.ndarray, "3"]
+    distmap_scale: float
+    frames: tuple[Described, ...]
+    parts: Mapping[str, tuple[int, ...]]
+
+
+@dataclass(frozen=True, eq=False)
+class RayDistance(DepthFormat):
+    """16-bit distance along the ray; 0 is unknown. What ends at C3VD's 100 mm is there or beyond.
+
+    Attributes:
+        size: mm a step, along the ray.
+        cosine: z-depth per distance, of each working pixel's source pixel. [h, w]
+    """
+
+    size: float
+    cosine: Float32[np.ndarray, "h w"]
+
+    def read(self, path: Path) -> Shaped[np.ndarray, "H W"]:
+        """See :class:`DepthFormat`."""
+        return read_gray(path, 16, "a one-channel 16-bit distance map")
+
+    def z_depth(self, stored: Shaped[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+        """See :class:`DepthFormat`."""
+        depth = self._z(stored)
+        depth[(stored == 0) | self._ends(stored, depth)] = np.nan
+        return depth
+
+    def clipped_at(self, stored: Shaped[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"] | None:
+        """See :class:`DepthFormat`."""
+        depth = self._z(stored)
+        ends = self._ends(stored, depth)
+        if not ends.any():
+            return None
+        return np.where(ends, np.minimum(depth, np.float32(C3VD_RANGE)), np.float32(np.nan))
+
+    def _z(self, stored: Shaped[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+        return np.asarray(stored.astype(np.float32) * np.float32(self.size) * self.cosine)
+
+    def _ends(self, stored: Shaped[np.ndarray, "h w"], depth: Float32[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+        """Where the distance map or the depth it was made from ends; one step is lost to rounding. [h, w]"""
+        return np.asarray((stored == 65535) | (depth >= C3VD_RANGE - self.size))
+
+
+def ray_cosines(lens: Lens) -> Float32[np.ndarray, "H W"]:
+    """z-depth per distance at every stored pixel; 0 where the lens does not reach.
+
+    The preprocessing takes its rays at integers + 0.5, which is undone here as it was done; the half pixel is worth
+    3e-4 of the depth at most.
+    """
+    column, row = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
+    rays = lens.unproject(np.stack([column.ravel(), row.ravel()], axis=1))
+    cosine = 1.0 / np.linalg.norm(rays, axis=1)
+    return np.nan_to_num(cosine, nan=0.0).astype(np.float32).reshape(lens.height, lens.width)
+
+
+def recognise(folder: Path) -> str | None:
+    """What in the folder says that it is such a sequence; None where nothing does."""
+    if not (folder / "transforms_train.json").is_file():
+        return None
+    beside = next((name for name in ("distmaps", "rgb_mask.png") if (folder / name).exists()), None)
+    return None if beside is None else f"transforms_train.json beside {beside}"
+
+
+def read_sequence(folder: Path) -> Sequence:
+    """Read the JSON files of a folder.
+
+    Raises:
+        InputError: The folder or ``transforms_train.json`` is missing; a file is not as it should be, naming the frame;
+            or two files contradict each other.
+    """
+    if not folder.is_dir():
+        raise InputError(f"no folder {folder}", EXPECTED, "Check the path")
+    files = {part: folder / f"transforms_{part}.json" for part in PARTS}
+    files = {part: file for part, file in files.items() if file.is_file()}
+    if "train" not in files:
+        raise InputError(f"{folder} holds {inventory(folder)}", EXPECTED, "Add transforms_train.json")
+    contents = {part: _read(file) for part, file in files.items()}
+    first = contents["train"]
+    for part, content in contents.items():
+        _check_same(files["train"], first, files[part], content)
+    lens = _lens(files["train"], first)
+    scale, shift = _normalisation(files["train"], first)
+    found: dict[str, Described] = {}
+    named: dict[str, list[str]] = {}
+    for part, content in contents.items():
+        named[part] = []
+        for name, frame in _frames(folder, files[part], content, scale, shift):
+            known = found.setdefault(name, frame)
+            if known.distances != frame.distances or not np.allclose(
+                known.camera_to_world, frame.camera_to_world, atol=1e-4
+            ):
+                raise InputError(
+                    f"{files[part]}: {name} has another pose or distance map than in another of the files",
+                    "the same of each frame in all of them",
+                    "Write them again, all from one run",
+                )
+            named[part].append(name)
+    names = list(found)
+    names = [names[index] for index in natural_order(names)]
+    place = {name: index for index, name in enumerate(names)}
+    if sum(frame.distances is not None for frame in found.values()) not in (0, len(found)):
+        lone = next(name for name in names if found[name].distances is None)
+        raise InputError(f"{folder}: {lone} has no distmap_path, but others have", "one for every frame, or for none")
+    return Sequence(
+        files,
+        lens,
+        scale,
+        shift,
+        _positive(files["train"], first, "distmap_scale", math.pi),
+        tuple(found[name] for name in names),
+        {part: tuple(sorted(place[name] for name in names)) for part, names in named.items()},
+    )
+
+
+def _read(file: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(read_text(file, "a JSON object"))
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise InputError(f"{file} is no JSON: {error}", "a JSON object with frames") from error
+    frames = content.get("frames") if isinstance(content, dict) else None
+    # A short video has no validation frames; one without training frames is none.
+    if not isinstance(frames, list) or (not frames and file.name == "transforms_train.json"):
+        raise InputError(f"{file} has no frames", "'frames': [{'file_path': ..., 'transform_matrix': ...}, ...]")
+    return content
+
+
+def _check_same(file: Path, first: Mapping[str, Any], other: Path, content: Mapping[str, Any]) -> None:
+    for key in (*_SHARED, "scene_T"):
+        if first.get(key) != content.get(key):
+            raise InputError(
+                f"{other}: {key} is not that of {file.name}",
+                "one camera and one scale for all files",
+                "Write them again",
+            )
+
+
+def _lens(file: Path, content: Mapping[str, Any]) -> FisheyeLens:
+    if content.get("camera_model") not in ("FISHEYE_OPENCV", "OPENCV_FISHEYE"):
+        raise InputError(f"{file}: camera_model {content.get('camera_model')!r}", "FISHEYE_OPENCV")
+    values = {key: _number(file, content, key) for key in _LENS}
+    width, height = values.pop("w"), values.pop("h")
+    if min(width, height, values["fx"], values["fy"]) <= 0 or width != int(width) or height != int(height):
+        raise InputError(
+            f"{file}: a picture of {width:g} x {height:g}, focal lengths {values['fx']:g}, {values['fy']:g}",
+            "whole sizes and focal lengths above 0",
+        )
+    for key in ("p1", "p2"):
+        if content.get(key):
+            raise InputError(f"{file}: {key} = {content[key]!r}", "0: OpenCV's fisheye has no such term")
+    fx, fy, cx, cy, k1, k2, k3, k4 = (values[key] for key in ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"))
+    return FisheyeLens(width=int(width), height=int(height), fx=fx, fy=fy, cx=cx, cy=cy, k1=k1, k2=k2, k3=k3, k4=k4)
+
+
+def _normalisation(file: Path, content: Mapping[str, Any]) -> tuple[float, Float[np.ndarray, "3"]]:
+    scale = _positive(file, content, "scene_scale", None)
+    shift = _array(content.get("scene_T"))
+    if shift.shape != (4, 4) or not np.allclose(shift[:3, :3], np.eye(3)) or not np.allclose(shift[3], (0, 0, 0, 1)):
+        raise InputError(f"{file}: scene_T is no shift", "a 4x4 matrix that moves the world and does not turn it")
+    return scale, shift[:3, 3]
+
+
+def _frames(
+    folder: Path, file: Path, content: Mapping[str, Any], scale: float, shift: Float[np.ndarray, "3"]
+) -> list[tuple[str, Described]]:
+    result, names, matrices = [], [], []
+    for index, frame in enumerate(content["frames"]):
+        name = frame.get("file_path") if isinstance(frame, dict) else None
+        if not isinstance(name, str) or not name:
+            raise InputError(f"{file}, frame {index}: no file_path", "the name of the frame's picture")
+        matrix = _array(frame.get("transform_matrix"))
+        if matrix.shape != (4, 4):
+            raise InputError(
+                f"{file}, frame {index} ({name}): transform_matrix is missing or no matrix",
+                "4 rows of 4 finite numbers",
+            )
+        names.append(name)
+        matrices.append(matrix)
+    refuse_repeated(names, str(file))
+    # Of no frames too: a short video has none to validate on.
+    check_rigid(np.reshape(matrices, (-1, 4, 4)), lambda index: f"{file}, frame {index} ({names[index]})")
+    for name, matrix, frame in zip(names, matrices, content["frames"], strict=True):
+        camera_to_world = matrix @ FLIP_Y_AND_Z
+        camera_to_world[:3, 3] = camera_to_world[:3, 3] / scale - shift
+        distances = frame.get("distmap_path")
+        paths = [folder / name, *([folder / distances] if isinstance(distances, str) else [])]
+        for path in paths:
+            if not path.is_file():
+                raise InputError(f"{file} names {path}, which is not there", "every file that it names", "Restore it")
+        result.append((name, Described(paths[0], paths[1] if len(paths) > 1 else None, camera_to_world)))
+    return result
+
+
+def _array(value: Any) -> np.ndarray:
+    """An array of finite numbers; empty where the value is none."""
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return np.empty(0)
+    return array if np.all(np.isfinite(array)) else np.empty(0)
+
+
+def _positive(file: Path, content: Mapping[str, Any], key: str, default: float | None) -> float:
+    if default is not None and key not in content:
+        return default
+    number = _number(file, content, key)
+    if number <= 0.0:
+        raise InputError(f"{file}: {key} = {number:g}", "a number above 0")
+    return number
+
+
+def _number(file: Path, content: Mapping[str, Any], key: str) -> float:
+    value = content.get(key)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise InputError(f"{file}: {key} = {value!r}", "a finite number")
+    return float(value)

@@ -1,0 +1,118 @@
+"""REIM-NeRF's preprocessed C3VD: fisheye pictures, normalised poses, and distance maps (Psychogyios et al., 2023)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool
+from pydantic import Field
+
+from coliags_plugin.datamanagers.reading.frame_files import marks
+from coliags_plugin.datamanagers.reading.images import read_mask
+from coliags_plugin.datamanagers.reading.picture_names import others_beside, warn_of_others
+from coliags_plugin.datamanagers.recorded import RecordedDataManager
+from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
+from coliags_plugin.datamanagers.reim_nerf.files import RayDistance, Sequence, ray_cosines, read_sequence, recognise
+from coliags_plugin.datamanagers.scene_settings import SceneSettings
+from coliags_plugin.datamanagers.splits import Split
+from coliags_plugin.datamanagers.views import View
+from coliags_plugin.errors import InputError
+
+MASK_FILE = "rgb_mask.png"
+
+
+class ReimNerfSettings(SceneSettings):
+    """Options of the ``reim-nerf`` data manager."""
+
+    split: Split = Field(
+        "own",
+        description="Test frames: 'own': trains on transforms_train.json and tests on transforms_true_test.json, as "
+        "REIM-NeRF does; its validation frames are in neither. Others as for every format.",
+    )
+    mask: bool = Field(True, description=f"Ignore what {MASK_FILE} marks.")
+
+
+class ReimNerfDataManager(RecordedDataManager):
+    """Reads what REIM-NeRF's preprocessing writes, back in millimetres and C3VD's world (docs/layouts/reim-nerf.md)."""
+
+    Settings = ReimNerfSettings
+
+    settings: ReimNerfSettings
+    name = "reim-nerf"
+
+    @classmethod
+    def recognise(cls, path: Path) -> str | None:
+        """See :class:`DataManager`."""
+        return recognise(path)
+
+    def open(self, path: Path) -> Recording:
+        """See :class:`RecordedDataManager`."""
+        settings = self.settings
+        sequence = read_sequence(path)
+        if settings.split == "own" and "true_test" not in sequence.parts:
+            raise InputError(
+                f"{path} has no transforms_true_test.json",
+                "the frames that split 'own' tests on",
+                "Add it, or choose another split",
+            )
+        file, lens = sequence.files["train"], sequence.lens
+        mask = path / MASK_FILE if settings.mask else None
+        shows = None if mask is None else _shows(mask, lens.width, lens.height)
+        view = View.through(lens, file, settings.size, settings.focal_scale, shows)
+        size = sequence.distmap_scale / 65535.0 / sequence.scene_scale
+        form = RayDistance(size, view.nearest(ray_cosines(lens)))
+        seen = self._seen(path, sequence)
+        shots = [
+            Shot(
+                frame.image.stem, frame.image, view, frame.camera_to_world, frame.distances, form, seen=seen.get(place)
+            )
+            for place, frame in enumerate(sequence.frames)
+        ]
+        large = [found for frame in sequence.frames for found in (frame.image, frame.distances)]
+        warn_of_others(path, others_beside([frame.image for frame in sequence.frames], large))
+        parts = sequence.parts
+        return Recording(
+            kind="REIM-NeRF layout",
+            shots=shots,
+            facts=self._facts(sequence, view),
+            fingerprint=fingerprint(path, large, (*sequence.files.values(), mask)),
+            own_split={"train": parts["train"], "test": parts.get("true_test", ())},
+        )
+
+    def _seen(self, path: Path, sequence: Sequence) -> dict[int, Path]:
+        """``truth/seen/NNNN_seen.png`` of the test frames; valid for the data's own split of all frames."""
+        settings, count = self.settings, len(sequence.frames)
+        if settings.split != "own" or settings.frame_step > 1 or (settings.max_frames or count) < count:
+            return {}
+        test = set(sequence.parts["true_test"])
+        found = marks(path / "truth" / "seen", "seen", count)
+        return {place: mark for place, mark in found.items() if place in test}
+
+    def _facts(self, sequence: Sequence, view: View) -> dict[str, Any]:
+        return {
+            "layout": "REIM-NeRF",
+            "lens": "fisheye of the JSON files",
+            "focal_scale": self.settings.focal_scale,
+            "mask": MASK_FILE if self.settings.mask else None,
+            **view.facts(),
+            "parts": {part: len(places) for part, places in sequence.parts.items()},
+            "pose_convention": {
+                "order": "camera-to-world, OpenGL axes, normalised",
+                "scene_scale": sequence.scene_scale,
+                "scene_shift_mm": [float(value) for value in sequence.scene_shift],
+            },
+        }
+
+
+def _shows(mask: Path, width: int, height: int) -> Bool[np.ndarray, "H W"]:
+    """Stored pixels that count: the mask is white where a pixel is to be ignored."""
+    if not mask.is_file():
+        raise InputError(f"no file {mask}", "the mask of what lies outside the lens's circle", "Or set mask: false")
+    ignored = read_mask(mask)
+    if ignored.shape != (height, width):
+        raise InputError(
+            f"{mask} is {ignored.shape[1]} x {ignored.shape[0]}", f"the pictures' size, {width} x {height}"
+        )
+    return np.asarray(~ignored)

@@ -1,0 +1,256 @@
+"""Finding what belongs to a scene in TUM's RGB-D form: pictures, depth, trajectory and intrinsics."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from coliags_plugin.datamanagers.reading.camera_json import read_intrinsics
+from coliags_plugin.datamanagers.reading.frame_files import DEPTH_SUFFIXES, IMAGE_SUFFIXES, inventory
+from coliags_plugin.datamanagers.reading.images import size_of
+from coliags_plugin.errors import InputError
+from coliags_plugin.lenses import Pinhole
+from coliags_plugin.poses import tum
+from coliags_plugin.poses.colmap import read_text_cameras
+from coliags_plugin.poses.text import read_text, shortened
+from coliags_plugin.scenes import PointCloud
+
+PICTURE_FOLDERS = ("rgb", "color", "images")
+DEPTH_FOLDERS = ("depth", "depths")
+MASK_FOLDERS = ("mask", "masks")
+TRAJECTORIES = ("groundtruth.txt", "poses.txt", "traj.txt", "trajectory.txt", "*_poses.txt")
+CAMERA_FILES = ("camera.json", "intrinsics.txt", "cameras.txt")
+EXPECTED = (
+    f"{', '.join(f'{name}/' for name in PICTURE_FOLDERS)} with pictures, a TUM trajectory ({', '.join(TRAJECTORIES)}) "
+    f"and one of {', '.join(CAMERA_FILES)}"
+)
+#: Where the principal point of a picture may lie, as a share of its size, when nothing says which size it is for.
+_MIDDLE = (0.3, 0.7)
+
+
+@dataclass(frozen=True)
+class CameraFile:
+    """What a file says about the camera.
+
+    Attributes:
+        path: The file.
+        pinhole: Intrinsics, pixels, centres at integers.
+        width, height: Size of the pictures they are for, pixels.
+        depth_scale: Depth steps per scene unit; None where the file does not say.
+    """
+
+    path: Path
+    pinhole: Pinhole
+    width: int
+    height: int
+    depth_scale: float | None = None
+
+
+def recognise(folder: Path) -> str | None:
+    """What in the folder says that it is such a scene; None where nothing does."""
+    pictures = next((name for name in PICTURE_FOLDERS if (folder / name).is_dir()), None)
+    trajectory = next((path for path in _trajectories(folder) if tum.recognise(path)), None)
+    if pictures is None or trajectory is None:
+        return None
+    return f"the TUM trajectory {trajectory.name} beside {pictures}/"
+
+
+def find_pictures(folder: Path) -> list[Path]:
+    """The colour pictures, in no order.
+
+    Raises:
+        InputError: There is no folder of pictures, or more than one, or it holds none.
+    """
+    if not folder.is_dir():
+        raise InputError(f"no folder {folder}", EXPECTED, "Check the path")
+    found = _only(folder, PICTURE_FOLDERS)
+    if found is None:
+        raise InputError(f"{folder} holds {inventory(folder)}", EXPECTED, "Name the scene's own folder")
+    pictures = [path for path in found.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
+    if not pictures:
+        raise InputError(f"{found} holds {inventory(found)}", "PNG or JPEG pictures")
+    return pictures
+
+
+def find_depths(folder: Path) -> list[Path]:
+    """The depth files, in no order; none where there is no folder of them.
+
+    Raises:
+        InputError: There is more than one such folder.
+    """
+    found = _only(folder, DEPTH_FOLDERS)
+    return [] if found is None else [path for path in found.iterdir() if path.suffix.lower() in DEPTH_SUFFIXES]
+
+
+def find_masks(folder: Path, pictures: Sequence[Path]) -> dict[str, Path]:
+    """Masks by the stem of their picture; none where there is no folder of them.
+
+    Raises:
+        InputError: There is more than one such folder, or a picture has no mask.
+    """
+    found = _only(folder, MASK_FOLDERS)
+    if found is None:
+        return {}
+    masks = {path.stem: path for path in found.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES}
+    lone = next((picture for picture in pictures if picture.stem not in masks), None)
+    if lone is not None:
+        raise InputError(
+            f"{found} has no mask for {lone.name}",
+            "a mask of the same name for every picture, or no such folder",
+            "Restore the missing ones, or move the folder away",
+        )
+    return {picture.stem: masks[picture.stem] for picture in pictures}
+
+
+def lacks_trajectory(folder: Path) -> bool:
+    """Whether a folder holds pictures and depth in this form, and nothing that may be their poses."""
+    return (
+        folder.is_dir()
+        and any((folder / name).is_dir() for name in PICTURE_FOLDERS)
+        and any((folder / name).is_dir() for name in DEPTH_FOLDERS)
+        and any((folder / name).is_file() for name in CAMERA_FILES)
+        and not any(tum.recognise(path) for path in _trajectories(folder))
+    )
+
+
+def find_trajectory(folder: Path, named: str | None) -> Path:
+    """The trajectory file.
+
+    Args:
+        folder: Of the scene.
+        named: Its name, where the user gives one; relative to the folder, or absolute.
+
+    Raises:
+        InputError: There is none, or more than one and none is named.
+    """
+    if named is not None:
+        if not (folder / named).is_file():
+            raise InputError(f"no file {folder / named}", "a TUM trajectory", "Mend the option trajectory")
+        return folder / named
+    found = _trajectories(folder)
+    if not found:
+        raise InputError(
+            f"{folder} has pictures but no {' or '.join(TRAJECTORIES)}",
+            EXPECTED,
+            "Add it, or let coliags poses track find one from depth",
+        )
+    if len(found) > 1:
+        raise InputError(
+            f"{folder} has the trajectories {', '.join(path.name for path in found)}",
+            "one",
+            f"Choose with the option trajectory, for instance --set datamanager.trajectory={found[0].name}",
+        )
+    return found[0]
+
+
+def find_camera(folder: Path, picture: Path) -> CameraFile:
+    """The camera: of ``camera.json``, else of ``intrinsics.txt``, else of COLMAP's ``cameras.txt``.
+
+    Args:
+        folder: Of the scene.
+        picture: One of its pictures, for the size where the file does not say it.
+
+    Raises:
+        InputError: There is no such file, or it is not as it should be.
+    """
+    for name, read in zip(CAMERA_FILES, (_read_json, _read_intrinsics_txt, _read_cameras_txt), strict=True):
+        if (folder / name).is_file():
+            return read(folder / name, picture)
+    raise InputError(f"{folder} has pictures but no {', '.join(CAMERA_FILES)}", EXPECTED, "Add the camera")
+
+
+def find_mesh(folder: Path) -> Path | None:
+    """The only OBJ file of the folder; None where there is none, or several."""
+    found = sorted(folder.glob("*.obj"))
+    return found[0] if len(found) == 1 else None
+
+
+def read_obj_points(path: Path) -> PointCloud:
+    """The vertices of an OBJ file, and their colours where every vertex has one behind its position, from 0 to 1.
+
+    Raises:
+        InputError: The file cannot be read, or a vertex line holds no three or six numbers.
+    """
+    rows: list[list[float]] = []
+    for number, line in enumerate(read_text(path, "an OBJ file").splitlines(), start=1):
+        if not line.startswith("v "):
+            continue
+        try:
+            row = [float(word) for word in line.split()[1:]]
+        except ValueError:
+            row = []
+        if len(row) not in (3, 6) or (rows and len(row) != len(rows[0])):
+            raise InputError(f"{path}, line {number}: '{shortened(line)}'", "v x y z, or v x y z r g b in every line")
+        rows.append(row)
+    values = np.array(rows).reshape(len(rows), -1)
+    colors = None
+    if values.shape[1] == 6:
+        colors = torch.from_numpy(np.rint(np.clip(values[:, 3:], 0.0, 1.0) * 255.0).astype(np.uint8))
+    return PointCloud(torch.from_numpy(values[:, :3].astype(np.float32).reshape(-1, 3)), colors)
+
+
+def _only(folder: Path, names: tuple[str, ...]) -> Path | None:
+    found = [folder / name for name in names if (folder / name).is_dir()]
+    if len(found) > 1:
+        raise InputError(
+            f"{folder} holds {' and '.join(f'{path.name}/' for path in found)}", "one of them", "Move the other away"
+        )
+    return found[0] if found else None
+
+
+def _trajectories(folder: Path) -> list[Path]:
+    found = {path for pattern in TRAJECTORIES for path in folder.glob(pattern) if path.is_file()}
+    return sorted(found)
+
+
+def _read_json(path: Path, picture: Path) -> CameraFile:
+    pinhole, width, height = read_intrinsics(path)
+    scale = json.loads(path.read_text(encoding="utf-8-sig")).get("depth_scale")
+    if scale is None:
+        return CameraFile(path, pinhole, width, height)
+    if isinstance(scale, bool) or not isinstance(scale, (int, float)) or not (math.isfinite(scale) and scale > 0):
+        raise InputError(f"{path}: depth_scale = {scale!r}", "a number above 0: depth steps per scene unit")
+    return CameraFile(path, pinhole, width, height, float(scale))
+
+
+def _read_intrinsics_txt(path: Path, picture: Path) -> CameraFile:
+    words = [word for line in read_text(path, "numbers").splitlines() for word in line.replace(",", " ").split()]
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        values = []
+    if len(values) == 9:
+        fx, skew, cx, below, fy, cy, *last = values
+        if (skew, below, *last) != (0.0, 0.0, 0.0, 0.0, 1.0):
+            raise InputError(f"{path}: {shortened(' '.join(words))}", "K = fx 0 cx, 0 fy cy, 0 0 1, without skew")
+        values = [fx, fy, cx, cy]
+    if len(values) != 4 or not np.all(np.isfinite(values)) or min(values[:2]) <= 0.0:
+        raise InputError(f"{path}: '{shortened(' '.join(words))}'", "fx fy cx cy, or the nine numbers of K; pixels")
+    width, height = size_of(picture)
+    fx, fy, cx, cy = values
+    if not all(_MIDDLE[0] < share < _MIDDLE[1] for share in (cx / width, cy / height)):
+        raise InputError(
+            f"{path}: the principal point ({cx:g}, {cy:g}) is far from the middle of {picture.name}, "
+            f"{width} x {height}",
+            "intrinsics of the pictures as they are stored",
+            "Scale them, or say their size in a camera.json with fx, fy, cx, cy, w, h if that is where it is",
+        )
+    return CameraFile(path, Pinhole(fx, fy, cx, cy), width, height)
+
+
+def _read_cameras_txt(path: Path, picture: Path) -> CameraFile:
+    cameras = list(read_text_cameras(path).values())
+    if len(cameras) != 1:
+        raise InputError(f"{path} has {len(cameras)} cameras", "one, PINHOLE or SIMPLE_PINHOLE")
+    camera = cameras[0]
+    if isinstance(camera, str):
+        raise InputError(f"{path}: {camera}", "PINHOLE or SIMPLE_PINHOLE", "Undistort the pictures first")
+    # COLMAP counts pixel centres at integers + 0.5.
+    pinhole = Pinhole(camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5)
+    return CameraFile(path, pinhole, camera.width, camera.height)

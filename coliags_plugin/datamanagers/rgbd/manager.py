@@ -1,0 +1,280 @@
+"""Pictures, depth and a trajectory in TUM's RGB-D form: what SLAM systems and Gaussian Pancakes read and write."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from coliags_plugin.datamanagers.fusion import load_points
+from coliags_plugin.datamanagers.reading.depth_formats import DepthSteps
+from coliags_plugin.datamanagers.recorded import RecordedDataManager
+from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
+from coliags_plugin.datamanagers.rgbd.association import by_number, is_time, nearest_in_time, times
+from coliags_plugin.datamanagers.rgbd.files import (
+    CameraFile,
+    find_camera,
+    find_depths,
+    find_masks,
+    find_mesh,
+    find_pictures,
+    find_trajectory,
+    read_obj_points,
+    recognise,
+)
+from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
+from coliags_plugin.datamanagers.seen import seen_marks
+from coliags_plugin.datamanagers.views import View
+from coliags_plugin.errors import InputError
+from coliags_plugin.poses import tum
+from coliags_plugin.poses.trajectory import Trajectory
+from coliags_plugin.scenes import PointCloud
+
+log = logging.getLogger(__name__)
+
+
+class RGBDSettings(SceneSettings):
+    """Options of the ``rgbd`` data manager."""
+
+    depth: Literal["metric", "none"] = Field(
+        "metric",
+        description="'metric': depth files hold z-depth in even steps. 'none': leave them alone, for depth that is "
+        "relative, as Gaussian Pancakes' may be.",
+    )
+    depth_scale: float | None = Field(
+        None,
+        gt=0.0,
+        description="Depth steps per scene unit, the unit of the trajectory. None: as camera.json says. TUM's own "
+        "files have 5000 per metre.",
+    )
+    association: Literal["auto", "time", "order"] = Field(
+        "auto",
+        description="What puts pictures, poses and depth together: 'time': pictures are named by their time; 'order': "
+        "line n of the trajectory belongs to picture n; 'auto': time, where names have a decimal point.",
+    )
+    max_time_difference: float = Field(
+        0.02, ge=0.0, description="For association by time: the largest difference, seconds. 0.02 is TUM's own."
+    )
+    trajectory: str | None = Field(
+        None, description="The trajectory file where there are several; relative to the scene folder, or absolute."
+    )
+
+
+@dataclass(frozen=True)
+class _Frames:
+    """What belongs together, in video order."""
+
+    pictures: Sequence[Path]
+    depths: Sequence[Path | None]
+    poses: Sequence[int]
+    facts: dict[str, Any]
+
+
+class RGBDDataManager(RecordedDataManager):
+    """Reads pictures, depth and a TUM trajectory (docs/layouts/rgbd.md)."""
+
+    Settings = RGBDSettings
+
+    settings: RGBDSettings
+    name = "rgbd"
+
+    @classmethod
+    def recognise(cls, path: Path) -> str | None:
+        """See :class:`DataManager`."""
+        return recognise(path)
+
+    def open(self, path: Path) -> Recording:
+        """See :class:`RecordedDataManager`."""
+        settings = self.settings
+        pictures = find_pictures(path)
+        depths = find_depths(path) if settings.depth == "metric" else []
+        file, trajectory = self._trajectory(path, pictures)
+        by_time = self._by_time(pictures)
+        pair = self._paired_by_time if by_time else self._paired_by_order
+        frames = pair(pictures, depths, trajectory, file or path)
+        camera = find_camera(path, frames.pictures[0])
+        scale = self._depth_scale(camera, path) if depths else None
+        form = None if scale is None else DepthSteps(1.0 / scale)
+        view = View.of_pinhole(camera.pinhole, camera.width, camera.height, camera.path, settings.size)
+        # Masks are numbered by picture, so that a picture left out, or gone, would put them out of step.
+        complete = len(frames.pictures) == len(pictures) == len(trajectory)
+        seen = seen_marks(path, len(pictures), settings, "every-8th") if complete else {}
+        masks = find_masks(path, frames.pictures)
+        shots = [
+            Shot(
+                picture.stem,
+                picture,
+                view,
+                trajectory.camera_to_world[pose],
+                depth,
+                form,
+                mask=masks.get(picture.stem),
+                seen=seen.get(place),
+            )
+            for place, (picture, depth, pose) in enumerate(
+                zip(frames.pictures, frames.depths, frames.poses, strict=True)
+            )
+        ]
+        facts: dict[str, Any] = {
+            "layout": "TUM RGB-D",
+            "trajectory": None if file is None else file.name,
+            "intrinsics_from": camera.path.name,
+            "depth_scale": scale,
+            "association": frames.facts,
+            "masks": len(masks),
+            **view.facts(),
+            "pose_convention": None
+            if file is None
+            else {
+                "order": "TUM: camera-to-world, quaternion with w last",
+                "poses": len(trajectory),
+                "summary": trajectory.summary(),
+            },
+        }
+        points = next((found for found in (path / POINTS_FILE, find_mesh(path)) if found and found.is_file()), None)
+        return Recording(
+            kind=f"TUM RGB-D, associated by {frames.facts['by']}",
+            shots=shots,
+            facts=facts,
+            fingerprint=fingerprint(path, (*frames.pictures, *frames.depths, *masks.values()), (file, camera.path)),
+            own_points=(lambda: _points(points)) if points is not None else None,
+            points_source=points,
+        )
+
+    def _trajectory(self, path: Path, pictures: Sequence[Path]) -> tuple[Path | None, Trajectory]:
+        """The poses, and the file they come from."""
+        file = find_trajectory(path, self.settings.trajectory)
+        return file, tum.read(file)
+
+    def _by_time(self, pictures: Sequence[Path]) -> bool:
+        if self.settings.association != "auto":
+            return self.settings.association == "time"
+        timed = [is_time(path.stem) for path in pictures]
+        if any(timed) and not all(timed):
+            raise InputError(
+                f"{pictures[timed.index(False)]} is not named by a time, but {pictures[timed.index(True)].name} is",
+                "names of one kind",
+                "Rename, or choose with the option association",
+            )
+        return all(timed)
+
+    def _paired_by_time(
+        self, pictures: Sequence[Path], depths: Sequence[Path], trajectory: Trajectory, file: Path
+    ) -> _Frames:
+        tolerance = self.settings.max_time_difference
+        taken = times(pictures)
+        order = np.argsort(taken, kind="stable")
+        pictures, taken = [pictures[index] for index in order], taken[order]
+        same = np.flatnonzero(np.diff(taken) == 0.0)
+        if len(same):
+            first = int(same[0])
+            raise InputError(f"{pictures[first]} and {pictures[first + 1].name} have the same time", "one of them")
+        known = np.zeros(0) if trajectory.timestamps is None else trajectory.timestamps
+        pose = nearest_in_time(taken, known, tolerance)
+        if not (pose >= 0).any():
+            raise InputError(
+                f"no pose of {file} is within {tolerance:g} of a picture: pictures from {taken[0]:.6f} to "
+                f"{taken[-1]:.6f}, poses from {known.min():.6f} to {known.max():.6f}",
+                "times of one clock in names and trajectory, in seconds",
+                "Shift the trajectory's times, or set association: order if line n belongs to picture n",
+            )
+        posed = pose >= 0
+        depth = np.full(len(pictures), -1)
+        complete = posed.copy()
+        if depths:
+            depth[posed] = nearest_in_time(taken[posed], times(depths), tolerance)
+            complete &= depth >= 0
+        if not complete.any():
+            raise InputError(
+                f"no depth file within {tolerance:g} of a picture that has a pose",
+                "depth files named by times of the pictures' clock",
+                "Rename them, or set depth: none",
+            )
+        kept = np.flatnonzero(complete)
+        dropped = {
+            "without_pose": int((~posed).sum()),
+            "without_depth": int((posed & ~complete).sum()),
+        }
+        if sum(dropped.values()):
+            log.warning(
+                "%s: of %d pictures %d have no pose and %d no depth within %g s; they are left out",
+                file.parent,
+                len(pictures),
+                *dropped.values(),
+                tolerance,
+            )
+        difference = np.abs(taken[kept] - known[pose[kept]]).max()
+        facts = {"by": "time", **dropped, "largest_difference_s": float(difference)}
+        return _Frames(
+            [pictures[index] for index in kept],
+            [depths[depth[index]] if depths else None for index in kept],
+            [int(pose[index]) for index in kept],
+            facts,
+        )
+
+    def _paired_by_order(
+        self, pictures: Sequence[Path], depths: Sequence[Path], trajectory: Trajectory, file: Path
+    ) -> _Frames:
+        numbered = by_number(pictures)
+        if len(trajectory) != len(numbered):
+            raise InputError(
+                f"{file} has {len(trajectory)} poses for {len(numbered)} pictures",
+                "a pose for every picture, in order",
+                "Restore the missing ones; or set association: time, if pictures are named by the times in that file",
+            )
+        self._check_times_say_the_same(numbered, trajectory, file)
+        deep = by_number(depths)
+        if deep and deep.keys() != numbered.keys():
+            lone = min(deep.keys() ^ numbered.keys())
+            raise InputError(
+                f"{file.parent} has {len(numbered)} pictures and {len(deep)} depth files; frame "
+                f"{' '.join(map(str, lone))} has only one of the two",
+                "a depth file for every picture, or none at all",
+                "Restore the missing files, or set depth: none",
+            )
+        return _Frames(
+            list(numbered.values()), [deep.get(key) for key in numbered], range(len(numbered)), {"by": "order"}
+        )
+
+    def _check_times_say_the_same(
+        self, numbered: dict[tuple[int, ...], Path], trajectory: Trajectory, file: Path
+    ) -> None:
+        """Refuse frame numbers as times of which most, but not all, are the pictures' numbers: poses went astray."""
+        if trajectory.timestamps is None or self.settings.association == "order":
+            return
+        named = np.array([key[0] if len(key) == 1 else -1 for key in numbered], np.float64)
+        agrees = named == trajectory.timestamps
+        if 0.5 < agrees.mean() < 1.0 or (set(named) == set(trajectory.timestamps) and not agrees.all()):
+            place = int(np.argmin(agrees))
+            raise InputError(
+                f"{file}: pose {place} is of time {trajectory.timestamps[place]:g}, but picture {place} is "
+                f"{list(numbered.values())[place].name}",
+                "line n for picture n, or the times as names",
+                "Set association: time if the names are the times, or order if the times mean nothing",
+            )
+
+    def _depth_scale(self, camera: CameraFile, path: Path) -> float:
+        said, given = camera.depth_scale, self.settings.depth_scale
+        if said is not None and given is not None and said != given:
+            raise InputError(
+                f"{camera.path}: depth_scale = {said:g}, but the option depth_scale is {given:g}",
+                "one depth_scale",
+                "Leave the option out, or mend the file",
+            )
+        scale = said if said is not None else given
+        if scale is None:
+            raise InputError(
+                f"{path} has depth files, but nothing says how many of their steps make one unit of the trajectory",
+                '"depth_scale" in camera.json, or the option depth_scale; TUM\'s own files have 5000 steps a metre',
+                "Say it, for instance --set datamanager.depth_scale=5000, or set depth: none if depth is relative",
+            )
+        return scale
+
+
+def _points(path: Path) -> PointCloud:
+    return read_obj_points(path) if path.suffix == ".obj" else load_points(path)

@@ -1,0 +1,110 @@
+"""Writing a scene in TUM's RGB-D form, as this package and most SLAM systems read it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt16
+
+from coliags_plugin.errors import InputError
+from coliags_plugin.files import atomic_folder, write_json
+from coliags_plugin.poses import tum
+from coliags_plugin.poses.trajectory import Trajectory
+from coliags_plugin.progress import Progress
+from coliags_plugin.scenes import Frame
+
+#: The largest number of 16 bits.
+_LARGEST = 65_535
+TRAJECTORY = "trajectory.txt"
+
+
+def write_rgbd_scene(
+    folder: Path,
+    frames: Sequence[Frame],
+    camera_to_world: Float[np.ndarray, "N 4 4"],
+    *,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Path:
+    """Write a scene that the ``rgbd`` data manager reads with no option (docs/layouts/rgbd.md 1).
+
+    Pictures are numbered; their numbers are the times of the trajectory. Masks are written where a frame has one.
+    Depth is in the finest of the steps 1, 1/2, 1/5, 1/10, ... that reach the farthest pixel.
+
+    Args:
+        folder: The folder to make.
+        frames: In video order, all of one camera; the poses in them are not used.
+        camera_to_world: Rigid, OpenCV axes, the unit of the depth. [N, 4, 4]
+        overwrite: Replace what is there.
+        progress: Told how far it is.
+
+    Returns:
+        The trajectory's file.
+
+    Raises:
+        InputError: There are no frames or other numbers of poses; a frame has no depth, or another camera; or the
+            folder exists or cannot be written.
+    """
+    if not frames or len(frames) != len(camera_to_world):
+        raise InputError(f"{len(frames)} frames and {len(camera_to_world)} poses", "one pose for each frame")
+    camera = frames[0].camera
+    pinhole = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+    scale = depth_scale(max(_farthest(frame) for frame in frames))
+    with atomic_folder(folder, overwrite) as scratch:
+        for name in ("rgb", "depth"):
+            (scratch / name).mkdir()
+        for index, frame in enumerate(frames):
+            other = frame.camera
+            if (other.fx, other.fy, other.cx, other.cy, other.width, other.height) != pinhole:
+                raise InputError(f"frame {frame.name} has a camera of its own", "one pinhole for all frames")
+            picture = f"{index:04d}.png"
+            _write_png(scratch / "rgb" / picture, frame.image.numpy()[..., ::-1])
+            _write_png(scratch / "depth" / picture, depth_steps(_depth(frame), scale))
+            mask = frame.mask
+            if mask is not None:
+                (scratch / "mask").mkdir(exist_ok=True)
+                _write_png(scratch / "mask" / picture, mask.numpy().astype(np.uint8) * 255)
+            if progress is not None:
+                progress("write frames", index + 1, len(frames))
+        trajectory = Trajectory(camera_to_world, timestamps=np.arange(len(frames), dtype=np.float64))
+        tum.write(scratch / TRAJECTORY, trajectory)
+        # Pixel centres at integers, as all of this format's cameras.
+        fx, fy, cx, cy, width, height = pinhole
+        record = {"fx": fx, "fy": fy, "cx": cx - 0.5, "cy": cy - 0.5, "w": width, "h": height, "depth_scale": scale}
+        write_json(scratch / "camera.json", record)
+    return folder / TRAJECTORY
+
+
+def depth_scale(farthest: float) -> float:
+    """Steps per unit of length: the largest of 1, 2, 5 times a power of ten that reaches so far in 16 bits."""
+    finest = _LARGEST / farthest
+    power = 10.0 ** np.floor(np.log10(finest))
+    return float(next(power * digit for digit in (5, 2, 1) if power * digit <= finest))
+
+
+def depth_steps(depth: Float[np.ndarray, "H W"], scale: float) -> UInt16[np.ndarray, "H W"]:
+    """z-depth as stored; 0 where unknown. [H, W]"""
+    known = np.isfinite(depth) & (depth > 0.0)
+    steps = np.rint(np.where(known, depth, 0.0) * scale)
+    return np.where(known, np.clip(steps, 1, _LARGEST), 0).astype(np.uint16)
+
+
+def _depth(frame: Frame) -> Float[np.ndarray, "H W"]:
+    depth = frame.depth
+    if depth is None:
+        raise InputError(f"frame {frame.name} has no depth", "depth for every frame")
+    return depth.numpy().astype(np.float64)
+
+
+def _farthest(frame: Frame) -> float:
+    depth = _depth(frame)
+    known = depth[np.isfinite(depth)]
+    return float(known.max(initial=1e-9))
+
+
+def _write_png(path: Path, pixels: np.ndarray) -> None:
+    import cv2
+
+    path.write_bytes(cv2.imencode(".png", pixels)[1].tobytes())

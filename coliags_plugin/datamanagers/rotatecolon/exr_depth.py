@@ -1,0 +1,73 @@
+"""Depth in OpenEXR files, as Blender renders it: named channels of floating-point numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Shaped
+
+from coliags_plugin.datamanagers.reading.depth_formats import DepthFormat
+from coliags_plugin.errors import InputError
+
+#: Blender writes 1e10 where a ray meets nothing; from here on it is no depth in any unit.
+NOTHING = 1e6
+
+
+@dataclass(frozen=True)
+class ExrDepth(DepthFormat):
+    """One channel, proportional to z-depth; whatever is not finite, not positive or beyond ``NOTHING`` is unknown.
+
+    Attributes:
+        channel: Its full name.
+        divisor: Stored numbers over this are scene units.
+    """
+
+    channel: str
+    divisor: float = 1.0
+
+    def read(self, path: Path) -> Shaped[np.ndarray, "H W"]:
+        """See :class:`DepthFormat`; float32, 0 where unknown."""
+        stored = read_exr_channel(path, self.channel)
+        known = np.isfinite(stored) & (stored > 0.0) & (stored < NOTHING)
+        return np.where(known, stored, np.float32(0.0))
+
+    def z_depth(self, stored: Shaped[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
+        """See :class:`DepthFormat`."""
+        return np.where(stored > 0.0, stored / np.float32(self.divisor), np.float32(np.nan)).astype(np.float32)
+
+
+def read_exr_channel(path: Path, channel: str) -> Float32[np.ndarray, "H W"]:
+    """A channel of an EXR file, by its full name, from whichever part has it.
+
+    Raises:
+        InputError: The file cannot be read whole, or has no such channel; the message names those it has.
+    """
+    import OpenEXR
+
+    if not path.is_file():
+        raise InputError(f"no file {path}", "an OpenEXR file")
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            # A damaged file has no parts.
+            channels = {name: found.pixels for part in file.parts for name, found in part.channels.items()}
+    except (OSError, RuntimeError, ValueError) as error:
+        raise _damaged(path) from error
+    if not channels:
+        raise _damaged(path)
+    if channel not in channels:
+        raise InputError(
+            f"{path} has the channels {', '.join(sorted(channels))}",
+            f"a channel {channel}",
+            "Set depth_channel to the one that holds depth",
+        )
+    return np.asarray(channels[channel]).astype(np.float32)
+
+
+def _damaged(path: Path) -> InputError:
+    return InputError(
+        f"{path} ({path.stat().st_size} bytes) cannot be decoded",
+        "a whole OpenEXR file",
+        "It is damaged or cut short: fetch it again",
+    )

@@ -1,0 +1,157 @@
+"""Where the files of a RotateColon scene are, and what its JSON says (docs/layouts/rotatecolon.md 1, 2)."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from coliags_plugin.datamanagers.reading.frame_files import inventory, numbered
+from coliags_plugin.errors import InputError
+from coliags_plugin.poses.nerfstudio import read as read_transforms
+from coliags_plugin.poses.text import read_text
+
+log = logging.getLogger(__name__)
+
+LAYOUT = "RotateColon's transforms.json, train_views/NNNN.png and perhaps depth_train/NNNN.exr"
+TRAIN, TRAIN_VIEWS, TRAIN_DEPTH = "transforms.json", "train_views", "depth_train"
+TEST = "transforms_test.json"
+POINTS = "init_point_cloud.ply"
+
+
+@dataclass(frozen=True)
+class ViewFiles:
+    """Pictures of one JSON file.
+
+    Attributes:
+        transforms: The file.
+        images: In order of their numbers.
+        depths: Of the same pictures; None where there is not one.
+        camera_to_world: Rigid, OpenCV axes, the data's units. [N, 4, 4]
+        angle: Horizontal field of view, radians.
+        unposed: Number of pictures in the folder that the file says nothing about.
+    """
+
+    transforms: Path
+    images: tuple[Path, ...]
+    depths: tuple[Path, ...] | None
+    camera_to_world: Float[np.ndarray, "N 4 4"]
+    angle: float
+    unposed: int
+
+
+def recognise(folder: Path) -> str | None:
+    """What in the folder says that it is a RotateColon scene; None where nothing does."""
+    if (folder / TRAIN).is_file() and (folder / TRAIN_VIEWS).is_dir():
+        return f"{TRAIN} beside {TRAIN_VIEWS}/"
+    return None
+
+
+def find_train(folder: Path) -> ViewFiles:
+    """The training views.
+
+    Raises:
+        InputError: The folder is missing or holds something else; or as :func:`find_views`.
+    """
+    if not folder.is_dir():
+        raise InputError(f"no folder {folder}", LAYOUT, "Check the path")
+    if recognise(folder) is None:
+        raise InputError(f"{folder} holds {inventory(folder)}", LAYOUT, "Name the scene's own folder")
+    return find_views(folder / TRAIN, folder / TRAIN_VIEWS, folder / TRAIN_DEPTH)
+
+
+def find_test(folder: Path, test_folder: str) -> ViewFiles | None:
+    """The test views, which have no depth; None where the data have none.
+
+    Raises:
+        InputError: There are poses but no pictures; or as :func:`find_views`.
+    """
+    if not (folder / TEST).is_file():
+        return None
+    if not (folder / test_folder).is_dir():
+        raise InputError(
+            f"{folder} has {TEST} but no folder {test_folder}",
+            "the pictures of the test views",
+            "Set test_folder to the folder they are in",
+        )
+    return find_views(folder / TEST, folder / test_folder, None)
+
+
+def find_views(transforms: Path, pictures: Path, depth: Path | None) -> ViewFiles:
+    """Poses, and the pictures and depth files they belong to.
+
+    Raises:
+        InputError: The JSON cannot be read, or a pose is not rigid; a frame is no number, stands twice or has no
+            picture; or some but not all frames have a depth file.
+    """
+    trajectory = read_transforms(transforms)
+    found = numbered(pictures, "", frozenset({".png"}))
+    stated = _numbers(transforms, trajectory.names_or_numbers())
+    order = sorted(range(len(stated)), key=stated.__getitem__)
+    numbers = [stated[index] for index in order]
+    for number in numbers:
+        if number not in found:
+            raise InputError(
+                f"{transforms}: frame {number} has no picture {pictures / f'{number:04d}.png'}",
+                "a picture for every frame",
+                "Restore it, or remove the frame",
+            )
+    unposed = len(found) - len(numbers)
+    if unposed:
+        log.warning("%s: %d pictures of %s have no pose and are left out", transforms, unposed, pictures.name)
+    return ViewFiles(
+        transforms,
+        tuple(found[number] for number in numbers),
+        _depths(numbers, depth),
+        trajectory.camera_to_world[order],
+        _angle(transforms),
+        unposed,
+    )
+
+
+def _numbers(transforms: Path, names: Sequence[str]) -> list[int]:
+    """The frames' numbers, which ``file_path`` holds, with a folder and a suffix or without."""
+    numbers: list[int] = []
+    seen: set[int] = set()
+    for name in names:
+        stem = name.replace("\\", "/").rsplit("/", 1)[-1].removesuffix(".png")
+        if not stem.isdecimal():
+            raise InputError(f"{transforms}: file_path '{name}'", "the frame's number, for instance '12'")
+        number = int(stem)
+        if number in seen:
+            raise InputError(f"{transforms}: frame {number} stands twice", "one pose for each picture")
+        seen.add(number)
+        numbers.append(number)
+    return numbers
+
+
+def _depths(numbers: Sequence[int], folder: Path | None) -> tuple[Path, ...] | None:
+    found: Mapping[int, Path] = {}
+    if folder is not None and folder.is_dir():
+        found = numbered(folder, "", frozenset({".exr"}))
+    lacking = [number for number in numbers if number not in found]
+    if folder is None or len(lacking) == len(numbers):
+        return None
+    if lacking:
+        raise InputError(
+            f"{folder} has {len(numbers) - len(lacking)} depth files for {len(numbers)} frames; frame {lacking[0]} has "
+            "none",
+            "a depth file for every picture, or none at all",
+            "Restore the missing files: archives cut short are common",
+        )
+    return tuple(found[number] for number in numbers)
+
+
+def _angle(transforms: Path) -> float:
+    angle = json.loads(read_text(transforms)).get("camera_angle_x")
+    if isinstance(angle, bool) or not isinstance(angle, int | float) or not 0.0 < angle < math.pi:
+        raise InputError(
+            f"{transforms}: camera_angle_x is {angle!r}", "the horizontal field of view, radians, between 0 and pi"
+        )
+    return float(angle)

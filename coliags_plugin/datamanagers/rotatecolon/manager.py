@@ -1,0 +1,155 @@
+"""RotateColon, PR-Endo's rendered colon whose test views are turned as no training view is."""
+
+from __future__ import annotations
+
+import logging
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+from pydantic import Field
+
+from coliags_plugin.datamanagers.fusion import load_points
+from coliags_plugin.datamanagers.reading.frame_files import marks
+from coliags_plugin.datamanagers.reading.images import size_of
+from coliags_plugin.datamanagers.recorded import RecordedDataManager
+from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
+from coliags_plugin.datamanagers.rotatecolon.depth_scale import fit_scale
+from coliags_plugin.datamanagers.rotatecolon.exr_depth import ExrDepth
+from coliags_plugin.datamanagers.rotatecolon.files import POINTS, ViewFiles, find_test, find_train, recognise
+from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
+from coliags_plugin.datamanagers.seen import ROTATION
+from coliags_plugin.datamanagers.splits import Split
+from coliags_plugin.datamanagers.views import View
+from coliags_plugin.lenses import Pinhole
+from coliags_plugin.scenes import PointCloud
+
+log = logging.getLogger(__name__)
+
+#: The colour PR-Endo and the authors' code give every initial point, whatever the file says.
+PINK = (188, 99, 76)
+#: The test set of the split's own, in the absence of which the data's test views are it.
+_MAIN_SET = "test"
+
+
+class RotateColonSettings(SceneSettings):
+    """Options of the ``rotatecolon`` data manager."""
+
+    depth_divisor: float = Field(
+        1.4,
+        gt=0.0,
+        description="Stored depth over this is in units of the poses. Of unknown origin: PR-Endo's code has it, and "
+        "nothing says why (docs/layouts/rotatecolon.md 4).",
+    )
+    depth_channel: str = Field("ViewLayer.Depth.Z", description="The EXR channel that holds depth.")
+    test_folder: str = Field("test_views_1", description="The folder of the pictures of transforms_test.json.")
+    split: Split = Field("all-train", description="As for all data; the test views come apart from the video.")
+    initial_points: InitialPoints = Field("data", description="As for all data; init_point_cloud.ply.")
+
+
+class RotateColonDataManager(RecordedDataManager):
+    """Reads a RotateColon scene; see docs/layouts/rotatecolon.md.
+
+    The views of transforms_test.json, which have no depth, are the test set ``test``; where a split holds out training
+    views, these are ``test`` and the others ``rotation``. ``truth/seen/NNNN_seen.png`` marks what all training views
+    see of them.
+    """
+
+    Settings = RotateColonSettings
+
+    settings: RotateColonSettings
+    name = "rotatecolon"
+
+    @classmethod
+    def recognise(cls, path: Path) -> str | None:
+        """See :class:`DataManager`."""
+        return recognise(path)
+
+    def open(self, path: Path) -> Recording:
+        """See :class:`RecordedDataManager`."""
+        settings = self.settings
+        train, test = find_train(path), find_test(path, settings.test_folder)
+        shots, facts = self._shots(train)
+        holds_out = settings.split not in ("all-train", "own")
+        name = ROTATION if holds_out else _MAIN_SET
+        test_sets = {}
+        if test is not None:
+            # Marks say what all training views see; with fewer of them they would be wrong.
+            whole = not holds_out and settings.frame_step == 1 and settings.max_frames is None
+            seen = marks(path / "truth" / "seen", "seen", len(test.images)) if whole else {}
+            test_sets[name], facts[name] = self._shots(test, seen, "test-")
+        points = path / POINTS
+        facts["depth_against_points"] = self._compared(shots, points)
+        files = [part for part in (train, test) if part is not None]
+        return Recording(
+            kind="RotateColon layout",
+            shots=shots,
+            facts=facts,
+            fingerprint=fingerprint(
+                path,
+                (
+                    points if points.is_file() else None,
+                    *(file for part in files for file in (*part.images, *(part.depths or ()))),
+                ),
+                (part.transforms for part in files),
+            ),
+            test_sets=test_sets,
+            own_split={"train": range(len(shots)), "test": ()},
+            own_points=(lambda: _pink(load_points(points))) if points.is_file() else None,
+            points_source=points,
+        )
+
+    def _shots(
+        self, files: ViewFiles, seen: dict[int, Path] | None = None, prefix: str = ""
+    ) -> tuple[list[Shot], dict[str, Any]]:
+        settings = self.settings
+        width, height = size_of(files.images[0])
+        focal = 0.5 * width / math.tan(0.5 * files.angle)
+        # In the middle of the picture; the corner of its first pixel lies at -0.5.
+        pinhole = Pinhole(focal, focal, 0.5 * width - 0.5, 0.5 * height - 0.5)
+        view = View.of_pinhole(pinhole, width, height, files.images[0], settings.size)
+        depth_format = ExrDepth(settings.depth_channel, settings.depth_divisor)
+        depths = files.depths or (None,) * len(files.images)
+        shots = [
+            Shot(prefix + image.stem, image, view, pose, depth, depth_format, seen=(seen or {}).get(place))
+            for place, (image, depth, pose) in enumerate(zip(files.images, depths, files.camera_to_world, strict=True))
+        ]
+        facts = {
+            "layout": "rotatecolon",
+            "transforms": files.transforms.name,
+            "pictures_without_pose": files.unposed,
+            "depth_divisor": None if files.depths is None else settings.depth_divisor,
+            **view.facts(),
+            "pose_convention": "camera-to-world, OpenGL axes",
+        }
+        return shots, facts
+
+    def _compared(self, shots: list[Shot], points: Path) -> dict[str, float] | None:
+        """How well depth and the initial points agree; None where one of them is absent."""
+        if not points.is_file():
+            return None
+        fit = fit_scale(shots, load_points(points).positions.double().numpy())
+        if fit is None:
+            return None
+        divisor = self.settings.depth_divisor
+        if fit.disagrees:
+            log.warning(
+                "%s: depth / %g lies off the points by %.2g of its length, depth / %.4g by %.2g; "
+                "consider depth_divisor (docs/layouts/rotatecolon.md 4)",
+                points,
+                divisor,
+                fit.distance,
+                divisor / fit.factor,
+                fit.distance_at_best,
+            )
+        return {
+            "best_divisor": divisor / fit.factor,
+            "ratio": fit.factor,
+            "median_distance_over_depth": fit.distance,
+            "at_best_divisor": fit.distance_at_best,
+        }
+
+
+def _pink(points: PointCloud) -> PointCloud:
+    return PointCloud(points.positions, torch.tensor(PINK, dtype=torch.uint8).expand(len(points), 3).contiguous())

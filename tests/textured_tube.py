@@ -1,0 +1,70 @@
+"""A blind tube with a solid texture, filmed from inside: pictures with features, and closed-form depth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from coliags_plugin.cameras import Camera
+from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
+from coliags_plugin.lenses import Pinhole
+from coliags_plugin.scenes import Frame
+
+RADIUS, END = 20.0, 60.0
+WIDTH, HEIGHT = 160, 128
+#: Off-centre, non-square pixels; pixel centres at integers + 0.5.
+INTRINSICS = (101.0, 98.0, 83.0, 61.5)
+
+
+def depth_along(origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """How many ray lengths away the wall x^2 + y^2 = RADIUS^2 or the end z = END is. [..., 3] -> [...]"""
+    a = (rays[..., :2] ** 2).sum(-1)
+    b = (rays[..., :2] * origin[:2]).sum(-1)
+    c = (origin[:2] ** 2).sum() - RADIUS**2
+    wall = (-b + np.sqrt(b**2 - a * c)) / np.maximum(a, 1e-12)
+    return np.minimum(wall, (END - origin[2]) / rays[..., 2])
+
+
+def texture(points: np.ndarray) -> np.ndarray:
+    """RGB in [0, 255] of places in space: waves of 2.5 to 15 mm in all directions. [..., 3] -> [..., 3]"""
+    rng = np.random.default_rng(1)
+    waves = rng.normal(size=(48, 3))
+    waves *= rng.uniform(0.4, 2.5, (48, 1)) / np.linalg.norm(waves, axis=1, keepdims=True)
+    phases, weights = rng.uniform(0, 2 * np.pi, 48), rng.normal(size=(48, 3)) + 1.0
+    value = np.sin(points @ waves.T + phases) @ weights
+    return np.clip(120.0 + 9.0 * value, 5, 245)
+
+
+def tube_frames(count: int = 10, step: float = 1.6) -> list[Frame]:
+    """A camera that goes into the tube, ``step`` mm a frame, and sways and turns a little."""
+    frames = []
+    for index in range(count):
+        c2w = np.eye(4)
+        c2w[:3, :3] = Rotation.from_euler(
+            "xyz", [2.0 * index / count, 5.0 * np.sin(index / 3), index], True
+        ).as_matrix()
+        c2w[:3, 3] = 4.0 * np.sin(index / 2.5), 3.0 * np.cos(index / 3.0), step * index
+        camera = Camera(*INTRINSICS, WIDTH, HEIGHT, torch.from_numpy(c2w))
+        rays = camera.rays().numpy()
+        depth = depth_along(c2w[:3, 3], rays)
+        image = np.rint(texture(c2w[:3, 3] + depth[..., None] * rays)).astype(np.uint8)
+        frames.append(
+            Frame(f"{index:04d}", index, torch.from_numpy(image), camera, torch.from_numpy(depth.astype(np.float32)))
+        )
+    return frames
+
+
+def write_tube(folder: Path, count: int = 10, step: float = 1.6) -> Path:
+    """:func:`tube_frames` in C3VD's undistorted layout, without depth or points."""
+    frames = tube_frames(count, step)
+    fx, fy, cx, cy = INTRINSICS
+    write_c3vd_scene(
+        folder,
+        [frame.image.numpy() for frame in frames],
+        torch.stack([frame.camera.camera_to_world for frame in frames]).numpy(),
+        Pinhole(fx, fy, cx - 0.5, cy - 0.5),
+    )
+    return folder
