@@ -200,9 +200,12 @@ def _binary_images(path: Path) -> Iterator[_Image]:
             name = data[at + _BINARY_IMAGE.size : end].decode()
             (points,) = struct.unpack_from("<Q", data, end + 1)
             at = end + 9 + _POINT_BYTES * points
-            if at > len(data) or not np.all(np.isfinite(values)):
+            if at > len(data):
                 raise ValueError("out of bounds")
-            yield _Image(f"{path}, picture {number} ({name})", tuple(values[:4]), tuple(values[4:]), camera, name)
+            place = f"{path}, picture {number} ({name})"
+            if not np.all(np.isfinite(values)):
+                raise InputError(f"{place}: its pose is {', '.join(f'{v:g}' for v in values)}", "seven finite numbers")
+            yield _Image(place, tuple(values[:4]), tuple(values[4:]), camera, name)
     except (struct.error, ValueError) as error:
         raise _damaged(path, data) from error
     if at != len(data):

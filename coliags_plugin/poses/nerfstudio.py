@@ -103,8 +103,12 @@ def _matrix(value: Any, place: str) -> np.ndarray:
         matrix = np.empty(0)
     if matrix.shape == (3, 4):
         matrix = np.vstack([matrix, (0.0, 0.0, 0.0, 1.0)])
-    if matrix.shape != (4, 4) or not np.all(np.isfinite(matrix)):
-        raise InputError(f"{place} is missing or no matrix", "4 (or 3) rows of 4 finite numbers")
+    expected = "4 (or 3) rows of 4 finite numbers"
+    if matrix.shape != (4, 4):
+        raise InputError(f"{place} is {'missing' if value is None else 'no matrix'}", expected)
+    if not np.all(np.isfinite(matrix)):
+        row, column = np.argwhere(~np.isfinite(matrix))[0]
+        raise InputError(f"{place} is {matrix[row, column]} in row {row}, column {column}", expected)
     return matrix
 
 

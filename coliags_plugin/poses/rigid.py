@@ -79,7 +79,8 @@ def rotations_from_wxyz(
     lengths = np.linalg.norm(quats_wxyz, axis=1)
     for index in np.flatnonzero(~(lengths > ZERO_QUATERNION) | ~np.isfinite(lengths)):
         raise InputError(
-            f"{place(int(index))}: the quaternion ({_listed(quats_wxyz[index])}) is no rotation", "four finite numbers"
+            f"{place(int(index))}: the quaternion ({_listed(quats_wxyz[index])}) is no rotation",
+            "four finite numbers, not all 0",
         )
     for index in np.flatnonzero(np.abs(lengths - 1.0) > RIGID_TOLERANCE) if unit else ():
         raise InputError(

@@ -157,7 +157,7 @@ def test_binary_numbers_that_cannot_be(tmp_path):
         colmap.read(tmp_path / "model")
     content[12:20] = struct.pack("<d", np.nan)
     (tmp_path / "model" / "images.bin").write_bytes(content)
-    with pytest.raises(InputError, match="damaged"):
+    with pytest.raises(InputError, match=r"picture 1 \(0000\.png\): its pose is nan"):
         colmap.read(tmp_path / "model")
 
 
