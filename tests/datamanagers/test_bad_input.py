@@ -330,7 +330,10 @@ REFUSED: dict[str, Rows] = {
             change_row("sparse/0/images.txt", 6, 1, lambda quat: quat * np.nan),
             (r"images\.txt, line \d+: '4 nan", "all numbers finite"),
         ),
-        "colmap": (change_binary_pose(3, lambda values: values * np.nan), (r"images\.bin, picture \d+ ", "its pose is nan")),
+        "colmap": (
+            change_binary_pose(3, lambda values: values * np.nan),
+            (r"images\.bin, picture \d+ ", "its pose is nan"),
+        ),
         **per_kind(
             PARAMS,
             lambda name, kind: (

@@ -218,7 +218,10 @@ def test_different_cameras_are_no_common_intrinsics(tmp_path):
         ('{"frames": [3]}', "frame 0: no file_path"),
         ('{"frames": [{"file_path": "a"}]}', r"frame 0 \(a\): transform_matrix is missing"),
         ('{"frames": [{"file_path": "a", "transform_matrix": [[1, 2], [3]]}]}', "4 .or 3. rows of 4 finite numbers"),
-        ('{"frames": [{"file_path": "a", "transform_matrix": [[NaN,0,0,0],[0,1,0,0],[0,0,1,0]]}]}', "is nan in row 0, column 0"),
+        (
+            '{"frames": [{"file_path": "a", "transform_matrix": [[NaN,0,0,0],[0,1,0,0],[0,0,1,0]]}]}',
+            "is nan in row 0, column 0",
+        ),
     ],
 )
 def test_broken_transforms_are_refused(tmp_path, text, message):
