@@ -26,6 +26,7 @@ def wall(tmp_path_factory):
 def test_every_layout_is_recognised_by_one_format_and_loads(layout, tmp_path):
     # REIM-NeRF validates on every 25th frame: so short a video has none.
     settings = {"layout": layout, "width": 64, "height": 52, "frames": 9, "rotation_views": 2, "path_length": 5.0}
+    settings |= {"mesh_spacing": 1.2, "texture_spacing": 0.4, "interreflection": 0.0, "supersampling": 1}
     output = tmp_path / "colon"
     generate(phantom_settings(settings), output)
     folder = next((path for path in output.rglob("color") if layout == "pr-endo"), output / "color").parent
