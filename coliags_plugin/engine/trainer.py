@@ -219,16 +219,19 @@ class Trainer:
         """Refuse terms that need a kind of depth of which no training frame has any."""
         dense = [key for key, loss in self.losses.items() if loss.needs_depth]
         sparse = [key for key, loss in self.losses.items() if loss.needs_sparse_depth]
-        if dense and all(frame.depth is None for frame in self.scene.train):
-            raise self._missing(dense[0], "depth")
-        if sparse and all(frame.sparse_depth is None for frame in self.scene.train):
+        has_dense = any(frame.depth is not None for frame in self.scene.train)
+        has_sparse = any(frame.sparse_depth is not None for frame in self.scene.train)
+        if dense and not has_dense:
+            there = ", or train on its points with --set 'losses.{}={{name: sparse-depth, weight: 0.2}}'"
+            raise self._missing(dense[0], "depth", there.format(dense[0]) if has_sparse else "")
+        if sparse and not has_sparse:
             raise self._missing(sparse[0], "depth at single points")
 
-    def _missing(self, key: str, what: str) -> InputError:
+    def _missing(self, key: str, what: str, instead: str = "") -> InputError:
         return InputError(
             f"loss term '{key}' needs {what}, and no training frame of scene '{self.scene.name}' has any",
             f"frames with {what}, or no such term",
-            f"Remove it with --set losses.{key}=null",
+            f"Remove it with --set losses.{key}=null{instead}",
         )
 
     def _optimizers(self) -> Optimizers:

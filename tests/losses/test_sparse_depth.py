@@ -181,5 +181,5 @@ def test_any_method_can_be_given_the_term(tmp_path):
 def test_a_scene_without_such_depth_is_refused_before_training(tmp_path):
     with pytest.raises(InputError, match=r"'sparse_depth' needs depth at single points.*losses\.sparse_depth=null"):
         trainer(tmp_path / "run", wall_scene())
-    with pytest.raises(InputError, match=r"'depth' needs depth, .*losses\.depth=null"):
+    with pytest.raises(InputError, match=r"'depth' needs depth, .*losses\.depth=null, or .*name: sparse-depth"):
         trainer(tmp_path / "run", sparse_scene(), SPARSE[1:])
