@@ -43,7 +43,8 @@ def find_format(path: Path) -> str:
         raise InputError(
             f"{path} holds {holds}, which none of the formats {', '.join(known)} recognises",
             "a scene's own folder",
-            "docs/data.md lists what each looks like; --format NAME chooses one and says what it misses",
+            "docs/data.md lists what each looks like; --format NAME chooses one and says what it misses. Pictures "
+            "without poses become a scene by coliags poses track, if there is depth, or coliags poses sfm",
         )
     if len(found) > 1:
         seen = "; ".join(f"{name}: {reason}" for name, reason in found.items())
