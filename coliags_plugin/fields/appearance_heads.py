@@ -10,7 +10,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from coliags_plugin.fields.embedding import cosine_embedding
-from coliags_plugin.fields.perceptron import perceptron
+from coliags_plugin.fields.perceptron import first_layer, perceptron
 from coliags_plugin.settings import Settings
 
 
@@ -87,8 +87,11 @@ class PlainAppearanceHead(nn.Module):
         Returns:
             RGB in (0, 1). [V, K, 3]
         """
-        seen = torch.cat([features, self.embed(directions, distances, cosines)], dim=1)
-        return self.color_mlp(seen).view(len(seen), self.children_per_anchor, 3).sigmoid()
+        layers: list[Any] = list(self.color_mlp)
+        first, activation, last = layers
+        embedded = self.embed(directions, distances, cosines)
+        hidden = activation(first_layer(features, embedded, first.weight, first.bias))
+        return last(hidden).view(len(features), self.children_per_anchor, 3).sigmoid()
 
 
 class IMIAAppearanceSettings(AppearanceSettings):

@@ -10,7 +10,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from coliags_plugin.fields.embedding import cosine_embedding
-from coliags_plugin.fields.perceptron import perceptron
+from coliags_plugin.fields.perceptron import first_layer, perceptron
 from coliags_plugin.settings import Settings
 
 
@@ -50,12 +50,13 @@ class PlainGeometryHead(nn.Module):
             Signed opacities in (-1, 1), of which only positive ones are drawn [V, K]; and three scale logits and four
             quaternion components (w first) per child [V, K, 7].
         """
-        seen = torch.cat([features, self.embed(directions)], dim=1)
         # Both perceptrons read the same input: one product for both first layers.
         first: list[Any] = [self.opacity_mlp[0], self.covariance_mlp[0]]
         weight, bias = torch.cat([layer.weight for layer in first]), torch.cat([layer.bias for layer in first])
-        opacity_hidden, covariance_hidden = nn.functional.linear(seen, weight, bias).relu().chunk(2, dim=1)
-        covariances = self.covariance_mlp[2](covariance_hidden).view(len(seen), self.children_per_anchor, 7)
+        opacity_hidden, covariance_hidden = (
+            first_layer(features, self.embed(directions), weight, bias).relu().chunk(2, dim=1)
+        )
+        covariances = self.covariance_mlp[2](covariance_hidden).view(len(features), self.children_per_anchor, 7)
         return self.opacity_mlp[2](opacity_hidden).tanh(), covariances
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 import torch
-from torch import nn
+from jaxtyping import Float
+from torch import Tensor, nn
 
 
 def perceptron(inputs: int, hidden: int, outputs: int, generator: torch.Generator) -> nn.Sequential:
@@ -20,3 +21,17 @@ def perceptron(inputs: int, hidden: int, outputs: int, generator: torch.Generato
             layer.weight.uniform_(-bound, bound, generator=generator)
             layer.bias.uniform_(-bound, bound, generator=generator)
     return nn.Sequential(layers[0], nn.ReLU(), layers[1])
+
+
+def first_layer(
+    features: Float[Tensor, "V F"],
+    embedded: Float[Tensor, "V E"],
+    weight: Float[Tensor, "H F+E"],
+    bias: Float[Tensor, "H"],
+) -> Float[Tensor, "V H"]:
+    """A linear layer that sees both inputs side by side, without laying them side by side.
+
+    What is embedded (directions, distances) has no gradient; joined with the features it would be given one.
+    """
+    split = features.shape[1]
+    return torch.addmm(nn.functional.linear(embedded, weight[:, split:], bias), features, weight[:, :split].t())
