@@ -16,6 +16,7 @@ from coliags_plugin.datamanagers.rgbd.unposed import UnposedRGBDDataManager
 from coliags_plugin.datamanagers.rgbd.writer import depth_scale, depth_steps, write_rgbd_scene
 from coliags_plugin.engine.data_formats import find_format
 from coliags_plugin.errors import InputError
+from coliags_plugin.poses import tum
 from tests.scenes import wall_scene, write_wall
 
 SETTINGS = RGBDSettings(split="all-train", initial_points="none")
@@ -49,6 +50,18 @@ def test_what_is_written_is_read(tmp_path):
         camera, other = found.camera, written.camera
         np.testing.assert_allclose(camera.camera_to_world, other.camera_to_world, atol=1e-6)
         assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((other.fx, other.fy, other.cx, other.cy))
+
+
+def test_times_stay(tmp_path):
+    frames = [replace(frame, name=f"130503110{frame.index}.175304") for frame in wall()]
+    trajectory = write_rgbd_scene(tmp_path / "scene", frames, poses_of(frames))
+    assert [path.stem for path in sorted((tmp_path / "scene" / "depth").iterdir())] == [frame.name for frame in frames]
+    assert tum.read(trajectory).timestamps.tolist() == [float(frame.name) for frame in frames]
+    read = RGBDDataManager(SETTINGS).load(tmp_path / "scene").train
+    assert [frame.name for frame in read] == [frame.name for frame in frames]
+    backwards = [replace(frame, name=f"{9 - frame.index}.5") for frame in frames]
+    numbered = write_rgbd_scene(tmp_path / "numbered", backwards, poses_of(frames))
+    assert tum.read(numbered).timestamps.tolist() == [0.0, 1.0, 2.0, 3.0]
 
 
 @given(farthest=st.floats(1e-3, 1e5))

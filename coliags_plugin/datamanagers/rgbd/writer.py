@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt16
 
+from coliags_plugin.datamanagers.rgbd.association import is_time, times
 from coliags_plugin.errors import InputError
 from coliags_plugin.files import atomic_folder, write_json
 from coliags_plugin.poses import tum
@@ -30,7 +31,8 @@ def write_rgbd_scene(
 ) -> Path:
     """Write a scene that the ``rgbd`` data manager reads with no option (docs/layouts/rgbd.md 1).
 
-    Pictures are numbered; their numbers are the times of the trajectory. Masks are written where a frame has one.
+    Frames named by their times (docs/layouts/rgbd.md) keep their names, and the trajectory has these times; others are
+    numbered, and their numbers are the times. Masks are written where a frame has one.
     Depth is in the finest of the steps 1, 1/2, 1/5, 1/10, ... that reach the farthest pixel.
 
     Args:
@@ -52,6 +54,12 @@ def write_rgbd_scene(
     camera = frames[0].camera
     pinhole = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
     scale = depth_scale(max(_farthest(frame) for frame in frames))
+    pictures = [f"{frame.name}.png" for frame in frames]
+    timed = all(is_time(frame.name) for frame in frames) and bool(
+        (np.diff(times([Path(picture) for picture in pictures])) > 0.0).all()
+    )
+    if not timed:
+        pictures = [f"{index:04d}.png" for index in range(len(frames))]
     with atomic_folder(folder, overwrite) as scratch:
         for name in ("rgb", "depth"):
             (scratch / name).mkdir()
@@ -59,7 +67,7 @@ def write_rgbd_scene(
             other = frame.camera
             if (other.fx, other.fy, other.cx, other.cy, other.width, other.height) != pinhole:
                 raise InputError(f"frame {frame.name} has a camera of its own", "one pinhole for all frames")
-            picture = f"{index:04d}.png"
+            picture = pictures[index]
             _write_png(scratch / "rgb" / picture, frame.image.numpy()[..., ::-1])
             _write_png(scratch / "depth" / picture, depth_steps(_depth(frame), scale))
             mask = frame.mask
@@ -68,8 +76,9 @@ def write_rgbd_scene(
                 _write_png(scratch / "mask" / picture, mask.numpy().astype(np.uint8) * 255)
             if progress is not None:
                 progress("write frames", index + 1, len(frames))
-        trajectory = Trajectory(camera_to_world, timestamps=np.arange(len(frames), dtype=np.float64))
-        tum.write(scratch / TRAJECTORY, trajectory)
+        tum.write(
+            scratch / TRAJECTORY, Trajectory(camera_to_world, timestamps=times([Path(picture) for picture in pictures]))
+        )
         # Pixel centres at integers, as all of this format's cameras.
         fx, fy, cx, cy, width, height = pinhole
         record = {"fx": fx, "fy": fy, "cx": cx - 0.5, "cy": cy - 0.5, "w": width, "h": height, "depth_scale": scale}
