@@ -14,7 +14,7 @@ from coliags_plugin.components import DataManagerNode, FieldNode, LossNode, Rend
 from coliags_plugin.errors import InputError, did_you_mean
 from coliags_plugin.methods import method_folder, method_names
 from coliags_plugin.settings import Settings
-from coliags_plugin.yaml_tree import Node, dump, merge, override, read_tree
+from coliags_plugin.yaml_tree import Node, dump, merge, override_all, read_tree
 
 
 class OptimizerSettings(Settings):
@@ -110,10 +110,7 @@ def method_tree(method: str, overrides: Iterable[str] = ()) -> Node:
     Raises:
         InputError: No such method, or a file of it is not YAML.
     """
-    tree = _resolve(_find(method, Path.cwd()), ())
-    for assignment in overrides:
-        tree = override(tree, assignment)
-    return tree
+    return override_all(_resolve(_find(method, Path.cwd()), ()), overrides)
 
 
 def _is_path(method: str) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -159,6 +159,17 @@ def override(tree: Node, assignment: str) -> Node:
     for key in reversed(keys):
         node = Node({key: node}, origin)
     return merge(tree, node)
+
+
+def override_all(tree: Node, assignments: Iterable[str]) -> Node:
+    """Apply ``key.path=value`` assignments, the last one last.
+
+    Raises:
+        InputError: See :func:`override`.
+    """
+    for assignment in assignments:
+        tree = override(tree, assignment)
+    return tree
 
 
 def dump(plain: Any) -> str:

@@ -19,7 +19,7 @@ from coliags_plugin.datamanagers.rgbd.unposed import UnposedRGBDDataManager
 from coliags_plugin.errors import InputError
 from coliags_plugin.progress import Progress
 from coliags_plugin.scenes import Scene
-from coliags_plugin.yaml_tree import Node, override
+from coliags_plugin.yaml_tree import Node, override_all
 
 log = logging.getLogger(__name__)
 
@@ -108,12 +108,12 @@ def open_scene(
         InputError: See :func:`find_format`; an option is unknown; or the scene cannot be read.
     """
     name = find_format(path) if data_format is None else data_format
-    tree = _tree(options)
+    given = override_all(Node({}, "options"), options).plain()
     try:
-        return _opened(path, name, tree.plain(), progress)
+        return _opened(path, name, given, progress)
     except NoPointsError as error:
         log.warning("%s", error)
-        return _opened(path, name, {**tree.plain(), "initial_points": "none"}, progress)
+        return _opened(path, name, {**given, "initial_points": "none"}, progress)
 
 
 def open_video(
@@ -134,20 +134,13 @@ def open_video(
         InputError: See :func:`open_scene`.
     """
     options = (*options, "split=all-train", "initial_points=none")
-    given = _tree(options).plain()
+    given = override_all(Node({}, "options"), options).plain()
     unposed = lacks_trajectory(path) and "trajectory" not in given
     # Other formats have pictures and depth too, and their poses elsewhere.
     if data_format not in (None, "rgbd") or not unposed or (data_format is None and _recognised(path)):
         return open_scene(path, data_format, options, progress), True
     log.info("%s: pictures and depth without a trajectory", path)
     return UnposedRGBDDataManager(_component("rgbd", given).settings).load(path, progress), False
-
-
-def _tree(options: Sequence[str]) -> Node:
-    tree = Node({}, "options")
-    for option in options:
-        tree = override(tree, option)
-    return tree
 
 
 def _opened(path: Path, name: str, options: Mapping[str, Any], progress: Progress | None) -> Scene:

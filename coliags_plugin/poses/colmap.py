@@ -10,6 +10,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,6 +19,9 @@ from coliags_plugin.files import atomic_folder
 from coliags_plugin.poses.rigid import inverse, rigid, rotations_from_wxyz, wxyz_from_rotations
 from coliags_plugin.poses.text import placed, read_text, shortened
 from coliags_plugin.poses.trajectory import Intrinsics, Trajectory, natural_order, refuse_repeated
+
+if TYPE_CHECKING:
+    import pycolmap
 
 #: Models without distortion by COLMAP's number, with the number of their parameters.
 _PINHOLES = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4)}
@@ -109,22 +113,11 @@ def _suffix(path: Path) -> str | None:
     return None
 
 
-def _write(path: Path, trajectory: Trajectory, text: bool) -> None:
-    if trajectory.intrinsics is None:
-        raise InputError(
-            f"no intrinsics for {path}",
-            "a COLMAP model to hold the camera's intrinsics and picture size",
-            "Pass --intrinsics fx,fy,cx,cy --size WIDTHxHEIGHT",
-        )
-    names = trajectory.names_or_numbers()
-    refuse_repeated(names, str(path))
-    others = sorted(found.name for found in path.iterdir() if found.name not in _MODEL_FILES) if path.is_dir() else []
-    if others:
-        raise InputError(f"{path} holds {others[0]}, which is no part of a COLMAP model", "a folder to itself")
+def posed_model(trajectory: Trajectory, pinhole: Intrinsics) -> pycolmap.Reconstruction:
+    """A model without points, of pictures that one pinhole camera took: pose i is image i + 1, of camera 1."""
     import pycolmap
 
     model = pycolmap.Reconstruction()
-    pinhole = trajectory.intrinsics
     model.add_camera_with_trivial_rig(
         pycolmap.Camera(
             camera_id=1,
@@ -136,12 +129,27 @@ def _write(path: Path, trajectory: Trajectory, text: bool) -> None:
     )
     world_to_camera = inverse(trajectory.camera_to_world)
     quats_wxyz = wxyz_from_rotations(world_to_camera[:, :3, :3])
-    for index, name in enumerate(names):
+    for index, name in enumerate(trajectory.names_or_numbers()):
         rotation = pycolmap.Rotation3d(quats_wxyz[index, [1, 2, 3, 0]])
         model.add_image_with_trivial_frame(
             pycolmap.Image(name=name, camera_id=1, image_id=index + 1),
             pycolmap.Rigid3d(rotation, world_to_camera[index, :3, 3]),
         )
+    return model
+
+
+def _write(path: Path, trajectory: Trajectory, text: bool) -> None:
+    if trajectory.intrinsics is None:
+        raise InputError(
+            f"no intrinsics for {path}",
+            "a COLMAP model to hold the camera's intrinsics and picture size",
+            "Pass --intrinsics fx,fy,cx,cy --size WIDTHxHEIGHT",
+        )
+    refuse_repeated(trajectory.names_or_numbers(), str(path))
+    others = sorted(found.name for found in path.iterdir() if found.name not in _MODEL_FILES) if path.is_dir() else []
+    if others:
+        raise InputError(f"{path} holds {others[0]}, which is no part of a COLMAP model", "a folder to itself")
+    model = posed_model(trajectory, trajectory.intrinsics)
     with atomic_folder(path, overwrite=True) as scratch:
         (model.write_text if text else model.write_binary)(str(scratch))
 

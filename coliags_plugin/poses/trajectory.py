@@ -104,13 +104,18 @@ class Trajectory:
         """Camera-to-world rotations. [N, 3, 3]"""
         return self.camera_to_world[:, :3, :3]
 
+    @property
+    def steps(self) -> Float[np.ndarray, "N-1"]:
+        """Distance of each centre from the one before it. [N - 1]"""
+        return np.asarray(np.linalg.norm(np.diff(self.centers, axis=0), axis=1))
+
     def summary(self, unit: str = "units") -> str:
         """Count, length and looking direction in one line: a wrong convention shows in them first.
 
         Args:
             unit: What to call the unit of length.
         """
-        steps = np.linalg.norm(np.diff(self.centers, axis=0), axis=1)
+        steps = self.steps
         mean_step = float(steps.mean()) if len(steps) else 0.0
         x, y, z = self.rotations[:, :, 2].mean(axis=0)
         return (

@@ -16,18 +16,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coliags_plugin.cli import main
 from coliags_plugin.outputs.pictures import read_depth_tiff, read_rgb
+from tests.commands import refused, run
 from tests.scenes import SMALL, write_wall
 
 SETS = [part for override in SMALL for part in ("--set", override)]
-
-
-def run(*argv):
-    """Exit status of a command run in this process."""
-    with pytest.raises(SystemExit) as stopped:
-        main([str(arg) for arg in argv])
-    return stopped.value.code
 
 
 @pytest.fixture(scope="module")
@@ -43,15 +36,6 @@ def trained(scene, tmp_path_factory):
     assert run("eval", path) == 0
     assert run("eval", path, "--protocol", "authors-code") == 0
     return path
-
-
-def refused(capsys, *argv):
-    """The one-line message of a command that must fail with status 2, without a traceback."""
-    assert run(*argv) == 2
-    message = capsys.readouterr().err
-    assert "Traceback" not in message
-    assert message.startswith("coliags: ") or "\ncoliags: " in message
-    return message
 
 
 def test_train_prints_the_run_and_leaves_everything(trained):

@@ -9,28 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from coliags_plugin.cli import main
 from coliags_plugin.outputs.pictures import read_rgb, write_png
 from coliags_plugin.poses.formats import FORMATS, format_of, write_trajectory
 from coliags_plugin.poses.trajectory import Trajectory
+from tests.commands import refused, run
 
 PINHOLE = ("--intrinsics", "61,55,33.5,21.5", "--size", "64x48")
-
-
-def run(*argv):
-    """Exit status of a command run in this process."""
-    with pytest.raises(SystemExit) as stopped:
-        main([str(arg) for arg in argv])
-    return stopped.value.code
-
-
-def refused(capsys, *argv):
-    """The one-line message of a command that must fail with status 2, without a traceback."""
-    assert run(*argv) == 2
-    message = capsys.readouterr().err
-    assert "Traceback" not in message
-    assert message.startswith("coliags: ") or "\ncoliags: " in message
-    return message
 
 
 def spiral(count=20):

@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 import torch
 
-from coliags_plugin.cli import main
 from coliags_plugin.cli.poses.arguments import settings_of
 from coliags_plugin.cli.poses.triangulate import _held_out
 from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.poses.structure.sfm import SfmSettings
 from coliags_plugin.poses.structure.triangulation import TriangulationSettings
 from coliags_plugin.scenes import PointCloud, Scene
+from tests import commands
+from tests.commands import run
 from tests.scenes import SMALL
 from tests.textured_tube import INTRINSICS, tube_frames, write_tube
 
@@ -24,20 +25,9 @@ CAMERA = ("--camera", "PINHOLE", "--params", ",".join(map(str, INTRINSICS)))
 COUNT = 9
 
 
-def run(*argv):
-    """Exit status of a command run in this process."""
-    with pytest.raises(SystemExit) as stopped:
-        main([str(arg) for arg in argv])
-    return stopped.value.code
-
-
 def refused(capsys, *argv):
-    """The one-line message of a command that must fail with status 2, without a traceback."""
-    assert run(*argv) == 2
-    message = capsys.readouterr().err
-    assert "Traceback" not in message
-    assert message.startswith("coliags: ") or "\ncoliags: " in message
-    return " ".join(message.split())
+    """What a command that must fail says, in one line."""
+    return " ".join(commands.refused(capsys, *argv).split())
 
 
 def trains(command, folder):

@@ -11,30 +11,21 @@ import numpy as np
 import pytest
 import torch
 
-from coliags_plugin.cli import main
 from coliags_plugin.datamanagers.rgbd.writer import write_rgbd_scene
 from coliags_plugin.engine.data_formats import find_format, open_scene
 from coliags_plugin.poses import tum
 from coliags_plugin.poses.trajectory import Trajectory
+from tests import commands
+from tests.commands import run
 from tests.scenes import SMALL
 from tests.textured_tube import tube_frames
 
 FAST = ("--set", "tracking.method=hybrid", "--set", "tracking.pose_graph=false")
 
 
-def run(*argv):
-    """Exit status of a command run in this process."""
-    with pytest.raises(SystemExit) as stopped:
-        main([str(arg) for arg in argv])
-    return stopped.value.code
-
-
 def refused(capsys, *argv):
-    """The one-line message of a command that must fail with status 2, without a traceback."""
-    assert run(*argv) == 2
-    message = capsys.readouterr().err
-    assert "Traceback" not in message
-    return message.splitlines()[-1]
+    """The last line of what a command that must fail says."""
+    return commands.refused(capsys, *argv).splitlines()[-1]
 
 
 @pytest.fixture(scope="module")

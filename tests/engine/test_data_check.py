@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from coliags_plugin.cli import main
 from coliags_plugin.datamanagers.c3vd.manager import C3VDDataManager, C3VDSettings
 from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
 from coliags_plugin.datamanagers.phantom.generate import generate
@@ -22,13 +21,7 @@ from coliags_plugin.engine.data_check.reprojection import Pair, agreement, best_
 from coliags_plugin.engine.data_check.text import lines
 from coliags_plugin.lenses import Pinhole
 from coliags_plugin.scenes import Frame, Scene
-
-
-def run_coliags(*words) -> int:
-    """Exit status of a command run in this process."""
-    with pytest.raises(SystemExit) as stopped:
-        main([str(word) for word in words])
-    return stopped.value.code
+from tests.commands import run
 
 
 @pytest.fixture(scope="module")
@@ -175,7 +168,7 @@ def test_matches_lie_on_their_lines(scene):
 
 
 def test_command_says_it_all(folder, scene, tmp_path, capsys):
-    status = run_coliags("data", "check", folder, "--html", tmp_path / "check.html", "--json", tmp_path / "check.json")
+    status = run("data", "check", folder, "--html", tmp_path / "check.html", "--json", tmp_path / "check.json")
     told = capsys.readouterr().out
     assert status == 0
     assert "nothing suspect" in told
@@ -198,7 +191,7 @@ def test_command_fails_on_what_is_suspect(scene, tmp_path, capsys):
         Pinhole(k.fx, k.fy, k.cx - 0.5, k.cy - 0.5),
         depths=[frame.depth.numpy() for frame in frames],
     )
-    status = run_coliags("data", "check", tmp_path / "inverted", "--json", tmp_path / "check.json")
+    status = run("data", "check", tmp_path / "inverted", "--json", tmp_path / "check.json")
     assert status == 1
     assert "SUSPECT poses agree with depth when read as: world-to-camera" in capsys.readouterr().out
     assert json.loads((tmp_path / "check.json").read_text())["suspect"] is True
@@ -211,7 +204,7 @@ def test_bad_input_of_the_command(folder, tmp_path, capsys):
         (["data", "check", folder, "--format", "c3vb"], "Did you mean 'c3vd'"),
         (["data", "check", folder, "--set", "lenz=x"], "lenz"),
     ]:
-        assert run_coliags(*words) == 2
+        assert run(*words) == 2
         assert told in capsys.readouterr().err
 
 

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 S = TypeVar("S", bound="Settings")
 
+#: How to train on a scene whose only depth is that of its points.
+SPARSE_DEPTH = "losses.depth={name: sparse-depth, weight: 0.2, final_weight: 0.01}"
+
 OptionalFormat = Annotated[str | None, tyro.conf.arg(metavar="FORMAT")]
 
 
@@ -72,11 +75,9 @@ def settings_of(kind: type[S], assignments: Sequence[str], prefix: str = "") -> 
     """
     from pydantic import ValidationError
 
-    from coliags_plugin.yaml_tree import Node, override
+    from coliags_plugin.yaml_tree import Node, override_all
 
-    tree = Node({}, "options")
-    for assignment in assignments:
-        tree = override(tree, assignment)
+    tree = override_all(Node({}, "options"), assignments)
     try:
         # Upon the defaults, as those of a part may differ from the part's own.
         return kind.model_validate(_upon(kind().model_dump(), tree.plain()))
@@ -84,6 +85,16 @@ def settings_of(kind: type[S], assignments: Sequence[str], prefix: str = "") -> 
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
         raise InputError(f"--set {prefix}{key}: {first['msg']} (got {first['input']!r})") from error
+
+
+def settings_among(kind: type[S], assignments: Sequence[str], prefix: str) -> tuple[S, list[str]]:
+    """Settings from those ``--set`` assignments whose keys begin with a prefix, and the others, which are the data's.
+
+    Raises:
+        InputError: See :func:`settings_of`.
+    """
+    own = [assignment.removeprefix(prefix) for assignment in assignments if assignment.startswith(prefix)]
+    return settings_of(kind, own, prefix), [item for item in assignments if not item.startswith(prefix)]
 
 
 def _upon(base: Any, over: Any) -> Any:
@@ -106,7 +117,6 @@ def refuse_output(out: Path, source: Path, overwrite: bool) -> None:
 
 
 def train_command(out: Path, *assignments: str) -> str:
-    """The command that trains on a scene whose only depth is that of its points, for a shell."""
-    losses = "losses.depth={name: sparse-depth, weight: 0.2, final_weight: 0.01}"
+    """The command that trains on a scene, for a shell."""
     words = ["coliags", "train", "coliags", "--data", str(out)]
-    return shlex.join([*words, *(word for assignment in (losses, *assignments) for word in ("--set", assignment))])
+    return shlex.join([*words, *(word for assignment in assignments for word in ("--set", assignment))])

@@ -36,7 +36,7 @@ class Sfm:
 
     def run(self) -> None:
         """Reconstruct, write, and say what came out."""
-        from coliags_plugin.cli.poses.arguments import refuse_output, settings_of, train_command
+        from coliags_plugin.cli.poses.arguments import SPARSE_DEPTH, refuse_output, settings_of, train_command
         from coliags_plugin.engine.progress import progress_callback
         from coliags_plugin.errors import InputError
         from coliags_plugin.poses.structure.pictures import pictures_of
@@ -57,5 +57,5 @@ class Sfm:
             f"{found.summary()}\n"
             f"the unit of length is arbitrary: in the median the points are {found.median_depth:.4g} units away; where "
             "their distance in mm is known, divide it by that and pass --set datamanager.scale=QUOTIENT\n"
-            f"{self.out}\n{train_command(self.out)}"
+            f"{self.out}\n{train_command(self.out, SPARSE_DEPTH)}"
         )

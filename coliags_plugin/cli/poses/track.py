@@ -35,7 +35,7 @@ class Track:
 
     def run(self) -> None:
         """Track, write, and say what came out."""
-        from coliags_plugin.cli.poses.arguments import refuse_output, settings_of
+        from coliags_plugin.cli.poses.arguments import refuse_output, settings_among, train_command
         from coliags_plugin.datamanagers.rgbd.writer import write_rgbd_scene
         from coliags_plugin.engine.data_formats import open_video
         from coliags_plugin.engine.progress import progress_callback
@@ -45,9 +45,7 @@ class Track:
         from coliags_plugin.poses.trajectory import Intrinsics
 
         refuse_output(self.out, self.scene, self.overwrite)
-        own = [option.removeprefix(_OWN) for option in self.set if option.startswith(_OWN)]
-        settings = settings_of(TrackingSettings, own, _OWN)
-        options = [option for option in self.set if not option.startswith(_OWN)]
+        settings, options = settings_among(TrackingSettings, self.set, _OWN)
         with progress_callback() as progress:
             scene, posed = open_video(self.scene, self.format, options, progress)
             camera = scene.train[0].camera
@@ -60,7 +58,7 @@ class Track:
         print("\n".join(_described(found)))
         if posed:
             print(_errors(found, scene))
-        print(f"{trajectory}\n{self.out}\ncoliags train coliags --data {_quoted(self.out)}")
+        print(f"{trajectory}\n{self.out}\n{train_command(self.out)}")
 
 
 def _warn_of_losses(found: Tracking) -> None:
@@ -110,16 +108,10 @@ def _errors(found: Tracking, scene: Scene) -> str:
     given = Trajectory(np.stack([frame.camera.camera_to_world.double().numpy() for frame in scene.train]))
     estimate = Trajectory(found.camera_to_world)
     result = align(estimate, given, associate(estimate, given, "index"))
-    path = float(np.linalg.norm(np.diff(given.centers, axis=0), axis=1).sum())
+    path = float(given.steps.sum())
     share = f" ({100.0 * result.ate.rmse / path:.3g} % of the path, {path:.4g})" if path > 0.0 else ""
     rpe, turn = result.rpe_translation, result.rpe_rotation_deg
     return (
         f"against the scene's own poses: ATE rmse {result.ate.rmse:.4g}{share}, max {result.ate.max:.4g}; "
         f"RPE over 1 frame rmse {rpe.rmse:.4g} and {turn.rmse:.4g} deg"
     )
-
-
-def _quoted(path: Path) -> str:
-    import shlex
-
-    return shlex.quote(str(path))

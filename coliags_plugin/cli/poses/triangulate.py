@@ -37,16 +37,14 @@ class Triangulate:
         """Triangulate the training frames, write all frames, and say what came out."""
         import logging
 
-        from coliags_plugin.cli.poses.arguments import refuse_output, settings_of, train_command
+        from coliags_plugin.cli.poses.arguments import SPARSE_DEPTH, refuse_output, settings_among, train_command
         from coliags_plugin.engine.data_formats import open_scene
         from coliags_plugin.engine.progress import progress_callback
         from coliags_plugin.poses.structure.colmap_scene import write_colmap_scene
         from coliags_plugin.poses.structure.triangulation import TriangulationSettings, triangulate
 
         refuse_output(self.out, self.scene, self.overwrite)
-        own = [option.removeprefix(_OWN) for option in self.set if option.startswith(_OWN)]
-        settings = settings_of(TriangulationSettings, own, _OWN)
-        options = [option for option in self.set if not option.startswith(_OWN)]
+        settings, options = settings_among(TriangulationSettings, self.set, _OWN)
         with progress_callback() as progress:
             # Whatever initial points there are is not wanted here, unless it is asked for.
             scene = open_scene(self.scene, self.format, ["initial_points=none", *options], progress)
@@ -58,7 +56,7 @@ class Triangulate:
             log.info(
                 "points come from the %d training frames; the %d test frames see none", len(scene.train), len(test)
             )
-        print(f"{found.summary()}\n{self.out}\n{train_command(self.out, *split)}")
+        print(f"{found.summary()}\n{self.out}\n{train_command(self.out, SPARSE_DEPTH, *split)}")
 
 
 def _held_out(scene: Scene) -> tuple[list[Frame], list[str]]:

@@ -88,14 +88,14 @@ def path_facts(video: Sequence[Frame]) -> PathFacts | None:
     if len(video) < 2:
         return None
     poses = np.stack([frame.camera.camera_to_world.double().numpy() for frame in video])
-    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    centers = poses[:, :3, 3]
+    lengths = np.linalg.norm(np.diff(centers, axis=0), axis=1)
     # Frames left out make a longer step, not a jump.
-    steps /= np.maximum(1, np.diff([frame.index for frame in video]))
+    steps = lengths / np.maximum(1, np.diff([frame.index for frame in video]))
     relative = poses[:-1, :3, :3].transpose(0, 2, 1) @ poses[1:, :3, :3]
     cosines = np.clip((np.trace(relative, axis1=1, axis2=2) - 1.0) / 2.0, -1.0, 1.0)
-    centers = poses[:, :3, 3]
     return PathFacts(
-        length=float(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum()),
+        length=float(lengths.sum()),
         mean_step=float(steps.mean()),
         median_step=float(np.median(steps)),
         largest_step=float(steps.max()),

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 from coliags_plugin.datamanagers.phantom.imaging import Optics, PinholeOptics
 from coliags_plugin.datamanagers.phantom.trajectory import every_8th
 from coliags_plugin.lenses import Pinhole
+from coliags_plugin.poses.trajectory import Intrinsics
 
 #: ``video``: the sequence itself. ``rotation``: the test views at its places, turned away from it.
 Part = Literal["video", "rotation"]
@@ -121,6 +122,18 @@ class Layout(ABC):
     def seen_mask(self, folder: Path, part: Part, index: int) -> Path:
         """Where the mask goes that says what training frames saw of a test frame."""
         return folder / ("truth" if part == "video" else part) / "seen" / f"{index:04d}_seen.png"
+
+
+def pinhole_of(optics: Optics) -> Intrinsics:
+    """Intrinsics of frames that are a pinhole's, pixel centres at integers + 0.5.
+
+    Raises:
+        TypeError: They are taken through another lens.
+    """
+    if not isinstance(optics, PinholeOptics):
+        raise TypeError(f"{type(optics).__name__} is no pinhole, and the layout holds a pinhole camera")
+    k = optics.pinhole
+    return Intrinsics(k.fx, k.fy, k.cx + 0.5, k.cy + 0.5, optics.width, optics.height)
 
 
 def place(folder: Path, part: Part) -> Path:

@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from coliags_plugin.datamanagers.phantom.imaging import Optics, PinholeOptics
-from coliags_plugin.datamanagers.phantom.layouts.base import Layout, Part, WallPoints
+from coliags_plugin.datamanagers.phantom.imaging import Optics
+from coliags_plugin.datamanagers.phantom.layouts.base import Layout, Part, WallPoints, pinhole_of
 from coliags_plugin.datamanagers.phantom.layouts.pictures import write_image
-from coliags_plugin.poses.rigid import inverse, wxyz_from_rotations
+from coliags_plugin.poses.colmap import posed_model
+from coliags_plugin.poses.rigid import inverse
+from coliags_plugin.poses.trajectory import Trajectory
 
 #: A feature detector finds a point in one of so many of the pictures that show it.
 _FOUND_IN_ONE_OF = 3
@@ -45,34 +47,19 @@ class ColmapLayout(Layout):
         """See :class:`Layout`. Points seen in fewer than two pictures are left out, as COLMAP leaves them out."""
         import pycolmap
 
-        if not isinstance(optics, PinholeOptics):
-            raise TypeError("the colmap layout holds pinhole frames")
-        k = optics.pinhole
-        model = pycolmap.Reconstruction()
-        model.add_camera_with_trivial_rig(
-            pycolmap.Camera(
-                camera_id=1,
-                model="PINHOLE",
-                width=optics.width,
-                height=optics.height,
-                params=[k.fx, k.fy, k.cx + 0.5, k.cy + 0.5],
-            )
-        )
+        names = tuple(_name(index) for index in range(len(poses)))
+        model = posed_model(Trajectory(np.stack(poses), names=names), pinhole_of(optics))
         numbers = np.arange(len(points.positions))
         seen = [points.seen_in(index) & ((numbers + index) % _FOUND_IN_ONE_OF == 0) for index in range(len(poses))]
         kept = np.sum(seen, axis=0) >= 2
         tracks: dict[int, list[pycolmap.TrackElement]] = {int(number): [] for number in np.flatnonzero(kept)}
-        world_to_camera = inverse(np.stack(poses))
-        quats_wxyz = wxyz_from_rotations(world_to_camera[:, :3, :3])
-        for index, matrix in enumerate(world_to_camera):
+        for index, matrix in enumerate(inverse(np.stack(poses))):
             found = np.flatnonzero(seen[index] & kept)
             local = points.positions[found] @ matrix[:3, :3].T + matrix[:3, 3]
             for place, found_number in enumerate(found.tolist()):
                 tracks[found_number].append(pycolmap.TrackElement(index + 1, place))
-            image = pycolmap.Image(name=_name(index), camera_id=1, image_id=index + 1)
-            image.points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in optics.project(local) + 0.5])
-            pose = pycolmap.Rigid3d(pycolmap.Rotation3d(quats_wxyz[index, [1, 2, 3, 0]]), matrix[:3, 3])
-            model.add_image_with_trivial_frame(image, pose)
+            pixels = [pycolmap.Point2D(pixel) for pixel in optics.project(local) + 0.5]
+            model.images[index + 1].points2D = pycolmap.Point2DList(pixels)
         for number, track in tracks.items():
             model.add_point3D(points.positions[number], pycolmap.Track(track), points.colors[number])
         model.update_point_3d_errors()

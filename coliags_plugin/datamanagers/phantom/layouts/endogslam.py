@@ -11,13 +11,13 @@ from jaxtyping import Bool, Float, UInt8
 from coliags_plugin.datamanagers.c3vd_endogslam.files import PARAMS
 from coliags_plugin.datamanagers.c3vd_endogslam.manager import PREPARED_DEPTH, PREPARED_PINHOLE, PREPARED_SIZE
 from coliags_plugin.datamanagers.phantom.imaging import Optics, PinholeOptics
-from coliags_plugin.datamanagers.phantom.layouts.base import Layout, Part, WallPoints, place
+from coliags_plugin.datamanagers.phantom.layouts.base import Layout, Part, WallPoints, pinhole_of, place
 from coliags_plugin.datamanagers.phantom.layouts.c3vd_raw import write_poses
 from coliags_plugin.datamanagers.phantom.layouts.pictures import write_image
 from coliags_plugin.datamanagers.phantom.trajectory import TEST_EVERY
 from coliags_plugin.poses import endogslam
 from coliags_plugin.poses.rigid import inverse
-from coliags_plugin.poses.trajectory import Intrinsics, Trajectory
+from coliags_plugin.poses.trajectory import Trajectory
 
 #: Standard deviation of the map's Gaussians, mm.
 _SIZE = 0.3
@@ -88,11 +88,7 @@ def write_params(
     Returns:
         The map's points in its world, mm. [N, 3]
     """
-    if not isinstance(optics, PinholeOptics):
-        raise TypeError(f"{path.name} holds a pinhole camera")
-    k = optics.pinhole
-    intrinsics = Intrinsics(k.fx, k.fy, k.cx + 0.5, k.cy + 0.5, optics.width, optics.height)
-    endogslam.write(path, Trajectory(np.stack(poses), intrinsics=intrinsics))
+    endogslam.write(path, Trajectory(np.stack(poses), intrinsics=pinhole_of(optics)))
     with np.load(path) as file:
         arrays = dict(file)
     count = len(points.positions)
