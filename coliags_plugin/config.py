@@ -7,28 +7,38 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
+from typing_extensions import Self
 
 from coliags_plugin import registry
 from coliags_plugin.components import DataManagerNode, FieldNode, LossNode, RendererNode, StrategyNode
 from coliags_plugin.errors import InputError, did_you_mean
 from coliags_plugin.methods import method_folder, method_names
-from coliags_plugin.settings import Settings
+from coliags_plugin.settings import Settings, refuse_zero_ends
 from coliags_plugin.yaml_tree import Node, dump, merge, override_all, read_tree
 
 
 class OptimizerSettings(Settings):
-    """Adam for one parameter group of the field; the rate is constant, or log-linear to ``final_lr`` over the run."""
+    """Adam for one parameter group of the field; the rate is constant, or log-linear to ``final_lr`` over the run.
+
+    A constant rate of 0 freezes the group; one that falls needs both ends above 0.
+    """
 
     lr: float = Field(ge=0)
     final_lr: float | None = Field(default=None, ge=0)
     times_extent: bool = False  # multiply both rates by the scene's extent (docs/methods.md 2.1)
+
+    @model_validator(mode="after")
+    def _ends_above_zero(self) -> Self:
+        refuse_zero_ends(self, "lr", "final_lr")
+        return self
 
 
 class ScheduleSettings(Settings):
     """How long to train and how often to write."""
 
     steps: int = Field(default=30_000, ge=1)
+    written_for: int = Field(default=30_000, ge=1)  # run length that step numbers elsewhere in the config mean
     log_every: int = Field(default=10, ge=1)
     checkpoint_every: int = Field(default=5_000, ge=1)
 
@@ -149,14 +159,18 @@ def _resolve(path: Path, seen: tuple[Path, ...]) -> Node:
     return merge(Node(inherited, parent.origin), Node(own, tree.origin))
 
 
+#: Errors of this package's own, whose text says what was seen.
+_TELLING = frozenset({"no_name", "unknown_key", "unknown_component", "value_error", "zero_end"})
+
+
 def _describe(error: ValidationError, tree: Node) -> list[str]:
     lines = []
     for item in error.errors():
         path = [key for key in item["loc"] if isinstance(key, str)]
-        message = item["msg"]
-        if item["type"] in ("missing", "no_name"):
-            message = "is missing" if item["type"] == "missing" else message
-        elif item["type"] not in ("unknown_key", "unknown_component"):
+        message = item["msg"].removeprefix("Value error, ")
+        if item["type"] == "missing":
+            message = "is missing"
+        elif item["type"] not in _TELLING:
             message = f"{message}, got {item['input']!r}"
         lines.append(f"{tree.find(path).origin}: {'.'.join(path) or 'config'}: {message.strip()}")
     return lines

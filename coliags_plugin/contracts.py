@@ -10,6 +10,8 @@ from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float
+from pydantic import Field as Option
+from pydantic import model_validator
 from torch import Tensor, nn
 from typing_extensions import Self
 
@@ -17,7 +19,7 @@ from coliags_plugin.cameras import Camera
 from coliags_plugin.gaussians import Gaussians, RenderOutput
 from coliags_plugin.progress import Progress
 from coliags_plugin.scenes import Frame, Scene
-from coliags_plugin.settings import Settings
+from coliags_plugin.settings import Settings, refuse_zero_ends
 
 
 class DataManager(ABC):
@@ -115,21 +117,45 @@ class Renderer(ABC):
         """
 
 
+@dataclass(frozen=True)
+class Schedule:
+    """How long a run is, and the run length for which the step numbers in its config were written.
+
+    The one rule for every method (docs/configs.md): step numbers in a config keep their share of the run, so
+    ``--steps`` moves them; intervals between events do not change.
+
+    Attributes:
+        steps: Steps of this run.
+        written_for: Steps of the run that the config's step numbers mean.
+    """
+
+    steps: int
+    written_for: int
+
+    def at(self, step: int) -> int:
+        """The step of this run at which the config's ``step`` falls."""
+        return round(step * self.steps / self.written_for)
+
+
 class Strategy(ABC):
     """Grows, splits and prunes a field between optimiser steps. Owns its counters.
 
     Args:
         settings: Its options.
         generator: For whatever is left to chance.
-        steps: How many steps the run has.
+        schedule: Of the run.
     """
 
     Settings: ClassVar[type[Settings]]
 
-    def __init__(self, settings: Any, generator: torch.Generator, steps: int) -> None:
+    def __init__(self, settings: Any, generator: torch.Generator, schedule: Schedule) -> None:
         self.settings = settings
         self.generator = generator
-        self.steps = steps
+        self.schedule = schedule
+
+    @abstractmethod
+    def plan(self) -> str:
+        """What it will do and between which steps, or why it will do nothing, for the log when training starts."""
 
     @abstractmethod
     def after_backward(
@@ -173,25 +199,35 @@ class Loss(ABC):
 
 
 class LossSettings(Settings):
-    """Weight of a term: constant, or log-linear from ``weight`` to ``final_weight`` over the run."""
+    """Weight of a term: constant, or log-linear from ``weight`` to ``final_weight``, both above 0, over the run.
+
+    It falls no further than to ``min_weight``.
+    """
 
     weight: float
     final_weight: float | None = None
+    min_weight: float = Option(default=0.0, ge=0.0)
+
+    @model_validator(mode="after")
+    def _ends_above_zero(self) -> Self:
+        refuse_zero_ends(self, "weight", "final_weight")
+        return self
 
     def weight_at(self, step: int, steps: int) -> float:
         """The weight at step ``step`` (from 1) of ``steps``."""
         if self.final_weight is None:
             return self.weight
-        return log_linear(self.weight, self.final_weight, step / steps)
+        return max(self.min_weight, log_linear(self.weight, self.final_weight, step / steps))
 
 
 def log_linear(start: float, end: float, progress: float) -> float:
     """``start`` to ``end`` on a straight line in the logarithm; progress is clipped to [0, 1] (docs/methods.md 2.3).
 
-    Zero ends give zero (a frozen group).
+    Raises:
+        ValueError: An end is not above 0: it has no logarithm.
     """
-    if start <= 0.0 or end <= 0.0:
-        return 0.0
+    if not (start > 0.0 and end > 0.0):
+        raise ValueError(f"log_linear({start}, {end}): expected both ends above 0")
     u = min(max(progress, 0.0), 1.0)
     return float(start ** (1.0 - u) * end**u)
 

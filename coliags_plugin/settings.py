@@ -46,3 +46,29 @@ class Settings(BaseModel):
                 ],
             )
         return data
+
+
+def refuse_zero_ends(settings: Settings, start: str, end: str) -> None:
+    """Refuse a logarithmic schedule with an end that is not above 0 (docs/methods.md 2.3).
+
+    Args:
+        settings: Whose schedule; without a value at ``end`` there is none.
+        start: Name of the value at the first step.
+        end: Name of the value at the last step.
+
+    Raises:
+        ValidationError: At the key to blame, with what was seen and what to do.
+    """
+    first, last = getattr(settings, start), getattr(settings, end)
+    if last is None or (first > 0 and last > 0):
+        return
+    problem = PydanticCustomError(
+        "zero_end",
+        "{end} {last} with {start} {first}: a logarithmic schedule cannot reach or leave 0; give both above 0, or "
+        "leave {end} out (null) for a constant {start}",
+        {"start": start, "first": str(first), "end": end, "last": str(last)},
+    )
+    key, value = (start, first) if last > 0 else (end, last)
+    raise ValidationError.from_exception_data(
+        type(settings).__name__, [InitErrorDetails(type=problem, loc=(key,), input=value)]
+    )

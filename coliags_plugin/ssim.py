@@ -10,9 +10,11 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Any
 
+import cv2
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import conv2d
 
 from coliags_plugin.masked import masked_mean, zero_outside
 
@@ -21,10 +23,6 @@ SIGMA = 1.5
 REACH = 5
 C1 = 0.01**2
 C2 = 0.03**2
-
-# Rows blurred by one matrix product. The band is REACH wide on either side, so a product over the whole image would
-# multiply zeros for the most part, while a much smaller tile would mostly copy.
-_TILE = 32
 
 
 def ssim(
@@ -62,11 +60,10 @@ def ssim_map(
     """
     if rendered.shape != truth.shape or rendered.dim() != 3:
         raise ValueError(f"SSIM of images of shapes {tuple(rendered.shape)} and {tuple(truth.shape)}: both [H, W, C]")
-    a = zero_outside(rendered, mask).transpose(1, 2)
-    b = zero_outside(truth, mask).transpose(1, 2)
+    a, b = zero_outside(rendered, mask), zero_outside(truth, mask)
     # Only the sum of the two variances is ever used, so one blur serves both. The truth is blurred apart, which spares
     # the backward pass a blur of a gradient that nobody asked for.
-    mean_a, squares, products = _blur(torch.cat([a, a * a + b * b, a * b], dim=1)).chunk(3, dim=1)
+    mean_a, squares, products = _blur(torch.cat([a, a * a + b * b, a * b], dim=2)).chunk(3, dim=2)
     mean_b = _blur(b)
     if mask is not None:
         gain = _coverage_gain(mask, a.dtype)
@@ -75,19 +72,18 @@ def ssim_map(
     squared_means = mean_a * mean_a + mean_b * mean_b
     likeness = (2.0 * product_of_means + C1) * (2.0 * (products - product_of_means) + C2)
     energy = (squared_means + C1) * (squares - squared_means + C2)
-    return (likeness / energy).permute(2, 0, 1)
+    return likeness / energy
 
 
-def _coverage_gain(mask: Bool[Tensor, "H W"], dtype: torch.dtype) -> Float[Tensor, "W 1 H"]:
+def _coverage_gain(mask: Bool[Tensor, "H W"], dtype: torch.dtype) -> Float[Tensor, "H W 1"]:
     """By how much each window's weights grow to make up for its ignored pixels; 0 around an ignored pixel."""
-    covered = _blur(mask.to(dtype)[:, None])
-    whole = _blur(torch.ones_like(mask, dtype=dtype)[:, None])
-    inside = mask.T[:, None]
+    inside = mask[..., None]
+    covered, whole = _blur(inside.to(dtype)), _blur(torch.ones_like(inside, dtype=dtype))
     return torch.where(inside, whole, 0.0) / torch.where(inside, covered, 1.0)
 
 
-def _blur(images: Float[Tensor, "H C W"]) -> Float[Tensor, "W C H"]:
-    """Both passes of the Gaussian window with zero padding; rows and columns come out exchanged."""
+def _blur(images: Float[Tensor, "H W C"]) -> Float[Tensor, "H W C"]:
+    """The Gaussian window with zero padding."""
     blurred: Tensor = _Blur.apply(images)  # type: ignore[no-untyped-call]
     return blurred
 
@@ -97,37 +93,33 @@ class _Blur(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, images: Tensor) -> Tensor:
-        return _blur_rows(_blur_rows(images).transpose(0, 2))
+        return _blur_by_opencv(images) if images.device.type == "cpu" else _blur_by_torch(images)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Tensor:
         return _blur(gradient)
 
 
-def _blur_rows(images: Float[Tensor, "H C W"]) -> Float[Tensor, "H C W"]:
-    """Along the first dimension, as a product with a banded matrix, tile of rows by tile of rows.
-
-    Products cost much the same on every thread count and dtype: 12 ms for one SSIM of 338x270 with its gradient. A
-    depth-wise ``conv2d`` took from 16 ms to over a second on the same machine, depending on both.
-    """
-    height, channels, width = images.shape
-    tiles = -(-height // _TILE)
-    padded = images.new_zeros(tiles * _TILE + 2 * REACH, channels * width)
-    padded[REACH : REACH + height] = images.reshape(height, -1)
-    overlapping = padded.unfold(0, _TILE + 2 * REACH, _TILE).transpose(1, 2)
-    band = _band(images.dtype, images.device).expand(tiles, -1, -1)
-    return torch.bmm(band, overlapping).view(-1, channels, width)[:height]
+def _blur_by_opencv(images: Float[Tensor, "H W C"]) -> Float[Tensor, "H W C"]:
+    """An eighth of the time of banded matrix products, and far less of ``conv2d``."""
+    pixels = images.detach().contiguous().numpy()
+    weights = _window().numpy()
+    blurred = cv2.sepFilter2D(pixels, -1, weights, weights, borderType=cv2.BORDER_CONSTANT)
+    return torch.from_numpy(blurred.reshape(pixels.shape))
 
 
-@lru_cache(maxsize=16)
-def _band(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "T S"]:
-    """The window's weights, shifted by one from row to row. [_TILE, _TILE + 2 * REACH]"""
+def _blur_by_torch(images: Float[Tensor, "H W C"]) -> Float[Tensor, "H W C"]:
+    """The same on any device."""
+    weights = _window().to(images)
+    planes = images.permute(2, 0, 1)[:, None]
+    planes = conv2d(planes, weights[None, None, :, None], padding=(REACH, 0))
+    return conv2d(planes, weights[None, None, None, :], padding=(0, REACH))[:, 0].permute(1, 2, 0)
+
+
+@lru_cache(maxsize=1)
+def _window() -> Float[Tensor, "11"]:
+    """The window along one axis."""
     # Kept between calls, so it must not be an inference tensor: those cannot take part in a later backward pass.
     with torch.inference_mode(False):
-        offsets = torch.arange(2 * REACH + 1, dtype=torch.float64) - REACH
-        weights = torch.exp(-0.5 * (offsets / SIGMA) ** 2)
-        weights = weights / weights.sum()
-        band = torch.zeros(_TILE, _TILE + 2 * REACH, dtype=torch.float64)
-        for row in range(_TILE):
-            band[row, row : row + len(weights)] = weights
-        return band.to(dtype=dtype, device=device)
+        weights = torch.exp(-0.5 * ((torch.arange(2 * REACH + 1, dtype=torch.float64) - REACH) / SIGMA) ** 2)
+        return weights / weights.sum()

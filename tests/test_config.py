@@ -32,11 +32,31 @@ def test_scaffold_and_coliags_differ_in_heads_only():
     rival = load_method("scaffold-gs-depth").config.model_dump()
     assert ours.pop("description") != rival.pop("description")
     assert ours["field"].pop("geometry_head") == {"name": "imve", "hidden": 32, "frequencies": 10}
-    appearance = {"hidden": 32, "spread_kinks": True}
+    appearance = {"hidden": 32, "bias_init": "scene_distances"}
     assert ours["field"].pop("appearance_head") == {"name": "imia", "frequencies": 5, **appearance}
     assert rival["field"].pop("geometry_head") == {"name": "plain", "hidden": 32}
     assert rival["field"].pop("appearance_head") == {"name": "plain", "distance": False, **appearance}
     assert ours == rival
+
+
+def test_the_rival_that_sees_the_distance_differs_from_the_closest_in_that_only():
+    rival = load_method("scaffold-gs-distance").config.model_dump()
+    closest = load_method("scaffold-gs-depth").config.model_dump()
+    assert rival.pop("description") != closest.pop("description")
+    assert rival["field"]["appearance_head"].pop("distance") is True
+    assert closest["field"]["appearance_head"].pop("distance") is False
+    assert rival == closest
+
+
+def test_the_start_of_biases_is_written_out_and_its_ablation_changes_nothing_else():
+    for name in ("coliags", "scaffold-gs-distance"):
+        assert f"bias_init: scene_distances  # {name}.yaml:" in load_method(name).with_origins()
+    ours = load_method("coliags").config.model_dump()
+    theirs = load_method("ablations/bias-init-pytorch").config.model_dump()
+    assert ours.pop("description") != theirs.pop("description")
+    assert ours["field"]["appearance_head"].pop("bias_init") == "scene_distances"
+    assert theirs["field"]["appearance_head"].pop("bias_init") == "pytorch"
+    assert ours == theirs
 
 
 @pytest.mark.parametrize(
@@ -118,7 +138,16 @@ def test_bases_may_be_paths_beside_the_file(method_file):
         ("base: coliags\nrenderer: {name: cuda-magic}\n", ["mine.yaml:2", "no renderers component 'cuda-magic'"]),
         ("base: coliags\nlosses:\n  extra: {weight: 1.0}\n", ["mine.yaml:3", "needs 'name'", "depth-l1"]),
         ("base: coliags\nlosses:\n  l1: {weight: heavy}\n", ["mine.yaml:3", "losses.l1.weight", "heavy"]),
-        ("base: coliags\nprotocol: papper\n", ["mine.yaml:2", "papper", "Did you mean 'paper'"]),
+        (
+            "base: coliags\nfield:\n  appearance_head: {spread_kinks: true}\n",
+            ["mine.yaml:3", "field.appearance_head.spread_kinks", "unknown key 'spread_kinks'", "bias_init"],
+        ),
+        (
+            "base: coliags\nlosses:\n  depth:\n    final_weight: 0\n",
+            ["mine.yaml:4: losses.depth.final_weight: final_weight 0.0 with weight 0.2: a logarithmic schedule cannot"],
+        ),
+        ("base: coliags\ndatamanager:\n  width: 8\n", ["mine.yaml:2: datamanager: width = 8 and height = None: give"]),
+        ("base: coliags\nprotocol: papper\n", ["mine.yaml:2: protocol: no protocol 'papper'", "Did you mean 'paper'"]),
         ("base: coliags\nschedule: {steps: 5}\nschedule: {steps: 6}\n", ["mine.yaml:3", "twice", "mine.yaml:2"]),
         ("base: coliags\n  bad: [\n", ["mine.yaml:"]),
         ("- a\n- b\n", ["mine.yaml", "mapping"]),
@@ -142,6 +171,34 @@ def test_mistakes_are_named(method_file, text, parts):
 def test_bad_assignments_are_named(assignment):
     with pytest.raises(InputError, match="--set"):
         load_method("coliags", [assignment])
+
+
+@pytest.mark.parametrize(
+    ("assignment", "seen"),
+    [
+        ("losses.depth.final_weight=0", "final_weight 0.0 with weight 0.2"),
+        ("losses.depth.weight=0", "final_weight 0.01 with weight 0.0"),
+        ("optimizers.offsets.final_lr=0", "final_lr 0.0 with lr 0.01"),
+        ("optimizers.offsets.lr=0", "final_lr 0.0001 with lr 0.0"),
+    ],
+)
+def test_a_schedule_with_an_end_at_zero_is_refused_in_one_line(assignment, seen):
+    """It would be 0 for the whole run."""
+    with pytest.raises(InputError) as caught:
+        load_method("coliags", [assignment])
+    key = assignment.split("=")[0]
+    end, _, _, start, _ = seen.split()
+    assert str(caught.value) == (
+        f"--set {assignment}: {key}: {seen}: a logarithmic schedule cannot reach or leave 0; give both above 0, or "
+        f"leave {end} out (null) for a constant {start}."
+    )
+
+
+def test_a_constant_zero_switches_off():
+    off = ["losses.depth.final_weight=null", "losses.depth.weight=0", "optimizers.features.lr=0"]
+    config = load_method("coliags", off).config
+    assert config.losses["depth"].settings.weight == 0.0
+    assert config.optimizers["features"].lr == 0.0
 
 
 def test_unknown_method_is_named():

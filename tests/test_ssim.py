@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import correlate1d
 from skimage.metrics import structural_similarity
 
-from coliags_plugin.ssim import REACH, _band, ssim, ssim_map
+from coliags_plugin.ssim import REACH, _blur_by_opencv, _blur_by_torch, _window, ssim, ssim_map
 
 few = settings(max_examples=15, deadline=None)
 
@@ -37,7 +37,7 @@ def reference_map(a, b):
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 50), (31, 32), (33, 64), (65, 97)])
-def test_whole_map_against_scipy_whatever_the_tiling(size):
+def test_whole_map_against_scipy_at_every_size(size):
     a, b = images(*size)
     np.testing.assert_allclose(ssim_map(a, b).numpy(), reference_map(a.numpy(), b.numpy()), atol=1e-12)
 
@@ -183,7 +183,7 @@ def test_no_valid_pixel_gives_zero_with_a_graph():
 
 def test_the_kept_weights_survive_a_first_use_in_inference_mode():
     a, b = images(12, 12)
-    _band.cache_clear()
+    _window.cache_clear()
     with torch.inference_mode():
         ssim(a, b)
     ssim(a.requires_grad_(), b).backward()
@@ -193,3 +193,10 @@ def test_the_kept_weights_survive_a_first_use_in_inference_mode():
 def test_images_of_different_sizes_are_refused():
     with pytest.raises(ValueError, match=r"\(4, 5, 3\) and \(5, 4, 3\)"):
         ssim(torch.zeros(4, 5, 3), torch.zeros(5, 4, 3))
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-14), (torch.float32, 1e-6)])
+@pytest.mark.parametrize("shape", [(1, 1, 1), (4, 30, 9), (40, 33, 3)])
+def test_both_blurs_agree(shape, dtype, tolerance):
+    image = torch.rand(shape, generator=torch.Generator().manual_seed(0), dtype=dtype)
+    torch.testing.assert_close(_blur_by_opencv(image), _blur_by_torch(image), rtol=0, atol=tolerance)

@@ -24,9 +24,9 @@ class Train:
     output: OptionalPath = None
     """Run folder; default runs/SCENE/METHOD/STAMP."""
     steps: OptionalInt = None
-    """Training steps; schedules are compressed to them."""
-    seed: int = 0
-    """Seed of every random stream."""
+    """Training steps; schedules are compressed to them. A resumed run keeps its own unless they are given."""
+    seed: OptionalInt = None
+    """Seed of every random stream; default 0, and a resumed run's own."""
     renderer: OptionalText = None
     """Renderer by name (`coliags list renderers`); default: the method's."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -45,6 +45,7 @@ class Train:
         from coliags_plugin.config import method_name
         from coliags_plugin.engine.backends import choose_device
         from coliags_plugin.engine.data_formats import load_method_for
+        from coliags_plugin.engine.resuming import resumed_method, resumed_seed
         from coliags_plugin.engine.run_folder import RunFolder
         from coliags_plugin.engine.trained import load_scene
         from coliags_plugin.engine.trainer import Trainer
@@ -66,11 +67,14 @@ class Train:
             run = RunFolder.newest(scene_name, short) if self.resume else RunFolder.default(scene_name, short)
         if self.resume:
             run = RunFolder.existing(run.path)
+            method = resumed_method(run, self.method, self.data, overrides, self.format)
+            seed = resumed_seed(run, self.seed)
         else:
             run.check_free(self.overwrite)
-        method = load_method_for(self.data, self.method, overrides, self.format)
+            method = load_method_for(self.data, self.method, overrides, self.format)
+            seed = self.seed or 0
         scene = load_scene(method.config, self.data)
-        trainer = Trainer(method, scene, str(self.data.resolve()), run, self.seed, device)
+        trainer = Trainer(method, scene, str(self.data.resolve()), run, seed, device)
         logging.getLogger(__name__).info("renderer %s: %s", trainer.chosen.name, trainer.chosen.reason)
         if self.resume:
             trainer.resume()

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Shaped, UInt8
 
-from coliags_plugin.datamanagers.views import View, default_size
+from coliags_plugin.datamanagers.views import View
 from coliags_plugin.lenses import Lens, Pinhole
 from coliags_plugin.undistortion import Undistortion
 
@@ -43,10 +43,10 @@ class LensView(View):
 
     @classmethod
     def of(
-        cls, lens: Lens, described_by: Path, size: tuple[int, int] | None, focal_scale: float, undistort: Undistorter
+        cls, lens: Lens, described_by: Path, size: tuple[int, int], focal_scale: float, undistort: Undistorter
     ) -> LensView:
         """As :meth:`View.through`."""
-        width, height = size or default_size(lens.width, lens.height)
+        width, height = size
         nominal = lens.scaled(width, height).pinhole
         return cls(
             source_width=lens.width,

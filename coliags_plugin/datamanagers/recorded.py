@@ -17,8 +17,10 @@ from coliags_plugin.contracts import DataManager
 from coliags_plugin.datamanagers.fusion import fuse_depth, read_points, thinned
 from coliags_plugin.datamanagers.recording import Recording, Shot
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
-from coliags_plugin.datamanagers.splits import held_out
+from coliags_plugin.datamanagers.seen import with_valid_marks
+from coliags_plugin.datamanagers.splits import Split, divide
 from coliags_plugin.datamanagers.stored_frames import StoredFrame, read_side_by_side
+from coliags_plugin.datamanagers.views import PAPER_SIZE, fitted
 from coliags_plugin.errors import InputError
 from coliags_plugin.progress import Progress
 from coliags_plugin.scenes import Frame, PointCloud, Scene
@@ -38,6 +40,11 @@ class RecordedDataManager(DataManager):
     settings: SceneSettings
     #: The name it is registered under.
     name: ClassVar[str]
+    #: Width and height, pixels, that pictures are made to fit by default: what is published for the data, or else the
+    #: paper's (docs/data.md 2). None: they stay as large as they are stored.
+    fits: ClassVar[tuple[int, int] | None] = PAPER_SIZE
+    #: The split of all frames whose training frames the data's seen masks tell of (docs/layouts/c3vd.md 5).
+    seen_split: ClassVar[Split] = "every-8th"
 
     @abstractmethod
     def open(self, path: Path) -> Recording:
@@ -46,6 +53,10 @@ class RecordedDataManager(DataManager):
         Raises:
             InputError: The folder is missing, or its files are not as they should be.
         """
+
+    def working_size(self, width: int, height: int) -> tuple[int, int]:
+        """Working width and height of pictures stored at a size, pixels: as set, or the largest in :attr:`fits`."""
+        return self.settings.size or fitted(width, height, self.fits)
 
     def load(self, path: Path, progress: Progress | None = None) -> Scene:
         """Read the scene.
@@ -65,7 +76,9 @@ class RecordedDataManager(DataManager):
         for doubt in dict.fromkeys(shot.view.doubt() for shot in recording.shots):
             if doubt is not None:
                 log.warning("%s", doubt)
+        self._tell_of_smaller_pictures(recording, path)
         train_places, test_places = self._split(recording, path)
+        recording = with_valid_marks(recording, self.seen_split, train_places, test_places, path)
         train = self._frames(recording.shots, train_places)
         test_sets = {"test": self._frames(recording.shots, test_places)} if test_places else {}
         for name, shots in recording.test_sets.items():
@@ -101,6 +114,23 @@ class RecordedDataManager(DataManager):
         log.info("%s: %d frames, %s", path, len(recording.shots), recording.kind)
         return Scene(path.resolve().name, train, test_sets, points, provenance)
 
+    def _tell_of_smaller_pictures(self, recording: Recording, path: Path) -> None:
+        """Log that pictures are made smaller than they are stored, where nobody asked for it."""
+        if self.settings.size is not None:
+            return
+        for view in (shot.view for shot in recording.shots):
+            if (view.width, view.height) != (view.source_width, view.source_height):
+                log.info(
+                    "%s: pictures stored at %d x %d are used at %d x %d; datamanager.width and datamanager.height set "
+                    "another size",
+                    path,
+                    view.source_width,
+                    view.source_height,
+                    view.width,
+                    view.height,
+                )
+                return
+
     def _frames(self, shots: Sequence[Shot], places: Sequence[int]) -> list[Frame]:
         return [StoredFrame(shots[place], place, self.settings.keep_pixels) for place in places]
 
@@ -108,19 +138,9 @@ class RecordedDataManager(DataManager):
         """Places of training and of test frames."""
         settings = self.settings
         places = list(range(0, len(recording.shots), settings.frame_step))[: settings.max_frames]
-        if settings.split == "own":
-            if recording.own_split is None:
-                raise InputError(
-                    f"{path} does not say which of its frames are for testing", "a split of another name", ""
-                )
-            chosen = set(places)
-            train, test = (
-                [place for place in recording.own_split[part] if place in chosen] for part in ("train", "test")
-            )
-        else:
-            is_test = held_out(settings.split, len(places), settings.block)
-            train = [place for place, held in zip(places, is_test, strict=True) if not held]
-            test = [place for place, held in zip(places, is_test, strict=True) if held]
+        if settings.split == "own" and recording.own_split is None:
+            raise InputError(f"{path} does not say which of its frames are for testing", "a split of another name", "")
+        train, test = divide(settings.split, places, recording.own_split, settings.block)
         if not train:
             raise InputError(
                 f"split '{settings.split}' of {len(places)} frames of {path} leaves none to train on",

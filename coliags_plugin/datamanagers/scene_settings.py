@@ -19,7 +19,10 @@ class SceneSettings(Settings):
     """Working size, split and initial points."""
 
     width: int | None = Field(
-        None, gt=0, description="Working width, pixels. None: what fits 338 x 270, the paper's quarter of a raw frame."
+        None,
+        gt=0,
+        description="Working width, pixels. None: the format's own (docs/data.md 2): what fits 338 x 270, the paper's "
+        "quarter of a raw frame; for 'reim-nerf' 270 x 216; for 'c3vd-endogslam' and 'rotatecolon' as stored.",
     )
     height: int | None = Field(None, gt=0, description="Working height, pixels; goes with width.")
     focal_scale: float = Field(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -33,3 +34,28 @@ def held_out(split: Split, count: int, block: tuple[float, float] = (0.4, 0.6)) 
     if split == "block":
         return np.asarray((place >= round(block[0] * count)) & (place < round(block[1] * count)))
     return np.zeros(count, bool)
+
+
+def divide(
+    split: Split,
+    places: Sequence[int],
+    own: Mapping[str, Sequence[int]] | None = None,
+    block: tuple[float, float] = (0.4, 0.6),
+) -> tuple[list[int], list[int]]:
+    """Places to train on and places to test on, among those of a video that are used.
+
+    Args:
+        split: As for :func:`held_out`.
+        places: Of the frames used, in video order.
+        own: What the data say, ``{"train": ..., "test": ...}``; there must be some for split ``own``.
+        block: As for :func:`held_out`.
+    """
+    if split == "own":
+        if own is None:
+            raise ValueError("split 'own' of data that have none")
+        used = set(places)
+        train, test = ([place for place in own[part] if place in used] for part in ("train", "test"))
+        return train, test
+    is_test = held_out(split, len(places), block)
+    train = [place for place, held in zip(places, is_test, strict=True) if not held]
+    return train, [place for place, held in zip(places, is_test, strict=True) if held]

@@ -26,9 +26,15 @@ FAR_FROM_MIDDLE = 0.2
 PAPER_SIZE = (338, 270)
 
 
-def default_size(width: int, height: int) -> tuple[int, int]:
-    """The largest size that fits the paper's 338 x 270, keeps the aspect ratio and enlarges nothing, pixels."""
-    scale = min(1.0, PAPER_SIZE[0] / width, PAPER_SIZE[1] / height)
+def fitted(width: int, height: int, within: tuple[int, int] | None) -> tuple[int, int]:
+    """The largest size that fits another, keeps the aspect ratio and enlarges nothing, pixels.
+
+    Args:
+        width: Of the stored pictures, pixels.
+        height: Likewise.
+        within: Width and height to fit, pixels; None: none, and the stored size is kept.
+    """
+    scale = 1.0 if within is None else min(1.0, within[0] / width, within[1] / height)
     if scale == 1.0:
         return width, height
     # Halves are rounded up: the paper's 338 is a quarter of 1350.
@@ -61,7 +67,7 @@ class View:
         cls,
         lens: Lens,
         described_by: Path,
-        size: tuple[int, int] | None = None,
+        size: tuple[int, int],
         focal_scale: float = 1.0,
         shows: Bool[np.ndarray, "H W"] | None = None,
     ) -> View:
@@ -70,22 +76,20 @@ class View:
         Args:
             lens: Of the stored pictures, at their size.
             described_by: The file the lens or its size comes from.
-            size: Working width and height, pixels; None: :func:`default_size`.
+            size: Working width and height, pixels.
             focal_scale: Factor on the nominal focal length.
             shows: Stored pixels that show something; None for all. [H, W]
         """
-        width, height = size or default_size(lens.width, lens.height)
+        width, height = size
         nominal = lens.scaled(width, height).pinhole
         pinhole = nominal._replace(fx=nominal.fx * focal_scale, fy=nominal.fy * focal_scale)
         undistortion = Undistortion(lens, pinhole, width, height, shows)
         return cls(lens.width, lens.height, width, height, pinhole, described_by, undistortion)
 
     @classmethod
-    def of_pinhole(
-        cls, pinhole: Pinhole, width: int, height: int, described_by: Path, size: tuple[int, int] | None = None
-    ) -> View:
+    def of_pinhole(cls, pinhole: Pinhole, width: int, height: int, described_by: Path, size: tuple[int, int]) -> View:
         """The view of pinhole pictures of a width and height; ``size`` as for :meth:`through`."""
-        working_width, working_height = size or default_size(width, height)
+        working_width, working_height = size
         scaled = pinhole.scaled(working_width / width, working_height / height)
         return cls(width, height, working_width, working_height, scaled, described_by)
 

@@ -16,10 +16,10 @@ from torch import Tensor
 from coliags_plugin.contracts import Field, Strategy
 from coliags_plugin.engine.optimizers import Optimizers
 from coliags_plugin.engine.randomness import FrameOrder
-from coliags_plugin.errors import InputError
+from coliags_plugin.errors import InputError, NotFiniteError
 from coliags_plugin.files import atomic_folder
 
-FORMAT = 1
+FORMAT = 2
 
 
 @dataclass(frozen=True)
@@ -58,6 +58,9 @@ def save_checkpoint(
 
     Returns:
         The checkpoint's folder.
+
+    Raises:
+        NotFiniteError: A number in it is NaN or infinite; nothing was written.
     """
     tensors: dict[str, Tensor] = {f"field/{name}": value for name, value in field.state_dict().items()}
     for group, adam in optimizers.adam.items():
@@ -66,6 +69,7 @@ def save_checkpoint(
                 tensors[f"optimizer/{group}/{index}/{key}"] = value
     tensors |= {f"strategy/{name}": value for name, value in strategy.state_dict().items()}
     tensors |= {f"generator/{name}": generator.get_state() for name, generator in generators.items()}
+    _check_finite(tensors, step)
     target = folder / f"step-{step:06d}"
     state: dict[str, Any] = {"format": FORMAT, "step": step, "method": method, "frame_queue": order.queue}
     with atomic_folder(target, overwrite=True) as scratch:
@@ -74,16 +78,31 @@ def save_checkpoint(
     return target
 
 
+def _check_finite(tensors: Mapping[str, Tensor], step: int) -> None:
+    spoiled = [key for key, value in tensors.items() if not torch.isfinite(value).all()]
+    if spoiled:
+        raise NotFiniteError(
+            f"after step {step} these are not finite: {', '.join(spoiled)}. No checkpoint was written; "
+            "the last one is whole. Look for too large a learning rate."
+        )
+
+
+def newest_checkpoint(folder: Path) -> Path | None:
+    """The checkpoint of the highest step; None where there is none."""
+    found = sorted(folder.glob("step-*/state.json"), key=lambda path: int(path.parent.name.split("-")[1]))
+    return found[-1].parent if found else None
+
+
 def latest_checkpoint(folder: Path) -> Path:
     """The checkpoint of the highest step.
 
     Raises:
         InputError: There is none.
     """
-    found = sorted(folder.glob("step-*/state.json"), key=lambda path: int(path.parent.name.split("-")[1]))
-    if not found:
+    found = newest_checkpoint(folder)
+    if found is None:
         raise InputError(f"no checkpoint in {folder}", "at least one step-* folder", "Train first: `coliags train`")
-    return found[-1].parent
+    return found
 
 
 def read_checkpoint(path: Path, method: str, device: torch.device) -> Checkpoint:

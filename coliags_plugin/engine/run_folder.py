@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 
 from coliags_plugin.config import LoadedMethod, load_method
 from coliags_plugin.errors import InputError
-from coliags_plugin.files import atomic_write, make_folder, not_writable, write_json
+from coliags_plugin.files import atomic_folder, atomic_write, write_json
 
 FORMAT = 1
 
@@ -77,20 +76,23 @@ class RunFolder:
         return folder
 
     def create(self, config_yaml: str, provenance: dict[str, Any], overwrite: bool) -> None:
-        """Make the folder and write what the run starts from.
+        """Make the folder and write what the run starts from; a kill leaves either no folder or all of this.
 
         Raises:
             InputError: It exists and ``overwrite`` is off, or it cannot be written.
         """
         self.check_free(overwrite)
-        if self.path.is_dir():
-            try:
-                shutil.rmtree(self.path)
-            except OSError as error:
-                raise not_writable(self.path, error) from error
-        make_folder(self.path)
+        provenance = {"format": FORMAT, **provenance}
+        if self.path.is_dir() and not any(self.path.iterdir()):
+            self.rewrite(config_yaml, provenance)  # perhaps somebody's working directory, which must not be replaced
+            return
+        with atomic_folder(self.path, overwrite=True) as scratch:
+            RunFolder(scratch).rewrite(config_yaml, provenance)
+
+    def rewrite(self, config_yaml: str, provenance: dict[str, Any]) -> None:
+        """Write the resolved method config, and where the run comes from."""
+        write_json(self.provenance_file, provenance)
         atomic_write(self.config_file, config_yaml)
-        write_json(self.provenance_file, {"format": FORMAT, **provenance})
 
     def check_free(self, overwrite: bool) -> None:
         """Refuse a folder that holds anything, or that is not a run and would be overwritten.

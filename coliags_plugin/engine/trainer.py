@@ -9,19 +9,21 @@ import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from coliags_plugin.config import LoadedMethod
-from coliags_plugin.contracts import Field, Loss
+from coliags_plugin.contracts import Field, Loss, Schedule, Strategy
 from coliags_plugin.engine import checkpoints
 from coliags_plugin.engine.backends import ChosenRenderer, choose_renderer
 from coliags_plugin.engine.optimizers import Optimizers
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.provenance import software
 from coliags_plugin.engine.randomness import FrameOrder, generators
+from coliags_plugin.engine.resuming import check_same_run, record_schedule, resume_command
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.errors import InputError, InterruptedRunError, NotFiniteError
 from coliags_plugin.files import atomic_write
@@ -64,7 +66,11 @@ class Trainer:
         self.generators = generators(seed)
         self.frames = _resident(scene.train, device)
         self.order = FrameOrder(len(scene.train), self.generators["frame_order"])
-        self.strategy = config.strategy.target(config.strategy.settings, self.generators["densification"], self.steps)
+        self.strategy: Strategy = config.strategy.target(
+            config.strategy.settings,
+            self.generators["densification"],
+            Schedule(self.steps, config.schedule.written_for),
+        )
         self.field: Field = config.field.target.from_scene(
             scene, config.field.settings, self.generators["initialisation"]
         ).to(device)
@@ -81,13 +87,24 @@ class Trainer:
         self.run.create(self.method.config.to_yaml(), self.provenance(), overwrite)
 
     def resume(self) -> None:
-        """Go on from the run's latest checkpoint; CPU runs continue to the bit.
+        """Go on from the run's latest checkpoint, or from the start where it has none; CPU runs continue to the bit.
+
+        A schedule that differs from the run's own is taken as a change on purpose and recorded.
 
         Raises:
-            InputError: The checkpoint is damaged or of another method, or the run's config or data differ.
+            InputError: The checkpoint is damaged or of another method, the run's config or data differ, or the run has
+                more steps behind it than the schedule has.
         """
-        self._check_same_run()
-        path = checkpoints.latest_checkpoint(self.run.checkpoints)
+        check_same_run(self.run, self.method, self.scene, self.scene_path)
+        path = checkpoints.newest_checkpoint(self.run.checkpoints)
+        if path is not None:
+            self._restore(path)
+        record_schedule(self.run, self.method.config, self.step)
+        self._cut_log()
+        logger.info("resuming %s at step %d of %d", self.run.path, self.step, self.steps)
+
+    def _restore(self, path: Path) -> None:
+        """Take everything up as a checkpoint left it."""
         saved = checkpoints.read_checkpoint(path, self.method.name, self.device)
         config = self.method.config
         try:
@@ -100,17 +117,16 @@ class Trainer:
         self.strategy.load_state_dict(saved.part("strategy"))
         self.order.queue = list(saved.queue)
         self.step = saved.step
-        self._cut_log()
-        logger.info("resuming %s at step %d", self.run.path, self.step)
 
     def train(self) -> None:
         """Train to the last step, logging and saving on the way.
 
         Raises:
             InterruptedRunError: Ctrl-C; what was done is saved.
-            NotFiniteError: A loss term is NaN or infinite.
+            NotFiniteError: A loss term or a parameter is NaN or infinite.
         """
         schedule = self.method.config.schedule
+        logger.info("%s", self.strategy.plan())
         began = time.monotonic() - self.seconds
         with (
             _deferred_interrupt() as interrupted,
@@ -128,8 +144,10 @@ class Trainer:
                 if self.step % schedule.checkpoint_every == 0 or self.step == self.steps or stop:
                     self.save()
                 if stop and self.step < self.steps:
-                    where = f"--output {self.run.path} --resume"
-                    raise InterruptedRunError(f"stopped after step {self.step}, which is saved; go on with {where}")
+                    raise InterruptedRunError(
+                        f"stopped after step {self.step} of {self.steps}, which is saved; go on with "
+                        f"{resume_command(self.run, self.method.name, self.scene_path)}"
+                    )
 
     def take_step(self) -> dict[str, Any]:
         """Train on the next frame.
@@ -138,7 +156,7 @@ class Trainer:
             The row of the log: step, loss, terms, PSNR of this view in dB, what was drawn, what the strategy did.
 
         Raises:
-            NotFiniteError: A loss term is NaN or infinite.
+            NotFiniteError: A loss term, or a parameter as the step before left it, is NaN or infinite.
         """
         step = self.step + 1
         frame = self.frames[self.order.next()].to(self.device)
@@ -146,9 +164,14 @@ class Trainer:
         terms = {key: loss(output, frame) for key, loss in self.losses.items()}
         weights = {key: loss.settings.weight_at(step, self.steps) for key, loss in self.losses.items()}
         total = torch.stack([weights[key] * term for key, term in terms.items()]).sum()
-        # Everything the log and the check need, in one wait for the device.
-        loss, error, *values = torch.stack([total, _squared_error(output, frame), *terms.values()]).tolist()
-        self._check_finite(dict(zip(terms, values, strict=True)), step, frame)
+        # A NaN opacity draws nothing and leaves every term finite, so parameters are looked at themselves.
+        sums = _parameter_sums(self.field)
+        # Everything the log and the checks need, in one wait for the device.
+        scalars = [total, _squared_error(output, frame), *terms.values(), *sums.values()]
+        loss, error, *rest = torch.stack(scalars).tolist()
+        values, totals = rest[: len(terms)], rest[len(terms) :]
+        self._check_parameters(dict(zip(sums, totals, strict=True)), step)
+        self._check_terms(dict(zip(terms, values, strict=True)), step, frame)
         if total.requires_grad:
             torch.autograd.backward(total)
         done = self.strategy.after_backward(step, self.field, self.optimizers.adam, output)
@@ -197,7 +220,15 @@ class Trainer:
             },
         }
 
-    def _check_finite(self, terms: dict[str, float], step: int, frame: Frame) -> None:
+    def _check_parameters(self, sums: dict[str, float], step: int) -> None:
+        for group, total in sums.items():
+            if not math.isfinite(total):
+                raise NotFiniteError(
+                    f"step {step - 1} left parameters of group '{group}' that are not finite. "
+                    f"The last checkpoint is whole; look for too large a learning rate of {group}."
+                )
+
+    def _check_terms(self, terms: dict[str, float], step: int, frame: Frame) -> None:
         for key, term in terms.items():
             if not math.isfinite(term):
                 raise NotFiniteError(
@@ -237,23 +268,6 @@ class Trainer:
     def _optimizers(self) -> Optimizers:
         return Optimizers(self.field, self.method.config.optimizers, self.steps, self.scene.extent)
 
-    def _check_same_run(self) -> None:
-        saved = self.run.method().config.model_dump(exclude={"schedule", "description"})
-        now = self.method.config.model_dump(exclude={"schedule", "description"})
-        differing = [key for key in now if now[key] != saved[key]]
-        if self.run.provenance().get("method") != self.method.name:
-            owner = self.run.provenance().get("method")
-            raise InputError(f"{self.run.path} is a run of method '{owner}'", f"one of '{self.method.name}'")
-        if differing:
-            raise InputError(
-                f"{self.run.path} was trained with other settings of {', '.join(differing)}",
-                "the settings it was started with",
-                f"Compare with {self.run.config_file}",
-            )
-        before = self.run.provenance()["scene"]["provenance"].get("fingerprint")
-        if before != self.scene.provenance.get("fingerprint"):
-            raise InputError(f"{self.scene_path} is not the data this run was started on", "unchanged data")
-
     def _cut_log(self) -> None:
         """Drop rows of steps that the checkpoint does not hold: they are about to be taken again."""
         if not self.run.log_file.is_file():
@@ -270,6 +284,13 @@ def _logged_step(row: str) -> float:
         return float(json.loads(row)["step"])
     except (ValueError, KeyError):
         return math.inf  # a line cut short by a kill
+
+
+@torch.no_grad()
+def _parameter_sums(field: Field) -> dict[str, Tensor]:
+    """The sum of every parameter group: finite if all of the group is. []"""
+    groups = field.parameter_groups()
+    return {name: torch.stack([value.sum() for value in group]).sum() for name, group in groups.items()}
 
 
 @torch.no_grad()

@@ -57,6 +57,7 @@ class AnchorField(Field):
         features: [M, F]
         scalings: Log scales: three for the offsets, three bases of the children's sizes. [M, 6]
         voxel_size: Scene units. []
+        spacing: Of the anchors at the start: median root mean squared distance to the three nearest, scene units. []
     """
 
     Settings: ClassVar[type[Settings]] = AnchorFieldSettings
@@ -66,12 +67,14 @@ class AnchorField(Field):
 
     anchors: Tensor
     voxel_size: Tensor
+    spacing: Tensor
 
     def __init__(self, settings: Any, anchor_count: int, generator: torch.Generator) -> None:
         super().__init__()
         self.settings = settings
         self.register_buffer("anchors", torch.zeros(anchor_count, 3))
         self.register_buffer("voxel_size", torch.zeros(()))
+        self.register_buffer("spacing", torch.zeros(()))
         self.offsets = nn.Parameter(torch.zeros(anchor_count, settings.children, 3))
         self.features = nn.Parameter(torch.zeros(anchor_count, settings.features))
         self.scalings = nn.Parameter(torch.zeros(anchor_count, 6))
@@ -107,8 +110,10 @@ class AnchorField(Field):
         field = cls(settings, len(anchors), generator)
         field.anchors.copy_(anchors)
         field.voxel_size.fill_(size)
+        log_scales = neighbour_log_scales(anchors)
+        field.spacing.copy_(log_scales.exp().median())
         with torch.no_grad():
-            field.scalings.copy_(neighbour_log_scales(anchors)[:, None].expand(-1, 6))
+            field.scalings.copy_(log_scales[:, None].expand(-1, 6))
             cameras = [frame.camera for frame in scene.train[:: max(1, len(scene.train) // _CAMERAS_ASKED)]]
             field.appearance_head.expect(torch.cat([field._distances(camera) for camera in cameras]))
         logger.info("%d points in voxels of %.3g scene units make %d anchors", len(scene.points), size, len(anchors))
@@ -176,6 +181,6 @@ class AnchorField(Field):
             scales=scales[:, 3:] * covariances[:, :3].sigmoid(),
             opacities=opacities.reshape(-1).index_select(0, slots),
             colors=colors.reshape(-1, 3).index_select(0, slots),
-            source_index=visible.index_select(0, parents) * self.settings.children + slots % self.settings.children,
+            source_index=(visible.index_select(0, parents) - parents) * self.settings.children + slots,
             visible_sources=visible,
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -15,10 +15,14 @@ from coliags_plugin.settings import Settings
 
 
 class AppearanceSettings(Settings):
-    """Options of every appearance head."""
+    """Options of every appearance head.
+
+    ``bias_init`` is where the biases of hidden units that see the distance start: "scene_distances" moves each unit's
+    kink over the distances that occur (docs/methods.md 3.4), "pytorch" leaves PyTorch's default start, the paper's.
+    """
 
     hidden: int = Field(default=32, ge=1)
-    spread_kinks: bool = True  # whether hidden units start over the scene's distances; see PlainAppearanceHead.expect
+    bias_init: Literal["scene_distances", "pytorch"] = "scene_distances"
 
 
 class PlainAppearanceSettings(AppearanceSettings):
@@ -61,9 +65,9 @@ class PlainAppearanceHead(nn.Module):
         Args:
             distances: From cameras to anchors in their view, scene units. [D]
         """
-        first: Any = self.color_mlp[0]
-        if not (self.sees_distance and self.settings.spread_kinks) or len(distances) == 0:
+        if not self.sees_distance or self.settings.bias_init == "pytorch" or len(distances) == 0:
             return
+        first: Any = self.color_mlp[0]
         units = first.out_features
         places = (torch.arange(units, device=distances.device) * 2 + 1) * len(distances) // (2 * units)
         kinks = distances.sort().values[places]

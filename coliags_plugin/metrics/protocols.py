@@ -70,17 +70,17 @@ class PaperProtocol(Protocol):
 class AuthorsCodeProtocol(Protocol):
     """The figures the authors' released code prints (docs/methods.md 5.4): through PNG files, and without any mask.
 
-    The rendered depth is 1 / (sum w/z), 100 mm where nothing was drawn, through 16 bit over 150 mm; the true depth goes
-    through 16 bit over 100 mm with unknown pixels at 0 and the sensor's clipped ones at its limit, against which the
-    rendered ones are scored. Both wrap around beyond their full scale.
+    The rendered depth is 1 / (sum w/z) through 16 bit over 150 mm; where nothing was drawn that is infinite, which the
+    cast turns into 0. The true depth goes through 16 bit over 100 mm with unknown pixels at 0 and the sensor's clipped
+    ones at its limit, against which the rendered ones are scored. Both wrap around beyond their full scale.
     """
 
     name: ClassVar[str] = "authors-code"
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     description: ClassVar[str] = (
         "8-bit images; depth 1/(sum w/z) as 16 bit over 150 mm against truth as 16 bit over 100 mm, both wrapping "
-        "around; no mask, unknown true depth counts as 0, clipped true depth as its limit. SSIM 11x11 sigma 1.5; "
-        "LPIPS VGG fed [0, 1]."
+        "around; no mask, pixels where nothing was drawn and unknown true depth count as 0, clipped true depth as its "
+        "limit. SSIM 11x11 sigma 1.5; LPIPS VGG fed [0, 1]."
     )
     wants: ClassVar[frozenset[str]] = frozenset({"inverse_depth_accumulated"})
     metrics: ClassVar[MetricTable] = MappingProxyType(
@@ -92,8 +92,6 @@ class AuthorsCodeProtocol(Protocol):
         }
     )
 
-    #: Depth of a pixel nothing was drawn on, mm.
-    empty_depth: ClassVar[float] = 100.0
     #: Depths of level 65535 in the files of rendered and true depth, mm.
     rendered_full_scale: ClassVar[float] = 150.0
     true_full_scale: ClassVar[float] = 100.0
@@ -104,8 +102,7 @@ class AuthorsCodeProtocol(Protocol):
         image = Comparison(rgb=through_8_bit(output.rgb.detach()), true_rgb=through_8_bit(frame.rgb), valid=everywhere)
         if frame.depth is None:
             return image
-        inverse = output["inverse_depth_accumulated"].detach()
-        rendered = torch.where(inverse != 0, 1.0 / inverse, self.empty_depth)
+        rendered = 1.0 / output["inverse_depth_accumulated"].detach()  # infinite where nothing was drawn
         known = frame.depth
         if frame.depth_at_least is not None:
             known = torch.where(torch.isfinite(frame.depth_at_least), frame.depth_at_least, known)

@@ -1,7 +1,8 @@
-"""Scaffold-GS's way of growing and pruning anchors."""
+"""Growing and pruning anchors: Scaffold-GS's statistics, cells of the anchors' spacing, births that disturb little."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -9,44 +10,59 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from coliags_plugin.contracts import Strategy
+from coliags_plugin.contracts import Schedule, Strategy
 from coliags_plugin.gaussians import RenderOutput
 from coliags_plugin.settings import Settings
+from coliags_plugin.strategies.births import Births, one_per_free_cell
 from coliags_plugin.strategies.parameter_rows import append_rows, keep_rows
 
 
 class AnchorGrowthSettings(Settings):
-    """Options of anchor growth; the defaults are Scaffold-GS's and ColIAGS's (docs/methods.md 4.3)."""
+    """Options of anchor growth (docs/methods.md 4.3 says which are Scaffold-GS's). Steps scale with the run."""
 
     statistics_from: int = Field(default=500, ge=0)  # steps; first and last are themselves left out
     growth_from: int = Field(default=1500, ge=0)
     until: int = Field(default=15_000, ge=0)
-    every: int = Field(default=100, ge=1)
+    every: int = Field(default=100, ge=1)  # steps between events, whatever the run's length
     gradient_threshold: float = Field(default=0.0002, gt=0)  # of the centres' gradient, normalised image units
     success_share: float = Field(default=0.8, gt=0, le=1)
     min_opacity: float = Field(default=0.005, ge=0)
-    levels: int = Field(default=3, ge=1)
-    coarsest_cell: int = Field(default=16, ge=1)  # in voxels; each further level is a quarter of the one before
-    max_log_scale: float | None = 0.05  # cap on the children's base scales whenever anchors are pruned, log scene units
+    levels: int = Field(default=3, ge=1)  # cells of the anchors' spacing, and each further level a quarter of that
+    finest_cell: float = Field(default=0.25, ge=0)  # in voxels; finer levels are left out
+    pixels_per_birth: int = Field(default=500, ge=1)  # pixels of a view for each birth of an event, strongest first
+    max_scale: float | None = Field(default=4.0, gt=0)  # cap on base scales at every event, times the spacing
 
 
 class AnchorGrowth(Strategy):
-    """New anchors where children's image gradients stay large, none where they stay transparent (docs/methods.md 4.3).
+    """Adds anchors where children's image gradients stay large and removes anchors that stay transparent.
 
-    Counts only anchors that the view can see, as Scaffold-GS does; ColIAGS's released code counts all of them, so that
-    its pruning test is an average over views that never saw the anchor.
+    Scaffold-GS's statistics and thresholds; cells, births and the limit on each event are this package's own, because
+    the published ones rest on cells finer than the spacing of the initial points (docs/methods.md 4.3). Counts only
+    anchors that the view can see, as Scaffold-GS does.
     """
 
     Settings: ClassVar[type[Settings]] = AnchorGrowthSettings
 
-    def __init__(self, settings: Any, generator: torch.Generator, steps: int) -> None:
-        super().__init__(settings, generator, steps)
-        # The published 15,000 are half of a run. What grows in the end of a shorter one would never be trained.
-        self.until = min(settings.until, steps // 2)
+    def __init__(self, settings: Any, generator: torch.Generator, schedule: Schedule) -> None:
+        super().__init__(settings, generator, schedule)
+        self.statistics_from = schedule.at(settings.statistics_from)
+        self.growth_from = schedule.at(settings.growth_from)
+        self.until = schedule.at(settings.until)
         self.opacity_sum = torch.zeros(0)  # [M]
         self.seen = torch.zeros(0)  # [M]
         self.gradient_sum = torch.zeros(0)  # [M * K]
         self.drawn = torch.zeros(0)  # [M * K]
+
+    def plan(self) -> str:
+        """When this run grows and prunes, or why it does not."""
+        every = self.settings.every
+        events = range((self.growth_from // every + 1) * every, self.until, every)
+        if len(events) == 0:
+            return (
+                f"this run neither grows nor prunes anchors: its {self.schedule.steps} steps leave no multiple of "
+                f"{every} between steps {self.growth_from} and {self.until}"
+            )
+        return f"this run grows and prunes anchors every {every} steps from step {events[0]} to {events[-1]}"
 
     def state_dict(self) -> dict[str, Tensor]:
         """The counters."""
@@ -62,15 +78,14 @@ class AnchorGrowth(Strategy):
         self, step: int, field: Any, optimizers: Mapping[str, torch.optim.Optimizer], output: RenderOutput
     ) -> dict[str, int]:
         """Count; every so often grow and prune."""
-        options = self.settings
-        if not options.statistics_from < step < self.until:
+        if not self.statistics_from < step < self.until:
             return {}
         children = field.offsets.shape[1]
         self._resize(len(field.anchors), children, field.anchors.device)
         self._count(output, children)
-        if step <= options.growth_from or step % options.every:
+        if step <= self.growth_from or step % self.settings.every:
             return {}
-        grown = self._grow(field, optimizers, children)
+        grown = self._grow(field, optimizers, children, max(1, output.alpha.numel() // self.settings.pixels_per_birth))
         pruned = self._prune(field, optimizers, children)
         return {"grown": grown, "pruned": pruned}
 
@@ -98,71 +113,62 @@ class AnchorGrowth(Strategy):
         self.gradient_sum.index_add_(0, gaussians.source_index, torch.where(drawn, lengths, 0.0))
         self.drawn.index_add_(0, gaussians.source_index, drawn.to(self.drawn.dtype))
 
-    def _grow(self, field: Any, optimizers: Mapping[str, torch.optim.Optimizer], children: int) -> int:
+    def _grow(
+        self, field: Any, optimizers: Mapping[str, torch.optim.Optimizer], children: int, most_births: int
+    ) -> int:
         options = self.settings
         ready = self.drawn > options.every * options.success_share * 0.5
         gradient = self.gradient_sum / self.drawn.clamp_min(1.0)
         positions = field.child_positions().reshape(-1, 3)
         first_count = len(field.anchors)
         for level in range(options.levels):
-            chosen = ready & (gradient >= options.gradient_threshold * 2.0**level)
-            draw = torch.rand(len(chosen), generator=self.generator).to(chosen.device)
-            chosen &= draw > 0.5 ** (level + 1)
-            if level > 0 and len(field.anchors) == first_count:
-                continue  # finer levels follow only where a coarser one found something (docs/methods.md 4.3)
-            cell = float(field.voxel_size) * max(1, options.coarsest_cell // 4**level)
-            slots = chosen.nonzero().squeeze(1)
-            self._add_anchors(field, optimizers, positions[slots], slots // children, cell)
+            cell = float(field.spacing) / 4**level
+            left = most_births - (len(field.anchors) - first_count)
+            if left == 0 or cell < options.finest_cell * float(field.voxel_size):
+                break
+            slots = (ready & (gradient >= options.gradient_threshold * 2.0**level)).nonzero().squeeze(1)
+            births = one_per_free_cell(field.anchors, positions[slots], gradient[slots], cell, left)
+            self._add(field, optimizers, births, slots // children, cell)
         self.gradient_sum[ready] = 0.0
         self.drawn[ready] = 0.0
         self._resize(len(field.anchors), children, field.anchors.device)
         return len(field.anchors) - first_count
 
-    def _add_anchors(
+    def _add(
         self,
         field: Any,
         optimizers: Mapping[str, torch.optim.Optimizer],
-        positions: Tensor,
-        parents: Tensor,
+        births: Births,
+        anchor_of: Tensor,
         cell: float,
     ) -> None:
-        """One anchor in every cell that holds candidates and no anchor."""
-        if len(positions) == 0:
+        """Append anchors that look like their parents at a cell's size, and that Adam moves no faster than these."""
+        if len(births) == 0:
             return
-        taken = torch.unique(torch.round(field.anchors / cell), dim=0)
-        cells, member_of = torch.unique(torch.round(positions / cell), dim=0, return_inverse=True)
-        both, place = torch.unique(torch.cat([taken, cells]), dim=0, return_inverse=True)
-        occupied = torch.zeros(len(both), dtype=torch.bool, device=cells.device)
-        occupied[place[: len(taken)]] = True
-        free = ~occupied[place[len(taken) :]]
-        if not free.any():
-            return
-        features = field.features[parents]
-        pooled = features.new_full((len(cells), features.shape[1]), -torch.inf)
-        pooled = pooled.scatter_reduce(0, member_of[:, None].expand_as(features), features, "amax")[free]
-        new = cells[free] * cell
-        field.anchors = torch.cat([field.anchors, new])
+        parents = anchor_of[births.candidates]
+        scalings = field.scalings[parents].clamp_max(math.log(cell))
+        field.anchors = torch.cat([field.anchors, births.positions])
         rows = {
-            "offsets": field.offsets.new_zeros(len(new), *field.offsets.shape[1:]),
-            "features": pooled,
-            "scalings": field.scalings.new_full((len(new), field.scalings.shape[1]), cell).log(),
+            "offsets": field.offsets.new_zeros(len(births), *field.offsets.shape[1:]),
+            "features": field.features[parents],
+            "scalings": scalings,
         }
-        append_rows(field, optimizers, rows)
+        append_rows(field, optimizers, rows, parents)
 
     def _prune(self, field: Any, optimizers: Mapping[str, torch.optim.Optimizer], children: int) -> int:
         options = self.settings
+        if options.max_scale is not None:
+            field.scalings[:, 3:].clamp_(max=math.log(options.max_scale * float(field.spacing)))
         judged = self.seen > options.every * options.success_share
         faint = judged & (self.opacity_sum < options.min_opacity * self.seen)
         self.opacity_sum[judged] = 0.0
         self.seen[judged] = 0.0
         keep = ~faint
-        if not keep.any():
+        if not keep.any() or keep.all():
             return 0  # an empty field could never recover
         keep_children = keep.repeat_interleave(children)
         self.opacity_sum, self.seen = self.opacity_sum[keep], self.seen[keep]
         self.gradient_sum, self.drawn = self.gradient_sum[keep_children], self.drawn[keep_children]
         field.anchors = field.anchors[keep]
         keep_rows(field, optimizers, field.anchor_parameters, keep)
-        if options.max_log_scale is not None:
-            field.scalings[:, 3:].clamp_(max=options.max_log_scale)
         return int(faint.sum())

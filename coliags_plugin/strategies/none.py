@@ -21,6 +21,10 @@ class NoStrategy(Strategy):
 
     Settings: ClassVar[type[Settings]] = NoStrategySettings
 
+    def plan(self) -> str:
+        """That nothing will happen."""
+        return "this run neither grows nor prunes: strategy none"
+
     def after_backward(
         self, step: int, field: Any, optimizers: Mapping[str, torch.optim.Optimizer], output: RenderOutput
     ) -> dict[str, int]:

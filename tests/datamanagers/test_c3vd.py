@@ -263,7 +263,7 @@ class TestExtras:
         assert all(frame.seen is None for frame in scene.train)
         for options in ({"split": "block"}, {"frame_step": 2}, {"split": "all-train"}):
             scene = small(with_rotation, **options)
-            assert all(frame.seen is None for frame in scene.train + scene.test_sets.get("test", []))
+            assert all(frame.seen is None for frames in (scene.train, *scene.test_sets.values()) for frame in frames)
 
     def test_marks_of_frames_that_do_not_exist(self, with_rotation):
         shutil.copy(with_rotation / "rotation/seen/0001_seen.png", with_rotation / "rotation/seen/0007_seen.png")

@@ -9,7 +9,7 @@ import pytest
 from coliags_plugin.datamanagers.c3vd.writer import depth_steps
 from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH
 from coliags_plugin.datamanagers.reading.images import read_mask, read_rgb, resize_nearest, resize_rgb
-from coliags_plugin.datamanagers.views import default_size
+from coliags_plugin.datamanagers.views import PAPER_SIZE, fitted
 from coliags_plugin.errors import InputError
 
 
@@ -105,5 +105,6 @@ def test_nearest_takes_the_pixel_under_the_centre(size):
         ((3000, 10), (338, 1)),
     ],
 )
-def test_default_size_fits_the_papers_and_enlarges_nothing(stored, size):
-    assert default_size(*stored) == size
+def test_sizes_fit_the_papers_and_nothing_is_enlarged(stored, size):
+    assert fitted(*stored, PAPER_SIZE) == size
+    assert fitted(*stored, None) == stored

@@ -29,7 +29,7 @@ def test_coliags_beats_scaffold_gs_where_the_lamp_moves(tmp_path):
     run("phantom", tmp_path / "strong", "--light", "strong", "--seed", 0, "--size", "169x135")
     ours = figures(tmp_path, "coliags", tmp_path / "strong")
     rival = figures(tmp_path, "scaffold-gs-depth", tmp_path / "strong")
-    assert ours["psnr"] >= rival["psnr"] + 4.0
+    assert ours["psnr"] >= rival["psnr"] + 5.0
     assert ours["ssim"] > rival["ssim"]
     assert ours["depth_mse"] <= rival["depth_mse"] / 1.2
     assert ours["depth_mse_inner"] <= rival["depth_mse_inner"] / 2.0

@@ -26,8 +26,9 @@ EARLY_GROWTH = (
     "strategy.every=3",
     "strategy.min_opacity=0.5",
     "strategy.gradient_threshold=1e-7",
-    "strategy.coarsest_cell=1",
-    "strategy.levels=1",
+    "strategy.pixels_per_birth=50",
+    "schedule.written_for=16",
+    "strategy.until=8",
     "field.voxel_size=1.0",
     "optimizers.offsets.lr=0.3",
 )
@@ -231,10 +232,47 @@ def test_damaged_checkpoint_is_refused(tmp_path, damage):
         make_trainer(tmp_path / "run", steps=1).resume()
 
 
-def test_run_without_checkpoint_is_refused(tmp_path):
-    make_trainer(tmp_path / "run").start()
-    with pytest.raises(InputError, match="no checkpoint"):
-        make_trainer(tmp_path / "run").resume()
+def test_a_run_killed_before_its_first_checkpoint_starts_again(tmp_path):
+    whole = train(tmp_path / "whole", steps=4)
+    killed = make_trainer(tmp_path / "run", steps=4)
+    killed.start()
+    killed.run.log_file.write_text('{"step": 1, "loss": 1.0}\n')
+    again = make_trainer(tmp_path / "run", steps=4)
+    again.resume()
+    again.train()
+    assert_same(final_state(whole), final_state(again))
+    assert without_clock(log_rows(whole)) == without_clock(log_rows(again))
+
+
+def test_a_changed_schedule_is_recorded(tmp_path):
+    train(tmp_path / "run", steps=4)
+    longer = make_trainer(tmp_path / "run", steps=6)
+    longer.resume()
+    longer.train()
+    found = longer.run.provenance()
+    assert found["steps"] == longer.run.method().config.schedule.steps == 6
+    (change,) = found["schedule_changes"]
+    assert (change["at_step"], change["from"]["steps"], change["to"]["steps"]) == (4, 4, 6)
+    make_trainer(tmp_path / "run", steps=6).resume()
+    assert longer.run.provenance() == found
+    with pytest.raises(InputError, match="has taken 6 steps already"):
+        make_trainer(tmp_path / "run", steps=5).resume()
+
+
+def test_nan_parameters_are_found_in_the_next_step_and_never_saved(tmp_path):
+    """A NaN opacity head draws nothing, and every loss term stays finite."""
+    trainer = make_trainer(tmp_path / "run", steps=9)
+    trainer.start()
+    trainer.take_step()
+    trainer.save()
+    with torch.no_grad():
+        trainer.field.geometry_head.opacity_mlp[0].weight[0, 0] = float("nan")
+    with pytest.raises(NotFiniteError, match="step 1 left parameters of group 'opacity_mlp'"):
+        trainer.take_step()
+    with pytest.raises(NotFiniteError, match=r"field/geometry_head\.opacity_mlp\.0\.weight"):
+        trainer.save()
+    assert [path.name for path in trainer.run.checkpoints.iterdir()] == ["step-000001"]
+    assert latest_checkpoint(trainer.run.checkpoints).name == "step-000001"
 
 
 def test_optimizer_groups_must_be_the_fields(tmp_path):

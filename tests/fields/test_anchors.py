@@ -42,6 +42,13 @@ def test_perceptron_sizes_are_the_papers():
     assert sizes["color_mlp"] == [(32, 47), (30, 32)]
 
 
+def test_spacing_is_the_anchors_own_and_travels_with_the_state():
+    """A wall of points merged into voxels of 2: three of the nearest neighbours stand one voxel away."""
+    field = make_field(COLIAGS, voxel_size=2.0)
+    assert field.spacing == pytest.approx(2.0, rel=1e-5)
+    assert type(field).from_state(field.state_dict(), field.settings).spacing == field.spacing
+
+
 def test_scaffold_perceptron_sizes():
     field = make_field(SCAFFOLD)
     assert field.geometry_head.opacity_mlp[0].in_features == 35
@@ -238,7 +245,7 @@ def test_same_seed_same_field():
 @pytest.mark.parametrize("head", [{"name": "imia"}, {"name": "plain", "distance": True}])
 def test_hidden_units_start_over_the_distances_that_occur(head):
     """Each unit's pre-activation at its own quantile of the distances is what the default start has at distance 0."""
-    default = make_field(COLIAGS, appearance_head={**head, "spread_kinks": False})
+    default = make_field(COLIAGS, appearance_head={**head, "bias_init": "pytorch"})
     spread = make_field(COLIAGS, appearance_head=head)
     cameras = [frame.camera for frame in wall_scene().train]
     with torch.no_grad():
@@ -259,17 +266,18 @@ def test_few_units_start_dead():
     generator = torch.Generator().manual_seed(0)
     directions = torch.nn.functional.normalize(torch.randn(500, 3, generator=generator), dim=1)
     dead = {}
-    for spread in (True, False):
-        head = IMIAAppearanceHead(IMIAAppearanceSettings(spread_kinks=spread), 32, 10, generator.manual_seed(1))
+    for start in ("scene_distances", "pytorch"):
+        head = IMIAAppearanceHead(IMIAAppearanceSettings(bias_init=start), 32, 10, generator.manual_seed(1))
         head.expect(distances)
         inputs = torch.cat(
             [torch.zeros(500, 32), head.embed(directions, distances[:, None], directions[:, 2:].abs())], dim=1
         )
-        dead[spread] = int((head.color_mlp[0](inputs) <= 0).all(dim=0).sum())
-    assert dead[True] <= 2
-    assert dead[False] >= 11
+        dead[start] = int((head.color_mlp[0](inputs) <= 0).all(dim=0).sum())
+    assert dead["scene_distances"] <= 2
+    assert dead["pytorch"] >= 11
 
 
 def test_a_head_that_does_not_see_the_distance_expects_nothing():
-    plain, other = (make_field(SCAFFOLD, appearance_head={"name": "plain", "spread_kinks": s}) for s in (True, False))
+    starts = ("scene_distances", "pytorch")
+    plain, other = (make_field(SCAFFOLD, appearance_head={"name": "plain", "bias_init": start}) for start in starts)
     assert torch.equal(plain.appearance_head.color_mlp[0].bias, other.appearance_head.color_mlp[0].bias)

@@ -1,3 +1,4 @@
+import math
 from typing import get_args
 
 import pytest
@@ -5,7 +6,7 @@ import torch
 from pydantic import ValidationError
 
 from coliags_plugin import registry
-from coliags_plugin.contracts import LossSettings
+from coliags_plugin.contracts import LossSettings, log_linear
 from coliags_plugin.errors import InputError
 from coliags_plugin.gaussians import DEPTH_KINDS
 from coliags_plugin.losses.depth import DepthKind
@@ -190,5 +191,22 @@ def test_the_depth_weight_falls_as_in_the_authors_code(step, weight):
     assert settings.weight_at(step, 30_000) == pytest.approx(weight, rel=3e-3)
 
 
-def test_a_weight_without_an_end_is_constant():
-    assert {LossSettings(weight=0.8).weight_at(step, 10) for step in (1, 5, 10)} == {0.8}
+@pytest.mark.parametrize("weight", [0.8, 0.0])
+def test_a_weight_without_an_end_is_constant(weight):
+    assert {LossSettings(weight=weight).weight_at(step, 10) for step in (1, 5, 10)} == {weight}
+
+
+def test_a_weight_falls_no_further_than_its_minimum():
+    floored = LossSettings(weight=0.2, final_weight=0.01, min_weight=0.05)
+    free = LossSettings(weight=0.2, final_weight=0.01)
+    reached = 30_000 * math.log(4) / math.log(20)  # 0.2 * (1 / 20)^u = 0.05
+    assert floored.weight_at(int(reached), 30_000) == free.weight_at(int(reached), 30_000) > 0.05
+    assert floored.weight_at(int(reached) + 1, 30_000) == floored.weight_at(30_000, 30_000) == 0.05
+
+
+@pytest.mark.parametrize(("weight", "final"), [(0.2, 0.0), (0.0, 0.01), (0.0, 0.0), (0.2, -0.01), (float("nan"), 0.1)])
+def test_a_weight_that_falls_has_both_ends_above_zero(weight, final):
+    with pytest.raises(ValidationError, match=rf"final_weight {final} with weight {weight}: a logarithmic schedule"):
+        LossSettings(weight=weight, final_weight=final)
+    with pytest.raises(ValueError, match="both ends above 0"):
+        log_linear(weight, final, 0.5)

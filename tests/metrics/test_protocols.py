@@ -42,7 +42,7 @@ def scene(make_output, make_frame):
 def test_what_a_protocol_promises(name):
     made = protocol(name)
     assert made.name == name
-    assert made.version == 1
+    assert made.version == {"paper": 1, "authors-code": 2}[name]
     assert made.description
     assert made.wants <= set(OUTPUTS)
     for metric, options in made.metrics.values():
@@ -140,11 +140,19 @@ def test_authors_code_rounds_pictures_to_eight_bits(scene):
     assert torch.equal(comparison.true_rgb, frame.rgb)
 
 
-def test_authors_code_draws_nothing_at_a_hundred_millimetres(make_output, scene):
+def test_authors_code_scores_pixels_nothing_was_drawn_on_at_zero(make_output, scene):
+    """Of 12 rows the upper 3 are empty, one of their pixels without truth: 1/0 is infinite and its cast 0."""
     _, frame = scene
-    empty = make_output(torch.zeros(HEIGHT, WIDTH, 3), inverse_depth_accumulated=torch.zeros(HEIGHT, WIDTH))
-    depth = protocol("authors-code").compare(empty, frame).depth
-    assert depth.unique().tolist() == pytest.approx([100.0], abs=0.0023)
+    inverse = torch.full((HEIGHT, WIDTH), 1 / 20.0)
+    inverse[:3] = 0.0
+    output = make_output(torch.zeros(HEIGHT, WIDTH, 3), inverse_depth_accumulated=inverse)
+    comparison = protocol("authors-code").compare(output, frame)
+    assert not comparison.depth[:3].any()
+    # 20 mm over 150 is level 8738 (20 mm) or, truncated in float32, one less
+    drawn, truth = comparison.depth[3, 0].item(), comparison.true_depth[0, 0].item()
+    assert drawn == pytest.approx(20.0, abs=0.0023)
+    expected = ((3 * WIDTH - 1) * truth**2 + 9 * WIDTH * (drawn - truth) ** 2) / (HEIGHT * WIDTH)
+    assert score("authors-code", "depth_mse", comparison) == pytest.approx(expected, rel=1e-5)
 
 
 def test_authors_code_wraps_a_surface_beyond_150_mm_to_the_camera(make_output, scene):

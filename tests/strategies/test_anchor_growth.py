@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
 
 from coliags_plugin.components import make_component
+from coliags_plugin.contracts import Schedule
 from coliags_plugin.gaussians import Gaussians, RenderOutput
+from coliags_plugin.strategies.births import one_per_free_cell
 from coliags_plugin.strategies.parameter_rows import append_rows, keep_rows
 from tests.scenes import wall_scene
 
@@ -27,9 +27,9 @@ def make_field(voxel=2.0):
     return field, adam
 
 
-def make_strategy(seed=0, steps=30_000, **options):
+def make_strategy(steps=30_000, **options):
     component = make_component("strategies", {"name": "anchor-growth", **options})
-    return component.target(component.settings, torch.Generator().manual_seed(seed), steps)
+    return component.target(component.settings, torch.Generator(), Schedule(steps, 30_000))
 
 
 def make_output(slots, gradients, opacity=0.5, visible=None, radii=None, width=200, height=100):
@@ -62,13 +62,31 @@ def test_counts_only_inside_the_window():
     assert strategy.drawn[[0, 11]].tolist() == [1.0, 1.0]
 
 
-def test_growth_ends_at_half_of_a_short_run():
+@pytest.mark.parametrize(("steps", "first", "last"), [(1600, 27, 800), (30_000, 500, 15_000), (60_000, 1000, 30_000)])
+def test_statistics_keep_their_share_of_the_run(steps, first, last):
     field, adam = make_field()
-    strategy = make_strategy(steps=1600)
-    strategy.after_backward(799, field, adam, make_output([0], [1.0]))
-    assert strategy.seen[0] == 1
-    strategy.after_backward(800, field, adam, make_output([0], [1.0]))
-    assert strategy.seen[0] == 1
+    strategy = make_strategy(steps=steps)
+    for step, seen in ((first, 0), (first + 1, 1), (last - 1, 2), (last, 2)):
+        strategy.after_backward(step, field, adam, make_output([0], [1.0]))
+        assert (strategy.seen.sum() if len(strategy.seen) else 0) == seen
+
+
+@pytest.mark.parametrize(
+    ("steps", "plan", "first_and_last"),
+    [
+        (30_000, "every 100 steps from step 1600 to 14900", [1600, 14_900]),
+        (3000, "every 100 steps from step 200 to 1400", [200, 1400]),
+        (1200, "every 100 steps from step 100 to 500", [100, 500]),
+        (200, "neither grows nor prunes anchors: its 200 steps leave no multiple of 100 between steps 10 and 100", []),
+    ],
+)
+def test_the_plan_is_what_happens(steps, plan, first_and_last):
+    strategy = make_strategy(steps=steps)
+    assert plan in strategy.plan()
+    field, adam = make_field()
+    events = [s for s in range(0, steps + 1, 50) if strategy.after_backward(s, field, adam, make_output([0], [0.0]))]
+    assert events[:1] + events[-1:] == first_and_last
+    assert all(step % 100 == 0 for step in events)
 
 
 def test_undrawn_children_and_childless_anchors():
@@ -81,19 +99,15 @@ def test_undrawn_children_and_childless_anchors():
     assert strategy.opacity_sum[5] == 0.0
 
 
-def grow_once(gradient, voxel=2.0, **options):
-    """One child, far from every anchor, seen often enough with one gradient; returns what grew.
-
-    The first level keeps half of its candidates by chance; the seed is one that keeps this one.
-    """
-    field, adam = make_field(voxel)
+def grow_once(gradient, **options):
+    """One child of anchor 3, far from every anchor, drawn often enough with one gradient; returns what grew."""
+    field, adam = make_field()
     with torch.no_grad():
         field.offsets.zero_()
         field.offsets[3, 4] = torch.tensor([0.0, 0.0, 200.0]) / field.scalings[3, :3].exp()
+        field.features.copy_(torch.rand(field.features.shape, generator=torch.Generator().manual_seed(2)))
     before = len(field.anchors)
-    slots = before * CHILDREN
-    seed = next(s for s in range(99) if torch.rand(slots, generator=torch.Generator().manual_seed(s))[34] > 0.5)
-    strategy = make_strategy(seed, statistics_from=0, growth_from=0, every=100, min_opacity=0.0, **options)
+    strategy = make_strategy(statistics_from=0, growth_from=0, min_opacity=0.0, **options)
     strategy._resize(before, CHILDREN, torch.device("cpu"))
     strategy.drawn[34] = 41.0  # one more than 100 * 0.8 * 0.5
     strategy.gradient_sum[34] = 41.0 * gradient
@@ -101,28 +115,60 @@ def grow_once(gradient, voxel=2.0, **options):
     return field, adam, before, done
 
 
-def test_growth_adds_one_anchor_with_the_parents_feature():
-    field, adam, before, done = grow_once(1.0, levels=1, coarsest_cell=1, max_log_scale=None)
+def test_a_birth_stands_where_its_candidate_stood_and_looks_like_its_parent():
+    field, _, before, done = grow_once(1.0, levels=1)
     assert done == {"grown": 1, "pruned": 0}
     assert len(field.anchors) == before + 1
-    torch.testing.assert_close(field.features[-1], field.features[3])
+    torch.testing.assert_close(field.anchors[-1], field.child_positions()[3, 4])
+    assert torch.equal(field.features[-1], field.features[3])
     assert field.offsets[-1].abs().sum() == 0
-    torch.testing.assert_close(field.scalings[-1], torch.full((6,), math.log(2.0)))
-    cells = field.anchors[-1] / 2.0
-    torch.testing.assert_close(cells, cells.round())
-    assert field.anchors[-1, 2] == pytest.approx(220.0, abs=1.0)
+    assert (field.scalings[-1] <= torch.minimum(field.scalings[3], field.spacing.log())).all()
+
+
+def test_adam_moves_a_birth_no_faster_than_its_parent():
+    field, adam, *_ = grow_once(1.0, levels=1)
     for name in field.anchor_parameters:
-        (parameter,) = adam[name].param_groups[0]["params"]
-        assert parameter is getattr(field, name)
+        parameter = getattr(field, name)
+        assert adam[name].param_groups[0]["params"] == [parameter]
         moments = adam[name].state[parameter]
-        assert moments["exp_avg"].shape == parameter.shape
-        assert moments["exp_avg"][-1].abs().sum() == 0
+        assert moments["exp_avg"].shape == parameter.shape == parameter.grad.shape
         assert moments["exp_avg"][:-1].abs().sum() > 0
+        assert moments["exp_avg"][-1].abs().sum() == parameter.grad[-1].abs().sum() == 0
+        assert torch.equal(moments["exp_avg_sq"][-1], moments["exp_avg_sq"][3])
+        before = parameter.detach().clone()
+        adam[name].step()  # nothing is known yet that could move it
+        assert torch.equal(parameter[-1], before[-1])
+        assert not torch.equal(parameter[:-1], before[:-1])
+
+
+@pytest.mark.parametrize(("thresholds", "grown"), [(1.05, 0), (2.05, 1), (4.05, 1)])
+def test_finer_cells_ask_for_larger_gradients(thresholds, grown):
+    """A child beside an anchor, in its cell but not in its quarter: the second level's, from two thresholds on."""
+    field, adam = make_field()
+    strategy = make_strategy(statistics_from=0, growth_from=0, min_opacity=0.0)
+    strategy._resize(len(field.anchors), CHILDREN, torch.device("cpu"))
+    spacing = field.spacing.item()
+    center = torch.tensor([0.0, 0.0, 100 * spacing])
+    side = torch.tensor([0.2 * spacing, 0.0, 0.0])
+    with torch.no_grad():
+        field.offsets.zero_()
+        field.anchors[7] = center - side
+        field.offsets[7, 0] = 2 * side / field.scalings[7, :3].exp()
+    strategy.drawn[70] = 41.0
+    strategy.gradient_sum[70] = 41.0 * 0.0002 * thresholds
+    assert strategy.after_backward(100, field, adam, make_output([0], [0.0]))["grown"] == grown
+    if grown:
+        torch.testing.assert_close(field.anchors[-1], center + side)
+        assert (field.scalings[-1].exp() <= 0.2501 * spacing).all()
+
+
+def test_cells_below_a_quarter_of_a_voxel_are_left_out():
+    assert grow_once(1.0, levels=1, finest_cell=0.9)[3]["grown"] == 1
+    assert grow_once(1.0, levels=1, finest_cell=9.0)[3]["grown"] == 0
 
 
 def test_small_gradients_grow_nothing():
-    *_, done = grow_once(0.0001, levels=1, coarsest_cell=1)
-    assert done["grown"] == 0
+    assert grow_once(0.00019)[3]["grown"] == 0
 
 
 def test_occupied_cells_grow_nothing():
@@ -137,24 +183,39 @@ def test_occupied_cells_grow_nothing():
     assert strategy.drawn.sum() == 0  # used candidates start counting anew
 
 
-def test_coarse_cells_first_then_finer_ones():
-    """Many eager children far away: the coarse level opens the way, births have their cell's size."""
+def test_an_event_adds_at_most_one_anchor_for_so_many_pixels():
     field, adam = make_field()
     with torch.no_grad():
         field.offsets.copy_(torch.rand(field.offsets.shape, generator=torch.Generator().manual_seed(3)) * 60)
-    before = len(field.anchors)
-    strategy = make_strategy(statistics_from=0, growth_from=0, min_opacity=0.0, max_log_scale=None)
-    strategy._resize(before, CHILDREN, torch.device("cpu"))
+    strategy = make_strategy(statistics_from=0, growth_from=0, min_opacity=0.0, pixels_per_birth=1000)
+    strategy._resize(len(field.anchors), CHILDREN, torch.device("cpu"))
     strategy.drawn.fill_(50.0)
     strategy.gradient_sum.fill_(50.0)
-    grown = strategy.after_backward(100, field, adam, make_output([0], [0.0]))["grown"]
-    sizes = field.scalings[before:, 0].exp().detach()
-    counts = [int(((sizes - size).abs() < 1e-3).sum()) for size in (32.0, 8.0, 2.0)]
-    assert all(counts)
-    assert sum(counts) == grown == len(field.anchors) - before
-    for size, count in zip((32.0, 8.0, 2.0), counts, strict=True):
-        own = field.anchors[before:][(sizes - size).abs() < 1e-3]
-        assert len(torch.unique((own / size).round(), dim=0)) == count  # one anchor a cell
+    # 200 x 100 pixels
+    assert strategy.after_backward(100, field, adam, make_output([0], [0.0]))["grown"] == 20
+
+
+def test_strongest_candidate_of_each_free_cell_strongest_cells_first():
+    anchors = torch.tensor([[0.0, 0.0, 0.0]])
+    positions = torch.tensor([[0.1, 0, 0], [2.1, 0, 0], [1.9, 0, 0], [4.0, 0, 0], [6.2, 0, 0], [5.8, 0, 0]])
+    gradients = torch.tensor([9.0, 1.0, 3.0, 5.0, 4.0, 2.0])
+    births = one_per_free_cell(anchors, positions, gradients, 2.0, 10)
+    assert births.candidates.tolist() == [3, 4, 2]  # cells of 4, 6 and 2; that of 0 is taken
+    assert torch.equal(births.positions, positions[[3, 4, 2]])
+    assert one_per_free_cell(anchors, positions, gradients, 2.0, 2).candidates.tolist() == [3, 4]
+    assert len(one_per_free_cell(anchors, positions[:0], gradients[:0], 2.0, 2)) == 0
+
+
+def test_base_scales_are_capped_in_spacings():
+    field, adam = make_field()
+    with torch.no_grad():
+        field.scalings[5, 3:] = 9.0
+    strategy = make_strategy(statistics_from=0, growth_from=0)
+    before = field.scalings.detach().clone()
+    strategy.after_backward(100, field, adam, make_output([0], [0.0]))
+    torch.testing.assert_close(field.scalings[5, 3:].exp(), torch.full((3,), 4 * field.spacing.item()))
+    before[5, 3:] = field.scalings[5, 3:].detach()
+    assert torch.equal(field.scalings.detach(), before)
 
 
 def test_faint_anchors_go_and_the_rest_keeps_its_moments():
@@ -176,7 +237,6 @@ def test_faint_anchors_go_and_the_rest_keeps_its_moments():
     assert len(strategy.seen) == len(kept) == len(field.anchors)
     assert strategy.seen[7] == 10.0  # anchor 9, moved up by two, keeps counting
     assert strategy.seen.sum() == 10.0
-    assert field.scalings[:, 3:].max() <= 0.05
 
 
 def test_never_prunes_everything():
@@ -202,15 +262,7 @@ def test_rows_without_an_optimizer_change_too():
     field, adam = make_field()
     del adam["features"]
     count = len(field.features)
-    append_rows(field, adam, {"features": torch.ones(2, 32)})
+    append_rows(field, adam, {"features": torch.ones(2, 32)}, torch.tensor([0, 1]))
     assert len(field.features) == count + 2
     keep_rows(field, adam, ("features",), torch.arange(count + 2) < 5)
     assert len(field.features) == 5
-
-
-def test_after_growth_adam_steps_on():
-    field, adam, _, _ = grow_once(1.0, levels=1, coarsest_cell=1, max_log_scale=None)
-    for name in field.anchor_parameters:
-        getattr(field, name).grad = torch.ones_like(getattr(field, name))
-        adam[name].step()
-        assert torch.isfinite(getattr(field, name)).all()

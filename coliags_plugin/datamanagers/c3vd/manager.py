@@ -8,7 +8,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from coliags_plugin.datamanagers.c3vd.layouts import find_layout, recognise
-from coliags_plugin.datamanagers.c3vd.sequences import SequenceDataManager, SequenceFiles, octagon_view
+from coliags_plugin.datamanagers.c3vd.sequences import SequenceDataManager, SequenceFiles
 from coliags_plugin.datamanagers.reading.camera_json import read_intrinsics
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
 from coliags_plugin.datamanagers.views import View
@@ -58,5 +58,6 @@ class C3VDDataManager(SequenceDataManager):
         }
         if files.camera is not None:
             pinhole, width, height = read_intrinsics(files.camera)
-            return View.of_pinhole(pinhole, width, height, files.camera, settings.size), facts
-        return octagon_view(LENSES[settings.lens], files.images[0], settings, settings.mask), facts
+            size = self.working_size(width, height)
+            return View.of_pinhole(pinhole, width, height, files.camera, size), facts
+        return self.octagon_view(LENSES[settings.lens], files.images[0], settings.mask), facts

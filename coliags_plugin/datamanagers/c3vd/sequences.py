@@ -10,10 +10,9 @@ from typing import Any
 
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH
-from coliags_plugin.datamanagers.reading.frame_files import marks
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, check_pose_count, fingerprint
-from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
+from coliags_plugin.datamanagers.scene_settings import POINTS_FILE
 from coliags_plugin.datamanagers.seen import ROTATION, seen_marks
 from coliags_plugin.datamanagers.views import View, whole_frame
 from coliags_plugin.lenses import Lens, octagon_mask
@@ -49,8 +48,7 @@ class SequenceDataManager(RecordedDataManager):
     """A data manager of one of the releases, which says where the files are and how they were looked at.
 
     A sub-folder ``rotation`` in the same layout becomes the test set of that name. ``seen/NNNN_seen.png`` in it, and
-    ``truth/seen/NNNN_seen.png`` beside the sequence (valid for the split every-8th of all frames), mark what training
-    frames see.
+    ``truth/seen/NNNN_seen.png`` beside the sequence, mark what training frames see: those of :attr:`seen_split`.
     """
 
     @abstractmethod
@@ -72,11 +70,11 @@ class SequenceDataManager(RecordedDataManager):
     def open(self, path: Path) -> Recording:
         """See :class:`RecordedDataManager`."""
         files = self.find(path)
-        shots, facts = self._shots(files, seen_marks(path, len(files.images), self.settings, "every-8th"))
+        shots, facts = self._shots(files, seen_marks(path / "truth", len(files.images)))
         test_sets = {}
         if (path / ROTATION).is_dir():
             rotation = self.find(path / ROTATION)
-            seen = marks(path / ROTATION / "seen", "seen", len(rotation.images))
+            seen = seen_marks(path / ROTATION, len(rotation.images))
             test_sets[ROTATION], facts[ROTATION] = self._shots(rotation, seen, f"{ROTATION}-")
         points = path / POINTS_FILE
         return Recording(
@@ -88,6 +86,17 @@ class SequenceDataManager(RecordedDataManager):
             own_points=(lambda: load_points(points)) if points.is_file() else None,
             points_source=points,
         )
+
+    def octagon_view(self, lens: Lens, image: Path, mask: bool) -> View:
+        """The view of raw frames, of which one is ``image``: undistorted, and masked outside the octagon if wanted.
+
+        Raises:
+            InputError: The picture is a crop, so that the lens's calibration does not apply to it.
+        """
+        lens = whole_frame(lens, image)
+        shows = octagon_mask(lens.width, lens.height) if mask else None
+        size = self.working_size(lens.width, lens.height)
+        return View.through(lens, image, size, self.settings.focal_scale, shows)
 
     def _shots(
         self, files: SequenceFiles, seen: Mapping[int, Path], prefix: str = ""
@@ -107,14 +116,3 @@ class SequenceDataManager(RecordedDataManager):
             "pose_convention": {"order": poses.convention, **poses.evidence},
         }
         return shots, facts
-
-
-def octagon_view(lens: Lens, image: Path, settings: SceneSettings, mask: bool) -> View:
-    """The view of raw frames, of which one is ``image``: undistorted, and masked outside the octagon if wanted.
-
-    Raises:
-        InputError: The picture is a crop, so that the lens's calibration does not apply to it.
-    """
-    lens = whole_frame(lens, image)
-    shows = octagon_mask(lens.width, lens.height) if mask else None
-    return View.through(lens, image, settings.size, settings.focal_scale, shows)

@@ -20,7 +20,6 @@ from coliags_plugin.datamanagers.c3vd_endogslam.files import (
 )
 from coliags_plugin.datamanagers.c3vd_endogslam.poses import Placement, PoseSource, place_sequence
 from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH, DepthFormat, DepthSteps
-from coliags_plugin.datamanagers.reading.frame_files import marks
 from coliags_plugin.datamanagers.reading.images import bits_of, size_of
 from coliags_plugin.datamanagers.reading.ply_vertices import read_vertices
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
@@ -66,14 +65,16 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
     """Reads C3VD with EndoGSLAM's poses and map: EndoGSLAM's own folders, or PR-Endo's release.
 
     See docs/layouts/c3vd-endogslam.md. A sub-folder ``rotation``, with its own pose.txt, becomes the test set of that
-    name; ``rotation/seen`` and ``truth/seen`` (valid for the split endogslam of all frames) mark what training frames
-    see.
+    name; ``rotation/seen`` and ``truth/seen`` mark what training frames see: those of :attr:`seen_split`.
     """
 
     Settings = C3VDEndoGSLAMSettings
 
     settings: C3VDEndoGSLAMSettings
     name = "c3vd-endogslam"
+    #: EndoGSLAM and PR-Endo publish at the prepared pictures' own size.
+    fits = None
+    seen_split = "endogslam"
 
     @classmethod
     def recognise(cls, path: Path) -> str | None:
@@ -96,8 +97,7 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
             "depth_step_mm": None if depth_format is None else depth_format.size,
             **view.facts(),
         }
-        count = len(files.images)
-        seen = seen_marks(folder, count, self.settings, "endogslam")
+        seen = seen_marks(folder / "truth", len(files.images))
         shots = _shots(files, view, placement.camera_to_world, depth_format, seen)
         test_sets = {}
         if (folder / ROTATION).is_dir():
@@ -137,7 +137,7 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
                 "intrinsics of the size that org_width and org_height say",
                 "They are of another resolution: mend org_width and org_height, or the intrinsics",
             )
-        return View.of_pinhole(pinhole, width, height, files.images[0], self.settings.size)
+        return View.of_pinhole(pinhole, width, height, files.images[0], self.working_size(width, height))
 
     def _rotation(self, folder: Path, view: View, placement: Placement) -> list[Shot]:
         files = find_sequence(folder, None)
@@ -149,7 +149,7 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
             )
         poses = read_poses(files.poses).camera_to_world
         check_pose_count(files.poses, len(poses), len(files.images))
-        seen = marks(folder / "seen", "seen", len(files.images))
+        seen = seen_marks(folder, len(files.images))
         return _shots(files, view, placement.from_file @ poses, _depth_format(files), seen, f"{ROTATION}-")
 
 

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from coliags_plugin.datamanagers.c3vd.sequences import SequenceDataManager, SequenceFiles, octagon_view
+from coliags_plugin.datamanagers.c3vd.sequences import SequenceDataManager, SequenceFiles
 from coliags_plugin.datamanagers.c3vd_v2.files import INTRINSICS, find_sequence, recognise
 from coliags_plugin.datamanagers.c3vd_v2.lens import CANDIDATE_LENS, read_camera_intrinsics
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
@@ -60,7 +60,7 @@ class C3VDv2DataManager(SequenceDataManager):
             "focal_scale": settings.focal_scale,
             "mask": "octagon" if settings.mask else None,
         }
-        return octagon_view(lens, files.images[0], settings, settings.mask), facts
+        return self.octagon_view(lens, files.images[0], settings.mask), facts
 
     def _lens(self, files: SequenceFiles) -> tuple[Lens, str]:
         """The lens, and where its numbers come from."""

@@ -92,8 +92,7 @@ class ColmapDataManager(RecordedDataManager):
         names = short_names([picture.name for picture in model.pictures])
         others = others_beside(images, (*masks, *depths))
         warn_of_others(model.files[1], others)
-        # Seen masks are numbered by picture, so that a picture left out would put them out of step.
-        seen = {} if others else seen_marks(path, len(images), settings, "every-8th")
+        seen = seen_marks(path / "truth", len(images), complete=not others)
         shots, used = [], 0
         for place, picture in enumerate(model.pictures):
             camera_to_world = model.camera_to_world[place].copy()
@@ -154,12 +153,13 @@ class ColmapDataManager(RecordedDataManager):
         return found[0]
 
     def _views(self, model: Model) -> dict[int, View]:
-        settings, undistort = self.settings, undistorter()
+        focal_scale, undistort = self.settings.focal_scale, undistorter()
 
         def view(lens: ColmapLens) -> View:
+            size = self.working_size(lens.width, lens.height)
             if lens.model in PINHOLES:
-                return View.of_pinhole(lens.pinhole, lens.width, lens.height, model.cameras_file, settings.size)
-            return LensView.of(lens, model.cameras_file, settings.size, settings.focal_scale, undistort)
+                return View.of_pinhole(lens.pinhole, lens.width, lens.height, model.cameras_file, size)
+            return LensView.of(lens, model.cameras_file, size, focal_scale, undistort)
 
         return {number: view(lens) for number, lens in model.cameras.items()}
 

@@ -81,8 +81,7 @@ class NerfstudioDataManager(RecordedDataManager):
         others = [found for entry in entries for found in (entry.depth, entry.mask)]
         unposed = others_beside(images, others)
         warn_of_others(file, unposed)
-        # Seen masks are numbered by picture, so that a picture left out would put them out of step.
-        seen = {} if unposed else seen_marks(path, len(images), settings, "every-8th")
+        seen = seen_marks(path / "truth", len(images), complete=not unposed)
         shots = [
             Shot(
                 short,
@@ -131,12 +130,13 @@ class NerfstudioDataManager(RecordedDataManager):
         return 1.0
 
     def _views(self, entries: list[Entry], file: Path) -> dict[Lens | PinholeCamera, View]:
-        settings, undistort = self.settings, undistorter()
+        focal_scale, undistort = self.settings.focal_scale, undistorter()
 
         def view(camera: Lens | PinholeCamera) -> View:
+            size = self.working_size(camera.width, camera.height)
             if isinstance(camera, PinholeCamera):
-                return View.of_pinhole(camera.pinhole, camera.width, camera.height, file, settings.size)
-            return LensView.of(camera, file, settings.size, settings.focal_scale, undistort)
+                return View.of_pinhole(camera.pinhole, camera.width, camera.height, file, size)
+            return LensView.of(camera, file, size, focal_scale, undistort)
 
         return {camera: view(camera) for camera in dict.fromkeys(entry.camera for entry in entries)}
 

@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Bool
 from pydantic import Field
 
-from coliags_plugin.datamanagers.reading.frame_files import marks
 from coliags_plugin.datamanagers.reading.images import read_mask
 from coliags_plugin.datamanagers.reading.picture_names import others_beside, warn_of_others
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
 from coliags_plugin.datamanagers.reim_nerf.files import RayDistance, Sequence, ray_cosines, read_sequence, recognise
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
+from coliags_plugin.datamanagers.seen import seen_marks
 from coliags_plugin.datamanagers.splits import Split
 from coliags_plugin.datamanagers.views import View
 from coliags_plugin.errors import InputError
@@ -41,6 +41,9 @@ class ReimNerfDataManager(RecordedDataManager):
 
     settings: ReimNerfSettings
     name = "reim-nerf"
+    #: REIM-NeRF trains and evaluates at a fifth of a raw frame.
+    fits = (270, 216)
+    seen_split = "own"
 
     @classmethod
     def recognise(cls, path: Path) -> str | None:
@@ -60,10 +63,10 @@ class ReimNerfDataManager(RecordedDataManager):
         file, lens = sequence.files["train"], sequence.lens
         mask = path / MASK_FILE if settings.mask else None
         shows = None if mask is None else _shows(mask, lens.width, lens.height)
-        view = View.through(lens, file, settings.size, settings.focal_scale, shows)
+        view = View.through(lens, file, self.working_size(lens.width, lens.height), settings.focal_scale, shows)
         size = sequence.distmap_scale / 65535.0 / sequence.scene_scale
         form = RayDistance(size, view.nearest(ray_cosines(lens)))
-        seen = self._seen(path, sequence)
+        seen = seen_marks(path / "truth", len(sequence.frames))
         shots = [
             Shot(
                 frame.image.stem, frame.image, view, frame.camera_to_world, frame.distances, form, seen=seen.get(place)
@@ -80,15 +83,6 @@ class ReimNerfDataManager(RecordedDataManager):
             fingerprint=fingerprint(path, large, (*sequence.files.values(), mask)),
             own_split={"train": parts["train"], "test": parts.get("true_test", ())},
         )
-
-    def _seen(self, path: Path, sequence: Sequence) -> dict[int, Path]:
-        """``truth/seen/NNNN_seen.png`` of the test frames; valid for the data's own split of all frames."""
-        settings, count = self.settings, len(sequence.frames)
-        if settings.split != "own" or settings.frame_step > 1 or (settings.max_frames or count) < count:
-            return {}
-        test = set(sequence.parts["true_test"])
-        found = marks(path / "truth" / "seen", "seen", count)
-        return {place: mark for place, mark in found.items() if place in test}
 
     def _facts(self, sequence: Sequence, view: View) -> dict[str, Any]:
         return {

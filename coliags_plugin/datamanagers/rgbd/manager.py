@@ -100,10 +100,10 @@ class RGBDDataManager(RecordedDataManager):
         camera = find_camera(path, frames.pictures[0])
         scale = self._depth_scale(camera, path) if depths else None
         form = None if scale is None else DepthSteps(1.0 / scale)
-        view = View.of_pinhole(camera.pinhole, camera.width, camera.height, camera.path, settings.size)
-        # Masks are numbered by picture, so that a picture left out, or gone, would put them out of step.
+        size = self.working_size(camera.width, camera.height)
+        view = View.of_pinhole(camera.pinhole, camera.width, camera.height, camera.path, size)
         complete = len(frames.pictures) == len(pictures) == len(trajectory)
-        seen = seen_marks(path, len(pictures), settings, "every-8th") if complete else {}
+        seen = seen_marks(path / "truth", len(pictures), complete)
         masks = find_masks(path, frames.pictures)
         shots = [
             Shot(

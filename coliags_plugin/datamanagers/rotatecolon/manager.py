@@ -11,7 +11,6 @@ import torch
 from pydantic import Field
 
 from coliags_plugin.datamanagers.fusion import load_points
-from coliags_plugin.datamanagers.reading.frame_files import marks
 from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
@@ -19,7 +18,7 @@ from coliags_plugin.datamanagers.rotatecolon.depth_scale import fit_scale
 from coliags_plugin.datamanagers.rotatecolon.exr_depth import ExrDepth
 from coliags_plugin.datamanagers.rotatecolon.files import POINTS, ViewFiles, find_test, find_train, recognise
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
-from coliags_plugin.datamanagers.seen import ROTATION
+from coliags_plugin.datamanagers.seen import ROTATION, seen_marks
 from coliags_plugin.datamanagers.splits import Split
 from coliags_plugin.datamanagers.views import View
 from coliags_plugin.lenses import Pinhole
@@ -53,13 +52,16 @@ class RotateColonDataManager(RecordedDataManager):
 
     The views of transforms_test.json, which have no depth, are the test set ``test``; where a split holds out training
     views, these are ``test`` and the others ``rotation``. ``truth/seen/NNNN_seen.png`` marks what all training views
-    see of them.
+    see of the views of transforms_test.json.
     """
 
     Settings = RotateColonSettings
 
     settings: RotateColonSettings
     name = "rotatecolon"
+    #: What is published was made at the pictures' own size.
+    fits = None
+    seen_split = "all-train"
 
     @classmethod
     def recognise(cls, path: Path) -> str | None:
@@ -75,9 +77,7 @@ class RotateColonDataManager(RecordedDataManager):
         name = ROTATION if holds_out else _MAIN_SET
         test_sets = {}
         if test is not None:
-            # Marks say what all training views see; with fewer of them they would be wrong.
-            whole = not holds_out and settings.frame_step == 1 and settings.max_frames is None
-            seen = marks(path / "truth" / "seen", "seen", len(test.images)) if whole else {}
+            seen = seen_marks(path / "truth", len(test.images), complete=not train.unposed and not test.unposed)
             test_sets[name], facts[name] = self._shots(test, seen, "test-")
         points = path / POINTS
         facts["depth_against_points"] = self._compared(shots, points)
@@ -108,7 +108,7 @@ class RotateColonDataManager(RecordedDataManager):
         focal = 0.5 * width / math.tan(0.5 * files.angle)
         # In the middle of the picture; the corner of its first pixel lies at -0.5.
         pinhole = Pinhole(focal, focal, 0.5 * width - 0.5, 0.5 * height - 0.5)
-        view = View.of_pinhole(pinhole, width, height, files.images[0], settings.size)
+        view = View.of_pinhole(pinhole, width, height, files.images[0], self.working_size(width, height))
         depth_format = ExrDepth(settings.depth_channel, settings.depth_divisor)
         depths = files.depths or (None,) * len(files.images)
         shots = [

@@ -1,0 +1,152 @@
+"""Held-out figures over a whole training run, one row every so many steps.
+
+    python benchmarks/training_curve.py --data PHANTOM --method coliags --out RUN --threads 1
+
+RUN becomes a run folder as `coliags train` makes it, with `curve.jsonl` beside its log. A killed curve goes on where it
+was when the same command is given again. Seconds are those of training alone; looking at the views does not count.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import resource
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("GOMP_SPINCOUNT", "10000")  # as the command line does; read when torch is first imported
+
+import torch
+import tyro
+
+from coliags_plugin.components import make_component
+from coliags_plugin.contracts import Metric
+from coliags_plugin.engine.backends import choose_device
+from coliags_plugin.engine.data_formats import load_method_for
+from coliags_plugin.engine.evaluator import MAIN_SET
+from coliags_plugin.engine.run_folder import RunFolder
+from coliags_plugin.engine.trained import load_scene
+from coliags_plugin.engine.trainer import Trainer
+from coliags_plugin.errors import UnavailableError
+from coliags_plugin.files import atomic_write
+from coliags_plugin.metrics.protocols import PaperProtocol
+from coliags_plugin.scenes import Frame
+
+#: Figures of protocol `paper` that a curve holds; LPIPS would cost more than the training between two looks.
+METRICS = ("psnr", "ssim", "depth_mse", "depth_mse_inner", "depth_median_error")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Train and look at the held-out views every so often."""
+
+    data: Path
+    """The scene's folder."""
+    out: Path
+    """Run folder; goes on where it was if it is there."""
+    method: str = "coliags"
+    """Method config."""
+    steps: int = 30_000
+    """Training steps."""
+    every: int = 1000
+    """Steps between looks."""
+    seed: int = 0
+    """Seed of every random stream."""
+    threads: int | None = None
+    """Threads to compute with; default: torch's own choice."""
+    set: tuple[str, ...] = ()
+    """Change a value of the method config, for instance strategy.name=none."""
+    device: str = "auto"
+    """Where to compute."""
+
+
+@torch.no_grad()
+def look(trainer: Trainer, frames: list[Frame], metrics: dict[str, Metric], seen_only: bool) -> dict[str, float]:
+    """Means over frames, of all pixels or of those that training frames see where the frames tell."""
+    protocol = PaperProtocol()
+    wants = tuple(sorted({"rgb", "alpha"} | protocol.wants))
+    rows: list[dict[str, float]] = []
+    for frame in frames:
+        placed = frame.to(trainer.device)
+        comparison = protocol.compare(trainer.chosen.renderer.render(trainer.field, placed.camera, wants), placed)
+        if seen_only and placed.seen is not None:
+            depth_valid = None if comparison.depth_valid is None else comparison.depth_valid & placed.seen
+            comparison = replace(comparison, valid=comparison.valid & placed.seen, depth_valid=depth_valid)
+        row = {}
+        for name, metric in metrics.items():
+            try:
+                row[name] = metric(comparison)
+            except UnavailableError:
+                continue
+        rows.append(row)
+    found = {name: [row[name] for row in rows if name in row] for name in metrics}
+    return {name: sum(values) / len(values) for name, values in found.items() if values}
+
+
+def curve_row(trainer: Trainer, metrics: dict[str, Metric], taken: dict[str, Any], seconds: float) -> dict[str, Any]:
+    """One row of the curve."""
+    row: dict[str, Any] = {"step": trainer.step}
+    for name, frames in trainer.scene.test_sets.items():
+        beside = name != MAIN_SET  # views turned away from the path show what no training frame did
+        figures = look(trainer, frames, metrics, seen_only=beside)
+        row |= {f"{name}_{key}" if beside else key: value for key, value in figures.items()}
+    return {
+        **row,
+        "anchors": len(trainer.field.get_buffer("anchors")),
+        "gaussians": taken["gaussians"],
+        "train_psnr": taken["psnr"],
+        "loss": taken["loss"],
+        "seconds": round(seconds, 1),
+        "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
+    }
+
+
+def rows_until(path: Path, step: int) -> list[dict[str, Any]]:
+    """The rows of a curve up to a step."""
+    if not path.is_file():
+        return []
+    return [row for line in path.read_text(encoding="utf-8").splitlines() if (row := json.loads(line))["step"] <= step]
+
+
+def main(options: Options) -> None:
+    """Train to the end, or go on."""
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    if options.threads is not None:
+        torch.set_num_threads(options.threads)
+    changes = [*options.set, f"schedule.steps={options.steps}"]
+    method = load_method_for(options.data, options.method, changes, None)
+    scene = load_scene(method.config, options.data)
+    run = RunFolder(options.out)
+    trainer = Trainer(method, scene, str(options.data.resolve()), run, options.seed, choose_device(options.device))
+    curve = options.out / "curve.jsonl"
+    if any(run.checkpoints.glob("step-*")):
+        trainer.resume()
+    else:
+        trainer.start(overwrite=True)
+    metrics: dict[str, Metric] = {}
+    for name in METRICS:
+        component = make_component("metrics", {"name": name})
+        metrics[name] = component.target(component.settings)
+    rows = rows_until(curve, trainer.step)
+    seconds = float(rows[-1]["seconds"]) if rows else 0.0
+    while trainer.step < options.steps:
+        began = time.perf_counter()
+        events: dict[str, int] = {}
+        while True:
+            taken = trainer.take_step()
+            for name in ("grown", "pruned"):
+                events[name] = events.get(name, 0) + taken.get(name, 0)
+            if trainer.step % options.every == 0 or trainer.step == options.steps:
+                break
+        seconds += time.perf_counter() - began
+        rows.append({**curve_row(trainer, metrics, taken, seconds), **events})
+        print(json.dumps(rows[-1]), flush=True)
+        trainer.save()
+        atomic_write(curve, "".join(json.dumps(row) + "\n" for row in rows))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

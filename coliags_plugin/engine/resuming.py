@@ -1,0 +1,109 @@
+"""Going on with a run: with its own method, its own data, and a schedule that changes only on purpose."""
+
+from __future__ import annotations
+
+import logging
+import shlex
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from coliags_plugin.config import LoadedMethod, MethodConfig, method_name
+from coliags_plugin.engine.data_formats import load_method_for
+from coliags_plugin.engine.run_folder import RunFolder
+from coliags_plugin.errors import InputError
+from coliags_plugin.scenes import Scene
+
+logger = logging.getLogger(__name__)
+
+
+def resume_command(run: RunFolder, method: str, data: str) -> str:
+    """The command that goes on with a run."""
+    return shlex.join(["coliags", "train", method, "--data", data, "--output", str(run.path), "--resume"])
+
+
+def resumed_method(
+    run: RunFolder, method: str, data: Path, overrides: Sequence[str] = (), data_format: str | None = None
+) -> LoadedMethod:
+    """A run's own method, whatever the config of that name says by now, with the overrides on top.
+
+    Args:
+        run: The run.
+        method: Name or path of the method the user believes it to be of.
+        data: The scene's folder.
+        overrides: ``key.path=value`` assignments.
+        data_format: A data manager's name, or None for the run's own.
+
+    Raises:
+        InputError: The run is of another method, or its config is damaged.
+    """
+    owner = run.provenance().get("method")
+    if owner != method_name(method):
+        raise InputError(f"{run.path} is a run of method '{owner}'", f"one of '{method_name(method)}'")
+    loaded = load_method_for(data, str(run.config_file.resolve()), overrides, data_format)
+    return replace(loaded, name=owner)
+
+
+def resumed_seed(run: RunFolder, asked: int | None) -> int:
+    """A run's own seed.
+
+    Raises:
+        InputError: Another one was asked for.
+    """
+    seed: int = run.provenance()["seed"]
+    if asked not in (None, seed):
+        raise InputError(f"--seed {asked} for {run.path}, which was started with seed {seed}", "no --seed, or that one")
+    return seed
+
+
+def check_same_run(run: RunFolder, method: LoadedMethod, scene: Scene, scene_path: str) -> None:
+    """Refuse to go on with another method, other settings (the schedule apart) or other data.
+
+    Raises:
+        InputError: See above.
+    """
+    provenance = run.provenance()
+    if provenance.get("method") != method.name:
+        raise InputError(f"{run.path} is a run of method '{provenance.get('method')}'", f"one of '{method.name}'")
+    ignored = {"schedule", "description"}
+    saved = run.method().config.model_dump(exclude=ignored)
+    now = method.config.model_dump(exclude=ignored)
+    differing = [key for key in now if now[key] != saved[key]]
+    if differing:
+        raise InputError(
+            f"{run.path} was trained with other settings of {', '.join(differing)}",
+            "the settings it was started with",
+            f"Compare with {run.config_file}",
+        )
+    if provenance["scene"]["provenance"].get("fingerprint") != scene.provenance.get("fingerprint"):
+        raise InputError(f"{scene_path} is not the data this run was started on", "unchanged data")
+
+
+def record_schedule(run: RunFolder, config: MethodConfig, step: int) -> None:
+    """Write a schedule that differs from the run's own into its config, and the change into its provenance.
+
+    Args:
+        run: The run.
+        config: What it goes on with.
+        step: Steps it has taken.
+
+    Raises:
+        InputError: The schedule ends before that step.
+    """
+    before, now = run.method().config.schedule, config.schedule
+    if now.steps < step:
+        raise InputError(f"{run.path} has taken {step} steps already", f"--steps {step} or more, not {now.steps}")
+    if now == before:
+        return
+    provenance = run.provenance()
+    change = {"at_step": step, "from": before.model_dump(), "to": now.model_dump()}
+    changes = [*provenance.get("schedule_changes", []), change]
+    run.rewrite(config.to_yaml(), {**provenance, "steps": now.steps, "schedule_changes": changes})
+    logger.warning(
+        "the schedule changes at step %d from %d to %d steps: rates and weights jump there, and the result is not that "
+        "of a run of %d steps",
+        step,
+        before.steps,
+        now.steps,
+        now.steps,
+    )
