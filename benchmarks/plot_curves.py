@@ -31,6 +31,7 @@ WIDTH, HEIGHT, LEGEND = 600, 300, 24
 
 STYLE = """
 text { font-family: system-ui, sans-serif; fill: #1b1f24; font-size: 13px; }
+.chart { overflow: visible; }
 .chart .tick { fill: #5b6470; font-size: 12.5px; }
 .frame { fill: none; stroke: #5b6470; stroke-width: 1; }
 .grid { fill: none; stroke: #e9ecf0; stroke-width: 1; }
