@@ -22,6 +22,7 @@ os.environ.setdefault("GOMP_SPINCOUNT", "10000")  # as the command line does; re
 import torch
 import tyro
 
+from coliags_plugin.cli.arguments import Assignments
 from coliags_plugin.components import make_component
 from coliags_plugin.contracts import Metric
 from coliags_plugin.engine.backends import choose_device
@@ -57,7 +58,7 @@ class Options:
     """Seed of every random stream."""
     threads: int | None = None
     """Threads to compute with; default: torch's own choice."""
-    set: tuple[str, ...] = ()
+    set: Assignments = ()
     """Change a value of the method config, for instance strategy.name=none."""
     device: str = "auto"
     """Where to compute."""
