@@ -28,6 +28,8 @@ PANELS = (
 # As in the report.
 COLORS = ("#0b62b0", "#c8500a", "#15803d", "#a2307f", "#8a6a00", "#0e7c86", "#6d4bc3", "#b3261e")
 WIDTH, HEIGHT, LEGEND = 600, 300, 24
+#: Room to the right for the last tick label.
+MARGIN = 16
 
 STYLE = """
 text { font-family: system-ui, sans-serif; fill: #1b1f24; font-size: 13px; }
@@ -84,10 +86,11 @@ def picture(curves: list[tuple[str, list[dict[str, Any]]]], keys: list[str]) -> 
     charts = [chart for chart in charts if chart]
     height = head + HEIGHT * -(-len(charts) // 2)
     colors = "".join(f".s{index} {{ color: {color}; }}" for index, color in enumerate(COLORS))
+    width = 2 * WIDTH + MARGIN
     parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {2 * WIDTH} {height}" width="{2 * WIDTH}">',
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}">',
         f"<style>{STYLE}{colors}</style>",
-        f'<rect width="{2 * WIDTH}" height="{height}" fill="#ffffff"/>',
+        f'<rect width="{width}" height="{height}" fill="#ffffff"/>',
         *legend([name for name, _ in curves], LEGEND - 4),
     ]
     for index, chart in enumerate(charts):
