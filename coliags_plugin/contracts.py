@@ -155,7 +155,7 @@ class Strategy(ABC):
 
     @abstractmethod
     def plan(self) -> str:
-        """What it will do and between which steps, or why it will do nothing, for the log when training starts."""
+        """One sentence for the log at the start: the steps at which it grows or prunes, or why it will not."""
 
     @abstractmethod
     def after_backward(

@@ -52,8 +52,9 @@ def with_valid_marks(
         path: The scene, for the log.
     """
     meant, _ = divide(split, range(len(recording.shots)), recording.own_split)
-    if set(meant) == set(train):
-        shots = [_unmarked(shot) if place in meant else shot for place, shot in enumerate(recording.shots)]
+    trained = set(train)
+    if set(meant) == trained:
+        shots = [_unmarked(shot) if place in trained else shot for place, shot in enumerate(recording.shots)]
         return replace(recording, shots=shots)
     tested = bool(test or recording.test_sets)
     if tested and any(shot.seen for shots in (recording.shots, *recording.test_sets.values()) for shot in shots):

@@ -25,7 +25,7 @@ def resume_command(run: RunFolder, method: str, data: str) -> str:
 def resumed_method(
     run: RunFolder, method: str, data: Path, overrides: Sequence[str] = (), data_format: str | None = None
 ) -> LoadedMethod:
-    """A run's own method, whatever the config of that name says by now, with the overrides on top.
+    """Load the method config stored in a run folder, with the overrides applied to it.
 
     Args:
         run: The run.
@@ -37,11 +37,16 @@ def resumed_method(
     Raises:
         InputError: The run is of another method, or its config is damaged.
     """
-    owner = run.provenance().get("method")
-    if owner != method_name(method):
-        raise InputError(f"{run.path} is a run of method '{owner}'", f"one of '{method_name(method)}'")
+    name = method_name(method)
+    _check_method(run, name)
     loaded = load_method_for(data, str(run.config_file.resolve()), overrides, data_format)
-    return replace(loaded, name=owner)
+    return replace(loaded, name=name)
+
+
+def _check_method(run: RunFolder, name: str) -> None:
+    owner = run.provenance().get("method")
+    if owner != name:
+        raise InputError(f"{run.path} is a run of method '{owner}'", f"one of '{name}'")
 
 
 def resumed_seed(run: RunFolder, asked: int | None) -> int:
@@ -62,9 +67,7 @@ def check_same_run(run: RunFolder, method: LoadedMethod, scene: Scene, scene_pat
     Raises:
         InputError: See above.
     """
-    provenance = run.provenance()
-    if provenance.get("method") != method.name:
-        raise InputError(f"{run.path} is a run of method '{provenance.get('method')}'", f"one of '{method.name}'")
+    _check_method(run, method.name)
     ignored = {"schedule", "description"}
     saved = run.method().config.model_dump(exclude=ignored)
     now = method.config.model_dump(exclude=ignored)
@@ -75,7 +78,7 @@ def check_same_run(run: RunFolder, method: LoadedMethod, scene: Scene, scene_pat
             "the settings it was started with",
             f"Compare with {run.config_file}",
         )
-    if provenance["scene"]["provenance"].get("fingerprint") != scene.provenance.get("fingerprint"):
+    if run.provenance()["scene"]["provenance"].get("fingerprint") != scene.provenance.get("fingerprint"):
         raise InputError(f"{scene_path} is not the data this run was started on", "unchanged data")
 
 

@@ -1,4 +1,4 @@
-"""Where new anchors go: at most one in every cell that no anchor holds."""
+"""Choosing positions of new anchors: at most one in every grid cell that holds no anchor."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ class NoStrategy(Strategy):
     Settings: ClassVar[type[Settings]] = NoStrategySettings
 
     def plan(self) -> str:
-        """That nothing will happen."""
+        """The sentence for the log: no growing, no pruning."""
         return "this run neither grows nor prunes: strategy none"
 
     def after_backward(
