@@ -102,11 +102,12 @@ def record_schedule(run: RunFolder, config: MethodConfig, step: int) -> None:
     change = {"at_step": step, "from": before.model_dump(), "to": now.model_dump()}
     changes = [*provenance.get("schedule_changes", []), change]
     run.rewrite(config.to_yaml(), {**provenance, "steps": now.steps, "schedule_changes": changes})
-    logger.warning(
-        "the schedule changes at step %d from %d to %d steps: rates and weights jump there, and the result is not that "
-        "of a run of %d steps",
-        step,
-        before.steps,
-        now.steps,
-        now.steps,
-    )
+    if (now.steps, now.written_for) != (before.steps, before.written_for):
+        logger.warning(
+            "the schedule changes at step %d from %d to %d steps: rates and weights jump there, and the result is not "
+            "that of a run of %d steps",
+            step,
+            before.steps,
+            now.steps,
+            now.steps,
+        )
