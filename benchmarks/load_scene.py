@@ -43,8 +43,8 @@ class Options:
 
 def write_sequence(folder: Path, frames: int, width: int, height: int) -> Path:
     """A few phantom frames over and over, each time from a little further on."""
-    from coliags_plugin.datamanagers.phantom.generate import generate
-    from coliags_plugin.datamanagers.phantom.settings import PhantomSettings
+    from coliags_plugin.phantom.generate import generate
+    from coliags_plugin.phantom.settings import PhantomSettings
 
     coarse = {"mesh_spacing": 1.0, "texture_spacing": 0.3, "interreflection": 0.0, "rotation_views": 0}
     made = folder / "originals"

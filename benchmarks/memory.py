@@ -41,7 +41,7 @@ def train(options: Options) -> tuple[float, float]:
     """Resident memory before the first step and at the peak, MiB."""
     from tube import tube_scene
 
-    from coliags_plugin.config import load_method
+    from coliags_plugin.config.method_config import load_method
     from coliags_plugin.engine.run_folder import RunFolder
     from coliags_plugin.engine.trainer import Trainer
 

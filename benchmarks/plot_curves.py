@@ -13,7 +13,7 @@ from typing import Any
 
 import tyro
 
-from coliags_plugin.files import atomic_write
+from coliags_plugin.core.files import atomic_write
 from coliags_plugin.outputs.charts import Series, line_chart
 
 #: What is drawn: key of a row, axis label, whether the axis is logarithmic.

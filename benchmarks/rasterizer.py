@@ -28,12 +28,12 @@ from machine import describe_machine, markdown_table, write_results
 from train_step import Handed
 from workload import camera, wall
 
-from coliags_plugin.components import make_component
+from coliags_plugin.config.components import make_component
+from coliags_plugin.config.registry import REGISTRIES
 from coliags_plugin.contracts import Renderer
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.engine.backends import choose_renderer
-from coliags_plugin.errors import InputError
-from coliags_plugin.gaussians import Gaussians
-from coliags_plugin.registry import REGISTRIES
 
 INPUTS = ("means", "quats_wxyz", "scales", "opacities", "colors")
 WANTS = ("rgb", "alpha", "depth_accumulated")

@@ -16,8 +16,8 @@ import tyro
 from machine import describe_machine, markdown_table, write_results
 from tube import tube_scene
 
-from coliags_plugin.components import make_component
-from coliags_plugin.config import load_method
+from coliags_plugin.config.components import make_component
+from coliags_plugin.config.method_config import load_method
 from coliags_plugin.engine.backends import choose_device, choose_renderer
 
 

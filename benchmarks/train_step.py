@@ -22,11 +22,11 @@ from machine import describe_machine, markdown_table, write_results
 from torch import Tensor
 from tube import tube_scene
 
-from coliags_plugin.config import load_method
+from coliags_plugin.config.method_config import load_method
+from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.engine.backends import choose_device
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer
-from coliags_plugin.gaussians import Gaussians
 
 STAGES = ("decode", "render", "loss", "loss backward", "render backward", "decode backward", "strategy", "optimiser")
 

@@ -23,18 +23,18 @@ import torch
 import tyro
 
 from coliags_plugin.cli.arguments import Assignments
-from coliags_plugin.components import make_component
+from coliags_plugin.config.components import make_component
 from coliags_plugin.contracts import Metric
+from coliags_plugin.core.errors import UnavailableError
+from coliags_plugin.core.files import atomic_write
+from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.backends import choose_device
 from coliags_plugin.engine.data_formats import load_method_for
 from coliags_plugin.engine.evaluator import MAIN_SET
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trained import load_scene
 from coliags_plugin.engine.trainer import Trainer
-from coliags_plugin.errors import UnavailableError
-from coliags_plugin.files import atomic_write
 from coliags_plugin.metrics.protocols import PaperProtocol
-from coliags_plugin.scenes import Frame
 
 #: Figures of protocol `paper` that a curve holds; LPIPS would cost more than the training between two looks.
 METRICS = ("psnr", "ssim", "depth_mse", "depth_mse_inner", "depth_median_error")

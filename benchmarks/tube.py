@@ -6,8 +6,8 @@ import math
 
 import torch
 
-from coliags_plugin.cameras import Camera
-from coliags_plugin.scenes import Frame, PointCloud, Scene
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 
 RADIUS = 20.0
 DEPTH_LIMIT = 100.0

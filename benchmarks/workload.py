@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from coliags_plugin.cameras import Camera
-from coliags_plugin.gaussians import Gaussians
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.gaussians import Gaussians
 
 WIDTH, HEIGHT, FOCAL = 338, 270, 200.0
 #: The wall: radius and its spread, and where it begins and ends before the camera. Millimetres.

@@ -15,11 +15,11 @@ from pydantic import model_validator
 from torch import Tensor, nn
 from typing_extensions import Self
 
-from coliags_plugin.cameras import Camera
-from coliags_plugin.gaussians import Gaussians, RenderOutput
-from coliags_plugin.progress import Progress
-from coliags_plugin.scenes import Frame, Scene
-from coliags_plugin.settings import Settings, refuse_zero_ends
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.gaussians import Gaussians, RenderOutput
+from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.scenes import Frame, Scene
+from coliags_plugin.core.settings import Settings, refuse_zero_ends
 
 
 class DataManager(ABC):
@@ -112,7 +112,7 @@ class Renderer(ABC):
         Args:
             field: What to draw; its ``primitive`` must be one this renderer serves.
             camera: Where from.
-            wants: Names from :data:`coliags_plugin.gaussians.OUTPUTS`; rgb and alpha always come.
+            wants: Names from :data:`coliags_plugin.core.gaussians.OUTPUTS`; rgb and alpha always come.
             pixels: For renderers of radiance fields: only these pixels. Splatting renderers draw whole images.
         """
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import torch
 
-from coliags_plugin.cameras import Camera
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
-from coliags_plugin.lenses import Pinhole
-from coliags_plugin.scenes import Frame, PointCloud, Scene
+from coliags_plugin.lenses.models import Pinhole
 
 
 def camera_at(x: float, y: float, z: float, width: int = 32, height: int = 24, yaw: float = 0.0) -> Camera:

@@ -18,14 +18,14 @@ from coliags_plugin import cli
 from coliags_plugin.cli.config import Config
 from coliags_plugin.cli.phantom import Phantom
 from coliags_plugin.cli.train import Train
-from coliags_plugin.config import MethodConfig, OptimizerSettings, ScheduleSettings, load_method
-from coliags_plugin.datamanagers.phantom.settings import PRESETS, PhantomSettings
+from coliags_plugin.config.method_config import MethodConfig, OptimizerSettings, ScheduleSettings, load_method
+from coliags_plugin.config.registry import REGISTRIES, datamanagers
+from coliags_plugin.core.gaussians import OUTPUTS
+from coliags_plugin.core.settings import Settings
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
 from coliags_plugin.datamanagers.splits import held_out
 from coliags_plugin.engine.randomness import PURPOSES
-from coliags_plugin.gaussians import OUTPUTS
-from coliags_plugin.registry import REGISTRIES, datamanagers
-from coliags_plugin.settings import Settings
+from coliags_plugin.phantom.settings import PRESETS, PhantomSettings
 from tests.scenes import SMALL, write_wall
 
 ROOT = Path(__file__).parents[1]
@@ -179,7 +179,7 @@ def test_commands_parse(page, command, monkeypatch, capsys):
         assert load_method(found.method, overrides).config
     if isinstance(found, Phantom):
         made = []
-        monkeypatch.setattr("coliags_plugin.datamanagers.phantom.generate.generate", lambda *a, **k: made.append(a))
+        monkeypatch.setattr("coliags_plugin.phantom.generate.generate", lambda *a, **k: made.append(a))
         found.run()
         assert made
 

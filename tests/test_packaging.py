@@ -32,7 +32,7 @@ def test_wheel_contents(wheel):
     configs = {
         f"coliags_plugin/{path.relative_to(ROOT).as_posix()}" for path in (ROOT / "method_configs").rglob("*.yaml")
     }
-    assert sources | configs | {"coliags_plugin/py.typed", "coliags_plugin/engine/page_template.html"} <= names
+    assert sources | configs | {"coliags_plugin/py.typed", "coliags_plugin/outputs/page_template.html"} <= names
     assert {name.split("/")[0] for name in names} == {"coliags_plugin", f"coliags_plugin-{__version__}.dist-info"}
     assert "License-Expression: Apache-2.0" in metadata
     assert f"Version: {__version__}" in metadata
@@ -44,7 +44,7 @@ def test_methods_are_found_inside_an_installed_wheel(wheel, tmp_path):
     """Unpacked alone, as pip would install it: the configs come from inside the package."""
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(tmp_path)
-    code = "import coliags_plugin.methods as m; print(m.method_folder()); print(*m.method_names())"
+    code = "import coliags_plugin.config.method_files as m; print(m.method_folder()); print(*m.method_names())"
     shown = subprocess.run(
         [sys.executable, "-I", "-c", f"import sys; sys.path.insert(0, {str(tmp_path)!r}); {code}"],
         check=True,

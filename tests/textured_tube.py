@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from coliags_plugin.cameras import Camera
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
-from coliags_plugin.lenses import Pinhole
-from coliags_plugin.scenes import Frame
+from coliags_plugin.lenses.models import Pinhole
 
 RADIUS, END = 20.0, 60.0
 WIDTH, HEIGHT = 160, 128

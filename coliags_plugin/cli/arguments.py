@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from coliags_plugin.errors import InputError
+from coliags_plugin.core.errors import InputError
 
 #: ``--set key=value``, as often as needed.
 Assignments = Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="KEY=VALUE"), tyro.conf.UseAppendAction]

@@ -25,7 +25,7 @@ class Config:
 
     def run(self) -> None:
         """Print YAML."""
-        from coliags_plugin.config import load_method
+        from coliags_plugin.config.method_config import load_method
 
         loaded = load_method(self.method, self.set)
         print(loaded.with_origins() if self.origin else loaded.config.to_yaml(), end="")

@@ -31,12 +31,12 @@ class Data:
 
     def run(self) -> None:
         """Print what was found."""
-        from coliags_plugin.engine.data_check.check import check_scene
-        from coliags_plugin.engine.data_check.page import write_check_page
-        from coliags_plugin.engine.data_check.text import lines
+        from coliags_plugin.core.files import write_json
+        from coliags_plugin.data_check.check import check_scene
+        from coliags_plugin.data_check.page import write_check_page
+        from coliags_plugin.data_check.text import lines
         from coliags_plugin.engine.data_formats import open_scene
         from coliags_plugin.engine.progress import progress_callback
-        from coliags_plugin.files import write_json
 
         with progress_callback() as progress:
             check = check_scene(open_scene(self.scene, self.format, self.set, progress), progress)

@@ -32,8 +32,8 @@ class Evaluate:
 
         from coliags_plugin.engine.backends import choose_device
         from coliags_plugin.engine.evaluator import evaluate
-        from coliags_plugin.engine.figures_table import figures_table
         from coliags_plugin.engine.trained import load_trained
+        from coliags_plugin.reporting.metrics_table import figures_table
 
         trained = load_trained(self.path, choose_device(self.device), self.data)
         folder = evaluate(trained, self.protocol or trained.config.protocol)

@@ -16,9 +16,9 @@ class List:
 
     def run(self) -> None:
         """Print names by kind, with where they come from unless built in."""
-        from coliags_plugin.errors import InputError, did_you_mean
-        from coliags_plugin.methods import method_descriptions
-        from coliags_plugin.registry import REGISTRIES
+        from coliags_plugin.config.method_files import method_descriptions
+        from coliags_plugin.config.registry import REGISTRIES
+        from coliags_plugin.core.errors import InputError, did_you_mean
 
         kinds = ["methods", *REGISTRIES]
         if self.kind not in ("all", *kinds):

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import tyro
 
 from coliags_plugin.cli.arguments import Assignments, OptionalText, parse_size, parse_vector
-from coliags_plugin.datamanagers.phantom.layouts import LayoutName
+from coliags_plugin.phantom.layouts import LayoutName
 
 
 @dataclass(frozen=True)
@@ -45,11 +45,11 @@ class Phantom:
 
     def run(self) -> None:
         """Generate and say where."""
-        from coliags_plugin.datamanagers.phantom.generate import generate
-        from coliags_plugin.datamanagers.phantom.settings import phantom_settings
+        from coliags_plugin.config.yaml_tree import parse_value
+        from coliags_plugin.core.errors import InputError
         from coliags_plugin.engine.progress import progress_callback
-        from coliags_plugin.errors import InputError
-        from coliags_plugin.yaml_tree import parse_value
+        from coliags_plugin.phantom.generate import generate
+        from coliags_plugin.phantom.settings import phantom_settings
 
         options: dict[str, Any] = {
             "seed": self.seed,

@@ -29,7 +29,7 @@ class Report:
 
     def run(self) -> None:
         """Write the report, and say where."""
-        from coliags_plugin.engine.report import write_report
+        from coliags_plugin.reporting.html_report import write_report
 
         write_report(self.runs, self.output, self.protocol, self.frames, self.title, self.note)
         print(self.output.resolve())

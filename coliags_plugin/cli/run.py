@@ -6,7 +6,7 @@ import logging
 import sys
 from typing import Protocol
 
-from coliags_plugin.errors import ReportedError
+from coliags_plugin.core.errors import ReportedError
 
 
 class Runnable(Protocol):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from coliags_plugin.core.settings import Settings
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
-from coliags_plugin.settings import Settings
 
 
 class AutoDataManager:

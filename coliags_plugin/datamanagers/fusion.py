@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.scenes import Frame, PointCloud
 from coliags_plugin.datamanagers.reading.ply_vertices import read_vertices
 from coliags_plugin.datamanagers.reading.side_by_side import side_by_side
-from coliags_plugin.errors import InputError
-from coliags_plugin.progress import Progress
-from coliags_plugin.scenes import Frame, PointCloud
 
 log = logging.getLogger(__name__)
 

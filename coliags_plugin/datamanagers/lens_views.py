@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped, UInt8
 
 from coliags_plugin.datamanagers.views import View
-from coliags_plugin.lenses import Lens, Pinhole
-from coliags_plugin.undistortion import Undistortion
+from coliags_plugin.lenses.models import Lens, Pinhole
+from coliags_plugin.lenses.undistortion import Undistortion
 
 #: Undistortions kept at a time: as many as pictures are read side by side.
 _KEPT = 8

@@ -14,6 +14,9 @@ import numpy as np
 import torch
 
 from coliags_plugin.contracts import DataManager
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.datamanagers.fusion import fuse_depth, read_points, thinned
 from coliags_plugin.datamanagers.recording import Recording, Shot
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
@@ -21,9 +24,6 @@ from coliags_plugin.datamanagers.seen import with_valid_marks
 from coliags_plugin.datamanagers.splits import Split, divide
 from coliags_plugin.datamanagers.stored_frames import StoredFrame, read_side_by_side
 from coliags_plugin.datamanagers.views import PAPER_SIZE, fitted
-from coliags_plugin.errors import InputError
-from coliags_plugin.progress import Progress
-from coliags_plugin.scenes import Frame, PointCloud, Scene
 
 log = logging.getLogger(__name__)
 

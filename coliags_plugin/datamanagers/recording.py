@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scenes import PointCloud, SparseDepth
 from coliags_plugin.datamanagers.reading.depth_formats import DepthFormat
 from coliags_plugin.datamanagers.views import View
-from coliags_plugin.errors import InputError
-from coliags_plugin.scenes import PointCloud, SparseDepth
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
+from coliags_plugin.core.settings import Settings
 from coliags_plugin.datamanagers.splits import Split
-from coliags_plugin.settings import Settings
 
 POINTS_FILE = "points3D.ply"
 Share = Annotated[float, Field(ge=0.0, le=1.0)]

@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Bool, Float, Shaped, UInt8
 from torch import Tensor
 
+from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.reading.images import read_mask, read_rgb
 from coliags_plugin.datamanagers.reading.side_by_side import side_by_side
 from coliags_plugin.datamanagers.recording import Shot
-from coliags_plugin.progress import Progress
-from coliags_plugin.scenes import Frame
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Shaped, UInt8
 
-from coliags_plugin.cameras import Camera
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.reading.images import read_rgb, resize_nearest, resize_rgb
-from coliags_plugin.errors import InputError
-from coliags_plugin.lenses import Lens, Pinhole
-from coliags_plugin.undistortion import Undistortion
+from coliags_plugin.lenses.models import Lens, Pinhole
+from coliags_plugin.lenses.undistortion import Undistortion
 
 #: How far a raw frame's aspect ratio may be from the lens's: rounding to whole pixels, but no cropping.
 ASPECT_TOLERANCE = 0.02

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import torch
 
-from coliags_plugin.components import Component, make_component
+from coliags_plugin.config.components import Component, make_component
 from coliags_plugin.contracts import Renderer
-from coliags_plugin.errors import InputError
+from coliags_plugin.core.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,10 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from coliags_plugin.contracts import Field, Strategy
+from coliags_plugin.core.errors import InputError, NotFiniteError
+from coliags_plugin.core.files import atomic_folder
 from coliags_plugin.engine.optimizers import Optimizers
 from coliags_plugin.engine.randomness import FrameOrder
-from coliags_plugin.errors import InputError, NotFiniteError
-from coliags_plugin.files import atomic_folder
 
 FORMAT = 2
 

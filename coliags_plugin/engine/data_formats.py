@@ -10,16 +10,16 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_core import PydanticCustomError
 
-from coliags_plugin import registry
-from coliags_plugin.components import Component, make_component
-from coliags_plugin.config import LoadedMethod, load_method, method_tree
+from coliags_plugin.config import registry
+from coliags_plugin.config.components import Component, make_component
+from coliags_plugin.config.method_config import LoadedMethod, load_method, method_tree
+from coliags_plugin.config.yaml_tree import Node, override_all
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.scenes import Scene
 from coliags_plugin.datamanagers.recorded import NoPointsError
 from coliags_plugin.datamanagers.rgbd.files import lacks_trajectory
 from coliags_plugin.datamanagers.rgbd.unposed import UnposedRGBDDataManager
-from coliags_plugin.errors import InputError
-from coliags_plugin.progress import Progress
-from coliags_plugin.scenes import Scene
-from coliags_plugin.yaml_tree import Node, override_all
 
 log = logging.getLogger(__name__)
 

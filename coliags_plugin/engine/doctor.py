@@ -10,10 +10,11 @@ from importlib.metadata import PackageNotFoundError, version
 
 import torch
 
-from coliags_plugin import __version__, registry
-from coliags_plugin.components import make_component
+from coliags_plugin import __version__
+from coliags_plugin.config import registry
+from coliags_plugin.config.components import make_component
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.backends import choose_device, choose_renderer
-from coliags_plugin.errors import InputError
 
 #: Distribution -> module. Imported for real: a library that is installed may still fail to load.
 LIBRARIES = {

@@ -11,17 +11,17 @@ from typing import Any
 
 import torch
 
-from coliags_plugin import registry
-from coliags_plugin.components import make_component
+from coliags_plugin.config import registry
+from coliags_plugin.config.components import make_component
 from coliags_plugin.contracts import Comparison, Metric, Protocol
+from coliags_plugin.core.errors import InputError, UnavailableError
+from coliags_plugin.core.files import atomic_folder, atomic_write, write_json
+from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.provenance import software
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.errors import InputError, UnavailableError
-from coliags_plugin.files import atomic_folder, atomic_write, write_json
 from coliags_plugin.outputs.figures import DEPTH_ERROR_LIMIT_MM, depth_error_picture
 from coliags_plugin.outputs.pictures import eight_bit, write_depth_tiff, write_png
-from coliags_plugin.scenes import Frame
 
 #: The main test set: its figures stand at the top of metrics.json.
 MAIN_SET = "test"

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 import torch
 
-from coliags_plugin.config import OptimizerSettings
+from coliags_plugin.config.method_config import OptimizerSettings
 from coliags_plugin.contracts import Field, log_linear
-from coliags_plugin.errors import InputError
+from coliags_plugin.core.errors import InputError
 
 #: Everywhere in the splatting lineage (docs/methods.md 2.3).
 ADAM_EPSILON = 1e-15

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import atomic_folder
+from coliags_plugin.core.gaussians import RenderOutput
+from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.errors import InputError
-from coliags_plugin.files import atomic_folder
-from coliags_plugin.gaussians import RenderOutput
 from coliags_plugin.outputs.figures import (
     DEPTH_ERROR_LIMIT_MM,
     color_bar,
@@ -22,7 +23,6 @@ from coliags_plugin.outputs.figures import (
 )
 from coliags_plugin.outputs.pictures import eight_bit, write_png
 from coliags_plugin.outputs.video import write_video
-from coliags_plugin.scenes import Frame
 
 #: Full scale of the colour error pictures, parts of full scale.
 RGB_ERROR_LIMIT = 0.2

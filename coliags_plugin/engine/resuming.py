@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from coliags_plugin.config import LoadedMethod, MethodConfig, method_name
+from coliags_plugin.config.method_config import LoadedMethod, MethodConfig, method_name
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.data_formats import load_method_for
 from coliags_plugin.engine.run_folder import RunFolder
-from coliags_plugin.errors import InputError
-from coliags_plugin.scenes import Scene
 
 logger = logging.getLogger(__name__)
 

@@ -8,9 +8,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from coliags_plugin.config import LoadedMethod, load_method
-from coliags_plugin.errors import InputError
-from coliags_plugin.files import atomic_folder, atomic_write, write_json
+from coliags_plugin.config.method_config import LoadedMethod, load_method
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import atomic_folder, atomic_write, write_json
 
 FORMAT = 1
 

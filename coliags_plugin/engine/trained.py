@@ -8,15 +8,15 @@ from typing import Any
 
 import torch
 
-from coliags_plugin.config import MethodConfig
+from coliags_plugin.config.method_config import MethodConfig
 from coliags_plugin.contracts import Field, Renderer
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.backends import choose_renderer
 from coliags_plugin.engine.checkpoints import latest_checkpoint, read_checkpoint
 from coliags_plugin.engine.data_formats import chosen_datamanager
 from coliags_plugin.engine.progress import progress_callback
 from coliags_plugin.engine.run_folder import RunFolder
-from coliags_plugin.errors import InputError
-from coliags_plugin.scenes import Scene
 
 #: Seconds of reading from which on it is worth saying how far it is.
 READING_IS_LONG = 2.0

@@ -15,8 +15,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from coliags_plugin.config import LoadedMethod
+from coliags_plugin.config.method_config import LoadedMethod
 from coliags_plugin.contracts import Field, Loss, Schedule, Strategy
+from coliags_plugin.core.errors import InputError, InterruptedRunError, NotFiniteError
+from coliags_plugin.core.files import atomic_write
+from coliags_plugin.core.gaussians import RenderOutput
+from coliags_plugin.core.masked import masked_mean
+from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.engine import checkpoints
 from coliags_plugin.engine.backends import ChosenRenderer, choose_renderer
 from coliags_plugin.engine.optimizers import Optimizers
@@ -25,11 +30,6 @@ from coliags_plugin.engine.provenance import software
 from coliags_plugin.engine.randomness import FrameOrder, generators
 from coliags_plugin.engine.resuming import check_same_run, record_schedule, resume_command
 from coliags_plugin.engine.run_folder import RunFolder
-from coliags_plugin.errors import InputError, InterruptedRunError, NotFiniteError
-from coliags_plugin.files import atomic_write
-from coliags_plugin.gaussians import RenderOutput
-from coliags_plugin.masked import masked_mean
-from coliags_plugin.scenes import Frame, Scene
 
 logger = logging.getLogger(__name__)
 

@@ -13,15 +13,15 @@ from pydantic import Field as Option
 from torch import Tensor, nn
 from typing_extensions import Self
 
-from coliags_plugin.cameras import Camera
-from coliags_plugin.components import AppearanceHeadNode, GeometryHeadNode
+from coliags_plugin.config.components import AppearanceHeadNode, GeometryHeadNode
 from coliags_plugin.contracts import Field
-from coliags_plugin.errors import InputError
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.scenes import Scene
+from coliags_plugin.core.settings import Settings
 from coliags_plugin.fields.anchor_points import neighbour_log_scales, voxelize
 from coliags_plugin.fields.frustum import spheres_in_frustum
-from coliags_plugin.gaussians import Gaussians
-from coliags_plugin.scenes import Scene
-from coliags_plugin.settings import Settings
 
 logger = logging.getLogger(__name__)
 

@@ -9,9 +9,9 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
 
+from coliags_plugin.core.settings import Settings
 from coliags_plugin.fields.embedding import cosine_embedding
 from coliags_plugin.fields.perceptron import first_layer, perceptron
-from coliags_plugin.settings import Settings
 
 
 class AppearanceSettings(Settings):

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from coliags_plugin.cameras import Camera
+from coliags_plugin.core.cameras import Camera
 
 
 def spheres_in_frustum(

@@ -10,12 +10,12 @@ from pydantic import Field
 from torch import Tensor
 
 from coliags_plugin.contracts import Loss, LossSettings
-from coliags_plugin.errors import InputError
-from coliags_plugin.gaussians import RenderOutput
-from coliags_plugin.masked import masked_mean, zero_outside
-from coliags_plugin.scenes import Frame
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.gaussians import RenderOutput
+from coliags_plugin.core.masked import masked_mean, zero_outside
+from coliags_plugin.core.scenes import Frame
 
-#: :data:`coliags_plugin.gaussians.DEPTH_KINDS`, spelt out for the type checker; a test holds the two together.
+#: :data:`coliags_plugin.core.gaussians.DEPTH_KINDS`, spelt out for the type checker; a test holds the two together.
 DepthKind = Literal["depth_accumulated", "depth_expected", "depth_median", "inverse_depth_accumulated"]
 
 

@@ -8,10 +8,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from coliags_plugin.contracts import Loss, LossSettings
-from coliags_plugin.gaussians import RenderOutput
-from coliags_plugin.masked import masked_mean, zero_outside
-from coliags_plugin.scenes import Frame
-from coliags_plugin.ssim import ssim_map
+from coliags_plugin.core.gaussians import RenderOutput
+from coliags_plugin.core.masked import masked_mean, zero_outside
+from coliags_plugin.core.scenes import Frame
+from coliags_plugin.core.ssim import ssim_map
 
 
 class L1Loss(Loss):
@@ -29,7 +29,7 @@ class L1Loss(Loss):
 class DSSIMLoss(Loss):
     """1 - SSIM over valid pixels (the paper's L_D-SSIM; docs/methods.md 2.4, 4.1).
 
-    Ignored pixels are kept out of the windows too, see :func:`coliags_plugin.ssim.ssim_map`.
+    Ignored pixels are kept out of the windows too, see :func:`coliags_plugin.core.ssim.ssim_map`.
     """
 
     Settings: ClassVar[type[LossSettings]] = LossSettings

@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from coliags_plugin.contracts import Loss, LossSettings
-from coliags_plugin.gaussians import RenderOutput
-from coliags_plugin.scenes import Frame
+from coliags_plugin.core.gaussians import RenderOutput
+from coliags_plugin.core.scenes import Frame
 
 
 class ScaleVolumeLoss(Loss):

@@ -10,9 +10,9 @@ from pydantic import Field
 from torch import Tensor
 
 from coliags_plugin.contracts import Loss, LossSettings
-from coliags_plugin.gaussians import RenderOutput
+from coliags_plugin.core.gaussians import RenderOutput
+from coliags_plugin.core.scenes import Frame, SparseDepth
 from coliags_plugin.losses.depth import DepthKind
-from coliags_plugin.scenes import Frame, SparseDepth
 
 
 class SparseDepthSettings(LossSettings):

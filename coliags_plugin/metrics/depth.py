@@ -14,9 +14,9 @@ from pydantic import Field
 from torch import Tensor
 
 from coliags_plugin.contracts import Comparison, Metric
-from coliags_plugin.errors import UnavailableError
+from coliags_plugin.core.errors import UnavailableError
+from coliags_plugin.core.settings import Settings
 from coliags_plugin.metrics.depth_steps import depth_steps, near
-from coliags_plugin.settings import Settings
 
 
 class DepthSettings(Settings):

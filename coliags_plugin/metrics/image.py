@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from coliags_plugin.contracts import Comparison, Metric
-from coliags_plugin.errors import UnavailableError
-from coliags_plugin.settings import Settings
-from coliags_plugin.ssim import ssim
+from coliags_plugin.core.errors import UnavailableError
+from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.ssim import ssim
 
 
 class PSNRSettings(Settings):
@@ -46,7 +46,7 @@ class SSIMSettings(Settings):
 
 
 class SSIM(Metric):
-    """Structural similarity of :func:`coliags_plugin.ssim.ssim`, ignored pixels kept out of the windows."""
+    """Structural similarity of :func:`coliags_plugin.core.ssim.ssim`, ignored pixels kept out of the windows."""
 
     Settings: ClassVar[type[Settings]] = SSIMSettings
     higher_is_better: ClassVar[bool] = True

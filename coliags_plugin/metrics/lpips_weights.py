@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from coliags_plugin.errors import UnavailableError
+from coliags_plugin.core.errors import UnavailableError
 from coliags_plugin.metrics.lpips_network import TAPS, LPIPSNetwork
 
 WEIGHTS_VARIABLE = "COLIAGS_LPIPS_WEIGHTS"

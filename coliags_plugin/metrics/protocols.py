@@ -13,9 +13,9 @@ from typing import Any, ClassVar
 import torch
 
 from coliags_plugin.contracts import Comparison, Protocol
-from coliags_plugin.gaussians import RenderOutput
+from coliags_plugin.core.gaussians import RenderOutput
+from coliags_plugin.core.scenes import Frame
 from coliags_plugin.metrics.roundtrips import through_8_bit, through_16_bit
-from coliags_plugin.scenes import Frame
 
 MetricTable = Mapping[str, tuple[str, Mapping[str, Any]]]
 

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from coliags_plugin.errors import InputError
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.outputs.pictures import as_array
 from coliags_plugin.outputs.scales import linear_ticks, tick_label
 

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from coliags_plugin.errors import InputError
-from coliags_plugin.files import atomic_write
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import atomic_write
 
 if TYPE_CHECKING:
     from torch import Tensor

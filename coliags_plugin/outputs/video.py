@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from coliags_plugin.errors import InputError
-from coliags_plugin.files import make_folder, not_writable
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import make_folder, not_writable
 from coliags_plugin.outputs.pictures import as_array
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from coliags_plugin.errors import InputError
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.poses.endogslam import image_indices
 from coliags_plugin.poses.rigid import inverse, rigid, rotation_angles_deg
 from coliags_plugin.poses.trajectory import Trajectory

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from coliags_plugin.errors import InputError
-from coliags_plugin.files import atomic_write
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import atomic_write
 from coliags_plugin.poses.rigid import RIGID_TOLERANCE, check_rigid
 from coliags_plugin.poses.text import count_first_numbers, read_numbers
 from coliags_plugin.poses.trajectory import Trajectory

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from coliags_plugin.errors import InputError
-from coliags_plugin.files import atomic_folder
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import atomic_folder
 from coliags_plugin.poses.rigid import inverse, rigid, rotations_from_wxyz, wxyz_from_rotations
 from coliags_plugin.poses.text import placed, read_text, shortened
 from coliags_plugin.poses.trajectory import Intrinsics, Trajectory, natural_order, refuse_repeated

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from coliags_plugin.errors import InputError
-from coliags_plugin.files import atomic_write
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import atomic_write
 from coliags_plugin.poses.rigid import check_rigid, inverse, rigid, rotations_from_wxyz, wxyz_from_rotations
 from coliags_plugin.poses.text import head, placed
 from coliags_plugin.poses.trajectory import Intrinsics, Trajectory

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from coliags_plugin.errors import InputError, did_you_mean
+from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.poses import c3vd, colmap, endogslam, nerfstudio, tum
 from coliags_plugin.poses.text import count_first_numbers
 from coliags_plugin.poses.trajectory import Trajectory

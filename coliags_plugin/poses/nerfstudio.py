@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from coliags_plugin.errors import InputError
-from coliags_plugin.files import write_json
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import write_json
 from coliags_plugin.poses.rigid import FLIP_Y_AND_Z, check_rigid
 from coliags_plugin.poses.text import head, placed, read_text
 from coliags_plugin.poses.trajectory import Intrinsics, Trajectory, natural_order, refuse_repeated

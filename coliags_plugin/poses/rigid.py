@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from coliags_plugin.errors import InputError
+from coliags_plugin.core.errors import InputError
 
 #: How far R^T R may be from the identity, and a quaternion from unit length. The files carry six digits: 1e-6 off.
 RIGID_TOLERANCE = 1e-3

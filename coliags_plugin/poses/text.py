@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from coliags_plugin.errors import InputError
+from coliags_plugin.core.errors import InputError
 
 #: How much of a file is looked at to recognise it.
 _HEAD_BYTES = 65_536

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from coliags_plugin.files import atomic_write
+from coliags_plugin.core.files import atomic_write
 from coliags_plugin.poses.rigid import rigid, rotations_from_wxyz, wxyz_from_rotations
 from coliags_plugin.poses.text import count_first_numbers, read_numbers
 from coliags_plugin.poses.trajectory import Trajectory

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from coliags_plugin.settings import Settings
+from coliags_plugin.core.settings import Settings
 
 
 class AutoSettings(Settings):

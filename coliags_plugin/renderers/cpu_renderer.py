@@ -12,12 +12,12 @@ import pydantic
 import torch
 from torch import Tensor
 
-from coliags_plugin.cameras import Camera
 from coliags_plugin.contracts import Availability, Field, Renderer
-from coliags_plugin.errors import InputError, did_you_mean
-from coliags_plugin.gaussians import OUTPUTS, Gaussians, RenderOutput
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.gaussians import OUTPUTS, Gaussians, RenderOutput
+from coliags_plugin.core.settings import Settings
 from coliags_plugin.renderers.projection import JACOBIAN_MARGIN
-from coliags_plugin.settings import Settings
 
 #: Tensors of the Gaussians and the width of their rows; None for none.
 _SHAPES = {"means": 3, "quats_wxyz": 4, "scales": 3, "opacities": None, "colors": 3}
@@ -79,7 +79,7 @@ class CpuRenderer(Renderer):
         Args:
             field: A field of 3D Gaussians, float32, on the CPU.
             camera: Where from.
-            wants: Names from :data:`coliags_plugin.gaussians.OUTPUTS`; rgb and alpha always come.
+            wants: Names from :data:`coliags_plugin.core.gaussians.OUTPUTS`; rgb and alpha always come.
             pixels: Must be None: a splatting renderer draws whole images.
 
         Raises:
@@ -116,7 +116,7 @@ def render_gaussians(
     Args:
         gaussians: 3D Gaussians, float32, on the CPU.
         camera: Where from; its pose is cast to float32.
-        wants: Names from :data:`coliags_plugin.gaussians.OUTPUTS`; rgb and alpha always come.
+        wants: Names from :data:`coliags_plugin.core.gaussians.OUTPUTS`; rgb and alpha always come.
         settings: The defaults where None.
 
     Raises:

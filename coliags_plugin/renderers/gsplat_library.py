@@ -18,7 +18,7 @@ from types import ModuleType
 import torch
 
 from coliags_plugin.contracts import Availability
-from coliags_plugin.errors import InputError
+from coliags_plugin.core.errors import InputError
 
 logger = logging.getLogger(__name__)
 

@@ -15,14 +15,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from coliags_plugin.cameras import Camera
 from coliags_plugin.contracts import Availability, Field, Renderer
-from coliags_plugin.errors import InputError, did_you_mean
-from coliags_plugin.gaussians import OUTPUTS, Gaussians, RenderOutput
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.gaussians import OUTPUTS, Gaussians, RenderOutput
+from coliags_plugin.core.settings import Settings
 from coliags_plugin.renderers import gsplat_library
 from coliags_plugin.renderers.projection import rotation_matrices
 from coliags_plugin.renderers.torch_renderer import TorchRendererSettings, render_gaussians
-from coliags_plugin.settings import Settings
 
 #: Edge of gsplat's tiles, pixels: the one size it is tested with.
 _TILE_SIZE = 16
@@ -74,7 +74,7 @@ class GsplatRenderer(Renderer):
         Args:
             field: A field of 3D Gaussians or surfels, float32 on a CUDA device.
             camera: Where from.
-            wants: Names from :data:`coliags_plugin.gaussians.OUTPUTS`; rgb and alpha always come.
+            wants: Names from :data:`coliags_plugin.core.gaussians.OUTPUTS`; rgb and alpha always come.
             pixels: Must be None: a splatting renderer draws whole images.
 
         Raises:
@@ -117,7 +117,7 @@ def render_with_gsplat(
     Args:
         gaussians: float32, on a CUDA device.
         camera: Where from; its pose is cast to the Gaussians' dtype and device.
-        wants: Names from :data:`coliags_plugin.gaussians.OUTPUTS`; rgb and alpha always come.
+        wants: Names from :data:`coliags_plugin.core.gaussians.OUTPUTS`; rgb and alpha always come.
         settings: The defaults where None.
 
     Raises:

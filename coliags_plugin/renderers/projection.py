@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from coliags_plugin.cameras import Camera
-from coliags_plugin.errors import InputError
-from coliags_plugin.gaussians import Gaussians
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.gaussians import Gaussians
 
 #: Share of the half field of view by which a centre may leave the image before the Jacobian stops following it.
 JACOBIAN_MARGIN = 0.3

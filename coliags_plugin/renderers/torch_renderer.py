@@ -10,14 +10,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from coliags_plugin.cameras import Camera
 from coliags_plugin.contracts import Availability, Field, Renderer
-from coliags_plugin.errors import InputError, did_you_mean
-from coliags_plugin.gaussians import OUTPUTS, Gaussians, RenderOutput
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.gaussians import OUTPUTS, Gaussians, RenderOutput
+from coliags_plugin.core.settings import Settings
 from coliags_plugin.renderers.compositing import Cuts, composite, log_alpha_polynomials, median_depths, monomials
 from coliags_plugin.renderers.projection import ProjectedGaussians, facing_normals, project_gaussians
 from coliags_plugin.renderers.tiles import TileGrid, bin_gaussians, gaussian_extents
-from coliags_plugin.settings import Settings
 
 #: What each output beyond rgb and alpha is composited from. The median depth is no weighted sum.
 _SUMMED = {
@@ -74,7 +74,7 @@ class TorchRenderer(Renderer):
         Args:
             field: A field of 3D Gaussians.
             camera: Where from.
-            wants: Names from :data:`coliags_plugin.gaussians.OUTPUTS`; rgb and alpha always come.
+            wants: Names from :data:`coliags_plugin.core.gaussians.OUTPUTS`; rgb and alpha always come.
             pixels: Must be None: a splatting renderer draws whole images.
 
         Raises:
@@ -109,7 +109,7 @@ def render_gaussians(
     Args:
         gaussians: 3D Gaussians, all of one dtype (float32 or float64) on one device. The result is of that dtype.
         camera: Where from; its pose is cast to the Gaussians' dtype and device.
-        wants: Names from :data:`coliags_plugin.gaussians.OUTPUTS`; rgb and alpha always come.
+        wants: Names from :data:`coliags_plugin.core.gaussians.OUTPUTS`; rgb and alpha always come.
         settings: The defaults where None.
 
     Raises:

@@ -11,8 +11,8 @@ from pydantic import Field
 from torch import Tensor
 
 from coliags_plugin.contracts import Schedule, Strategy
-from coliags_plugin.gaussians import RenderOutput
-from coliags_plugin.settings import Settings
+from coliags_plugin.core.gaussians import RenderOutput
+from coliags_plugin.core.settings import Settings
 from coliags_plugin.strategies.births import Births, one_per_free_cell
 from coliags_plugin.strategies.parameter_rows import append_rows, keep_rows
 

@@ -8,8 +8,8 @@ from typing import Any, ClassVar
 import torch
 
 from coliags_plugin.contracts import Strategy
-from coliags_plugin.gaussians import RenderOutput
-from coliags_plugin.settings import Settings
+from coliags_plugin.core.gaussians import RenderOutput
+from coliags_plugin.core.settings import Settings
 
 
 class NoStrategySettings(Settings):

@@ -12,10 +12,10 @@ import torch
 
 from coliags_plugin.cli.poses.arguments import settings_of
 from coliags_plugin.cli.poses.triangulate import _held_out
+from coliags_plugin.core.scenes import PointCloud, Scene
 from coliags_plugin.engine.data_formats import open_scene
-from coliags_plugin.poses.structure.sfm import SfmSettings
-from coliags_plugin.poses.structure.triangulation import TriangulationSettings
-from coliags_plugin.scenes import PointCloud, Scene
+from coliags_plugin.reconstruction.structure.sfm import SfmSettings
+from coliags_plugin.reconstruction.structure.triangulation import TriangulationSettings
 from tests import commands
 from tests.commands import run
 from tests.scenes import SMALL

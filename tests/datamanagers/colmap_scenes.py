@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pycolmap
-from wall_scenes import colors, look, poses
+from tests.datamanagers.wall_scenes import colors, look, poses
 
 WIDTH, HEIGHT = 64, 48
 #: Off-centre; pixel centres at integers + 0.5. One set of parameters for every model that takes pictures.

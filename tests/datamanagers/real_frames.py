@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
 from coliags_plugin.datamanagers.reading.images import read_rgb
-from coliags_plugin.lenses import FisheyeLens, Lens, Pinhole
-from coliags_plugin.scenes import PointCloud
-from coliags_plugin.undistortion import Undistortion
+from coliags_plugin.lenses.models import FisheyeLens, Lens, Pinhole
+from coliags_plugin.lenses.undistortion import Undistortion
 
 
 def real_lens(shared_data: Path) -> FisheyeLens:

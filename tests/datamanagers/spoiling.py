@@ -14,7 +14,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pycolmap
-from phantom_layouts import write_phantom
+
+from tests.phantom.phantom_layouts import write_phantom
 
 WIDTH, HEIGHT, FRAMES = 64, 51, 11
 

@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from phantom_layouts import in_video_order, true_poses
-from spoiling import (
+from tests.datamanagers.spoiling import (
     FRAMES,
     KINDS,
     Kind,
@@ -45,11 +44,12 @@ from spoiling import (
     write_all,
 )
 
-from coliags_plugin.engine.data_check.check import check_scene
+from coliags_plugin.config.registry import datamanagers
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scenes import Scene
+from coliags_plugin.data_check.check import check_scene
 from coliags_plugin.engine.data_formats import find_format
-from coliags_plugin.errors import InputError
-from coliags_plugin.registry import datamanagers
-from coliags_plugin.scenes import Scene
+from tests.phantom.phantom_layouts import in_video_order, true_poses
 
 #: Kinds whose poses are sixteen numbers a line.
 MATRICES = ("c3vd", "c3vd-raw", "c3vd-raw-old", "c3vd-v2", "c3vd-endogslam")

@@ -10,10 +10,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from phantom_layouts import depth_gap, distance_from_wall, in_video_order, read, true_poses, write_phantom
 from scipy.spatial.transform import Rotation
-from wall_scenes import PINHOLE, look, off_wall, poses
+from tests.datamanagers.wall_scenes import PINHOLE, look, off_wall, poses
 
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scenes import Scene
 from coliags_plugin.datamanagers.c3vd.writer import depth_steps
 from coliags_plugin.datamanagers.c3vd_endogslam.manager import (
     PREPARED_DEPTH,
@@ -21,13 +22,12 @@ from coliags_plugin.datamanagers.c3vd_endogslam.manager import (
     C3VDEndoGSLAMDataManager,
     C3VDEndoGSLAMSettings,
 )
-from coliags_plugin.datamanagers.phantom.layouts.c3vd_raw import write_poses
-from coliags_plugin.errors import InputError
-from coliags_plugin.lenses import Pinhole
+from coliags_plugin.lenses.models import Pinhole
+from coliags_plugin.phantom.layouts.c3vd_raw import write_poses
 from coliags_plugin.poses import endogslam
 from coliags_plugin.poses.rigid import inverse, rigid, wxyz_from_rotations
 from coliags_plugin.poses.trajectory import Intrinsics, Trajectory
-from coliags_plugin.scenes import Scene
+from tests.phantom.phantom_layouts import depth_gap, distance_from_wall, in_video_order, read, true_poses, write_phantom
 
 WIDTH, HEIGHT = 64, 48
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from coliags_plugin.cameras import Camera
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.fusion import fuse_depth, read_points
-from coliags_plugin.errors import InputError
-from coliags_plugin.scenes import Frame
 
 
 def frame(depth, index=0, mask=None):

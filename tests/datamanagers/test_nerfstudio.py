@@ -11,20 +11,20 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from phantom_layouts import depth_gap, distance_from_wall, in_video_order, read, true_poses, write_phantom
-from real_frames import real_lens
-from wall_scenes import PINHOLE, look, off_wall, poses
+from tests.datamanagers.real_frames import real_lens
+from tests.datamanagers.wall_scenes import PINHOLE, look, off_wall, poses
 
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.nerfstudio.manager import NerfstudioDataManager, NerfstudioSettings
-from coliags_plugin.datamanagers.phantom.layouts.meshes import write_points
 from coliags_plugin.datamanagers.reading.images import read_rgb
 from coliags_plugin.engine.data_formats import find_format
-from coliags_plugin.errors import InputError
-from coliags_plugin.lenses import FisheyeLens, Lens
-from coliags_plugin.lenses_opencv import OpenCVLens
+from coliags_plugin.lenses.models import FisheyeLens, Lens
+from coliags_plugin.lenses.opencv import OpenCVLens
+from coliags_plugin.lenses.undistortion import Undistortion
+from coliags_plugin.phantom.layouts.meshes import write_points
 from coliags_plugin.poses.rigid import FLIP_Y_AND_Z
-from coliags_plugin.undistortion import Undistortion
+from tests.phantom.phantom_layouts import depth_gap, distance_from_wall, in_video_order, read, true_poses, write_phantom
 
 WIDTH, HEIGHT = 64, 48
 SIZE = {"width": WIDTH, "height": HEIGHT, **PINHOLE._asdict()}

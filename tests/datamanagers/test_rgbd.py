@@ -12,17 +12,17 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from wall_scenes import PINHOLE, colors, look, off_wall, poses
+from tests.datamanagers.wall_scenes import PINHOLE, colors, look, off_wall, poses
 
-from coliags_plugin.datamanagers.phantom.generate import generate
-from coliags_plugin.datamanagers.phantom.settings import PhantomSettings
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scenes import Scene
 from coliags_plugin.datamanagers.rgbd.association import nearest_in_time
 from coliags_plugin.datamanagers.rgbd.manager import RGBDDataManager, RGBDSettings
 from coliags_plugin.engine.data_formats import find_format
-from coliags_plugin.errors import InputError
+from coliags_plugin.phantom.generate import generate
+from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.poses import tum
 from coliags_plugin.poses.trajectory import Trajectory
-from coliags_plugin.scenes import Scene
 
 WIDTH, HEIGHT = 64, 48
 #: Steps per mm: 0.001 mm each.

@@ -12,17 +12,17 @@ import numpy as np
 import OpenEXR
 import pytest
 import torch
-from phantom_layouts import depth_gap, distance_from_wall, in_video_order, read, true_poses, write_phantom
 
-from coliags_plugin.config import load_method
+from coliags_plugin.config.method_config import load_method
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scenes import Scene
 from coliags_plugin.datamanagers.rotatecolon.exr_depth import ExrDepth, read_exr_channel
 from coliags_plugin.datamanagers.rotatecolon.manager import RotateColonDataManager, RotateColonSettings
 from coliags_plugin.engine.evaluator import evaluate
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trained import load_trained
 from coliags_plugin.engine.trainer import Trainer
-from coliags_plugin.errors import InputError
-from coliags_plugin.scenes import Scene
+from tests.phantom.phantom_layouts import depth_gap, distance_from_wall, in_video_order, read, true_poses, write_phantom
 from tests.scenes import SMALL
 
 Z = "ViewLayer.Depth.Z"

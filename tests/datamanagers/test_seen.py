@@ -7,11 +7,11 @@ import shutil
 from pathlib import Path
 
 import pytest
-from phantom_layouts import write_phantom
 
+from coliags_plugin.config.registry import datamanagers
+from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.engine.data_formats import find_format
-from coliags_plugin.registry import datamanagers
-from coliags_plugin.scenes import Frame, Scene
+from tests.phantom.phantom_layouts import write_phantom
 
 #: Layouts with rotation views, and the split whose training frames their masks tell of.
 SPLITS = {

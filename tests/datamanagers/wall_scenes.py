@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from coliags_plugin.datamanagers.c3vd.writer import depth_steps, write_c3vd_scene
-from coliags_plugin.lenses import LENSES, Lens, Pinhole, octagon_mask
+from coliags_plugin.lenses.models import LENSES, Lens, Pinhole, octagon_mask
 
 #: The wall is where NORMAL . x = OFFSET (mm).
 NORMAL = np.array([0.2, -0.1, 1.0])

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from safetensors.torch import load_file
 
-from coliags_plugin.methods import method_names
+from coliags_plugin.config.method_files import method_names
 
 STEPS = 60
 #: Few pixels, few anchors, and growth from the first steps on.
@@ -44,9 +44,7 @@ def coliags(*argv: object) -> None:
 def digests(run: Path) -> list[str]:
     """Shape and SHA-256 of every tensor of the last checkpoint, sorted."""
     tensors = load_file(run / "checkpoints" / f"step-{STEPS:06d}" / "state.safetensors").values()
-    return sorted(
-        f"{list(tensor.shape)} {hashlib.sha256(tensor.numpy().tobytes()).hexdigest()}" for tensor in tensors
-    )
+    return sorted(f"{list(tensor.shape)} {hashlib.sha256(tensor.numpy().tobytes()).hexdigest()}" for tensor in tensors)
 
 
 def fingerprint(data: Path, method: str, seed: int, changes: tuple[str, ...], folder: Path) -> dict[str, object]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
-from coliags_plugin import registry
-from coliags_plugin.components import make_component
+from coliags_plugin.config import registry
+from coliags_plugin.config.components import make_component
 from coliags_plugin.contracts import Availability
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.backends import choose_device, choose_renderer
-from coliags_plugin.errors import InputError
 
 CPU = torch.device("cpu")
 

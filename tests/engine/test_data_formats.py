@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from coliags_plugin import registry
-from coliags_plugin.components import make_component
-from coliags_plugin.datamanagers.phantom.generate import generate
-from coliags_plugin.datamanagers.phantom.layouts import LAYOUTS
-from coliags_plugin.datamanagers.phantom.settings import phantom_settings
+from coliags_plugin.config import registry
+from coliags_plugin.config.components import make_component
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.data_formats import chosen_datamanager, find_format, load_method_for, open_scene
-from coliags_plugin.errors import InputError
+from coliags_plugin.phantom.generate import generate
+from coliags_plugin.phantom.layouts import LAYOUTS
+from coliags_plugin.phantom.settings import phantom_settings
 from tests.scenes import write_wall
 
 #: Layouts of the phantom whose name is not their format's.

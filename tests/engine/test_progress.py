@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from coliags_plugin.config import load_method
+from coliags_plugin.config.method_config import load_method
 from coliags_plugin.engine import progress as module
 from coliags_plugin.engine.progress import progress_callback
 from coliags_plugin.engine.trained import load_scene

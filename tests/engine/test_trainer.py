@@ -9,12 +9,12 @@ import signal
 import pytest
 import torch
 
-from coliags_plugin.config import load_method
+from coliags_plugin.config.method_config import load_method
+from coliags_plugin.core.errors import InputError, InterruptedRunError, NotFiniteError
 from coliags_plugin.engine import trainer as trainer_module
 from coliags_plugin.engine.checkpoints import latest_checkpoint, read_checkpoint
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer
-from coliags_plugin.errors import InputError, InterruptedRunError, NotFiniteError
 from tests.scenes import SMALL, wall_scene
 
 CPU = torch.device("cpu")

@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from coliags_plugin.components import make_component
-from coliags_plugin.errors import InputError
+from coliags_plugin.config.components import make_component
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.fields.anchor_points import neighbour_log_scales, voxelize
 from coliags_plugin.fields.appearance_heads import IMIAAppearanceHead, IMIAAppearanceSettings
 from coliags_plugin.fields.frustum import spheres_in_frustum
-from coliags_plugin.scenes import PointCloud
 from tests.scenes import camera_at, wall_scene
 
 COLIAGS = {"name": "anchors", "geometry_head": "imve", "appearance_head": "imia"}

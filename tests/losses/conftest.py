@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from coliags_plugin.cameras import Camera
-from coliags_plugin.gaussians import Gaussians, RenderOutput
-from coliags_plugin.scenes import Frame
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.gaussians import Gaussians, RenderOutput
+from coliags_plugin.core.scenes import Frame
 
 
 def _output(rgb, scales=None, **maps):

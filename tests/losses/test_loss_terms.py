@@ -5,12 +5,12 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from coliags_plugin import registry
+from coliags_plugin.config import registry
 from coliags_plugin.contracts import LossSettings, log_linear
-from coliags_plugin.errors import InputError
-from coliags_plugin.gaussians import DEPTH_KINDS
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.gaussians import DEPTH_KINDS
+from coliags_plugin.core.ssim import ssim
 from coliags_plugin.losses.depth import DepthKind
-from coliags_plugin.ssim import ssim
 
 HEIGHT, WIDTH = 14, 17
 

@@ -8,12 +8,12 @@ import pytest
 import torch
 from torch.nn.functional import grid_sample, huber_loss
 
-from coliags_plugin import registry
-from coliags_plugin.config import load_method
+from coliags_plugin.config import registry
+from coliags_plugin.config.method_config import load_method
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scenes import SparseDepth
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer
-from coliags_plugin.errors import InputError
-from coliags_plugin.scenes import SparseDepth
 from tests.scenes import SMALL, wall_scene
 
 HEIGHT, WIDTH = 7, 9

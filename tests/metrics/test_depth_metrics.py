@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import maximum_filter, minimum_filter
 from skimage.metrics import mean_squared_error
 
-from coliags_plugin.errors import UnavailableError
+from coliags_plugin.core.errors import UnavailableError
 from coliags_plugin.metrics.depth_steps import depth_steps, near
 
 ALL = ["depth_mse", "depth_mse_inner", "depth_rmse", "depth_mae", "depth_median_error", "depth_abs_rel"]

@@ -4,9 +4,9 @@ import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio
 
-from coliags_plugin import registry
-from coliags_plugin.errors import UnavailableError
-from coliags_plugin.ssim import ssim
+from coliags_plugin.config import registry
+from coliags_plugin.core.errors import UnavailableError
+from coliags_plugin.core.ssim import ssim
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import torch
 
-from coliags_plugin.errors import InputError, UnavailableError
+from coliags_plugin.core.errors import InputError, UnavailableError
 from coliags_plugin.metrics import lpips_weights
 from coliags_plugin.metrics.lpips_network import TAPS, LPIPSNetwork, features
 

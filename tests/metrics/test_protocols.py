@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-from coliags_plugin import registry
-from coliags_plugin.errors import UnavailableError
-from coliags_plugin.gaussians import OUTPUTS
+from coliags_plugin.config import registry
+from coliags_plugin.core.errors import UnavailableError
+from coliags_plugin.core.gaussians import OUTPUTS
 
 HEIGHT, WIDTH = 12, 15
 NAMES = ["paper", "authors-code"]

@@ -7,7 +7,7 @@ import skimage.io
 import tifffile
 import torch
 
-from coliags_plugin.errors import InputError
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.outputs.pictures import (
     encode_jpeg,
     encode_png,

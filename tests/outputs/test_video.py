@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import torch
 
-from coliags_plugin.errors import InputError
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.outputs import video
 from coliags_plugin.outputs.video import write_video
 

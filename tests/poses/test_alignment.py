@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
-from winding import some_transform, trajectories, winding
+from tests.poses.winding import some_transform, trajectories, winding
 
-from coliags_plugin.errors import InputError
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.poses import c3vd, nerfstudio
 from coliags_plugin.poses.alignment import Matches, Spread, align, associate, umeyama
 from coliags_plugin.poses.rigid import rigid

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from coliags_plugin.errors import InputError
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.poses.c3vd import read_poses
 from tests.datamanagers.wall_scenes import poses
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from winding import PINHOLE, winding
+from tests.poses.winding import PINHOLE, winding
 
-from coliags_plugin.errors import InputError
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.poses import colmap
 
 NAMES = ("10.png", "2.png", "frame.png", "sub/1.png")

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from winding import PINHOLE, winding
+from tests.poses.winding import PINHOLE, winding
 
-from coliags_plugin.errors import InputError
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.poses import endogslam
 from coliags_plugin.poses.rigid import inverse
 

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from winding import as_text, some_transform, winding
+from tests.poses.winding import as_text, some_transform, winding
 
-from coliags_plugin.errors import InputError
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.poses import c3vd, nerfstudio, tum
 from coliags_plugin.poses.rigid import rotation_angles_deg, rotations_from_wxyz, wxyz_from_rotations
 from coliags_plugin.poses.trajectory import natural_order

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from winding import winding
+from tests.poses.winding import winding
 
 from coliags_plugin.outputs.trajectory_plot import ESTIMATE_RGB, REFERENCE_RGB, trajectory_picture
 from coliags_plugin.poses.alignment import align, associate

@@ -11,10 +11,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_torch_renderer import INPUTS, SCENES, SUMS, cast, make, pinhole, random_gaussians, relative, scene
+from tests.renderers.test_torch_renderer import INPUTS, SCENES, SUMS, cast, make, pinhole, random_gaussians, relative, scene
 
-from coliags_plugin.errors import InputError
-from coliags_plugin.gaussians import OUTPUTS
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.gaussians import OUTPUTS
 from coliags_plugin.renderers import cpu_renderer, torch_renderer
 from coliags_plugin.renderers.numba_kernels import pipeline
 

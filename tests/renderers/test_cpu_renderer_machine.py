@@ -14,7 +14,7 @@ import pytest
 import torch
 from numba import types
 from numba.core.registry import cpu_target
-from test_torch_renderer import cast, scene
+from tests.renderers.test_torch_renderer import cast, scene
 
 from coliags_plugin.renderers import cpu_renderer
 from coliags_plugin.renderers.numba_kernels import compilation, sweep_backward, sweep_forward
@@ -191,7 +191,7 @@ def test_views_may_wait_for_their_gradients_in_any_order():
 def test_forked_processes_draw_even_where_another_thread_was_drawing():
     code = """
 import os, signal, threading, torch
-from test_cpu_renderer_machine import gradient, view
+from tests.renderers.test_cpu_renderer_machine import gradient, view
 
 torch.set_num_threads(2)
 seen = view()  # before the fork, for torch's own threads do not survive it

@@ -9,11 +9,11 @@ import math
 import sys
 import types
 
-import fake_gsplat
+from tests.renderers import fake_gsplat
 import pytest
 import torch
 from pydantic import ValidationError
-from test_torch_renderer import (
+from tests.renderers.test_torch_renderer import (
     INPUTS,
     SCENES,
     SUMS,
@@ -28,12 +28,12 @@ from test_torch_renderer import (
     with_gradients,
 )
 
-from coliags_plugin import registry
-from coliags_plugin.components import make_component
+from coliags_plugin.config import registry
+from coliags_plugin.config.components import make_component
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.gaussians import OUTPUTS
 from coliags_plugin.engine.backends import choose_renderer
 from coliags_plugin.engine.doctor import examine
-from coliags_plugin.errors import InputError
-from coliags_plugin.gaussians import OUTPUTS
 from coliags_plugin.renderers import gsplat_library
 from coliags_plugin.renderers.gsplat_renderer import GsplatRenderer, GsplatRendererSettings, render_with_gsplat
 from coliags_plugin.renderers.torch_renderer import render_gaussians

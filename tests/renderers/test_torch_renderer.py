@@ -9,13 +9,13 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from naive_splatting import extent, splat
+from tests.renderers.naive_splatting import extent, splat
 from pydantic import ValidationError
 
-from coliags_plugin import registry
-from coliags_plugin.cameras import Camera
-from coliags_plugin.errors import InputError
-from coliags_plugin.gaussians import OUTPUTS, Gaussians
+from coliags_plugin.config import registry
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.gaussians import OUTPUTS, Gaussians
 from coliags_plugin.renderers import compositing
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings, render_gaussians
 

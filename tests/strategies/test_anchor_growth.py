@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from coliags_plugin.components import make_component
+from coliags_plugin.config.components import make_component
 from coliags_plugin.contracts import Schedule
-from coliags_plugin.gaussians import Gaussians, RenderOutput
+from coliags_plugin.core.gaussians import Gaussians, RenderOutput
 from coliags_plugin.strategies.births import one_per_free_cell
 from coliags_plugin.strategies.parameter_rows import append_rows, keep_rows
 from tests.scenes import wall_scene

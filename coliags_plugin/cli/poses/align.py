@@ -52,8 +52,8 @@ class Align:
 
         from rich.console import Console
 
-        from coliags_plugin.errors import InputError
-        from coliags_plugin.files import write_json
+        from coliags_plugin.core.errors import InputError
+        from coliags_plugin.core.files import write_json
         from coliags_plugin.poses.alignment import align, associate
 
         log = logging.getLogger(__name__)

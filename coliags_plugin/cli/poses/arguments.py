@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import tyro
 
 from coliags_plugin.cli.arguments import parse_size
-from coliags_plugin.errors import InputError
+from coliags_plugin.core.errors import InputError
 
 if TYPE_CHECKING:
+    from coliags_plugin.core.settings import Settings
     from coliags_plugin.poses.formats import Format
     from coliags_plugin.poses.trajectory import Intrinsics, Trajectory
-    from coliags_plugin.settings import Settings
 
 S = TypeVar("S", bound="Settings")
 
@@ -75,7 +75,7 @@ def settings_of(kind: type[S], assignments: Sequence[str], prefix: str = "") -> 
     """
     from pydantic import ValidationError
 
-    from coliags_plugin.yaml_tree import Node, override_all
+    from coliags_plugin.config.yaml_tree import Node, override_all
 
     tree = override_all(Node({}, "options"), assignments)
     try:

@@ -38,7 +38,7 @@ class Convert:
         import logging
         from dataclasses import replace
 
-        from coliags_plugin.errors import InputError
+        from coliags_plugin.core.errors import InputError
         from coliags_plugin.poses.formats import format_named, write_trajectory
 
         log = logging.getLogger(__name__)
@@ -68,7 +68,7 @@ class Convert:
 
 def _picture_names(folder: Path, count: int) -> tuple[str, ...]:
     """Names of a folder's pictures as people count, one for each pose."""
-    from coliags_plugin.errors import InputError
+    from coliags_plugin.core.errors import InputError
     from coliags_plugin.poses.trajectory import natural_order
 
     if not folder.is_dir():

@@ -37,10 +37,10 @@ class Sfm:
     def run(self) -> None:
         """Reconstruct, write, and say what came out."""
         from coliags_plugin.cli.poses.arguments import SPARSE_DEPTH, refuse_output, settings_of, train_command
+        from coliags_plugin.core.errors import InputError
         from coliags_plugin.engine.progress import progress_callback
-        from coliags_plugin.errors import InputError
-        from coliags_plugin.poses.structure.pictures import pictures_of
-        from coliags_plugin.poses.structure.sfm import SfmSettings, masks_for, reconstruct, write_sfm_scene
+        from coliags_plugin.reconstruction.structure.pictures import pictures_of
+        from coliags_plugin.reconstruction.structure.sfm import SfmSettings, masks_for, reconstruct, write_sfm_scene
 
         refuse_output(self.out, self.frames, self.overwrite)
         if self.every < 1 or (self.max_frames is not None and self.max_frames < 2):

@@ -11,8 +11,8 @@ import tyro
 from coliags_plugin.cli.arguments import Assignments, DataFormat
 
 if TYPE_CHECKING:
-    from coliags_plugin.poses.odometry.tracking import Tracking
-    from coliags_plugin.scenes import Scene
+    from coliags_plugin.core.scenes import Scene
+    from coliags_plugin.reconstruction.odometry.tracking import Tracking
 
 #: Options of tracking begin with this; all others are the data manager's.
 _OWN = "tracking."
@@ -39,10 +39,10 @@ class Track:
         from coliags_plugin.datamanagers.rgbd.writer import write_rgbd_scene
         from coliags_plugin.engine.data_formats import open_video
         from coliags_plugin.engine.progress import progress_callback
-        from coliags_plugin.poses.odometry.frames import Video
-        from coliags_plugin.poses.odometry.settings import TrackingSettings
-        from coliags_plugin.poses.odometry.tracking import track
         from coliags_plugin.poses.trajectory import Intrinsics
+        from coliags_plugin.reconstruction.odometry.frames import Video
+        from coliags_plugin.reconstruction.odometry.settings import TrackingSettings
+        from coliags_plugin.reconstruction.odometry.tracking import track
 
         refuse_output(self.out, self.scene, self.overwrite)
         settings, options = settings_among(TrackingSettings, self.set, _OWN)

@@ -11,8 +11,8 @@ import tyro
 from coliags_plugin.cli.arguments import Assignments, DataFormat
 
 if TYPE_CHECKING:
+    from coliags_plugin.core.scenes import Frame, Scene
     from coliags_plugin.datamanagers.splits import Split
-    from coliags_plugin.scenes import Frame, Scene
 
 #: Options of triangulation begin with this; all others are the data manager's.
 _OWN = "triangulation."
@@ -40,8 +40,8 @@ class Triangulate:
         from coliags_plugin.cli.poses.arguments import SPARSE_DEPTH, refuse_output, settings_among, train_command
         from coliags_plugin.engine.data_formats import open_scene
         from coliags_plugin.engine.progress import progress_callback
-        from coliags_plugin.poses.structure.colmap_scene import write_colmap_scene
-        from coliags_plugin.poses.structure.triangulation import TriangulationSettings, triangulate
+        from coliags_plugin.reconstruction.structure.colmap_scene import write_colmap_scene
+        from coliags_plugin.reconstruction.structure.triangulation import TriangulationSettings, triangulate
 
         refuse_output(self.out, self.scene, self.overwrite)
         settings, options = settings_among(TriangulationSettings, self.set, _OWN)

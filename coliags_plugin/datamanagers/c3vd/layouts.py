@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.c3vd.sequences import SequenceFiles
 from coliags_plugin.datamanagers.reading.frame_files import (
     DEPTH_SUFFIXES,
@@ -14,7 +15,6 @@ from coliags_plugin.datamanagers.reading.frame_files import (
     numbered,
     paired,
 )
-from coliags_plugin.errors import InputError
 
 KINDS = (
     "the raw release (NNNN_color.png, NNNN_depth.tiff and pose.txt in one folder) "

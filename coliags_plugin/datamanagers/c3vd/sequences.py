@@ -15,7 +15,7 @@ from coliags_plugin.datamanagers.recording import Recording, Shot, check_pose_co
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE
 from coliags_plugin.datamanagers.seen import ROTATION, seen_marks
 from coliags_plugin.datamanagers.views import View, whole_frame
-from coliags_plugin.lenses import Lens, octagon_mask
+from coliags_plugin.lenses.models import Lens, octagon_mask
 from coliags_plugin.poses.c3vd import read_poses
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import atomic_folder, write_json
+from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH
-from coliags_plugin.errors import InputError
-from coliags_plugin.files import atomic_folder, write_json
-from coliags_plugin.lenses import Pinhole
-from coliags_plugin.scenes import PointCloud
+from coliags_plugin.lenses.models import Pinhole
 
 
 def write_c3vd_scene(

@@ -6,9 +6,9 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.reading.frame_files import TIFF_SUFFIXES, inventory, numbered, paired
 from coliags_plugin.datamanagers.recording import fingerprint
-from coliags_plugin.errors import InputError
 from coliags_plugin.poses.c3vd import recognise as has_matrices
 
 LAYOUT = (

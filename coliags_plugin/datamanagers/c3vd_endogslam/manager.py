@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Float
 from pydantic import Field
 
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.c3vd_endogslam.files import (
     PARAMS,
     PreparedFiles,
@@ -28,11 +30,9 @@ from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSetti
 from coliags_plugin.datamanagers.seen import ROTATION, seen_marks
 from coliags_plugin.datamanagers.splits import Split
 from coliags_plugin.datamanagers.views import ASPECT_TOLERANCE, View
-from coliags_plugin.errors import InputError
-from coliags_plugin.lenses import Pinhole
+from coliags_plugin.lenses.models import Pinhole
 from coliags_plugin.poses.c3vd import read_poses
 from coliags_plugin.poses.endogslam import EndoGslamParams, read_params
-from coliags_plugin.scenes import PointCloud
 
 #: K of the prepared pictures, half of the calibration behind them (docs/layouts/c3vd.md 2), as EndoGSLAM has it.
 PREPARED_PINHOLE = Pinhole(401.1595, 400.9425, 334.1430, 273.8665)

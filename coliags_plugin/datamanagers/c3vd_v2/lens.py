@@ -6,8 +6,8 @@ import math
 import re
 from pathlib import Path
 
-from coliags_plugin.errors import InputError
-from coliags_plugin.lenses import OmnidirectionalLens
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.lenses.models import OmnidirectionalLens
 from coliags_plugin.poses.text import read_text
 
 #: From the configuration of the same group's later renderer (C3VDv3). C3VDv2's own page gives no numbers, so this is

@@ -10,7 +10,7 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
-from coliags_plugin.errors import InputError
+from coliags_plugin.core.errors import InputError
 
 _POSE = 7 * 8
 _SENSOR = 8

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.colmap.binary import check_whole
 from coliags_plugin.datamanagers.colmap.lens import ColmapLens
-from coliags_plugin.errors import InputError
 from coliags_plugin.poses import colmap as colmap_poses
 
 if TYPE_CHECKING:

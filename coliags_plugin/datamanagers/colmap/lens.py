@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from coliags_plugin.lenses import Array, Pinhole
-from coliags_plugin.mapped_lens import MappedLens
+from coliags_plugin.lenses.models import Array, Pinhole
+from coliags_plugin.lenses.tabulated import MappedLens
 
 if TYPE_CHECKING:
     import pycolmap

@@ -10,6 +10,8 @@ import numpy as np
 import torch
 from pydantic import Field
 
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scenes import PointCloud, SparseDepth
 from coliags_plugin.datamanagers.colmap.files import Model, Picture, beside, find_models, read_model
 from coliags_plugin.datamanagers.colmap.lens import PINHOLES, ColmapLens
 from coliags_plugin.datamanagers.lens_views import LensView, undistorter
@@ -20,8 +22,6 @@ from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
 from coliags_plugin.datamanagers.seen import seen_marks
 from coliags_plugin.datamanagers.views import View
-from coliags_plugin.errors import InputError
-from coliags_plugin.scenes import PointCloud, SparseDepth
 
 log = logging.getLogger(__name__)
 

@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from coliags_plugin.errors import InputError
-from coliags_plugin.lenses import FisheyeLens, Lens, Pinhole
-from coliags_plugin.lenses_opencv import OpenCVLens
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.lenses.models import FisheyeLens, Lens, Pinhole
+from coliags_plugin.lenses.opencv import OpenCVLens
 
 PixelCenters = Literal["half", "integer"]
 

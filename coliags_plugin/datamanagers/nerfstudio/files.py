@@ -12,11 +12,11 @@ from typing import Any, cast
 
 import numpy as np
 
+from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.datamanagers.nerfstudio.cameras import PinholeCamera, PixelCenters, camera_of, number
 from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.reading.picture_names import first_few
-from coliags_plugin.errors import InputError, did_you_mean
-from coliags_plugin.lenses import Lens
+from coliags_plugin.lenses.models import Lens
 
 FILE = "transforms.json"
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")

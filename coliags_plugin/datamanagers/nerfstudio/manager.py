@@ -9,6 +9,8 @@ from typing import Any
 import torch
 from pydantic import Field
 
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.lens_views import LensView, undistorter
 from coliags_plugin.datamanagers.nerfstudio.cameras import PinholeCamera, PixelCenters
@@ -20,10 +22,8 @@ from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
 from coliags_plugin.datamanagers.seen import seen_marks
 from coliags_plugin.datamanagers.views import View
-from coliags_plugin.errors import InputError
-from coliags_plugin.lenses import Lens
+from coliags_plugin.lenses.models import Lens
 from coliags_plugin.poses import nerfstudio as nerfstudio_poses
-from coliags_plugin.scenes import PointCloud
 
 #: RotateColon's own folders and second file: its pictures are named by number, and its depth is scaled.
 _ROTATECOLON = ("train_views", "transforms_test.json")

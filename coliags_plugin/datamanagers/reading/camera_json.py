@@ -6,8 +6,8 @@ import json
 import math
 from pathlib import Path
 
-from coliags_plugin.errors import InputError
-from coliags_plugin.lenses import Pinhole
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.lenses.models import Pinhole
 
 
 def read_intrinsics(path: Path) -> tuple[Pinhole, int, int]:

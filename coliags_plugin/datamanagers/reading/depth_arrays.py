@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Shaped
 
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.reading.depth_formats import DepthFormat, DepthSteps
-from coliags_plugin.errors import InputError
 
 
 @dataclass(frozen=True)

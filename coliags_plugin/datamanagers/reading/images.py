@@ -8,7 +8,7 @@ from typing import cast
 import numpy as np
 from jaxtyping import Shaped, UInt8
 
-from coliags_plugin.errors import InputError
+from coliags_plugin.core.errors import InputError
 
 
 def read_rgb(path: Path) -> UInt8[np.ndarray, "H W 3"]:

@@ -8,7 +8,7 @@ import posixpath
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
-from coliags_plugin.errors import InputError
+from coliags_plugin.core.errors import InputError
 
 log = logging.getLogger(__name__)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from coliags_plugin.errors import InputError
+from coliags_plugin.core.errors import InputError
 
 _KINDS = {
     **{name: "i1" for name in ("char", "int8")},

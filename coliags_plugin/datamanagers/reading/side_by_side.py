@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-from coliags_plugin.progress import Progress
+from coliags_plugin.core.progress import Progress
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Shaped
 
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.reading.depth_formats import DepthFormat
 from coliags_plugin.datamanagers.reading.frame_files import inventory
 from coliags_plugin.datamanagers.reading.images import read_gray
-from coliags_plugin.errors import InputError
-from coliags_plugin.lenses import FisheyeLens, Lens
+from coliags_plugin.lenses.models import FisheyeLens, Lens
 from coliags_plugin.poses.rigid import FLIP_Y_AND_Z, check_rigid
 from coliags_plugin.poses.text import read_text
 from coliags_plugin.poses.trajectory import natural_order, refuse_repeated

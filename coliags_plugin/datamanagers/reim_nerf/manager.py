@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool
 from pydantic import Field
 
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.reading.images import read_mask
 from coliags_plugin.datamanagers.reading.picture_names import others_beside, warn_of_others
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
@@ -18,7 +19,6 @@ from coliags_plugin.datamanagers.scene_settings import SceneSettings
 from coliags_plugin.datamanagers.seen import seen_marks
 from coliags_plugin.datamanagers.splits import Split
 from coliags_plugin.datamanagers.views import View
-from coliags_plugin.errors import InputError
 
 MASK_FILE = "rgb_mask.png"
 

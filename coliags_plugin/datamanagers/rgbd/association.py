@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from coliags_plugin.errors import InputError
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.poses.trajectory import natural_order
 
 #: A name that is a time: seconds with a fraction, as TUM's are, and perhaps a word behind it.

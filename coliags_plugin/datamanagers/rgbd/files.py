@@ -11,15 +11,15 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.reading.camera_json import read_intrinsics
 from coliags_plugin.datamanagers.reading.frame_files import DEPTH_SUFFIXES, IMAGE_SUFFIXES, inventory
 from coliags_plugin.datamanagers.reading.images import size_of
-from coliags_plugin.errors import InputError
-from coliags_plugin.lenses import Pinhole
+from coliags_plugin.lenses.models import Pinhole
 from coliags_plugin.poses import tum
 from coliags_plugin.poses.colmap import read_text_cameras
 from coliags_plugin.poses.text import read_text, shortened
-from coliags_plugin.scenes import PointCloud
 
 PICTURE_FOLDERS = ("rgb", "color", "images")
 DEPTH_FOLDERS = ("depth", "depths")

@@ -11,6 +11,8 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.reading.depth_formats import DepthSteps
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
@@ -30,10 +32,8 @@ from coliags_plugin.datamanagers.rgbd.files import (
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
 from coliags_plugin.datamanagers.seen import seen_marks
 from coliags_plugin.datamanagers.views import View
-from coliags_plugin.errors import InputError
 from coliags_plugin.poses import tum
 from coliags_plugin.poses.trajectory import Trajectory
-from coliags_plugin.scenes import PointCloud
 
 log = logging.getLogger(__name__)
 

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt16
 
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import atomic_folder, write_json
+from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.rgbd.association import is_time, times
-from coliags_plugin.errors import InputError
-from coliags_plugin.files import atomic_folder, write_json
 from coliags_plugin.poses import tum
 from coliags_plugin.poses.trajectory import Trajectory
-from coliags_plugin.progress import Progress
-from coliags_plugin.scenes import Frame
 
 #: The largest number of 16 bits.
 _LARGEST = 65_535

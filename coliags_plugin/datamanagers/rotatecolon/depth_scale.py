@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.recording import Shot
-from coliags_plugin.errors import InputError
 
 #: Frames and pixels of each that are looked at, and points they are compared with, at most.
 _FRAMES, _PIXELS, _POINTS = 6, 100, 50_000

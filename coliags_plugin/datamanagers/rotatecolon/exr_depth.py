@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Shaped
 
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.reading.depth_formats import DepthFormat
-from coliags_plugin.errors import InputError
 
 #: Blender writes 1e10 where a ray meets nothing; from here on it is no depth in any unit.
 NOTHING = 1e6

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.reading.frame_files import inventory, numbered
-from coliags_plugin.errors import InputError
 from coliags_plugin.poses.nerfstudio import read as read_transforms
 from coliags_plugin.poses.text import read_text
 

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from pydantic import Field
 
+from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
@@ -21,8 +22,7 @@ from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSetti
 from coliags_plugin.datamanagers.seen import ROTATION, seen_marks
 from coliags_plugin.datamanagers.splits import Split
 from coliags_plugin.datamanagers.views import View
-from coliags_plugin.lenses import Pinhole
-from coliags_plugin.scenes import PointCloud
+from coliags_plugin.lenses.models import Pinhole
 
 log = logging.getLogger(__name__)
 

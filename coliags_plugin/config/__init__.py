@@ -1,0 +1,1 @@
+"""Names to components, and YAML to validated method configs."""

@@ -1,0 +1,74 @@
+"""A component in a config: its name in a registry, and settings validated against that component's own class."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated, Any
+
+from pydantic import PlainSerializer, PlainValidator
+from pydantic_core import PydanticCustomError
+
+from coliags_plugin.config.registry import REGISTRIES
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.settings import Settings
+
+
+@dataclass(frozen=True)
+class Component:
+    """One validated node of a method config.
+
+    Attributes:
+        kind: The registry's kind.
+        name: The name in that registry.
+        settings: Validated options.
+    """
+
+    kind: str
+    name: str
+    settings: Settings
+
+    @property
+    def target(self) -> Any:
+        """The registered class."""
+        return REGISTRIES[self.kind].get(self.name)
+
+
+def make_component(kind: str, node: Any) -> Component:
+    """Validate ``{"name": ..., options...}``, or a bare name, into a component.
+
+    Raises:
+        PydanticCustomError: The name is missing or unknown.
+        pydantic.ValidationError: An option is unknown or of the wrong type.
+    """
+    if isinstance(node, Component):
+        return node
+    if isinstance(node, str):
+        node = {"name": node}
+    if not isinstance(node, dict) or not isinstance(node.get("name"), str):
+        known = ", ".join(REGISTRIES[kind].names())
+        raise PydanticCustomError("no_name", "a component needs 'name', one of {known}", {"known": known})
+    options = {key: value for key, value in node.items() if key != "name"}
+    try:
+        settings_class = REGISTRIES[kind].get(node["name"]).Settings
+    except InputError as error:
+        raise PydanticCustomError("unknown_component", "{text}", {"text": str(error)}) from error
+    return Component(kind, node["name"], settings_class.model_validate(options))
+
+
+def _dump(component: Component) -> dict[str, Any]:
+    return {"name": component.name, **component.settings.model_dump()}
+
+
+def _validator(kind: str) -> Callable[[Any], Component]:
+    return partial(make_component, kind)
+
+
+DataManagerNode = Annotated[Component, PlainValidator(_validator("datamanagers")), PlainSerializer(_dump)]
+FieldNode = Annotated[Component, PlainValidator(_validator("fields")), PlainSerializer(_dump)]
+GeometryHeadNode = Annotated[Component, PlainValidator(_validator("geometry_heads")), PlainSerializer(_dump)]
+AppearanceHeadNode = Annotated[Component, PlainValidator(_validator("appearance_heads")), PlainSerializer(_dump)]
+RendererNode = Annotated[Component, PlainValidator(_validator("renderers")), PlainSerializer(_dump)]
+StrategyNode = Annotated[Component, PlainValidator(_validator("strategies")), PlainSerializer(_dump)]
+LossNode = Annotated[Component, PlainValidator(_validator("losses")), PlainSerializer(_dump)]

@@ -1,0 +1,191 @@
+"""Method configs: declarative YAML -> one validated, frozen :class:`MethodConfig`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field, ValidationError, field_validator, model_validator
+from typing_extensions import Self
+
+from coliags_plugin.config import registry
+from coliags_plugin.config.components import DataManagerNode, FieldNode, LossNode, RendererNode, StrategyNode
+from coliags_plugin.config.method_files import method_folder, method_names
+from coliags_plugin.config.yaml_tree import Node, dump, merge, override_all, read_tree
+from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.settings import Settings, refuse_zero_ends
+
+
+class OptimizerSettings(Settings):
+    """Adam for one parameter group of the field; the rate is constant, or log-linear to ``final_lr`` over the run.
+
+    A constant rate of 0 freezes the group; one that falls needs both ends above 0.
+    """
+
+    lr: float = Field(ge=0)
+    final_lr: float | None = Field(default=None, ge=0)
+    times_extent: bool = False  # multiply both rates by the scene's extent (docs/methods.md 2.1)
+
+    @model_validator(mode="after")
+    def _ends_above_zero(self) -> Self:
+        refuse_zero_ends(self, "lr", "final_lr")
+        return self
+
+
+class ScheduleSettings(Settings):
+    """How long to train and how often to write."""
+
+    steps: int = Field(default=30_000, ge=1)
+    written_for: int = Field(default=30_000, ge=1)  # run length that step numbers elsewhere in the config mean
+    log_every: int = Field(default=10, ge=1)
+    checkpoint_every: int = Field(default=5_000, ge=1)
+
+
+class MethodConfig(Settings):
+    """A method: named components and their settings. What a run folder's ``config.yaml`` holds."""
+
+    description: str = ""
+    datamanager: DataManagerNode
+    field: FieldNode
+    renderer: RendererNode
+    strategy: StrategyNode
+    losses: dict[str, LossNode] = Field(min_length=1)
+    optimizers: dict[str, OptimizerSettings]
+    schedule: ScheduleSettings = ScheduleSettings()
+    protocol: str = "paper"
+
+    @field_validator("losses", "optimizers", mode="before")
+    @classmethod
+    def _null_removes(cls, entries: Any) -> Any:
+        return (
+            {key: value for key, value in entries.items() if value is not None}
+            if isinstance(entries, dict)
+            else entries
+        )
+
+    @field_validator("protocol")
+    @classmethod
+    def _known_protocol(cls, name: str) -> str:
+        if name not in registry.protocols.names():
+            known = ", ".join(registry.protocols.names())
+            raise ValueError(f"no protocol '{name}'; known: {known}. {did_you_mean(name, registry.protocols.names())}")
+        return name
+
+    def to_yaml(self) -> str:
+        """The whole config, defaults included; itself a valid method config."""
+        return dump(self.model_dump())
+
+
+@dataclass(frozen=True)
+class LoadedMethod:
+    """A method config and where each of its values was written."""
+
+    name: str
+    config: MethodConfig
+    tree: Node
+
+    def with_origins(self) -> str:
+        """The resolved config as YAML, each value followed by where it comes from."""
+        return "\n".join(_annotated(self.config.model_dump(), self.tree, 0)) + "\n"
+
+
+def load_method(method: str, overrides: Iterable[str] = ()) -> LoadedMethod:
+    """Resolve a method config.
+
+    Args:
+        method: A name (``coliags``, ``ablations/imia``), or the path of a YAML file.
+        overrides: ``key.path=value`` assignments, applied last.
+
+    Raises:
+        InputError: No such method, or it is not valid; names file, line and key.
+    """
+    tree = method_tree(method, overrides)
+    try:
+        config = MethodConfig.model_validate(tree.plain())
+    except ValidationError as error:
+        raise InputError("\n".join(_describe(error, tree))) from error
+    return LoadedMethod(method_name(method), config, tree)
+
+
+def method_name(method: str) -> str:
+    """What a method is called: its name, or its file's without the suffix."""
+    return Path(method).stem if _is_path(method) else method
+
+
+def method_tree(method: str, overrides: Iterable[str] = ()) -> Node:
+    """What :func:`load_method` validates: inherited, merged and overridden, each value with its origin.
+
+    Raises:
+        InputError: No such method, or a file of it is not YAML.
+    """
+    return override_all(_resolve(_find(method, Path.cwd()), ()), overrides)
+
+
+def _is_path(method: str) -> bool:
+    return method.endswith((".yaml", ".yml"))
+
+
+def _find(method: str, folder: Path) -> Path:
+    if _is_path(method):
+        path = folder / method
+        if not path.is_file():
+            raise InputError(f"no file {path}", "a method config", "See `coliags list methods`")
+        return path
+    path = method_folder() / f"{method}.yaml"
+    if method not in method_names():
+        raise InputError(
+            f"no method '{method}'",
+            f"one of {', '.join(method_names())}, or the path of a .yaml file",
+            did_you_mean(method, method_names()),
+        )
+    return path
+
+
+def _resolve(path: Path, seen: tuple[Path, ...]) -> Node:
+    if path in seen:
+        chain = " -> ".join(p.name for p in (*seen, path))
+        raise InputError(f"method configs inherit from each other: {chain}", "a chain of bases that ends")
+    tree = read_tree(path)
+    base = tree.value.get("base")
+    if base is None:
+        return tree
+    if not isinstance(base.value, str):
+        raise InputError(f"{base.origin}: base is {base.value!r}", "the name or path of a method config")
+    parent = _resolve(_find(base.value, path.parent), (*seen, path))
+    inherited = {key: node for key, node in parent.value.items() if key != "description"}
+    own = {key: node for key, node in tree.value.items() if key != "base"}
+    return merge(Node(inherited, parent.origin), Node(own, tree.origin))
+
+
+#: Errors of this package's own, whose text says what was seen.
+_TELLING = frozenset({"no_name", "unknown_key", "unknown_component", "value_error", "zero_end"})
+
+
+def _describe(error: ValidationError, tree: Node) -> list[str]:
+    lines = []
+    for item in error.errors():
+        path = [key for key in item["loc"] if isinstance(key, str)]
+        message = item["msg"].removeprefix("Value error, ")
+        if item["type"] == "missing":
+            message = "is missing"
+        elif item["type"] not in _TELLING:
+            message = f"{message}, got {item['input']!r}"
+        lines.append(f"{tree.find(path).origin}: {'.'.join(path) or 'config'}: {message.strip()}")
+    return lines
+
+
+def _annotated(plain: Any, tree: Node, depth: int) -> Sequence[str]:
+    lines: list[str] = []
+    for key, value in plain.items():
+        node = tree.value.get(key) if tree.is_mapping else None
+        indent = "  " * depth
+        if isinstance(value, dict) and value:
+            lines.append(f"{indent}{key}:")
+            lines.extend(_annotated(value, node or Node({}, ""), depth + 1))
+        else:
+            origin = node.origin if node is not None else "default"
+            text = dump([value]).strip()[1:-1] if not isinstance(value, (list, tuple)) else dump(value).strip()
+            lines.append(f"{indent}{key}: {text}  # {origin}")
+    return lines

@@ -1,0 +1,218 @@
+"""Components by name.
+
+One :class:`Registry` per kind. Built-ins are ``"name": "module:Class"`` strings, so listing them imports
+nothing. Other packages add components through entry points in the group ``coliags_plugin.<kind>``; uninstalled
+work does so through ``COLIAGS_PLUGIN_PATH``, a path list of Python files that each define
+``COMPONENTS = {"<kind>": {"<name>": Class or "module:Class"}}``.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from functools import cache
+from importlib import import_module
+from importlib.metadata import entry_points
+from pathlib import Path
+from runpy import run_path
+from typing import Any
+
+from coliags_plugin.core.errors import InputError, did_you_mean
+
+PLUGIN_PATH_VARIABLE = "COLIAGS_PLUGIN_PATH"
+
+
+class Registry:
+    """The components of one kind.
+
+    Args:
+        kind: Plural noun, for instance ``"renderers"``.
+        builtins: Name to ``"module:Class"``.
+    """
+
+    def __init__(self, kind: str, builtins: Mapping[str, str]) -> None:
+        self.kind = kind
+        self._targets: dict[str, Any] = {}
+        self._sources: dict[str, str] = {}
+        self._complete = False
+        for name, target in builtins.items():
+            self.register(name, target, source="built in")
+
+    def register(self, name: str, target: Any, source: str = "registered") -> None:
+        """Add one component.
+
+        Args:
+            name: The name method configs use.
+            target: The class, or ``"module:Class"`` to import it when first asked for.
+            source: Where it comes from, for listings and errors.
+
+        Raises:
+            InputError: The name is taken.
+        """
+        if name in self._targets:
+            raise InputError(
+                f"{self.kind}: '{name}' from {source} is already taken by {self._sources[name]}",
+                "one component per name",
+                "Rename one of the two",
+            )
+        self._targets[name] = target
+        self._sources[name] = source
+
+    def names(self) -> list[str]:
+        """All known names, sorted."""
+        self._discover()
+        return sorted(self._targets)
+
+    def source(self, name: str) -> str:
+        """Where the component of this name comes from."""
+        self._discover()
+        return self._sources[name]
+
+    def get(self, name: str) -> Any:
+        """The class registered under a name, imported now if it was not yet.
+
+        Raises:
+            InputError: No such name; says which are known and which was probably meant.
+        """
+        self._discover()
+        if name not in self._targets:
+            raise InputError(
+                f"no {self.kind} component '{name}'",
+                f"one of {', '.join(self.names())}",
+                did_you_mean(name, self._targets),
+            )
+        target = self._targets[name]
+        if isinstance(target, str):
+            target = self._targets[name] = _load(target)
+        return target
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names())
+
+    def _discover(self) -> None:
+        if self._complete:
+            return
+        self._complete = True
+        for entry in entry_points(group=f"coliags_plugin.{self.kind}"):
+            self.register(entry.name, entry.value, source=f"entry point {entry.value}")
+        for path, components in _plugin_files(os.environ.get(PLUGIN_PATH_VARIABLE, "")).items():
+            for name, target in components.get(self.kind, {}).items():
+                self.register(name, target, source=path)
+
+
+def _load(target: str) -> Any:
+    module, _, attribute = target.partition(":")
+    return getattr(import_module(module), attribute)
+
+
+@cache
+def _plugin_files(path_list: str) -> dict[str, dict[str, dict[str, Any]]]:
+    found: dict[str, dict[str, dict[str, Any]]] = {}
+    for path in filter(None, path_list.split(os.pathsep)):
+        if not Path(path).is_file():
+            raise InputError(
+                f"{PLUGIN_PATH_VARIABLE} names '{path}', which is not a file",
+                "a path list of Python files",
+                f"Mend or unset {PLUGIN_PATH_VARIABLE}",
+            )
+        components = run_path(path).get("COMPONENTS")
+        if not isinstance(components, dict) or not set(components) <= set(REGISTRIES):
+            raise InputError(
+                f"{path} defines COMPONENTS = {components!r}",
+                f"a dict from kind to components, the kinds being {', '.join(REGISTRIES)}",
+            )
+        found[path] = components
+    return found
+
+
+datamanagers = Registry(
+    "datamanagers",
+    {
+        "auto": "coliags_plugin.datamanagers.auto:AutoDataManager",
+        "c3vd": "coliags_plugin.datamanagers.c3vd.manager:C3VDDataManager",
+        "c3vd-endogslam": "coliags_plugin.datamanagers.c3vd_endogslam.manager:C3VDEndoGSLAMDataManager",
+        "c3vd-v2": "coliags_plugin.datamanagers.c3vd_v2.manager:C3VDv2DataManager",
+        "colmap": "coliags_plugin.datamanagers.colmap.manager:ColmapDataManager",
+        "nerfstudio": "coliags_plugin.datamanagers.nerfstudio.manager:NerfstudioDataManager",
+        "reim-nerf": "coliags_plugin.datamanagers.reim_nerf.manager:ReimNerfDataManager",
+        "rgbd": "coliags_plugin.datamanagers.rgbd.manager:RGBDDataManager",
+        "rotatecolon": "coliags_plugin.datamanagers.rotatecolon.manager:RotateColonDataManager",
+    },
+)
+fields = Registry("fields", {"anchors": "coliags_plugin.fields.anchors:AnchorField"})
+geometry_heads = Registry(
+    "geometry_heads",
+    {
+        "plain": "coliags_plugin.fields.geometry_heads:PlainGeometryHead",
+        "imve": "coliags_plugin.fields.geometry_heads:IMVEGeometryHead",
+    },
+)
+appearance_heads = Registry(
+    "appearance_heads",
+    {
+        "plain": "coliags_plugin.fields.appearance_heads:PlainAppearanceHead",
+        "imia": "coliags_plugin.fields.appearance_heads:IMIAAppearanceHead",
+    },
+)
+renderers = Registry(
+    "renderers",
+    {
+        "auto": "coliags_plugin.renderers.auto:AutoRenderer",
+        "cpu": "coliags_plugin.renderers.cpu_renderer:CpuRenderer",
+        "gsplat": "coliags_plugin.renderers.gsplat_renderer:GsplatRenderer",
+        "torch": "coliags_plugin.renderers.torch_renderer:TorchRenderer",
+    },
+)
+strategies = Registry(
+    "strategies",
+    {
+        "none": "coliags_plugin.strategies.none:NoStrategy",
+        "anchor-growth": "coliags_plugin.strategies.anchor_growth:AnchorGrowth",
+    },
+)
+losses = Registry(
+    "losses",
+    {
+        "l1": "coliags_plugin.losses.photometric:L1Loss",
+        "d-ssim": "coliags_plugin.losses.photometric:DSSIMLoss",
+        "depth-l1": "coliags_plugin.losses.depth:DepthL1Loss",
+        "sparse-depth": "coliags_plugin.losses.sparse_depth:SparseDepthLoss",
+        "scale-volume": "coliags_plugin.losses.scale_volume:ScaleVolumeLoss",
+    },
+)
+metrics = Registry(
+    "metrics",
+    {
+        "psnr": "coliags_plugin.metrics.image:PSNR",
+        "ssim": "coliags_plugin.metrics.image:SSIM",
+        "lpips": "coliags_plugin.metrics.lpips:LPIPS",
+        "depth_mse": "coliags_plugin.metrics.depth:DepthMSE",
+        "depth_mse_inner": "coliags_plugin.metrics.depth:DepthMSEInner",
+        "depth_rmse": "coliags_plugin.metrics.depth:DepthRMSE",
+        "depth_mae": "coliags_plugin.metrics.depth:DepthMAE",
+        "depth_median_error": "coliags_plugin.metrics.depth:DepthMedianError",
+        "depth_abs_rel": "coliags_plugin.metrics.depth:DepthAbsRel",
+    },
+)
+protocols = Registry(
+    "protocols",
+    {
+        "paper": "coliags_plugin.metrics.protocols:PaperProtocol",
+        "authors-code": "coliags_plugin.metrics.protocols:AuthorsCodeProtocol",
+    },
+)
+
+REGISTRIES: dict[str, Registry] = {
+    registry.kind: registry
+    for registry in (
+        datamanagers,
+        fields,
+        geometry_heads,
+        appearance_heads,
+        renderers,
+        strategies,
+        losses,
+        metrics,
+        protocols,
+    )
+}

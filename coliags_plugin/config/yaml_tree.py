@@ -1,0 +1,185 @@
+"""YAML read with the place of every key, merged by inheritance, and written back."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from coliags_plugin.core.errors import InputError
+
+
+@dataclass(frozen=True)
+class Node:
+    """A value and where it was written: a mapping of nodes, or a plain scalar or tuple.
+
+    Attributes:
+        value: The value.
+        origin: ``file:line``, or the command-line option that set it.
+    """
+
+    value: Any
+    origin: str
+
+    @property
+    def is_mapping(self) -> bool:
+        """Whether this is a mapping of further nodes."""
+        return isinstance(self.value, dict)
+
+    def plain(self) -> Any:
+        """The value without origins."""
+        if self.is_mapping:
+            return {key: child.plain() for key, child in self.value.items()}
+        return self.value
+
+    def find(self, path: Sequence[Any]) -> Node:
+        """The deepest node on a path that exists."""
+        node = self
+        for key in path:
+            if not node.is_mapping or key not in node.value:
+                break
+            node = node.value[key]
+        return node
+
+
+class _Loader(yaml.SafeLoader):
+    """Safe loader in which ``1e-5`` is a number and ``on`` is a word, as YAML 1.2 has it."""
+
+
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in resolvers if tag not in (_FLOAT, _BOOL)]
+    for _FLOAT, _BOOL in [("tag:yaml.org,2002:float", "tag:yaml.org,2002:bool")]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?$|^[-+]?\.(inf|Inf|INF)$|^\.(nan|NaN|NAN)$"),
+    list("-+0123456789."),
+)
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:bool", re.compile(r"^(true|True|TRUE|false|False|FALSE)$"), list("tTfF")
+)
+
+
+def read_tree(path: Path) -> Node:
+    """Read a YAML file whose top level is a mapping.
+
+    Raises:
+        InputError: The file is missing, is not YAML, repeats a key, or is no mapping.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}", "a YAML file") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is not UTF-8 text", "a YAML file") from error
+    return parse_tree(text, path.name)
+
+
+def parse_tree(text: str, source: str) -> Node:
+    """Parse YAML text whose top level is a mapping; ``source`` names it in origins. Raises InputError as read_tree."""
+    try:
+        loader = _Loader(text)
+        try:
+            root = loader.get_single_node()
+            tree = Node({}, source) if root is None else _convert(loader, root, source)
+        finally:
+            loader.dispose()
+    except yaml.MarkedYAMLError as error:
+        line = error.problem_mark.line + 1 if error.problem_mark else 0
+        raise InputError(f"{source}:{line}: {error.problem}", "valid YAML") from error
+    except yaml.YAMLError as error:
+        raise InputError(f"{source}: {error}", "valid YAML") from error
+    if not tree.is_mapping:
+        raise InputError(f"{source} holds {type(tree.value).__name__}", "a mapping at the top level")
+    return tree
+
+
+def parse_value(text: str) -> Any:
+    """The value of ``--set key=VALUE``, read as YAML."""
+    try:
+        return _tuples(yaml.load(text, _Loader))
+    except yaml.YAMLError:
+        return text
+
+
+def _convert(loader: _Loader, node: yaml.Node, source: str) -> Node:
+    origin = f"{source}:{node.start_mark.line + 1}"
+    if not isinstance(node, yaml.MappingNode):
+        return Node(_tuples(loader.construct_object(node, deep=True)), origin)
+    children: dict[str, Node] = {}
+    for key_node, value_node in node.value:
+        key = str(loader.construct_object(key_node))
+        line = f"{source}:{key_node.start_mark.line + 1}"
+        if key in children:
+            raise InputError(f"{line}: key '{key}' is there twice, first at {children[key].origin}", "each key once")
+        children[key] = Node(_convert(loader, value_node, source).value, line)
+    return Node(children, origin)
+
+
+def _tuples(value: Any) -> Any:
+    if isinstance(value, list):
+        return tuple(_tuples(item) for item in value)
+    return value
+
+
+def merge(base: Node, over: Node) -> Node:
+    """``over`` upon ``base``, key by key.
+
+    A component whose ``name`` changes keeps nothing of the options inherited for the old name.
+    """
+    if not base.is_mapping or not over.is_mapping:
+        return over
+    names = [node.value["name"].value if "name" in node.value else None for node in (base, over)]
+    if None not in names and names[0] != names[1]:
+        return over
+    merged = dict(base.value)
+    for key, child in over.value.items():
+        merged[key] = merge(merged[key], child) if key in merged else child
+    return Node(merged, over.origin)
+
+
+def override(tree: Node, assignment: str) -> Node:
+    """Apply one ``key.path=value``.
+
+    Raises:
+        InputError: It has no ``=`` or an empty key.
+    """
+    path, equals, text = assignment.partition("=")
+    keys = path.strip().split(".")
+    if not equals or not all(keys):
+        raise InputError(f"--set {assignment}", "key.path=value, for instance field.geometry_head.frequencies=8")
+    origin = f"--set {assignment}"
+    value = parse_value(text)
+    node = Node({k: Node(v, origin) for k, v in value.items()} if isinstance(value, dict) else value, origin)
+    for key in reversed(keys):
+        node = Node({key: node}, origin)
+    return merge(tree, node)
+
+
+def override_all(tree: Node, assignments: Iterable[str]) -> Node:
+    """Apply ``key.path=value`` assignments, the last one last.
+
+    Raises:
+        InputError: See :func:`override`.
+    """
+    for assignment in assignments:
+        tree = override(tree, assignment)
+    return tree
+
+
+def dump(plain: Any) -> str:
+    """YAML text of plain data, keys in their own order, the innermost collections on one line."""
+    return yaml.safe_dump(_lists(plain), sort_keys=False, allow_unicode=True, default_flow_style=None, width=1000)
+
+
+def _lists(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _lists(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_lists(item) for item in value]
+    return value

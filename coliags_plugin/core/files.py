@@ -1,0 +1,88 @@
+"""Writing without losing: every file and folder is written beside its place and then renamed."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from coliags_plugin.core.errors import InputError
+
+
+@contextmanager
+def atomic_folder(target: Path, overwrite: bool = False) -> Iterator[Path]:
+    """A scratch folder that takes the place of ``target`` when the block ends without an error.
+
+    Args:
+        target: The folder to make. Its parents are made too.
+        overwrite: Replace what is there.
+
+    Raises:
+        InputError: ``target`` exists and ``overwrite`` is off, or its parent cannot be written.
+    """
+    if not overwrite and target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise InputError(f"{target} already exists", "a new or empty folder", "Choose another, or pass --overwrite")
+    make_folder(target.parent)
+    try:
+        scratch = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
+    except OSError as error:
+        raise not_writable(target.parent, error) from error
+    try:
+        yield scratch
+        scratch.chmod(0o755)
+        replaced = None
+        if target.exists():
+            replaced = Path(tempfile.mkdtemp(prefix=f".{target.name}.old.", dir=target.parent))
+            target.rename(replaced / target.name)
+        scratch.rename(target)
+        if replaced is not None:
+            shutil.rmtree(replaced)
+    except BaseException:
+        shutil.rmtree(scratch, ignore_errors=True)
+        raise
+
+
+def atomic_write(target: Path, data: bytes | str) -> None:
+    """Write a file beside ``target``, then rename it there.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    make_folder(target.parent)
+    try:
+        handle, scratch = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
+        with os.fdopen(handle, "wb") as file:
+            file.write(data.encode() if isinstance(data, str) else data)
+        os.chmod(scratch, 0o644)
+        os.replace(scratch, target)
+    except OSError as error:
+        raise not_writable(target.parent, error) from error
+
+
+def write_json(target: Path, data: Any) -> None:
+    """Write JSON for people and programs; NaN is refused, so that any reader can read it."""
+    atomic_write(target, json.dumps(data, indent=2, allow_nan=False) + "\n")
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder and its parents.
+
+    Raises:
+        InputError: It cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise not_writable(folder, error) from error
+
+
+def not_writable(folder: Path, error: OSError) -> InputError:
+    """The error for a place that cannot be written."""
+    return InputError(
+        f"cannot write to {folder}: {error.strerror or error}", "a writable folder", "Choose another output"
+    )

@@ -1,0 +1,74 @@
+"""Typed settings: the base class of every component's options."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+from coliags_plugin.core.errors import did_you_mean
+
+
+class Settings(BaseModel):
+    """Frozen, strictly typed options; an unknown key is an error that names the nearest known one.
+
+    Sequences are tuples (YAML lists are converted before they arrive here).
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, arbitrary_types_allowed=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_unknown_keys(cls, data: Any) -> Any:
+        if not isinstance(data, dict):
+            return data
+        unknown = [key for key in data if key not in cls.model_fields]
+        if unknown:
+            known = ", ".join(cls.model_fields) or "none"
+            raise ValidationError.from_exception_data(
+                cls.__name__,
+                [
+                    InitErrorDetails(
+                        type=PydanticCustomError(
+                            "unknown_key",
+                            "unknown key '{key}'; known keys: {known}. {hint}",
+                            {
+                                "key": str(key),
+                                "known": known,
+                                "hint": did_you_mean(str(key), cls.model_fields),
+                            },
+                        ),
+                        loc=(key,),
+                        input=data[key],
+                    )
+                    for key in unknown
+                ],
+            )
+        return data
+
+
+def refuse_zero_ends(settings: Settings, start: str, end: str) -> None:
+    """Refuse a logarithmic schedule with an end that is not above 0 (docs/methods.md 2.3).
+
+    Args:
+        settings: Whose schedule; without a value at ``end`` there is none.
+        start: Name of the value at the first step.
+        end: Name of the value at the last step.
+
+    Raises:
+        ValidationError: At the key to blame, with what was seen and what to do.
+    """
+    first, last = getattr(settings, start), getattr(settings, end)
+    if last is None or (first > 0 and last > 0):
+        return
+    problem = PydanticCustomError(
+        "zero_end",
+        "{end} {last} with {start} {first}: a logarithmic schedule cannot reach or leave 0; give both above 0, or "
+        "leave {end} out (null) for a constant {start}",
+        {"start": start, "first": str(first), "end": end, "last": str(last)},
+    )
+    key, value = (start, first) if last > 0 else (end, last)
+    raise ValidationError.from_exception_data(
+        type(settings).__name__, [InitErrorDetails(type=problem, loc=(key,), input=value)]
+    )

@@ -1,0 +1,115 @@
+"""A scene looked at from all sides."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.scenes import Frame, Scene
+from coliags_plugin.data_check import findings as suspect
+from coliags_plugin.data_check.facts import (
+    DepthFacts,
+    PathFacts,
+    PictureFacts,
+    depth_facts,
+    looked_at,
+    path_facts,
+    picture_facts,
+    video_of,
+)
+from coliags_plugin.data_check.findings import Finding
+from coliags_plugin.data_check.hypotheses import CHANGES
+from coliags_plugin.data_check.matches import EpipolarAgreement, epipolar_agreement, match
+from coliags_plugin.data_check.reprojection import Agreement, Pair, agreement, best_scale, video_pairs
+
+
+@dataclass(frozen=True)
+class SceneCheck:
+    """What was found.
+
+    Attributes:
+        scene: What was looked at.
+        pairs: The frames that were carried into one another.
+        depth, path, pictures: Figures; None where there is nothing to measure.
+        agreement: How frames with depth agree, by the reading of the poses.
+        scale: The factor on depth with which they agree best, and the relative depth error then.
+        matches: How matched features agree with the poses, by the reading; empty where depth tells more.
+        findings: What is suspect.
+    """
+
+    scene: Scene
+    pairs: list[tuple[Frame, Frame]]
+    depth: DepthFacts | None
+    path: PathFacts | None
+    pictures: PictureFacts
+    agreement: dict[str, Agreement]
+    scale: tuple[float, float] | None
+    matches: dict[str, EpipolarAgreement]
+    findings: list[Finding]
+
+    def as_json(self) -> dict[str, Any]:
+        """The same facts for a program; what cannot be had is null."""
+        plain = {
+            "scene": self.scene.name,
+            "suspect": bool(self.findings),
+            "findings": [asdict(finding) for finding in self.findings],
+            "data": self.scene.provenance,
+            "initial_points": len(self.scene.points),
+            "depth": None if self.depth is None else asdict(self.depth),
+            "path": None if self.path is None else asdict(self.path),
+            "pictures": asdict(self.pictures),
+            "pairs": [[source.name, target.name] for source, target in self.pairs],
+            "agreement": {name: asdict(found) for name, found in self.agreement.items()},
+            "best_depth_scale": None if self.scale is None else {"factor": self.scale[0], "depth_error": self.scale[1]},
+            "matches": {name: asdict(found) for name, found in self.matches.items()},
+        }
+        cleaned: dict[str, Any] = _without_nan(plain)
+        return cleaned
+
+
+def check_scene(scene: Scene, progress: Progress | None = None) -> SceneCheck:
+    """Look at a scene.
+
+    Args:
+        scene: As a data manager gave it.
+        progress: Told how far the comparison of frames is.
+    """
+    video = video_of(scene)
+    looked = looked_at(video)
+    pairs = video_pairs(video)
+    with_depth = [Pair(a, b) for a, b in pairs if a.depth is not None and b.depth is not None]
+    readings, scale, matched = {}, None, {}
+    if with_depth:
+        for done, name in enumerate(CHANGES):
+            if progress is not None:
+                progress("compare frames", done, len(CHANGES))
+            readings[name] = agreement(with_depth, name)
+        scale = best_scale(with_depth)
+    else:
+        # A pixel off a line is little: farther frames show more.
+        pairs = video_pairs(video, farther=3)
+        matches = match(pairs)
+        found = {name: epipolar_agreement(matches, name) for name in CHANGES}
+        matched = {name: reading for name, reading in found.items() if reading is not None}
+    if progress is not None:
+        progress("compare frames", len(CHANGES), len(CHANGES))
+    depth, path, pictures = depth_facts(looked), path_facts(video), picture_facts(looked)
+    found_suspect = [
+        *suspect.agreement_findings(readings, scale, path),
+        *suspect.match_findings(matched),
+        *suspect.depth_findings(depth),
+        *suspect.path_findings(path),
+        *suspect.calibration_findings(video),
+        *suspect.picture_findings(pictures),
+    ]
+    return SceneCheck(scene, pairs, depth, path, pictures, readings, scale, matched, found_suspect)
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_without_nan(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

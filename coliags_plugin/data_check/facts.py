@@ -1,0 +1,129 @@
+"""What a scene holds, in figures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from coliags_plugin.core.scenes import Frame, Scene
+
+#: Frames whose depth and colours are looked at, at most.
+_LOOKED_AT = 64
+
+
+@dataclass(frozen=True)
+class DepthFacts:
+    """z-depth of the frames looked at, scene units; shares of the unmasked pixels."""
+
+    nearest: float
+    median: float
+    farthest: float
+    invalid_share: float
+    clipped_share: float
+
+
+@dataclass(frozen=True)
+class PathFacts:
+    """The way of the camera: lengths in scene units, turns in degrees."""
+
+    length: float
+    mean_step: float
+    median_step: float
+    largest_step: float
+    largest_step_at: str
+    extent: float
+    turn: float
+
+
+@dataclass(frozen=True)
+class PictureFacts:
+    """Colours of the frames looked at, grey levels; shares of the unmasked pixels."""
+
+    mean: float
+    darkest_frame: float
+    darkest_at: str
+    brightest_frame: float
+    overexposed_share: float
+    masked_share: float
+    repeated: tuple[str, ...]
+
+
+def looked_at(frames: Sequence[Frame]) -> list[Frame]:
+    """At most so many of the frames, evenly chosen."""
+    places = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), _LOOKED_AT)).astype(int))
+    return [frames[place] for place in places]
+
+
+def video_of(scene: Scene) -> list[Frame]:
+    """Training frames and the split's own test frames, in video order."""
+    return sorted([*scene.train, *scene.test_sets.get("test", [])], key=lambda frame: frame.index)
+
+
+def depth_facts(frames: Sequence[Frame]) -> DepthFacts | None:
+    """None where no frame has depth."""
+    known, pixels, clipped = [], 0, 0
+    for frame in frames:
+        depth, bound = frame.depth, frame.depth_at_least
+        if depth is None:
+            continue
+        inside = depth[frame.valid]
+        pixels += len(inside)
+        clipped += 0 if bound is None else int(torch.isfinite(bound[frame.valid]).sum())
+        known.append(inside[torch.isfinite(inside)])
+    if not pixels:
+        return None
+    values = torch.cat(known).double().numpy()
+    if not len(values):
+        return DepthFacts(math.nan, math.nan, math.nan, 1.0, clipped / pixels)
+    nearest, median, farthest = (float(value) for value in np.quantile(values, (0.01, 0.5, 0.99)))
+    return DepthFacts(nearest, median, farthest, 1.0 - len(values) / pixels, clipped / pixels)
+
+
+def path_facts(video: Sequence[Frame]) -> PathFacts | None:
+    """None where there are fewer than two frames."""
+    if len(video) < 2:
+        return None
+    poses = np.stack([frame.camera.camera_to_world.double().numpy() for frame in video])
+    centers = poses[:, :3, 3]
+    lengths = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+    # Frames left out make a longer step, not a jump.
+    steps = lengths / np.maximum(1, np.diff([frame.index for frame in video]))
+    relative = poses[:-1, :3, :3].transpose(0, 2, 1) @ poses[1:, :3, :3]
+    cosines = np.clip((np.trace(relative, axis1=1, axis2=2) - 1.0) / 2.0, -1.0, 1.0)
+    return PathFacts(
+        length=float(lengths.sum()),
+        mean_step=float(steps.mean()),
+        median_step=float(np.median(steps)),
+        largest_step=float(steps.max()),
+        largest_step_at=video[int(steps.argmax()) + 1].name,
+        extent=float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max() * 2.0),
+        turn=float(np.degrees(np.arccos(cosines)).sum()),
+    )
+
+
+def picture_facts(frames: Sequence[Frame]) -> PictureFacts:
+    """Of frames in video order."""
+    means, over, masked, repeated = [], [], [], []
+    before: torch.Tensor | None = None
+    for frame in frames:
+        image, valid = frame.image, frame.valid
+        inside = image[valid].float()
+        means.append(float(inside.mean()) if len(inside) else 0.0)
+        over.append(float((inside >= 254).all(dim=1).float().mean()) if len(inside) else 0.0)
+        masked.append(1.0 - float(valid.float().mean()))
+        if before is not None and before.shape == image.shape and torch.equal(before, image):
+            repeated.append(frame.name)
+        before = image
+    return PictureFacts(
+        mean=float(np.mean(means)),
+        darkest_frame=float(min(means)),
+        darkest_at=frames[int(np.argmin(means))].name,
+        brightest_frame=float(max(means)),
+        overexposed_share=float(np.mean(over)),
+        masked_share=float(np.mean(masked)),
+        repeated=tuple(repeated),
+    )

@@ -1,0 +1,229 @@
+"""What is suspect about a scene, with the figures that say so and what to do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from coliags_plugin.core.scenes import Frame
+from coliags_plugin.data_check.facts import DepthFacts, PathFacts, PictureFacts
+from coliags_plugin.data_check.hypotheses import ADVICE, GIVEN, NO_MOTION
+from coliags_plugin.data_check.matches import EpipolarAgreement
+from coliags_plugin.data_check.reprojection import Agreement
+
+#: Frames agree when their surfaces differ by no more than this part of the depth, in the median.
+DEPTH_AGREES = 0.02
+#: Another reading is believed when it makes the error so many times smaller.
+CLEARLY_BETTER = 2.0
+#: A factor on depth nearer to 1 than this says nothing.
+SCALE_TOLERANCE = 0.1
+#: Share of pixels that must land in the other picture.
+SHARE_LANDS = 0.3
+#: Matches agree with poses within this median distance, px.
+EPIPOLAR_AGREES = 2.0
+#: Below this the pictures' own sharpness decides, px.
+EPIPOLAR_SURE = 0.5
+#: Share of good matches that must lie in front of both cameras.
+IN_FRONT = 0.6
+#: Steps beyond so many median ones are jumps.
+JUMP = 10.0
+#: What the renderers' default near plane hides, scene units.
+NEAR = 0.2
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One suspect thing.
+
+    Attributes:
+        what: In a few words.
+        evidence: The figures behind it.
+        do: The next thing to try.
+    """
+
+    what: str
+    evidence: str
+    do: str
+
+
+def depth_findings(depth: DepthFacts | None) -> Iterator[Finding]:
+    """Depth that cannot be what it says."""
+    if depth is None:
+        return
+    if depth.invalid_share > 0.5:
+        yield Finding(
+            "most of the depth is unknown",
+            f"{depth.invalid_share:.0%} of the unmasked pixels",
+            "Check that the depth files belong to these pictures and are read with the right number of bits",
+        )
+    if math.isnan(depth.median):
+        return
+    if depth.farthest - depth.nearest < 1e-3 * depth.median:
+        yield Finding(
+            "depth is the same everywhere",
+            f"{depth.nearest:.4g} to {depth.farthest:.4g}",
+            "Check the depth files: pictures of one value are what a failed export leaves",
+        )
+    if depth.median < 1.0:
+        yield Finding(
+            "depth looks like metres",
+            f"median {depth.median:.4g}; this package takes lengths for millimetres, and renderers leave out what is "
+            f"nearer than {NEAR:g}",
+            "Give lengths in mm: poses and depth times 1000, or the format's unit option",
+        )
+    elif depth.median > 1000.0:
+        yield Finding(
+            "depth is too far for an endoscope",
+            f"median {depth.median:.4g} mm",
+            "Check the unit of the depth files",
+        )
+
+
+def agreement_findings(
+    readings: Mapping[str, Agreement], scale: tuple[float, float] | None, path: PathFacts | None
+) -> Iterator[Finding]:
+    """Poses and depth that contradict each other, and the change that would set them right."""
+    given = readings.get(GIVEN)
+    if given is None or path is None or path.length == 0.0:
+        return
+    error = math.inf if given.depth_error is None or given.share < SHARE_LANDS else given.depth_error
+    told = f"surfaces differ by {_percent(given.depth_error)} of the depth, {given.share:.0%} of the pixels land"
+    better = {
+        name: reading
+        for name, reading in readings.items()
+        if name in ADVICE and reading.depth_error is not None and reading.share >= SHARE_LANDS
+    }
+    best = min(better, key=lambda name: better[name].depth_error or 0.0, default=None)
+    least = math.inf if best is None else better[best].depth_error or 0.0
+    by_scale = math.inf if scale is None or abs(math.log(scale[0])) < SCALE_TOLERANCE else scale[1]
+    if scale is not None and by_scale * CLEARLY_BETTER < min(error, least * CLEARLY_BETTER):
+        yield Finding(
+            "depth and poses are in different units",
+            f"as they are, {told}; with depth times {scale[0]:.3g}, {_percent(by_scale)}",
+            f"Check the units: depth seems to be {1.0 / scale[0]:.3g} times what the poses expect",
+        )
+    elif best is not None and least * CLEARLY_BETTER < error:
+        yield Finding(
+            f"poses agree with depth when read as: {best}",
+            f"as they are, {told}; read so, {_percent(least)}",
+            ADVICE[best],
+        )
+    elif error > DEPTH_AGREES:
+        still = readings[NO_MOTION].depth_error
+        yield Finding(
+            "frames do not agree on the surface",
+            f"{told}; with no motion at all, {_percent(still)}",
+            "Check that pictures, depth and poses belong together frame by frame, and the calibration",
+        )
+
+
+def match_findings(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Finding]:
+    """Poses that features contradict."""
+    given = readings.get(GIVEN)
+    if given is None:
+        return
+    told = (
+        f"{given.count} matches lie {given.error:.2g} px from their epipolar lines (median), {given.in_front:.0%} in "
+        "front of both cameras"
+    )
+    in_front = given.in_front >= IN_FRONT
+    right = [
+        name
+        for name, reading in readings.items()
+        if name in ADVICE
+        and reading.in_front >= IN_FRONT
+        and (
+            (given.error > EPIPOLAR_SURE and reading.error * CLEARLY_BETTER < given.error)
+            or (not in_front and reading.error <= max(EPIPOLAR_SURE, given.error))
+        )
+    ]
+    best = min(right, key=lambda name: readings[name].error, default=None)
+    if best is not None:
+        reading = readings[best]
+        yield Finding(
+            f"poses agree with the pictures when read as: {best}",
+            f"as they are, {told}; read so, {reading.error:.2g} px, {reading.in_front:.0%} in front",
+            ADVICE[best],
+        )
+    elif given.error > EPIPOLAR_AGREES or not in_front:
+        yield Finding(
+            "pictures do not agree with the poses",
+            told,
+            "Check that pictures and poses belong together frame by frame, and the calibration",
+        )
+
+
+def path_findings(path: PathFacts | None) -> Iterator[Finding]:
+    """A camera that jumps or stands still."""
+    if path is None:
+        return
+    if path.length == 0.0:
+        yield Finding("the camera does not move", "all poses have one centre", "Check the pose file")
+    elif path.largest_step > JUMP * max(path.median_step, 1e-3 * path.mean_step):
+        yield Finding(
+            "the camera jumps",
+            f"{path.largest_step:.4g} to {path.largest_step_at}, {path.median_step:.4g} in the median",
+            "Check the poses around that frame: a cut in the video, or lines missing",
+        )
+
+
+def calibration_findings(frames: Sequence[Frame]) -> Iterator[Finding]:
+    """Intrinsics of another picture size, mostly."""
+    seen: set[tuple[float, ...]] = set()
+    for frame in frames:
+        camera = frame.camera
+        key = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+        if key in seen:
+            continue
+        seen.add(key)
+        off = max(abs(camera.cx / camera.width - 0.5), abs(camera.cy / camera.height - 0.5))
+        if off > 0.2:
+            yield Finding(
+                "the principal point is far from the middle",
+                f"{frame.name}: ({camera.cx:.4g}, {camera.cy:.4g}) of {camera.width} x {camera.height} px",
+                "Check that the intrinsics are for pictures of this size",
+            )
+        ratio = camera.fx / camera.fy
+        if not 1 / 1.15 < ratio < 1.15:
+            yield Finding(
+                "pixels are far from square",
+                f"{frame.name}: fx / fy = {ratio:.3g}",
+                "Check the intrinsics, or the working width and height",
+            )
+        angle = 2.0 * math.degrees(math.atan(0.5 * camera.width / camera.fx))
+        if not 25.0 < angle < 160.0:
+            yield Finding(
+                "the view is no endoscope's",
+                f"{frame.name}: {angle:.3g} degrees across",
+                "Check the focal length and the picture size it is for",
+            )
+
+
+def picture_findings(pictures: PictureFacts) -> Iterator[Finding]:
+    """Pictures that show nothing, or the same thing twice."""
+    if pictures.darkest_frame < 4.0:
+        yield Finding(
+            "a picture is black", f"{pictures.darkest_at}: mean {pictures.darkest_frame:.2g} of 255", "Leave it out"
+        )
+    if pictures.overexposed_share > 0.25:
+        yield Finding("pictures are overexposed", f"{pictures.overexposed_share:.0%} of the pixels are white", "")
+    if pictures.masked_share > 0.75:
+        yield Finding(
+            "masks leave little",
+            f"{pictures.masked_share:.0%} of the pixels are ignored",
+            "Check the meaning of the mask: black is ignored here",
+        )
+    if pictures.repeated:
+        count = len(pictures.repeated)
+        yield Finding(
+            "pictures repeat",
+            f"{pictures.repeated[0]}"
+            + (f" and {count - 1} more equal" if count > 1 else " equals")
+            + " the picture before",
+            "Leave repeated pictures and their poses out: the video was captured at a higher rate than the scope's",
+        )
+
+
+def _percent(value: float | None) -> str:
+    return "an unknown part" if value is None else f"{value:.2%}"

@@ -1,0 +1,122 @@
+"""Scenes without depth: features matched between frames must lie on each other's epipolar lines, in front of both."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from coliags_plugin.core.scenes import Frame
+from coliags_plugin.data_check.hypotheses import CHANGES, GIVEN
+
+#: Matches a pair needs to say anything.
+_ENOUGH = 8
+#: A match within so many pixels of its line speaks for the poses.
+_NEAR = 3.0
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Features matched between two frames: (column, row), centres at integers + 0.5. [K, 2] each."""
+
+    source: Frame
+    target: Frame
+    pixels: Float[np.ndarray, "K 2"]
+    pixels_there: Float[np.ndarray, "K 2"]
+
+
+@dataclass(frozen=True)
+class EpipolarAgreement:
+    """How well matches obey one reading of the poses.
+
+    Attributes:
+        error: Median distance from the epipolar line, px.
+        in_front: Share of the matches near their line whose point lies in front of both cameras.
+        count: Matches.
+    """
+
+    error: float
+    in_front: float
+    count: int
+
+
+def match(pairs: Sequence[tuple[Frame, Frame]]) -> list[Matches]:
+    """Match SIFT features of local-contrast pictures, those that are each other's best; pairs with few are left out."""
+    import cv2
+
+    detector: Any = cv2.SIFT.create(nfeatures=2000, contrastThreshold=0.01)
+    contrast = cv2.createCLAHE(clipLimit=4.0, tileGridSize=(8, 8))
+    matcher = cv2.BFMatcher(cv2.NORM_L2)
+    found = []
+    for source, target in pairs:
+        described = []
+        for frame in (source, target):
+            gray = contrast.apply(cv2.cvtColor(frame.image.numpy(), cv2.COLOR_RGB2GRAY))
+            described.append(detector.detectAndCompute(gray, frame.valid.numpy().astype(np.uint8)))
+        (points, features), (points_there, features_there) = described
+        if features is None or features_there is None or min(len(points), len(points_there)) < _ENOUGH:
+            continue
+        forward = [m for m, n in matcher.knnMatch(features, features_there, k=2) if m.distance < 0.8 * n.distance]
+        back = {m.queryIdx: m.trainIdx for m in matcher.match(features_there, features)}
+        mutual = [m for m in forward if back.get(m.trainIdx) == m.queryIdx]
+        if len(mutual) < _ENOUGH:
+            continue
+        # OpenCV counts centres at integers.
+        here = np.array([points[m.queryIdx].pt for m in mutual]) + 0.5
+        there = np.array([points_there[m.trainIdx].pt for m in mutual]) + 0.5
+        found.append(Matches(source, target, here, there))
+    return found
+
+
+def epipolar_agreement(matches: Sequence[Matches], change: str = GIVEN) -> EpipolarAgreement | None:
+    """Judge matches by the poses as ``change`` reads them; None where there are none or the cameras do not move."""
+    errors, in_front = [], []
+    for pair in matches:
+        judged = _judge(pair, change)
+        if judged is not None:
+            errors.append(judged[0])
+            in_front.append(judged[1])
+    if not errors:
+        return None
+    distance, front = np.concatenate(errors), np.concatenate(in_front)
+    near = distance < _NEAR
+    return EpipolarAgreement(
+        float(np.median(distance)), float(front[near].mean()) if near.any() else 0.0, len(distance)
+    )
+
+
+def _judge(pair: Matches, change: str) -> tuple[np.ndarray, np.ndarray] | None:
+    cameras = [
+        replace(frame.camera, camera_to_world=CHANGES[change](frame.camera.camera_to_world.double()))
+        for frame in (pair.source, pair.target)
+    ]
+    relative = (cameras[1].world_to_camera @ cameras[0].camera_to_world).numpy()
+    rotation, translation = relative[:3, :3], relative[:3, 3]
+    length = float(np.linalg.norm(translation))
+    if length == 0.0:
+        return None
+    rays = _rays(pair.pixels, cameras[0].intrinsics)
+    rays_there = _rays(pair.pixels_there, cameras[1].intrinsics)
+    x, y, z = translation / length
+    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
+    lines = np.linalg.inv(cameras[1].intrinsics.double().numpy()).T @ essential @ rays.T
+    homogeneous = np.concatenate([pair.pixels_there, np.ones((len(rays), 1))], axis=1)
+    distance = np.abs((homogeneous * lines.T).sum(axis=1)) / np.linalg.norm(lines[:2], axis=0)
+    return distance, _in_front(rays @ rotation.T, rays_there, translation)
+
+
+def _rays(pixels: np.ndarray, intrinsics: torch.Tensor) -> np.ndarray:
+    homogeneous = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
+    return np.asarray(homogeneous @ np.linalg.inv(intrinsics.double().numpy()).T)
+
+
+def _in_front(turned: np.ndarray, there: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """Whether ``a turned + translation = b there`` has a, b > 0, in the sense of least squares."""
+    aa, bb, ab = (turned**2).sum(1), (there**2).sum(1), (turned * there).sum(1)
+    at, bt = turned @ translation, there @ translation
+    determinant = np.maximum(aa * bb - ab**2, 1e-30)
+    return np.asarray(((ab * bt - bb * at) / determinant > 0) & ((aa * bt - ab * at) / determinant > 0))

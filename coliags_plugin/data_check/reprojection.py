@@ -1,0 +1,199 @@
+"""One frame's surface in another frame: where depth, poses and calibration agree, it lies on that frame's surface."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.scenes import Frame
+from coliags_plugin.data_check.hypotheses import CHANGES, GIVEN, Change
+
+#: Pixels of a frame that are carried over at most.
+_PIXELS = 4000
+#: Pairs of frames looked at.
+PAIRS = 12
+#: Factors on depth that are tried, before the best is refined.
+_SCALES = np.logspace(-4.0, 4.0, 65)
+#: For those, every so-many-th pixel will do.
+_THINNED = 8
+#: Share of pixels that must land in the other picture for a factor to count.
+_LAND = 0.2
+
+
+@dataclass(frozen=True)
+class Landing:
+    """Pixels of one frame, carried into another.
+
+    Attributes:
+        share: Share of the pixels that land in the other picture, in front of it.
+        depth_errors: |z - z there| / z there, of those that land on known depth. [K]
+        depth_errors_mm: |z - z there|, scene units. [K]
+        color_errors: Mean absolute difference of the channels, grey levels, brightness matched. [K]
+    """
+
+    share: float
+    depth_errors: Float[Tensor, "K"]
+    depth_errors_mm: Float[Tensor, "K"]
+    color_errors: Float[Tensor, "K"]
+
+
+class Pair:
+    """Two frames with depth, one of which is carried into the other under several readings of their poses.
+
+    Args:
+        source: The frame whose pixels are carried.
+        target: Where to.
+    """
+
+    def __init__(self, source: Frame, target: Frame) -> None:
+        depth, there = _known_depth(source), _known_depth(target)
+        chosen = _some(torch.isfinite(depth))
+        own_axes = replace(source.camera, camera_to_world=torch.eye(4, dtype=torch.float64))
+        self._source, self._target = source.camera, target.camera
+        #: Points in the source camera's axes. [K, 3]
+        self._points = own_axes.unproject(depth).reshape(-1, 3)[chosen]
+        self._depth_there = there.reshape(-1)
+        self._colors = source.image.reshape(-1, 3)[chosen].double()
+        self._colors_there = target.image.reshape(-1, 3).double()
+
+    def carried(self, change: Change, scale: float = 1.0, every: int = 1) -> Landing:
+        """Carry pixels over.
+
+        Args:
+            change: Of both poses.
+            scale: Factor on both depths.
+            every: Take only every so-many-th pixel.
+        """
+        points = self._points[::every] * scale
+        if not len(points):
+            nothing = torch.zeros(0, dtype=torch.float64)
+            return Landing(0.0, nothing, nothing, nothing)
+        pose = change(self._source.camera_to_world.double())
+        camera = _changed(self._target, change)
+        pixels, z = camera.project(points @ pose[:3, :3].T + pose[:3, 3])
+        column, row = pixels.floor().nan_to_num(-1.0).clamp(-1, 1 << 20).long().unbind(-1)
+        lands = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        place = row[lands] * camera.width + column[lands]
+        there = self._depth_there[place] * scale
+        difference = (z[lands] - there).abs()
+        known = torch.isfinite(difference)
+        return Landing(
+            float(lands.double().mean()),
+            (difference / there)[known],
+            difference[known],
+            _color_difference(self._colors[::every][lands], self._colors_there[place]),
+        )
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How well frames agree under one reading of the poses: medians over all pairs' pixels.
+
+    Attributes:
+        depth_error: Relative, of z-depth; None where too little lands on known depth.
+        depth_error_mm: The same in scene units.
+        color_error: Grey levels.
+        share: Share of pixels that land in the other picture.
+    """
+
+    depth_error: float | None
+    depth_error_mm: float | None
+    color_error: float | None
+    share: float
+
+
+def video_pairs(frames: Sequence[Frame], farther: int = 1, count: int = PAIRS) -> list[tuple[Frame, Frame]]:
+    """Frames a little apart: far enough that a wrong pose shows, near enough to see the same wall.
+
+    Args:
+        frames: Of the video.
+        farther: How many times the usual distance.
+        count: Pairs, at most.
+    """
+    video = sorted(frames, key=lambda frame: frame.index)
+    apart = min(farther * min(max(1, round(len(video) / 30)), 10), max(1, len(video) - 1))
+    if len(video) <= apart:
+        return []
+    starts = np.unique(np.linspace(0, len(video) - 1 - apart, count).astype(int))
+    return [(video[start], video[start + apart]) for start in starts]
+
+
+def agreement(pairs: Sequence[Pair], change: str = GIVEN, scale: float = 1.0, every: int = 1) -> Agreement:
+    """Carry every pair's first frame into its second; the arguments are those of :meth:`Pair.carried`."""
+    landings = [pair.carried(CHANGES[change], scale, every) for pair in pairs]
+    return Agreement(
+        _median([landing.depth_errors for landing in landings]),
+        _median([landing.depth_errors_mm for landing in landings]),
+        _median([landing.color_errors for landing in landings]),
+        float(np.mean([landing.share for landing in landings])) if landings else 0.0,
+    )
+
+
+def best_scale(pairs: Sequence[Pair]) -> tuple[float, float] | None:
+    """The factor on depth with which frames agree best, and the relative depth error then; None where none does."""
+
+    def error(scale: float) -> float:
+        found = agreement(pairs, scale=float(scale), every=_THINNED)
+        return np.inf if found.depth_error is None or found.share < _LAND else found.depth_error
+
+    errors = [error(scale) for scale in _SCALES]
+    least = int(np.argmin(errors))
+    if not np.isfinite(errors[least]):
+        return None
+    step = _SCALES[1] / _SCALES[0]
+    fine = _SCALES[least] * step ** np.linspace(-1.0, 1.0, 17)
+    fine_errors = [error(scale) for scale in fine]
+    return float(fine[int(np.argmin(fine_errors))]), float(min(fine_errors))
+
+
+def carried_picture(source: Frame, target: Frame) -> tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"]]:
+    """The target's view painted with the source's colours, and where it could be: each pixel looked up by its depth."""
+    depth = _known_depth(target)
+    pixels, z = _changed(source.camera).project(_changed(target.camera).unproject(depth).reshape(-1, 3))
+    camera = source.camera
+    grid = (pixels / pixels.new_tensor([camera.width, camera.height]) * 2 - 1).reshape(1, *depth.shape, 2)
+    picture = source.image.permute(2, 0, 1)[None].double()
+    painted = torch.nn.functional.grid_sample(picture, grid.nan_to_num(2.0), align_corners=False)[0].permute(1, 2, 0)
+    z_there = torch.nn.functional.grid_sample(
+        _known_depth(source)[None, None].nan_to_num(0.0), grid.nan_to_num(2.0), mode="nearest", align_corners=False
+    )[0, 0]
+    z = z.reshape(depth.shape)
+    # What another fold hides in the source picture has no colour there.
+    shown = (grid[0].abs() <= 1).all(-1) & (z > 0) & ((z_there - z).abs() < 0.05 * z)
+    return painted / 255.0, shown
+
+
+def _known_depth(frame: Frame) -> Float[Tensor, "H W"]:
+    depth = frame.depth
+    if depth is None:
+        return torch.full(frame.image.shape[:2], torch.nan, dtype=torch.float64)
+    return torch.where(frame.valid, depth.double(), torch.nan)
+
+
+def _changed(camera: Camera, change: Change = CHANGES[GIVEN]) -> Camera:
+    return replace(camera, camera_to_world=change(camera.camera_to_world.double()))
+
+
+def _some(known: Bool[Tensor, "H W"]) -> Tensor:
+    """Flat places of known pixels, evenly thinned."""
+    places = known.reshape(-1).nonzero()[:, 0]
+    return places[:: max(1, len(places) // _PIXELS)]
+
+
+def _color_difference(colors: Tensor, colors_there: Tensor) -> Tensor:
+    """The lamp and the gain change between frames; so brightness is matched, channel by channel."""
+    if not len(colors):
+        return torch.zeros(0, dtype=torch.float64)
+    factor = (colors_there.median(dim=0).values + 1.0) / (colors.median(dim=0).values + 1.0)
+    return (colors * factor - colors_there).abs().mean(dim=1)
+
+
+def _median(parts: Sequence[Tensor]) -> float | None:
+    values = torch.cat(list(parts)) if parts else torch.zeros(0)
+    return float(values.median()) if len(values) else None

@@ -1,0 +1,84 @@
+"""Resampling distorted pictures into pinhole pictures."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Shaped, UInt8
+
+from coliags_plugin.lenses.models import Lens, Pinhole, undistortion_map
+
+
+class Undistortion:
+    """Turns pictures taken through one lens into pictures of one pinhole camera.
+
+    Colour is averaged, not picked: where one pixel of the result covers several source pixels, it is the mean of
+    ``supersampling`` x ``supersampling`` bilinear samples spread over it, so that nothing aliases. Everything that must
+    not be mixed (depth, masks) is taken from the nearest source pixel, in its own type. z-depth needs no conversion:
+    both cameras share their optical axis.
+
+    Args:
+        lens: The lens of the source pictures.
+        pinhole: Intrinsics of the result, pixels, centres at integers.
+        width: Width of the result, pixels.
+        height: Its height.
+        source_mask: Source pixels that show something. None means all. [H_source, W_source]
+
+    Attributes:
+        supersampling: Bilinear samples per result pixel, along each side.
+        valid: Result pixels made only of source pixels that show something. [height, width]
+    """
+
+    def __init__(
+        self,
+        lens: Lens,
+        pinhole: Pinhole,
+        width: int,
+        height: int,
+        source_mask: Bool[np.ndarray, "H_source W_source"] | None = None,
+    ) -> None:
+        self.lens = lens
+        self.width, self.height = width, height
+        self._columns, self._rows = undistortion_map(lens, *pinhole, width, height)
+        self.supersampling = s = max(1, round(_longest_step(self._columns, self._rows)))
+        self._fine_columns, self._fine_rows = self._columns, self._rows
+        if s > 1:
+            fine = pinhole.scaled(s, s)
+            self._fine_columns, self._fine_rows = undistortion_map(lens, *fine, width * s, height * s)
+        shows = np.ones((lens.height, lens.width), bool) if source_mask is None else _eroded(source_mask)
+        fine_valid = self._pick(shows, self._fine_columns, self._fine_rows, False)
+        self.valid: np.ndarray = np.all(fine_valid.reshape(height, s, width, s), axis=(1, 3))
+
+    def image(self, rgb: UInt8[np.ndarray, "H_source W_source 3"]) -> UInt8[np.ndarray, "H W 3"]:
+        """A colour picture, resampled. Pixels outside :attr:`valid` are mixed with the picture's border."""
+        import cv2
+
+        fine = cv2.remap(rgb, self._fine_columns, self._fine_rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        if self.supersampling > 1:
+            # A whole-number INTER_AREA is the exact mean of each block.
+            fine = cv2.resize(fine, (self.width, self.height), interpolation=cv2.INTER_AREA)
+        return np.asarray(fine, np.uint8)
+
+    def nearest(self, values: Shaped[np.ndarray, "H_source W_source"], fill: float) -> Shaped[np.ndarray, "H W"]:
+        """Values of the nearest source pixels, unmixed and of the same type; ``fill`` where there is no source."""
+        return self._pick(values, self._columns, self._rows, fill)
+
+    def _pick(self, values: np.ndarray, columns: np.ndarray, rows: np.ndarray, fill: float) -> np.ndarray:
+        column, row = np.rint(columns).astype(np.int64), np.rint(rows).astype(np.int64)
+        inside = (column >= 0) & (column < self.lens.width) & (row >= 0) & (row < self.lens.height)
+        picked = np.full(columns.shape, fill, values.dtype)
+        picked[inside] = values[row[inside], column[inside]]
+        return picked
+
+
+def _longest_step(columns: np.ndarray, rows: np.ndarray) -> float:
+    """Source pixels per result pixel where the map is coarsest, leaving out the rim it does not reach."""
+    steps = [np.hypot(np.diff(columns, axis=axis), np.diff(rows, axis=axis)).ravel() for axis in (0, 1)]
+    return float(np.quantile(np.concatenate(steps), 0.95)) if columns.size > 1 else 1.0
+
+
+def _eroded(mask: np.ndarray) -> np.ndarray:
+    """The mask less its outermost pixels, whose bilinear neighbours show nothing."""
+    import cv2
+
+    kernel = np.ones((3, 3), np.uint8)
+    return np.asarray(cv2.erode(mask.astype(np.uint8), kernel, borderType=cv2.BORDER_REPLICATE)).astype(bool)

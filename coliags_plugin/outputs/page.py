@@ -1,0 +1,108 @@
+"""Self-contained HTML pages of one look."""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Iterable, Mapping
+from html import escape
+from pathlib import Path
+from string import Template
+from typing import Any
+
+from coliags_plugin import __version__
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import atomic_write
+from coliags_plugin.outputs.scales import tick_label
+
+_TEMPLATE = Path(__file__).with_name("page_template.html")
+_LONGEST_LIST = 6
+_LARGEST_MAPPING = 12
+_ABSOLUTE_PATH = re.compile(r"^(/|~|[A-Za-z]:[\\/]|\\\\|file:)")
+
+
+def write_page(output: Path, title: str, header: str, sections: Iterable[str]) -> None:
+    """Write a page.
+
+    Args:
+        output: The file; replaced if it is there.
+        title: Of the browser's tab, plain text.
+        header: HTML of the heading.
+        sections: HTML; empty ones are left out.
+
+    Raises:
+        InputError: ``output`` is a folder, or cannot be written.
+    """
+    refuse_folder(output)
+    page = Template(_TEMPLATE.read_text(encoding="utf-8")).substitute(
+        title=escape(title),
+        header=header,
+        sections="\n".join(filter(None, sections)),
+        footer=f"Written by coliags_plugin {escape(__version__)}.",
+    )
+    atomic_write(output, page)
+
+
+def refuse_folder(output: Path) -> None:
+    """Raise InputError where a page is to be written over a folder."""
+    if output.is_dir():
+        raise InputError(f"{output} is a folder", "a file", f"Write to {output / 'report.html'}")
+
+
+def fact_list(facts: Mapping[str, str]) -> str:
+    """A row of named facts under a heading; empty ones are left out."""
+    items = "".join(f"<div><dt>{escape(k)}</dt><dd>{escape(v)}</dd></div>" for k, v in facts.items() if v)
+    return f'<dl class="facts">{items}</dl>'
+
+
+def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """A table; cells are plain text, the first of each row names it."""
+    columns = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in head)
+    lines = []
+    for first, *others in rows:
+        cells = "".join(f"<td>{escape(cell)}</td>" for cell in others)
+        lines.append(f'<tr><th scope="row">{escape(first)}</th>{cells}</tr>')
+    return f'<div class="scroll"><table><thead><tr>{columns}</tr></thead><tbody>{"".join(lines)}</tbody></table></div>'
+
+
+def picture(png: bytes, caption: str) -> str:
+    """A cell of a ``view`` row: a picture under its name."""
+    source = base64.b64encode(png).decode()
+    name = escape(caption, quote=True)
+    return (
+        f'<figure class="cell"><div class="name">{name}</div>'
+        f'<img src="data:image/png;base64,{source}" alt="{name}"></figure>'
+    )
+
+
+def record(title: str, values: Mapping[str, Any]) -> str:
+    """Nested values, folded away."""
+    texts = ((key, plain(value)) for key, value in leaves(values))
+    rows = "".join(f"<dt>{escape(key)}</dt><dd>{escape(text)}</dd>" for key, text in texts if text)
+    body = f'<dl class="record">{rows}</dl>' if rows else '<p class="record">nothing recorded</p>'
+    return f"<details><summary>{escape(title)}</summary>{body}</details>"
+
+
+def leaves(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    """Values under dotted keys, large mappings kept whole; paths, which say nothing elsewhere, are left out."""
+    found: list[tuple[str, Any]] = []
+    for key, value in values.items():
+        if isinstance(value, Mapping) and len(value) <= _LARGEST_MAPPING:
+            found += leaves(value, f"{prefix}{key}.")
+        elif key != "path" and not (isinstance(value, str) and _ABSOLUTE_PATH.match(value)):
+            found.append((f"{prefix}{key}", value))
+    return found
+
+
+def plain(value: Any) -> str:
+    """A JSON value in words; long lists by their ends."""
+    if isinstance(value, Mapping):
+        return f"{len(value)} entries"
+    if isinstance(value, (list, tuple)):
+        words = [plain(entry) for entry in value]
+        if len(words) > _LONGEST_LIST:
+            return f"{words[0]}, {words[1]}, …, {words[-1]} ({len(words)})"
+        return ", ".join(words)
+    if isinstance(value, float):
+        return tick_label(value)
+    return {None: "", True: "yes", False: "no"}[value] if value is None or isinstance(value, bool) else str(value)

@@ -1,0 +1,279 @@
+"""The colon's wall: anatomy as a radius over arc length and clock angle, and the triangle mesh made of it.
+
+The wall lies at ``centre(s) + radius(s, phi) (cos phi n + sin phi b)``. Sizes follow docs/phantom.md 1: radius
+20 mm, three taeniae that make the lumen three-lobed, and between them haustral folds - thin crescents 5 to 8 mm high
+about every 25 mm. Lengths are mm, angles radians.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from coliags_plugin.phantom.centreline import LENGTH, CentreLine, grow_centre_line
+from coliags_plugin.phantom.settings import PhantomSettings
+from coliags_plugin.phantom.streams import Purpose, SolidNoise, smoothstep, stream
+
+RADIUS = 20.0
+#: Length over which the far end rounds off into a closed dome.
+_DOME = 18.0
+_TAENIAE = 2.0 * np.pi / 3.0 * np.arange(3)
+#: Size and standard deviation of the wall's unevenness, mm.
+_RELIEF = ((4.0, 0.2), (1.5, 0.05), (0.6, 0.015))
+
+
+@dataclass(frozen=True)
+class Fold:
+    """A haustral fold: a thin crescent across part of the circumference.
+
+    Attributes:
+        arc: Where along the colon, mm.
+        clock: Middle of the crescent, radians.
+        half_width: Half the angle it spans, radians.
+        height: How far it stands into the lumen at its middle, mm.
+        thickness: Full width at half height, mm.
+        slant: How far its ends lie ahead of its middle, mm.
+        sway: Amplitude and phase of its waviness, mm and radians.
+    """
+
+    arc: float
+    clock: float
+    half_width: float
+    height: float
+    thickness: float
+    slant: float
+    sway: tuple[float, float]
+
+    def rise(self, arc: Float[np.ndarray, "S 1"], clock: Float[np.ndarray, "1 C"]) -> Float[np.ndarray, "S C"]:
+        """Height above the wall, mm. [S, C]"""
+        turn = _wrapped(clock - self.clock)
+        across = np.clip(1.0 - (turn / self.half_width) ** 2, 0.0, None)
+        ridge = self.arc + self.slant * (turn / self.half_width) ** 2 + self.sway[0] * np.sin(3.0 * turn + self.sway[1])
+        along = np.abs(arc - ridge)
+        crest = np.exp(-np.log(2.0) * (2.0 * along / self.thickness) ** 2.4)
+        foot = np.exp(-((along / 6.0) ** 2))
+        return np.asarray(self.height * across**1.3 * (0.82 * crest + 0.18 * foot))
+
+
+@dataclass(frozen=True)
+class Polyp:
+    """A sessile polyp: a cap of ``width`` mm that stands ``height`` mm into the lumen."""
+
+    arc: float
+    clock: float
+    width: float
+    height: float
+
+    def nearness(self, arc: Float[np.ndarray, "S 1"], clock: Float[np.ndarray, "1 C"]) -> Float[np.ndarray, "S C"]:
+        """1 at the middle, 0 at the rim and outside. [S, C]"""
+        along = arc - self.arc
+        across = _wrapped(clock - self.clock) * RADIUS
+        return np.asarray(np.clip(1.0 - (along**2 + across**2) / (0.5 * self.width) ** 2, 0.0, None))
+
+
+@dataclass(frozen=True)
+class Anatomy:
+    """Everything that decides the wall's large-scale shape."""
+
+    centre_line: CentreLine
+    folds: tuple[Fold, ...]
+    polyps: tuple[Polyp, ...]
+    taenia_clock: float
+    taenia_twist: float
+    swell_phase: float
+
+    def taenia_distance(
+        self, arc: Float[np.ndarray, "S 1"], clock: Float[np.ndarray, "1 C"]
+    ) -> Float[np.ndarray, "3 S C"]:
+        """Clock angle to each of the three taeniae, radians. [3, S, C]"""
+        turned = clock - self.taenia_clock - self.taenia_twist * arc
+        return _wrapped(turned[None] - _TAENIAE[:, None, None])
+
+    def radius(self, arc: Float[np.ndarray, "S"], clock: Float[np.ndarray, "C"]) -> Float[np.ndarray, "S C"]:
+        """Distance of the wall from the centre line, mm. [S, C]"""
+        arc, clock = arc[:, None], clock[None, :]
+        # Narrower beyond the bend (and so never wider than the bend's radius of curvature).
+        calibre = RADIUS * (1.0 + 0.05 * np.sin(2.0 * np.pi * arc / 90.0 + self.swell_phase))
+        calibre *= 1.0 - 0.15 * smoothstep((arc - 110.0) / 50.0)
+        bands = np.exp(-0.5 * (self.taenia_distance(arc, clock) / 0.2) ** 2).sum(axis=0)
+        lobes = np.cos(3.0 * (clock - self.taenia_clock - self.taenia_twist * arc))
+        wall = calibre * (1.0 - 0.055 * lobes - 0.04 * bands)
+        # A fourth-power sum keeps crossing crescents from piling up, and is smooth.
+        rise = np.zeros_like(wall)
+        for fold in self.folds:
+            rows = slice(*np.searchsorted(arc[:, 0], [fold.arc - 22.0, fold.arc + 22.0]))
+            rise[rows] += fold.rise(arc[rows], clock) ** 4
+        wall -= rise**0.25
+        for polyp in self.polyps:
+            rows = slice(*np.searchsorted(arc[:, 0], [polyp.arc - polyp.width, polyp.arc + polyp.width]))
+            wall[rows] -= polyp.height * polyp.nearness(arc[rows], clock) ** 0.75
+        into_dome = np.clip((arc - (LENGTH - _DOME)) / _DOME, 0.0, 1.0)
+        return np.asarray(np.clip(wall, 4.0, None) * np.sqrt(np.clip(1.0 - into_dome**2, 0.0, None)))
+
+
+def grow_anatomy(settings: PhantomSettings) -> Anatomy:
+    """Draw a colon."""
+    generator = stream(settings.seed, Purpose.ANATOMY)
+    centre_line = grow_centre_line(generator)
+    taenia_clock = generator.uniform(0.0, 2.0 * np.pi)
+    twist = generator.uniform(-0.003, 0.003)
+    swell = generator.uniform(0.0, 2.0 * np.pi)
+    folds: list[Fold] = []
+    stations: list[float] = []
+    station = generator.uniform(6.0, 14.0)
+    while station < LENGTH - _DOME - 4.0:
+        stations.append(station)
+        # Two or three of the sectors between taeniae carry a crescent; together they shape the opening.
+        sectors = generator.permutation(3)[: generator.choice([2, 3])]
+        tallest = generator.uniform(5.0, 8.0)
+        for place, sector in enumerate(sectors):
+            middle = taenia_clock + twist * station + _TAENIAE[sector] + np.pi / 3.0
+            folds.append(
+                Fold(
+                    arc=station + generator.uniform(-2.5, 2.5),
+                    clock=float(middle + generator.normal(0.0, 0.12)),
+                    half_width=generator.uniform(np.pi / 3.0, 2.0 * np.pi / 3.0),
+                    height=tallest if place == 0 else generator.uniform(5.0, max(tallest, 5.01)),
+                    thickness=generator.uniform(2.2, 4.0),
+                    slant=generator.uniform(-3.0, 3.0),
+                    sway=(generator.uniform(0.2, 0.8), generator.uniform(0.0, 2.0 * np.pi)),
+                )
+            )
+        station += generator.normal(25.0, 3.0)
+    polyps = tuple(_draw_polyp(generator, stations) for _ in range(settings.polyps))
+    return Anatomy(centre_line, tuple(folds), polyps, taenia_clock, twist, swell)
+
+
+def _draw_polyp(generator: np.random.Generator, stations: list[float]) -> Polyp:
+    """A polyp between two folds, on the stretch the camera looks at."""
+    between = [0.5 * (a + b) for a, b in pairwise(stations)]
+    places = [arc for arc in between if 30.0 < arc < 125.0]
+    arc = float(generator.choice(places)) + generator.uniform(-4.0, 4.0)
+    width = generator.uniform(3.0, 10.0)
+    return Polyp(arc, generator.uniform(0.0, 2.0 * np.pi), width, width * generator.uniform(0.33, 0.39))
+
+
+@dataclass(frozen=True)
+class ColonSurface:
+    """The wall as a mesh on a grid: rows along the colon, columns around it (periodic).
+
+    Rows are evenly spaced in the length one walks along the wall, over folds and all, not in arc length of the centre
+    line; so texture and mesh are not stretched on the flanks of folds.
+
+    Attributes:
+        vertices: World, mm, row-major. [R*C, 3]
+        normals: Unit, into the lumen. [R*C, 3]
+        tangents: Unit, along the colon. [R*C, 3]
+        triangles: Vertex numbers; counter-clockwise seen from the lumen. [F, 3]
+        areas: Wall area belonging to each vertex, mm^2. [R*C]
+        arc: Arc length of each row, mm. [R]
+        columns: C.
+        row_length: Mean distance of rows along the wall, mm.
+    """
+
+    vertices: Float[np.ndarray, "V 3"]
+    normals: Float[np.ndarray, "V 3"]
+    tangents: Float[np.ndarray, "V 3"]
+    triangles: Int[np.ndarray, "F 3"]
+    areas: Float[np.ndarray, "V"]
+    arc: Float[np.ndarray, "R"]
+    columns: int
+    row_length: float
+
+    @property
+    def rows(self) -> int:
+        """R."""
+        return len(self.arc)
+
+    @property
+    def clock(self) -> Float[np.ndarray, "C"]:
+        """Clock angle of each column, radians. [C]"""
+        return np.arange(self.columns) * (2.0 * np.pi / self.columns)
+
+    def grid_place(
+        self, triangle: Int[np.ndarray, "N"], barycentric: Float[np.ndarray, "N 2"]
+    ) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
+        """Row and column, with fractions, of points inside triangles.
+
+        Args:
+            triangle: Triangle numbers. [N]
+            barycentric: Weights of the second and third corner. [N, 2]
+        """
+        cell, odd = np.divmod(triangle, 2)
+        row, column = np.divmod(cell, self.columns)
+        sign = 1.0 - 2.0 * odd.astype(np.float32)
+        start = odd.astype(np.float32)
+        return (
+            row.astype(np.float32) + start + sign * barycentric[:, 0],
+            column.astype(np.float32) + start + sign * barycentric[:, 1],
+        )
+
+
+def build_surface(anatomy: Anatomy, settings: PhantomSettings) -> ColonSurface:
+    """Mesh the wall, with its fine unevenness, at ``settings.mesh_spacing``."""
+    arc, wall_length = _even_rows(anatomy, settings.mesh_spacing)
+    columns = max(round(2.0 * np.pi * 0.95 * RADIUS / settings.mesh_spacing), 24)
+    clock = np.arange(columns) * (2.0 * np.pi / columns)
+    row_length = wall_length / (len(arc) - 1)
+    radius = anatomy.radius(arc, clock)
+    centres, frames = anatomy.centre_line.at(arc)
+    around = np.cos(clock)[None, :, None] * frames[:, None, :, 0] + np.sin(clock)[None, :, None] * frames[:, None, :, 1]
+    noise = SolidNoise(stream(settings.seed, Purpose.RELIEF))
+    smooth = (centres[:, None, :] + radius[:, :, None] * around).astype(np.float32)
+    for scale, height in _RELIEF:
+        bumps = noise.layer(smooth, scale)
+        # A mesh too coarse for a layer would only alias it.
+        if scale > settings.mesh_spacing:
+            radius -= height * np.clip(radius / RADIUS, 0.0, 1.0) * bumps
+    grid = centres[:, None, :] + radius[:, :, None] * around
+    along = np.gradient(grid, axis=0)
+    across = 0.5 * (np.roll(grid, -1, axis=1) - np.roll(grid, 1, axis=1))
+    normals = np.cross(along, across)
+    areas = np.linalg.norm(normals, axis=-1)
+    # At the tip of the dome a whole row is one point, whose normal looks back along the colon.
+    tip = areas < 1e-9
+    normals[tip] = np.broadcast_to(-frames[:, None, :, 2], grid.shape)[tip]
+    along[tip] = np.broadcast_to(frames[:, None, :, 0], grid.shape)[tip]
+    return ColonSurface(
+        vertices=grid.reshape(-1, 3).astype(np.float32),
+        normals=_unit(normals).reshape(-1, 3).astype(np.float32),
+        tangents=_unit(along).reshape(-1, 3).astype(np.float32),
+        triangles=_grid_triangles(len(arc), columns),
+        areas=areas.reshape(-1).astype(np.float32),
+        arc=arc,
+        columns=columns,
+        row_length=row_length,
+    )
+
+
+def _even_rows(anatomy: Anatomy, spacing: float) -> tuple[Float[np.ndarray, "R"], float]:
+    """Arc lengths of rows that are evenly spaced along the wall, and the wall's whole length, mm."""
+    fine = np.linspace(0.0, LENGTH, 4 * round(LENGTH) + 1)
+    step = fine[1] - fine[0]
+    radius = anatomy.radius(fine, np.arange(96) * (2.0 * np.pi / 96))
+    slope = np.diff(radius, axis=0) / step
+    stretch = np.sqrt(1.0 + (slope**2).mean(axis=1))
+    walked = np.concatenate([[0.0], np.cumsum(stretch * step)])
+    rows = max(round(walked[-1] / spacing), 24) + 1
+    return np.interp(np.linspace(0.0, walked[-1], rows), walked, fine), float(walked[-1])
+
+
+def _grid_triangles(rows: int, columns: int) -> Int[np.ndarray, "F 3"]:
+    row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns), indexing="ij")
+    following = (column + 1) % columns
+    a, b = row * columns + column, (row + 1) * columns + column
+    c, d = row * columns + following, (row + 1) * columns + following
+    even, odd = np.stack([a, b, c], axis=-1), np.stack([d, c, b], axis=-1)
+    return np.stack([even, odd], axis=2).reshape(-1, 3).astype(np.uint32)
+
+
+def _unit(vectors: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+def _wrapped(angle: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """The same angle in [-pi, pi)."""
+    return np.asarray((angle + np.pi) % (2.0 * np.pi) - np.pi)

@@ -1,0 +1,334 @@
+"""Making a phantom: colon, light, path, pictures, truth."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from coliags_plugin import __version__
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import atomic_folder
+from coliags_plugin.core.progress import Progress
+from coliags_plugin.phantom.colon import ColonSurface, build_surface, grow_anatomy
+from coliags_plugin.phantom.imaging import Exposure, Sensor, World, expose, meter
+from coliags_plugin.phantom.interreflection import IndirectLight, indirect_lights
+from coliags_plugin.phantom.layouts import layout_of, meshes
+from coliags_plugin.phantom.layouts.base import Part, WallPoints
+from coliags_plugin.phantom.layouts.pictures import write_image
+from coliags_plugin.phantom.light import Lamp
+from coliags_plugin.phantom.mucosa import Mucosa, paint_mucosa
+from coliags_plugin.phantom.response import KNEE, develop, exposure_for, exposures, white_balances
+from coliags_plugin.phantom.settings import PhantomSettings, either
+from coliags_plugin.phantom.streams import Purpose, stream
+from coliags_plugin.phantom.tracing import Tracer
+from coliags_plugin.phantom.trajectory import RotationView, travel, turn_away
+from coliags_plugin.phantom.visibility import likeliest_first, seen_from
+
+_LOG = logging.getLogger(__name__)
+
+#: Pixels an exposure meter looks at.
+_METERED = 2500
+#: Pictures taken side by side; open3d shares the cores anyway, this fills the gaps between its calls.
+_AT_ONCE = 2
+#: Initial points of the layouts that have some: about as many as structure from motion finds in such a video.
+_POINTS = 20_000
+
+
+@dataclass(frozen=True)
+class Phantom:
+    """A colon, ready to be filmed: what :func:`generate` writes is this, seen from every pose.
+
+    Attributes:
+        settings: Resolved.
+        world: Wall, material, lamp.
+        sensor: Of every picture.
+        poses: Of the sequence. Each [4, 4]
+        rotation_views: Test views away from it.
+        indirect: Light from the wall, for the sequence and then the rotation views.
+        gains: Red, green, blue gain of every frame of the sequence. [T, 3]
+    """
+
+    settings: PhantomSettings
+    world: World
+    sensor: Sensor
+    poses: list[Float[np.ndarray, "4 4"]]
+    rotation_views: list[RotationView]
+    indirect: list[IndirectLight | None]
+    gains: Float[np.ndarray, "T 3"]
+
+    @property
+    def training_poses(self) -> list[Float[np.ndarray, "4 4"]]:
+        """Poses of the frames that are not held out."""
+        is_test = layout_of(self.settings.layout).is_test
+        return [pose for index, pose in enumerate(self.poses) if not is_test(index)]
+
+    @property
+    def vertex_albedo(self) -> Float[np.ndarray, "V 3"]:
+        """Albedo at the mesh's vertices, linear RGB. [V, 3]"""
+        return vertex_albedo(self.world.surface, self.world.mucosa)
+
+    def photograph(self, number: int) -> tuple[Exposure, UInt8[np.ndarray, "P 3"]]:
+        """Take picture ``number``: the sequence's frames come first, then the rotation views.
+
+        A rotation view is taken with the exposure of the frame it turns away from, as if the camera turned faster than
+        the exposure follows.
+        """
+        frames = len(self.poses)
+        if number < frames:
+            pose, gain = self.poses[number], self.gains[number]
+        else:
+            view = self.rotation_views[number - frames]
+            pose, gain = view.camera_to_world, self.gains[view.frame]
+        exposure = expose(self.world, self.sensor, pose, self.indirect[number])
+        noise = stream(self.settings.seed, Purpose.SENSOR, number)
+        return exposure, develop(exposure.radiance, gain, self.settings, noise)
+
+    def seen(
+        self, points: Float[np.ndarray, "N 3"], camera_to_world: Float[np.ndarray, "4 4"]
+    ) -> Bool[np.ndarray, "N"]:
+        """Which points of the wall, seen from this pose, a training frame sees too. [N]"""
+        order = likeliest_first(camera_to_world, self.training_poses)
+        return seen_from(points, order, self.sensor.optics, self.sensor.mask, self.world.tracer)
+
+
+def prepare(settings: PhantomSettings, progress: Progress | None = None) -> Phantom:
+    """Grow the colon, choose the path, and solve for indirect light and exposure.
+
+    Raises:
+        InputError: The seed's colon has no room for the path, or open3d is missing.
+    """
+    tell = progress or _silent
+    settings = settings.resolved()
+    tell("colon", 0, 4)
+    anatomy = grow_anatomy(settings)
+    surface = build_surface(anatomy, settings)
+    tell("colon", 1, 4)
+    mucosa = paint_mucosa(anatomy, surface, settings)
+    tell("colon", 2, 4)
+    tracer = Tracer(surface)
+    lamp = Lamp.of(settings)
+    world = World(surface, mucosa, tracer, lamp, either(settings.vignetting, settings.preset.vignetting))
+    poses = list(travel(anatomy.centre_line, settings, tracer.clearance))
+    layout = layout_of(settings.layout)
+    views = turn_away(np.stack(poses), settings, layout.is_test) if layout.has_rotation else []
+    everywhere = [*poses, *(view.camera_to_world for view in views)]
+    indirect: list[IndirectLight | None] = [None] * len(everywhere)
+    if settings.interreflection > 0.0:
+        generator = stream(settings.seed, Purpose.INTERREFLECTION)
+        indirect[:] = indirect_lights(
+            surface,
+            vertex_albedo(surface, mucosa),
+            tracer,
+            lamp,
+            everywhere,
+            settings.interreflection,
+            generator,
+        )
+    tell("colon", 3, 4)
+    optics, mask = layout.optics(*settings.size)
+    sensor = Sensor.behind(optics, mask, settings.supersampling)
+    thin = sensor.thinned(_METERED)
+    ideal = []
+    for index, pose in enumerate(poses):
+        ideal.append(exposure_for(meter(world, thin, pose, indirect[index]), settings.target_grey, settings.gamma))
+    gains = exposures(ideal, settings)[:, None] * white_balances(settings)
+    tell("colon", 4, 4)
+    return Phantom(settings, world, sensor, poses, views, indirect, gains)
+
+
+def generate(
+    settings: PhantomSettings, output: Path, overwrite: bool = False, progress: Progress | None = None
+) -> None:
+    """Make a phantom and write it.
+
+    The folder holds the sequence in ``settings.layout``; the rotation-only test views and masks of what training frames
+    saw of them, where the layout has a place for them; ``truth/``, with the mesh, the albedo, the light, every frame's
+    gain, the poses in float64, and the masks of the sequence's own test frames; and ``phantom.json``. The same settings
+    give the same bytes.
+
+    Args:
+        settings: What to make.
+        output: The folder to make. It appears whole or not at all.
+        overwrite: Replace the folder if it exists.
+        progress: Called with a stage's name, how much of it is done and how much there is.
+
+    Raises:
+        InputError: The folder exists or cannot be written, the seed's colon has no room for the path, or open3d is
+            missing.
+    """
+    tell = progress or _silent
+    try:
+        with atomic_folder(output, overwrite) as folder:
+            phantom = prepare(settings, tell)
+            _write(phantom, folder, tell)
+            (folder / "phantom.json").write_text(
+                _json({"version": __version__, "settings": phantom.settings.model_dump()})
+            )
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise InputError(f"cannot write to {output}: {reason}", "a writable folder", "Choose another output") from error
+    _LOG.info("phantom of seed %d written to %s", settings.seed, output)
+
+
+def _write(phantom: Phantom, folder: Path, tell: Progress) -> None:
+    layout = layout_of(phantom.settings.layout)
+    frames, optics = len(phantom.poses), phantom.sensor.optics
+    turned = [view.camera_to_world for view in phantom.rotation_views]
+    total = frames + len(turned)
+    # Coverage as C3VD counts it: triangles that are the first hit of any pixel ray of any frame.
+    observed = np.zeros(len(phantom.world.surface.triangles), bool)
+    trained_on = np.zeros_like(observed)
+    drawn = []
+    tell("frames", 0, total)
+    for number, (exposure, color) in enumerate(_photographs(phantom, total)):
+        image = phantom.sensor.image
+        part: Part = "video" if number < frames else "rotation"
+        index = number if part == "video" else number - frames
+        pose = phantom.poses[index] if part == "video" else turned[index]
+        layout.write_frame(folder, part, index, image(color), image(exposure.z_depth), image(exposure.normals))
+        if part == "video":
+            observed[exposure.triangles] = True
+        if part == "video" and not layout.is_test(index):
+            trained_on[exposure.triangles] = True
+            if layout.has_points:
+                drawn.append(_draw_points(phantom, index, exposure, color))
+        else:
+            seen = image(_seen_mask(phantom, exposure, pose))
+            write_image(layout.seen_mask(folder, part, index), seen)
+        tell("frames", number + 1, total)
+    layout.write_sequence(folder, "video", phantom.poses, optics)
+    if turned:
+        layout.write_sequence(folder, "rotation", turned, optics)
+    if layout.has_points:
+        layout.write_points(folder, _wall_points(phantom, drawn), phantom.poses, optics)
+    if layout.has_coverage_mesh:
+        meshes.write_coverage_obj(folder / "coverage_mesh.obj", phantom.world.surface, observed)
+    tell("truth", 0, 1)
+    _write_truth(phantom, folder / "truth", trained_on, observed)
+    tell("truth", 1, 1)
+
+
+def _photographs(phantom: Phantom, total: int) -> Iterator[tuple[Exposure, UInt8[np.ndarray, "P 3"]]]:
+    """All pictures in order, a few ahead of whoever writes them."""
+    with ThreadPoolExecutor(_AT_ONCE) as pool:
+        waiting = [pool.submit(phantom.photograph, number) for number in range(min(_AT_ONCE, total))]
+        for number in range(total):
+            ready = waiting.pop(0).result()
+            if number + _AT_ONCE < total:
+                waiting.append(pool.submit(phantom.photograph, number + _AT_ONCE))
+            yield ready
+
+
+def _seen_mask(
+    phantom: Phantom, exposure: Exposure, camera_to_world: Float[np.ndarray, "4 4"]
+) -> UInt8[np.ndarray, "P"]:
+    """255 where a pixel's wall is also seen by a training frame; 0 elsewhere, and where there is no wall. [P]"""
+    found = np.flatnonzero(exposure.z_depth > 0.0)
+    points = _wall(phantom, exposure, camera_to_world, found)
+    mask = np.zeros(len(exposure.z_depth), np.uint8)
+    mask[found] = np.where(phantom.seen(points, camera_to_world), 255, 0)
+    return mask
+
+
+def _wall(
+    phantom: Phantom,
+    exposure: Exposure,
+    camera_to_world: Float[np.ndarray, "4 4"],
+    pixels: Int[np.ndarray, "N"],
+) -> Float[np.ndarray, "N 3"]:
+    """Where on the wall, world frame, lit pixels look. [N, 3]"""
+    local = phantom.sensor.centers[pixels] * exposure.z_depth[pixels, None]
+    return np.asarray(local.astype(np.float64) @ camera_to_world[:3, :3].T + camera_to_world[:3, 3])
+
+
+def _draw_points(
+    phantom: Phantom, index: int, exposure: Exposure, color: UInt8[np.ndarray, "P 3"]
+) -> tuple[Float[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"]]:
+    """This training frame's share of the initial points and their colours."""
+    found = np.flatnonzero(exposure.z_depth > 0.0)
+    share = min(-(-_POINTS // len(phantom.training_poses)), len(found))
+    generator = stream(phantom.settings.seed, Purpose.POINTS, index)
+    chosen = np.sort(generator.choice(found, share, replace=False))
+    return _wall(phantom, exposure, phantom.poses[index], chosen), color[chosen]
+
+
+def _wall_points(
+    phantom: Phantom, drawn: Sequence[tuple[Float[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"]]]
+) -> WallPoints:
+    positions = np.concatenate([positions for positions, _ in drawn])
+
+    def seen_in(index: int) -> Bool[np.ndarray, "N"]:
+        sensor = phantom.sensor
+        return seen_from(positions, [phantom.poses[index]], sensor.optics, sensor.mask, phantom.world.tracer)
+
+    return WallPoints(positions, np.concatenate([colors for _, colors in drawn]), seen_in)
+
+
+def _write_truth(
+    phantom: Phantom, folder: Path, trained_on: Bool[np.ndarray, "F"], observed: Bool[np.ndarray, "F"]
+) -> None:
+    surface, settings = phantom.world.surface, phantom.settings
+    folder.mkdir(parents=True, exist_ok=True)
+    albedo = phantom.vertex_albedo
+    meshes.write_ply(folder / "mesh.ply", surface, albedo)
+    vertices = surface.vertices.astype(np.float64)
+    seen = seen_from(vertices, phantom.training_poses, phantom.sensor.optics, phantom.sensor.mask, phantom.world.tracer)
+    np.savez(folder / "mesh_seen.npz", vertex_seen=seen, face_seen=trained_on, face_seen_by_any_frame=observed)
+    np.savez(
+        folder / "albedo.npz",
+        texture=phantom.world.mucosa.albedo.astype(np.float16),
+        vertex_albedo=albedo,
+        row_arc_mm=surface.arc,
+        columns=surface.columns,
+    )
+    np.save(folder / "camera_to_world.npy", np.stack(phantom.poses))
+    (folder / "gain.csv").write_text(_gain_csv(range(len(phantom.poses)), phantom.gains))
+    if phantom.rotation_views:
+        used = phantom.gains[[view.frame for view in phantom.rotation_views]]
+        (folder / "rotation_gain.csv").write_text(_gain_csv(range(len(used)), used))
+    light = {
+        "law": "pixel = noise + shoulder(gain * cos(theta)^vignetting * (albedo * (E n.l + E_indirect) + gloss E))"
+        "^(1/gamma), E = beam(psi) (unit_distance_mm / d)^2, psi and d at the lamp",
+        "lamp": phantom.world.lamp.describe(),
+        "vignetting": settings.vignetting,
+        "interreflection": settings.interreflection,
+        "gamma": settings.gamma,
+        "shoulder_knee": KNEE,
+        "noise_grey_levels": settings.noise,
+        "gain": settings.gain,
+        "rotation_views": [
+            {"frame": view.frame, "turn_degrees": round(view.turn, 6)} for view in phantom.rotation_views
+        ],
+    }
+    (folder / "light.json").write_text(_json(light))
+
+
+def vertex_albedo(surface: ColonSurface, mucosa: Mucosa) -> Float[np.ndarray, "V 3"]:
+    """Albedo at the mesh's vertices, averaged over a mesh cell. [V, 3]"""
+    row, column = np.meshgrid(
+        np.arange(surface.rows, dtype=np.float32), np.arange(surface.columns, dtype=np.float32), indexing="ij"
+    )
+    footprint = np.full(row.size, surface.row_length, np.float32)
+    return mucosa.sample(row.ravel(), column.ravel(), footprint).albedo
+
+
+def _gain_csv(frames: range, gains: Float[np.ndarray, "T 3"]) -> str:
+    lines = [
+        f"{frame},{red:.9g},{green:.9g},{blue:.9g}" for frame, (red, green, blue) in zip(frames, gains, strict=True)
+    ]
+    return "\n".join(["frame,gain_r,gain_g,gain_b", *lines]) + "\n"
+
+
+def _json(value: object) -> str:
+    return json.dumps(value, indent=2) + "\n"
+
+
+def _silent(stage: str, done: int, total: int) -> None:
+    pass

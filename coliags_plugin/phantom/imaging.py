@@ -1,0 +1,246 @@
+"""Taking pictures: rays through a lens, onto the mesh, and back as radiance, z-depth and normals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
+
+from coliags_plugin.lenses.models import Pinhole
+from coliags_plugin.phantom.colon import ColonSurface
+from coliags_plugin.phantom.interreflection import IndirectLight
+from coliags_plugin.phantom.light import Lamp
+from coliags_plugin.phantom.mucosa import Mucosa
+from coliags_plugin.phantom.tracing import Hits, Tracer, turned
+
+#: Samples shaded at a time: bounds memory, and keeps the working set in the cache.
+_CHUNK = 1 << 15
+
+
+class Optics(Protocol):
+    """What a picture is taken through. Pixel centres lie at integers; directions have z = 1."""
+
+    @property
+    def width(self) -> int:
+        """Pixels."""
+
+    @property
+    def height(self) -> int:
+        """Pixels."""
+
+    def unproject(self, pixels: ArrayLike) -> Float[np.ndarray, "N 3"]:
+        """Viewing directions, camera axes. [N, 3]"""
+
+    def project(self, points: ArrayLike) -> Float[np.ndarray, "N 2"]:
+        """Pixels of points in camera axes; NaN for points not in front of the camera. [N, 2]"""
+
+
+@dataclass(frozen=True)
+class PinholeOptics:
+    """A camera without distortion.
+
+    Attributes:
+        pinhole: Intrinsics, pixels, centres at integers.
+        width, height: Pixels.
+    """
+
+    pinhole: Pinhole
+    width: int
+    height: int
+
+    def unproject(self, pixels: ArrayLike) -> Float[np.ndarray, "N 3"]:
+        """See :class:`Optics`."""
+        pixels = np.asarray(pixels, np.float64)
+        k = self.pinhole
+        x, y = (pixels[:, 0] - k.cx) / k.fx, (pixels[:, 1] - k.cy) / k.fy
+        return np.stack([x, y, np.ones_like(x)], axis=1)
+
+    def project(self, points: ArrayLike) -> Float[np.ndarray, "N 2"]:
+        """See :class:`Optics`."""
+        points = np.asarray(points, np.float64)
+        z = np.where(points[:, 2] > 0.0, points[:, 2], np.nan)
+        k = self.pinhole
+        return np.stack([k.fx * points[:, 0] / z + k.cx, k.fy * points[:, 1] / z + k.cy], axis=1)
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """The pixels that see something, and the directions they sample.
+
+    Attributes:
+        optics: The lens.
+        mask: Pixels that the lens lights. [H, W]
+        centers: Direction through each such pixel's centre. [P, 3]
+        samples: Directions of its K colour samples. [P, K, 3]
+    """
+
+    optics: Optics
+    mask: Bool[np.ndarray, "H W"]
+    centers: Float[np.ndarray, "P 3"]
+    samples: Float[np.ndarray, "P K 3"]
+
+    @classmethod
+    def behind(cls, optics: Optics, mask: Bool[np.ndarray, "H W"], supersampling: int) -> Sensor:
+        """A sensor with ``supersampling`` x ``supersampling`` colour samples a pixel."""
+        row, column = np.nonzero(mask)
+        pixels = np.stack([column, row], axis=1).astype(np.float64)
+        reached = ~np.isnan(optics.unproject(pixels)[:, 0])
+        mask = mask.copy()
+        mask[row, column] = reached
+        pixels = pixels[reached]
+        offsets = (np.arange(supersampling) + 0.5) / supersampling - 0.5
+        sub = np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(-1, 2)
+        centers = optics.unproject(pixels)
+        samples = np.stack([optics.unproject(pixels + offset) for offset in sub], axis=1)
+        # A sub-sample past the lens's reach looks where its pixel's centre does.
+        samples = np.where(np.isnan(samples), centers[:, None, :], samples)
+        return cls(optics, mask, centers.astype(np.float32), samples.astype(np.float32))
+
+    def thinned(self, most: int) -> Sensor:
+        """An exposure meter: about ``most`` of the pixels, evenly spread, one sample each."""
+        stride = max(int(np.sqrt(len(self.centers) / most)), 1)
+        grid = np.zeros_like(self.mask)
+        grid[stride // 2 :: stride, stride // 2 :: stride] = True
+        mask = self.mask & grid
+        chosen = self.centers[mask[self.mask]]
+        return Sensor(self.optics, mask, chosen, chosen[:, None, :])
+
+    def image(self, values: np.ndarray) -> np.ndarray:
+        """Values of the lit pixels as an image that is 0 elsewhere. [P, ...] -> [H, W, ...]"""
+        image = np.zeros((*self.mask.shape, *values.shape[1:]), values.dtype)
+        image[self.mask] = values
+        return image
+
+
+@dataclass(frozen=True)
+class World:
+    """Everything a picture depends on but the camera's place."""
+
+    surface: ColonSurface
+    mucosa: Mucosa
+    tracer: Tracer
+    lamp: Lamp
+    vignetting: float
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """What reaches the sensor's P lit pixels.
+
+    Attributes:
+        radiance: Linear, before exposure. [P, 3]
+        z_depth: mm at the pixel's centre; 0 where the ray meets nothing. [P]
+        normals: Unit, camera axes, towards the camera; 0 where the ray meets nothing. [P, 3]
+        triangles: Numbers of all triangles met.
+    """
+
+    radiance: Float[np.ndarray, "P 3"]
+    z_depth: Float[np.ndarray, "P"]
+    normals: Float[np.ndarray, "P 3"]
+    triangles: Int[np.ndarray, "T"]
+
+
+def expose(
+    world: World, sensor: Sensor, camera_to_world: Float[np.ndarray, "4 4"], indirect: IndirectLight | None
+) -> Exposure:
+    """Take one picture. Colour is the mean of a pixel's samples; z-depth and normal are those of its centre alone."""
+    pixels, per_pixel = sensor.samples.shape[:2]
+    radiance = np.empty((pixels, 3), np.float32)
+    met = np.zeros(len(world.surface.triangles), bool)
+    # Distance between neighbouring samples per mm of depth.
+    spacing = float(np.sqrt(_pixel_solid_angle(sensor) / per_pixel))
+    step = max(_CHUNK // per_pixel, 1)
+    for start in range(0, pixels, step):
+        directions = sensor.samples[start : start + step].reshape(-1, 3)
+        hits = world.tracer.cast(camera_to_world, directions)
+        met[hits.triangle[hits.found]] = True
+        light = np.zeros((len(directions), 3), np.float32)
+        light[hits.found] = shade(world, camera_to_world, directions[hits.found], hits.kept(), spacing, indirect)
+        radiance[start : start + step] = light.reshape(-1, per_pixel, 3).mean(axis=1)
+    hits = world.tracer.cast(camera_to_world, sensor.centers)
+    met[hits.triangle[hits.found]] = True
+    z_depth = np.where(hits.found, hits.z_depth, np.float32(0.0))
+    normals = np.zeros((pixels, 3), np.float32)
+    facing = _unit(world.tracer.interpolate(world.surface.normals, hits.kept()))
+    normals[hits.found] = turned(facing, camera_to_world[:3, :3].T)
+    return Exposure(radiance, z_depth, normals, np.flatnonzero(met))
+
+
+def meter(
+    world: World, sensor: Sensor, camera_to_world: Float[np.ndarray, "4 4"], indirect: IndirectLight | None
+) -> Float[np.ndarray, "P 3"]:
+    """Radiance of the pixels' centres only; what an exposure meter looks at. [P, 3]"""
+    hits = world.tracer.cast(camera_to_world, sensor.centers)
+    light = np.zeros((len(sensor.centers), 3), np.float32)
+    spacing = float(np.sqrt(_pixel_solid_angle(sensor)))
+    light[hits.found] = shade(world, camera_to_world, sensor.centers[hits.found], hits.kept(), spacing, indirect)
+    return light
+
+
+def shade(
+    world: World,
+    camera_to_world: Float[np.ndarray, "4 4"],
+    directions: Float[np.ndarray, "N 3"],
+    hits: Hits,
+    spacing: float,
+    indirect: IndirectLight | None,
+) -> Float[np.ndarray, "N 3"]:
+    """Radiance that hits send back along their rays.
+
+    ``cos^k theta (albedo (E n.l + E_indirect) + gloss E)`` with ``E = beam (20 / d)^2``.
+
+    Args:
+        world: Wall, lamp and lens.
+        camera_to_world: Pose. [4, 4]
+        directions: Of the rays, camera axes, z = 1. [N, 3]
+        hits: Where they met the wall; all found. [N]
+        spacing: Distance between neighbouring samples at z-depth 1.
+        indirect: Light that the wall throws onto the wall, or none.
+    """
+    length = np.sqrt(np.einsum("nc,nc->n", directions, directions))
+    cos_theta = 1.0 / length
+    to_eye = turned(directions, camera_to_world[:3, :3]) * -cos_theta[:, None]
+    points = camera_to_world[:3, 3].astype(np.float32) - to_eye * (hits.z_depth * length)[:, None]
+
+    normals = _unit(world.tracer.interpolate(world.surface.normals, hits))
+    slant = np.maximum(np.einsum("nc,nc->n", normals, to_eye), 0.15)
+    row, column = world.surface.grid_place(hits.triangle, hits.barycentric)
+    # A sample's footprint is an ellipse, longer where the wall slants away; the texture is blurred evenly.
+    material = world.mucosa.sample(row, column, hits.z_depth * spacing / np.sqrt(slant))
+
+    along = world.surface.tangents[world.surface.triangles[hits.triangle, 0]]
+    along = _unit(along - normals * np.einsum("nc,nc->n", along, normals)[:, None])
+    across = np.cross(normals, along)
+    tipped = along * material.slopes[:, :1] + across * material.slopes[:, 1:]
+    film = _unit(normals - tipped)
+    # Light diffuses about half a millimetre inside tissue, which evens out half of the finest relief's shading.
+    tissue = _unit(normals - 0.5 * tipped)
+
+    strength, to_lamp = world.lamp.irradiance(points, camera_to_world)
+    if world.lamp.casts_shadows:
+        lamp = camera_to_world[:3, 3] + camera_to_world[:3, :3] @ np.asarray(world.lamp.offset)
+        strength *= world.tracer.visible(points, lamp)
+    diffuse = strength * np.maximum(np.einsum("nc,nc->n", tissue, to_lamp), 0.0)
+    received = diffuse[:, None]
+    if indirect is not None:
+        received = received + indirect.at(row, column)
+    gloss = strength * material.wetness * world.lamp.gloss(film, to_lamp, to_eye, material.slope_variance)
+    # The film cannot shine where the wall itself turns its back.
+    gloss *= np.einsum("nc,nc->n", normals, to_lamp) > 0.0
+    light = material.albedo * received + gloss[:, None]
+    return np.asarray(light * (cos_theta**world.vignetting)[:, None], dtype=np.float32)
+
+
+def _pixel_solid_angle(sensor: Sensor) -> float:
+    """Mean area that a pixel covers at z-depth 1, seen near the middle of the image."""
+    middle = np.array([0.5 * sensor.optics.width, 0.5 * sensor.optics.height])
+    corner = sensor.optics.unproject(middle + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
+    return float(np.linalg.norm(np.cross(corner[1] - corner[0], corner[2] - corner[0])))
+
+
+def _unit(vectors: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
+    length = np.sqrt(np.einsum("nc,nc->n", vectors, vectors))
+    return np.asarray(vectors / np.maximum(length, 1e-12)[:, None])

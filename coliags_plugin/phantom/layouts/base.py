@@ -1,0 +1,141 @@
+"""What a folder layout has to say for a phantom to be written in it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from coliags_plugin.lenses.models import Pinhole
+from coliags_plugin.phantom.imaging import Optics, PinholeOptics
+from coliags_plugin.phantom.trajectory import every_8th
+from coliags_plugin.poses.trajectory import Intrinsics
+
+#: ``video``: the sequence itself. ``rotation``: the test views at its places, turned away from it.
+Part = Literal["video", "rotation"]
+
+#: Intrinsics of C3VD's undistorted frames at 338 x 270, centres at integers (docs/phantom.md 3).
+_C3VD_PINHOLE = Pinhole(200.8769, 200.4713, 167.3190, 136.9333)
+
+
+@dataclass(frozen=True)
+class WallPoints:
+    """Points of the wall that training frames see, as structure from motion would have found them.
+
+    Attributes:
+        positions: World, mm. [N, 3]
+        colors: RGB as a training frame photographed them. [N, 3]
+        seen_in: Which of the points a frame of the sequence sees, by the frame's index. [N]
+    """
+
+    positions: Float[np.ndarray, "N 3"]
+    colors: UInt8[np.ndarray, "N 3"]
+    seen_in: Callable[[int], Bool[np.ndarray, "N"]]
+
+
+class Layout(ABC):
+    """How one phantom lies in a folder.
+
+    A folder is written in this order: every frame of the video, every rotation view, then :meth:`write_sequence` for
+    the video and for the rotation views, then :meth:`write_points`. ``phantom.json`` and ``truth/`` are not the
+    layout's: they are the same beside every layout.
+    """
+
+    #: Width and height, pixels, where none are asked for.
+    default_size: ClassVar[tuple[int, int]] = (338, 270)
+    #: Whether there is a place for rotation views; where there is none, none are taken.
+    has_rotation: ClassVar[bool] = False
+    #: Whether there is a place for initial points; where there is none, none are drawn.
+    has_points: ClassVar[bool] = False
+    #: Whether the mesh and its coverage belong to the layout, as ``coverage_mesh.obj``.
+    has_coverage_mesh: ClassVar[bool] = False
+
+    def optics(self, width: int, height: int) -> tuple[Optics, Bool[np.ndarray, "H W"]]:
+        """The lens of frames of this size, and which of their pixels are lit. The mask is [H, W].
+
+        Unless a layout says otherwise: C3VD's undistorted camera, scaled by width; its principal point keeps its
+        distance from the middle. All of its pixels are lit.
+        """
+        scale = width / 338.0
+        k = _C3VD_PINHOLE
+        pinhole = Pinhole(
+            k.fx * scale,
+            k.fy * scale,
+            0.5 * width - 0.5 + (k.cx + 0.5 - 169.0) * scale,
+            0.5 * height - 0.5 + (k.cy + 0.5 - 135.0) * scale,
+        )
+        return PinholeOptics(pinhole, width, height), np.ones((height, width), bool)
+
+    def is_test(self, index: int) -> bool:
+        """Whether a frame of the video is held out by the split that goes with the layout.
+
+        0, 8, 16, ... unless a layout says otherwise. Points, rotation views and the masks of what training frames saw
+        go by it.
+        """
+        return every_8th(index)
+
+    @abstractmethod
+    def write_frame(
+        self,
+        folder: Path,
+        part: Part,
+        index: int,
+        color: UInt8[np.ndarray, "H W 3"],
+        z_depth: Float[np.ndarray, "H W"],
+        normals: Float[np.ndarray, "H W 3"],
+    ) -> None:
+        """Write one frame.
+
+        Args:
+            folder: Of the phantom.
+            part: What the frame belongs to.
+            index: Place in its part, counted from 0.
+            color: RGB. [H, W, 3]
+            z_depth: mm; 0 where there is no wall. [H, W]
+            normals: Unit, camera axes, towards the camera; 0 where there is no wall. [H, W, 3]
+        """
+
+    @abstractmethod
+    def write_sequence(
+        self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], optics: Optics
+    ) -> None:
+        """Write what belongs to all frames of a part: poses and, where the layout has one, the camera.
+
+        Args:
+            folder: Of the phantom.
+            part: What the frames belong to.
+            poses: Camera-to-world, OpenCV axes, mm. Each [4, 4]
+            optics: Of all of them, from :meth:`optics`.
+        """
+
+    def write_points(
+        self, folder: Path, points: WallPoints, poses: Sequence[Float[np.ndarray, "4 4"]], optics: Optics
+    ) -> None:
+        """Write initial points; called where :attr:`has_points`. ``poses`` are those of the video."""
+        raise NotImplementedError(f"{type(self).__name__} has no place for points")
+
+    def seen_mask(self, folder: Path, part: Part, index: int) -> Path:
+        """Where the mask goes that says what training frames saw of a test frame."""
+        return folder / ("truth" if part == "video" else part) / "seen" / f"{index:04d}_seen.png"
+
+
+def pinhole_of(optics: Optics) -> Intrinsics:
+    """Intrinsics of frames that are a pinhole's, pixel centres at integers + 0.5.
+
+    Raises:
+        TypeError: They are taken through another lens.
+    """
+    if not isinstance(optics, PinholeOptics):
+        raise TypeError(f"{type(optics).__name__} is no pinhole, and the layout holds a pinhole camera")
+    k = optics.pinhole
+    return Intrinsics(k.fx, k.fy, k.cx + 0.5, k.cy + 0.5, optics.width, optics.height)
+
+
+def place(folder: Path, part: Part) -> Path:
+    """The folder of a part where rotation views lie in ``rotation/`` in the layout of the sequence itself."""
+    return folder if part == "video" else folder / part

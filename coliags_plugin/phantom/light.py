@@ -1,0 +1,132 @@
+"""The lamp and the wall's reflection, in linear light (docs/phantom.md 2, 2.2).
+
+Radiance is counted in units of what a white Lambertian wall sends back that the lamp's axis strikes squarely at
+20 mm, so exposures are of the order of 1.
+
+No cast shadows are drawn for a lamp on the optical axis. Exactly at the lens it casts none that the lens could see.
+Behind the lens it stands for a ring of light guides around it (such a ring, too, gains less than 1/d^2 on close walls,
+docs/phantom.md 2.1), and what the lens sees, the ring as a whole lights. A lamp beside the lens does cast shadows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from coliags_plugin.phantom.settings import PhantomSettings, SpreadLaw, either
+from coliags_plugin.phantom.streams import smoothstep
+
+#: Distance at which radiance is 1, mm.
+UNIT_DISTANCE = 20.0
+#: cos psi below which the beam fades to nothing at 90 degrees: light guides shine forward only. No pixel looks there.
+_EDGE = float(np.cos(np.radians(72.0)))
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """A spotlight that the camera carries, and the mucosa's gloss.
+
+    Attributes:
+        offset: Position in camera axes, mm.
+        axis: Unit direction of the beam in camera axes.
+        spread_law, spread: Angular fall-off; see :class:`PhantomSettings`.
+        specular, roughness, f0: The mucus film; see :class:`PhantomSettings`.
+    """
+
+    offset: tuple[float, float, float]
+    axis: tuple[float, float, float]
+    spread_law: SpreadLaw
+    spread: float
+    specular: float
+    roughness: float
+    f0: float
+
+    @classmethod
+    def of(cls, settings: PhantomSettings) -> Lamp:
+        """The lamp that settings describe; it is tilted downwards in the image."""
+        preset = settings.preset
+        tilt = np.radians(either(settings.tilt, preset.tilt))
+        return cls(
+            offset=either(settings.light_offset, preset.light_offset),
+            axis=(0.0, float(np.sin(tilt)), float(np.cos(tilt))),
+            spread_law=either(settings.spread_law, preset.spread_law),
+            spread=either(settings.spread, preset.spread),
+            specular=settings.specular,
+            roughness=settings.roughness,
+            f0=settings.f0,
+        )
+
+    @property
+    def casts_shadows(self) -> bool:
+        """Whether the lamp stands beside the optical axis."""
+        return bool(np.hypot(self.offset[0], self.offset[1]) > 0.0)
+
+    def beam(self, cosine: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
+        """Intensity at an angle psi from the beam's axis, 1 on it. [N]
+
+        Args:
+            cosine: cos psi. [N]
+        """
+        if self.spread_law == "cosine":
+            shape = np.maximum(cosine, 0.0) ** self.spread
+        else:
+            shape = np.exp(-self.spread * (1.0 - cosine))
+        return np.asarray(shape * smoothstep(cosine / _EDGE), dtype=cosine.dtype)
+
+    def irradiance(
+        self, points: Float[np.ndarray, "N 3"], camera_to_world: Float[np.ndarray, "4 4"]
+    ) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N 3"]]:
+        """What a wall square to the light would receive, and where the light comes from.
+
+        Args:
+            points: World, mm. [N, 3]
+            camera_to_world: Pose of the camera that carries the lamp. [4, 4]
+
+        Returns:
+            ``beam(cos psi) (20 / d)^2`` and unit directions from the points to the lamp, world. [N], [N, 3]
+        """
+        rotation, center = camera_to_world[:3, :3], camera_to_world[:3, 3]
+        lamp = (center + rotation @ np.asarray(self.offset)).astype(points.dtype)
+        axis = (rotation @ np.asarray(self.axis)).astype(points.dtype)
+        to_lamp = lamp - points
+        square = np.einsum("nc,nc->n", to_lamp, to_lamp)
+        to_lamp /= np.sqrt(square)[:, None]
+        return self.beam(-np.einsum("nc,c->n", to_lamp, axis)) * (UNIT_DISTANCE**2 / square), to_lamp
+
+    def gloss(
+        self,
+        normals: Float[np.ndarray, "N 3"],
+        to_lamp: Float[np.ndarray, "N 3"],
+        to_eye: Float[np.ndarray, "N 3"],
+        slope_variance: Float[np.ndarray, "N"],
+    ) -> Float[np.ndarray, "N"]:
+        """Pi times the GGX reflection of the film times n.l: radiance per unit of :meth:`irradiance`. [N]
+
+        Smith's height-correlated masking and Schlick's Fresnel term.
+
+        Args:
+            normals: Unit, with the micro-relief. [N, 3]
+            to_lamp: Unit. [N, 3]
+            to_eye: Unit. [N, 3]
+            slope_variance: Relief too small for the sample, summed over two directions; it widens the lobe as
+                roughness does (a GGX lobe of width alpha stands for slopes of variance alpha^2). [N]
+        """
+        half = to_lamp + to_eye
+        half /= np.maximum(np.sqrt(np.einsum("nc,nc->n", half, half)), 1e-6)[:, None]
+        light = np.maximum(np.einsum("nc,nc->n", normals, to_lamp), 0.0)
+        eye = np.maximum(np.einsum("nc,nc->n", normals, to_eye), 1e-3)
+        facing = np.maximum(np.einsum("nc,nc->n", normals, half), 0.0)
+        grazing = np.maximum(np.einsum("nc,nc->n", to_lamp, half), 0.0)
+        alpha2 = np.minimum(self.roughness**4 + slope_variance, 1.0)
+        lobe = alpha2 / (facing * facing * (alpha2 - 1.0) + 1.0) ** 2
+        masking = light * np.sqrt(eye * eye * (1.0 - alpha2) + alpha2)
+        masking += eye * np.sqrt(light * light * (1.0 - alpha2) + alpha2)
+        fresnel = self.f0 + (1.0 - self.f0) * (1.0 - grazing) ** 5
+        return np.asarray(self.specular * fresnel * lobe * 0.5 * light / np.maximum(masking, 1e-6))
+
+    def describe(self) -> dict[str, Any]:
+        """Plain values for the truth folder."""
+        return {**asdict(self), "unit_distance_mm": UNIT_DISTANCE}

@@ -1,0 +1,231 @@
+"""What can be chosen about a phantom, and the two presets of light and motion."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, TypeVar
+
+from pydantic import Field, ValidationError, field_validator
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.settings import Settings
+from coliags_plugin.phantom.layouts import LayoutName, layout_of
+
+_T = TypeVar("_T")
+
+SpreadLaw = Literal["exponential", "cosine"]
+GainMode = Literal["auto", "fixed"]
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Values that stand in for settings left at None, and the motion that goes with them.
+
+    Attributes:
+        light_offset: Lamp position in camera axes, mm.
+        spread_law: See :class:`PhantomSettings`.
+        spread: See :class:`PhantomSettings`.
+        vignetting: See :class:`PhantomSettings`.
+        tilt: See :class:`PhantomSettings`.
+        gain: See :class:`PhantomSettings`.
+        white_balance_drift: See :class:`PhantomSettings`.
+        turn: Largest yaw, pitch and roll of the wobble, degrees.
+        scan: Largest turn away from the lumen of the ``rotation`` trajectory, degrees.
+        wobble: Smallest and largest lateral excursion from the centre line, mm.
+        approaches: How often the camera comes close to the wall.
+        closest: Camera-to-wall distance of an approach, mm.
+    """
+
+    light_offset: tuple[float, float, float]
+    spread_law: SpreadLaw
+    spread: float
+    vignetting: float
+    tilt: float
+    gain: GainMode
+    white_balance_drift: float
+    turn: tuple[float, float, float]
+    scan: float
+    wobble: tuple[float, float]
+    approaches: int
+    closest: float
+
+
+#: ``c3vd`` is the fair default. Its fall-off towards the rim adds up to the cos^1.25 that a free fit of real C3VD
+#: pixels gave, its look direction stays near C3VD's median of 7 degrees, and its exposure is automatic
+#: (docs/phantom.md 3, 4). ``strong`` is the stress case (docs/phantom.md 4): the lamp at the lens,
+#: cos^1.5 spread under cos^2.5 vignetting, a fixed exposure, large rotations and two approaches to 9 mm.
+PRESETS: dict[str, Preset] = {
+    "c3vd": Preset(
+        light_offset=(0.0, 0.0, -3.6),
+        spread_law="exponential",
+        spread=0.75,
+        vignetting=0.5,
+        tilt=0.6,
+        gain="auto",
+        white_balance_drift=0.02,
+        turn=(5.5, 4.5, 3.0),
+        scan=28.0,
+        wobble=(1.5, 3.0),
+        approaches=0,
+        closest=9.0,
+    ),
+    "strong": Preset(
+        light_offset=(0.0, 0.0, 0.0),
+        spread_law="cosine",
+        spread=1.5,
+        vignetting=2.5,
+        tilt=0.0,
+        gain="fixed",
+        white_balance_drift=0.0,
+        turn=(16.0, 14.0, 12.0),
+        scan=34.0,
+        wobble=(1.5, 3.5),
+        approaches=2,
+        closest=9.0,
+    ),
+}
+
+
+def either(value: _T | None, otherwise: _T) -> _T:
+    """The value, unless it is None."""
+    return otherwise if value is None else value
+
+
+class PhantomSettings(Settings):
+    """A phantom: the colon, the scope that films it, and the folder layout.
+
+    Ranges bracket what is published about colons and endoscopes (docs/phantom.md 1, 2, 3). A setting left at None
+    takes the value of the preset ``light`` names.
+    """
+
+    seed: int = Field(0, ge=0, description="The whole phantom follows from it.")
+    layout: LayoutName = Field("c3vd", description="Files and folders to write; docs/phantom.md 5 lists the layouts.")
+    trajectory: Literal["pullback", "rotation"] = Field(
+        "pullback", description="pullback: withdrawal along the lumen. rotation: the camera mostly turns on the spot."
+    )
+    frames: int = Field(120, ge=9, le=2000, description="Frames of the sequence; every 8th is a test frame.")
+    width: int | None = Field(None, ge=16, le=4096, description="Image width, pixels. None: the layout's own.")
+    height: int | None = Field(None, ge=16, le=4096, description="Image height, pixels. None: the layout's own.")
+    rotation_views: int = Field(
+        12,
+        ge=0,
+        le=500,
+        description="Test views at positions of the path, turned 15 to 30 degrees away from it; none in a layout that "
+        "has no place for them.",
+    )
+    supersampling: int = Field(2, ge=1, le=4, description="Colour samples per pixel side; depth is never averaged.")
+
+    light: Literal["c3vd", "strong"] = Field("c3vd", description="Preset of light and motion; see PRESETS.")
+    gain: GainMode | None = Field(
+        None, description="auto: exposure follows the picture with a lag. fixed: one exposure for the whole sequence."
+    )
+    light_offset: tuple[float, float, float] | None = Field(
+        None,
+        description="Lamp in camera axes (x right, y down, z forward), mm, at most 5 mm from the lens. A fitted real "
+        "endoscope: (-0.06, -1.14, -3.61).",
+    )
+    spread_law: SpreadLaw | None = Field(
+        None, description="exponential: exp(-spread (1 - cos psi)), Modrzejewski 2020. cosine: cos^spread psi."
+    )
+    spread: float | None = Field(None, ge=0.0, le=4.0, description="How narrow the lamp's beam is; range 0 to 4.")
+    vignetting: float | None = Field(
+        None, ge=0.0, le=4.0, description="Exponent of the lens's cos theta fall-off; 0 is none; range 0 to 4."
+    )
+    tilt: float | None = Field(
+        None, ge=0.0, le=10.0, description="Lamp axis against optical axis, degrees; measured 0.64 on one endoscope."
+    )
+    interreflection: float = Field(
+        1.0,
+        ge=0.0,
+        le=1.0,
+        description="Share of the light that the wall throws onto the wall; 1 is the solved radiosity, 0 none.",
+    )
+    specular: float = Field(1.0, ge=0.0, le=1.0, description="Share of the mucus film's Fresnel reflection.")
+    roughness: float = Field(
+        0.3, ge=0.15, le=0.7, description="GGX roughness of the mucus film, whose alpha is its square."
+    )
+    f0: float = Field(0.028, ge=0.0, le=0.08, description="Normal reflectance of the film; .028 is an index of 1.40.")
+    albedo: tuple[float, float, float] = Field(
+        (0.78, 0.29, 0.22),
+        description="Mean albedo of the mucosa, linear RGB, each between 0.02 and 0.9 (docs/phantom.md 1).",
+    )
+
+    target_grey: float = Field(
+        0.45,
+        ge=0.1,
+        le=0.8,
+        description="Mean of the encoded picture that the exposure aims at; C3VD has .19 to .59 (docs/phantom.md 3).",
+    )
+    gain_lag: float = Field(
+        2.0, ge=0.0, le=100.0, description="Time constant of the automatic exposure, frames; 0 follows at once."
+    )
+    gain_span: float = Field(
+        3.0, ge=1.0, le=8.0, description="Largest over smallest automatic gain, linear; C3VD's cecum_t1_a spans 3."
+    )
+    white_balance_drift: float | None = Field(
+        None, ge=0.0, le=0.2, description="Standard deviation of the slow drift of log red/green and blue/green gain."
+    )
+    gamma: float = Field(2.2, ge=1.0, le=3.0, description="Camera response: pixel = linear^(1/gamma).")
+    noise: float = Field(
+        1.5, ge=0.0, le=8.0, description="Standard deviation of shot and read noise at mid grey, grey levels of 255."
+    )
+
+    polyps: int = Field(4, ge=0, le=20, description="Sessile polyps, 3 to 10 mm wide.")
+    path_length: float = Field(50.0, ge=0.0, le=60.0, description="Length of the pullback, mm; C3VD's median is 47.")
+    mesh_spacing: float = Field(0.42, ge=0.2, le=4.0, description="Distance of mesh vertices, mm.")
+    texture_spacing: float = Field(0.1, ge=0.05, le=2.0, description="Size of a texel of the mucosa, mm.")
+
+    @field_validator("light_offset")
+    @classmethod
+    def _lamp_near_lens(cls, offset: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
+        # The camera keeps 6 mm from the wall, so a lamp within 5 mm of it never enters the wall.
+        if offset is not None and not math.hypot(*offset) <= 5.0:
+            raise ValueError(f"the lamp is {math.hypot(*offset):.3g} mm from the lens; it must be within 5 mm")
+        return offset
+
+    @field_validator("albedo")
+    @classmethod
+    def _albedo_is_one(cls, albedo: tuple[float, float, float]) -> tuple[float, float, float]:
+        if not all(0.02 <= value <= 0.9 for value in albedo):
+            raise ValueError(f"albedo {albedo} has a channel outside 0.02 to 0.9")
+        return albedo
+
+    @property
+    def preset(self) -> Preset:
+        """The preset behind the settings left at None."""
+        return PRESETS[self.light]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Image width and height, pixels."""
+        width, height = layout_of(self.layout).default_size
+        return either(self.width, width), either(self.height, height)
+
+    def resolved(self) -> PhantomSettings:
+        """The same settings with every None replaced by what it stands for."""
+        width, height = self.size
+        chosen: dict[str, Any] = {"width": width, "height": height}
+        if not layout_of(self.layout).has_rotation:
+            chosen["rotation_views"] = 0
+        for name in ("light_offset", "spread_law", "spread", "vignetting", "tilt", "gain", "white_balance_drift"):
+            chosen[name] = either(getattr(self, name), getattr(self.preset, name))
+        return self.model_copy(update=chosen)
+
+
+def phantom_settings(options: Mapping[str, Any]) -> PhantomSettings:
+    """Validated settings from plain options.
+
+    Raises:
+        InputError: An option is unknown, of the wrong type or out of range; the first such one is named.
+    """
+    try:
+        return PhantomSettings(**options)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "options"
+        raise InputError(
+            f"phantom setting {where}: {first['msg']} (got {first['input']!r})",
+            do="docs/phantom.md lists every setting with its unit and range",
+        ) from error

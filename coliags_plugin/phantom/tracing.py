@@ -1,0 +1,109 @@
+"""Ray casting against the colon's mesh, by open3d."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.phantom.colon import ColonSurface
+
+
+@dataclass(frozen=True)
+class Hits:
+    """Where N rays first meet the wall.
+
+    Attributes:
+        found: Whether they do. [N]
+        z_depth: mm along the optical axis; infinite where they do not. [N]
+        triangle: Triangle number. [N]
+        barycentric: Weights of the triangle's second and third corner. [N, 2]
+    """
+
+    found: Bool[np.ndarray, "N"]
+    z_depth: Float[np.ndarray, "N"]
+    triangle: Int[np.ndarray, "N"]
+    barycentric: Float[np.ndarray, "N 2"]
+
+    def kept(self) -> Hits:
+        """Only the rays that meet the wall."""
+        keep = self.found
+        return Hits(keep[keep], self.z_depth[keep], self.triangle[keep], self.barycentric[keep])
+
+
+def turned(vectors: Float[np.ndarray, "N 3"], rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "N 3"]:
+    """``rotation @ vector`` for many vectors, in their precision; a matrix product takes several times as long."""
+    return np.einsum("nc,dc->nd", vectors, rotation.astype(vectors.dtype))
+
+
+class Tracer:
+    """The mesh, prepared for rays.
+
+    Raises:
+        InputError: open3d cannot be imported.
+    """
+
+    def __init__(self, surface: ColonSurface) -> None:
+        try:
+            import open3d
+        except (ImportError, OSError) as error:
+            raise InputError(
+                f"open3d does not import here ({error})",
+                "open3d, which traces a phantom's rays",
+                "Install it with `pip install open3d`; on Debian and Ubuntu it also needs the package libusb-1.0-0",
+            ) from error
+        # Its stubs know only some of its constructors.
+        self._open3d: Any = open3d
+        self._surface = surface
+        self._scene = open3d.t.geometry.RaycastingScene()
+        self._scene.add_triangles(
+            self._open3d.core.Tensor(np.ascontiguousarray(surface.vertices, np.float32)),
+            self._open3d.core.Tensor(np.ascontiguousarray(surface.triangles, np.uint32)),
+        )
+
+    def cast(self, camera_to_world: Float[np.ndarray, "4 4"], directions: Float[np.ndarray, "N 3"]) -> Hits:
+        """First hits of rays from a camera.
+
+        Args:
+            camera_to_world: Pose. [4, 4]
+            directions: Camera axes, z = 1, so that the hit's parameter is the z-depth. [N, 3]
+        """
+        rays = np.empty((len(directions), 6), np.float32)
+        rays[:, :3] = camera_to_world[:3, 3]
+        rays[:, 3:] = turned(directions, camera_to_world[:3, :3])
+        answer = self._scene.cast_rays(self._open3d.core.Tensor(rays))
+        z_depth = answer["t_hit"].numpy()
+        found = np.isfinite(z_depth)
+        triangle = np.where(found, answer["primitive_ids"].numpy(), 0).astype(np.int64)
+        return Hits(found, z_depth, triangle, answer["primitive_uvs"].numpy())
+
+    def interpolate(self, values: Float[np.ndarray, "V K"], hits: Hits) -> Float[np.ndarray, "N K"]:
+        """Values of the mesh's vertices at hits. [N, K]"""
+        corners = self._surface.triangles[hits.triangle]
+        second, third = hits.barycentric[:, :1], hits.barycentric[:, 1:]
+        return np.asarray(
+            values[corners[:, 0]] * (1.0 - second - third)
+            + values[corners[:, 1]] * second
+            + values[corners[:, 2]] * third
+        )
+
+    def visible(
+        self, points: Float[np.ndarray, "N 3"], viewpoints: Float[np.ndarray, "3"] | Float[np.ndarray, "N 3"]
+    ) -> Bool[np.ndarray, "N"]:
+        """Whether nothing stands between points on the wall and viewpoints off it. [N]
+
+        The last thousandth of the way is left out: the point lies on the wall itself.
+        """
+        rays = np.empty((len(points), 6), np.float32)
+        rays[:, :3] = viewpoints
+        rays[:, 3:] = points - viewpoints
+        blocked = self._scene.test_occlusions(self._open3d.core.Tensor(rays), tnear=0.0, tfar=0.999)
+        return ~np.asarray(blocked.numpy(), dtype=bool)
+
+    def clearance(self, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N"]:
+        """Distance to the nearest wall, mm. [N]"""
+        query = self._open3d.core.Tensor(np.ascontiguousarray(points, np.float32))
+        return np.asarray(self._scene.compute_distance(query).numpy())

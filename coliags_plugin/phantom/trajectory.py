@@ -1,0 +1,223 @@
+"""Where the camera goes: withdrawal along the lumen, turning on the spot, and test views turned away from the path."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.phantom.centreline import CentreLine
+from coliags_plugin.phantom.settings import PhantomSettings
+from coliags_plugin.phantom.streams import Purpose, stream
+
+#: No closer to the wall than this, mm; C3VD's nearest surface of any sequence is 5.9 mm away.
+NEAREST = 6.0
+#: Every how many frames one is held out for testing.
+TEST_EVERY = 8
+#: Arc length of the pullback's shallow end, mm. Far enough in that a view turned sideways still ends on the wall.
+_SHALLOW_END = 26.0
+#: Travel of the ``rotation`` trajectory, mm.
+_ROTATION_TRAVEL = 6.0
+#: How far ahead on the centre line the camera looks, mm.
+_LOOK_AHEAD = 28.0
+#: Width of an approach, as a share of the sequence.
+_APPROACH_WIDTH = 0.07
+_ROTATION_TURN = (15.0, 30.0)
+
+Clearance = Callable[[Float[np.ndarray, "N 3"]], Float[np.ndarray, "N"]]
+
+
+@dataclass(frozen=True)
+class RotationView:
+    """A test view at the place of a frame, turned away from it.
+
+    Attributes:
+        frame: The frame whose place and exposure it shares.
+        turn: By how much its look direction differs from that frame's, degrees.
+        camera_to_world: OpenCV axes, mm. [4, 4]
+    """
+
+    frame: int
+    turn: float
+    camera_to_world: Float[np.ndarray, "4 4"]
+
+
+def travel(centre_line: CentreLine, settings: PhantomSettings, clearance: Clearance) -> Float[np.ndarray, "T 4 4"]:
+    """Camera-to-world pose of every frame, OpenCV axes, mm.
+
+    Args:
+        centre_line: Of the colon.
+        settings: Frames, trajectory, preset.
+        clearance: Distance of points to the wall, mm.
+
+    Raises:
+        InputError: The colon drawn leaves no way that keeps 6 mm from the wall.
+    """
+    generator = stream(settings.seed, Purpose.TRAJECTORY)
+    preset = settings.preset
+    time = np.linspace(0.0, 1.0, settings.frames)
+    if settings.trajectory == "pullback":
+        arc = _SHALLOW_END + settings.path_length * (1.0 - time)
+    else:
+        arc = _SHALLOW_END + 0.5 * settings.path_length + _ROTATION_TRAVEL * (0.5 - time)
+    points, frames = centre_line.at(arc)
+
+    waver = np.stack([_sway(time, generator) for _ in range(5)], axis=1)
+    on_the_spot = settings.trajectory == "rotation"
+    low, high = (0.3 * excursion if on_the_spot else excursion for excursion in preset.wobble)
+    clock = generator.uniform(0.0, 2.0 * np.pi) + 2.2 * waver[:, 0] + 4.0 * time
+    amount = 0.5 * (low + high) + 0.5 * (high - low) * waver[:, 1]
+    sideways = amount[:, None] * np.stack([np.cos(clock), np.sin(clock)], axis=1)
+    sideways = _kept_off(sideways, points, frames, clearance, NEAREST + 0.5)
+    for approach in range(0 if on_the_spot else preset.approaches):
+        sideways = _approached(sideways, points, frames, clearance, preset.closest, approach, time, generator)
+    centers = points + np.einsum("nck,nk->nc", frames[:, :, :2], sideways)
+    nearest = float(clearance(centers).min())
+    if nearest < NEAREST:
+        raise InputError(
+            f"the colon of seed {settings.seed} leaves only {nearest:.1f} mm between the camera's path and the wall",
+            f"at least {NEAREST:g} mm",
+            "Choose another seed",
+        )
+
+    ahead, _ = centre_line.at(arc + _LOOK_AHEAD)
+    poses = _looking(centers, ahead, frames)
+    if not on_the_spot:
+        yaw, pitch, roll = (np.radians(limit) * waver[:, 2 + axis] for axis, limit in enumerate(preset.turn))
+    else:
+        # Round and round, outwards: the look direction goes over a whole disc.
+        clock = 2.0 * np.pi * 2.5 * time + generator.uniform(0.0, 2.0 * np.pi)
+        away = np.radians(preset.scan) * np.sqrt(time)
+        yaw, pitch = away * np.cos(clock), away * np.sin(clock)
+        roll = np.radians(preset.turn[2]) * waver[:, 4]
+    for pose, turn in zip(poses, np.stack([yaw, pitch, roll], axis=1), strict=True):
+        pose[:3, :3] = pose[:3, :3] @ rotation(*turn)
+    return poses
+
+
+def every_8th(index: int) -> bool:
+    """Whether a frame is held out for testing where nothing else is said: 0, 8, 16, ..."""
+    return index % TEST_EVERY == 0
+
+
+def turn_away(
+    poses: Float[np.ndarray, "T 4 4"], settings: PhantomSettings, is_test: Callable[[int], bool] = every_8th
+) -> list[RotationView]:
+    """Test views at places of training frames, their look direction 15 to 30 degrees off.
+
+    On a pullback they turn all round the clock; where the camera scans, they go on outwards from where it looked.
+    """
+    generator = stream(settings.seed, Purpose.ROTATION_VIEWS)
+    training = [index for index in range(len(poses)) if not is_test(index)]
+    views = []
+    clock = generator.uniform(0.0, 2.0 * np.pi)
+    for number in range(settings.rotation_views):
+        place = (number + 0.5) / settings.rotation_views * len(training)
+        frame = training[min(int(place), len(training) - 1)]
+        # The golden angle spreads directions evenly over the clock however many views there are.
+        clock += np.pi * (3.0 - np.sqrt(5.0))
+        turn = generator.uniform(*_ROTATION_TURN)
+        direction = clock
+        if settings.trajectory == "rotation":
+            middle = poses[frame, :3, :3].T @ poses[:, :3, 2].mean(axis=0)
+            direction = float(np.arctan2(-middle[1], -middle[0]))
+        axis = np.array([-np.sin(direction), np.cos(direction), 0.0])
+        pose = poses[frame].copy()
+        pose[:3, :3] = pose[:3, :3] @ about(axis, np.radians(turn))
+        views.append(RotationView(frame, float(turn), pose))
+    return views
+
+
+def rotation(yaw: float, pitch: float, roll: float) -> Float[np.ndarray, "3 3"]:
+    """Turn right by yaw, then up by pitch, then clockwise by roll; radians, camera axes."""
+    return np.asarray(
+        about(np.array([0.0, 1.0, 0.0]), yaw)
+        @ about(np.array([1.0, 0.0, 0.0]), pitch)
+        @ about(np.array([0.0, 0.0, 1.0]), roll)
+    )
+
+
+def about(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarray, "3 3"]:
+    """Rotation about a unit axis, radians, right-handed (Rodrigues)."""
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross)
+
+
+def _looking(
+    centers: Float[np.ndarray, "T 3"], targets: Float[np.ndarray, "T 3"], frames: Float[np.ndarray, "T 3 3"]
+) -> Float[np.ndarray, "T 4 4"]:
+    """Poses that look at targets, x along the centre line's first across direction."""
+    forward = targets - centers
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    right = frames[:, :, 0] - (frames[:, :, 0] * forward).sum(axis=1, keepdims=True) * forward
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    poses = np.tile(np.eye(4), (len(centers), 1, 1))
+    poses[:, :3, :3] = np.stack([right, np.cross(forward, right), forward], axis=2)
+    poses[:, :3, 3] = centers
+    return poses
+
+
+def _sway(time: Float[np.ndarray, "T"], generator: np.random.Generator) -> Float[np.ndarray, "T"]:
+    """A smooth wander whose largest excursion is 1; the same curve however finely it is sampled."""
+    cycles = np.array([0.6, 1.3, 2.4])
+    phase = generator.uniform(0.0, 2.0 * np.pi, 3)
+    weight = np.array([1.0, 0.7, 0.35]) * generator.uniform(0.7, 1.3, 3)
+
+    def curve(at: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T"]:
+        return np.asarray((weight * np.sin(2.0 * np.pi * cycles * at[:, None] + phase)).sum(axis=1))
+
+    return np.asarray(curve(time) / np.abs(curve(np.linspace(0.0, 1.0, 512))).max())
+
+
+def _kept_off(
+    sideways: Float[np.ndarray, "T 2"],
+    points: Float[np.ndarray, "T 3"],
+    frames: Float[np.ndarray, "T 3 3"],
+    clearance: Clearance,
+    least: float,
+) -> Float[np.ndarray, "T 2"]:
+    """The excursion, shrunk as a whole until it keeps its distance."""
+    for _ in range(30):
+        if clearance(points + np.einsum("nck,nk->nc", frames[:, :, :2], sideways)).min() >= least:
+            break
+        sideways = 0.85 * sideways
+    return sideways
+
+
+def _approached(
+    sideways: Float[np.ndarray, "T 2"],
+    points: Float[np.ndarray, "T 3"],
+    frames: Float[np.ndarray, "T 3 3"],
+    clearance: Clearance,
+    closest: float,
+    number: int,
+    time: Float[np.ndarray, "T"],
+    generator: np.random.Generator,
+) -> Float[np.ndarray, "T 2"]:
+    """The excursion with one swing towards the wall that comes as close as ``closest``, mm."""
+    middle = (0.40, 0.78)[number % 2] + generator.uniform(-0.04, 0.04)
+    swing = np.exp(-0.5 * ((time - middle) / _APPROACH_WIDTH) ** 2)
+    clock = generator.uniform(0.0, 2.0 * np.pi)
+    direction = np.array([np.cos(clock), np.sin(clock)])
+    near = swing > 0.1
+
+    def swung(amount: float) -> Float[np.ndarray, "T 2"]:
+        # The wobble gives way to the swing, so that the two do not add up.
+        return np.asarray(sideways * (1.0 - swing[:, None]) + amount * swing[:, None] * direction)
+
+    def distance(amount: float) -> float:
+        places = points[near] + np.einsum("nck,nk->nc", frames[near][:, :, :2], swung(amount)[near])
+        return float(clearance(places).min())
+
+    low, high = 0.0, 14.0
+    for _ in range(18):
+        amount = 0.5 * (low + high)
+        if distance(amount) > closest:
+            low = amount
+        else:
+            high = amount
+    return swung(low)

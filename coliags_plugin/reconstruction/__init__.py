@@ -1,0 +1,1 @@
+"""Poses and points from pictures: structure from motion, triangulation, RGB-D odometry."""

@@ -1,0 +1,182 @@
+"""What is tracked, and how a picture is made comparable with its neighbours although the lamp moves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scenes import Frame
+
+#: Frames that a scene's unit of length is found from.
+_SAMPLED = 16
+#: Above this in every channel a pixel is the lamp's mirror image, not the wall.
+_HIGHLIGHT = 200
+#: Margin around a highlight, and standard deviation of the window that brightness is normalised over; shares of the
+#: picture's width. At 338 px they are 2 px and 8 px: of 5, 8, 15 and 30 px, 5 and 8 drifted least (docs/poses.md 11).
+_HIGHLIGHT_MARGIN, _WINDOW = 0.006, 0.024
+#: Linear light below this is noise, and so is a contrast below that.
+_DARK, _FLAT = 0.02, 0.02
+#: Of the pixels that depth is interpolated from, all must be known; the rest is rounding.
+_ALL_KNOWN = 0.999
+#: Standard deviations of the window that span the whole range of normalised intensity.
+_SPAN = 8.0
+
+
+@dataclass(frozen=True, eq=False)
+class RgbdFrame:
+    """One picture with its depth, from nobody knows where.
+
+    Attributes:
+        name: What to call it.
+        image: RGB. [H, W, 3]
+        depth: z-depth, any unit of length; not finite or not positive where unknown. [H, W]
+        mask: False where a pixel is to be ignored; None where every pixel counts. [H, W]
+    """
+
+    name: str
+    image: UInt8[np.ndarray, "H W 3"]
+    depth: Float32[np.ndarray, "H W"]
+    mask: Bool[np.ndarray, "H W"] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedFrame:
+    """A frame ready for registration.
+
+    Attributes:
+        intensity: Brightness relative to its surroundings, 0 to 1, 0.5 where it is theirs. [H, W]
+        depth: z-depth in the video's own unit; 0 where unknown, masked or a highlight. [H, W]
+    """
+
+    intensity: Float32[np.ndarray, "H W"]
+    depth: Float32[np.ndarray, "H W"]
+
+
+class Video(Sequence[RgbdFrame]):
+    """The pictures and depth of frames, read one at a time; their cameras stay behind.
+
+    Args:
+        frames: In video order.
+
+    Raises:
+        InputError: A frame has no depth, when it is asked for.
+    """
+
+    def __init__(self, frames: Sequence[Frame]) -> None:
+        self._frames = frames
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self._frames)
+
+    def __getitem__(self, index: int) -> RgbdFrame:  # type: ignore[override]  # no slices
+        """Read a frame."""
+        frame = self._frames[index]
+        depth, mask = frame.depth, frame.mask
+        if depth is None:
+            raise InputError(
+                f"frame {frame.name} has no depth",
+                "depth for every frame: odometry takes the unit of length and the shape of the wall from it",
+                "Without depth use coliags poses sfm, which finds poses from pictures alone",
+            )
+        return RgbdFrame(frame.name, frame.image.numpy(), depth.numpy(), None if mask is None else mask.numpy())
+
+
+class PreparedVideo:
+    """Frames prepared when they are first asked for; the latest stay in memory.
+
+    Args:
+        video: What to prepare.
+        unit: Length that becomes 1.
+        keep: Frames that stay in memory.
+        enlarge: Factor on their size.
+    """
+
+    def __init__(self, video: Sequence[RgbdFrame], unit: float, keep: int, enlarge: int = 1) -> None:
+        self._video, self._unit, self._keep, self._enlarge = video, unit, keep, enlarge
+        self._kept: dict[int, PreparedFrame] = {}
+
+    def __getitem__(self, index: int) -> PreparedFrame:
+        """A prepared frame."""
+        found = self._kept.pop(index, None)
+        if found is None:
+            found = prepare(self._video[index], self._unit)
+            found = found if self._enlarge == 1 else enlarged(found, self._enlarge)
+        self._kept[index] = found
+        while len(self._kept) > self._keep:
+            self._kept.pop(next(iter(self._kept)))
+        return found
+
+
+def prepare(frame: RgbdFrame, unit: float) -> PreparedFrame:
+    """Normalise brightness, and leave out what is masked, unknown or a highlight.
+
+    The lamp rides on the camera: a patch of wall gets brighter as the camera nears and darker towards the edge of the
+    picture, by far more than its texture differs. What does not change with the light is the ratio to neighbours
+    within the same fall of light. So the logarithm of the brightness is taken, its local mean subtracted, and the rest
+    divided by the local standard deviation.
+
+    Args:
+        frame: A frame.
+        unit: Length that becomes 1.
+    """
+    image, width = frame.image, frame.image.shape[1]
+    valid = np.ones(image.shape[:2], bool) if frame.mask is None else frame.mask
+    margin = max(1, round(_HIGHLIGHT_MARGIN * width))
+    highlight = cv2.dilate(
+        (image.min(axis=2) > _HIGHLIGHT).astype(np.uint8), np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
+    )
+    valid = valid & (highlight == 0)
+    weight = valid.astype(np.float32)
+    logarithm = np.log(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255.0 + _DARK)
+    blurred = _local_mean(weight, max(3.0, _WINDOW * width))
+    contrast = logarithm - blurred(logarithm)
+    deviation = np.sqrt(blurred(contrast**2) + _FLAT**2)
+    intensity = np.where(valid, np.clip(0.5 + contrast / (_SPAN * deviation), 0.0, 1.0), 0.5)
+    known = valid & np.isfinite(frame.depth) & (frame.depth > 0.0)
+    depth = np.where(known, frame.depth / unit, 0.0)
+    return PreparedFrame(intensity.astype(np.float32), depth.astype(np.float32))
+
+
+def enlarged(frame: PreparedFrame, factor: int) -> PreparedFrame:
+    """A frame sampled more finely; depth where all pixels around are known."""
+    height, width = frame.depth.shape
+    size = width * factor, height * factor
+    known = cv2.resize((frame.depth > 0.0).astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
+    depth = cv2.resize(frame.depth, size, interpolation=cv2.INTER_LINEAR)
+    return PreparedFrame(
+        np.asarray(cv2.resize(frame.intensity, size, interpolation=cv2.INTER_CUBIC), np.float32),
+        np.where(known > _ALL_KNOWN, depth, 0.0).astype(np.float32),
+    )
+
+
+def typical_depth(video: Sequence[RgbdFrame]) -> float:
+    """Median of known depth over frames spread along the video: the unit that thresholds are meant in.
+
+    Raises:
+        InputError: No depth is known in any of them.
+    """
+    places = np.unique(np.linspace(0, len(video) - 1, min(_SAMPLED, len(video))).round().astype(int))
+    depths = [video[int(place)].depth[::4, ::4].ravel() for place in places]
+    known = np.concatenate(depths)
+    known = known[np.isfinite(known) & (known > 0.0)]
+    if not len(known):
+        raise InputError(
+            f"{len(places)} of {len(video)} frames were looked at, and none has a pixel of known depth",
+            "depth files that are not empty",
+            "Check the depth folder and its scale",
+        )
+    return float(np.median(known))
+
+
+def _local_mean(
+    weight: Float32[np.ndarray, "H W"], deviation: float
+) -> Callable[[np.ndarray], Float[np.ndarray, "H W"]]:
+    """A Gaussian-weighted mean over the pixels that count."""
+    share = cv2.GaussianBlur(weight, (0, 0), deviation) + 1e-6
+    return lambda values: cv2.GaussianBlur(values * weight, (0, 0), deviation) / share

@@ -1,0 +1,1 @@
+"""Reports: figures, charts and pictures of runs on one page."""

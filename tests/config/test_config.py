@@ -1,0 +1,228 @@
+"""Method configs: inheritance, overrides, and errors that name file, line and key."""
+
+from __future__ import annotations
+
+import pytest
+import yaml
+
+from coliags_plugin.config.method_config import load_method
+from coliags_plugin.config.method_files import method_descriptions, method_names
+from coliags_plugin.config.yaml_tree import parse_tree, parse_value
+from coliags_plugin.core.errors import InputError
+
+
+@pytest.fixture
+def method_file(tmp_path):
+    def write(text, name="mine.yaml"):
+        path = tmp_path / name
+        path.write_text(text)
+        return str(path)
+
+    return write
+
+
+@pytest.mark.parametrize("name", method_names())
+def test_every_shipped_method_is_valid_and_described(name):
+    assert load_method(name).config.optimizers
+    assert method_descriptions()[name]
+
+
+def test_scaffold_and_coliags_differ_in_heads_only():
+    ours = load_method("coliags").config.model_dump()
+    rival = load_method("scaffold-gs-depth").config.model_dump()
+    assert ours.pop("description") != rival.pop("description")
+    assert ours["field"].pop("geometry_head") == {"name": "imve", "hidden": 32, "frequencies": 10}
+    appearance = {"hidden": 32, "bias_init": "scene_distances"}
+    assert ours["field"].pop("appearance_head") == {"name": "imia", "frequencies": 5, **appearance}
+    assert rival["field"].pop("geometry_head") == {"name": "plain", "hidden": 32}
+    assert rival["field"].pop("appearance_head") == {"name": "plain", "distance": False, **appearance}
+    assert ours == rival
+
+
+def test_the_rival_that_sees_the_distance_differs_from_the_closest_in_that_only():
+    rival = load_method("scaffold-gs-distance").config.model_dump()
+    closest = load_method("scaffold-gs-depth").config.model_dump()
+    assert rival.pop("description") != closest.pop("description")
+    assert rival["field"]["appearance_head"].pop("distance") is True
+    assert closest["field"]["appearance_head"].pop("distance") is False
+    assert rival == closest
+
+
+def test_the_start_of_biases_is_written_out_and_its_ablation_changes_nothing_else():
+    for name in ("coliags", "scaffold-gs-distance"):
+        assert f"bias_init: scene_distances  # {name}.yaml:" in load_method(name).with_origins()
+    ours = load_method("coliags").config.model_dump()
+    theirs = load_method("ablations/bias-init-pytorch").config.model_dump()
+    assert ours.pop("description") != theirs.pop("description")
+    assert ours["field"]["appearance_head"].pop("bias_init") == "scene_distances"
+    assert theirs["field"]["appearance_head"].pop("bias_init") == "pytorch"
+    assert ours == theirs
+
+
+@pytest.mark.parametrize(
+    ("row", "depth", "geometry", "appearance"),
+    [
+        ("none", False, "plain", "plain"),
+        ("depth", True, "plain", "plain"),
+        ("depth-imia", True, "plain", "imia"),
+        ("depth-imve", True, "imve", "plain"),
+        ("depth-imve-imia", True, "imve", "imia"),
+    ],
+)
+def test_the_papers_five_ablation_rows(row, depth, geometry, appearance):
+    config = load_method(f"ablations/{row}").config
+    assert ("depth" in config.losses) == depth
+    assert config.field.settings.geometry_head.name == geometry
+    assert config.field.settings.appearance_head.name == appearance
+
+
+@pytest.mark.parametrize("sizes", [(10, 0), (10, 5), (10, 10), (5, 5), (15, 5)])
+def test_the_papers_embedding_sizes(sizes):
+    field = load_method(f"ablations/embedding-{sizes[0]}-{sizes[1]}").config.field.settings
+    found = (field.geometry_head.settings.frequencies, field.appearance_head.settings.frequencies)
+    assert found == sizes
+
+
+def test_resolved_config_is_a_valid_method_config(method_file):
+    config = load_method("coliags").config
+    again = load_method(method_file(config.to_yaml())).config
+    assert again == config
+
+
+def test_changed_name_drops_inherited_options(method_file):
+    path = method_file("base: coliags\nfield:\n  geometry_head: {name: plain}\n")
+    head = load_method(path).config.field.settings.geometry_head
+    assert head.name == "plain"
+    assert not hasattr(head.settings, "frequencies")
+
+
+def test_same_name_keeps_inherited_options(method_file):
+    path = method_file("base: coliags\nfield:\n  geometry_head: {frequencies: 4}\n")
+    head = load_method(path).config.field.settings.geometry_head
+    assert (head.name, head.settings.frequencies, head.settings.hidden) == ("imve", 4, 32)
+
+
+def test_null_removes_a_loss():
+    assert "depth" not in load_method("coliags", ["losses.depth=null"]).config.losses
+
+
+def test_set_overrides_and_says_so():
+    loaded = load_method("coliags", ["field.geometry_head.frequencies=8", "optimizers.features.lr=1e-3"])
+    assert loaded.config.field.settings.geometry_head.settings.frequencies == 8
+    assert loaded.config.optimizers["features"].lr == 1e-3
+    assert "frequencies: 8  # --set field.geometry_head.frequencies=8" in loaded.with_origins()
+
+
+def test_origins_name_file_and_line():
+    text = load_method("coliags").with_origins()
+    assert "# scaffold-gs.yaml:" in text
+    assert "# coliags.yaml:" in text
+    assert "# default" in text
+    assert yaml.safe_load(text)["field"]["geometry_head"]["frequencies"] == 10
+
+
+def test_bases_may_be_paths_beside_the_file(method_file):
+    method_file("base: coliags\nschedule: {steps: 7}\n", "parent.yaml")
+    path = method_file("base: parent.yaml\n")
+    assert load_method(path).config.schedule.steps == 7
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("base: coliags\nfield:\n  geometry_head: {frequences: 4}\n", ["mine.yaml:3", "frequences", "'frequencies'"]),
+        ("base: coliags\nfeild: {}\n", ["mine.yaml:2", "unknown key 'feild'", "Did you mean 'field'"]),
+        ("base: coliags\nschedule:\n  steps: many\n", ["mine.yaml:3", "schedule.steps", "'many'"]),
+        ("base: coliags\nschedule:\n  steps: 1.5\n", ["mine.yaml:3", "schedule.steps", "1.5"]),
+        ("base: coliags\nschedule:\n  steps: 0\n", ["mine.yaml:3", "greater than or equal to 1"]),
+        ("base: coliags\nrenderer: {name: cuda-magic}\n", ["mine.yaml:2", "no renderers component 'cuda-magic'"]),
+        ("base: coliags\nlosses:\n  extra: {weight: 1.0}\n", ["mine.yaml:3", "needs 'name'", "depth-l1"]),
+        ("base: coliags\nlosses:\n  l1: {weight: heavy}\n", ["mine.yaml:3", "losses.l1.weight", "heavy"]),
+        (
+            "base: coliags\nfield:\n  appearance_head: {spread_kinks: true}\n",
+            ["mine.yaml:3", "field.appearance_head.spread_kinks", "unknown key 'spread_kinks'", "bias_init"],
+        ),
+        (
+            "base: coliags\nlosses:\n  depth:\n    final_weight: 0\n",
+            ["mine.yaml:4: losses.depth.final_weight: final_weight 0.0 with weight 0.2: a logarithmic schedule cannot"],
+        ),
+        ("base: coliags\ndatamanager:\n  width: 8\n", ["mine.yaml:2: datamanager: width = 8 and height = None: give"]),
+        ("base: coliags\nprotocol: papper\n", ["mine.yaml:2: protocol: no protocol 'papper'", "Did you mean 'paper'"]),
+        ("base: coliags\nschedule: {steps: 5}\nschedule: {steps: 6}\n", ["mine.yaml:3", "twice", "mine.yaml:2"]),
+        ("base: coliags\n  bad: [\n", ["mine.yaml:"]),
+        ("- a\n- b\n", ["mine.yaml", "mapping"]),
+        ("base: coliagz\n", ["no method 'coliagz'", "Did you mean 'coliags'"]),
+        ("base: gone.yaml\n", ["gone.yaml"]),
+        ("base: mine.yaml\n", ["inherit from each other"]),
+        ("base: 3\n", ["mine.yaml:1", "base is 3"]),
+        ("description: lonely\n", ["datamanager: is missing"]),
+        ("base: scaffold-gs\nlosses: {l1: null, d-ssim: null, scale-volume: null}\n", ["losses", "at least 1 item"]),
+        ("base: coliags\nlosses: 3\n", ["mine.yaml:2", "losses"]),
+    ],
+)
+def test_mistakes_are_named(method_file, text, parts):
+    with pytest.raises(InputError) as caught:
+        load_method(method_file(text))
+    for part in parts:
+        assert part in str(caught.value)
+
+
+@pytest.mark.parametrize("assignment", ["steps", "=3", "schedule..steps=3", "schedule.stepz=3"])
+def test_bad_assignments_are_named(assignment):
+    with pytest.raises(InputError, match="--set"):
+        load_method("coliags", [assignment])
+
+
+@pytest.mark.parametrize(
+    ("assignment", "seen"),
+    [
+        ("losses.depth.final_weight=0", "final_weight 0.0 with weight 0.2"),
+        ("losses.depth.weight=0", "final_weight 0.01 with weight 0.0"),
+        ("optimizers.offsets.final_lr=0", "final_lr 0.0 with lr 0.01"),
+        ("optimizers.offsets.lr=0", "final_lr 0.0001 with lr 0.0"),
+    ],
+)
+def test_a_schedule_with_an_end_at_zero_is_refused_in_one_line(assignment, seen):
+    """It would be 0 for the whole run."""
+    with pytest.raises(InputError) as caught:
+        load_method("coliags", [assignment])
+    key = assignment.split("=")[0]
+    end, _, _, start, _ = seen.split()
+    assert str(caught.value) == (
+        f"--set {assignment}: {key}: {seen}: a logarithmic schedule cannot reach or leave 0; give both above 0, or "
+        f"leave {end} out (null) for a constant {start}."
+    )
+
+
+def test_a_constant_zero_switches_off():
+    off = ["losses.depth.final_weight=null", "losses.depth.weight=0", "optimizers.features.lr=0"]
+    config = load_method("coliags", off).config
+    assert config.losses["depth"].settings.weight == 0.0
+    assert config.optimizers["features"].lr == 0.0
+
+
+def test_unknown_method_is_named():
+    with pytest.raises(InputError, match="Did you mean 'coliags'"):
+        load_method("colliags")
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("1e-5", 1e-5),
+        ("-3", -3),
+        ("0.5", 0.5),
+        ("true", True),
+        ("null", None),
+        ("[1, 2]", (1, 2)),
+        ("on", "on"),
+        ("a", "a"),
+    ],
+)
+def test_scalars_are_read_as_yaml_1_2(text, value):
+    assert parse_value(text) == value
+    assert type(parse_value(text)) is type(value)
+
+
+def test_an_empty_file_is_an_empty_mapping():
+    assert parse_tree("", "x").plain() == {}

@@ -1,0 +1,69 @@
+"""Names find components; names that do not, say what would."""
+
+from __future__ import annotations
+
+from importlib import metadata
+
+import pytest
+
+from coliags_plugin.config import registry as registry_module
+from coliags_plugin.config.registry import REGISTRIES, Registry
+from coliags_plugin.core.errors import InputError
+
+
+def test_every_builtin_can_be_imported_and_has_settings_or_is_a_protocol():
+    for kind, registry in REGISTRIES.items():
+        for name in registry:
+            component = registry.get(name)
+            assert kind == "protocols" or component.Settings is not None
+
+
+def test_unknown_name_says_what_was_meant():
+    with pytest.raises(InputError, match="Did you mean 'torch'"):
+        REGISTRIES["renderers"].get("troch")
+
+
+def test_duplicate_name_is_refused():
+    registry = Registry("things", {"one": "math:pi"})
+    with pytest.raises(InputError, match="already taken by built in"):
+        registry.register("one", "math:e")
+
+
+def test_listing_imports_nothing():
+    registry = Registry("things", {"ghost": "no_such_module:Ghost"})
+    assert registry.names() == ["ghost"]
+
+
+def test_entry_points_are_found(monkeypatch):
+    def fake(group):
+        wanted = group == "coliags_plugin.things"
+        return [metadata.EntryPoint("pi", "math:pi", group)] if wanted else []
+
+    monkeypatch.setattr(registry_module, "entry_points", fake)
+    registry = Registry("things", {})
+    assert registry.get("pi") == pytest.approx(3.14159, abs=1e-4)
+    assert "entry point" in registry.source("pi")
+
+
+def test_plugin_path_files_are_found(monkeypatch, tmp_path):
+    plugin = tmp_path / "mine.py"
+    plugin.write_text("class Mine: pass\nCOMPONENTS = {'fields': {'mine': Mine}}\n")
+    monkeypatch.setenv("COLIAGS_PLUGIN_PATH", str(plugin))
+    registry = Registry("fields", {})
+    assert registry.get("mine").__name__ == "Mine"
+    assert registry.source("mine") == str(plugin)
+
+
+@pytest.mark.parametrize("text", ["x = 1\n", "COMPONENTS = {'nonsense': {}}\n"])
+def test_bad_plugin_file_is_an_input_error(monkeypatch, tmp_path, text):
+    plugin = tmp_path / "bad.py"
+    plugin.write_text(text)
+    monkeypatch.setenv("COLIAGS_PLUGIN_PATH", str(plugin))
+    with pytest.raises(InputError, match="COMPONENTS"):
+        Registry("fields", {}).names()
+
+
+def test_missing_plugin_file_is_an_input_error(monkeypatch, tmp_path):
+    monkeypatch.setenv("COLIAGS_PLUGIN_PATH", str(tmp_path / "gone.py"))
+    with pytest.raises(InputError, match="not a file"):
+        Registry("fields", {}).names()

@@ -1,0 +1,202 @@
+import kornia.metrics
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.ndimage import correlate1d
+from skimage.metrics import structural_similarity
+
+from coliags_plugin.core.ssim import REACH, _blur_by_opencv, _blur_by_torch, _window, ssim, ssim_map
+
+few = settings(max_examples=15, deadline=None)
+
+
+def images(height, width, seed=0, dtype=torch.float64, channels=3):
+    """A smooth-ish picture and a disturbed copy of it."""
+    generator = torch.Generator().manual_seed(seed)
+    truth = torch.rand(height, width, channels, dtype=dtype, generator=generator)
+    rendered = (truth + 0.2 * torch.randn(height, width, channels, dtype=dtype, generator=generator)).clamp(0, 1)
+    return rendered, truth
+
+
+def window():
+    weights = np.exp(-0.5 * ((np.arange(11) - 5) / 1.5) ** 2)
+    return weights / weights.sum()
+
+
+def reference_map(a, b):
+    """Wang et al. 2004 from scipy's correlation, zero padding."""
+
+    def blur(image):
+        return correlate1d(correlate1d(image, window(), 0, mode="constant"), window(), 1, mode="constant")
+
+    mean_a, mean_b = blur(a), blur(b)
+    var_a, var_b, cov = blur(a * a) - mean_a**2, blur(b * b) - mean_b**2, blur(a * b) - mean_a * mean_b
+    return ((2 * mean_a * mean_b + 1e-4) * (2 * cov + 9e-4)) / ((mean_a**2 + mean_b**2 + 1e-4) * (var_a + var_b + 9e-4))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 50), (31, 32), (33, 64), (65, 97)])
+def test_whole_map_against_scipy_at_every_size(size):
+    a, b = images(*size)
+    np.testing.assert_allclose(ssim_map(a, b).numpy(), reference_map(a.numpy(), b.numpy()), atol=1e-12)
+
+
+def test_interior_against_scikit_image():
+    a, b = images(70, 45)
+    _, expected = structural_similarity(
+        a.numpy(), b.numpy(), gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.0,
+        channel_axis=-1, full=True,
+    )  # fmt: skip
+    inner = slice(REACH, -REACH)
+    np.testing.assert_allclose(ssim_map(a, b).numpy()[inner, inner], expected[inner, inner], atol=1e-12)
+
+
+def test_interior_against_kornia():
+    a, b = images(40, 52, dtype=torch.float32)
+    expected = kornia.metrics.ssim(a.permute(2, 0, 1)[None], b.permute(2, 0, 1)[None], window_size=11)
+    inner = slice(REACH, -REACH)
+    torch.testing.assert_close(
+        ssim_map(a, b)[inner, inner], expected[0].permute(1, 2, 0)[inner, inner], atol=1e-5, rtol=0
+    )
+
+
+def test_flat_images_score_by_their_means_alone():
+    a, b = torch.full((31, 31, 3), 0.25, dtype=torch.float64), torch.full((31, 31, 3), 0.75, dtype=torch.float64)
+    expected = (2 * 0.25 * 0.75 + 1e-4) / (0.25**2 + 0.75**2 + 1e-4)
+    assert ssim_map(a, b)[15, 15, 0].item() == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize("with_mask", [False, True])
+def test_gradients(with_mask):
+    torch.set_num_threads(1)  # thousands of tiny products, which two threads only slow down
+    a, b = images(4, 7, channels=2)
+    mask = torch.rand(4, 7, generator=torch.Generator().manual_seed(1)) < 0.7 if with_mask else None
+    a.requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: ssim(x, b, mask), a)
+    assert torch.autograd.gradgradcheck(lambda x: ssim(x, b, mask), a, fast_mode=True)
+    b.requires_grad_()
+    assert torch.autograd.gradcheck(lambda y: ssim(a.detach(), y, mask), b)
+
+
+def brute_force(a, b, mask):
+    """Pixel by pixel: moments over the window's valid pixels, weighted to the window's total within the image."""
+    height, width = mask.shape
+    total = []
+    weights = np.outer(window(), window())
+    for i, j in zip(*np.nonzero(mask), strict=True):
+        rows, columns = slice(max(i - 5, 0), i + 6), slice(max(j - 5, 0), j + 6)
+        inside = weights[rows.start - i + 5 : rows.start - i + 5 + len(range(height)[rows])]
+        inside = inside[:, columns.start - j + 5 : columns.start - j + 5 + len(range(width)[columns])]
+        weight = inside * mask[rows, columns]
+        weight = (weight * inside.sum() / weight.sum())[..., None]
+        x, y = a[rows, columns], b[rows, columns]
+        mean_x, mean_y = (weight * x).sum((0, 1)), (weight * y).sum((0, 1))
+        variances = (weight * (x * x + y * y)).sum((0, 1)) - mean_x**2 - mean_y**2
+        covariance = (weight * x * y).sum((0, 1)) - mean_x * mean_y
+        total.append(
+            (2 * mean_x * mean_y + 1e-4)
+            * (2 * covariance + 9e-4)
+            / ((mean_x**2 + mean_y**2 + 1e-4) * (variances + 9e-4))
+        )
+    return float(np.mean(total))
+
+
+@few
+@given(height=st.integers(1, 36), width=st.integers(1, 20), share=st.floats(0.05, 0.95), seed=st.integers(0, 99))
+def test_masked_value_against_brute_force(height, width, share, seed):
+    a, b = images(height, width, seed)
+    mask = torch.rand(height, width, generator=torch.Generator().manual_seed(seed)) < share
+    mask[0, 0] = True
+    assert ssim(a, b, mask).item() == pytest.approx(brute_force(a.numpy(), b.numpy(), mask.numpy()), abs=1e-10)
+
+
+@few
+@given(share=st.floats(0.05, 0.95), seed=st.integers(0, 99))
+def test_ignored_pixels_influence_nothing(share, seed):
+    a, b = images(34, 23, seed, torch.float32)
+    mask = torch.rand(34, 23, generator=torch.Generator().manual_seed(seed)) < share
+    junk_a, junk_b = a.clone(), b.clone()
+    junk_a[~mask] = torch.nan
+    junk_b[~mask] = 1e6
+    a.requires_grad_()
+    junk_a.requires_grad_()
+    clean, dirty = ssim(a, b, mask), ssim(junk_a, junk_b, mask)
+    assert torch.equal(clean, dirty)
+    clean.backward()
+    dirty.backward()
+    assert torch.equal(a.grad, junk_a.grad)
+    assert not a.grad[~mask].any()
+
+
+@few
+@given(share=st.floats(0.05, 1.0), seed=st.integers(0, 99))
+def test_equal_images_score_one_and_the_score_is_symmetric(share, seed):
+    a, b = images(21, 40, seed)
+    mask = torch.rand(21, 40, generator=torch.Generator().manual_seed(seed)) < share
+    mask[3, 3] = True
+    assert ssim(a, a, mask).item() == pytest.approx(1.0, abs=1e-12)
+    assert ssim(a, b, mask).item() == pytest.approx(ssim(b, a, mask).item(), abs=1e-13)
+    assert ssim(a, b, mask).item() <= 1.0
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_full_mask_is_no_mask_to_the_bit(dtype):
+    a, b = images(47, 66, dtype=dtype)
+    full = torch.ones(47, 66, dtype=torch.bool)
+    assert torch.equal(ssim_map(a, b, full), ssim_map(a, b))
+    assert torch.equal(ssim(a, b, full), ssim(a, b))
+
+
+def test_a_hole_leaves_distant_windows_untouched():
+    a, b = images(40, 40)
+    mask = torch.ones(40, 40, dtype=torch.bool)
+    mask[20, 20] = False
+    changed = (ssim_map(a, b, mask) != ssim_map(a, b)).any(-1)
+    assert changed[15:26, 15:26].all()
+    assert changed.sum() == 11 * 11
+
+
+def test_a_hole_does_not_flatter_its_surroundings():
+    """Blacking out both images instead would put a shared edge into the windows and raise the score."""
+    a, b = images(61, 61)
+    mask = torch.rand(61, 61, generator=torch.Generator().manual_seed(5)) < 0.9
+    plain, masked = ssim(a, b), ssim(a, b, mask)
+    blacked = ssim_map(a * mask[..., None], b * mask[..., None])[mask].mean()
+    assert abs(masked - plain) < 0.01
+    assert blacked - plain > 0.02
+
+
+def test_single_precision_is_good_enough_for_training():
+    a, b = images(270, 338, dtype=torch.float32)
+    assert ssim(a, b).item() == pytest.approx(ssim(a.double(), b.double()).item(), abs=1e-6)
+
+
+def test_no_valid_pixel_gives_zero_with_a_graph():
+    a, b = images(12, 12)
+    a.requires_grad_()
+    value = ssim(a, b, torch.zeros(12, 12, dtype=torch.bool))
+    value.backward()
+    assert value.item() == 0.0
+    assert not a.grad.any()
+
+
+def test_the_kept_weights_survive_a_first_use_in_inference_mode():
+    a, b = images(12, 12)
+    _window.cache_clear()
+    with torch.inference_mode():
+        ssim(a, b)
+    ssim(a.requires_grad_(), b).backward()
+    assert a.grad.isfinite().all()
+
+
+def test_images_of_different_sizes_are_refused():
+    with pytest.raises(ValueError, match=r"\(4, 5, 3\) and \(5, 4, 3\)"):
+        ssim(torch.zeros(4, 5, 3), torch.zeros(5, 4, 3))
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-14), (torch.float32, 1e-6)])
+@pytest.mark.parametrize("shape", [(1, 1, 1), (4, 30, 9), (40, 33, 3)])
+def test_both_blurs_agree(shape, dtype, tolerance):
+    image = torch.rand(shape, generator=torch.Generator().manual_seed(0), dtype=dtype)
+    torch.testing.assert_close(_blur_by_opencv(image), _blur_by_torch(image), rtol=0, atol=tolerance)

@@ -1,0 +1,214 @@
+"""A check that finds what is wrong: sound scenes pass, spoilt ones are called by name."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from coliags_plugin.core.scenes import Frame, Scene
+from coliags_plugin.data_check.check import check_scene
+from coliags_plugin.data_check.hypotheses import CHANGES
+from coliags_plugin.data_check.matches import epipolar_agreement, match
+from coliags_plugin.data_check.page import write_check_page
+from coliags_plugin.data_check.reprojection import Pair, agreement, best_scale, video_pairs
+from coliags_plugin.data_check.text import lines
+from coliags_plugin.datamanagers.c3vd.manager import C3VDDataManager, C3VDSettings
+from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
+from coliags_plugin.lenses.models import Pinhole
+from coliags_plugin.phantom.generate import generate
+from coliags_plugin.phantom.settings import phantom_settings
+from tests.commands import run
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A phantom whose camera turns as it travels."""
+    path = tmp_path_factory.mktemp("check") / "colon"
+    options = {"seed": 3, "light": "strong", "width": 120, "height": 96, "frames": 24, "rotation_views": 0}
+    generate(phantom_settings({**options, "path_length": 14.0}), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def scene(folder):
+    return C3VDDataManager(C3VDSettings()).load(folder)
+
+
+def changed(scene: Scene, pose=None, depth=None, camera=None, image=None) -> Scene:
+    """The scene with every frame's pose, depth, camera or picture put through a function of it and its place."""
+
+    def of(frame: Frame) -> Frame:
+        whole = frame.to("cpu")
+        if pose is not None:
+            whole = replace(whole, camera=replace(whole.camera, camera_to_world=pose(whole.camera.camera_to_world)))
+        if camera is not None:
+            whole = replace(whole, camera=camera(whole.camera))
+        if depth is not None:
+            whole = replace(whole, depth=depth(whole.depth))
+        if image is not None:
+            whole = replace(whole, image=image(whole.image, whole.index))
+        return whole
+
+    sets = {name: [of(frame) for frame in frames] for name, frames in scene.test_sets.items()}
+    return replace(scene, train=[of(frame) for frame in scene.train], test_sets=sets)
+
+
+def whats(scene: Scene) -> str:
+    return "; ".join(finding.what + ": " + finding.do for finding in check_scene(scene).findings)
+
+
+def scaled_translation(pose, factor):
+    moved = pose.clone()
+    moved[:3, 3] *= factor
+    return moved
+
+
+def test_a_sound_scene_is_not_suspected(scene):
+    check = check_scene(scene)
+    assert check.findings == []
+    # Depth is stored in steps of 0.0015 mm and sampled at pixel centres: surfaces agree far below a percent.
+    assert check.agreement["given"].depth_error < 0.005
+    assert check.scale[0] == pytest.approx(1.0, abs=0.02)
+    assert check.depth.nearest < check.depth.median < check.depth.farthest <= 100.0
+
+
+@pytest.mark.parametrize(
+    "reading",
+    ["world-to-camera", "rotation transposed", "translation of opposite sign", "camera axes y up, z backward"],
+)
+def test_poses_in_another_convention_are_called_by_it(scene, reading):
+    # Each of these changes undoes itself.
+    wrong = changed(scene, pose=CHANGES[reading])
+    assert f"read as: {reading}" in whats(wrong)
+
+
+@pytest.mark.parametrize("reading", ["world-to-camera", "rotation transposed", "translation of opposite sign"])
+def test_so_they_are_without_depth(scene, reading):
+    sound, wrong = (
+        changed(scene, pose=lambda pose, name=name: CHANGES[name](pose), depth=lambda depth: None)
+        for name in ("given", reading)
+    )
+    assert whats(sound) == ""
+    assert "poses agree with the pictures when read as" in whats(wrong)
+
+
+@pytest.mark.parametrize(("factor", "told"), [(0.001, "0.001 times"), (0.5, "0.5 times"), (25.4, "25.4 times")])
+def test_depth_in_another_unit_than_poses(scene, factor, told):
+    wrong = changed(scene, depth=lambda depth: depth * factor)
+    found = whats(wrong)
+    assert "depth and poses are in different units" in found
+    measured = float(found.split("depth seems to be ")[1].split(" times")[0])
+    assert measured == pytest.approx(factor, rel=0.1), told
+
+
+def test_everything_in_metres(scene):
+    metres = changed(scene, pose=lambda pose: scaled_translation(pose, 1e-3), depth=lambda depth: depth * 1e-3)
+    assert "depth looks like metres" in whats(metres)
+    assert "different units" not in whats(metres)
+
+
+def test_pictures_of_other_frames(scene):
+    turned = changed(scene, depth=lambda depth: depth.flip(1))
+    assert "frames do not agree on the surface" in whats(turned)
+
+
+def test_intrinsics_of_another_size(scene):
+    doubled = changed(scene, camera=lambda c: replace(c, fx=2 * c.fx, fy=2 * c.fy, cx=2 * c.cx, cy=2 * c.cy))
+    assert "principal point is far from the middle" in whats(doubled)
+
+
+def test_a_jump_a_standstill_black_and_repeated_pictures(scene):
+    middle = torch.stack([frame.camera.center for frame in scene.train])[:, 2].median()
+
+    def jumping(pose):
+        moved = pose.clone()
+        moved[0, 3] += 500.0 * (pose[2, 3] > middle)
+        return moved
+
+    assert "the camera jumps" in whats(changed(scene, pose=jumping))
+    assert "the camera does not move" in whats(changed(scene, pose=lambda pose: torch.eye(4)))
+    assert "a picture is black" in whats(changed(scene, image=lambda image, index: image * (index != 5)))
+    first = scene.train[0].image
+    repeated = changed(scene, image=lambda image, index: first if index in (1, 2, 3) else image)
+    assert "pictures repeat" in whats(repeated)
+
+
+def test_constant_and_unknown_depth(scene):
+    flat = changed(scene, depth=lambda depth: torch.full_like(depth, 30.0))
+    assert "depth is the same everywhere" in whats(flat)
+    unknown = changed(scene, depth=lambda depth: torch.full_like(depth, torch.nan))
+    assert "most of the depth is unknown" in whats(unknown)
+
+
+def test_carrying_a_plane_is_exact(tmp_path):
+    """Two cameras before a plane: depth there is known in closed form."""
+    pinhole, size = Pinhole(60.0, 60.0, 39.5, 29.5), (60, 80)
+    poses = np.stack([np.eye(4)] * 3)
+    poses[:, 2, 3] = 0.0, 2.0, 4.0
+    depths = [np.full(size, 20.0 - z) for z in poses[:, 2, 3]]
+    images = [np.full((*size, 3), 90, np.uint8)] * 3
+    write_c3vd_scene(tmp_path / "plane", images, poses, pinhole, depths=depths)
+    plane = C3VDDataManager(C3VDSettings(split="all-train")).load(tmp_path / "plane")
+    pairs = [Pair(a, b) for a, b in video_pairs(plane.train)]
+    assert agreement(pairs).depth_error < 1e-4
+    assert agreement(pairs, "no motion").depth_error == pytest.approx(np.median([2 / 18, 2 / 16]), rel=0.07)
+    assert best_scale(pairs)[0] == pytest.approx(1.0, abs=0.02)
+    # The picture of a camera 2 ahead holds the middle 18 / 20 of the first one's, each way.
+    assert agreement(pairs[:1]).share == pytest.approx(0.9**2, abs=0.03)
+
+
+def test_matches_lie_on_their_lines(scene):
+    matches = match(video_pairs(scene.train))
+    assert epipolar_agreement(matches).error < 1.0
+    assert epipolar_agreement(matches, "no motion") is None
+
+
+def test_command_says_it_all(folder, scene, tmp_path, capsys):
+    status = run("data", "check", folder, "--html", tmp_path / "check.html", "--json", tmp_path / "check.json")
+    told = capsys.readouterr().out
+    assert status == 0
+    assert "nothing suspect" in told
+    assert "c3vd (undistorted layout)" in told
+    facts = json.loads((tmp_path / "check.json").read_text())
+    assert facts["suspect"] is False
+    assert facts["data"]["frames"]["train"] == 21
+    page = (tmp_path / "check.html").read_text()
+    assert page.count("<img ") == 18
+    assert "z, scene units" in page
+
+
+def test_command_fails_on_what_is_suspect(scene, tmp_path, capsys):
+    frames = sorted([*scene.train, *scene.test_sets["test"]], key=lambda frame: frame.index)
+    k = frames[0].camera
+    write_c3vd_scene(
+        tmp_path / "inverted",
+        [frame.image.numpy() for frame in frames],
+        np.stack([np.linalg.inv(frame.camera.camera_to_world.double().numpy()) for frame in frames]),
+        Pinhole(k.fx, k.fy, k.cx - 0.5, k.cy - 0.5),
+        depths=[frame.depth.numpy() for frame in frames],
+    )
+    status = run("data", "check", tmp_path / "inverted", "--json", tmp_path / "check.json")
+    assert status == 1
+    assert "SUSPECT poses agree with depth when read as: world-to-camera" in capsys.readouterr().out
+    assert json.loads((tmp_path / "check.json").read_text())["suspect"] is True
+
+
+def test_bad_input_of_the_command(folder, tmp_path, capsys):
+    for words, told in [
+        (["data", "check", tmp_path / "gone"], "no folder"),
+        (["data", "check", tmp_path], "none of the formats"),
+        (["data", "check", folder, "--format", "c3vb"], "Did you mean 'c3vd'"),
+        (["data", "check", folder, "--set", "lenz=x"], "lenz"),
+    ]:
+        assert run(*words) == 2
+        assert told in capsys.readouterr().err
+
+
+def test_the_page_escapes_names(scene, tmp_path):
+    write_check_page(check_scene(replace(scene, name="<b>")), tmp_path / "page.html")
+    assert "<b>" not in (tmp_path / "page.html").read_text()
+    assert list(lines(check_scene(scene)))[-1] == "nothing suspect"

@@ -1,0 +1,254 @@
+"""Whole phantoms, tiny ones: what lies on disk against the geometry it claims to show."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.lenses.models import LENSES, octagon_mask
+from coliags_plugin.phantom.generate import generate
+from coliags_plugin.phantom.settings import PhantomSettings
+
+TINY = {
+    "width": 48,
+    "height": 38,
+    "frames": 17,
+    "rotation_views": 3,
+    "mesh_spacing": 1.2,
+    "texture_spacing": 0.4,
+    "interreflection": 0.0,
+}
+
+
+@pytest.fixture(scope="module")
+def phantom(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("phantoms") / "plain"
+    generate(PhantomSettings(**TINY), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def raw(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("phantoms") / "raw"
+    generate(PhantomSettings(**{**TINY, "layout": "c3vd-raw", "width": 54, "height": 43, "frames": 9}), folder)
+    return folder
+
+
+def read(path: Path) -> np.ndarray:
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert image is not None, path
+    return image
+
+
+def z_depth(path: Path) -> torch.Tensor:
+    return torch.from_numpy(read(path).astype(np.float64) * (100.0 / 65535.0))
+
+
+def poses(path: Path) -> np.ndarray:
+    return np.array([[float(number) for number in line.split(",")] for line in path.read_text().splitlines()])
+
+
+def cameras(folder: Path) -> list[Camera]:
+    k = json.loads((folder / "camera.json").read_text())
+    assert sorted(k) == ["cx", "cy", "fx", "fy", "h", "w"]
+    stored = poses(folder / "camera_pose.txt").reshape(-1, 4, 4).transpose(0, 2, 1)
+    return [
+        Camera(k["fx"], k["fy"], k["cx"] + 0.5, k["cy"] + 0.5, k["w"], k["h"], torch.from_numpy(pose.copy()))
+        for pose in stored
+    ]
+
+
+def digest(folder: Path) -> dict[str, str]:
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def mesh_distance(folder: Path, points: np.ndarray) -> np.ndarray:
+    import open3d
+
+    mesh = open3d.t.io.read_triangle_mesh(str(folder / "truth" / "mesh.ply"))
+    scene = open3d.t.geometry.RaycastingScene()
+    scene.add_triangles(mesh)
+    return scene.compute_distance(open3d.core.Tensor(points.astype(np.float32))).numpy()
+
+
+def test_layout_is_coliags_own(phantom):
+    assert [path.name for path in sorted((phantom / "images").iterdir())] == [f"{i:04d}_color.png" for i in range(17)]
+    color, depth = read(phantom / "images/0000_color.png"), read(phantom / "depths/0016_depth.png")
+    assert color.shape == (38, 48, 3) and color.dtype == np.uint8
+    assert depth.shape == (38, 48) and depth.dtype == np.uint16 and depth.min() > 0
+    turned = phantom / "rotation"
+    assert len(list((turned / "images").iterdir())) == len(list((turned / "seen").iterdir())) == 3
+    assert (turned / "camera.json").read_text() == (phantom / "camera.json").read_text()
+    assert sorted(path.name for path in (phantom / "truth/seen").iterdir()) == [f"{i:04d}_seen.png" for i in (0, 8, 16)]
+    record = json.loads((phantom / "phantom.json").read_text())
+    assert record["settings"]["spread"] == 0.75 and record["settings"]["width"] == 48
+
+
+def test_the_picture_is_exposed_and_red(phantom):
+    for path in (phantom / "images").iterdir():
+        blue, green, red = (read(path) / 255.0).mean(axis=(0, 1))
+        assert 0.35 < (red + green + blue) / 3 < 0.55
+        assert red > 1.3 * green and green > blue
+
+
+def test_poses_are_rigid_column_major_and_those_of_the_truth(phantom):
+    truth = np.load(phantom / "truth/camera_to_world.npy")
+    rows = poses(phantom / "camera_pose.txt")
+    assert rows.shape == (17, 16)
+    assert np.all(rows[:, [3, 7, 11]] == 0.0) and np.all(rows[:, 15] == 1.0)
+    np.testing.assert_allclose(rows[:, 12:15], truth[:, :3, 3], rtol=1e-8)
+    for row in rows:
+        rotation = row.reshape(4, 4).T[:3, :3]
+        np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-7)
+        assert np.linalg.det(rotation) == pytest.approx(1.0)
+
+
+def test_depth_lies_on_the_mesh(phantom):
+    for folder in (phantom, phantom / "rotation"):
+        depth = z_depth(folder / "depths/0001_depth.png")
+        points = cameras(folder)[1].unproject(depth).numpy()[(depth < 99.9).numpy()]
+        # Half a depth step of .0015 mm, a little more along oblique rays.
+        assert mesh_distance(phantom, points).max() < 0.003
+
+
+def test_depth_of_one_frame_reprojects_onto_another(phantom):
+    views = cameras(phantom)
+    for first, second in ((3, 4), (4, 3), (10, 12)):
+        depth = z_depth(phantom / f"depths/{first:04d}_depth.png")
+        other = z_depth(phantom / f"depths/{second:04d}_depth.png")
+        known = depth < 99.9
+        pixels, z = views[second].project(views[first].unproject(depth)[known])
+        column, row = (pixels - 0.5).round().long().unbind(-1)
+        framed = (z > 0) & (column >= 0) & (row >= 0) & (column < 48) & (row < 38)
+        column, row, z, pixels = column[framed], row[framed], z[framed], pixels[framed]
+        found = other[row, column]
+        # The nearest pixel is up to half a pixel away, so compare where the wall is nearly square to the view.
+        gradient = torch.stack(torch.gradient(other)).abs().sum(0)[row, column]
+        fair = (gradient < 1.0) & (found < 99.9)
+        assert fair.sum() > 100
+        assert ((found - z).abs() / z)[fair].median() < 0.01
+
+
+def test_seen_masks_agree_with_a_depth_test(phantom):
+    views = cameras(phantom)
+    training = [index for index in range(17) if index % 8]
+    agreement = []
+    for number, turned in enumerate(cameras(phantom / "rotation")):
+        depth = z_depth(phantom / f"rotation/depths/{number:04d}_depth.png")
+        mask = read(phantom / f"rotation/seen/{number:04d}_seen.png")
+        assert mask.dtype == np.uint8 and set(np.unique(mask)) <= {0, 255}
+        points = turned.unproject(depth).reshape(-1, 3)
+        seen = torch.zeros(len(points), dtype=torch.bool)
+        for index in training:
+            other = z_depth(phantom / f"depths/{index:04d}_depth.png")
+            pixels, z = views[index].project(points)
+            column, row = (pixels - 0.5).round().long().unbind(-1)
+            framed = (z > 0) & (column >= 0) & (row >= 0) & (column < 48) & (row < 38)
+            found = other[row.clamp(0, 37), column.clamp(0, 47)]
+            seen |= framed & (z < 1.06 * found + 0.3)
+        agreement.append((seen.reshape(38, 48).numpy() == (mask > 0)).mean())
+    assert min(agreement) > 0.93
+    assert read(phantom / "truth/seen/0008_seen.png").mean() > 0.97 * 255
+
+
+def test_mesh_flags_what_training_frames_saw(phantom):
+    flags = np.load(phantom / "truth/mesh_seen.npz")
+    albedo = np.load(phantom / "truth/albedo.npz")
+    assert len(flags["vertex_seen"]) == len(albedo["vertex_albedo"])
+    assert 0.1 < flags["vertex_seen"].mean() < 0.6
+    assert np.all(flags["face_seen_by_any_frame"] >= flags["face_seen"])
+    # A triangle that was hit has, nearly always, a corner that is seen.
+    import open3d
+
+    mesh = open3d.io.read_triangle_mesh(str(phantom / "truth/mesh.ply"))
+    corners = flags["vertex_seen"][np.asarray(mesh.triangles)]
+    assert corners[flags["face_seen"]].any(axis=1).mean() > 0.97
+    assert mesh.has_vertex_colors() and mesh.has_vertex_normals()
+
+
+def test_gain_and_light_are_told(phantom):
+    rows = list(csv.DictReader((phantom / "truth/gain.csv").open()))
+    assert [int(row["frame"]) for row in rows] == list(range(17))
+    light = json.loads((phantom / "truth/light.json").read_text())
+    assert light["lamp"]["offset"] == [0.0, 0.0, -3.6] and light["gain"] == "auto"
+    turned = list(csv.DictReader((phantom / "truth/rotation_gain.csv").open()))
+    for view, row in zip(light["rotation_views"], turned, strict=True):
+        # Turned faster than the exposure follows: the gain of the frame it turned away from.
+        assert row["gain_g"] == rows[view["frame"]]["gain_g"]
+
+
+def test_same_seed_same_bytes_and_another_seed_another_colon(phantom, tmp_path):
+    small = {**TINY, "frames": 9, "rotation_views": 1, "interreflection": 1.0, "mesh_spacing": 2.5}
+    for name, seed in (("one", 7), ("two", 7), ("other", 8)):
+        generate(PhantomSettings(**small, seed=seed), tmp_path / name)
+    one, two, other = (digest(tmp_path / name) for name in ("one", "two", "other"))
+    assert one == two
+    assert one.keys() == other.keys()
+    assert all(one[name] != other[name] for name in one if name.endswith((".png", ".ply")) and "seen" not in name)
+
+
+def test_raw_layout_is_the_releases_own(raw):
+    names = {path.name for path in raw.iterdir()}
+    assert {"0000_color.png", "0008_depth.tiff", "0004_normals.tiff", "pose.txt", "coverage_mesh.obj"} <= names
+    lit = octagon_mask(54, 43)
+    color, depth, normals = (read(raw / f"0004_{kind}") for kind in ("color.png", "depth.tiff", "normals.tiff"))
+    assert not color[~lit].any() and not depth[~lit].any() and not normals[~lit].any()
+    assert depth.dtype == normals.dtype == np.uint16 and depth[lit].min() > 0
+    lens = LENSES["omnidirectional"].scaled(54, 43)
+    row, column = np.nonzero(lit)
+    directions = lens.unproject(np.stack([column, row], axis=1))
+    z = depth[lit] * (100.0 / 65535.0)
+    pose = poses(raw / "pose.txt")[4].reshape(4, 4).T
+    points = (directions * z[:, None]) @ pose[:3, :3].T + pose[:3, 3]
+    assert mesh_distance(raw, points[z < 99.9]).max() < 0.004
+    unit = normals[..., ::-1][lit] / 65535.0 * 2.0 - 1.0
+    np.testing.assert_allclose(np.linalg.norm(unit, axis=1), 1.0, atol=1e-3)
+    assert ((unit * directions).sum(axis=1) < 0.05).mean() > 0.99  # towards the camera
+    assert (raw / "rotation/seen/0000_seen.png").is_file()
+
+
+def test_coverage_mesh_marks_observed_faces(raw):
+    lines = (raw / "coverage_mesh.obj").read_text().splitlines()
+    faces = [line.split()[1:] for line in lines if line.startswith("f ")]
+    flags = np.array([[int(corner.split("/")[1]) for corner in face] for face in faces])
+    assert set(np.unique(flags)) == {1, 2} and np.all(flags == flags[:, :1])
+    np.testing.assert_array_equal(flags[:, 0] == 1, np.load(raw / "truth/mesh_seen.npz")["face_seen_by_any_frame"])
+
+
+def test_nothing_is_replaced_or_left_half_written(phantom, tmp_path):
+    before = digest(phantom)
+    with pytest.raises(InputError, match="already exists"):
+        generate(PhantomSettings(**TINY), phantom)
+    blocked = tmp_path / "file"
+    blocked.write_text("here first")
+    with pytest.raises(InputError):
+        generate(PhantomSettings(**TINY), blocked / "phantom")
+
+    def stop(stage: str, done: int, total: int) -> None:
+        if stage == "frames" and done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        generate(PhantomSettings(**TINY), tmp_path / "stopped", progress=stop)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+    assert digest(phantom) == before
+
+
+def test_importing_loads_nothing_heavy():
+    code = (
+        "import sys, coliags_plugin.phantom.generate;print(sorted({'open3d', 'torch', 'pycolmap'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,98 @@
+"""The table of layouts: names, what they declare, and what the page about phantoms says of them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from coliags_plugin.config.registry import datamanagers
+from coliags_plugin.engine.data_formats import find_format
+from coliags_plugin.phantom.layouts import LAYOUTS, LayoutName, layout_of
+from coliags_plugin.phantom.layouts.base import Layout
+from coliags_plugin.phantom.settings import PhantomSettings
+from tests.phantom.phantom_layouts import write_phantom
+
+PAGE = Path(__file__).parents[2] / "docs/phantom.md"
+
+
+def told() -> dict[str, list[str]]:
+    lines = PAGE.read_text().splitlines()
+    start = lines.index("| layout | what | size, px | rotation views |") + 2
+    rows = {}
+    for line in lines[start:]:
+        if not line.startswith("|"):
+            break
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        rows[cells[0].strip("`")] = cells[1:]
+    return rows
+
+
+def test_every_name_is_a_layout_and_every_layout_is_told():
+    assert list(get_args(LayoutName)) == list(LAYOUTS) == list(told())
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_sizes_and_rotation_views_are_as_told(name):
+    layout, (_, size, rotation) = layout_of(name), told()[name]
+    assert isinstance(layout, Layout)
+    assert size == "x".join(map(str, layout.default_size))
+    assert (rotation != "none") == layout.has_rotation
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_settings_resolve_to_what_the_layout_has(name):
+    layout, settings = layout_of(name), PhantomSettings(layout=name).resolved()
+    assert settings.size == layout.default_size
+    assert settings.rotation_views == (12 if layout.has_rotation else 0)
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_optics_are_of_the_size_asked_for(name):
+    optics, lit = layout_of(name).optics(64, 51)
+    assert (optics.width, optics.height) == (64, 51)
+    assert lit.shape == (51, 64)
+    assert lit.mean() > 0.5
+
+
+def test_names_load_nothing():
+    code = (
+        "import sys, coliags_plugin.phantom.layouts; "
+        "print([name for name in ('numpy', 'cv2', 'scipy', 'torch', 'open3d') if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert done.stdout.strip() == "[]"
+
+
+#: With a frame that REIM-NeRF validates on, number 25.
+FRAMES = 27
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_the_phantoms_split_is_the_one_that_its_manager_reads(name, tmp_path):
+    """Points, masks and turned views go by the phantom's own idea of which frames are trained on."""
+    options = {"frames": FRAMES, "mesh_spacing": 3.0, "texture_spacing": 1.0, "path_length": 20.0}
+    write_phantom(tmp_path / "colon", name, 48, 38, **options)
+    folder = tmp_path / "colon" / ("C3VD/phantom" if name == "pr-endo" else ".")
+    manager = datamanagers.get(find_format(folder))
+    scene = manager(manager.Settings(initial_points="none")).load(folder)
+    layout = layout_of(name)
+    held_out = {index for index in range(FRAMES) if layout.is_test(index)}
+    assert {frame.index for frame in scene.train} == set(range(FRAMES)) - held_out
+    # Masks say of every frame that is held out what training frames see of it.
+    masks = sorted(layout.seen_mask(tmp_path / "colon", "video", 0).parent.glob("*_seen.png"))
+    if name == "rotatecolon":
+        # It holds no frame out: the turned views are its test views.
+        assert not held_out and len(masks) == len(scene.test_sets["test"]) == 2
+    else:
+        assert {int(path.name[:4]) for path in masks} == held_out
+        tested = {frame.index for frame in scene.test_sets["test"]}
+        # REIM-NeRF's validation frames are neither trained nor tested on.
+        assert held_out - tested == ({25} if name == "reim-nerf" else set()) and tested <= held_out
+    for frame in scene.test_sets["test"]:
+        assert frame.seen is not None
+    assert np.load(tmp_path / "colon/truth/camera_to_world.npy").shape == (FRAMES, 4, 4)

@@ -1,0 +1,144 @@
+"""Features matched by descriptors alone, and along epipolar lines."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.reconstruction.structure.features import Features, FeatureSettings, highlights, usable
+from coliags_plugin.reconstruction.structure.matching import all_pairs, epipolar_matches, mutual_matches, video_pairs
+
+#: Error, ratio and distance that leave the decision to the geometry.
+LOOSE = (1.0, 1.0, 2.0)
+
+
+def features(pixels, descriptors, scale=2.0):
+    keypoints = np.zeros((len(pixels), 4), np.float32)
+    keypoints[:, :2], keypoints[:, 2] = pixels, scale
+    descriptors = np.asarray(descriptors, np.float32)
+    return Features(keypoints, descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True))
+
+
+def camera(x=0.0, y=0.0, z=0.0):
+    c2w = torch.eye(4, dtype=torch.float64)
+    c2w[:3, 3] = torch.tensor([x, y, z])
+    return Camera(100.0, 90.0, 52.0, 47.0, 100, 100, c2w)
+
+
+def seen(cam, points):
+    pixels, _ = cam.project(torch.as_tensor(points, dtype=torch.float64))
+    return pixels.numpy()
+
+
+@given(st.integers(0, 1000), st.integers(2, 60))
+@settings(max_examples=15, deadline=None)
+def test_a_shuffled_copy_is_matched_one_to_one(seed, count):
+    rng = np.random.default_rng(seed)
+    descriptors, order = rng.normal(size=(count, 128)), rng.permutation(count)
+    pixels = 10.0 * np.stack([np.arange(count), np.zeros(count)], axis=1)
+    noisy = descriptors[order] + 0.05 * rng.normal(size=(count, 128))
+    pairs = mutual_matches(features(pixels, descriptors), features(pixels, noisy), 0.8, 0.7)
+    np.testing.assert_array_equal(pairs[:, 0], np.arange(count))
+    np.testing.assert_array_equal(order[pairs[:, 1]], np.arange(count))
+
+
+@given(st.integers(0, 1000))
+@settings(max_examples=15, deadline=None)
+def test_mutual_matches_are_those_of_a_plain_loop(seed):
+    rng = np.random.default_rng(seed)
+    one = features(rng.uniform(0, 12, (20, 2)), rng.normal(size=(20, 128)) + 1.0)
+    other = features(rng.uniform(0, 12, (25, 2)), rng.normal(size=(25, 128)) + 1.0)
+    distance = np.linalg.norm(one.descriptors[:, None] - other.descriptors[None], axis=2)
+    expected = []
+    for i in range(20):
+        j = distance[i].argmin()
+        apart = np.linalg.norm(other.pixels - other.pixels[j], axis=1) > 2.0
+        if distance[:, j].argmin() == i and distance[i, j] < min(1.0, 0.97 * distance[i, apart].min()):
+            expected.append((i, j))
+    np.testing.assert_array_equal(mutual_matches(one, other, 0.97, 1.0), np.array(expected).reshape(-1, 2))
+
+
+@pytest.mark.parametrize(("apart", "count"), [(1.0, 1), (3.0, 0)])
+def test_a_twin_is_ambiguous_only_elsewhere(apart, count):
+    first = features([[0, 0], [50, 50]], np.eye(128)[:2])
+    second = features([[5, 5], [5 + apart, 5]], np.eye(128)[[0, 0]] + 0.01 * np.eye(128)[[3, 4]])
+    assert len(mutual_matches(first, second, 0.8, 0.7)) == count
+
+
+def test_nothing_matches_nothing():
+    none, some = features(np.empty((0, 2)), np.empty((0, 128))), features([[1, 1], [9, 9]], np.eye(128)[:2])
+    for pair in ((none, some), (some, none)):
+        assert mutual_matches(*pair, 0.8, 0.7).shape == (0, 2)
+        assert epipolar_matches(*pair, (camera(), camera(1.0)), *LOOSE).shape == (0, 2)
+
+
+def test_poses_tell_look_alikes_apart():
+    """Four spots that look the same, each on an epipolar line of its own."""
+    points = np.array([[-3.0, -3, 20], [-1, -1, 22], [1, 1, 21], [3, 3, 25]])
+    cameras = camera(), camera(x=2.0)
+    alike = np.ones((4, 128))
+    first, second = (features(seen(cam, points), alike) for cam in cameras)
+    np.testing.assert_array_equal(
+        epipolar_matches(first, second, cameras, 1.0, 0.7, 0.7), np.repeat(np.arange(4), 2).reshape(4, 2)
+    )
+    assert not len(mutual_matches(first, second, 0.7, 0.7))
+
+
+@pytest.mark.parametrize(("off", "count"), [(0.0, 1), (1.3, 1), (1.5, 0)])
+def test_the_epipolar_error_is_sampsons(off, count):
+    """Along x, off the common row by d: the Sampson distance is d / sqrt(2)."""
+    cameras = camera(), camera(x=2.0)
+    at = seen(cameras[0], [[0.0, 0, 20]])
+    there = seen(cameras[1], [[0.0, 0, 20]]) + np.array([0.0, off])
+    pairs = epipolar_matches(features(at, np.ones((1, 128))), features(there, np.ones((1, 128))), cameras, *LOOSE)
+    assert len(pairs) == count
+
+
+@pytest.mark.parametrize(("shift", "scale", "count"), [(-8.0, 1.0, 1), (8.0, 1.0, 0), (-8.0, 2.0, 0), (-8.0, 1.5, 1)])
+def test_rays_must_meet_in_front_and_scales_agree(shift, scale, count):
+    """From further right, things in front lie further left."""
+    cameras = camera(), camera(x=2.0)
+    at = seen(cameras[0], [[0.0, 0, 20]])
+    pairs = epipolar_matches(
+        features(at, np.ones((1, 128))),
+        features(at + np.array([shift, 0.0]), np.ones((1, 128)), 2.0 * scale),
+        cameras,
+        *LOOSE,
+    )
+    assert len(pairs) == count
+
+
+def test_cameras_in_one_place_match_nothing():
+    spots = features([[10, 10], [40, 40]], np.eye(128)[:2])
+    assert not len(epipolar_matches(spots, spots, (camera(), camera()), *LOOSE))
+
+
+def test_pairs_of_a_video():
+    assert video_pairs(4, 1) == [(0, 1), (1, 2), (2, 3)]
+    assert {second - first for first, second in video_pairs(100, 5)} == {1, 2, 3, 4, 5, 8, 16}
+    assert (
+        len(video_pairs(100, 5)) == len(set(video_pairs(100, 5))) == sum(100 - step for step in (1, 2, 3, 4, 5, 8, 16))
+    )
+    assert all_pairs(3) == [(0, 1), (0, 2), (1, 2)]
+
+
+def test_highlights_and_masks_yield_no_features():
+    image = np.full((60, 80, 3), 100, np.uint8)
+    image[20:24, 30:34] = 200  # twice as bright as its surroundings
+    image[50:52, 60:62] = 255
+    image[:, :10] = 118  # brighter, not by enough
+    np.testing.assert_array_equal(
+        np.unique(np.nonzero(highlights(image, FeatureSettings()))[1]), [30, 31, 32, 33, 60, 61]
+    )
+    assert not highlights(image, FeatureSettings(highlight_level=256)).any()
+    mask = np.ones((60, 80), bool)
+    mask[:, 70:] = False
+    free = usable(image, mask, FeatureSettings(margin=2))
+    assert not free[18:26, 28:36].any()
+    assert not free[:, 68:].any()
+    assert free[:, 40:50].all()
+    assert free[17, 31]

@@ -1,0 +1,220 @@
+"""Poses and points from pictures alone."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.engine.data_formats import open_scene
+from coliags_plugin.outputs.pictures import read_rgb, write_png
+from coliags_plugin.poses import colmap
+from coliags_plugin.poses.alignment import align, associate
+from coliags_plugin.poses.trajectory import Trajectory
+from coliags_plugin.reconstruction.structure.features import FeatureSettings
+from coliags_plugin.reconstruction.structure.pictures import file_names, pictures_of
+from coliags_plugin.reconstruction.structure.sfm import (
+    CameraSettings,
+    SfmSettings,
+    masks_for,
+    reconstruct,
+    write_sfm_scene,
+)
+from tests.textured_tube import INTRINSICS, tube_frames, write_tube
+
+KNOWN = SfmSettings(camera=CameraSettings(model="PINHOLE", params=INTRINSICS))
+COUNT = 6
+TRUTH = np.stack([frame.camera.camera_to_world.numpy() for frame in tube_frames(COUNT, 3.0)])
+
+
+@pytest.fixture(scope="module")
+def tube(tmp_path_factory):
+    return write_tube(tmp_path_factory.mktemp("tube") / "scene", COUNT, 3.0) / "images"
+
+
+@pytest.fixture(scope="module")
+def found(tube):
+    return reconstruct(pictures_of(tube), KNOWN)
+
+
+def share_of_path(trajectory, poses):
+    """ATE after Sim(3) alignment, as a share of the path; and the rotation error, degrees."""
+    reference = Trajectory(poses)
+    result = align(trajectory, reference, associate(trajectory, reference, "index"), with_scale=True)
+    path = np.linalg.norm(np.diff(reference.centers, axis=0), axis=1).sum()
+    return result.ate.rmse / path, result.rotation_deg.rmse
+
+
+def test_a_known_camera_finds_its_path(found):
+    assert found.registered == tuple(range(COUNT))
+    assert found.left_out == ()
+    error, degrees = share_of_path(found.trajectory, TRUTH)
+    assert error < 0.005
+    assert degrees < 3.0  # the path is nearly straight, and only positions are aligned
+    (camera,) = found.model.cameras.values()
+    assert tuple(camera.params) == INTRINSICS
+    assert f"{COUNT} of {COUNT} pictures posed" in found.summary()
+    assert found.trajectory.names == tuple(path.name for path in found.pictures)
+
+
+def test_median_depth_is_that_of_the_points(found):
+    depths = []
+    for place, pose in zip(found.registered, found.camera_to_world, strict=True):
+        for seen in found.model.images[place + 1].get_observation_points2D():
+            point = found.model.points3D[seen.point3D_id].xyz
+            depths.append(((point - pose[:3, 3]) @ pose[:3, :3])[2])
+    assert found.median_depth == pytest.approx(np.median(depths))
+
+
+def test_the_same_pictures_give_the_same_poses(found, tube):
+    again = reconstruct(pictures_of(tube), KNOWN)
+    np.testing.assert_array_equal(again.camera_to_world, found.camera_to_world)
+
+
+def test_the_written_scene_is_read_as_it_is(found, tmp_path):
+    mask = np.ones((128, 160), bool)
+    mask[:20] = False
+    write_sfm_scene(tmp_path / "scene", found, mask)
+    for path in found.pictures:
+        assert (tmp_path / "scene" / "images" / path.name).read_bytes() == path.read_bytes()
+    np.testing.assert_allclose(colmap.read(tmp_path / "scene" / "sparse" / "0").camera_to_world, found.camera_to_world)
+    scene = open_scene(tmp_path / "scene", options=["split=all-train"])
+    assert len(scene.points) == found.model.num_points3D()
+    assert all(len(frame.sparse_depth.depth) > 20 and not frame.mask[:20].any() for frame in scene.train)
+    # Points have the pictures' colours.
+    assert scene.points.colors.float().std() > 20
+
+
+def test_a_phantom_is_found_without_its_camera(phantom, caplog):
+    pictures = pictures_of(phantom / "images")
+    found = reconstruct(pictures, SfmSettings(camera=CameraSettings(model="SIMPLE_PINHOLE")))
+    assert len(found.registered) == len(pictures)
+    assert share_of_path(found.trajectory, np.load(phantom / "truth" / "camera_to_world.npy"))[0] < 0.005
+    (camera,) = found.model.cameras.values()
+    assert camera.focal_length == pytest.approx(json.loads((phantom / "camera.json").read_text())["fx"], rel=0.05)
+    assert "focal length went" not in caplog.text
+
+
+def test_a_focal_length_that_runs_away_is_doubted(tube, caplog):
+    reconstruct(pictures_of(tube), SfmSettings(camera=CameraSettings(model="SIMPLE_PINHOLE", focal_factor=2.5)))
+    assert "the focal length went from 400 to" in caplog.text
+
+
+def test_pictures_of_something_else_are_left_out_and_named(tube, tmp_path, caplog):
+    for path in pictures_of(tube):
+        write_png(tmp_path / path.name, read_rgb(path))
+    write_png(tmp_path / "9_other.png", np.random.default_rng(0).integers(0, 255, (128, 160, 3)).astype(np.uint8))
+    found = reconstruct(pictures_of(tmp_path), KNOWN)
+    assert [path.name for path in found.left_out] == ["9_other.png"]
+    assert f"1 of {COUNT + 1} pictures have no pose: 9_other.png" in caplog.text
+    write_sfm_scene(tmp_path / "scene", found)
+    assert not (tmp_path / "scene" / "images" / "9_other.png").exists()
+    assert len(open_scene(tmp_path / "scene", options=["split=all-train"]).train) == COUNT
+
+
+def test_masked_parts_have_no_features(tube):
+    mask = np.ones((128, 160), bool)
+    mask[64:] = False
+    half = reconstruct(pictures_of(tube), KNOWN, mask)
+    seen = [point.y() for image in half.model.images.values() for point in image.get_observation_points2D()]
+    assert max(seen) < 62
+
+
+def test_nothing_is_said_by_the_library(tube, capfd):
+    logging.getLogger("coliags_plugin").setLevel(logging.ERROR)
+    try:
+        reconstruct(pictures_of(tube), SfmSettings())
+    finally:
+        logging.getLogger("coliags_plugin").setLevel(logging.NOTSET)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_interrupts_are_heard(tube):
+    def interrupted(title, done, total):
+        if title == "find poses":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(pictures_of(tube), KNOWN, progress=interrupted)
+    assert pycolmap.logging.minloglevel < 3
+
+
+# Refusals
+
+
+def refusal(match, tube, settings=KNOWN, masks=None):
+    with pytest.raises(InputError, match=match):
+        reconstruct(pictures_of(tube), settings, masks)
+
+
+def test_pictures_without_motion_are_refused(tube, tmp_path):
+    for index in range(4):
+        write_png(tmp_path / f"{index}.png", read_rgb(pictures_of(tube)[0]))
+    refusal(r"no model from 4 pictures with \d+ features.*the camera has to move", tmp_path)
+
+
+def test_cameras_that_are_none_are_refused(tube, tmp_path):
+    refusal(
+        "camera model PINHOLES. Expected one of .*OPENCV_FISHEYE",
+        tube,
+        SfmSettings(camera=CameraSettings(model="PINHOLES")),
+    )
+    one = SfmSettings(camera=CameraSettings(model="PINHOLE", params=(1.0,)))
+    refusal("1 parameters for PINHOLE. Expected 4: fx, fy, cx, cy", tube, one)
+    write_png(tmp_path / "0.png", read_rgb(pictures_of(tube)[0]))
+    write_png(tmp_path / "1.png", np.zeros((20, 30, 3), np.uint8))
+    refusal("1.png is 30 x 20, 0.png 160 x 128. Expected pictures of one size", tmp_path, KNOWN)
+    refusal("the mask of .*0.png is 30 x 20, the picture 160 x 128", tmp_path, KNOWN, np.ones((20, 30), bool))
+
+
+def test_folders_without_pictures_are_refused(tmp_path):
+    with pytest.raises(InputError, match=r"no folder .*nowhere"):
+        pictures_of(tmp_path / "nowhere")
+    (tmp_path / "video.mp4").write_bytes(b"film")
+    with pytest.raises(InputError, match=r"video.mp4 is a file. Expected a folder of pictures.*ffmpeg -i"):
+        pictures_of(tmp_path / "video.mp4")
+    with pytest.raises(InputError, match=r"holds 0 pictures"):
+        pictures_of(tmp_path)
+    (tmp_path / "0.png").write_bytes(b"")
+    (tmp_path / "1.png").write_bytes(b"no picture")
+    with pytest.raises(InputError, match=r"0.png \(0 bytes\) cannot be decoded"):
+        reconstruct(pictures_of(tmp_path))
+    with pytest.raises(InputError, match="1 pictures"):
+        reconstruct([tmp_path / "0.png"])
+
+
+# Pictures, masks and settings
+
+
+def test_pictures_are_ordered_as_people_count(tmp_path):
+    for name in ("10.PNG", "9.jpg", "a.txt", "8.jpeg"):
+        (tmp_path / name).touch()
+    assert [path.name for path in pictures_of(tmp_path)] == ["8.jpeg", "9.jpg", "10.PNG"]
+    assert file_names(["2", "10"], ".png") == ["2.png", "10.png"]
+    assert file_names(["b", "a/c"], "") == ["00000_b", "00001_a-c"]
+
+
+def test_masks_of_a_file_and_of_a_folder(tmp_path):
+    pictures = [Path("a.jpg"), Path("b.jpg")]
+    black, white = np.zeros((4, 6, 3), np.uint8), np.full((4, 6, 3), 255, np.uint8)
+    write_png(tmp_path / "masks" / "a.jpg.png", black)
+    write_png(tmp_path / "masks" / "b.png", white)
+    masks = masks_for(tmp_path / "masks", pictures)
+    assert not masks[pictures[0]].any()
+    assert masks[pictures[1]].all()
+    assert masks_for(tmp_path / "masks" / "b.png", pictures).all()
+    with pytest.raises(InputError, match=r"has no mask for c.jpg. Expected c.jpg.png or c.png"):
+        masks_for(tmp_path / "masks", [Path("c.jpg")])
+
+
+def test_a_camera_is_refined_unless_it_is_given():
+    assert CameraSettings().is_refined
+    assert not KNOWN.camera.is_refined
+    assert CameraSettings(params=(1.0,), refine=True).is_refined
+    assert not CameraSettings(refine=False).is_refined
+    assert SfmSettings().features != FeatureSettings()

@@ -1,0 +1,230 @@
+"""Surface points under known poses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.datamanagers.colmap.manager import ColmapDataManager, ColmapSettings
+from coliags_plugin.engine.data_formats import find_format, open_scene
+from coliags_plugin.poses.rigid import FLIP_Y_AND_Z, inverse
+from coliags_plugin.reconstruction.structure.colmap_scene import write_colmap_scene
+from coliags_plugin.reconstruction.structure.triangulation import TriangulationSettings, triangulate
+from tests.textured_tube import texture, tube_frames
+
+FRAMES = tube_frames()
+SETTINGS = TriangulationSettings()
+
+
+@pytest.fixture(scope="module")
+def found():
+    return triangulate(FRAMES)
+
+
+def depth_errors(found, frames):
+    """Shares of the true depth that the points of each frame are off by, where it is known."""
+    errors = []
+    for frame, seen in zip(frames, found.observations, strict=True):
+        column, row = seen.pixels.astype(int).T
+        errors.append(seen.depth / frame.depth.numpy()[row, column] - 1.0)
+    errors = np.concatenate(errors)
+    return errors[np.isfinite(errors)]
+
+
+def moved(frame, camera_to_world):
+    return replace(frame, camera=replace(frame.camera, camera_to_world=torch.from_numpy(camera_to_world)))
+
+
+def test_points_lie_on_the_surface(found):
+    assert len(found) > 300
+    errors = depth_errors(found, FRAMES)
+    assert np.median(np.abs(errors)) < 0.01
+    assert np.quantile(np.abs(errors), 0.9) < 0.04
+    assert abs(np.median(errors)) < 0.003
+    # What it says of itself is of the right size.
+    assert 0.2 < np.median(np.abs(errors)) / np.median(found.depth_uncertainty) < 2.0
+
+
+def test_points_have_the_colour_of_the_surface(found):
+    assert np.median(np.abs(found.colors - texture(found.positions))) < 10
+
+
+def test_observations_reproject_and_add_up(found):
+    seen_in = np.zeros(len(found), int)
+    errors = np.zeros(len(found))
+    for frame, seen in zip(FRAMES, found.observations, strict=True):
+        pixels, depth = frame.camera.project(torch.from_numpy(found.positions[seen.points]))
+        error = np.linalg.norm(pixels.numpy() - seen.pixels, axis=1)
+        assert error.max() < SETTINGS.max_reprojection_error + 0.1
+        np.testing.assert_allclose(depth, seen.depth)
+        np.add.at(seen_in, seen.points, 1)
+        np.add.at(errors, seen.points, error)
+    np.testing.assert_array_equal(seen_in, found.track_lengths)
+    np.testing.assert_allclose(errors / seen_in, found.errors)
+    assert found.track_lengths.min() >= SETTINGS.min_track_length
+    assert found.depth_uncertainty.max() <= SETTINGS.max_depth_uncertainty
+    assert found.summary().startswith(f"{len(found)} points of {found.found} found, seen in")
+
+
+def test_the_same_frames_give_the_same_points():
+    one, other = (triangulate(FRAMES[:5]) for _ in range(2))
+    np.testing.assert_array_equal(one.positions, other.positions)
+    np.testing.assert_array_equal(one.colors, other.colors)
+
+
+def test_another_world_gives_the_same_points_in_it():
+    """Poses are taken as they are: turned, moved, and in another unit."""
+    turn = Rotation.from_rotvec([0.4, -2.0, 1.0]).as_matrix()
+    elsewhere = []
+    for frame in FRAMES[:5]:
+        c2w = frame.camera.camera_to_world.numpy().copy()
+        c2w[:3] = np.hstack([turn @ c2w[:3, :3], turn @ (0.1 * c2w[:3, 3:]) + [[5.0], [6.0], [7.0]]])
+        elsewhere.append(moved(frame, c2w))
+    here, there = triangulate(FRAMES[:5]), triangulate(elsewhere)
+    expected = 0.1 * here.positions @ turn.T + [5.0, 6.0, 7.0]
+    assert len(there) == pytest.approx(len(here), rel=0.05)
+    distance = np.linalg.norm(expected[:, None] - there.positions[None], axis=2).min(axis=1)
+    assert np.median(distance) < 1e-3
+
+
+def test_settings_do_what_they_say():
+    strict = triangulate(
+        FRAMES, TriangulationSettings(min_track_length=6, max_depth_uncertainty=0.01, max_reprojection_error=0.3)
+    )
+    assert strict.track_lengths.min() >= 6
+    assert strict.depth_uncertainty.max() <= 0.01
+    assert strict.errors.max() <= 0.3
+
+
+def test_what_is_masked_gives_no_points():
+    mask = torch.ones(FRAMES[0].image.shape[:2], dtype=torch.bool)
+    mask[:, :80] = False
+    masked = triangulate([replace(frame, mask=mask) for frame in FRAMES[:6]])
+    assert min(seen.pixels[:, 0].min() for seen in masked.observations if len(seen.pixels)) > 82
+    assert len(masked) > 20
+
+
+def test_progress_is_told():
+    told = []
+    triangulate(FRAMES[:4], progress=lambda *args: told.append(args))
+    assert told == [*(("find features", n, 4) for n in range(1, 5)), *(("match features", n, 6) for n in range(1, 7))]
+
+
+# The written scene
+
+
+def test_the_written_scene_has_the_points_and_their_depth(found, tmp_path):
+    write_colmap_scene(tmp_path / "scene", FRAMES, found)
+    assert find_format(tmp_path / "scene") == "colmap"
+    scene = ColmapDataManager(ColmapSettings(split="all-train")).load(tmp_path / "scene")
+    assert len(scene.train) == len(FRAMES)
+    for frame, truth, seen in zip(scene.train, FRAMES, found.observations, strict=True):
+        np.testing.assert_array_equal(frame.image, truth.image)
+        assert frame.mask is None
+        torch.testing.assert_close(
+            frame.camera.camera_to_world.double(), truth.camera.camera_to_world, atol=1e-5, rtol=0
+        )
+        assert (frame.camera.fx, frame.camera.fy, frame.camera.cx, frame.camera.cy) == pytest.approx(
+            (truth.camera.fx, truth.camera.fy, truth.camera.cx, truth.camera.cy)
+        )
+        points = torch.from_numpy(found.positions[np.sort(np.unique(seen.points))])
+        pixels, depth = truth.camera.project(points)
+        order, expected = np.argsort(frame.sparse_depth.depth), np.argsort(depth)
+        np.testing.assert_allclose(frame.sparse_depth.depth[order], depth[expected], rtol=1e-5)
+        np.testing.assert_allclose(frame.sparse_depth.pixels[order], pixels[expected], atol=1e-3)
+    order, expected = (np.lexsort(points.T) for points in (scene.points.positions.numpy(), found.positions))
+    np.testing.assert_allclose(scene.points.positions[order], found.positions[expected], rtol=1e-5, atol=1e-5)
+    np.testing.assert_array_equal(scene.points.colors[order], found.colors[expected])
+
+
+def test_held_out_frames_are_written_and_see_nothing(tmp_path):
+    mask = torch.zeros(FRAMES[0].image.shape[:2], dtype=torch.bool)
+    mask[30:, 30:] = True
+    train = [replace(frame, mask=mask) for frame in FRAMES if frame.index % 8]
+    write_colmap_scene(tmp_path / "scene", train, triangulate(train), FRAMES[::8])
+    scene = open_scene(tmp_path / "scene")
+    assert [frame.name for frame in scene.test_sets["test"]] == ["0000", "0008"]
+    assert all(frame.sparse_depth is None and frame.mask is None for frame in scene.test_sets["test"])
+    assert all(len(frame.sparse_depth.depth) > 20 for frame in scene.train)
+    assert all((frame.mask == mask).all() for frame in scene.train)
+
+
+def test_names_are_made_to_sort_and_to_be_files(tmp_path):
+    frames = [replace(frame, name=name) for frame, name in zip(FRAMES[:4], ("b/9", "b/10", "a", "a"), strict=True)]
+    write_colmap_scene(tmp_path / "scene", frames, triangulate(frames))
+    scene = open_scene(tmp_path / "scene", options=["split=all-train"])
+    assert [frame.name for frame in scene.train] == ["00000_b-9", "00001_b-10", "00002_a", "00003_a"]
+    for frame, truth in zip(scene.train, frames, strict=True):
+        np.testing.assert_array_equal(frame.image, truth.image)
+
+
+def test_other_frames_or_a_folder_that_is_there_are_refused(found, tmp_path):
+    with pytest.raises(InputError, match="a triangulation of 10 frames, and 9 frames"):
+        write_colmap_scene(tmp_path / "scene", FRAMES[:9], found)
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "mine").touch()
+    with pytest.raises(InputError, match="already exists"):
+        write_colmap_scene(tmp_path / "scene", FRAMES, found)
+    assert [path.name for path in tmp_path.rglob("*")] == ["scene", "mine"]
+    write_colmap_scene(tmp_path / "scene", FRAMES, found, overwrite=True)
+    assert not (tmp_path / "scene" / "mine").exists()
+
+
+# Refusals
+
+
+def test_one_frame_is_refused():
+    with pytest.raises(InputError, match=r"1 frames\. Expected two at least"):
+        triangulate(FRAMES[:1])
+
+
+def test_a_camera_that_only_turns_is_refused():
+    turned = []
+    for frame in FRAMES[:4]:
+        c2w = frame.camera.camera_to_world.numpy().copy()
+        c2w[:3, 3] = 1.0, 2.0, 3.0
+        turned.append(moved(frame, c2w))
+    with pytest.raises(InputError, match=r"all 4 cameras are in one place.*shows no depth"):
+        triangulate(turned)
+
+
+@pytest.mark.parametrize("change", ["reversed", "world-to-camera", "OpenGL", "transposed"])
+def test_poses_that_are_not_the_frames_own_are_refused(change):
+    poses = np.stack([frame.camera.camera_to_world.numpy() for frame in FRAMES])
+    if change == "reversed":
+        poses = poses[::-1]
+    elif change == "world-to-camera":
+        poses = inverse(poses)
+    elif change == "OpenGL":
+        poses = poses @ FLIP_Y_AND_Z
+    else:
+        poses[:, :3, :3] = poses[:, :3, :3].transpose(0, 2, 1)
+    with pytest.raises(InputError, match=r"depth that is certain.*Check the poses first \(coliags data check\)"):
+        triangulate([moved(frame, pose.copy()) for frame, pose in zip(FRAMES, poses, strict=True)])
+
+
+def test_pictures_without_anything_in_them_are_refused():
+    blank = [replace(frame, image=torch.full_like(frame.image, 90)) for frame in FRAMES[:3]]
+    with pytest.raises(InputError, match=r"no features of 3 frames \(0 a frame\) match"):
+        triangulate(blank)
+
+
+# The phantom
+
+
+def test_points_of_a_phantom_lie_on_its_wall(phantom):
+    scene = open_scene(phantom, options=["split=all-train", "initial_points=none"])
+    frames = [frame.to("cpu") for frame in scene.train]
+    assert isinstance(frames[0].camera, Camera)
+    found = triangulate(frames)
+    assert len(found) > 250
+    assert found.errors.mean() < 0.5
+    errors = depth_errors(found, frames)
+    assert np.median(np.abs(errors)) < 0.025
+    assert abs(np.median(errors)) < 0.005
