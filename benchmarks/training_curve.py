@@ -29,10 +29,9 @@ from coliags_plugin.core.errors import UnavailableError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.backends import choose_device
-from coliags_plugin.engine.data_formats import load_method_for
+from coliags_plugin.engine.data_formats import load_method_for, load_scene
 from coliags_plugin.engine.evaluator import MAIN_SET
 from coliags_plugin.engine.run_folder import RunFolder
-from coliags_plugin.engine.trained import load_scene
 from coliags_plugin.engine.trainer import Trainer
 from coliags_plugin.metrics.protocols import PaperProtocol
 

@@ -44,7 +44,9 @@ def imports(path: Path, top_level_only: bool = False) -> set[str]:
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
             parent = node.module or ""
-            found |= {f"{parent}.{alias.name}" if f"{parent}.{alias.name}" in SOURCES else parent for alias in node.names}
+            found |= {
+                f"{parent}.{alias.name}" if f"{parent}.{alias.name}" in SOURCES else parent for alias in node.names
+            }
     return found
 
 

@@ -20,7 +20,7 @@ from coliags_plugin.cli.phantom import Phantom
 from coliags_plugin.cli.train import Train
 from coliags_plugin.config.method_config import MethodConfig, OptimizerSettings, ScheduleSettings, load_method
 from coliags_plugin.config.registry import REGISTRIES, datamanagers
-from coliags_plugin.core.gaussians import OUTPUTS
+from coliags_plugin.core.render_output import OUTPUTS
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
 from coliags_plugin.datamanagers.splits import held_out

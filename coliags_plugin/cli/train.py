@@ -45,10 +45,9 @@ class Train:
         from coliags_plugin.config.method_config import method_name
         from coliags_plugin.core.errors import InputError
         from coliags_plugin.engine.backends import choose_device
-        from coliags_plugin.engine.data_formats import load_method_for
+        from coliags_plugin.engine.data_formats import load_method_for, load_scene
         from coliags_plugin.engine.resuming import resumed_method, resumed_seed
         from coliags_plugin.engine.run_folder import RunFolder
-        from coliags_plugin.engine.trained import load_scene
         from coliags_plugin.engine.trainer import Trainer
 
         if self.resume and self.overwrite:

@@ -70,5 +70,7 @@ FieldNode = Annotated[Component, PlainValidator(_validator("fields")), PlainSeri
 GeometryHeadNode = Annotated[Component, PlainValidator(_validator("geometry_heads")), PlainSerializer(_dump)]
 AppearanceHeadNode = Annotated[Component, PlainValidator(_validator("appearance_heads")), PlainSerializer(_dump)]
 RendererNode = Annotated[Component, PlainValidator(_validator("renderers")), PlainSerializer(_dump)]
+ModuleNode = Annotated[Component, PlainValidator(_validator("modules")), PlainSerializer(_dump)]
+SamplerNode = Annotated[Component, PlainValidator(_validator("samplers")), PlainSerializer(_dump)]
 StrategyNode = Annotated[Component, PlainValidator(_validator("strategies")), PlainSerializer(_dump)]
 LossNode = Annotated[Component, PlainValidator(_validator("losses")), PlainSerializer(_dump)]

@@ -11,7 +11,15 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 from typing_extensions import Self
 
 from coliags_plugin.config import registry
-from coliags_plugin.config.components import DataManagerNode, FieldNode, LossNode, RendererNode, StrategyNode
+from coliags_plugin.config.components import (
+    DataManagerNode,
+    FieldNode,
+    LossNode,
+    ModuleNode,
+    RendererNode,
+    SamplerNode,
+    StrategyNode,
+)
 from coliags_plugin.config.method_files import method_folder, method_names
 from coliags_plugin.config.yaml_tree import Node, dump, merge, override_all, read_tree
 from coliags_plugin.core.errors import InputError, did_you_mean
@@ -50,13 +58,15 @@ class MethodConfig(Settings):
     datamanager: DataManagerNode
     field: FieldNode
     renderer: RendererNode
+    modules: dict[str, ModuleNode] = Field(default_factory=dict)
+    sampler: SamplerNode = Field(default="frames", validate_default=True)
     strategy: StrategyNode
     losses: dict[str, LossNode] = Field(min_length=1)
     optimizers: dict[str, OptimizerSettings]
     schedule: ScheduleSettings = ScheduleSettings()
     protocol: str = "paper"
 
-    @field_validator("losses", "optimizers", mode="before")
+    @field_validator("losses", "optimizers", "modules", mode="before")
     @classmethod
     def _null_removes(cls, entries: Any) -> Any:
         return (
@@ -64,6 +74,14 @@ class MethodConfig(Settings):
             if isinstance(entries, dict)
             else entries
         )
+
+    @field_validator("modules")
+    @classmethod
+    def _names_without_dots(cls, modules: dict[str, Any]) -> dict[str, Any]:
+        for name in modules:
+            if not name.isidentifier():
+                raise ValueError(f"module name '{name}': expected letters, digits and underscores")
+        return modules
 
     @field_validator("protocol")
     @classmethod

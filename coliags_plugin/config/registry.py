@@ -139,7 +139,13 @@ datamanagers = Registry(
         "rotatecolon": "coliags_plugin.datamanagers.rotatecolon.manager:RotateColonDataManager",
     },
 )
-fields = Registry("fields", {"anchors": "coliags_plugin.fields.anchors:AnchorField"})
+fields = Registry(
+    "fields",
+    {
+        "anchors": "coliags_plugin.fields.anchors:AnchorField",
+        "gaussians": "coliags_plugin.fields.explicit_gaussians:ExplicitGaussians",
+    },
+)
 geometry_heads = Registry(
     "geometry_heads",
     {
@@ -161,11 +167,27 @@ renderers = Registry(
         "cpu": "coliags_plugin.renderers.cpu_renderer:CpuRenderer",
         "gsplat": "coliags_plugin.renderers.gsplat_renderer:GsplatRenderer",
         "torch": "coliags_plugin.renderers.torch_renderer:TorchRenderer",
+        "volume": "coliags_plugin.renderers.volume_renderer:VolumeRenderer",
+    },
+)
+modules = Registry(
+    "modules",
+    {
+        "gain": "coliags_plugin.modules.gain:FrameGain",
+        "pose-correction": "coliags_plugin.modules.pose_correction:PoseCorrection",
+    },
+)
+samplers = Registry(
+    "samplers",
+    {
+        "frames": "coliags_plugin.engine.samplers:FrameSampler",
+        "pixels": "coliags_plugin.engine.samplers:PixelSampler",
     },
 )
 strategies = Registry(
     "strategies",
     {
+        "adaptive-density": "coliags_plugin.strategies.adaptive_density:AdaptiveDensity",
         "none": "coliags_plugin.strategies.none:NoStrategy",
         "anchor-growth": "coliags_plugin.strategies.anchor_growth:AnchorGrowth",
     },
@@ -210,6 +232,8 @@ REGISTRIES: dict[str, Registry] = {
         geometry_heads,
         appearance_heads,
         renderers,
+        modules,
+        samplers,
         strategies,
         losses,
         metrics,

@@ -143,21 +143,25 @@ def merge(base: Node, over: Node) -> Node:
     return Node(merged, over.origin)
 
 
+#: One key of a path, quoted or not.
+_KEY = re.compile(r'"[^"]+"|[^".]+')
+
+
 def override(tree: Node, assignment: str) -> Node:
-    """Apply one ``key.path=value``.
+    """Apply one ``key.path=value``; a key that holds a dot stands in double quotes.
 
     Raises:
         InputError: It has no ``=`` or an empty key.
     """
     path, equals, text = assignment.partition("=")
-    keys = path.strip().split(".")
-    if not equals or not all(keys):
+    keys = _KEY.findall(path.strip())
+    if not equals or ".".join(keys) != path.strip():
         raise InputError(f"--set {assignment}", "key.path=value, for instance field.geometry_head.frequencies=8")
     origin = f"--set {assignment}"
     value = parse_value(text)
     node = Node({k: Node(v, origin) for k, v in value.items()} if isinstance(value, dict) else value, origin)
     for key in reversed(keys):
-        node = Node({key: node}, origin)
+        node = Node({key.strip('"'): node}, origin)
     return merge(tree, node)
 
 

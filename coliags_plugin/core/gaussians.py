@@ -1,24 +1,12 @@
-"""What a Gaussian field hands to a renderer, and what the renderer answers."""
+"""The Gaussians of one view, as a field hands them to a splatting renderer."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from jaxtyping import Float, Int
 from torch import Tensor
-
-#: Everything a renderer can be asked for. "depth" alone names nothing: each kind is a different quantity.
-OUTPUTS = (
-    "rgb",
-    "alpha",
-    "depth_accumulated",  # sum_i w_i z_i: the paper's D (Eq. 2); falls short where alpha < 1
-    "depth_expected",  # sum_i w_i z_i / sum_i w_i
-    "depth_median",  # z of the Gaussian at which transmittance falls to one half
-    "inverse_depth_accumulated",  # sum_i w_i / z_i: what the authors' code trains on and scores
-    "normals",  # sum_i w_i n_i, camera axes, n_i the shortest axis turned towards the camera
-)
-
-DEPTH_KINDS = tuple(name for name in OUTPUTS if "depth" in name)
 
 
 @dataclass(frozen=True)
@@ -35,6 +23,7 @@ class Gaussians:
             [N]
         visible_sources: Field elements evaluated for this view, those that yielded no Gaussian included
             (the anchor field: anchors in the frustum). [V]
+        features: Named channels that are composited like the colours, over 0; each comes out under its own name. [N, C]
     """
 
     means: Float[Tensor, "N 3"]
@@ -44,35 +33,7 @@ class Gaussians:
     colors: Float[Tensor, "N 3"]
     source_index: Int[Tensor, "N"]
     visible_sources: Int[Tensor, "V"]
+    features: Mapping[str, Float[Tensor, "N C"]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.means)
-
-
-@dataclass(frozen=True)
-class RenderOutput:
-    """One rendered view.
-
-    Attributes:
-        rgb: Composited colour over the background. [H, W, 3]
-        alpha: Accumulated opacity. [H, W]
-        maps: The other outputs asked for, by their names in :data:`OUTPUTS`. [H, W] or [H, W, 3]
-        means2d: Projected centres, pixels; holds its gradient after backward. [N, 2]
-        radii: Screen extent in pixels of each Gaussian, 0 where it was not drawn. [N]
-        gaussians: What was drawn.
-    """
-
-    rgb: Float[Tensor, "H W 3"]
-    alpha: Float[Tensor, "H W"]
-    means2d: Float[Tensor, "N 2"]
-    radii: Float[Tensor, "N"]
-    gaussians: Gaussians
-    maps: dict[str, Tensor] = field(default_factory=dict)
-
-    def __getitem__(self, name: str) -> Tensor:
-        """An output by name. Raises KeyError where it was not asked for."""
-        if name == "rgb":
-            return self.rgb
-        if name == "alpha":
-            return self.alpha
-        return self.maps[name]

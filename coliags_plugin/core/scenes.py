@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from coliags_plugin.core.cameras import Camera
@@ -27,6 +28,50 @@ class SparseDepth:
     def to(self, device: torch.device | str) -> SparseDepth:
         """The same points on another device."""
         return SparseDepth(self.pixels.to(device), self.depth.to(device))
+
+
+@dataclass(frozen=True)
+class View:
+    """Which frame of the video is rendered, for modules that know frames by name.
+
+    Attributes:
+        name: The frame's.
+        time: Of the frame: its index in the video, counted from 0.
+        trained: Whether it is among the training frames.
+    """
+
+    name: str
+    time: float
+    trained: bool
+
+
+@dataclass(frozen=True)
+class Target:
+    """What a training step's output is compared with: a frame, or P pixels of frames as P rows and one column.
+
+    Attributes:
+        name: Of the frame, or of the frames.
+        image: RGB. [H, W, 3]
+        mask: False where a pixel is to be ignored. None means every pixel counts. [H, W]
+        depth: z-depth, mm; NaN where unknown. None where there is none. [H, W]
+        sparse_depth: Depth at single points of a whole frame; None where there is none.
+    """
+
+    name: str
+    image: UInt8[Tensor, "H W 3"]
+    mask: Bool[Tensor, "H W"] | None = None
+    depth: Float[Tensor, "H W"] | None = None
+    sparse_depth: SparseDepth | None = None
+
+    @property
+    def rgb(self) -> Float[Tensor, "H W 3"]:
+        """The image in [0, 1], float32. [H, W, 3]"""
+        return _unit_range(self.image)
+
+    @property
+    def valid(self) -> Bool[Tensor, "H W"]:
+        """The mask, all True where there is none. [H, W]"""
+        return _all_true(self.image) if self.mask is None else self.mask
 
 
 @dataclass(frozen=True)
@@ -59,14 +104,34 @@ class Frame:
     @property
     def rgb(self) -> Float[Tensor, "H W 3"]:
         """The image in [0, 1], float32. [H, W, 3]"""
-        return self.image.to(torch.float32) / 255.0
+        return _unit_range(self.image)
 
     @property
     def valid(self) -> Bool[Tensor, "H W"]:
         """The mask, all True where there is none. [H, W]"""
-        if self.mask is not None:
-            return self.mask
-        return torch.ones(self.image.shape[:2], dtype=torch.bool, device=self.image.device)
+        return _all_true(self.image) if self.mask is None else self.mask
+
+    @property
+    def target(self) -> Target:
+        """The whole frame to compare with."""
+        return Target(self.name, self.image, self.mask, self.depth, self.sparse_depth)
+
+    def target_at(self, pixels: Int[Tensor, "P 2"]) -> Target:
+        """Some pixels to compare with.
+
+        Args:
+            pixels: Columns and rows. [P, 2]
+        """
+        column, row = pixels.to(self.image.device).unbind(1)
+
+        def taken(values: Tensor | None) -> Tensor | None:
+            return None if values is None else values[row, column][:, None]
+
+        return Target(self.name, self.image[row, column][:, None], taken(self.mask), taken(self.depth))
+
+    def view(self, trained: bool) -> View:
+        """This frame, for the modules of a model."""
+        return View(self.name, float(self.index), trained)
 
     def to(self, device: torch.device | str) -> Frame:
         """The same frame on another device."""
@@ -134,3 +199,30 @@ class Scene:
             fallback.append(size[depth > 0])
         found = torch.cat(sizes)
         return float((found if len(found) else torch.cat(fallback)).median())
+
+
+def _unit_range(image: UInt8[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
+    return image.to(torch.float32) / 255.0
+
+
+def _all_true(image: UInt8[Tensor, "H W 3"]) -> Bool[Tensor, "H W"]:
+    return torch.ones(image.shape[:2], dtype=torch.bool, device=image.device)
+
+
+def concatenate_targets(parts: Sequence[Target]) -> Target:
+    """Pixel batches of several frames as one: a missing mask is all True, missing depth beside other depth all NaN.
+
+    Args:
+        parts: Of P_i rows and one column each.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    masks = None if all(part.mask is None for part in parts) else torch.cat([part.valid for part in parts])
+    depths = None
+    if any(part.depth is not None for part in parts):
+        unknown = [torch.full(part.image.shape[:2], torch.nan, device=part.image.device) for part in parts]
+        depths = torch.cat(
+            [nothing if part.depth is None else part.depth for part, nothing in zip(parts, unknown, strict=True)]
+        )
+    images = torch.cat([part.image for part in parts])
+    return Target(", ".join(part.name for part in parts), images, masks, depths)

@@ -11,15 +11,17 @@ from typing import Any
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
-from torch import Tensor
+from torch import Tensor, nn
 
-from coliags_plugin.contracts import Field, Strategy
+from coliags_plugin.contracts import Sampler, Strategy
 from coliags_plugin.core.errors import InputError, NotFiniteError
 from coliags_plugin.core.files import atomic_folder
+from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.optimizers import Optimizers
-from coliags_plugin.engine.randomness import FrameOrder
 
-FORMAT = 2
+#: Written. Format 2 lacks view modules and is otherwise the same.
+FORMAT = 3
+READABLE = (2, FORMAT)
 
 
 @dataclass(frozen=True)
@@ -29,8 +31,8 @@ class Checkpoint:
     Attributes:
         step: Steps taken.
         method: Name of the method it belongs to.
-        tensors: By ``<part>/<name>``, the parts being field, optimizer, strategy and generator.
-        queue: Frames left in the current round, the last being next.
+        tensors: By ``<part>/<name>``, the parts being field, modules, optimizer, strategy and generator.
+        queue: Frames that the sampler has planned, the last being next.
     """
 
     step: int
@@ -48,11 +50,11 @@ def save_checkpoint(
     folder: Path,
     step: int,
     method: str,
-    field: Field,
+    model: Model,
     optimizers: Optimizers,
     strategy: Strategy,
     generators: Mapping[str, torch.Generator],
-    order: FrameOrder,
+    sampler: Sampler,
 ) -> Path:
     """Write ``step-<step>`` into ``folder``, so that training goes on from there to the bit.
 
@@ -62,7 +64,9 @@ def save_checkpoint(
     Raises:
         NotFiniteError: A number in it is NaN or infinite; nothing was written.
     """
-    tensors: dict[str, Tensor] = {f"field/{name}": value for name, value in field.state_dict().items()}
+    tensors: dict[str, Tensor] = {f"field/{name}": value for name, value in model.field.state_dict().items()}
+    for module, part in model.view_modules.items():
+        tensors |= {f"modules/{module}/{name}": value for name, value in part.state_dict().items()}
     for group, adam in optimizers.adam.items():
         for index, parameter in enumerate(adam.param_groups[0]["params"]):
             for key, value in adam.state.get(parameter, {}).items():
@@ -71,7 +75,7 @@ def save_checkpoint(
     tensors |= {f"generator/{name}": generator.get_state() for name, generator in generators.items()}
     _check_finite(tensors, step)
     target = folder / f"step-{step:06d}"
-    state: dict[str, Any] = {"format": FORMAT, "step": step, "method": method, "frame_queue": order.queue}
+    state: dict[str, Any] = {"format": FORMAT, "step": step, "method": method, "frame_queue": sampler.queue}
     with atomic_folder(target, overwrite=True) as scratch:
         save_file({key: value.detach().contiguous() for key, value in tensors.items()}, scratch / "state.safetensors")
         (scratch / "state.json").write_text(json.dumps(state, indent=2) + "\n", encoding="utf-8")
@@ -117,14 +121,28 @@ def read_checkpoint(path: Path, method: str, device: torch.device) -> Checkpoint
         step, owner, queue, version = (state[key] for key in ("step", "method", "frame_queue", "format"))
     except (OSError, ValueError, KeyError, SafetensorError) as error:
         raise InputError(f"checkpoint {path} cannot be read: {error}", "an intact checkpoint") from error
-    if version != FORMAT:
-        raise InputError(f"checkpoint {path} has format {version}", f"format {FORMAT}", "Train again with this version")
+    if version not in READABLE:
+        known = " or ".join(map(str, READABLE))
+        raise InputError(f"checkpoint {path} has format {version}", f"format {known}", "Train again with this version")
     if owner != method:
         raise InputError(
             f"checkpoint {path} is of method '{owner}'", f"one of method '{method}'", "Name its own method"
         )
     placed = {key: value if key.startswith("generator/") else value.to(device) for key, value in tensors.items()}
     return Checkpoint(step, owner, placed, queue)
+
+
+def restore_modules(checkpoint: Checkpoint, modules: Mapping[str, nn.Module]) -> None:
+    """Put the view modules' states back.
+
+    Raises:
+        InputError: The checkpoint does not hold them, or those of other frames.
+    """
+    for name, module in modules.items():
+        try:
+            module.load_state_dict(checkpoint.part(f"modules/{name}"))
+        except RuntimeError as error:
+            raise InputError(f"the checkpoint's module '{name}' does not fit: {error}", "one of this run") from error
 
 
 def restore_optimizers(checkpoint: Checkpoint, optimizers: Optimizers) -> None:

@@ -12,7 +12,7 @@ from pydantic_core import PydanticCustomError
 
 from coliags_plugin.config import registry
 from coliags_plugin.config.components import Component, make_component
-from coliags_plugin.config.method_config import LoadedMethod, load_method, method_tree
+from coliags_plugin.config.method_config import LoadedMethod, MethodConfig, load_method, method_tree
 from coliags_plugin.config.yaml_tree import Node, override_all
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress
@@ -20,9 +20,12 @@ from coliags_plugin.core.scenes import Scene
 from coliags_plugin.datamanagers.recorded import NoPointsError
 from coliags_plugin.datamanagers.rgbd.files import lacks_trajectory
 from coliags_plugin.datamanagers.rgbd.unposed import UnposedRGBDDataManager
+from coliags_plugin.engine.progress import progress_callback
 
 log = logging.getLogger(__name__)
 
+#: Seconds of reading from which on it is worth saying how far it is.
+READING_IS_LONG = 2.0
 #: Stands for the format that the files show.
 AUTO = "auto"
 
@@ -91,6 +94,18 @@ def load_method_for(
         data_format = find_format(path)
     chosen = [] if data_format is None else [f"datamanager.name={data_format}"]
     return load_method(method, [*chosen, *overrides])
+
+
+def load_scene(config: MethodConfig, path: Path) -> Scene:
+    """Read the data with the method's data manager; what takes long says how far it is.
+
+    Raises:
+        InputError: It cannot be read.
+    """
+    component = chosen_datamanager(config.datamanager, path)
+    with progress_callback(after=READING_IS_LONG) as progress:
+        scene: Scene = component.target(component.settings).load(path, progress)
+    return scene
 
 
 def open_scene(

@@ -5,20 +5,19 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from coliags_plugin.config import registry
-from coliags_plugin.config.components import make_component
 from coliags_plugin.contracts import Comparison, Metric, Protocol
-from coliags_plugin.core.errors import InputError, UnavailableError
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, atomic_write, write_json
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.provenance import software
+from coliags_plugin.engine.scoring import Scorer, Scores, within_seen
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.outputs.figures import DEPTH_ERROR_LIMIT_MM, depth_error_picture
 from coliags_plugin.outputs.pictures import eight_bit, write_depth_tiff, write_png
@@ -37,13 +36,12 @@ class _Figures:
     rows: dict[str, dict[str, float]] = field(default_factory=dict)
     reasons: dict[str, str] = field(default_factory=dict)
 
-    def take(self, frame: str, name: str, metric: Metric, comparison: Comparison) -> None:
-        """Compute one figure of one frame, or note why it cannot be had."""
+    def take(self, frame: str, scores: Scores, suffix: str = "") -> None:
+        """Note the figures of one frame, and why others cannot be had."""
         row = self.rows.setdefault(frame, {})
-        try:
-            row[name] = metric(comparison)
-        except UnavailableError as error:
-            self.reasons.setdefault(name, str(error))
+        row.update({name + suffix: value for name, value in scores.values.items()})
+        for name, reason in scores.reasons.items():
+            self.reasons.setdefault(name + suffix, reason)
 
     def means(self, names: list[str]) -> dict[str, float | None]:
         """Mean over the frames that have a figure; None where none has."""
@@ -67,54 +65,31 @@ def evaluate(trained: TrainedRun, protocol_name: str) -> Path:
     Raises:
         InputError: The protocol is unknown or wants what the renderer cannot deliver, or there is no test frame.
     """
-    protocol: Protocol = registry.protocols.get(protocol_name)()
-    wants = tuple(sorted({"rgb", "alpha"} | protocol.wants))
-    if not set(wants) <= trained.renderer.outputs:
-        raise InputError(f"protocol '{protocol_name}' wants {', '.join(wants)}", "a renderer that delivers them")
+    scorer = Scorer(protocol_name)
+    trained.model.check_outputs(scorer.wants, f"protocol '{protocol_name}'")
     sets = {name: frames for name, frames in trained.scene.test_sets.items() if frames}
     if not sets:
         raise InputError(f"scene '{trained.scene.name}' has no test frames", "a split that holds some out")
-    metrics = {key: _metric(name, options) for key, (name, options) in protocol.metrics.items()}
     total, done = sum(map(len, sets.values())), 0
-    target = trained.run.evaluation(protocol.name)
+    target = trained.run.evaluation(scorer.protocol.name)
     figures = {name: _Figures() for name in sets}
     with atomic_folder(target, overwrite=True) as scratch, ProgressReport("evaluate", total) as progress:
         for set_name, frames in sets.items():
             for frame in frames:
-                comparison = _compare(trained, protocol, wants, frame)
-                _take_figures(figures[set_name], frame, metrics, comparison)
+                comparison = scorer.compare(trained.model, frame, trained.device)
+                _take_figures(figures[set_name], frame, scorer, comparison)
                 _write_pictures(scratch, set_name, frame, comparison)
                 done += 1
                 progress.update(done)
-        write_json(scratch / "metrics.json", _summary(trained, protocol, metrics, figures))
-        atomic_write(scratch / "per_frame.csv", _table(figures, _columns(metrics, figures)))
+        write_json(scratch / "metrics.json", _summary(trained, scorer.protocol, scorer.metrics, figures))
+        atomic_write(scratch / "per_frame.csv", _table(figures, _columns(scorer.metrics, figures)))
     return target
 
 
-def _metric(name: str, options: Mapping[str, Any]) -> Metric:
-    component = make_component("metrics", {"name": name, **options})
-    metric: Metric = component.target(component.settings)
-    return metric
-
-
-@torch.no_grad()
-def _compare(trained: TrainedRun, protocol: Protocol, wants: tuple[str, ...], frame: Frame) -> Comparison:
-    placed = frame.to(trained.device)
-    return protocol.compare(trained.renderer.render(trained.field, placed.camera, wants), placed)
-
-
-def _take_figures(figures: _Figures, frame: Frame, metrics: Mapping[str, Metric], comparison: Comparison) -> None:
-    figures.rows.setdefault(frame.name, {})
-    for name, metric in metrics.items():
-        figures.take(frame.name, name, metric, comparison)
-    if frame.seen is None:
-        return
-    seen = frame.seen.to(comparison.valid.device)
-    depth_valid = None if comparison.depth_valid is None else comparison.depth_valid & seen
-    within = replace(comparison, valid=comparison.valid & seen, depth_valid=depth_valid)
-    for name in SEEN_METRICS:
-        if name in metrics:
-            figures.take(frame.name, name + SEEN_SUFFIX, metrics[name], within)
+def _take_figures(figures: _Figures, frame: Frame, scorer: Scorer, comparison: Comparison) -> None:
+    figures.take(frame.name, scorer.score(comparison))
+    if frame.seen is not None:
+        figures.take(frame.name, scorer.score(within_seen(comparison, frame), SEEN_METRICS), SEEN_SUFFIX)
 
 
 def _write_pictures(folder: Path, set_name: str, frame: Frame, comparison: Comparison) -> None:
@@ -147,6 +122,7 @@ def _summary(
         "method": trained.method,
         "scene": trained.scene.name,
         "step": trained.step,
+        "untrained_views": {name: module.untrained_views for name, module in trained.model.view_modules.items()},
         **main.means(list(metrics)),
         "reasons": reasons,
         "directions": {name: "higher" if metrics[base[name]].higher_is_better else "lower" for name in columns},

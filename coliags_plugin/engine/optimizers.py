@@ -1,39 +1,42 @@
-"""Adam per parameter group, with the rates a method config gives."""
+"""Adam per parameter group with the rates a method config gives, and changes of parameter rows."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
+from torch import Tensor, nn
 
 from coliags_plugin.config.method_config import OptimizerSettings
-from coliags_plugin.contracts import Field, log_linear
+from coliags_plugin.contracts import log_linear
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.engine.model import Model
 
 #: Everywhere in the splatting lineage (docs/methods.md 2.3).
 ADAM_EPSILON = 1e-15
+#: What belongs to a row beside its value.
+_GRADIENT, _MOMENTUM, _MEAN_SQUARE = "grad", "exp_avg", "exp_avg_sq"
 
 
 class Optimizers:
-    """One Adam per group of the field.
+    """One Adam per parameter group of the model, and the only place where Adam's moments are cut.
+
+    Implements :class:`coliags_plugin.contracts.ParameterRows`.
 
     Args:
-        field: Whose parameters to train.
-        settings: Rates by group name; must name exactly the field's groups.
+        model: Whose parameters to train.
+        settings: Rates by group name; must name exactly the model's groups.
         steps: Over which scheduled rates fall.
         extent: The scene's, for groups whose rates scale with it, scene units.
 
     Raises:
-        InputError: The groups named are not the field's.
+        InputError: The groups named are not the model's.
     """
 
-    def __init__(self, field: Field, settings: Mapping[str, OptimizerSettings], steps: int, extent: float) -> None:
-        groups = field.parameter_groups()
-        if set(groups) != set(settings):
-            raise InputError(
-                f"optimizers names the groups {', '.join(sorted(settings))}",
-                f"exactly the field's: {', '.join(sorted(groups))}",
-            )
+    def __init__(self, model: Model, settings: Mapping[str, OptimizerSettings], steps: int, extent: float) -> None:
+        groups = model.parameter_groups()
+        _check_groups(set(groups), set(settings))
+        self.model = model
         self.settings = settings
         self.steps = steps
         self.extent = extent
@@ -55,3 +58,99 @@ class Optimizers:
                 group["lr"] = self.rate(name, step)
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
+
+    def add_rows(self, rows: Mapping[str, Tensor], parents: Tensor | None = None) -> None:
+        """Append rows, which have no gradient and no momentum.
+
+        With ``parents`` their first Adam steps are as small as their parents': a mean square of zero beside a step
+        count long past its bias correction would make the first steps three times the learning rate, however small the
+        gradient.
+
+        Args:
+            rows: What to append, by group. [B, ...]
+            parents: For each new row, the row whose mean squared gradient it takes over. [B]
+        """
+        for name, extra in rows.items():
+
+            def appended(kind: str, old: Tensor, extra: Tensor = extra) -> Tensor:
+                if kind == _MEAN_SQUARE and parents is not None:
+                    return torch.cat([old, old[parents]])
+                moments = (_GRADIENT, _MOMENTUM, _MEAN_SQUARE)
+                return torch.cat([old, torch.zeros_like(extra) if kind in moments else extra])
+
+            self._change(name, appended)
+
+    def keep_rows(self, groups: Sequence[str], keep: Tensor) -> None:
+        """Keep only some rows of parameters, of their gradients and of their moments.
+
+        Args:
+            groups: Names of the groups.
+            keep: True for rows that stay. [M]
+        """
+        for name in groups:
+            self._change(name, lambda _, old: old[keep])
+
+    def reset_rows(self, group: str, rows: Tensor | None = None) -> None:
+        """Forget the moments of rows, of all of them where none are given.
+
+        Args:
+            group: Name of the group.
+            rows: True for those to reset. [M]
+        """
+        parameter = self._parameter(group)
+        state = self.adam[group].state.get(parameter, {})
+        for key in (_MOMENTUM, _MEAN_SQUARE):
+            if key in state:
+                state[key][slice(None) if rows is None else rows] = 0.0
+
+    @torch.no_grad()
+    def replace_values(self, group: str, values: Tensor) -> None:
+        """Put other values in the place of a group's, and forget their moments. [M, ...]"""
+        self._parameter(group).copy_(values)
+        self.reset_rows(group)
+
+    def _parameter(self, group: str) -> nn.Parameter:
+        """The one parameter of a group."""
+        (parameter,) = self.adam[group].param_groups[0]["params"]
+        return parameter
+
+    def _change(self, group: str, change: Callable[[str, Tensor], Tensor]) -> None:
+        """Put ``change(kind, old)`` in the place of a group's parameter and of all that has its shape."""
+        old = self._parameter(group)
+        new = nn.Parameter(change("value", old.detach()), requires_grad=old.requires_grad)
+        if old.grad is not None:
+            new.grad = change(_GRADIENT, old.grad)
+        owner, attribute = _owner(self.model, old)
+        setattr(owner, attribute, new)
+        optimizer = self.adam[group]
+        optimizer.param_groups[0]["params"] = [new]
+        state = optimizer.state.pop(old, None)
+        if state is not None:
+            optimizer.state[new] = {
+                key: change(key, value) if isinstance(value, Tensor) and value.shape == old.shape else value
+                for key, value in state.items()
+            }
+
+
+def _check_groups(there: set[str], named: set[str]) -> None:
+    if missing := sorted(there - named):
+        raise InputError(
+            f"optimizers lacks the parameter groups {', '.join(missing)}",
+            f"rates for each of {', '.join(sorted(there))}",
+            f"Add --set 'optimizers.\"{missing[0]}\"={{lr: 0.001}}'" if "." in missing[0] else "",
+        )
+    if unknown := sorted(named - there):
+        raise InputError(
+            f"optimizers names {', '.join(unknown)}, which the model does not have",
+            f"exactly its parameter groups: {', '.join(sorted(there))}",
+            f"Remove it with --set optimizers.{unknown[0]}=null",
+        )
+
+
+def _owner(model: nn.Module, parameter: nn.Parameter) -> tuple[nn.Module, str]:
+    """The module that holds a parameter, and the attribute's name."""
+    for module in model.modules():
+        for name, value in module.named_parameters(recurse=False):
+            if value is parameter:
+                return module, name
+    raise KeyError("a parameter of no module")

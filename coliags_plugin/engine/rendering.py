@@ -10,7 +10,7 @@ import torch
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder
-from coliags_plugin.core.gaussians import RenderOutput
+from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.trained import TrainedRun
@@ -71,8 +71,8 @@ def _choose(trained: TrainedRun, frames: str) -> list[Frame]:
 
 @torch.no_grad()
 def _render(trained: TrainedRun, frame: Frame) -> RenderOutput:
-    camera = frame.camera.to(trained.device)
-    return trained.renderer.render(trained.field, camera, ("rgb", "alpha", "depth_accumulated"))
+    view = frame.view(trained=frame.name in trained.training_frames)
+    return trained.model.render(frame.camera.to(trained.device), ("rgb", "alpha", "depth_accumulated"), view)
 
 
 def _depth_limits(trained: TrainedRun, frames: list[Frame]) -> tuple[float, float]:

@@ -3,49 +3,39 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from coliags_plugin.config.method_config import MethodConfig
-from coliags_plugin.contracts import Field, Renderer
+from coliags_plugin.contracts import Field
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.backends import choose_renderer
-from coliags_plugin.engine.checkpoints import latest_checkpoint, read_checkpoint
-from coliags_plugin.engine.data_formats import chosen_datamanager
-from coliags_plugin.engine.progress import progress_callback
+from coliags_plugin.engine.checkpoints import latest_checkpoint, read_checkpoint, restore_modules
+from coliags_plugin.engine.data_formats import load_scene
+from coliags_plugin.engine.model import Model, make_view_modules
 from coliags_plugin.engine.run_folder import RunFolder
-
-#: Seconds of reading from which on it is worth saying how far it is.
-READING_IS_LONG = 2.0
 
 
 @dataclass(frozen=True)
 class TrainedRun:
-    """Scene, field and renderer of a run at its latest checkpoint."""
+    """Scene and model of a run at its latest checkpoint."""
 
     run: RunFolder
     config: MethodConfig
     method: str
     scene: Scene
-    field: Field
-    renderer: Renderer
+    model: Model
     step: int
     device: torch.device
 
-
-def load_scene(config: MethodConfig, path: Path) -> Scene:
-    """Read the data with the method's data manager; what takes long says how far it is.
-
-    Raises:
-        InputError: It cannot be read.
-    """
-    component = chosen_datamanager(config.datamanager, path)
-    with progress_callback(after=READING_IS_LONG) as progress:
-        scene: Scene = component.target(component.settings).load(path, progress)
-    return scene
+    @cached_property
+    def training_frames(self) -> frozenset[str]:
+        """Names of the frames it was trained on."""
+        return frozenset(frame.name for frame in self.scene.train)
 
 
 def load_trained(path: Path, device: torch.device, data: Path | None = None) -> TrainedRun:
@@ -70,9 +60,12 @@ def load_trained(path: Path, device: torch.device, data: Path | None = None) -> 
     saved = read_checkpoint(latest_checkpoint(run.checkpoints), method, device)
     scene = load_scene(config, data or Path(scene_path))
     _check_same_data(scene, fingerprint, data or Path(scene_path))
-    field: Field = config.field.target.from_state(saved.part("field"), config.field.settings).to(device)
+    field: Field = config.field.target.from_state(saved.part("field"), config.field.settings)
     renderer = choose_renderer(config.renderer, field.primitive, device).renderer
-    return TrainedRun(run, config, method, scene, field.eval(), renderer, saved.step, device)
+    modules = make_view_modules(config, scene, torch.Generator())
+    restore_modules(saved, modules)
+    model = Model(field, renderer, modules).to(device).eval()
+    return TrainedRun(run, config, method, scene, model, saved.step, device)
 
 
 def _check_same_data(scene: Scene, fingerprint: Any, path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Training: one view per step."""
+"""Training a model on a scene, step by step."""
 
 from __future__ import annotations
 
@@ -16,18 +16,20 @@ import torch
 from torch import Tensor
 
 from coliags_plugin.config.method_config import LoadedMethod
-from coliags_plugin.contracts import Field, Loss, Schedule, Strategy
+from coliags_plugin.contracts import Draw, Loss, Sampler, Schedule, Strategy, TrainingStep, ViewModule
 from coliags_plugin.core.errors import InputError, InterruptedRunError, NotFiniteError
 from coliags_plugin.core.files import atomic_write
-from coliags_plugin.core.gaussians import RenderOutput
 from coliags_plugin.core.masked import masked_mean
-from coliags_plugin.core.scenes import Frame, Scene
+from coliags_plugin.core.render_output import RenderOutput, Splats, concatenate_pixels
+from coliags_plugin.core.scenes import Frame, Scene, Target, concatenate_targets
 from coliags_plugin.engine import checkpoints
 from coliags_plugin.engine.backends import ChosenRenderer, choose_renderer
+from coliags_plugin.engine.compatibility import check_components
+from coliags_plugin.engine.model import Model, make_view_modules
 from coliags_plugin.engine.optimizers import Optimizers
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.provenance import software
-from coliags_plugin.engine.randomness import FrameOrder, generators
+from coliags_plugin.engine.randomness import generators
 from coliags_plugin.engine.resuming import check_same_run, record_schedule, resume_command
 from coliags_plugin.engine.run_folder import RunFolder
 
@@ -60,20 +62,20 @@ class Trainer:
         self.seed, self.device = seed, device
         self.steps = config.schedule.steps
         self.chosen: ChosenRenderer = choose_renderer(config.renderer, config.field.target.primitive, device)
+        self.schedule = Schedule(self.steps, config.schedule.written_for)
         self.losses: dict[str, Loss] = {key: node.target(node.settings) for key, node in config.losses.items()}
-        self.wants = self._wanted_outputs()
-        self._check_depth()
         self.generators = generators(seed)
-        self.frames = _resident(scene.train, device)
-        self.order = FrameOrder(len(scene.train), self.generators["frame_order"])
+        sizes = [(frame.camera.width, frame.camera.height) for frame in scene.train]
+        self.sampler: Sampler = config.sampler.target(config.sampler.settings, sizes, self.generators["frame_order"])
         self.strategy: Strategy = config.strategy.target(
-            config.strategy.settings,
-            self.generators["densification"],
-            Schedule(self.steps, config.schedule.written_for),
+            config.strategy.settings, self.generators["densification"], self.schedule, scene.extent
         )
-        self.field: Field = config.field.target.from_scene(
-            scene, config.field.settings, self.generators["initialisation"]
-        ).to(device)
+        check_components(config, self.chosen, scene, self.losses, self.schedule)
+        self.frames = _resident(scene.train, device)
+        field = config.field.target.from_scene(scene, config.field.settings, self.generators["initialisation"])
+        self.model = Model(field, self.chosen.renderer, self._fresh_modules()).to(device)
+        self.wants = tuple(sorted({"rgb", "alpha"}.union(*(loss.wants for loss in self.losses.values()))))
+        self.model.check_outputs(self.wants, "a loss or module")
         self.optimizers = self._optimizers()
         self.step = 0
         self.seconds = 0.0
@@ -108,14 +110,17 @@ class Trainer:
         saved = checkpoints.read_checkpoint(path, self.method.name, self.device)
         config = self.method.config
         try:
-            self.field = config.field.target.from_state(saved.part("field"), config.field.settings).to(self.device)
+            field = config.field.target.from_state(saved.part("field"), config.field.settings)
         except (KeyError, RuntimeError) as error:
             raise InputError(f"checkpoint {path} does not fit the field: {error}", "one of this method") from error
+        modules = self._fresh_modules()
+        checkpoints.restore_modules(saved, modules)
+        self.model = Model(field, self.chosen.renderer, modules).to(self.device)
         self.optimizers = self._optimizers()
         checkpoints.restore_optimizers(saved, self.optimizers)
         checkpoints.restore_generators(saved, self.generators)
         self.strategy.load_state_dict(saved.part("strategy"))
-        self.order.queue = list(saved.queue)
+        self.sampler.queue = list(saved.queue)
         self.step = saved.step
 
     def train(self) -> None:
@@ -127,6 +132,8 @@ class Trainer:
         """
         schedule = self.method.config.schedule
         logger.info("%s", self.strategy.plan())
+        for name, module in self.model.view_modules.items():
+            logger.info("module %s: %s", name, module.untrained_views)
         began = time.monotonic() - self.seconds
         with (
             _deferred_interrupt() as interrupted,
@@ -159,33 +166,47 @@ class Trainer:
             NotFiniteError: A loss term, or a parameter as the step before left it, is NaN or infinite.
         """
         step = self.step + 1
-        frame = self.frames[self.order.next()].to(self.device)
-        output = self.chosen.renderer.render(self.field, frame.camera, self.wants)
-        terms = {key: loss(output, frame) for key, loss in self.losses.items()}
-        weights = {key: loss.settings.weight_at(step, self.steps) for key, loss in self.losses.items()}
+        self.model.field.before_step(step, self.schedule)
+        self.strategy.before_step(step, self.model.field, self.optimizers)
+        output, target = self._render(self.sampler.next())
+        seen = TrainingStep(output, target, self.model, step, self.schedule)
+        active = {key: loss for key, loss in self.losses.items() if loss.settings.active(step, self.schedule)}
+        terms = {key: loss(seen) for key, loss in active.items()}
+        weights = {key: loss.settings.weight_at(step, self.steps) for key, loss in active.items()}
         total = torch.stack([weights[key] * term for key, term in terms.items()]).sum()
         # A NaN opacity draws nothing and leaves every term finite, so parameters are looked at themselves.
-        sums = _parameter_sums(self.field)
+        sums = _parameter_sums(self.model)
         # Everything the log and the checks need, in one wait for the device.
-        scalars = [total, _squared_error(output, frame), *terms.values(), *sums.values()]
+        scalars = [total, _squared_error(output, target), *terms.values(), *sums.values()]
         loss, error, *rest = torch.stack(scalars).tolist()
         values, totals = rest[: len(terms)], rest[len(terms) :]
         self._check_parameters(dict(zip(sums, totals, strict=True)), step)
-        self._check_terms(dict(zip(terms, values, strict=True)), step, frame)
+        self._check_terms(dict(zip(terms, values, strict=True)), step, target)
         if total.requires_grad:
             torch.autograd.backward(total)
-        done = self.strategy.after_backward(step, self.field, self.optimizers.adam, output)
+        done = self.strategy.after_backward(seen, self.optimizers)
         self.optimizers.step(step)
+        done = done | self.strategy.after_step(seen, self.optimizers)
         self.step = step
+        drawn = output.splats
         return {
             "step": step,
             "loss": loss,
             "terms": dict(zip(terms, values, strict=True)),
             "psnr": min(MAX_PSNR, -10.0 * math.log10(max(error, 1e-30))),
-            "gaussians": len(output.gaussians),
-            "visible": len(output.gaussians.visible_sources),
+            **({} if drawn is None else _counts(drawn)),
             **done,
         }
+
+    def _render(self, draws: list[Draw]) -> tuple[RenderOutput, Target]:
+        """What the sampler has chosen, rendered, and what it is to be compared with."""
+        outputs, targets = [], []
+        for draw in draws:
+            frame = self.frames[draw.frame].to(self.device)
+            view = frame.view(trained=True)
+            outputs.append(self.model.render(frame.camera, self.wants, view, draw.pixels))
+            targets.append(frame.target if draw.pixels is None else frame.target_at(draw.pixels))
+        return concatenate_pixels(outputs), concatenate_targets(targets)
 
     def save(self) -> None:
         """Write a checkpoint of the current step."""
@@ -193,11 +214,11 @@ class Trainer:
             self.run.checkpoints,
             self.step,
             self.method.name,
-            self.field,
+            self.model,
             self.optimizers,
             self.strategy,
             self.generators,
-            self.order,
+            self.sampler,
         )
 
     def provenance(self) -> dict[str, Any]:
@@ -209,6 +230,7 @@ class Trainer:
             "device": str(self.device),
             "renderer": self.chosen.name,
             "renderer_reason": self.chosen.reason,
+            "untrained_views": {name: module.untrained_views for name, module in self.model.view_modules.items()},
             **software(),
             "scene": {
                 "name": self.scene.name,
@@ -228,45 +250,19 @@ class Trainer:
                     f"The last checkpoint is whole; look for too large a learning rate of {group}."
                 )
 
-    def _check_terms(self, terms: dict[str, float], step: int, frame: Frame) -> None:
+    def _check_terms(self, terms: dict[str, float], step: int, target: Target) -> None:
         for key, term in terms.items():
             if not math.isfinite(term):
                 raise NotFiniteError(
-                    f"step {step}, frame {frame.name}: loss term '{key}' is {term}. "
+                    f"step {step}, frame {target.name}: loss term '{key}' is {term}. "
                     "The last checkpoint is whole; look for too large a learning rate or damaged data in that frame."
                 )
 
-    def _wanted_outputs(self) -> tuple[str, ...]:
-        wants = {"rgb", "alpha"}.union(*(loss.wants for loss in self.losses.values()))
-        missing = wants - self.chosen.renderer.outputs
-        if missing:
-            raise InputError(
-                f"the losses want {', '.join(sorted(missing))}, which renderer '{self.chosen.name}' does not deliver",
-                f"losses on {', '.join(sorted(self.chosen.renderer.outputs))}",
-            )
-        return tuple(sorted(wants))
-
-    def _check_depth(self) -> None:
-        """Refuse terms that need a kind of depth of which no training frame has any."""
-        dense = [key for key, loss in self.losses.items() if loss.needs_depth]
-        sparse = [key for key, loss in self.losses.items() if loss.needs_sparse_depth]
-        has_dense = any(frame.depth is not None for frame in self.scene.train)
-        has_sparse = any(frame.sparse_depth is not None for frame in self.scene.train)
-        if dense and not has_dense:
-            there = ", or train on its points with --set 'losses.{}={{name: sparse-depth, weight: 0.2}}'"
-            raise self._missing(dense[0], "depth", there.format(dense[0]) if has_sparse else "")
-        if sparse and not has_sparse:
-            raise self._missing(sparse[0], "depth at single points")
-
-    def _missing(self, key: str, what: str, instead: str = "") -> InputError:
-        return InputError(
-            f"loss term '{key}' needs {what}, and no training frame of scene '{self.scene.name}' has any",
-            f"frames with {what}, or no such term",
-            f"Remove it with --set losses.{key}=null{instead}",
-        )
+    def _fresh_modules(self) -> dict[str, ViewModule]:
+        return make_view_modules(self.method.config, self.scene, self.generators["initialisation"])
 
     def _optimizers(self) -> Optimizers:
-        return Optimizers(self.field, self.method.config.optimizers, self.steps, self.scene.extent)
+        return Optimizers(self.model, self.method.config.optimizers, self.steps, self.scene.extent)
 
     def _cut_log(self) -> None:
         """Drop rows of steps that the checkpoint does not hold: they are about to be taken again."""
@@ -287,16 +283,21 @@ def _logged_step(row: str) -> float:
 
 
 @torch.no_grad()
-def _parameter_sums(field: Field) -> dict[str, Tensor]:
+def _parameter_sums(model: Model) -> dict[str, Tensor]:
     """The sum of every parameter group: finite if all of the group is. []"""
-    groups = field.parameter_groups()
+    groups = model.parameter_groups()
     return {name: torch.stack([value.sum() for value in group]).sum() for name, group in groups.items()}
 
 
 @torch.no_grad()
-def _squared_error(output: RenderOutput, frame: Frame) -> Tensor:
+def _squared_error(output: RenderOutput, target: Target) -> Tensor:
     """Mean squared colour error of this training view. []"""
-    return masked_mean((output.rgb - frame.rgb).square(), frame.mask)
+    return masked_mean((output.rgb - target.rgb).square(), target.mask)
+
+
+def _counts(drawn: Splats) -> dict[str, int]:
+    """How many Gaussians were drawn, and of how many of the field's elements."""
+    return {"gaussians": len(drawn.gaussians), "visible": len(drawn.gaussians.visible_sources)}
 
 
 def _resident(frames: list[Frame], device: torch.device) -> list[Frame]:

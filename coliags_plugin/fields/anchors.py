@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from typing_extensions import Self
 
 from coliags_plugin.config.components import AppearanceHeadNode, GeometryHeadNode
-from coliags_plugin.contracts import Field
+from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
@@ -45,7 +45,7 @@ class AnchorFieldSettings(Settings):
     near: float = Option(default=0.2, ge=0)  # scene units; anchors wholly before it are not decoded
 
 
-class AnchorField(Field):
+class AnchorField(GaussianField):
     """Anchors with features; two heads decode each visible one into its children (paper, II-A2 and II-C).
 
     Differs from the released ColIAGS code where that is defective (docs/methods.md 6): voxels are of a size that
@@ -62,7 +62,8 @@ class AnchorField(Field):
 
     Settings: ClassVar[type[Settings]] = AnchorFieldSettings
     primitive: ClassVar[str] = "gaussians3d"
-    #: Parameters with one row per anchor, for strategies that add and remove anchors.
+    elements: ClassVar[str] = "anchors"
+    #: Parameter groups with one row per anchor, for strategies that add and remove anchors.
     anchor_parameters: ClassVar[tuple[str, ...]] = ("offsets", "features", "scalings")
 
     anchors: Tensor
@@ -132,9 +133,8 @@ class AnchorField(Field):
             "offsets": [self.offsets],
             "features": [self.features],
             "scalings": [self.scalings],
-            "opacity_mlp": list(self.geometry_head.opacity_mlp.parameters()),
-            "covariance_mlp": list(self.geometry_head.covariance_mlp.parameters()),
-            "color_mlp": list(self.appearance_head.color_mlp.parameters()),
+            **self.geometry_head.parameter_groups(),
+            **self.appearance_head.parameter_groups(),
         }
 
     def child_positions(self) -> Float[Tensor, "M K 3"]:

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
 
+from coliags_plugin.contracts import AppearanceHead
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.fields.embedding import cosine_embedding
 from coliags_plugin.fields.perceptron import first_layer, perceptron
@@ -31,7 +32,7 @@ class PlainAppearanceSettings(AppearanceSettings):
     distance: bool = False  # Scaffold-GS's add_color_dist: also show the raw distance
 
 
-class PlainAppearanceHead(nn.Module):
+class PlainAppearanceHead(AppearanceHead):
     """Scaffold-GS's: colour from feature and viewing direction, optionally the distance (docs/methods.md 3.6)."""
 
     Settings: ClassVar[type[Settings]] = PlainAppearanceSettings
@@ -73,6 +74,10 @@ class PlainAppearanceHead(nn.Module):
         kinks = distances.sort().values[places]
         first.bias -= first.weight[:, self.features + 3] * kinks  # after the direction
 
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """The perceptron."""
+        return {"color_mlp": list(self.color_mlp.parameters())}
+
     def forward(
         self,
         features: Float[Tensor, "V F"],
@@ -80,17 +85,7 @@ class PlainAppearanceHead(nn.Module):
         distances: Float[Tensor, "V 1"],
         cosines: Float[Tensor, "V 1"],
     ) -> Float[Tensor, "V K 3"]:
-        """Decode the children's colours.
-
-        Args:
-            features: Anchor features. [V, F]
-            directions: Unit vectors from the camera (and lamp) to the anchors, world frame. [V, 3]
-            distances: Camera to anchor, scene units (mm), not normalised. [V, 1]
-            cosines: Of the angle between optical axis and direction, in [0, 1]. [V, 1]
-
-        Returns:
-            RGB in (0, 1). [V, K, 3]
-        """
+        """Decode the children's colours."""
         layers: list[Any] = list(self.color_mlp)
         first, activation, last = layers
         embedded = self.embed(directions, distances, cosines)

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
 
+from coliags_plugin.contracts import GeometryHead
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.fields.embedding import cosine_embedding
 from coliags_plugin.fields.perceptron import first_layer, perceptron
@@ -20,7 +21,7 @@ class PlainGeometrySettings(Settings):
     hidden: int = Field(default=32, ge=1)
 
 
-class PlainGeometryHead(nn.Module):
+class PlainGeometryHead(GeometryHead):
     """Scaffold-GS's: both perceptrons see the viewing direction as it is (docs/methods.md 3.6)."""
 
     Settings: ClassVar[type[Settings]] = PlainGeometrySettings
@@ -37,19 +38,17 @@ class PlainGeometryHead(nn.Module):
         """What the perceptrons see of the viewing direction."""
         return directions
 
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """The two perceptrons."""
+        return {
+            "opacity_mlp": list(self.opacity_mlp.parameters()),
+            "covariance_mlp": list(self.covariance_mlp.parameters()),
+        }
+
     def forward(
         self, features: Float[Tensor, "V F"], directions: Float[Tensor, "V 3"]
     ) -> tuple[Float[Tensor, "V K"], Float[Tensor, "V K 7"]]:
-        """Decode the children of the visible anchors.
-
-        Args:
-            features: Anchor features. [V, F]
-            directions: Unit vectors from the camera to the anchors, world frame. [V, 3]
-
-        Returns:
-            Signed opacities in (-1, 1), of which only positive ones are drawn [V, K]; and three scale logits and four
-            quaternion components (w first) per child [V, K, 7].
-        """
+        """Decode the children of the visible anchors."""
         # Both perceptrons read the same input: one product for both first layers.
         first: list[Any] = [self.opacity_mlp[0], self.covariance_mlp[0]]
         weight, bias = torch.cat([layer.weight for layer in first]), torch.cat([layer.bias for layer in first])

@@ -9,13 +9,11 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
-from coliags_plugin.contracts import Loss, LossSettings
+from coliags_plugin.contracts import Loss, LossSettings, TrainingStep
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.gaussians import RenderOutput
 from coliags_plugin.core.masked import masked_mean, zero_outside
-from coliags_plugin.core.scenes import Frame
 
-#: :data:`coliags_plugin.core.gaussians.DEPTH_KINDS`, spelt out for the type checker; a test holds the two together.
+#: :data:`coliags_plugin.core.render_output.DEPTH_KINDS`, spelt out for the type checker; a test holds the two together.
 DepthKind = Literal["depth_accumulated", "depth_expected", "depth_median", "inverse_depth_accumulated"]
 
 
@@ -41,30 +39,31 @@ class DepthL1Loss(Loss):
     """
 
     Settings: ClassVar[type[LossSettings]] = DepthL1Settings
-    needs_depth: ClassVar[bool] = True
+    needs: ClassVar[frozenset[str]] = frozenset({"depth"})
 
     @property
     def wants(self) -> frozenset[str]:
         """The rendered depth that is compared."""
         return frozenset({self.settings.depth})
 
-    def __call__(self, output: RenderOutput, frame: Frame) -> Float[Tensor, ""]:
+    def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
         """The unweighted term, mm; 0 where no valid pixel has a true depth.
 
         Raises:
-            InputError: The frame has no depth at all.
+            InputError: The target has no depth at all.
         """
-        if frame.depth is None:
+        target = step.target
+        if target.depth is None:
             raise InputError(
-                f"frame '{frame.name}' has no depth",
+                f"frame '{target.name}' has no depth",
                 "ground-truth depth for every training frame, since the losses include depth-l1",
                 "Remove the term with --set losses.depth=null",
             )
-        known = torch.isfinite(frame.depth) & frame.valid
-        rendered = output[self.settings.depth]
+        known = torch.isfinite(target.depth) & target.valid
+        rendered = step.output[self.settings.depth]
         if self.settings.depth == "inverse_depth_accumulated":
             rendered = _reciprocal(rendered, self.settings.empty_depth)
-        truth = frame.depth.to(rendered.dtype)
+        truth = target.depth.to(rendered.dtype)
         difference = zero_outside(rendered, known) - zero_outside(truth, known)
         return masked_mean(difference.abs(), known)
 

@@ -7,10 +7,8 @@ from typing import ClassVar
 from jaxtyping import Float
 from torch import Tensor
 
-from coliags_plugin.contracts import Loss, LossSettings
-from coliags_plugin.core.gaussians import RenderOutput
+from coliags_plugin.contracts import Loss, LossSettings, TrainingStep
 from coliags_plugin.core.masked import masked_mean, zero_outside
-from coliags_plugin.core.scenes import Frame
 from coliags_plugin.core.ssim import ssim_map
 
 
@@ -19,11 +17,11 @@ class L1Loss(Loss):
 
     Settings: ClassVar[type[LossSettings]] = LossSettings
 
-    def __call__(self, output: RenderOutput, frame: Frame) -> Float[Tensor, ""]:
+    def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
         """The unweighted term, in units of full scale; 0 where no pixel is valid."""
-        truth = frame.rgb.to(output.rgb.dtype)
-        difference = zero_outside(output.rgb, frame.mask) - zero_outside(truth, frame.mask)
-        return masked_mean(difference.abs(), frame.mask)
+        rgb, mask = step.output.rgb, step.target.mask
+        difference = zero_outside(rgb, mask) - zero_outside(step.target.rgb.to(rgb.dtype), mask)
+        return masked_mean(difference.abs(), mask)
 
 
 class DSSIMLoss(Loss):
@@ -33,8 +31,9 @@ class DSSIMLoss(Loss):
     """
 
     Settings: ClassVar[type[LossSettings]] = LossSettings
+    whole_image: ClassVar[bool] = True
 
-    def __call__(self, output: RenderOutput, frame: Frame) -> Float[Tensor, ""]:
+    def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
         """The unweighted term, from 0 (equal) to 2; 0 where no pixel is valid."""
-        similarity = ssim_map(output.rgb, frame.rgb.to(output.rgb.dtype), frame.mask)
-        return masked_mean(1.0 - similarity, frame.mask)
+        rgb, mask = step.output.rgb, step.target.mask
+        return masked_mean(1.0 - ssim_map(rgb, step.target.rgb.to(rgb.dtype), mask), mask)

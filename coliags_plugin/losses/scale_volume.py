@@ -1,4 +1,4 @@
-"""A price on large Gaussians."""
+"""Regularization of the volume of Gaussians."""
 
 from __future__ import annotations
 
@@ -7,9 +7,7 @@ from typing import ClassVar
 from jaxtyping import Float
 from torch import Tensor
 
-from coliags_plugin.contracts import Loss, LossSettings
-from coliags_plugin.core.gaussians import RenderOutput
-from coliags_plugin.core.scenes import Frame
+from coliags_plugin.contracts import Loss, LossSettings, TrainingStep
 
 
 class ScaleVolumeLoss(Loss):
@@ -19,8 +17,9 @@ class ScaleVolumeLoss(Loss):
     """
 
     Settings: ClassVar[type[LossSettings]] = LossSettings
+    needs_splats: ClassVar[bool] = True
 
-    def __call__(self, output: RenderOutput, frame: Frame) -> Float[Tensor, ""]:
+    def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
         """The unweighted term; 0 where the view has no Gaussians."""
-        scales = output.gaussians.scales
+        scales = step.output.drawn.gaussians.scales
         return scales.prod(dim=-1).sum() / max(len(scales), 1)

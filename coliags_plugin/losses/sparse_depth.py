@@ -9,9 +9,8 @@ from jaxtyping import Bool, Float
 from pydantic import Field
 from torch import Tensor
 
-from coliags_plugin.contracts import Loss, LossSettings
-from coliags_plugin.core.gaussians import RenderOutput
-from coliags_plugin.core.scenes import Frame, SparseDepth
+from coliags_plugin.contracts import Loss, LossSettings, TrainingStep
+from coliags_plugin.core.scenes import SparseDepth
 from coliags_plugin.losses.depth import DepthKind
 
 
@@ -39,24 +38,25 @@ class SparseDepthLoss(Loss):
     """
 
     Settings: ClassVar[type[LossSettings]] = SparseDepthSettings
-    needs_sparse_depth: ClassVar[bool] = True
+    needs: ClassVar[frozenset[str]] = frozenset({"sparse_depth"})
+    whole_image: ClassVar[bool] = True
 
     @property
     def wants(self) -> frozenset[str]:
         """The rendered depth that is compared."""
         return frozenset({self.settings.depth})
 
-    def __call__(self, output: RenderOutput, frame: Frame) -> Float[Tensor, ""]:
+    def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
         """The unweighted term, scene units; 0, still part of the graph, where no point counts."""
-        rendered = output[self.settings.depth]
-        if frame.sparse_depth is None or not len(frame.sparse_depth.depth):
+        rendered, points = step.output[self.settings.depth], step.target.sparse_depth
+        if points is None or not len(points.depth):
             return rendered.reshape(-1)[:0].sum()
-        drawn = (output.alpha > 0) & frame.valid & torch.isfinite(rendered)
+        drawn = (step.output.alpha > 0) & step.target.valid & torch.isfinite(rendered)
         if self.settings.depth == "inverse_depth_accumulated":
             drawn = drawn & (rendered > 0)
             rendered = 1.0 / torch.where(drawn, rendered, 1.0)
-        sampled, counts = _interpolated(rendered, drawn, frame.sparse_depth)
-        truth = frame.sparse_depth.depth.to(rendered.dtype)
+        sampled, counts = _interpolated(rendered, drawn, points)
+        truth = points.depth.to(rendered.dtype)
         difference = torch.where(counts, sampled - truth, 0.0).abs()
         if (near := self.settings.huber) is not None:
             difference = torch.where(difference < near, difference.square() / (2.0 * near), difference - 0.5 * near)

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import torch
 
 from coliags_plugin.contracts import Comparison, Protocol
-from coliags_plugin.core.gaussians import RenderOutput
+from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.metrics.roundtrips import through_8_bit, through_16_bit
 

@@ -8,16 +8,16 @@ from importlib.util import find_spec
 from typing import ClassVar
 
 import numpy as np
-import pydantic
 import torch
 from torch import Tensor
 
-from coliags_plugin.contracts import Availability, Field, Renderer
+from coliags_plugin.contracts import Availability
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.errors import InputError, did_you_mean
-from coliags_plugin.core.gaussians import OUTPUTS, Gaussians, RenderOutput
-from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.render_output import RenderOutput, Splats
 from coliags_plugin.renderers.projection import JACOBIAN_MARGIN
+from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer, check_outputs
 
 #: Tensors of the Gaussians and the width of their rows; None for none.
 _SHAPES = {"means": 3, "quats_wxyz": 4, "scales": 3, "opacities": None, "colors": 3}
@@ -33,30 +33,17 @@ _IMAGES = (
 )
 
 
-class CpuRendererSettings(Settings):
+class CpuRendererSettings(CutSettings):
     """Options of :class:`CpuRenderer`: those of the torch renderer, with its defaults."""
 
-    near: float = pydantic.Field(default=0.2, ge=0)
-    """Gaussians with a centre at z <= near are not drawn. Scene units."""
-    low_pass: float = pydantic.Field(default=0.3, gt=0)
-    """Added to the diagonal of every 2D covariance, so that nothing is thinner than a pixel. Square pixels."""
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """RGB behind everything."""
-    alpha_max: float = pydantic.Field(default=0.99, gt=0, lt=1)
-    """No Gaussian is more opaque than this at any pixel."""
-    alpha_min: float = pydantic.Field(default=1 / 255, gt=0, lt=1)
-    """Fainter contributions are skipped."""
-    transmittance_min: float = pydantic.Field(default=1e-4, ge=0, lt=1)
-    """Compositing stops before the Gaussian that would leave less light than this."""
 
-
-class CpuRenderer(Renderer):
+class CpuRenderer(SplattingRenderer):
     """Splats float32 Gaussians on the CPU by numba kernels. See ``docs/rendering.md``, section "The cpu backend"."""
 
     Settings = CpuRendererSettings
     primitives: ClassVar[frozenset[str]] = frozenset({"gaussians3d"})
-    outputs: ClassVar[frozenset[str]] = frozenset(OUTPUTS)
     devices: ClassVar[frozenset[str]] = frozenset({"cpu"})
+    name: ClassVar[str] = "cpu"
 
     settings: CpuRendererSettings
 
@@ -67,38 +54,9 @@ class CpuRenderer(Renderer):
             return Availability(False, "numba is not installed: pip install numba")
         return Availability(True, f"numba kernels on {torch.get_num_threads()} threads")
 
-    def render(
-        self,
-        field: Field,
-        camera: Camera,
-        wants: Sequence[str] = ("rgb", "alpha"),
-        pixels: Tensor | None = None,
-    ) -> RenderOutput:
-        """Render one view.
-
-        Args:
-            field: A field of 3D Gaussians, float32, on the CPU.
-            camera: Where from.
-            wants: Names from :data:`coliags_plugin.core.gaussians.OUTPUTS`; rgb and alpha always come.
-            pixels: Must be None: a splatting renderer draws whole images.
-
-        Raises:
-            InputError: ``pixels`` is given, an output is unknown, the field holds no 3D Gaussians, or one of them is
-                unusable.
-        """
-        if pixels is not None:
-            raise InputError(
-                "the cpu renderer was asked for single pixels",
-                "whole images: it splats",
-                "Leave pixels out, or choose a renderer of radiance fields",
-            )
-        if field.primitive not in self.primitives:
-            raise InputError(
-                f"a field of '{field.primitive}' for the cpu renderer",
-                f"one of {', '.join(sorted(self.primitives))}",
-                "Choose another renderer or another field",
-            )
-        return render_gaussians(field.gaussians(camera), camera, wants, self.settings)
+    def draw(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> RenderOutput:
+        """See :func:`render_gaussians`."""
+        return render_gaussians(gaussians, camera, wants, self.settings)
 
 
 def render_gaussians(
@@ -116,7 +74,7 @@ def render_gaussians(
     Args:
         gaussians: 3D Gaussians, float32, on the CPU.
         camera: Where from; its pose is cast to float32.
-        wants: Names from :data:`coliags_plugin.core.gaussians.OUTPUTS`; rgb and alpha always come.
+        wants: Names from :data:`coliags_plugin.core.render_output.OUTPUTS`; rgb and alpha always come.
         settings: The defaults where None.
 
     Raises:
@@ -126,11 +84,7 @@ def render_gaussians(
     from coliags_plugin.renderers.numba_kernels import autograd, layout, pipeline
 
     settings = settings or CpuRendererSettings()
-    for name in wants:
-        if name not in OUTPUTS:
-            raise InputError(
-                f"no renderer output '{name}'", f"some of {', '.join(OUTPUTS)}", did_you_mean(name, OUTPUTS)
-            )
+    check_outputs(wants, gaussians)
     _check_tensors(gaussians)
     pose = camera.camera_to_world.to(device="cpu", dtype=torch.float32)
     view = pipeline.Pipeline(
@@ -145,9 +99,13 @@ def render_gaussians(
         expected="depth_expected" in wants,
         median="depth_median" in wants,
     )
+    channels = [name for name in wants if name in gaussians.features]
     try:
-        means2d, radii, images = autograd.render(
-            layout.Parameters(*(getattr(gaussians, name) for name in _SHAPES)), pose, view
+        means2d, radii, images, features = autograd.render(
+            layout.Parameters(*(getattr(gaussians, name) for name in _SHAPES)),
+            [gaussians.features[name] for name in channels],
+            pose,
+            view,
         )
     except pipeline.UnusableGaussianError:
         raise _unusable(gaussians) from None
@@ -157,9 +115,10 @@ def render_gaussians(
             "less than 2^31",
             "Check their scales",
         ) from None
-    by_name = dict(zip(_IMAGES, images, strict=True))
+    by_name: dict[str, Tensor] = dict(zip(_IMAGES, images, strict=True))
+    by_name |= dict(zip(channels, features, strict=True))
     maps = {name: by_name[name] for name in wants if name not in ("rgb", "alpha")}
-    return RenderOutput(images.rgb, images.alpha, means2d, radii, gaussians, maps)
+    return RenderOutput(images.rgb, images.alpha, camera, maps, Splats(gaussians, means2d, radii))
 
 
 def _view_table(camera: Camera, pose: Tensor, settings: CpuRendererSettings) -> np.ndarray:
@@ -192,8 +151,9 @@ def _view_table(camera: Camera, pose: Tensor, settings: CpuRendererSettings) -> 
 def _check_tensors(gaussians: Gaussians) -> None:
     """Shape, dtype and device; values are checked while they are projected."""
     count = len(gaussians.means) if gaussians.means.ndim else 0
-    for name, width in _SHAPES.items():
-        tensor = getattr(gaussians, name)
+    checked = [(name, getattr(gaussians, name), width) for name, width in _SHAPES.items()]
+    checked += [(f"feature {name}", value, max(1, *value.shape[1:])) for name, value in gaussians.features.items()]
+    for name, tensor, width in checked:
         shape = (count,) if width is None else (count, width)
         if tuple(tensor.shape) != shape:
             raise InputError(

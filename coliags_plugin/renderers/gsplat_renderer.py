@@ -10,22 +10,24 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import ClassVar
 
-import pydantic
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from coliags_plugin.contracts import Availability, Field, Renderer
+from coliags_plugin.contracts import Availability
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.errors import InputError, did_you_mean
-from coliags_plugin.core.gaussians import OUTPUTS, Gaussians, RenderOutput
-from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.render_output import RenderOutput, Splats
 from coliags_plugin.renderers import gsplat_library
 from coliags_plugin.renderers.projection import rotation_matrices
+from coliags_plugin.renderers.splatting import SplattingRenderer, SplattingSettings, check_outputs
 from coliags_plugin.renderers.torch_renderer import TorchRendererSettings, render_gaussians
 
 #: Edge of gsplat's tiles, pixels: the one size it is tested with.
 _TILE_SIZE = 16
+#: Up to so many channels gsplat composites any number of.
+_ANY_CHANNELS = 4
 #: What each output beyond rgb and alpha needs composited or read off.
 _NEEDS = {
     "depth_accumulated": "depth",
@@ -36,24 +38,20 @@ _NEEDS = {
 }
 
 
-class GsplatRendererSettings(Settings):
-    """Options of :class:`GsplatRenderer`. gsplat's other constants are fixed (docs/rendering.md)."""
+class GsplatRendererSettings(SplattingSettings):
+    """Options of :class:`GsplatRenderer`. gsplat's other constants are fixed (docs/rendering.md).
 
-    near: float = pydantic.Field(default=0.2, ge=0)
-    """Gaussians with a centre at z < near are not drawn. Scene units."""
-    low_pass: float = pydantic.Field(default=0.3, gt=0)
-    """Added to the diagonal of every 2D covariance. Square pixels. Surfels have gsplat's own filter instead."""
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """RGB behind everything."""
+    It draws what lies at z = ``near``, too; surfels have gsplat's own filter instead of ``low_pass``.
+    """
 
 
-class GsplatRenderer(Renderer):
+class GsplatRenderer(SplattingRenderer):
     """Splats 3D Gaussians and surfels on CUDA, in float32. See ``docs/rendering.md``."""
 
     Settings = GsplatRendererSettings
     primitives: ClassVar[frozenset[str]] = frozenset({"gaussians3d", "surfels"})
-    outputs: ClassVar[frozenset[str]] = frozenset(OUTPUTS)
     devices: ClassVar[frozenset[str]] = frozenset({"cuda"})
+    name: ClassVar[str] = "gsplat"
 
     settings: GsplatRendererSettings
 
@@ -62,38 +60,12 @@ class GsplatRenderer(Renderer):
         """Where there is a CUDA device and gsplat's kernels work on it, tried once per process."""
         return gsplat_library.availability()
 
-    def render(
-        self,
-        field: Field,
-        camera: Camera,
-        wants: Sequence[str] = ("rgb", "alpha"),
-        pixels: Tensor | None = None,
-    ) -> RenderOutput:
-        """Render one view.
-
-        Args:
-            field: A field of 3D Gaussians or surfels, float32 on a CUDA device.
-            camera: Where from.
-            wants: Names from :data:`coliags_plugin.core.gaussians.OUTPUTS`; rgb and alpha always come.
-            pixels: Must be None: a splatting renderer draws whole images.
+    def draw(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> RenderOutput:
+        """See :func:`render_with_gsplat`.
 
         Raises:
-            InputError: ``pixels`` is given, an output is unknown, the field holds neither 3D Gaussians nor surfels, or
-                is not float32 on a CUDA device; or gsplat cannot be used here.
+            InputError: The Gaussians are not on a CUDA device, or gsplat cannot be used here.
         """
-        if pixels is not None:
-            raise InputError(
-                "the gsplat renderer was asked for single pixels",
-                "whole images: it splats",
-                "Leave pixels out, or choose a renderer of radiance fields",
-            )
-        if field.primitive not in self.primitives:
-            raise InputError(
-                f"a field of '{field.primitive}' for the gsplat renderer",
-                f"one of {', '.join(sorted(self.primitives))}",
-                "Choose another renderer or another field",
-            )
-        gaussians = field.gaussians(camera)
         if gaussians.means.device.type not in self.devices:
             raise InputError(
                 f"Gaussians on {gaussians.means.device.type} for the gsplat renderer",
@@ -117,25 +89,21 @@ def render_with_gsplat(
     Args:
         gaussians: float32, on a CUDA device.
         camera: Where from; its pose is cast to the Gaussians' dtype and device.
-        wants: Names from :data:`coliags_plugin.core.gaussians.OUTPUTS`; rgb and alpha always come.
+        wants: Names from :data:`coliags_plugin.core.render_output.OUTPUTS`; rgb and alpha always come.
         settings: The defaults where None.
 
     Raises:
         InputError: An output is unknown, the Gaussians are not float32, or gsplat cannot be used here.
     """
     settings = settings or GsplatRendererSettings()
-    for name in wants:
-        if name not in OUTPUTS:
-            raise InputError(
-                f"no renderer output '{name}'", f"some of {', '.join(OUTPUTS)}", did_you_mean(name, OUTPUTS)
-            )
+    check_outputs(wants, gaussians)
     if gaussians.means.dtype != torch.float32:
         raise InputError(
             f"Gaussians of {gaussians.means.dtype} for the gsplat renderer",
             "float32: its kernels know nothing else",
             "Convert the field, or choose renderer 'torch'",
         )
-    needs = {_NEEDS[name] for name in wants if name in _NEEDS}
+    needs = {_NEEDS.get(name, name) for name in wants if name not in ("rgb", "alpha")}
     camera = camera.to(gaussians.means.device, gaussians.means.dtype)
     # gsplat 1.5 divides by the number of Gaussians, and the process dies of it.
     draw = _draw_nothing if len(gaussians) == 0 else _draw_surfels if _are_surfels(gaussians) else _draw_gaussians
@@ -148,7 +116,9 @@ def render_with_gsplat(
             maps[name] = torch.where(covered, depth, 0.0)
         elif name in _NEEDS:
             maps[name] = drawn.sums[_NEEDS[name]]
-    return RenderOutput(drawn.rgb, drawn.alpha, drawn.means2d, drawn.radii, gaussians, maps)
+        elif name in gaussians.features:
+            maps[name] = drawn.sums[name].reshape(camera.height, camera.width, -1)
+    return RenderOutput(drawn.rgb, drawn.alpha, camera, maps, Splats(gaussians, drawn.means2d, drawn.radii))
 
 
 @dataclass(frozen=True)
@@ -198,6 +168,7 @@ def _draw_gaussians(gaussians: Gaussians, camera: Camera, needs: set[str], setti
         parts["inverse_depth"] = depths.reciprocal()[:, None]
     if "normal" in needs:
         parts["normal"] = _facing_normals(gaussians, sight, camera)
+    parts |= {name: gaussians.features[name] for name in gaussians.features if name in needs}
     features = torch.cat(list(parts.values()), dim=-1)
     image, alpha = library.rasterize_to_pixels(
         means2d[None],
@@ -239,11 +210,13 @@ def _draw_surfels(gaussians: Gaussians, camera: Camera, needs: set[str], setting
     parts = {"color": gaussians.colors}
     if "inverse_depth" in needs:
         parts["inverse_depth"] = depths.reciprocal()[:, None]
+    parts |= {name: gaussians.features[name] for name in gaussians.features if name in needs}
     if needs & {"depth", "median"}:
-        if "inverse_depth" in needs:
-            # gsplat would fill five channels up to eight with uninitialised memory, of which a NaN would spread into
+        width = 1 + sum(part.shape[1] for part in parts.values())
+        if width > _ANY_CHANNELS:
+            # gsplat would fill them up to a power of two with uninitialised memory, of which a NaN would spread into
             # the gradients.
-            parts["filling"] = depths.new_zeros(len(depths), 3)
+            parts["filling"] = depths.new_zeros(len(depths), (1 << (width - 1).bit_length()) - width)
         parts["depth"] = depths[:, None]  # the last channel: gsplat reads the median off it
     features = torch.cat(list(parts.values()), dim=-1)
     image, alpha, normals, _, medians = library.rasterize_to_pixels_2dgs(
@@ -272,7 +245,8 @@ def _draw_nothing(gaussians: Gaussians, camera: Camera, needs: set[str], setting
     others = (gaussians.quats_wxyz, gaussians.scales, gaussians.opacities, gaussians.colors, camera.camera_to_world)
     zero = 0.0 * torch.stack([value.sum() for value in (means2d, *others)]).sum()
     alpha = zero.expand(camera.height, camera.width)
-    sums = {name: alpha[..., None].expand(-1, -1, 3) if name == "normal" else alpha for name in needs}
+    widths = {"normal": 3, **{name: values.shape[1] for name, values in gaussians.features.items()}}
+    sums = {name: alpha[..., None].expand(-1, -1, widths[name]) if name in widths else alpha for name in needs}
     if "median" in sums:
         sums["median"] = alpha.detach()
     rgb = alpha[..., None] + alpha.new_tensor(settings.background)

@@ -10,13 +10,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from coliags_plugin.contracts import Availability, Field, Renderer
+from coliags_plugin.contracts import Availability
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.errors import InputError, did_you_mean
-from coliags_plugin.core.gaussians import OUTPUTS, Gaussians, RenderOutput
-from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.render_output import RenderOutput, Splats
 from coliags_plugin.renderers.compositing import Cuts, composite, log_alpha_polynomials, median_depths, monomials
 from coliags_plugin.renderers.projection import ProjectedGaussians, facing_normals, project_gaussians
+from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer, check_outputs
 from coliags_plugin.renderers.tiles import TileGrid, bin_gaussians, gaussian_extents
 
 #: What each output beyond rgb and alpha is composited from. The median depth is no weighted sum.
@@ -28,32 +28,20 @@ _SUMMED = {
 }
 
 
-class TorchRendererSettings(Settings):
-    """Options of :class:`TorchRenderer`. The defaults are the lineage's constants (docs/methods.md 2.1, 2.2)."""
+class TorchRendererSettings(CutSettings):
+    """Options of :class:`TorchRenderer`."""
 
-    near: float = pydantic.Field(default=0.2, ge=0)
-    """Gaussians with a centre at z <= near are not drawn. Scene units."""
-    low_pass: float = pydantic.Field(default=0.3, gt=0)
-    """Added to the diagonal of every 2D covariance, so that nothing is thinner than a pixel. Square pixels."""
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """RGB behind everything."""
     tile_size: int = pydantic.Field(default=8, ge=1)
     """Edge of a tile, pixels. Changes the speed, and the result by rounding only."""
-    alpha_max: float = pydantic.Field(default=0.99, gt=0, lt=1)
-    """No Gaussian is more opaque than this at any pixel."""
-    alpha_min: float = pydantic.Field(default=1 / 255, gt=0, lt=1)
-    """Fainter contributions are skipped."""
-    transmittance_min: float = pydantic.Field(default=1e-4, ge=0, lt=1)
-    """Compositing stops before the Gaussian that would leave less light than this."""
 
 
-class TorchRenderer(Renderer):
+class TorchRenderer(SplattingRenderer):
     """Splats 3D Gaussians on whatever device, and in whatever precision, they come. See ``docs/rendering.md``."""
 
     Settings = TorchRendererSettings
     primitives: ClassVar[frozenset[str]] = frozenset({"gaussians3d"})
-    outputs: ClassVar[frozenset[str]] = frozenset(OUTPUTS)
     devices: ClassVar[frozenset[str]] = frozenset({"cpu", "cuda"})
+    name: ClassVar[str] = "torch"
 
     settings: TorchRendererSettings
 
@@ -62,37 +50,9 @@ class TorchRenderer(Renderer):
         """Always: it needs nothing but PyTorch."""
         return Availability(True, "plain PyTorch, runs wherever PyTorch does")
 
-    def render(
-        self,
-        field: Field,
-        camera: Camera,
-        wants: Sequence[str] = ("rgb", "alpha"),
-        pixels: Tensor | None = None,
-    ) -> RenderOutput:
-        """Render one view.
-
-        Args:
-            field: A field of 3D Gaussians.
-            camera: Where from.
-            wants: Names from :data:`coliags_plugin.core.gaussians.OUTPUTS`; rgb and alpha always come.
-            pixels: Must be None: a splatting renderer draws whole images.
-
-        Raises:
-            InputError: ``pixels`` is given, an output is unknown, or the field holds no 3D Gaussians.
-        """
-        if pixels is not None:
-            raise InputError(
-                "the torch renderer was asked for single pixels",
-                "whole images: it splats",
-                "Leave pixels out, or choose a renderer of radiance fields",
-            )
-        if field.primitive not in self.primitives:
-            raise InputError(
-                f"a field of '{field.primitive}' for the torch renderer",
-                f"one of {', '.join(sorted(self.primitives))}",
-                "Choose another renderer or another field",
-            )
-        return render_gaussians(field.gaussians(camera), camera, wants, self.settings)
+    def draw(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> RenderOutput:
+        """See :func:`render_gaussians`."""
+        return render_gaussians(gaussians, camera, wants, self.settings)
 
 
 def render_gaussians(
@@ -109,18 +69,14 @@ def render_gaussians(
     Args:
         gaussians: 3D Gaussians, all of one dtype (float32 or float64) on one device. The result is of that dtype.
         camera: Where from; its pose is cast to the Gaussians' dtype and device.
-        wants: Names from :data:`coliags_plugin.core.gaussians.OUTPUTS`; rgb and alpha always come.
+        wants: Names from :data:`coliags_plugin.core.render_output.OUTPUTS`; rgb and alpha always come.
         settings: The defaults where None.
 
     Raises:
         InputError: An output is unknown or the Gaussians are surfels.
     """
     settings = settings or TorchRendererSettings()
-    for name in wants:
-        if name not in OUTPUTS:
-            raise InputError(
-                f"no renderer output '{name}'", f"some of {', '.join(OUTPUTS)}", did_you_mean(name, OUTPUTS)
-            )
+    check_outputs(wants, gaussians)
     grid = TileGrid(camera.width, camera.height, settings.tile_size)
     cuts = Cuts(settings.alpha_max, settings.alpha_min, settings.transmittance_min)
     projected = project_gaussians(gaussians, camera, settings.near, settings.low_pass)
@@ -149,8 +105,10 @@ def render_gaussians(
         elif name in _SUMMED:
             summed = sums[..., columns[_SUMMED[name]]]
             maps[name] = _expected(summed, alpha) if name == "depth_expected" else summed
+        elif name in gaussians.features:
+            maps[name] = sums[..., columns[name]]
     radii = torch.where(extents.drawn, extents.halves.amax(-1).ceil(), 0.0)
-    return RenderOutput(rgb, alpha, projected.means2d, radii, gaussians, maps)
+    return RenderOutput(rgb, alpha, camera, maps, Splats(gaussians, projected.means2d, radii))
 
 
 def _features(
@@ -169,7 +127,12 @@ def _features(
         columns["inverse_depth"], width = width, width + 1
     if "normal" in needed:
         parts.append(facing_normals(projected, gaussians.scales))
-        columns["normal"] = slice(width, width + 3)
+        columns["normal"], width = slice(width, width + 3), width + 3
+    for name in wants:
+        if name in gaussians.features:
+            feature = gaussians.features[name]
+            parts.append(feature)
+            columns[name], width = slice(width, width + feature.shape[1]), width + feature.shape[1]
     return torch.cat(parts, dim=-1), columns
 
 

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import torch
 from pydantic import Field
 from torch import Tensor
 
-from coliags_plugin.contracts import Schedule, Strategy
-from coliags_plugin.core.gaussians import RenderOutput
+from coliags_plugin.contracts import ParameterRows, Schedule, Strategy, TrainingStep
+from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.strategies.births import Births, one_per_free_cell
-from coliags_plugin.strategies.parameter_rows import append_rows, keep_rows
 
 
 class AnchorGrowthSettings(Settings):
@@ -33,6 +32,30 @@ class AnchorGrowthSettings(Settings):
     max_scale: float | None = Field(default=4.0, gt=0)  # cap on base scales at every event, times the spacing
 
 
+class Anchors(Protocol):
+    """What anchor growth needs of a field whose elements are anchors.
+
+    Attributes:
+        anchors: Positions, scene units. [M, 3]
+        offsets, features, scalings: One row for each anchor, as :class:`coliags_plugin.fields.anchors.AnchorField` has
+            them. [M, K, 3], [M, F], [M, 6]
+        spacing: Of the anchors at the start, scene units. []
+        voxel_size: Scene units. []
+        anchor_parameters: Names of the parameter groups with one row per anchor.
+    """
+
+    anchors: Tensor
+    offsets: Tensor
+    features: Tensor
+    scalings: Tensor
+    spacing: Tensor
+    voxel_size: Tensor
+    anchor_parameters: ClassVar[tuple[str, ...]]
+
+    def child_positions(self) -> Tensor:
+        """Where every child stands, scene units. [M, K, 3]"""
+
+
 class AnchorGrowth(Strategy):
     """Adds anchors where children's image gradients stay large and removes anchors that stay transparent.
 
@@ -42,9 +65,10 @@ class AnchorGrowth(Strategy):
     """
 
     Settings: ClassVar[type[Settings]] = AnchorGrowthSettings
+    serves: ClassVar[frozenset[str] | None] = frozenset({"anchors"})
 
-    def __init__(self, settings: Any, generator: torch.Generator, schedule: Schedule) -> None:
-        super().__init__(settings, generator, schedule)
+    def __init__(self, settings: Any, generator: torch.Generator, schedule: Schedule, extent: float) -> None:
+        super().__init__(settings, generator, schedule, extent)
         self.statistics_from = schedule.at(settings.statistics_from)
         self.growth_from = schedule.at(settings.growth_from)
         self.until = schedule.at(settings.until)
@@ -74,19 +98,19 @@ class AnchorGrowth(Strategy):
             setattr(self, name, state[name])
 
     @torch.no_grad()
-    def after_backward(
-        self, step: int, field: Any, optimizers: Mapping[str, torch.optim.Optimizer], output: RenderOutput
-    ) -> dict[str, int]:
+    def after_backward(self, step: TrainingStep, rows: ParameterRows) -> dict[str, int]:
         """Count; every so often grow and prune."""
-        if not self.statistics_from < step < self.until:
+        if not self.statistics_from < step.step < self.until:
             return {}
+        field: Anchors = step.model.field
         children = field.offsets.shape[1]
         self._resize(len(field.anchors), children, field.anchors.device)
-        self._count(output, children)
-        if step <= self.growth_from or step % self.settings.every:
+        self._count(step.output, children)
+        if step.step <= self.growth_from or step.step % self.settings.every:
             return {}
-        grown = self._grow(field, optimizers, children, max(1, output.alpha.numel() // self.settings.pixels_per_birth))
-        pruned = self._prune(field, optimizers, children)
+        most_births = max(1, step.output.alpha.numel() // self.settings.pixels_per_birth)
+        grown = self._grow(field, rows, children, most_births)
+        pruned = self._prune(field, rows, children)
         return {"grown": grown, "pruned": pruned}
 
     def _resize(self, anchors: int, children: int, device: torch.device) -> None:
@@ -99,23 +123,21 @@ class AnchorGrowth(Strategy):
             setattr(self, name, torch.cat([old, old.new_zeros(anchors * per_anchor - len(old))]))
 
     def _count(self, output: RenderOutput, children: int) -> None:
-        gaussians = output.gaussians
+        splats, gaussians = output.drawn, output.drawn.gaussians
         self.seen[gaussians.visible_sources] += 1
         self.opacity_sum.index_add_(0, gaussians.source_index // children, gaussians.opacities)
-        gradient = output.means2d.grad
+        gradient = splats.means2d.grad
         if gradient is None:
             return
         height, width = output.alpha.shape
         # In units of half the image, as the thresholds of the lineage are (docs/methods.md 4.3).
         lengths = torch.hypot(0.5 * width * gradient[:, 0], 0.5 * height * gradient[:, 1])
-        drawn = output.radii > 0
+        drawn = splats.radii > 0
         # Masks rather than selections: a selection's size would have to come back from a GPU first.
         self.gradient_sum.index_add_(0, gaussians.source_index, torch.where(drawn, lengths, 0.0))
         self.drawn.index_add_(0, gaussians.source_index, drawn.to(self.drawn.dtype))
 
-    def _grow(
-        self, field: Any, optimizers: Mapping[str, torch.optim.Optimizer], children: int, most_births: int
-    ) -> int:
+    def _grow(self, field: Anchors, rows: ParameterRows, children: int, most_births: int) -> int:
         options = self.settings
         ready = self.drawn > options.every * options.success_share * 0.5
         gradient = self.gradient_sum / self.drawn.clamp_min(1.0)
@@ -128,34 +150,27 @@ class AnchorGrowth(Strategy):
                 break
             slots = (ready & (gradient >= options.gradient_threshold * 2.0**level)).nonzero().squeeze(1)
             births = one_per_free_cell(field.anchors, positions[slots], gradient[slots], cell, left)
-            self._add(field, optimizers, births, slots // children, cell)
+            self._add(field, rows, births, slots // children, cell)
         self.gradient_sum[ready] = 0.0
         self.drawn[ready] = 0.0
         self._resize(len(field.anchors), children, field.anchors.device)
         return len(field.anchors) - first_count
 
-    def _add(
-        self,
-        field: Any,
-        optimizers: Mapping[str, torch.optim.Optimizer],
-        births: Births,
-        anchor_of: Tensor,
-        cell: float,
-    ) -> None:
+    def _add(self, field: Anchors, rows: ParameterRows, births: Births, anchor_of: Tensor, cell: float) -> None:
         """Append anchors that look like their parents at a cell's size, and that Adam moves no faster than these."""
         if len(births) == 0:
             return
         parents = anchor_of[births.candidates]
         scalings = field.scalings[parents].clamp_max(math.log(cell))
         field.anchors = torch.cat([field.anchors, births.positions])
-        rows = {
+        born = {
             "offsets": field.offsets.new_zeros(len(births), *field.offsets.shape[1:]),
             "features": field.features[parents],
             "scalings": scalings,
         }
-        append_rows(field, optimizers, rows, parents)
+        rows.add_rows(born, parents)
 
-    def _prune(self, field: Any, optimizers: Mapping[str, torch.optim.Optimizer], children: int) -> int:
+    def _prune(self, field: Anchors, rows: ParameterRows, children: int) -> int:
         options = self.settings
         if options.max_scale is not None:
             field.scalings[:, 3:].clamp_(max=math.log(options.max_scale * float(field.spacing)))
@@ -170,5 +185,5 @@ class AnchorGrowth(Strategy):
         self.opacity_sum, self.seen = self.opacity_sum[keep], self.seen[keep]
         self.gradient_sum, self.drawn = self.gradient_sum[keep_children], self.drawn[keep_children]
         field.anchors = field.anchors[keep]
-        keep_rows(field, optimizers, field.anchor_parameters, keep)
+        rows.keep_rows(field.anchor_parameters, keep)
         return int(faint.sum())

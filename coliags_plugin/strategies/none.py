@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, ClassVar
-
-import torch
+from typing import ClassVar
 
 from coliags_plugin.contracts import Strategy
-from coliags_plugin.core.gaussians import RenderOutput
 from coliags_plugin.core.settings import Settings
 
 
@@ -20,13 +16,8 @@ class NoStrategy(Strategy):
     """Neither grows nor prunes."""
 
     Settings: ClassVar[type[Settings]] = NoStrategySettings
+    serves: ClassVar[frozenset[str] | None] = None
 
     def plan(self) -> str:
         """The sentence for the log: no growing, no pruning."""
         return "this run neither grows nor prunes: strategy none"
-
-    def after_backward(
-        self, step: int, field: Any, optimizers: Mapping[str, torch.optim.Optimizer], output: RenderOutput
-    ) -> dict[str, int]:
-        """Do nothing."""
-        return {}

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pycolmap
+
 from tests.datamanagers.wall_scenes import colors, look, poses
 
 WIDTH, HEIGHT = 64, 48

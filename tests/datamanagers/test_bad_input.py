@@ -15,6 +15,12 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+
+from coliags_plugin.config.registry import datamanagers
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scenes import Scene
+from coliags_plugin.data_check.check import check_scene
+from coliags_plugin.engine.data_formats import find_format
 from tests.datamanagers.spoiling import (
     FRAMES,
     KINDS,
@@ -43,12 +49,6 @@ from tests.datamanagers.spoiling import (
     unregistered,
     write_all,
 )
-
-from coliags_plugin.config.registry import datamanagers
-from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.scenes import Scene
-from coliags_plugin.data_check.check import check_scene
-from coliags_plugin.engine.data_formats import find_format
 from tests.phantom.phantom_layouts import in_video_order, true_poses
 
 #: Kinds whose poses are sixteen numbers a line.

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 from pydantic import ValidationError
-from tests.datamanagers.wall_scenes import PINHOLE, colors, off_wall, poses, write_raw, write_undistorted
 
 from coliags_plugin.config.registry import datamanagers
 from coliags_plugin.core.errors import InputError
@@ -20,6 +19,7 @@ from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.datamanagers.c3vd.manager import C3VDDataManager, C3VDSettings
 from coliags_plugin.datamanagers.reading.camera_json import read_intrinsics
 from coliags_plugin.lenses.models import LENSES
+from tests.datamanagers.wall_scenes import PINHOLE, colors, off_wall, poses, write_raw, write_undistorted
 
 LENS_NAMES = sorted(LENSES)
 

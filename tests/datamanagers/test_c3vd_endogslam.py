@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from tests.datamanagers.wall_scenes import PINHOLE, look, off_wall, poses
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Scene
@@ -27,6 +26,7 @@ from coliags_plugin.phantom.layouts.c3vd_raw import write_poses
 from coliags_plugin.poses import endogslam
 from coliags_plugin.poses.rigid import inverse, rigid, wxyz_from_rotations
 from coliags_plugin.poses.trajectory import Intrinsics, Trajectory
+from tests.datamanagers.wall_scenes import PINHOLE, look, off_wall, poses
 from tests.phantom.phantom_layouts import depth_gap, distance_from_wall, in_video_order, read, true_poses, write_phantom
 
 WIDTH, HEIGHT = 64, 48

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tests.datamanagers.wall_scenes import off_wall, poses, write_raw
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud, Scene
@@ -18,6 +17,7 @@ from coliags_plugin.datamanagers.c3vd.writer import _write_ply
 from coliags_plugin.datamanagers.c3vd_v2.lens import CANDIDATE_LENS, ORDER, read_camera_intrinsics
 from coliags_plugin.datamanagers.c3vd_v2.manager import C3VDv2DataManager, C3VDv2Settings
 from coliags_plugin.lenses.models import LENSES, Lens
+from tests.datamanagers.wall_scenes import off_wall, poses, write_raw
 from tests.phantom.phantom_layouts import depth_gap, in_video_order, read, true_poses, write_phantom
 
 SMALL_LENS = CANDIDATE_LENS.scaled(270, 216)

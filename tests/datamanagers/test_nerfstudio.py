@@ -11,8 +11,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tests.datamanagers.real_frames import real_lens
-from tests.datamanagers.wall_scenes import PINHOLE, look, off_wall, poses
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.fusion import load_points
@@ -24,6 +22,8 @@ from coliags_plugin.lenses.opencv import OpenCVLens
 from coliags_plugin.lenses.undistortion import Undistortion
 from coliags_plugin.phantom.layouts.meshes import write_points
 from coliags_plugin.poses.rigid import FLIP_Y_AND_Z
+from tests.datamanagers.real_frames import real_lens
+from tests.datamanagers.wall_scenes import PINHOLE, look, off_wall, poses
 from tests.phantom.phantom_layouts import depth_gap, distance_from_wall, in_video_order, read, true_poses, write_phantom
 
 WIDTH, HEIGHT = 64, 48

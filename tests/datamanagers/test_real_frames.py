@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tests.datamanagers.real_frames import real_lens, undistort_real_frames
 
 from coliags_plugin.datamanagers.c3vd.manager import C3VDDataManager, C3VDSettings
 from coliags_plugin.datamanagers.reading.images import read_rgb
 from coliags_plugin.lenses.models import LENSES
+from tests.datamanagers.real_frames import real_lens, undistort_real_frames
 
 
 def test_the_crops_lens_is_the_fisheye_cropped(shared_data):

@@ -12,7 +12,6 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.datamanagers.wall_scenes import PINHOLE, colors, look, off_wall, poses
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Scene
@@ -23,6 +22,7 @@ from coliags_plugin.phantom.generate import generate
 from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.poses import tum
 from coliags_plugin.poses.trajectory import Trajectory
+from tests.datamanagers.wall_scenes import PINHOLE, colors, look, off_wall, poses
 
 WIDTH, HEIGHT = 64, 48
 #: Steps per mm: 0.001 mm each.

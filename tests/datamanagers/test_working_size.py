@@ -6,11 +6,11 @@ import logging
 from pathlib import Path
 
 import pytest
-from tests.datamanagers.wall_scenes import write_undistorted
 
 from coliags_plugin.config.registry import datamanagers
 from coliags_plugin.datamanagers.c3vd.manager import C3VDDataManager, C3VDSettings
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
+from tests.datamanagers.wall_scenes import write_undistorted
 
 ROOT = Path(__file__).parents[2]
 

@@ -6,8 +6,8 @@ import pytest
 
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.engine import progress as module
+from coliags_plugin.engine.data_formats import load_scene
 from coliags_plugin.engine.progress import progress_callback
-from coliags_plugin.engine.trained import load_scene
 from tests.scenes import write_wall
 
 

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.gaussians import Gaussians, RenderOutput
+from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Frame
 
 

@@ -8,7 +8,7 @@ from pydantic import ValidationError
 from coliags_plugin.config import registry
 from coliags_plugin.contracts import LossSettings, log_linear
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.gaussians import DEPTH_KINDS
+from coliags_plugin.core.render_output import DEPTH_KINDS
 from coliags_plugin.core.ssim import ssim
 from coliags_plugin.losses.depth import DepthKind
 

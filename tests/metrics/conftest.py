@@ -8,7 +8,8 @@ import torch
 from coliags_plugin.config import registry
 from coliags_plugin.contracts import Comparison
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.gaussians import Gaussians, RenderOutput
+from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Frame
 
 

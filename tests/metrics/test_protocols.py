@@ -7,7 +7,7 @@ import torch
 
 from coliags_plugin.config import registry
 from coliags_plugin.core.errors import UnavailableError
-from coliags_plugin.core.gaussians import OUTPUTS
+from coliags_plugin.core.render_output import OUTPUTS
 
 HEIGHT, WIDTH = 12, 15
 NAMES = ["paper", "authors-code"]

@@ -10,13 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
-from tests.poses.winding import some_transform, trajectories, winding
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.poses import c3vd, nerfstudio
 from coliags_plugin.poses.alignment import Matches, Spread, align, associate, umeyama
 from coliags_plugin.poses.rigid import rigid
 from coliags_plugin.poses.trajectory import Trajectory
+from tests.poses.winding import some_transform, trajectories, winding
 
 SEEDS = st.integers(0, 10_000)
 SCALES = st.floats(0.01, 100.0)

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.poses.winding import PINHOLE, winding
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.poses import colmap
+from tests.poses.winding import PINHOLE, winding
 
 NAMES = ("10.png", "2.png", "frame.png", "sub/1.png")
 #: As they come back: numbers before words, 2 before 10.

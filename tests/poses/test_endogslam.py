@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from tests.poses.winding import PINHOLE, winding
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.poses import endogslam
 from coliags_plugin.poses.rigid import inverse
+from tests.poses.winding import PINHOLE, winding
 
 FRAMES, GAUSSIANS = 5, 7
 

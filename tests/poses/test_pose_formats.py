@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.poses.winding import PINHOLE, as_text, trajectories, winding
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.poses.formats import FORMATS, format_of, write_trajectory
 from coliags_plugin.poses.rigid import inverse
 from coliags_plugin.poses.trajectory import Intrinsics, Trajectory
+from tests.poses.winding import PINHOLE, as_text, trajectories, winding
 
 WRITABLE = [name for name, known in FORMATS.items() if known.write is not None]
 #: EndoGSLAM's files are float32.

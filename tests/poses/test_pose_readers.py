@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from tests.poses.winding import as_text, some_transform, winding
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.poses import c3vd, nerfstudio, tum
 from coliags_plugin.poses.rigid import rotation_angles_deg, rotations_from_wxyz, wxyz_from_rotations
 from coliags_plugin.poses.trajectory import natural_order
+from tests.poses.winding import as_text, some_transform, winding
 
 #: A quarter turn about z: x to the right becomes y. Written out, so that no library decides what is right.
 QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

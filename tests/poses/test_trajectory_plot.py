@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tests.poses.winding import winding
 
 from coliags_plugin.outputs.trajectory_plot import ESTIMATE_RGB, REFERENCE_RGB, trajectory_picture
 from coliags_plugin.poses.alignment import align, associate
 from coliags_plugin.poses.trajectory import Trajectory
+from tests.poses.winding import winding
 
 #: The two views, above the charts: rows, then columns of each.
 VIEWS = slice(71, 500), (slice(71, 580), slice(671, 1180))

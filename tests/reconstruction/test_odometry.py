@@ -7,11 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tests.reconstruction.filmed import PINHOLE, filmed_wall, swaying
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from tests.poses.winding import some_transform, winding
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame
@@ -27,6 +25,8 @@ from coliags_plugin.reconstruction.odometry.pose_graph import further_pairs, opt
 from coliags_plugin.reconstruction.odometry.registration import Edge, agreement
 from coliags_plugin.reconstruction.odometry.settings import TrackingSettings
 from coliags_plugin.reconstruction.odometry.tracking import track
+from tests.poses.winding import some_transform, winding
+from tests.reconstruction.filmed import PINHOLE, filmed_wall, swaying
 from tests.textured_tube import tube_frames
 
 FAST = TrackingSettings(method="hybrid", pose_graph=False)

@@ -11,12 +11,22 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.renderers.test_torch_renderer import INPUTS, SCENES, SUMS, cast, make, pinhole, random_gaussians, relative, scene
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.gaussians import OUTPUTS
+from coliags_plugin.core.render_output import OUTPUTS
 from coliags_plugin.renderers import cpu_renderer, torch_renderer
 from coliags_plugin.renderers.numba_kernels import pipeline
+from tests.renderers.test_torch_renderer import (
+    INPUTS,
+    SCENES,
+    SUMS,
+    cast,
+    make,
+    pinhole,
+    random_gaussians,
+    relative,
+    scene,
+)
 
 #: How far the cut-offs are moved, relative to themselves: more than float32 can be off by.
 CUTOFF_MARGIN = 2e-5

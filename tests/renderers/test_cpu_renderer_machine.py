@@ -14,10 +14,10 @@ import pytest
 import torch
 from numba import types
 from numba.core.registry import cpu_target
-from tests.renderers.test_torch_renderer import cast, scene
 
 from coliags_plugin.renderers import cpu_renderer
 from coliags_plugin.renderers.numba_kernels import compilation, sweep_backward, sweep_forward
+from tests.renderers.test_torch_renderer import cast, scene
 
 # --- registers --------------------------------------------------------------------------------------------------------
 

@@ -9,10 +9,20 @@ import math
 import sys
 import types
 
-from tests.renderers import fake_gsplat
 import pytest
 import torch
 from pydantic import ValidationError
+
+from coliags_plugin.config import registry
+from coliags_plugin.config.components import make_component
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.render_output import OUTPUTS
+from coliags_plugin.engine.backends import choose_renderer
+from coliags_plugin.engine.doctor import examine
+from coliags_plugin.renderers import gsplat_library
+from coliags_plugin.renderers.gsplat_renderer import GsplatRenderer, GsplatRendererSettings, render_with_gsplat
+from coliags_plugin.renderers.torch_renderer import render_gaussians
+from tests.renderers import fake_gsplat
 from tests.renderers.test_torch_renderer import (
     INPUTS,
     SCENES,
@@ -27,16 +37,6 @@ from tests.renderers.test_torch_renderer import (
     scene,
     with_gradients,
 )
-
-from coliags_plugin.config import registry
-from coliags_plugin.config.components import make_component
-from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.gaussians import OUTPUTS
-from coliags_plugin.engine.backends import choose_renderer
-from coliags_plugin.engine.doctor import examine
-from coliags_plugin.renderers import gsplat_library
-from coliags_plugin.renderers.gsplat_renderer import GsplatRenderer, GsplatRendererSettings, render_with_gsplat
-from coliags_plugin.renderers.torch_renderer import render_gaussians
 
 BACKGROUND = (0.3, 0.1, 0.9)
 #: gsplat's cap on alpha, as the definition's setting; with it both draw the same picture.

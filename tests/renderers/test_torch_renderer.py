@@ -9,15 +9,16 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.renderers.naive_splatting import extent, splat
 from pydantic import ValidationError
 
 from coliags_plugin.config import registry
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.gaussians import OUTPUTS, Gaussians
+from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.render_output import OUTPUTS
 from coliags_plugin.renderers import compositing
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings, render_gaussians
+from tests.renderers.naive_splatting import extent, splat
 
 INPUTS = ("means", "quats_wxyz", "scales", "opacities", "colors")
 SUMS = tuple(name for name in OUTPUTS if name != "depth_median")

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import pytest
 import torch
+from coliags_plugin.strategies.parameter_rows import append_rows, keep_rows
 
 from coliags_plugin.config.components import make_component
 from coliags_plugin.contracts import Schedule
-from coliags_plugin.core.gaussians import Gaussians, RenderOutput
+from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.strategies.births import one_per_free_cell
-from coliags_plugin.strategies.parameter_rows import append_rows, keep_rows
 from tests.scenes import wall_scene
 
 CHILDREN = 10

@@ -1,7 +1,8 @@
-"""The pipeline as two differentiable functions: Gaussians -> records, records -> images."""
+"""The pipeline as differentiable functions: Gaussians -> records, records -> images, records -> feature images."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,16 +14,20 @@ from coliags_plugin.renderers.numba_kernels import layout
 from coliags_plugin.renderers.numba_kernels.pipeline import Array, Pipeline
 
 
-def render(gaussians: layout.Parameters, pose: Tensor, pipeline: Pipeline) -> tuple[Tensor, Tensor, layout.Images]:
+def render(
+    gaussians: layout.Parameters, features: Sequence[Tensor], pose: Tensor, pipeline: Pipeline
+) -> tuple[Tensor, Tensor, layout.Images, list[Tensor]]:
     """Render one view; differentiable, once, in all tensors.
 
     Args:
         gaussians: Float32 tensors on the CPU, checked for shape.
+        features: Further channels to composite, likewise. [N, C] each
         pose: camera_to_world; its values are those that the pipeline was made with.
         pipeline: A fresh one.
 
     Returns:
-        means2d, which holds its gradient after ``backward``; radii; and the images, None where not wanted.
+        means2d, which holds its gradient after ``backward``; radii; the images, None where not wanted; and the features'
+        images, [H, W, C] each.
 
     Raises:
         UnusableGaussianError: A Gaussian is not finite, has no direction or a negative scale.
@@ -32,7 +37,11 @@ def render(gaussians: layout.Parameters, pose: Tensor, pipeline: Pipeline) -> tu
     if means2d.requires_grad:
         means2d.retain_grad()
     images = _Composite.apply(means2d, records, pipeline)  # type: ignore[no-untyped-call]
-    return means2d, radii, layout.Images(*images)
+    channels: list[Tensor] = []
+    if features:
+        drawn = _CompositeFeatures.apply(means2d, records, torch.cat(list(features), dim=1), pipeline)  # type: ignore[no-untyped-call]
+        channels = list(torch.split(drawn, [feature.shape[1] for feature in features], dim=-1))
+    return means2d, radii, layout.Images(*images), channels
 
 
 class _Project(torch.autograd.Function):
@@ -83,6 +92,25 @@ class _Composite(torch.autograd.Function):
             return None, None, None
         of_means2d, sums = ctx.pipeline.composite_backward(layout.Images(*map(_array, given)))
         return torch.from_numpy(of_means2d), torch.from_numpy(sums), None
+
+
+class _CompositeFeatures(torch.autograd.Function):
+    """Projected centres, records and features -> the features' images, after :class:`_Composite`."""
+
+    @staticmethod
+    def forward(ctx: Any, means2d: Tensor, records: Tensor, features: Tensor, pipeline: Pipeline) -> Tensor:
+        ctx.save_for_backward(features)
+        ctx.pipeline = pipeline
+        return torch.from_numpy(pipeline.composite_features(np.asarray(features.detach().contiguous())))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, given: Tensor) -> tuple[Tensor | None, ...]:
+        (features,) = ctx.saved_tensors
+        of_means2d, sums, of_features = ctx.pipeline.composite_features_backward(
+            np.asarray(features.detach().contiguous()), np.asarray(given.contiguous())
+        )
+        return torch.from_numpy(of_means2d), torch.from_numpy(sums), torch.from_numpy(of_features), None
 
 
 def _array(tensor: Tensor | None) -> Array | None:

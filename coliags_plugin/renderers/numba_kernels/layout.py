@@ -106,6 +106,10 @@ class Extras(NamedTuple):
     normals: bool
 
 
+#: Channels of a sweep over features, where colours, depths and normals are in the first one.
+FEATURES = Extras(depth=True, inverse_depth=True, normals=True)
+
+
 class Grid(NamedTuple):
     """The image and its tiles.
 

@@ -65,6 +65,7 @@ class Pipeline:
         self._projections: layout.Projections
         self._bins: layout.Bins
         self._composited: Array
+        self._feature_composited: Array
 
     def project(self, gaussians: layout.Parameters) -> tuple[Array, Array, Array]:
         """Project Gaussians.
@@ -122,6 +123,96 @@ class Pipeline:
                 self._median, self._scratch(run, sweep_forward), self._composited, _flat_images(images),
             )  # fmt: skip
         return images
+
+    def composite_features(self, features: Array) -> Array:
+        """Composite further channels of the Gaussians over 0, after :meth:`composite` and over the same bins.
+
+        Eight channels at a time take the place of colour, depths and normal in the records.
+
+        Args:
+            features: [N, C]
+
+        Returns:
+            [H, W, C]
+        """
+        grid, extras, width = self._grid, layout.FEATURES, layout.MAX_CHANNELS
+        channels, count = (0,) * width, features.shape[1]
+        size = layout.BLOCKS * grid.tiles * 16 * (1 + width)
+        sweeps = -(-count // width)
+        result = np.empty((grid.height, grid.width, width * sweeps), np.float32)
+        self._feature_composited = self._arena.take("feature_composited", sweeps * size)
+        with _workers() as run:
+            for sweep in range(sweeps):
+                images = self._feature_images()
+                run(
+                    sweep_forward.sweep_forward, self._with_features(features, sweep), self._bins, self._dark_view(),
+                    grid, extras, channels, (), self._scratch(run, sweep_forward),
+                    self._feature_composited[sweep * size : (sweep + 1) * size], _flat_images(images),
+                )  # fmt: skip
+                result[..., width * sweep : width * (sweep + 1)] = _joined(images)
+        return result[..., :count]
+
+    def composite_features_backward(self, features: Array, of_features: Array) -> tuple[Array, Array, Array]:
+        """Derivatives of :meth:`composite_features`.
+
+        Args:
+            features: As given to it. [N, C]
+            of_features: Derivative of the loss with respect to its result. [H, W, C]
+
+        Returns:
+            Derivative with respect to the projected centres, the sums of each Gaussian without those of the channels,
+            and the derivative with respect to the features. [N, 2], [16 each], [N, C]
+        """
+        grid, width = self._grid, layout.MAX_CHANNELS
+        filled = self._count + -self._count % layout.GROUP
+        size = layout.BLOCKS * grid.tiles * 16 * (1 + width)
+        entry_sums = self._arena.take("entry_sums", layout.ROW * int(self._bins.starts[-1]))
+        part, of_part = self._arena.take("feature_sums", layout.ROW * filled), np.empty((filled, 2), np.float32)
+        total, of_means2d = np.zeros((filled, layout.ROW), np.float32), np.zeros((filled, 2), np.float32)
+        result = np.empty_like(features)
+        with _workers() as run:
+            for first in range(0, features.shape[1], width):
+                sweep = first // width
+                given = self._feature_images()
+                _part_into(of_features[..., first : first + width], given)
+                projections = self._with_features(features, sweep)
+                run(
+                    sweep_backward.sweep_backward, projections, self._bins, self._dark_view(), grid, layout.FEATURES,
+                    (0,) * width, self._scratch(run, sweep_backward),
+                    self._feature_composited[sweep * size : (sweep + 1) * size], _flat_images(given), entry_sums,
+                )  # fmt: skip
+                run(gather, projections, self._bins, entry_sums, part, of_part.reshape(-1))
+                rows = part.reshape(filled, layout.ROW)
+                total[:, : layout.SUM_CHANNELS] += rows[:, : layout.SUM_CHANNELS]
+                of_means2d += of_part
+                columns = min(width, features.shape[1] - first)
+                channels = rows[: self._count, layout.SUM_CHANNELS : layout.SUM_CHANNELS + columns]
+                result[:, first : first + columns] = channels
+        return of_means2d[: self._count], total.reshape(-1), result
+
+    def _with_features(self, features: Array, sweep: int) -> layout.Projections:
+        """The projections with a part of the features as channels."""
+        width = layout.MAX_CHANNELS
+        part = features[:, width * sweep : width * (sweep + 1)]
+        records = self._arena.take("feature_records", len(self._projections.records))
+        records[:] = self._projections.records
+        rows = records.reshape(-1, layout.ROW)[: self._count]
+        rows[:, layout.CHANNELS : layout.CHANNELS + width] = 0.0
+        rows[:, layout.CHANNELS : layout.CHANNELS + part.shape[1]] = part
+        return self._projections._replace(records=records)
+
+    def _dark_view(self) -> Array:
+        """The view with a black background."""
+        view = self._view.copy()
+        view[layout.VIEW_BACKGROUND : layout.VIEW_BACKGROUND + 3] = 0.0
+        return view
+
+    def _feature_images(self) -> layout.Images:
+        """Images for eight channels."""
+        height, width = self._grid.height, self._grid.width
+        rgb, normals = (np.zeros((height, width, 3), np.float32) for _ in range(2))
+        depth, inverse_depth = (np.zeros((height, width), np.float32) for _ in range(2))
+        return layout.Images(rgb, None, depth, inverse_depth, None, normals, None)
 
     def composite_backward(self, of_images: layout.Images) -> tuple[Array, Array]:
         """Derivatives of :meth:`composite`, any number of times.
@@ -253,6 +344,23 @@ def _workers() -> Iterator[_Run]:
 
 def _flat_images(images: layout.Images) -> layout.Images:
     return layout.Images(*(np.empty(0, np.float32) if image is None else image.reshape(-1) for image in images))
+
+
+def _joined(images: layout.Images) -> Array:
+    """Eight channels from the images that held them. [H, W, 8]"""
+    return np.concatenate(
+        [images.rgb, images.depth[..., None], images.inverse_depth[..., None], images.normals], axis=-1
+    )
+
+
+def _part_into(channels: Array, images: layout.Images) -> None:
+    """Put up to eight channels into images; the reverse of :func:`_joined`. [H, W, C]"""
+    filled = np.zeros((*channels.shape[:2], layout.MAX_CHANNELS), np.float32)
+    filled[..., : channels.shape[2]] = channels
+    images.rgb[:] = filled[..., :3]
+    images.depth[:] = filled[..., 3]
+    images.inverse_depth[:] = filled[..., 4]
+    images.normals[:] = filled[..., 5:]
 
 
 def _tail(gaussians: layout.Parameters, count: int) -> layout.Parameters:

@@ -1,0 +1,93 @@
+"""What a renderer answers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.gaussians import Gaussians
+
+#: Everything a renderer can be asked for beside a field's own feature channels. "depth" alone names nothing: each kind
+#: is a different quantity.
+OUTPUTS = (
+    "rgb",
+    "alpha",
+    "depth_accumulated",  # sum_i w_i z_i: the paper's D (Eq. 2); falls short where alpha < 1
+    "depth_expected",  # sum_i w_i z_i / sum_i w_i
+    "depth_median",  # z of the Gaussian at which transmittance falls to one half
+    "inverse_depth_accumulated",  # sum_i w_i / z_i: what the authors' code trains on and scores
+    "normals",  # sum_i w_i n_i, camera axes, n_i the shortest axis turned towards the camera
+)
+
+DEPTH_KINDS = tuple(name for name in OUTPUTS if "depth" in name)
+
+
+@dataclass(frozen=True)
+class Splats:
+    """What a splatting renderer knows of the Gaussians it has drawn.
+
+    Attributes:
+        gaussians: What was drawn.
+        means2d: Projected centres, pixels; holds its gradient after ``backward``. [N, 2]
+        radii: Screen extent in pixels of each Gaussian, 0 where it was not drawn. [N]
+    """
+
+    gaussians: Gaussians
+    means2d: Float[Tensor, "N 2"]
+    radii: Float[Tensor, "N"]
+
+
+@dataclass(frozen=True)
+class RenderOutput:
+    """One rendered view, or a batch of its pixels as an image of P rows and one column.
+
+    Attributes:
+        rgb: Composited colour over the background. [H, W, 3]
+        alpha: Accumulated opacity. [H, W]
+        camera: What it was rendered from, as the model's modules adjusted it; None for pixels of several cameras.
+        maps: The other outputs asked for, by name. [H, W] or [H, W, C]
+        splats: From splatting renderers only.
+    """
+
+    rgb: Float[Tensor, "H W 3"]
+    alpha: Float[Tensor, "H W"]
+    camera: Camera | None
+    maps: dict[str, Tensor] = field(default_factory=dict)
+    splats: Splats | None = None
+
+    @property
+    def drawn(self) -> Splats:
+        """The splats.
+
+        Raises:
+            InputError: The renderer draws none.
+        """
+        if self.splats is None:
+            raise InputError("a rendered view without splats", "one of a splatting renderer", "Choose another renderer")
+        return self.splats
+
+    def __getitem__(self, name: str) -> Tensor:
+        """An output by name. Raises KeyError where it was not asked for."""
+        if name == "rgb":
+            return self.rgb
+        if name == "alpha":
+            return self.alpha
+        return self.maps[name]
+
+
+def concatenate_pixels(parts: Sequence[RenderOutput]) -> RenderOutput:
+    """Pixel batches of several cameras as one.
+
+    Args:
+        parts: Outputs of P_i rows and one column each, with the same maps.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    maps = {name: torch.cat([part.maps[name] for part in parts]) for name in parts[0].maps}
+    return RenderOutput(torch.cat([p.rgb for p in parts]), torch.cat([p.alpha for p in parts]), None, maps)

@@ -1,0 +1,96 @@
+"""Whether the components of a method fit each other and the scene; found out before anything is written."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from coliags_plugin.config.method_config import MethodConfig
+from coliags_plugin.contracts import Loss, Schedule
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scenes import Scene
+from coliags_plugin.engine.backends import ChosenRenderer
+
+#: What messages call the attributes of a target that losses need.
+_DATA = {"depth": "depth", "sparse_depth": "depth at single points"}
+
+
+def check_components(
+    config: MethodConfig, chosen: ChosenRenderer, scene: Scene, losses: Mapping[str, Loss], schedule: Schedule
+) -> None:
+    """Refuse components that cannot work together.
+
+    Raises:
+        InputError: The strategy is for another field; the sampler's batches are not for the renderer or a loss; a loss
+            needs data that no training frame has; or no loss counts at some step.
+    """
+    _check_strategy(config)
+    _check_sampler(config, chosen, losses)
+    _check_splats(config, losses)
+    _check_data(scene, losses)
+    _check_schedule(losses, schedule)
+
+
+def _check_strategy(config: MethodConfig) -> None:
+    serves, elements = config.strategy.target.serves, config.field.target.elements
+    if serves is not None and elements not in serves:
+        raise InputError(
+            f"strategy '{config.strategy.name}' changes {', '.join(sorted(serves))}, and field '{config.field.name}' "
+            f"has {elements}",
+            "a strategy for this field",
+            "Choose another, or --set strategy=none",
+        )
+
+
+def _check_sampler(config: MethodConfig, chosen: ChosenRenderer, losses: Mapping[str, Loss]) -> None:
+    if config.sampler.target.whole_images:
+        return
+    if not chosen.renderer.renders_pixels:
+        raise InputError(
+            f"sampler '{config.sampler.name}' with renderer '{chosen.name}', which draws whole images",
+            "a renderer of radiance fields",
+            "Set --set sampler=frames",
+        )
+    for key, loss in losses.items():
+        if loss.whole_image:
+            raise InputError(
+                f"loss term '{key}' needs whole images, and sampler '{config.sampler.name}' gives single pixels",
+                "losses of single pixels",
+                f"Remove it with --set losses.{key}=null, or set --set sampler=frames",
+            )
+
+
+def _check_splats(config: MethodConfig, losses: Mapping[str, Loss]) -> None:
+    for key, loss in losses.items():
+        if loss.needs_splats and config.field.target.primitive == "radiance":
+            raise InputError(
+                f"loss term '{key}' is about Gaussians, and field '{config.field.name}' has none",
+                "a field of Gaussians",
+                f"Remove it with --set losses.{key}=null",
+            )
+
+
+def _check_data(scene: Scene, losses: Mapping[str, Loss]) -> None:
+    there = {name for name in _DATA if any(getattr(frame, name) is not None for frame in scene.train)}
+    for key, loss in losses.items():
+        for missing in sorted(loss.needs - there):
+            instead = ""
+            if missing == "depth" and "sparse_depth" in there:
+                instead = f", or train on its points with --set 'losses.{key}={{name: sparse-depth, weight: 0.2}}'"
+            raise InputError(
+                f"loss term '{key}' needs {_DATA.get(missing, missing)}, and no training frame of scene "
+                f"'{scene.name}' has any",
+                f"frames with {_DATA.get(missing, missing)}, or no such term",
+                f"Remove it with --set losses.{key}=null{instead}",
+            )
+
+
+def _check_schedule(losses: Mapping[str, Loss], schedule: Schedule) -> None:
+    """Terms start after ``from_step`` and end with ``until_step``: looking at each step after one of them will do."""
+    ends = {0, *(schedule.at(loss.settings.until_step) for loss in losses.values() if loss.settings.until_step)}
+    for step in sorted(end + 1 for end in ends if end < schedule.steps):
+        if not any(loss.settings.active(step, schedule) for loss in losses.values()):
+            raise InputError(
+                f"no loss term counts at step {step} of {schedule.steps}",
+                "at least one at every step",
+                "Change from_step and until_step of a term",
+            )

@@ -1,0 +1,102 @@
+"""A field, its renderer and the modules around them: the one thing that renders."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from coliags_plugin.config.method_config import MethodConfig
+from coliags_plugin.contracts import Field, GaussianField, Renderer, ViewModule
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.render_output import RenderOutput
+from coliags_plugin.core.scenes import Scene, View
+
+
+class Model(nn.Module):
+    """Renders a field through its view modules, for training, evaluation and export alike.
+
+    Args:
+        field: What the scene looks like.
+        renderer: Draws it.
+        view_modules: By their names in the method config; cameras pass through them in this order, outputs too.
+    """
+
+    field: Field
+
+    def __init__(self, field: Field, renderer: Renderer, view_modules: Mapping[str, ViewModule]) -> None:
+        super().__init__()
+        self.field = field
+        self.renderer = renderer
+        self._modules_by_name = nn.ModuleDict(view_modules)
+
+    @property
+    def view_modules(self) -> dict[str, ViewModule]:
+        """The view modules by name."""
+        return dict(self._modules_by_name.items())  # type: ignore[arg-type]
+
+    def render(
+        self,
+        camera: Camera,
+        wants: Sequence[str] = ("rgb", "alpha"),
+        view: View | None = None,
+        pixels: Tensor | None = None,
+    ) -> RenderOutput:
+        """Render a view.
+
+        Args:
+            camera: Where the view is taken from.
+            wants: Outputs to deliver; rgb and alpha always come, and what modules need beside.
+            view: Which frame of the video it is; None for a free camera.
+            pixels: Columns and rows of the only pixels to render. [P, 2]
+        """
+        modules = self.view_modules.values()
+        for module in modules:
+            camera = module.adjust_camera(camera, view)
+        needed = dict.fromkeys([*wants, *(name for module in modules for name in sorted(module.wants))])
+        output = self.renderer.render(self.field, camera, tuple(needed), pixels)
+        for module in modules:
+            output = module.shade(output, view)
+        return output
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Parameters by group: the field's under their own names, a module's as ``<module>.<group>``."""
+        groups = dict(self.field.parameter_groups())
+        for name, module in self.view_modules.items():
+            groups |= {f"{name}.{group}": parameters for group, parameters in module.parameter_groups().items()}
+        return groups
+
+    @property
+    def outputs(self) -> frozenset[str]:
+        """Every output that it can be asked for."""
+        channels = self.field.feature_channels if isinstance(self.field, GaussianField) else frozenset()
+        return self.renderer.outputs | channels
+
+    def check_outputs(self, wants: Sequence[str], asking: str) -> None:
+        """Refuse outputs that it cannot deliver.
+
+        Args:
+            wants: Their names.
+            asking: Who wants them, for the message.
+
+        Raises:
+            InputError: See above.
+        """
+        missing = sorted(set(wants) - self.outputs)
+        if missing:
+            name = type(self.renderer).__name__
+            raise InputError(
+                f"{asking} wants {', '.join(missing)}, which {name} does not deliver for this field",
+                f"some of {', '.join(sorted(self.outputs))}",
+            )
+
+
+def make_view_modules(config: MethodConfig, scene: Scene, generator: torch.Generator) -> dict[str, ViewModule]:
+    """Fresh view modules of a method for a scene.
+
+    Raises:
+        InputError: One names what the scene does not have.
+    """
+    return {name: node.target.from_scene(scene, node.settings, generator) for name, node in config.modules.items()}

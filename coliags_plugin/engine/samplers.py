@@ -1,0 +1,61 @@
+"""What each training step looks at: whole frames, or batches of pixels."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from pydantic import Field
+
+from coliags_plugin.contracts import Draw, Sampler
+from coliags_plugin.core.settings import Settings
+
+
+class FrameSamplerSettings(Settings):
+    """No options."""
+
+
+class FrameSampler(Sampler):
+    """One whole frame per step, each once per round in random order (docs/methods.md 4)."""
+
+    Settings: ClassVar[type[Settings]] = FrameSamplerSettings
+    whole_images: ClassVar[bool] = True
+
+    def next(self) -> list[Draw]:
+        """The next frame."""
+        return [Draw(_next_frame(self))]
+
+
+class PixelSamplerSettings(Settings):
+    """Options of pixel batches."""
+
+    pixels: int = Field(default=1024, ge=1)  # in all
+    frames: int = Field(default=4, ge=1)  # that they are taken from, as evenly as can be
+
+
+class PixelSampler(Sampler):
+    """Random pixels of a few frames per step; frames take their turns as whole ones do."""
+
+    Settings: ClassVar[type[Settings]] = PixelSamplerSettings
+    whole_images: ClassVar[bool] = False
+
+    settings: PixelSamplerSettings
+
+    def next(self) -> list[Draw]:
+        """The next pixels, by frame."""
+        frames = min(self.settings.frames, self.settings.pixels)
+        draws = []
+        for turn in range(frames):
+            frame = _next_frame(self)
+            width, height = self.sizes[frame]
+            count = self.settings.pixels * (turn + 1) // frames - self.settings.pixels * turn // frames
+            index = torch.randint(width * height, (count,), generator=self.generator)
+            draws.append(Draw(frame, torch.stack([index % width, index // width], dim=1)))
+        return draws
+
+
+def _next_frame(sampler: Sampler) -> int:
+    """The next frame of a round, each once; a new round is shuffled when the last has ended."""
+    if not sampler.queue:
+        sampler.queue = torch.randperm(len(sampler.sizes), generator=sampler.generator).tolist()
+    return sampler.queue.pop()

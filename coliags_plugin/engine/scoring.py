@@ -1,0 +1,84 @@
+"""Scores of single views under a protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+
+from coliags_plugin.config import registry
+from coliags_plugin.config.components import make_component
+from coliags_plugin.contracts import Comparison, Metric, Protocol
+from coliags_plugin.core.errors import UnavailableError
+from coliags_plugin.core.scenes import Frame
+from coliags_plugin.engine.model import Model
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores of one view.
+
+    Attributes:
+        values: By name.
+        reasons: Why others cannot be had, by name.
+    """
+
+    values: dict[str, float] = field(default_factory=dict)
+    reasons: dict[str, str] = field(default_factory=dict)
+
+
+class Scorer:
+    """Renders held-out views and scores them under one protocol.
+
+    Args:
+        protocol: Its name.
+        only: Of its metrics only these; all where None.
+
+    Raises:
+        InputError: There is no such protocol.
+    """
+
+    def __init__(self, protocol: str, only: Sequence[str] | None = None) -> None:
+        self.protocol: Protocol = registry.protocols.get(protocol)()
+        self.wants = tuple(sorted({"rgb", "alpha"} | self.protocol.wants))
+        self.metrics: dict[str, Metric] = {
+            key: _metric(name, options)
+            for key, (name, options) in self.protocol.metrics.items()
+            if only is None or key in only
+        }
+
+    @torch.no_grad()
+    def compare(self, model: Model, frame: Frame, device: torch.device) -> Comparison:
+        """A held-out frame as the model renders it, beside its truth."""
+        placed = frame.to(device)
+        output = model.render(placed.camera, self.wants, frame.view(trained=False))
+        return self.protocol.compare(output, placed)
+
+    def score(self, comparison: Comparison, names: Sequence[str] | None = None) -> Scores:
+        """Every metric of a view, or those named among them."""
+        scores = Scores()
+        for name, metric in self.metrics.items():
+            if names is not None and name not in names:
+                continue
+            try:
+                scores.values[name] = metric(comparison)
+            except UnavailableError as error:
+                scores.reasons[name] = str(error)
+        return scores
+
+
+def within_seen(comparison: Comparison, frame: Frame) -> Comparison:
+    """A comparison of only those pixels that a training frame sees, where the frame tells."""
+    if frame.seen is None:
+        return comparison
+    seen = frame.seen.to(comparison.valid.device)
+    depth_valid = None if comparison.depth_valid is None else comparison.depth_valid & seen
+    return replace(comparison, valid=comparison.valid & seen, depth_valid=depth_valid)
+
+
+def _metric(name: str, options: Mapping[str, Any]) -> Metric:
+    component = make_component("metrics", {"name": name, **options})
+    metric: Metric = component.target(component.settings)
+    return metric
