@@ -23,7 +23,7 @@ PANELS = (
     ("depth_mse_inner", "depth MSE, inner, mm²", True),
     ("depth_median_error", "depth error, median, mm", True),
     ("ssim", "SSIM", False),
-    ("anchors", "anchors", False),
+    ("elements", "anchors or Gaussians", False),
 )
 # As in the report.
 COLORS = ("#0b62b0", "#c8500a", "#15803d", "#a2307f", "#8a6a00", "#0e7c86", "#6d4bc3", "#b3261e")

@@ -7,14 +7,12 @@ The clock stands still while the held-out views are rendered.
 
 from __future__ import annotations
 
-import math
 import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 import tyro
 from machine import describe_machine, markdown_table, write_results
 
@@ -22,6 +20,7 @@ from coliags_plugin.config.method_config import load_method
 from coliags_plugin.engine.backends import choose_device
 from coliags_plugin.engine.data_formats import load_scene
 from coliags_plugin.engine.run_folder import RunFolder
+from coliags_plugin.engine.scoring import Scorer
 from coliags_plugin.engine.trainer import Trainer
 
 
@@ -47,15 +46,11 @@ class Options:
     """Also write the rows here."""
 
 
-@torch.no_grad()
-def held_out_psnr(trainer: Trainer) -> float:
+def held_out_psnr(trainer: Trainer, scorer: Scorer) -> float:
     """Mean PSNR of the test frames, dB."""
-    figures = []
-    for frame in trainer.scene.test_sets["test"]:
-        placed = frame.to(trainer.device)
-        rgb = trainer.chosen.renderer.render(trainer.field, placed.camera).rgb.clamp(0, 1)
-        figures.append(-10 * math.log10(float((rgb - placed.rgb)[placed.valid].square().mean())))
-    return sum(figures) / len(figures)
+    frames = trainer.scene.test_sets["test"]
+    scores = [scorer.score(scorer.compare(trainer.model, frame, trainer.device)) for frame in frames]
+    return sum(score.values["psnr"] for score in scores) / len(scores)
 
 
 def race(options: Options, name: str) -> dict[str, Any]:
@@ -65,6 +60,7 @@ def race(options: Options, name: str) -> dict[str, Any]:
     run = RunFolder(Path(tempfile.gettempdir()))
     trainer = Trainer(method, scene, str(options.data), run, 0, choose_device(options.device))
     levels = [float(level) for level in options.levels.split(",")]
+    scorer = Scorer("paper", only=["psnr"])
     passed: dict[float, float] = {}
     seconds, psnr = 0.0, 0.0
     while trainer.step < options.steps and len(passed) < len(levels):
@@ -72,7 +68,7 @@ def race(options: Options, name: str) -> dict[str, Any]:
         for _ in range(options.every):
             trainer.take_step()
         seconds += time.perf_counter() - began
-        psnr = held_out_psnr(trainer)
+        psnr = held_out_psnr(trainer, scorer)
         passed |= {level: seconds for level in levels if psnr >= level and level not in passed}
     row: dict[str, Any] = {"method": name, "renderer": trainer.chosen.name}
     row |= {f"s to {level:g} dB": passed.get(level, "not reached") for level in levels}

@@ -23,6 +23,7 @@ from torch import Tensor
 from tube import tube_scene
 
 from coliags_plugin.config.method_config import load_method
+from coliags_plugin.contracts import TrainingStep
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.engine.backends import choose_device
 from coliags_plugin.engine.run_folder import RunFolder
@@ -102,14 +103,15 @@ def hand_back(values: list[Tensor], cuts: list[Tensor]) -> None:
 def timed_step(trainer: Trainer, clock: Clock) -> int:
     """One training step, stage by stage; returns how many Gaussians it drew."""
     step = trainer.step + 1
-    frame = trainer.scene.train[trainer.order.next()].to(trainer.device)
+    (draw,) = trainer.sampler.next()
+    frame = trainer.scene.train[draw.frame].to(trainer.device)
     clock.start()
-    decoded = trainer.field.gaussians(frame.camera)
+    decoded = trainer.model.field.gaussians(frame.camera)
     clock.stop("decode")
     names = [f.name for f in fields(Gaussians) if getattr(decoded, f.name).requires_grad]
     leaves = replace(decoded, **{name: cut(getattr(decoded, name)) for name in names})
     clock.start()
-    output = trainer.chosen.renderer.render(Handed(leaves, trainer.field.primitive), frame.camera, trainer.wants)
+    output = trainer.chosen.renderer.render(Handed(leaves, trainer.model.field.primitive), frame.camera, trainer.wants)
     clock.stop("render")
     images = [output.rgb, output.alpha, *output.maps.values()]
     image_leaves = [cut(image) for image in images]
@@ -117,7 +119,8 @@ def timed_step(trainer: Trainer, clock: Clock) -> int:
     seen = replace(output, rgb=image_leaves[0], alpha=image_leaves[1], maps=maps)
     clock.start()
     weights = {key: loss.settings.weight_at(step, trainer.steps) for key, loss in trainer.losses.items()}
-    total = torch.stack([weights[key] * loss(seen, frame) for key, loss in trainer.losses.items()]).sum()
+    taken = TrainingStep(seen, frame.target, trainer.model, step, trainer.schedule)
+    total = torch.stack([weights[key] * loss(taken) for key, loss in trainer.losses.items()]).sum()
     clock.stop("loss")
     torch.autograd.backward(total)
     clock.stop("loss backward")
@@ -125,7 +128,7 @@ def timed_step(trainer: Trainer, clock: Clock) -> int:
     clock.stop("render backward")
     hand_back([getattr(decoded, name) for name in names], [getattr(leaves, name) for name in names])
     clock.stop("decode backward")
-    trainer.strategy.after_backward(step, trainer.field, trainer.optimizers.adam, output)
+    trainer.strategy.after_backward(replace(taken, output=output), trainer.optimizers)
     clock.stop("strategy")
     trainer.optimizers.step(step)
     clock.stop("optimiser")

@@ -13,7 +13,7 @@ import logging
 import os
 import resource
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,17 +23,14 @@ import torch
 import tyro
 
 from coliags_plugin.cli.arguments import Assignments
-from coliags_plugin.config.components import make_component
-from coliags_plugin.contracts import Metric
-from coliags_plugin.core.errors import UnavailableError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.backends import choose_device
 from coliags_plugin.engine.data_formats import load_method_for, load_scene
 from coliags_plugin.engine.evaluator import MAIN_SET
 from coliags_plugin.engine.run_folder import RunFolder
+from coliags_plugin.engine.scoring import Scorer, within_seen
 from coliags_plugin.engine.trainer import Trainer
-from coliags_plugin.metrics.protocols import PaperProtocol
 
 #: Figures of protocol `paper` that a curve holds; LPIPS would cost more than the training between two looks.
 METRICS = ("psnr", "ssim", "depth_mse", "depth_mse_inner", "depth_median_error")
@@ -63,45 +60,37 @@ class Options:
     """Where to compute."""
 
 
-@torch.no_grad()
-def look(trainer: Trainer, frames: list[Frame], metrics: dict[str, Metric], seen_only: bool) -> dict[str, float]:
+def look(trainer: Trainer, frames: list[Frame], scorer: Scorer, seen_only: bool) -> dict[str, float]:
     """Means over frames, of all pixels or of those that training frames see where the frames tell."""
-    protocol = PaperProtocol()
-    wants = tuple(sorted({"rgb", "alpha"} | protocol.wants))
-    rows: list[dict[str, float]] = []
+    rows = []
     for frame in frames:
-        placed = frame.to(trainer.device)
-        comparison = protocol.compare(trainer.chosen.renderer.render(trainer.field, placed.camera, wants), placed)
-        if seen_only and placed.seen is not None:
-            depth_valid = None if comparison.depth_valid is None else comparison.depth_valid & placed.seen
-            comparison = replace(comparison, valid=comparison.valid & placed.seen, depth_valid=depth_valid)
-        row = {}
-        for name, metric in metrics.items():
-            try:
-                row[name] = metric(comparison)
-            except UnavailableError:
-                continue
-        rows.append(row)
-    found = {name: [row[name] for row in rows if name in row] for name in metrics}
+        comparison = scorer.compare(trainer.model, frame, trainer.device)
+        rows.append(scorer.score(within_seen(comparison, frame) if seen_only else comparison).values)
+    found = {name: [row[name] for row in rows if name in row] for name in scorer.metrics}
     return {name: sum(values) / len(values) for name, values in found.items() if values}
 
 
-def curve_row(trainer: Trainer, metrics: dict[str, Metric], taken: dict[str, Any], seconds: float) -> dict[str, Any]:
+def curve_row(trainer: Trainer, scorer: Scorer, taken: dict[str, Any], seconds: float) -> dict[str, Any]:
     """One row of the curve."""
     row: dict[str, Any] = {"step": trainer.step}
     for name, frames in trainer.scene.test_sets.items():
         beside = name != MAIN_SET  # views turned away from the path show what no training frame did
-        figures = look(trainer, frames, metrics, seen_only=beside)
-        row |= {f"{name}_{key}" if beside else key: value for key, value in figures.items()}
+        scores = look(trainer, frames, scorer, seen_only=beside)
+        row |= {f"{name}_{key}" if beside else key: value for key, value in scores.items()}
     return {
         **row,
-        "anchors": len(trainer.field.get_buffer("anchors")),
-        "gaussians": taken["gaussians"],
+        "elements": elements(trainer.model.field),
+        "gaussians": taken.get("gaussians", 0),
         "train_psnr": taken["psnr"],
         "loss": taken["loss"],
         "seconds": round(seconds, 1),
         "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
     }
+
+
+def elements(field: Any) -> int:
+    """How many anchors or Gaussians a field has."""
+    return len(getattr(field, field.elements, field.parameter_groups().get("means", [[]])[0]))
 
 
 def rows_until(path: Path, step: int) -> list[dict[str, Any]]:
@@ -126,10 +115,7 @@ def main(options: Options) -> None:
         trainer.resume()
     else:
         trainer.start(overwrite=True)
-    metrics: dict[str, Metric] = {}
-    for name in METRICS:
-        component = make_component("metrics", {"name": name})
-        metrics[name] = component.target(component.settings)
+    scorer = Scorer("paper", only=METRICS)
     rows = rows_until(curve, trainer.step)
     seconds = float(rows[-1]["seconds"]) if rows else 0.0
     while trainer.step < options.steps:
@@ -142,7 +128,7 @@ def main(options: Options) -> None:
             if trainer.step % options.every == 0 or trainer.step == options.steps:
                 break
         seconds += time.perf_counter() - began
-        rows.append({**curve_row(trainer, metrics, taken, seconds), **events})
+        rows.append({**curve_row(trainer, scorer, taken, seconds), **events})
         print(json.dumps(rows[-1]), flush=True)
         trainer.save()
         atomic_write(curve, "".join(json.dumps(row) + "\n" for row in rows))

@@ -204,6 +204,6 @@ def _annotated(plain: Any, tree: Node, depth: int) -> Sequence[str]:
             lines.extend(_annotated(value, node or Node({}, ""), depth + 1))
         else:
             origin = node.origin if node is not None else "default"
-            text = dump([value]).strip()[1:-1] if not isinstance(value, (list, tuple)) else dump(value).strip()
+            text = dump([value]).strip()[1:-1] if not isinstance(value, (list, tuple, dict)) else dump(value).strip()
             lines.append(f"{indent}{key}: {text}  # {origin}")
     return lines

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 
@@ -70,6 +70,17 @@ class Camera:
             dim=-1,
         )
         return directions @ self.camera_to_world[:3, :3].T
+
+    def rays_at(self, pixels: Int[Tensor, "P 2"]) -> Float[Tensor, "P 3"]:
+        """Like :meth:`rays`, of some pixels.
+
+        Args:
+            pixels: Columns and rows. [P, 2]
+        """
+        like = self.camera_to_world
+        column, row = (pixels.to(like.device, like.dtype) + 0.5).unbind(1)
+        local = [(column - self.cx) / self.fx, (row - self.cy) / self.fy, torch.ones_like(row)]
+        return torch.stack(local, dim=-1) @ like[:3, :3].T
 
     def project(self, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N 2"], Float[Tensor, "N"]]:
         """Project world points.

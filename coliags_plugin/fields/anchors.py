@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -21,12 +20,10 @@ from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.fields.anchor_points import neighbour_log_scales, voxelize
-from coliags_plugin.fields.frustum import spheres_in_frustum
+from coliags_plugin.fields.frustum import DRAWN_SIGMAS, spheres_in_frustum
 
 logger = logging.getLogger(__name__)
 
-#: A Gaussian of opacity one is drawn up to alpha = 1/255, at sqrt(2 ln 255) standard deviations.
-DRAWN_SIGMAS = math.sqrt(2.0 * math.log(255.0))
 #: About so many training cameras, evenly chosen, are asked for the distances that occur.
 _CAMERAS_ASKED = 16
 

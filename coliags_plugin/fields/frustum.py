@@ -1,4 +1,4 @@
-"""Which anchors a camera can see."""
+"""Frustum culling of spheres."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from coliags_plugin.core.cameras import Camera
+
+#: A Gaussian of opacity one is drawn up to alpha = 1/255, at sqrt(2 ln 255) standard deviations.
+DRAWN_SIGMAS = math.sqrt(2.0 * math.log(255.0))
 
 
 def spheres_in_frustum(

@@ -19,8 +19,8 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput, Splats
+from coliags_plugin.core.rotations import rotation_matrices
 from coliags_plugin.renderers import gsplat_library
-from coliags_plugin.renderers.projection import rotation_matrices
 from coliags_plugin.renderers.splatting import SplattingRenderer, SplattingSettings, check_outputs
 from coliags_plugin.renderers.torch_renderer import TorchRendererSettings, render_gaussians
 

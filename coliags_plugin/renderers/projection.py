@@ -14,6 +14,7 @@ from torch import Tensor
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.rotations import rotation_matrices
 
 #: Share of the half field of view by which a centre may leave the image before the Jacobian stops following it.
 JACOBIAN_MARGIN = 0.3
@@ -95,17 +96,6 @@ def project_gaussians(gaussians: Gaussians, camera: Camera, near: float, low_pas
         whitenings=torch.stack([u_xx, -u_yy * xy / xx, u_yy], dim=-1),
         in_front=in_front,
     )
-
-
-def rotation_matrices(quats_wxyz: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"]:
-    """Rotation matrices of quaternions of any length; the zero quaternion is the identity. [N, 3, 3]"""
-    w, x, y, z = torch.nn.functional.normalize(quats_wxyz, dim=-1).unbind(-1)
-    rows = [
-        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    ]
-    return torch.stack(rows, dim=-1).view(-1, 3, 3)
 
 
 def facing_normals(projected: ProjectedGaussians, scales: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:

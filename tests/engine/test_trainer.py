@@ -151,9 +151,9 @@ def test_loss_that_is_not_finite_names_step_frame_and_term(tmp_path):
     class Poisoned:
         settings = honest.settings
 
-        def __call__(self, output, frame):
+        def __call__(self, step):
             calls["count"] += 1
-            return honest(output, frame) * (float("nan") if calls["count"] == 3 else 1.0)
+            return honest(step) * (float("nan") if calls["count"] == 3 else 1.0)
 
     trainer.losses["d-ssim"] = Poisoned()
     with pytest.raises(NotFiniteError, match=r"step 3, frame 000\d: loss term 'd-ssim' is nan"):
@@ -266,7 +266,7 @@ def test_nan_parameters_are_found_in_the_next_step_and_never_saved(tmp_path):
     trainer.take_step()
     trainer.save()
     with torch.no_grad():
-        trainer.field.geometry_head.opacity_mlp[0].weight[0, 0] = float("nan")
+        trainer.model.field.geometry_head.opacity_mlp[0].weight[0, 0] = float("nan")
     with pytest.raises(NotFiniteError, match="step 1 left parameters of group 'opacity_mlp'"):
         trainer.take_step()
     with pytest.raises(NotFiniteError, match=r"field/geometry_head\.opacity_mlp\.0\.weight"):
@@ -276,8 +276,10 @@ def test_nan_parameters_are_found_in_the_next_step_and_never_saved(tmp_path):
 
 
 def test_optimizer_groups_must_be_the_fields(tmp_path):
-    with pytest.raises(InputError, match="exactly the field's"):
+    with pytest.raises(InputError, match="optimizers lacks the parameter groups features"):
         make_trainer(tmp_path / "run", overrides=["optimizers.features=null"])
+    with pytest.raises(InputError, match="optimizers names mirrors, which the model does not have"):
+        make_trainer(tmp_path / "run", overrides=["optimizers.mirrors={lr: 0.1}"])
 
 
 def test_learning_rates_follow_the_papers_schedules(tmp_path):
@@ -292,9 +294,10 @@ def test_learning_rates_follow_the_papers_schedules(tmp_path):
 
 
 def test_frames_are_drawn_without_replacement(tmp_path):
-    order = make_trainer(tmp_path / "run").order
-    rounds = [[order.next() for _ in range(order.count)] for _ in range(3)]
-    assert all(sorted(drawn) == list(range(order.count)) for drawn in rounds)
+    sampler = make_trainer(tmp_path / "run").sampler
+    count = len(sampler.sizes)
+    rounds = [[sampler.next()[0].frame for _ in range(count)] for _ in range(3)]
+    assert all(sorted(drawn) == list(range(count)) for drawn in rounds)
     assert rounds[0] != rounds[1] or rounds[1] != rounds[2]
 
 

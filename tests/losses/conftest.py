@@ -7,7 +7,7 @@ import torch
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
-from coliags_plugin.core.render_output import RenderOutput
+from coliags_plugin.core.render_output import RenderOutput, Splats
 from coliags_plugin.core.scenes import Frame
 
 
@@ -18,7 +18,8 @@ def _output(rgb, scales=None, **maps):
         torch.zeros(count, 3), torch.zeros(count, 4), scales, torch.ones(count), torch.zeros(count, 3),
         torch.arange(count), torch.arange(count),
     )  # fmt: skip
-    return RenderOutput(rgb, torch.ones(rgb.shape[:2]), torch.zeros(count, 2), torch.zeros(count), gaussians, maps)
+    splats = Splats(gaussians, torch.zeros(count, 2), torch.zeros(count))
+    return RenderOutput(rgb, torch.ones(rgb.shape[:2]), None, maps, splats)
 
 
 def _frame(image, depth=None, mask=None):

@@ -11,13 +11,9 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.render_output import DEPTH_KINDS
 from coliags_plugin.core.ssim import ssim
 from coliags_plugin.losses.depth import DepthKind
+from tests.losses.terms import make
 
 HEIGHT, WIDTH = 14, 17
-
-
-def make(name, **options):
-    loss = registry.losses.get(name)
-    return loss(loss.Settings(weight=1.0, **options))
 
 
 @pytest.fixture
@@ -85,11 +81,10 @@ def test_double_precision_stays_double(make_output, make_frame, image, rgb, dept
 
 def test_only_the_depth_term_needs_depth_and_another_output():
     for name in ("l1", "d-ssim", "scale-volume"):
-        assert not make(name).needs_depth
-        assert make(name).wants == frozenset()
-    assert make("depth-l1").needs_depth
-    assert make("depth-l1").wants == {"depth_accumulated"}
-    assert make("depth-l1", depth="depth_median").wants == {"depth_median"}
+        assert make(name).loss.needs == make(name).loss.wants == frozenset()
+    assert make("depth-l1").loss.needs == {"depth"}
+    assert make("depth-l1").loss.wants == {"depth_accumulated"}
+    assert make("depth-l1", depth="depth_median").loss.wants == {"depth_median"}
 
 
 # -------------------------------------------------------------------------------------------------------- photometric

@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
 from torch.nn.functional import grid_sample, huber_loss
 
-from coliags_plugin.config import registry
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import SparseDepth
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer
+from tests.losses import terms
 from tests.scenes import SMALL, wall_scene
 
 HEIGHT, WIDTH = 7, 9
 
 
-def make(**options):
-    loss = registry.losses.get("sparse-depth")
-    return loss(loss.Settings(weight=1.0, **options))
+make = partial(terms.make, "sparse-depth")
 
 
 @pytest.fixture
@@ -141,10 +140,9 @@ def test_pictures_of_one_row_or_column(case, size):
 
 
 def test_what_it_asks_for():
-    assert make().wants == {"depth_expected"}
-    assert make(depth="depth_accumulated").wants == {"depth_accumulated"}
-    assert make().needs_sparse_depth
-    assert not make().needs_depth
+    assert make().loss.wants == {"depth_expected"}
+    assert make(depth="depth_accumulated").loss.wants == {"depth_accumulated"}
+    assert make().loss.needs == {"sparse_depth"}
 
 
 # Training with it

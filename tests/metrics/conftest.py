@@ -8,7 +8,6 @@ import torch
 from coliags_plugin.config import registry
 from coliags_plugin.contracts import Comparison
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Frame
 
@@ -30,11 +29,7 @@ def _depths(depth, true_depth, valid=None):
 
 
 def _output(rgb, **maps):
-    none = torch.zeros(0, dtype=torch.int64)
-    gaussians = Gaussians(
-        torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 3), none, none
-    )
-    return RenderOutput(rgb, torch.ones(rgb.shape[:2]), torch.zeros(0, 2), torch.zeros(0), gaussians, maps)
+    return RenderOutput(rgb, torch.ones(rgb.shape[:2]), None, maps)
 
 
 def _frame(image, depth=None, mask=None):

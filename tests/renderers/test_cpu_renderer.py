@@ -66,7 +66,7 @@ def drawn(module, gaussians, camera, dtype, wants=OUTPUTS, background=(0.3, 0.1,
     loss = sum((output[k] * cotangents[k].to(dtype)).sum() for k in SUMS if k in ("rgb", "alpha", *wants))
     loss.backward()
     gradients = {key: getattr(gaussians, key).grad for key in INPUTS}
-    return output, {**gradients, "pose": pose.grad, "means2d": output.means2d.grad}
+    return output, {**gradients, "pose": pose.grad, "means2d": output.splats.means2d.grad}
 
 
 def thousands():
@@ -91,8 +91,10 @@ def test_agrees_with_the_definition_in_float64(name):
     for key, gradient in gradients.items():
         allowed = 1e-4 if key == "pose" else 2e-5  # the pose's is a sum that cancels
         assert relative(gradient, true_gradients[key]) <= allowed, key
-    torch.testing.assert_close(ours.means2d.detach().double(), true.means2d.detach(), rtol=1e-5, atol=1e-4)
-    assert int((ours.radii.double() != true.radii).sum()) <= len(gaussians) // 1000
+    torch.testing.assert_close(
+        ours.splats.means2d.detach().double(), true.splats.means2d.detach(), rtol=1e-5, atol=1e-4
+    )
+    assert int((ours.splats.radii.double() != true.splats.radii).sum()) <= len(gaussians) // 1000
 
 
 @pytest.mark.parametrize(

@@ -249,13 +249,13 @@ def test_the_stand_in_gives_the_definition_s_numbers(calls, name):
         assert relative(found[key], true[key]) <= 5e-6, key
     for key, gradient in true_gradients.items():
         assert relative(gradients[key], gradient) <= 2e-5, key
-    assert relative(output.means2d.grad, expected.means2d.grad) <= 1e-5
-    drawn = expected.radii > 0
-    assert relative(output.means2d[drawn], expected.means2d[drawn]) <= 1e-6
+    assert relative(output.splats.means2d.grad, expected.splats.means2d.grad) <= 1e-5
+    drawn = expected.splats.radii > 0
+    assert relative(output.splats.means2d[drawn], expected.splats.means2d[drawn]) <= 1e-6
     # gsplat's box of a Gaussian may touch the image where its ellipse does not: such ones are drawn on no pixel.
-    assert torch.equal(output.radii[drawn], expected.radii[drawn].float())
-    assert not output.means2d.grad[~drawn].any()
-    assert output.means2d.isfinite().all() and output.means2d.grad.isfinite().all()
+    assert torch.equal(output.splats.radii[drawn], expected.splats.radii[drawn].float())
+    assert not output.splats.means2d.grad[~drawn].any()
+    assert output.splats.means2d.isfinite().all() and output.splats.means2d.grad.isfinite().all()
 
 
 def test_one_projection_and_one_pass_serve_all_outputs(calls):
@@ -343,13 +343,13 @@ def test_an_empty_view_is_the_background_and_a_graph(calls, what, surfels):
         drawn, pose = cast(gaussians, torch.float32, grad=True), torch.eye(4).requires_grad_()
         output = render_with_gsplat(drawn, pinhole(pose=pose), OUTPUTS, GsplatRendererSettings(background=background))
         assert torch.equal(output.rgb, torch.tensor(background).expand(7, 9, 3))
-        assert output.radii.tolist() == [0] * n
+        assert output.splats.radii.tolist() == [0] * n
         assert not any(output[name].any() for name in OUTPUTS if name != "rgb")
         assert not output["depth_median"].requires_grad
         sum(output[name].sum() for name in OUTPUTS).backward()
         for name in INPUTS:
             assert not getattr(drawn, name).grad.any(), name
-        assert output.means2d.grad.shape == (n, 2) and not output.means2d.grad.any()
+        assert output.splats.means2d.grad.shape == (n, 2) and not output.splats.means2d.grad.any()
         assert pose.grad is None or not pose.grad.any()
 
 
@@ -357,10 +357,10 @@ def test_without_gradients_nothing_is_retained(calls):
     gaussians, camera = single("random")
     for drawn in (gaussians, as_surfels(gaussians)):
         output = render_with_gsplat(drawn, camera, OUTPUTS)
-        assert not output.rgb.requires_grad and not output.means2d.requires_grad
+        assert not output.rgb.requires_grad and not output.splats.means2d.requires_grad
         with torch.no_grad():
             output = render_with_gsplat(cast(drawn, grad=True), camera, OUTPUTS)
-        assert not output.rgb.requires_grad and not output.means2d.requires_grad
+        assert not output.rgb.requires_grad and not output.splats.means2d.requires_grad
 
 
 def test_the_registered_component_renders_a_field(calls):
@@ -368,7 +368,7 @@ def test_the_registered_component_renders_a_field(calls):
     assert GsplatRenderer.outputs == set(OUTPUTS) and GsplatRenderer.primitives == {"gaussians3d", "surfels"}
     gaussians, camera = single("random")
     output = GsplatRenderer(GsplatRendererSettings()).render(FieldOf(gaussians), camera, ("rgb", "depth_expected"))
-    assert output.gaussians is gaussians
+    assert output.splats.gaussians is gaussians
     with pytest.raises(KeyError):
         output["depth_median"]
 
@@ -449,8 +449,8 @@ def check_frontal_disc(device, atol):
     assert (alpha == 0).any() and (alpha > 0.5).any()
     for name in OUTPUTS:
         torch.testing.assert_close(output[name].cpu().double(), expected[name], rtol=0, atol=5 * atol, msg=name)
-    torch.testing.assert_close(output.means2d[0].cpu().double(), center, rtol=0, atol=1e-5)
-    assert output.radii.tolist() == [math.ceil(3.33 * max(0.9 * 20 / 5, 0.5 * 24 / 5))]
+    torch.testing.assert_close(output.splats.means2d[0].cpu().double(), center, rtol=0, atol=1e-5)
+    assert output.splats.radii.tolist() == [math.ceil(3.33 * max(0.9 * 20 / 5, 0.5 * 24 / 5))]
 
 
 def test_a_disc_that_faces_the_camera(calls):
@@ -545,9 +545,9 @@ def test_the_gradient_of_a_disc_s_centre_is_that_of_moving_its_projection(calls)
             loss(discs, dataclasses.replace(camera, **{name: getattr(camera, name) + sign * step}))[0].item()
             for sign in (1, -1)
         )
-        total = output.means2d.grad[:, axis].sum().item()
+        total = output.splats.means2d.grad[:, axis].sum().item()
         assert total == pytest.approx((ahead - behind) / (2 * step), rel=2e-3, abs=2e-3)
-    assert (output.means2d.grad.norm(dim=1) > 0).all()
+    assert (output.splats.means2d.grad.norm(dim=1) > 0).all()
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -557,10 +557,10 @@ def test_no_uninitialised_memory_reaches_what_surfels_give(calls, name):
     found, output, gradients = with_gradients(theirs(background=BACKGROUND), as_surfels(gaussians), camera, cotangents)
     for key in OUTPUTS:
         assert found[key].isfinite().all(), key
-    for key, gradient in (*gradients.items(), ("means2d", output.means2d.grad)):
+    for key, gradient in (*gradients.items(), ("means2d", output.splats.means2d.grad)):
         assert gradient.isfinite().all(), key
-    assert output.means2d.isfinite().all()
-    assert not output.means2d.grad[output.radii == 0].any()
+    assert output.splats.means2d.isfinite().all()
+    assert not output.splats.means2d.grad[output.splats.radii == 0].any()
 
 
 # --- gsplat itself ----------------------------------------------------------------------------------------------------
@@ -610,10 +610,10 @@ def check_within_the_table(name, device, surfels=False):
     for key, gradient in true_gradients.items():
         allowed = gradients_bound * (POSE if key == "pose" else 1)
         assert relative(gradients[key].cpu(), gradient) <= allowed, key
-    drawn = expected.radii > 0
-    assert relative(output.means2d.grad.cpu()[drawn], expected.means2d.grad[drawn]) <= gradients_bound
-    radii = output.radii.cpu()[drawn]
-    assert ((radii - expected.radii[drawn]).abs() <= 1).all()  # rounded up from a hair beside
+    drawn = expected.splats.radii > 0
+    assert relative(output.splats.means2d.grad.cpu()[drawn], expected.splats.means2d.grad[drawn]) <= gradients_bound
+    radii = output.splats.radii.cpu()[drawn]
+    assert ((radii - expected.splats.radii[drawn]).abs() <= 1).all()  # rounded up from a hair beside
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -656,7 +656,7 @@ def test_gsplat_survives_empty_views(gsplat, surfels):
         gaussians = make(means, torch.full((n, 3), 0.1), torch.full((n,), 0.5))
         gaussians = cast(as_surfels(gaussians) if surfels else gaussians, torch.float32, "cuda", grad=True)
         output = render_with_gsplat(gaussians, pinhole(dtype=torch.float32), OUTPUTS)
-        assert not output.alpha.any() and not output.radii.any()
+        assert not output.alpha.any() and not output.splats.radii.any()
         sum(output[name].sum() for name in OUTPUTS).backward()
         assert not any(getattr(gaussians, name).grad.any() for name in INPUTS)
-        assert output.means2d.grad.shape == (n, 2) and not output.means2d.grad.any()
+        assert output.splats.means2d.grad.shape == (n, 2) and not output.splats.means2d.grad.any()

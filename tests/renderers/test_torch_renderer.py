@@ -164,8 +164,8 @@ def test_one_gaussian_on_the_axis(opacity):
         "depth_median": z if alpha >= 0.5 else 0.0,
     }.items():
         torch.testing.assert_close(output[name][3, 4].item(), value, msg=name)
-    torch.testing.assert_close(output.means2d, torch.tensor([[4.5, 3.5]], dtype=torch.float64))
-    assert output.radii.tolist() == [math.ceil(extent(opacity, variance))]
+    torch.testing.assert_close(output.splats.means2d, torch.tensor([[4.5, 3.5]], dtype=torch.float64))
+    assert output.splats.radii.tolist() == [math.ceil(extent(opacity, variance))]
 
 
 def test_two_gaussians_one_behind_the_other():
@@ -224,7 +224,7 @@ def test_the_stop_is_for_good():
 def test_what_is_fainter_than_the_cut_is_not_drawn():
     gaussians = make([[0, 0, 4.0]], 0.3, 1 / 256)
     output = render_gaussians(gaussians, pinhole())
-    assert not output.alpha.any() and output.radii.tolist() == [0]
+    assert not output.alpha.any() and output.splats.radii.tolist() == [0]
     camera, variance = pinhole(41, 1), (20 * 0.3 / 4) ** 2 + 0.3
     output = render_gaussians(make([[0, 0, 4.0]], 0.3, 0.7), camera)
     distance = (torch.arange(41) - 20).abs()
@@ -248,11 +248,11 @@ def test_nothing_at_or_before_the_near_plane(depth):
     gaussians = cast(make([[0, 0, depth]], 0.3, 0.7), grad=True)
     output = render_gaussians(gaussians, pinhole(), OUTPUTS, TorchRendererSettings(background=(0.1, 0.2, 0.3)))
     assert torch.equal(output.rgb, torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64).expand(7, 9, 3))
-    assert output.radii.tolist() == [0]
+    assert output.splats.radii.tolist() == [0]
     sum(output[name].sum() for name in OUTPUTS).backward()
     for name in INPUTS:
         assert not getattr(gaussians, name).grad.any(), name
-    assert not output.means2d.grad.any()
+    assert not output.splats.means2d.grad.any()
 
 
 def test_near_plane_is_a_setting():
@@ -270,7 +270,7 @@ def test_no_gaussians_leave_the_background_and_a_graph(size, dtype):
     assert torch.equal(output.rgb[0, 0], torch.tensor([1.0, 0.5, 0.0], dtype=dtype))
     assert not any(output[name].any() for name in OUTPUTS if name != "rgb")
     (output.rgb.sum() + output["depth_expected"].sum()).backward()
-    assert gaussians.means.grad.shape == (0, 3) and output.means2d.grad.shape == (0, 2)
+    assert gaussians.means.grad.shape == (0, 3) and output.splats.means2d.grad.shape == (0, 2)
 
 
 # --- against the naive renderer ---------------------------------------------------------------------------------------
@@ -332,7 +332,9 @@ def test_agrees_with_the_naive_renderer(name):
                 allowed = 10 * bound if key == "pose" and dtype == torch.float32 else bound  # a sum that cancels
                 assert relative(gradient, true_gradients[key]) <= allowed, (dtype, tile_size, key)
             for i, center in centers.items():
-                torch.testing.assert_close(output.means2d[i].double(), center, rtol=1e-5, atol=1e-5, check_dtype=False)
+                torch.testing.assert_close(
+                    output.splats.means2d[i].double(), center, rtol=1e-5, atol=1e-5, check_dtype=False
+                )
 
 
 # --- derivatives ------------------------------------------------------------------------------------------------------
@@ -412,24 +414,24 @@ def test_gradient_of_means2d_is_that_of_moving_the_projection():
             loss(dataclasses.replace(camera, **{name: getattr(camera, name) + sign * step}))[0] for sign in (1, -1)
         )
         torch.testing.assert_close(
-            output.means2d.grad[:, axis].sum(), (ahead - behind) / (2 * step), rtol=1e-6, atol=1e-8
+            output.splats.means2d.grad[:, axis].sum(), (ahead - behind) / (2 * step), rtol=1e-6, atol=1e-8
         )
-    assert (output.means2d.grad.norm(dim=1) > 0).all()
+    assert (output.splats.means2d.grad.norm(dim=1) > 0).all()
 
 
 def test_without_gradients_nothing_is_retained():
     gaussians, camera = smooth_scene()
-    assert not render_gaussians(gaussians, camera).means2d.requires_grad
+    assert not render_gaussians(gaussians, camera).splats.means2d.requires_grad
     with torch.no_grad():
         output = render_gaussians(cast(gaussians, grad=True), camera, OUTPUTS)
-    assert not output.rgb.requires_grad and not output.means2d.requires_grad
+    assert not output.rgb.requires_grad and not output.splats.means2d.requires_grad
 
 
 def test_median_depth_and_radii_carry_no_gradient():
     gaussians, camera = smooth_scene()
     output = render_gaussians(cast(gaussians, grad=True), camera, OUTPUTS)
     assert output["depth_median"].any()
-    assert not output["depth_median"].requires_grad and not output.radii.requires_grad
+    assert not output["depth_median"].requires_grad and not output.splats.radii.requires_grad
 
 
 # --- symmetries -------------------------------------------------------------------------------------------------------
@@ -438,9 +440,9 @@ def test_median_depth_and_radii_carry_no_gradient():
 def test_centres_land_where_the_camera_projects_them():
     gaussians, camera = scene("off centre")
     output = render_gaussians(gaussians, camera)
-    drawn = output.radii > 0
+    drawn = output.splats.radii > 0
     assert 0 < drawn.sum() < len(gaussians)
-    torch.testing.assert_close(output.means2d[drawn], camera.project(gaussians.means)[0][drawn])
+    torch.testing.assert_close(output.splats.means2d[drawn], camera.project(gaussians.means)[0][drawn])
 
 
 def test_an_off_centre_view_is_a_window_of_a_larger_one():
@@ -478,7 +480,7 @@ def test_the_order_of_the_input_does_not_matter(name):
     plain, other = (render_gaussians(g, camera, OUTPUTS) for g in (gaussians, shuffled))
     for key in OUTPUTS:
         torch.testing.assert_close(other[key], plain[key], rtol=1e-12, atol=1e-12)
-    assert torch.equal(other.radii, plain.radii[order])
+    assert torch.equal(other.splats.radii, plain.splats.radii[order])
 
 
 def test_gaussians_of_equal_depth_keep_the_order_they_came_in():
@@ -494,7 +496,7 @@ def test_the_tile_size_changes_nothing(tile_size):
     other = render_gaussians(gaussians, camera, OUTPUTS, TorchRendererSettings(tile_size=tile_size))
     for key in OUTPUTS:
         torch.testing.assert_close(other[key], plain[key], rtol=1e-10, atol=1e-10)
-    assert torch.equal(other.radii, plain.radii)
+    assert torch.equal(other.splats.radii, plain.splats.radii)
 
 
 @pytest.mark.parametrize("elements", [1, 2000, 2**22])
@@ -535,7 +537,7 @@ def test_shapes_and_ranges(n, width, height, tile_size, wants, dtype, seed):
     camera = pinhole(width, height, dtype=dtype)
     output = render_gaussians(gaussians, camera, wants, TorchRendererSettings(tile_size=tile_size))
     assert output.rgb.shape == (height, width, 3) and output.alpha.shape == (height, width)
-    assert output.means2d.shape == (n, 2) and output.radii.shape == (n,)
+    assert output.splats.means2d.shape == (n, 2) and output.splats.radii.shape == (n,)
     assert set(output.maps) == set(wants) - {"rgb", "alpha"}
     for name in wants:
         assert output[name].shape == ((height, width, 3) if name in ("rgb", "normals") else (height, width))
@@ -547,7 +549,7 @@ def test_shapes_and_ranges(n, width, height, tile_size, wants, dtype, seed):
     for name in INPUTS:
         assert getattr(gaussians, name).grad.isfinite().all(), name
     behind = gaussians.means[:, 2] <= 0.2
-    assert not output.radii[behind].any() and not output.means2d.grad[behind].any()
+    assert not output.splats.radii[behind].any() and not output.splats.means2d.grad[behind].any()
 
 
 # --- the component ----------------------------------------------------------------------------------------------------
@@ -570,7 +572,7 @@ def test_the_registered_component_renders_a_field():
     assert renderer_class.outputs == set(OUTPUTS) and renderer_class.primitives == {"gaussians3d"}
     gaussians, camera = smooth_scene()
     output = renderer_class(renderer_class.Settings()).render(FieldOf(gaussians), camera, ("rgb", "depth_expected"))
-    assert output.gaussians is gaussians
+    assert output.splats.gaussians is gaussians
     expected = render_gaussians(gaussians, camera, OUTPUTS)["depth_expected"]
     torch.testing.assert_close(output["depth_expected"], expected)
     with pytest.raises(KeyError):

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 import torch
-from coliags_plugin.strategies.parameter_rows import append_rows, keep_rows
 
 from coliags_plugin.config.components import make_component
 from coliags_plugin.contracts import Schedule
 from coliags_plugin.core.gaussians import Gaussians
-from coliags_plugin.core.render_output import RenderOutput
+from coliags_plugin.core.render_output import RenderOutput, Splats
 from coliags_plugin.strategies.births import one_per_free_cell
 from tests.scenes import wall_scene
+from tests.strategies.steps import after_backward, stepped_optimizers
 
 CHILDREN = 10
 
@@ -20,17 +20,12 @@ def make_field(voxel=2.0):
     node = {"name": "anchors", "geometry_head": "plain", "appearance_head": "plain", "voxel_size": voxel}
     component = make_component("fields", node)
     field = component.target.from_scene(wall_scene(), component.settings, torch.Generator().manual_seed(0))
-    adam = {name: torch.optim.Adam(group, lr=0.01) for name, group in field.parameter_groups().items()}
-    for optimizer in adam.values():
-        for parameter in optimizer.param_groups[0]["params"]:
-            parameter.grad = torch.randn(parameter.shape, generator=torch.Generator().manual_seed(1))
-        optimizer.step()
-    return field, adam
+    return field, stepped_optimizers(field, 0.01)
 
 
 def make_strategy(steps=30_000, **options):
     component = make_component("strategies", {"name": "anchor-growth", **options})
-    return component.target(component.settings, torch.Generator(), Schedule(steps, 30_000))
+    return component.target(component.settings, torch.Generator(), Schedule(steps, 30_000), 10.0)
 
 
 def make_output(slots, gradients, opacity=0.5, visible=None, radii=None, width=200, height=100):
@@ -46,16 +41,16 @@ def make_output(slots, gradients, opacity=0.5, visible=None, radii=None, width=2
     )
     image = torch.zeros(height, width)
     drawn = torch.ones(n) if radii is None else torch.as_tensor(radii)
-    return RenderOutput(image[..., None].expand(-1, -1, 3), image, means2d, drawn, gaussians)
+    return RenderOutput(image[..., None].expand(-1, -1, 3), image, None, splats=Splats(gaussians, means2d, drawn))
 
 
 def test_counts_only_inside_the_window():
-    field, adam = make_field()
+    field, rows = make_field()
     strategy = make_strategy()
     for step in (500, 15_000, 20_000):
-        assert strategy.after_backward(step, field, adam, make_output([0], [1.0])) == {}
+        assert after_backward(strategy, step, field, rows, make_output([0], [1.0])) == {}
         assert len(strategy.seen) == 0
-    strategy.after_backward(501, field, adam, make_output([0, 11], [0.01, 0.02]))
+    after_backward(strategy, 501, field, rows, make_output([0, 11], [0.01, 0.02]))
     assert strategy.seen.nonzero().flatten().tolist() == [0, 1]
     assert strategy.opacity_sum[:2].tolist() == [0.5, 0.5]
     # Pixel gradients times half the width are gradients in normalised image units.
@@ -65,10 +60,10 @@ def test_counts_only_inside_the_window():
 
 @pytest.mark.parametrize(("steps", "first", "last"), [(1600, 27, 800), (30_000, 500, 15_000), (60_000, 1000, 30_000)])
 def test_statistics_keep_their_share_of_the_run(steps, first, last):
-    field, adam = make_field()
+    field, rows = make_field()
     strategy = make_strategy(steps=steps)
     for step, seen in ((first, 0), (first + 1, 1), (last - 1, 2), (last, 2)):
-        strategy.after_backward(step, field, adam, make_output([0], [1.0]))
+        after_backward(strategy, step, field, rows, make_output([0], [1.0]))
         assert (strategy.seen.sum() if len(strategy.seen) else 0) == seen
 
 
@@ -84,17 +79,17 @@ def test_statistics_keep_their_share_of_the_run(steps, first, last):
 def test_the_plan_is_what_happens(steps, plan, first_and_last):
     strategy = make_strategy(steps=steps)
     assert plan in strategy.plan()
-    field, adam = make_field()
-    events = [s for s in range(0, steps + 1, 50) if strategy.after_backward(s, field, adam, make_output([0], [0.0]))]
+    field, rows = make_field()
+    events = [s for s in range(0, steps + 1, 50) if after_backward(strategy, s, field, rows, make_output([0], [0.0]))]
     assert events[:1] + events[-1:] == first_and_last
     assert all(step % 100 == 0 for step in events)
 
 
 def test_undrawn_children_and_childless_anchors():
-    field, adam = make_field()
+    field, rows = make_field()
     strategy = make_strategy()
     output = make_output([0, 1], [0.01, 0.01], visible=torch.tensor([0, 5]), radii=[3.0, 0.0])
-    strategy.after_backward(600, field, adam, output)
+    after_backward(strategy, 600, field, rows, output)
     assert strategy.drawn[:2].tolist() == [1.0, 0.0]
     assert strategy.seen[[0, 5]].tolist() == [1.0, 1.0]
     assert strategy.opacity_sum[5] == 0.0
@@ -102,7 +97,7 @@ def test_undrawn_children_and_childless_anchors():
 
 def grow_once(gradient, **options):
     """One child of anchor 3, far from every anchor, drawn often enough with one gradient; returns what grew."""
-    field, adam = make_field()
+    field, rows = make_field()
     with torch.no_grad():
         field.offsets.zero_()
         field.offsets[3, 4] = torch.tensor([0.0, 0.0, 200.0]) / field.scalings[3, :3].exp()
@@ -112,8 +107,8 @@ def grow_once(gradient, **options):
     strategy._resize(before, CHILDREN, torch.device("cpu"))
     strategy.drawn[34] = 41.0  # one more than 100 * 0.8 * 0.5
     strategy.gradient_sum[34] = 41.0 * gradient
-    done = strategy.after_backward(100, field, adam, make_output([0], [0.0]))
-    return field, adam, before, done
+    done = after_backward(strategy, 100, field, rows, make_output([0], [0.0]))
+    return field, rows, before, done
 
 
 def test_a_birth_stands_where_its_candidate_stood_and_looks_like_its_parent():
@@ -127,17 +122,17 @@ def test_a_birth_stands_where_its_candidate_stood_and_looks_like_its_parent():
 
 
 def test_adam_moves_a_birth_no_faster_than_its_parent():
-    field, adam, *_ = grow_once(1.0, levels=1)
+    field, rows, *_ = grow_once(1.0, levels=1)
     for name in field.anchor_parameters:
         parameter = getattr(field, name)
-        assert adam[name].param_groups[0]["params"] == [parameter]
-        moments = adam[name].state[parameter]
+        assert rows.adam[name].param_groups[0]["params"] == [parameter]
+        moments = rows.adam[name].state[parameter]
         assert moments["exp_avg"].shape == parameter.shape == parameter.grad.shape
         assert moments["exp_avg"][:-1].abs().sum() > 0
         assert moments["exp_avg"][-1].abs().sum() == parameter.grad[-1].abs().sum() == 0
         assert torch.equal(moments["exp_avg_sq"][-1], moments["exp_avg_sq"][3])
         before = parameter.detach().clone()
-        adam[name].step()  # nothing is known yet that could move it
+        rows.adam[name].step()  # nothing is known yet that could move it
         assert torch.equal(parameter[-1], before[-1])
         assert not torch.equal(parameter[:-1], before[:-1])
 
@@ -145,7 +140,7 @@ def test_adam_moves_a_birth_no_faster_than_its_parent():
 @pytest.mark.parametrize(("thresholds", "grown"), [(1.05, 0), (2.05, 1), (4.05, 1)])
 def test_finer_cells_ask_for_larger_gradients(thresholds, grown):
     """A child beside an anchor, in its cell but not in its quarter: the second level's, from two thresholds on."""
-    field, adam = make_field()
+    field, rows = make_field()
     strategy = make_strategy(statistics_from=0, growth_from=0, min_opacity=0.0)
     strategy._resize(len(field.anchors), CHILDREN, torch.device("cpu"))
     spacing = field.spacing.item()
@@ -157,7 +152,7 @@ def test_finer_cells_ask_for_larger_gradients(thresholds, grown):
         field.offsets[7, 0] = 2 * side / field.scalings[7, :3].exp()
     strategy.drawn[70] = 41.0
     strategy.gradient_sum[70] = 41.0 * 0.0002 * thresholds
-    assert strategy.after_backward(100, field, adam, make_output([0], [0.0]))["grown"] == grown
+    assert after_backward(strategy, 100, field, rows, make_output([0], [0.0]))["grown"] == grown
     if grown:
         torch.testing.assert_close(field.anchors[-1], center + side)
         assert (field.scalings[-1].exp() <= 0.2501 * spacing).all()
@@ -173,19 +168,19 @@ def test_small_gradients_grow_nothing():
 
 
 def test_occupied_cells_grow_nothing():
-    field, adam = make_field()
+    field, rows = make_field()
     with torch.no_grad():
         field.offsets.zero_()  # every child sits on its own anchor
     strategy = make_strategy(statistics_from=0, growth_from=0, min_opacity=0.0)
     strategy._resize(len(field.anchors), CHILDREN, torch.device("cpu"))
     strategy.drawn.fill_(50.0)
     strategy.gradient_sum.fill_(50.0)
-    assert strategy.after_backward(100, field, adam, make_output([0], [0.0]))["grown"] == 0
+    assert after_backward(strategy, 100, field, rows, make_output([0], [0.0]))["grown"] == 0
     assert strategy.drawn.sum() == 0  # used candidates start counting anew
 
 
 def test_an_event_adds_at_most_one_anchor_for_so_many_pixels():
-    field, adam = make_field()
+    field, rows = make_field()
     with torch.no_grad():
         field.offsets.copy_(torch.rand(field.offsets.shape, generator=torch.Generator().manual_seed(3)) * 60)
     strategy = make_strategy(statistics_from=0, growth_from=0, min_opacity=0.0, pixels_per_birth=1000)
@@ -193,7 +188,7 @@ def test_an_event_adds_at_most_one_anchor_for_so_many_pixels():
     strategy.drawn.fill_(50.0)
     strategy.gradient_sum.fill_(50.0)
     # 200 x 100 pixels
-    assert strategy.after_backward(100, field, adam, make_output([0], [0.0]))["grown"] == 20
+    assert after_backward(strategy, 100, field, rows, make_output([0], [0.0]))["grown"] == 20
 
 
 def test_strongest_candidate_of_each_free_cell_strongest_cells_first():
@@ -208,21 +203,21 @@ def test_strongest_candidate_of_each_free_cell_strongest_cells_first():
 
 
 def test_base_scales_are_capped_in_spacings():
-    field, adam = make_field()
+    field, rows = make_field()
     with torch.no_grad():
         field.scalings[5, 3:] = 9.0
     strategy = make_strategy(statistics_from=0, growth_from=0)
     before = field.scalings.detach().clone()
-    strategy.after_backward(100, field, adam, make_output([0], [0.0]))
+    after_backward(strategy, 100, field, rows, make_output([0], [0.0]))
     torch.testing.assert_close(field.scalings[5, 3:].exp(), torch.full((3,), 4 * field.spacing.item()))
     before[5, 3:] = field.scalings[5, 3:].detach()
     assert torch.equal(field.scalings.detach(), before)
 
 
 def test_faint_anchors_go_and_the_rest_keeps_its_moments():
-    field, adam = make_field()
+    field, rows = make_field()
     before = field.features.detach().clone()
-    moments = adam["features"].state[field.features]["exp_avg"].clone()
+    moments = rows.adam["features"].state[field.features]["exp_avg"].clone()
     strategy = make_strategy(statistics_from=0, growth_from=0)
     strategy._resize(len(before), CHILDREN, torch.device("cpu"))
     strategy.seen.fill_(81.0)
@@ -230,40 +225,30 @@ def test_faint_anchors_go_and_the_rest_keeps_its_moments():
     strategy.opacity_sum[[2, 7]] = 81.0 * 0.004
     strategy.seen[9] = 10.0  # too rarely seen to judge
     strategy.opacity_sum[9] = 0.0
-    done = strategy.after_backward(100, field, adam, make_output([], [], visible=torch.zeros(0, dtype=torch.long)))
+    done = after_backward(strategy, 100, field, rows, make_output([], [], visible=torch.zeros(0, dtype=torch.long)))
     assert done == {"grown": 0, "pruned": 2}
     kept = [i for i in range(len(before)) if i not in (2, 7)]
     assert torch.equal(field.features.detach(), before[kept])
-    assert torch.equal(adam["features"].state[field.features]["exp_avg"], moments[kept])
+    assert torch.equal(rows.adam["features"].state[field.features]["exp_avg"], moments[kept])
     assert len(strategy.seen) == len(kept) == len(field.anchors)
     assert strategy.seen[7] == 10.0  # anchor 9, moved up by two, keeps counting
     assert strategy.seen.sum() == 10.0
 
 
 def test_never_prunes_everything():
-    field, adam = make_field()
+    field, rows = make_field()
     strategy = make_strategy(statistics_from=0, growth_from=0)
     strategy._resize(len(field.anchors), CHILDREN, torch.device("cpu"))
     strategy.seen.fill_(100.0)
     count = len(field.anchors)
     output = make_output([], [], visible=torch.zeros(0, dtype=torch.long))
-    assert strategy.after_backward(100, field, adam, output)["pruned"] == 0
+    assert after_backward(strategy, 100, field, rows, output)["pruned"] == 0
     assert len(field.anchors) == count
 
 
 def test_state_round_trip():
-    field, adam = make_field()
+    field, rows = make_field()
     strategy, other = make_strategy(), make_strategy()
-    strategy.after_backward(600, field, adam, make_output([0, 11], [0.01, 0.02]))
+    after_backward(strategy, 600, field, rows, make_output([0, 11], [0.01, 0.02]))
     other.load_state_dict(strategy.state_dict())
     assert all(torch.equal(other.state_dict()[k], v) for k, v in strategy.state_dict().items())
-
-
-def test_rows_without_an_optimizer_change_too():
-    field, adam = make_field()
-    del adam["features"]
-    count = len(field.features)
-    append_rows(field, adam, {"features": torch.ones(2, 32)}, torch.tensor([0, 1]))
-    assert len(field.features) == count + 2
-    keep_rows(field, adam, ("features",), torch.arange(count + 2) < 5)
-    assert len(field.features) == 5

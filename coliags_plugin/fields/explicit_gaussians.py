@@ -1,0 +1,118 @@
+"""Explicit 3D Gaussians with spherical harmonics, as in 3D Gaussian Splatting."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import torch
+from pydantic import Field as Option
+from torch import Tensor, nn
+from typing_extensions import Self
+
+from coliags_plugin.contracts import GaussianField, Schedule
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.scenes import Scene
+from coliags_plugin.core.settings import Settings
+from coliags_plugin.fields import spherical_harmonics
+from coliags_plugin.fields.anchor_points import neighbour_log_scales
+from coliags_plugin.fields.frustum import DRAWN_SIGMAS, spheres_in_frustum
+
+
+class ExplicitGaussiansSettings(Settings):
+    """Options of explicit Gaussians (docs/methods.md 7.1)."""
+
+    sh_degree: int = Option(default=3, ge=0, le=spherical_harmonics.MAX_DEGREE)
+    sh_every: int = Option(default=1000, ge=1)  # steps after which one more degree counts
+    initial_opacity: float = Option(default=0.1, gt=0, lt=1)
+    near: float = Option(default=0.2, ge=0)  # scene units; Gaussians nearer are not looked at
+
+
+class ExplicitGaussians(GaussianField):
+    """One Gaussian per initial point, each with its own mean, covariance, opacity and spherical harmonics."""
+
+    Settings: ClassVar[type[Settings]] = ExplicitGaussiansSettings
+    primitive: ClassVar[str] = "gaussians3d"
+    elements: ClassVar[str] = "gaussians"
+    #: Parameter groups, each with one row per Gaussian; named as in gsplat.
+    row_parameters: ClassVar[tuple[str, ...]] = ("means", "scales", "quats", "opacities", "sh0", "shN")
+
+    degree: Tensor
+
+    def __init__(self, settings: Any, count: int) -> None:
+        super().__init__()
+        self.settings = settings
+        self.means = nn.Parameter(torch.zeros(count, 3))
+        self.scales = nn.Parameter(torch.zeros(count, 3))  # logarithms
+        self.quats = nn.Parameter(torch.zeros(count, 4))
+        self.opacities = nn.Parameter(torch.zeros(count))  # logits
+        self.sh0 = nn.Parameter(torch.zeros(count, 1, 3))
+        self.shN = nn.Parameter(torch.zeros(count, (settings.sh_degree + 1) ** 2 - 1, 3))
+        self.register_buffer("degree", torch.zeros((), dtype=torch.int64))
+
+    @classmethod
+    def from_scene(cls, scene: Scene, settings: Any, generator: torch.Generator) -> Self:
+        """A faint round Gaussian at every initial point, as wide as the distance to its neighbours.
+
+        Raises:
+            InputError: The scene has no points.
+        """
+        positions = scene.points.positions
+        if len(positions) == 0:
+            raise InputError(
+                "the scene has no initial points",
+                "at least one",
+                "Give the data manager points or depth; coliags poses triangulate makes points from posed pictures",
+            )
+        field = cls(settings, len(positions))
+        with torch.no_grad():
+            field.means.copy_(positions)
+            field.scales.copy_(neighbour_log_scales(positions.to(torch.float32))[:, None].expand(-1, 3))
+            field.quats[:, 0] = 1.0
+            field.opacities.fill_(math.log(settings.initial_opacity / (1.0 - settings.initial_opacity)))
+            if scene.points.colors is not None:
+                rgb = scene.points.colors.to(torch.float32) / 255.0
+                field.sh0.copy_((rgb[:, None] - 0.5) / spherical_harmonics.Y0)
+        return field
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Tensor], settings: Any) -> Self:
+        """The field of a checkpoint, with however many Gaussians it had grown to."""
+        field = cls(settings, len(state["means"]))
+        field.load_state_dict(state)
+        return field
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """One group for each kind of parameter."""
+        return {name: [getattr(self, name)] for name in self.row_parameters}
+
+    def before_step(self, step: int, schedule: Schedule) -> None:
+        """Let one more degree of spherical harmonics count every so often."""
+        every = max(1, schedule.at(self.settings.sh_every))
+        self.degree.fill_(min(self.settings.sh_degree, step // every))
+
+    def gaussians(self, camera: Camera) -> Gaussians:
+        """The Gaussians in the camera's view, coloured for it."""
+        camera = camera.to(self.means.device, self.means.dtype)
+        visible = self._visible(camera)
+        means, scales, quats, opacities, sh0, rest = (
+            getattr(self, name).index_select(0, visible) for name in self.row_parameters
+        )
+        directions = nn.functional.normalize(means - camera.center, dim=1)
+        return Gaussians(
+            means=means,
+            quats_wxyz=quats,
+            scales=scales.exp(),
+            opacities=opacities.sigmoid(),
+            colors=spherical_harmonics.colors(torch.cat([sh0, rest], dim=1), directions, int(self.degree)),
+            source_index=visible,
+            visible_sources=visible,
+        )
+
+    @torch.no_grad()
+    def _visible(self, camera: Camera) -> Tensor:
+        reach = DRAWN_SIGMAS * self.scales.amax(dim=1).exp()
+        return spheres_in_frustum(self.means, reach, camera, self.settings.near).nonzero().squeeze(1)

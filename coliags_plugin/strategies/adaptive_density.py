@@ -1,0 +1,176 @@
+"""Adaptive density control: cloning, splitting and pruning explicit Gaussians, as in 3D Gaussian Splatting."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar, Protocol
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from coliags_plugin.contracts import ParameterRows, Schedule, Strategy, TrainingStep
+from coliags_plugin.core.render_output import RenderOutput
+from coliags_plugin.core.rotations import rotation_matrices
+from coliags_plugin.core.settings import Settings
+
+#: A split Gaussian's scales are divided by 0.8 times the number of its parts.
+_SPLIT_PARTS = 2
+_SPLIT_SHRINK = 0.8 * _SPLIT_PARTS
+
+
+class AdaptiveDensitySettings(Settings):
+    """Options of adaptive density control; the defaults are 3DGS's (docs/methods.md 7.2). Steps scale with the run."""
+
+    densify_from: int = Field(default=500, ge=0)
+    until: int = Field(default=15_000, ge=0)
+    every: int = Field(default=100, ge=1)  # steps between events, whatever the run's length
+    gradient_threshold: float = Field(default=0.0002, gt=0)  # of the centres' gradient, normalised image units
+    dense_share: float = Field(default=0.01, gt=0)  # of the extent: larger Gaussians are split, smaller ones cloned
+    min_opacity: float = Field(default=0.005, ge=0)
+    reset_every: int = Field(default=3000, ge=1)  # steps between resets of the opacities, whatever the run's length
+    reset_opacity: float = Field(default=0.01, gt=0, lt=1)
+    max_radius: float | None = Field(default=20.0, gt=0)  # pixels; larger ones go after the first reset
+    max_scale_share: float | None = Field(default=0.1, gt=0)  # of the extent; likewise
+
+
+class ExplicitRows(Protocol):
+    """What adaptive density control needs of a field whose elements are Gaussians.
+
+    Attributes:
+        means, scales, quats, opacities: As :class:`coliags_plugin.fields.explicit_gaussians.ExplicitGaussians` has
+            them: log scales, opacity logits. [N, 3], [N, 3], [N, 4], [N]
+        row_parameters: Names of the parameter groups with one row per Gaussian.
+    """
+
+    means: Tensor
+    scales: Tensor
+    quats: Tensor
+    opacities: Tensor
+    row_parameters: ClassVar[tuple[str, ...]]
+
+
+class AdaptiveDensity(Strategy):
+    """Clones small and splits large Gaussians whose image gradients stay large; prunes faint and oversized ones."""
+
+    Settings: ClassVar[type[Settings]] = AdaptiveDensitySettings
+    serves: ClassVar[frozenset[str] | None] = frozenset({"gaussians"})
+
+    def __init__(self, settings: Any, generator: torch.Generator, schedule: Schedule, extent: float) -> None:
+        super().__init__(settings, generator, schedule, extent)
+        self.densify_from = schedule.at(settings.densify_from)
+        self.until = schedule.at(settings.until)
+        self.gradient_sum = torch.zeros(0)  # [N]
+        self.drawn = torch.zeros(0)  # [N]
+        self.largest_radius = torch.zeros(0)  # [N]
+
+    def plan(self) -> str:
+        """When this run densifies and resets opacities, or why it does not."""
+        every, reset = self.settings.every, self.settings.reset_every
+        events = range((self.densify_from // every + 1) * every, self.until, every)
+        if len(events) == 0:
+            return (
+                f"this run neither densifies nor prunes: its {self.schedule.steps} steps leave no multiple of {every} "
+                f"between steps {self.densify_from} and {self.until}"
+            )
+        resets = range(reset, self.until, reset)
+        told = f"resets opacities every {reset} steps until step {resets[-1]}" if resets else "never resets opacities"
+        return (
+            f"this run clones, splits and prunes every {every} steps from step {events[0]} to {events[-1]}, and {told}"
+        )
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The counters."""
+        return {name: getattr(self, name) for name in ("gradient_sum", "drawn", "largest_radius")}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:  # type: ignore[override]
+        """Restore the counters."""
+        for name in self.state_dict():
+            setattr(self, name, state[name])
+
+    @torch.no_grad()
+    def after_backward(self, step: TrainingStep, rows: ParameterRows) -> dict[str, int]:
+        """Count; every so often densify, prune, and reset opacities."""
+        if step.step >= self.until:
+            return {}
+        field: ExplicitRows = step.model.field
+        if len(self.drawn) != len(field.means):
+            self._forget(field.means)
+        self._count(step.output)
+        done = {}
+        if step.step > self.densify_from and step.step % self.settings.every == 0:
+            grown = self._densify(field, rows)
+            done = {"grown": grown, "pruned": self._prune(field, rows, step.step)}
+            self._forget(field.means)
+        if step.step % self.settings.reset_every == 0:
+            highest = math.log(self.settings.reset_opacity / (1.0 - self.settings.reset_opacity))
+            rows.replace_values("opacities", field.opacities.clamp_max(highest))
+        return done
+
+    def _forget(self, like: Tensor) -> None:
+        for name in self.state_dict():
+            setattr(self, name, like.new_zeros(len(like)))
+
+    def _count(self, output: RenderOutput) -> None:
+        splats = output.drawn
+        gradient, slots = splats.means2d.grad, splats.gaussians.source_index
+        if gradient is None:
+            return
+        height, width = output.alpha.shape
+        drawn = splats.radii > 0
+        # In units of half the image, as the thresholds of the lineage are (docs/methods.md 4.3).
+        lengths = torch.hypot(0.5 * width * gradient[:, 0], 0.5 * height * gradient[:, 1])
+        self.gradient_sum.index_add_(0, slots, torch.where(drawn, lengths, 0.0))
+        self.drawn.index_add_(0, slots, drawn.to(self.drawn.dtype))
+        self.largest_radius[slots] = torch.maximum(self.largest_radius[slots], splats.radii)
+
+    def _densify(self, field: ExplicitRows, rows: ParameterRows) -> int:
+        """Clone and split; returns how many more there are."""
+        before = len(field.means)
+        wanted = self.gradient_sum / self.drawn.clamp_min(1.0) >= self.settings.gradient_threshold
+        large = field.scales.amax(dim=1).exp() > self.settings.dense_share * self.extent
+        clones, splits = (wanted & ~large).nonzero().squeeze(1), (wanted & large).nonzero().squeeze(1)
+        parents = torch.cat([clones, splits.repeat(_SPLIT_PARTS)])
+        if len(parents) == 0:
+            return 0
+        born = {name: getattr(field, name)[parents] for name in field.row_parameters}
+        parts = slice(len(clones), None)
+        born["means"][parts] += self._shifts(born["scales"][parts], born["quats"][parts])
+        born["scales"][parts] -= math.log(_SPLIT_SHRINK)
+        rows.add_rows(born)
+        self._extend(len(parents))
+        keep = torch.ones(len(field.means), dtype=torch.bool, device=field.means.device)
+        keep[splits] = False
+        self._keep(field, rows, keep)
+        return len(field.means) - before
+
+    def _shifts(self, scales: Tensor, quats: Tensor) -> Tensor:
+        """Random points of Gaussians about their means. [S, 3]"""
+        points = torch.randn(len(scales), 3, generator=self.generator).to(scales)
+        turned = rotation_matrices(nn.functional.normalize(quats, dim=1)) @ (points * scales.exp())[..., None]
+        return turned.squeeze(-1)
+
+    def _prune(self, field: ExplicitRows, rows: ParameterRows, step: int) -> int:
+        """Remove the faint and, after the first reset, the oversized; returns how many."""
+        options = self.settings
+        gone = field.opacities.sigmoid() < options.min_opacity
+        if step > options.reset_every:
+            if options.max_radius is not None:
+                gone |= self.largest_radius > options.max_radius
+            if options.max_scale_share is not None:
+                gone |= field.scales.amax(dim=1).exp() > options.max_scale_share * self.extent
+        if gone.all():
+            return 0  # an empty field could never recover
+        self._keep(field, rows, ~gone)
+        return int(gone.sum())
+
+    def _extend(self, count: int) -> None:
+        for name, value in self.state_dict().items():
+            setattr(self, name, torch.cat([value, value.new_zeros(count)]))
+
+    def _keep(self, field: ExplicitRows, rows: ParameterRows, keep: Tensor) -> None:
+        if keep.all():
+            return
+        for name, value in self.state_dict().items():
+            setattr(self, name, value[keep])
+        rows.keep_rows(field.row_parameters, keep)
