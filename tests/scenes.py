@@ -29,8 +29,8 @@ def wall_color(points: torch.Tensor) -> torch.Tensor:
     return torch.stack(pattern, dim=-1)
 
 
-def wall_scene(frames: int = 9, width: int = 32, height: int = 24, depth: bool = True) -> Scene:
-    """The wall z = 20 mm, lit by a lamp on the camera (1/d^2 in linear light), filmed along a short path."""
+def wall_scene(frames: int = 9, width: int = 32, height: int = 24, depth: bool = True, lamp: bool = True) -> Scene:
+    """The wall z = 20 mm, lit by a lamp on the camera (1/d^2 in linear light) or evenly, filmed along a short path."""
     made = []
     for index in range(frames):
         camera = camera_at(0.4 * index, 0.1 * index, 0.5 * index, width, height)
@@ -38,7 +38,7 @@ def wall_scene(frames: int = 9, width: int = 32, height: int = 24, depth: bool =
         z = (20.0 - camera.center[2]) / rays[..., 2]
         points = camera.center + z[..., None] * rays
         distance = (points - camera.center).norm(dim=-1, keepdim=True)
-        rgb = wall_color(points) * (18.0 / distance) ** (2 / 2.2)
+        rgb = wall_color(points) * ((18.0 / distance) ** (2 / 2.2) if lamp else 1.0)
         image = (rgb.clamp(0, 1) * 255).round().to(torch.uint8)
         made.append(Frame(f"{index:04d}", index, image, camera, z.float() if depth else None))
     test = [frame for frame in made if frame.index % 8 == 0]

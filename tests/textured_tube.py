@@ -38,8 +38,13 @@ def texture(points: np.ndarray) -> np.ndarray:
     return np.clip(120.0 + 9.0 * value, 5, 245)
 
 
-def tube_frames(count: int = 10, step: float = 1.6) -> list[Frame]:
-    """A camera that goes into the tube, ``step`` mm a frame, and sways and turns a little."""
+def tube_frames(
+    count: int = 10, step: float = 1.6, size: tuple[int, int] = (WIDTH, HEIGHT), coarseness: float = 1.0
+) -> list[Frame]:
+    """A camera that goes into the tube, ``step`` mm a frame, and sways and turns a little.
+
+    The texture's waves are ``coarseness`` times as long as those of :func:`texture`.
+    """
     frames = []
     for index in range(count):
         c2w = np.eye(4)
@@ -47,10 +52,11 @@ def tube_frames(count: int = 10, step: float = 1.6) -> list[Frame]:
             "xyz", [2.0 * index / count, 5.0 * np.sin(index / 3), index], True
         ).as_matrix()
         c2w[:3, 3] = 4.0 * np.sin(index / 2.5), 3.0 * np.cos(index / 3.0), step * index
-        camera = Camera(*INTRINSICS, WIDTH, HEIGHT, torch.from_numpy(c2w))
+        camera = Camera(*INTRINSICS, WIDTH, HEIGHT, torch.from_numpy(c2w)).resized(*size)
         rays = camera.rays().numpy()
         depth = depth_along(c2w[:3, 3], rays)
-        image = np.rint(texture(c2w[:3, 3] + depth[..., None] * rays)).astype(np.uint8)
+        points = c2w[:3, 3] + depth[..., None] * rays
+        image = np.rint(texture(points / coarseness)).astype(np.uint8)
         frames.append(
             Frame(f"{index:04d}", index, torch.from_numpy(image), camera, torch.from_numpy(depth.astype(np.float32)))
         )

@@ -124,6 +124,8 @@ def _convert(loader: _Loader, node: yaml.Node, source: str) -> Node:
 def _tuples(value: Any) -> Any:
     if isinstance(value, list):
         return tuple(_tuples(item) for item in value)
+    if isinstance(value, dict):
+        return {key: _tuples(item) for key, item in value.items()}
     return value
 
 

@@ -1,0 +1,124 @@
+"""Components that do not fit are refused with one clear error before anything is written."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from coliags_plugin.config.method_config import load_method
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.engine.run_folder import RunFolder
+from coliags_plugin.engine.trainer import Trainer
+from tests.scenes import SMALL, wall_scene
+
+LOSSES = ("l1", "d-ssim", "scale-volume")
+
+
+def start(folder, overrides=(), method="scaffold-gs", scene=None):
+    small = [change for change in SMALL if "voxel" not in change or "scaffold" in method]
+    loaded = load_method(method, [*small, "schedule.steps=20", *overrides])
+    return Trainer(loaded, scene or wall_scene(), "wall", RunFolder(folder), 0, torch.device("cpu"))
+
+
+@pytest.mark.parametrize(
+    ("method", "overrides", "message"),
+    [
+        (
+            "3dgs",
+            ["strategy=anchor-growth"],
+            "strategy 'anchor-growth' changes anchors, and field 'gaussians' has gaussians",
+        ),
+        ("scaffold-gs", ["strategy=adaptive-density"], "strategy 'adaptive-density' changes gaussians"),
+        ("scaffold-gs", ["sampler=pixels"], "sampler 'pixels' with renderer 'cpu', which draws whole images"),
+        ("scaffold-gs", ["modules.exposure=gain"], "optimizers lacks the parameter groups exposure.gain"),
+        (
+            "scaffold-gs",
+            ["modules.exposure={name: gain, reference: '0099'}", 'optimizers."exposure.gain"={lr: 0.1}'],
+            "gain names frame '0099'",
+        ),
+        (
+            "scaffold-gs",
+            ["modules.poses={name: pose-correction, fixed: ['7']}"],
+            "pose-correction names frame '7'",
+        ),
+        ("scaffold-gs", ["renderer=volume"], "renderer 'volume' draws radiance, the field is made of gaussians3d"),
+        (
+            "scaffold-gs",
+            ["losses.l1.from_step=20000", "losses.d-ssim=null", "losses.scale-volume=null"],
+            "no loss term",
+        ),
+        (
+            "scaffold-gs",
+            [f"losses.{name}.until_step=15000" for name in LOSSES],
+            "no loss term counts at step 11 of 20",
+        ),
+    ],
+)
+def test_refused_by_name_before_anything_is_written(tmp_path, method, overrides, message):
+    with pytest.raises(InputError) as caught:
+        start(tmp_path / "run", overrides, method)
+    assert message in str(caught.value)
+    assert not (tmp_path / "run").exists()
+
+
+def test_module_names_are_plain_words():
+    with pytest.raises(InputError, match="letters, digits and underscores"):
+        load_method("scaffold-gs", ['modules."a.b"=gain'])
+
+
+def test_terms_count_between_their_steps(tmp_path):
+    trainer = start(tmp_path / "run", ["losses.scale-volume.from_step=15000", "losses.d-ssim.until_step=15000"])
+    rows = [trainer.take_step() for _ in range(20)]
+    assert [set(row["terms"]) for row in rows[:10]] == [{"l1", "d-ssim"}] * 10
+    assert [set(row["terms"]) for row in rows[10:]] == [{"l1", "scale-volume"}] * 10
+
+
+def test_a_term_that_would_never_count_is_refused():
+    with pytest.raises(InputError, match="until_step 5 does not come after from_step 9"):
+        load_method("scaffold-gs", ["losses.l1.from_step=9", "losses.l1.until_step=5"])
+
+
+def test_depth_that_no_frame_has(tmp_path):
+    with pytest.raises(InputError, match="loss term 'depth' needs depth, and no training frame"):
+        start(tmp_path / "run", method="scaffold-gs-depth", scene=wall_scene(depth=False))
+
+
+def test_a_run_with_modules_resumes_to_the_bit(tmp_path):
+    modules = [
+        "modules.exposure=gain",
+        'optimizers."exposure.gain"={lr: 0.01}',
+        "modules.poses=pose-correction",
+        'optimizers."poses.rotation"={lr: 0.001}',
+        'optimizers."poses.translation"={lr: 0.01}',
+    ]
+    straight, broken = (start(tmp_path / name, modules) for name in ("straight", "broken"))
+    for trainer in (straight, broken):
+        trainer.start()
+    for _ in range(6):
+        straight.take_step()
+    for _ in range(3):
+        broken.take_step()
+    broken.save()
+    resumed = start(tmp_path / "broken", modules)
+    resumed.resume()
+    for _ in range(3):
+        resumed.take_step()
+    ours, theirs = straight.model.state_dict(), resumed.model.state_dict()
+    assert ours.keys() == theirs.keys() and any("log_gain" in name for name in ours)
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+    assert straight.provenance()["untrained_views"].keys() == {"exposure", "poses"}
+
+
+def test_a_checkpoint_of_other_modules_is_refused(tmp_path):
+    modules = ["modules.exposure=gain", 'optimizers."exposure.gain"={lr: 0.01}']
+    trainer = start(tmp_path / "run", modules)
+    trainer.start()
+    trainer.take_step()
+    trainer.save()
+    with pytest.raises(InputError, match=r"other settings of .*modules"):
+        start(tmp_path / "run").resume()
+    fewer = replace(wall_scene(), train=wall_scene().train[:3])
+    with pytest.raises(InputError, match="module 'exposure' does not fit"):
+        start(tmp_path / "run", modules, scene=fewer).resume()

@@ -1,0 +1,110 @@
+"""Rates, and rows of parameters that come, go and are reset together with Adam's moments."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import nn
+
+from coliags_plugin.config.method_config import OptimizerSettings
+from coliags_plugin.engine.model import Model
+from coliags_plugin.engine.optimizers import Optimizers
+
+
+class Rows(nn.Module):
+    """A field of nothing but two parameters with rows, one of them inside a part."""
+
+    def __init__(self, count=5):
+        super().__init__()
+        self.points = nn.Parameter(torch.randn(count, 3, generator=torch.Generator().manual_seed(0)))
+        self.part = nn.Module()
+        self.part.sizes = nn.Parameter(torch.ones(count))
+
+    def parameter_groups(self):
+        return {"points": [self.points], "sizes": [self.part.sizes]}
+
+
+@pytest.fixture
+def stepped():
+    """Optimizers after three steps, with gradients that have not been used."""
+    field = Rows()
+    settings = {"points": OptimizerSettings(lr=0.1), "sizes": OptimizerSettings(lr=0.01)}
+    optimizers = Optimizers(Model(field, None, {}), settings, 100, 1.0)
+    for step in (1, 2, 3, None):
+        generator = torch.Generator().manual_seed(step or 0)
+        field.points.grad = torch.randn(5, 3, generator=generator)
+        field.part.sizes.grad = torch.randn(5, generator=generator)
+        if step:
+            optimizers.step(step)
+    return field, optimizers
+
+
+def moments(optimizers, group):
+    (parameter,) = optimizers.adam[group].param_groups[0]["params"]
+    return optimizers.adam[group].state[parameter]
+
+
+def test_new_rows_have_no_history(stepped):
+    field, optimizers = stepped
+    before = (
+        field.points.detach().clone(),
+        field.points.grad.clone(),
+        moments(optimizers, "points")["exp_avg_sq"].clone(),
+    )
+    optimizers.add_rows({"points": torch.full((2, 3), 7.0)})
+    assert torch.equal(field.points.detach(), torch.cat([before[0], torch.full((2, 3), 7.0)]))
+    assert torch.equal(field.points.grad, torch.cat([before[1], torch.zeros(2, 3)]))
+    assert torch.equal(moments(optimizers, "points")["exp_avg_sq"], torch.cat([before[2], torch.zeros(2, 3)]))
+    assert moments(optimizers, "points")["step"].item() == 3
+    assert optimizers.adam["points"].param_groups[0]["params"] == [field.points]
+    assert len(field.part.sizes) == 5
+
+
+def test_new_rows_take_their_parents_mean_square(stepped):
+    _, optimizers = stepped
+    squares = moments(optimizers, "points")["exp_avg_sq"].clone()
+    optimizers.add_rows({"points": torch.zeros(2, 3)}, torch.tensor([4, 1]))
+    assert torch.equal(moments(optimizers, "points")["exp_avg_sq"][5:], squares[[4, 1]])
+    assert not moments(optimizers, "points")["exp_avg"][5:].any()
+
+
+def test_rows_that_stay_keep_everything(stepped):
+    field, optimizers = stepped
+    keep = torch.tensor([True, False, True, True, False])
+    points, sizes, gradient = field.points.detach()[keep], field.part.sizes.detach()[keep], field.part.sizes.grad[keep]
+    momentum = moments(optimizers, "sizes")["exp_avg"][keep]
+    optimizers.keep_rows(("points", "sizes"), keep)
+    assert torch.equal(field.points.detach(), points) and torch.equal(field.part.sizes.detach(), sizes)
+    assert torch.equal(field.part.sizes.grad, gradient)
+    assert torch.equal(moments(optimizers, "sizes")["exp_avg"], momentum)
+
+
+def test_reset_rows_forget_their_moments_alone(stepped):
+    field, optimizers = stepped
+    values = field.points.detach().clone()
+    others = moments(optimizers, "points")["exp_avg"][[0, 2, 3]].clone()
+    optimizers.reset_rows("points", torch.tensor([False, True, False, False, True]))
+    state = moments(optimizers, "points")
+    assert not state["exp_avg"][[1, 4]].any() and not state["exp_avg_sq"][[1, 4]].any()
+    assert torch.equal(state["exp_avg"][[0, 2, 3]], others)
+    assert torch.equal(field.points.detach(), values)
+    optimizers.reset_rows("points")
+    assert not state["exp_avg"].any()
+
+
+def test_replaced_values_start_anew(stepped):
+    field, optimizers = stepped
+    parameter = field.part.sizes
+    optimizers.replace_values("sizes", torch.arange(5.0))
+    assert field.part.sizes is parameter and parameter.tolist() == [0, 1, 2, 3, 4]
+    assert not moments(optimizers, "sizes")["exp_avg"].any() and not moments(optimizers, "sizes")["exp_avg_sq"].any()
+
+
+def test_before_the_first_step_there_are_no_moments_to_cut():
+    field = Rows()
+    settings = {"points": OptimizerSettings(lr=0.1), "sizes": OptimizerSettings(lr=0.01)}
+    optimizers = Optimizers(Model(field, None, {}), settings, 100, 1.0)
+    optimizers.add_rows({"points": torch.zeros(1, 3)}, torch.tensor([0]))
+    optimizers.reset_rows("sizes")
+    optimizers.keep_rows(["points"], torch.arange(6) > 0)
+    assert len(field.points) == 5

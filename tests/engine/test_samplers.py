@@ -1,0 +1,64 @@
+"""What a training step looks at."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from coliags_plugin.config.components import make_component
+from coliags_plugin.core.scenes import concatenate_targets
+from tests.scenes import wall_scene
+
+SIZES = [(7, 5), (4, 3), (6, 6)]
+
+
+def make(name="pixels", seed=0, **options):
+    component = make_component("samplers", {"name": name, **options})
+    return component.target(component.settings, SIZES, torch.Generator().manual_seed(seed))
+
+
+def test_frames_come_whole_and_each_once_per_round():
+    sampler = make("frames")
+    drawn = [sampler.next() for _ in range(6)]
+    assert all(len(draws) == 1 and draws[0].pixels is None for draws in drawn)
+    assert sorted(draws[0].frame for draws in drawn[:3]) == sorted(draws[0].frame for draws in drawn[3:]) == [0, 1, 2]
+
+
+@pytest.mark.parametrize(("pixels", "frames", "counts"), [(10, 3, [3, 3, 4]), (8, 1, [8]), (2, 5, [1, 1])])
+def test_pixels_are_shared_between_frames_and_lie_inside(pixels, frames, counts):
+    sampler = make(pixels=pixels, frames=frames)
+    for _ in range(20):
+        draws = sampler.next()
+        assert sorted(len(draw.pixels) for draw in draws) == sorted(counts)
+        for draw in draws:
+            width, height = SIZES[draw.frame]
+            assert (draw.pixels >= 0).all() and (draw.pixels < torch.tensor([width, height])).all()
+
+
+def test_every_pixel_comes_up():
+    sampler = make(pixels=64, frames=1)
+    seen = {
+        (draws[0].frame, *pixel) for draws in (sampler.next() for _ in range(60)) for pixel in draws[0].pixels.tolist()
+    }
+    assert len(seen) == sum(width * height for width, height in SIZES)
+
+
+def test_a_queue_and_a_generator_restore_a_sampler():
+    first, second = make(pixels=5, frames=2), make(pixels=5, frames=2, seed=9)
+    first.next()
+    second.queue = list(first.queue)
+    second.generator.set_state(first.generator.get_state())
+    for ours, theirs in zip(first.next(), second.next(), strict=True):
+        assert ours.frame == theirs.frame and torch.equal(ours.pixels, theirs.pixels)
+
+
+def test_targets_at_pixels():
+    frames = wall_scene().train[:2]
+    pixels = torch.tensor([[3, 1], [30, 20]])
+    target = frames[0].target_at(pixels)
+    assert target.image.shape == (2, 1, 3) and target.depth.shape == (2, 1)
+    assert torch.equal(target.image[1, 0], frames[0].image[20, 30])
+    assert target.depth[0, 0] == frames[0].depth[1, 3]
+    both = concatenate_targets([target, frames[1].target_at(pixels)])
+    assert both.image.shape == (4, 1, 3) and both.name == "0001, 0002"
+    assert both.mask is None and both.depth[2, 0] == frames[1].depth[1, 3]
