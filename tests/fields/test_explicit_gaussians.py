@@ -1,0 +1,93 @@
+"""Explicit Gaussians: their start, what a camera sees of them, and degrees that come one by one."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from coliags_plugin.config.components import make_component
+from coliags_plugin.contracts import Schedule
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scenes import PointCloud
+from coliags_plugin.renderers.torch_renderer import render_gaussians
+from tests.scenes import camera_at, wall_scene
+
+
+def make(scene=None, **options):
+    component = make_component("fields", {"name": "gaussians", **options})
+    return component.target.from_scene(scene or colored_wall(), component.settings, torch.Generator())
+
+
+def colored_wall():
+    scene = wall_scene()
+    count = len(scene.points)
+    colors = torch.randint(0, 256, (count, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+    return replace(scene, points=PointCloud(scene.points.positions, colors))
+
+
+def test_one_faint_round_gaussian_at_every_point():
+    scene = colored_wall()
+    field = make(scene)
+    seen = field.gaussians(camera_at(0, 0, -50))
+    points = scene.points.positions[seen.source_index]
+    torch.testing.assert_close(seen.means, points)
+    torch.testing.assert_close(seen.opacities, torch.full((len(points),), 0.1))
+    torch.testing.assert_close(seen.colors, scene.points.colors[seen.source_index] / 255.0)
+    # Points on a grid of 0.5 mm: inner ones have three neighbours at that distance.
+    assert seen.scales.median().item() == pytest.approx(0.5, rel=1e-5)
+    assert torch.equal(seen.quats_wxyz, torch.tensor([1.0, 0, 0, 0]).expand(len(points), 4))
+
+
+def test_points_without_colours_are_grey_and_no_points_are_refused():
+    seen = make(wall_scene()).gaussians(camera_at(0, 0, 0))
+    torch.testing.assert_close(seen.colors, torch.full_like(seen.colors, 0.5))
+    with pytest.raises(InputError, match="no initial points"):
+        make(replace(wall_scene(), points=PointCloud(torch.zeros(0, 3))))
+
+
+def test_culling_changes_no_picture():
+    field, camera = make(), camera_at(0.3, 0.2, 3.0, yaw=0.3)
+    with torch.no_grad():
+        field.scales += torch.randn(field.scales.shape, generator=torch.Generator().manual_seed(1))
+    seen = field.gaussians(camera)
+    assert 0 < len(seen) < len(field.means)
+    field._visible = lambda camera: torch.arange(len(field.means))
+    torch.testing.assert_close(
+        render_gaussians(seen, camera).rgb, render_gaussians(field.gaussians(camera), camera).rgb, rtol=0, atol=2e-6
+    )
+
+
+def test_degrees_come_one_by_one_and_are_saved():
+    field, schedule = make(), Schedule(3000, 30_000)
+    degrees = []
+    for step in (1, 99, 100, 199, 200, 300, 2999):
+        field.before_step(step, schedule)
+        degrees.append(int(field.degree))
+    assert degrees == [0, 0, 1, 1, 2, 3, 3]
+    other = type(field).from_state(field.state_dict(), field.settings)
+    camera = camera_at(0, 0, 0)
+    with torch.no_grad():
+        for each in (field, other):
+            each.shN.fill_(0.1)
+    assert torch.equal(field.gaussians(camera).colors, other.gaussians(camera).colors)
+    other.before_step(1, schedule)
+    assert not torch.equal(field.gaussians(camera).colors, other.gaussians(camera).colors)
+
+
+def test_colours_turn_with_the_view():
+    field = make(sh_degree=1)
+    with torch.no_grad():
+        field.shN[:, 1] = 1.0  # the function that is linear in z
+    field.degree.fill_(1)
+    ahead = field.gaussians(camera_at(0, 0, 0))
+    middle = (ahead.means[:, :2].abs().amax(1) < 0.1).nonzero()[0, 0]
+    base = colored_wall().points.colors[ahead.source_index[middle]] / 255.0
+    slope = math.sqrt(3 / (4 * math.pi))
+    torch.testing.assert_close(ahead.colors[middle], base + slope, rtol=0, atol=1e-4)
+
+
+def test_parameter_groups_are_named_as_in_gsplat():
+    assert list(make().parameter_groups()) == ["means", "scales", "quats", "opacities", "sh0", "shN"]

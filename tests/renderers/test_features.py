@@ -1,0 +1,108 @@
+"""Named feature channels: composited like colours by every splatting renderer, with gradients."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.renderers import cpu_renderer, gsplat_library, gsplat_renderer, torch_renderer
+from tests.renderers import fake_gsplat
+from tests.renderers.test_torch_renderer import INPUTS, pinhole, random_gaussians, relative
+
+WANTS = ("albedo", "depth_accumulated", "one", "many")
+
+
+def gaussians_with_features(count=400, dtype=torch.float64):
+    """Random Gaussians with 3, 1 and 11 channels, all leaves."""
+    gaussians = random_gaussians(count, 5)
+    generator = torch.Generator().manual_seed(1)
+    features = {name: torch.randn(count, width, generator=generator) for name, width in
+                (("albedo", 3), ("one", 1), ("many", 11))}  # fmt: skip
+    leaves = {name: getattr(gaussians, name).to(dtype).requires_grad_() for name in INPUTS}
+    return replace(
+        gaussians, **leaves, features={name: value.to(dtype).requires_grad_() for name, value in features.items()}
+    )
+
+
+def drawn(module, dtype, background=(0.4, 0.0, 0.9)):
+    gaussians = gaussians_with_features(dtype=dtype)
+    kind = module.CpuRendererSettings if module is cpu_renderer else module.TorchRendererSettings
+    pose = torch.eye(4, dtype=dtype).requires_grad_()
+    camera = replace(pinhole(46, 35, 40.0, 41.0), camera_to_world=pose)
+    output = module.render_gaussians(gaussians, camera, WANTS, kind(background=background))
+    generator = torch.Generator().manual_seed(2)
+    loss = sum((output[k] * torch.randn(output[k].shape, generator=generator).to(dtype)).sum() for k in ("rgb", *WANTS))
+    loss.backward()
+    gradients = {name: getattr(gaussians, name).grad for name in INPUTS}
+    gradients |= {name: value.grad for name, value in gaussians.features.items()}
+    return output, {**gradients, "pose": pose.grad, "means2d": output.splats.means2d.grad}
+
+
+def test_a_feature_equal_to_the_colours_comes_out_as_they_do_over_black():
+    gaussians, camera = random_gaussians(200, 3), pinhole(30, 22, 25.0, 25.0)
+    gaussians = replace(gaussians, features={"copy": gaussians.colors})
+    output = torch_renderer.render_gaussians(gaussians, camera, ("copy",))
+    torch.testing.assert_close(output["copy"], output.rgb)
+
+
+def test_the_kernels_agree_with_the_definition():
+    ours, gradients = drawn(cpu_renderer, torch.float32)
+    true, true_gradients = drawn(torch_renderer, torch.float64)
+    for name in ("rgb", *WANTS):
+        assert ours[name].shape == true[name].shape
+        assert relative(ours[name], true[name]) <= 1e-5, name
+    for name, gradient in gradients.items():
+        assert relative(gradient, true_gradients[name]) <= (1e-4 if name == "pose" else 2e-5), name
+
+
+def test_features_change_nothing_else():
+    with_features, _ = drawn(cpu_renderer, torch.float32)
+    gaussians = replace(gaussians_with_features(dtype=torch.float32), features={})
+    camera = pinhole(46, 35, 40.0, 41.0, dtype=torch.float32)
+    kind = cpu_renderer.CpuRendererSettings(background=(0.4, 0.0, 0.9))
+    plain = cpu_renderer.render_gaussians(gaussians, camera, ("depth_accumulated",), kind)
+    assert torch.equal(plain.rgb, with_features.rgb)
+    assert torch.equal(plain["depth_accumulated"], with_features["depth_accumulated"])
+
+
+@pytest.mark.parametrize("module", [cpu_renderer, torch_renderer])
+def test_no_gaussians_and_unknown_features(module):
+    gaussians = replace(random_gaussians(0), features={"albedo": torch.zeros(0, 3)})
+    gaussians = replace(gaussians, **{name: getattr(gaussians, name).float() for name in INPUTS})
+    camera = pinhole(9, 7, dtype=torch.float32)
+    assert not module.render_gaussians(gaussians, camera, ("albedo",))["albedo"].any()
+    with pytest.raises(InputError, match=r"no renderer output 'albed'.*\n?.*'albedo'"):
+        module.render_gaussians(gaussians, camera, ("albed",))
+
+
+def test_unusable_features_are_refused():
+    gaussians = gaussians_with_features(dtype=torch.float32)
+    camera = pinhole(9, 7, dtype=torch.float32)
+    for spoiled, message in ((torch.zeros(3, 2), "feature one of shape"), (torch.zeros(400, 1).double(), "float64")):
+        with pytest.raises(InputError, match=message):
+            cpu_renderer.render_gaussians(replace(gaussians, features={"one": spoiled}), camera, ("one",))
+
+
+@pytest.mark.parametrize("surfels", [False, True])
+@pytest.mark.parametrize("wants", [WANTS, ("many", "depth_median"), ("albedo", "one", "inverse_depth_accumulated")])
+def test_gsplat_composites_features_with_the_rest(monkeypatch, surfels, wants):
+    """The stand-in for gsplat; its colours as a feature must come out as the colours do, whatever is asked beside."""
+    monkeypatch.setattr(gsplat_library, "load", fake_gsplat.module)
+    gaussians = gaussians_with_features(40, torch.float32)
+    features = {**gaussians.features, "copy": gaussians.colors}
+    gaussians = replace(gaussians, features=features, scales=gaussians.scales[:, :2] if surfels else gaussians.scales)
+    camera = pinhole(24, 18, 20.0, 20.0, dtype=torch.float32)
+    output = gsplat_renderer.render_with_gsplat(gaussians, camera, ("copy", *wants))
+    torch.testing.assert_close(output["copy"], output.rgb)
+    for name in wants:
+        if name in features:
+            assert output[name].shape == (18, 24, features[name].shape[1])
+            doubled = replace(gaussians, features={**features, name: 2.0 * features[name]})
+            again = gsplat_renderer.render_with_gsplat(doubled, camera, (name,))
+            torch.testing.assert_close(again[name], 2.0 * output[name])
+    none = replace(random_gaussians(0), features={"one": torch.zeros(0, 1)})
+    none = replace(none, **{name: getattr(none, name).float() for name in INPUTS})
+    assert gsplat_renderer.render_with_gsplat(none, camera, ("one",))["one"].shape == (18, 24, 1)

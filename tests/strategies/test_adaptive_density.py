@@ -1,0 +1,145 @@
+"""Adaptive density control: what is cloned, split, pruned and reset, and when."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from coliags_plugin.config.components import make_component
+from coliags_plugin.contracts import Schedule
+from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.render_output import RenderOutput, Splats
+from tests.scenes import wall_scene
+from tests.strategies.steps import after_backward, stepped_optimizers
+
+EXTENT = 10.0
+
+
+def make_field():
+    component = make_component("fields", "gaussians")
+    field = component.target.from_scene(wall_scene(), component.settings, torch.Generator())
+    with torch.no_grad():
+        field.opacities.fill_(0.0)
+        field.scales.fill_(math.log(0.05))  # small: below 0.01 of the extent
+    return field, stepped_optimizers(field, 0.0)
+
+
+def make_strategy(steps=30_000, **options):
+    component = make_component("strategies", {"name": "adaptive-density", **options})
+    return component.target(component.settings, torch.Generator().manual_seed(0), Schedule(steps, 30_000), EXTENT)
+
+
+def make_output(slots, gradients, radii=None, width=200, height=100):
+    """Gaussians of these rows whose projected centres have these gradients along x, in normalised image units."""
+    count = len(slots)
+    means2d = torch.zeros(count, 2, requires_grad=True)
+    means2d.grad = torch.stack([torch.as_tensor(gradients) / (0.5 * width), torch.zeros(count)], dim=1)
+    rows = torch.as_tensor(slots)
+    none = torch.zeros(count, 3)
+    gaussians = Gaussians(none, torch.zeros(count, 4), none, torch.ones(count), none, rows, rows)
+    image = torch.zeros(height, width)
+    drawn = torch.ones(count) if radii is None else torch.as_tensor(radii)
+    return RenderOutput(image[..., None].expand(-1, -1, 3), image, None, splats=Splats(gaussians, means2d, drawn))
+
+
+def test_small_ones_are_cloned():
+    field, rows = make_field()
+    strategy, before = make_strategy(), field.means.detach().clone()
+    done = after_backward(strategy, 600, field, rows, make_output([3, 7, 9], [0.0003, 0.0001, 0.0002]))
+    assert done == {"grown": 2, "pruned": 0}
+    assert torch.equal(field.means.detach(), torch.cat([before, before[[3, 9]]]))
+    for name in field.row_parameters:
+        assert torch.equal(getattr(field, name)[-2:], getattr(field, name)[[3, 9]])
+        assert rows.adam[name].param_groups[0]["params"] == [getattr(field, name)]
+    assert not rows.adam["means"].state[field.means]["exp_avg"][-2:].any()
+
+
+def test_large_ones_are_split_into_two_smaller_within_them():
+    field, rows = make_field()
+    with torch.no_grad():
+        field.scales[5] = torch.tensor([0.5, 0.1, 0.1]).log()
+        field.quats[5] = torch.tensor([math.cos(math.pi / 4), 0.0, 0.0, math.sin(math.pi / 4)])  # x becomes y
+    center, count = field.means[5].detach().clone(), len(field.means)
+    strategy = make_strategy()
+    assert after_backward(strategy, 600, field, rows, make_output([5], [0.001]))["grown"] == 1
+    assert len(field.means) == count + 1  # two came, one went
+    torch.testing.assert_close(field.scales[-2:].exp(), torch.tensor([[0.5, 0.1, 0.1]] * 2) / 1.6)
+    assert not (field.means == center).all(dim=1).any()
+    shifts = torch.cat([_split_shifts(seed) for seed in range(300)])
+    # The parts are drawn from the Gaussian that they replace.
+    torch.testing.assert_close(shifts.std(0), torch.tensor([0.1, 0.5, 0.1]), rtol=0.12, atol=0)
+    torch.testing.assert_close(shifts.mean(0), torch.zeros(3), rtol=0, atol=0.06)
+
+
+def _split_shifts(seed):
+    strategy = make_strategy()
+    strategy.generator.manual_seed(seed)
+    quat = torch.tensor([[math.cos(math.pi / 4), 0.0, 0.0, math.sin(math.pi / 4)]])
+    return strategy._shifts(torch.tensor([[0.5, 0.1, 0.1]]).log(), quat)
+
+
+def test_faint_ones_go_and_after_the_first_reset_oversized_ones_too():
+    field, rows = make_field()
+    with torch.no_grad():
+        field.opacities[2] = -6.0  # 0.0025
+        field.scales[4] = math.log(1.1)  # above a tenth of the extent
+    strategy, count = make_strategy(), len(field.means)
+    early = make_output([4, 6], [0.0, 0.0], radii=[3.0, 21.0])
+    assert after_backward(strategy, 600, field, rows, early) == {"grown": 0, "pruned": 1}
+    late = make_output([4, 6], [0.0, 0.0], radii=[3.0, 21.0])
+    assert after_backward(strategy, 3100, field, rows, late)["pruned"] == 2  # rows 3 and 6 as they are counted now
+    assert len(field.means) == count - 3
+
+
+def test_opacities_are_reset_and_adam_forgets_them():
+    field, rows = make_field()
+    with torch.no_grad():
+        field.opacities[1] = -5.0  # 0.0067: below the reset, above the pruning
+    strategy = make_strategy()
+    after_backward(strategy, 3000, field, rows, make_output([0], [0.0]))
+    opacities = field.opacities.sigmoid()
+    assert opacities[:2].tolist() == pytest.approx([0.01, 0.006693], rel=1e-4)
+    state = rows.adam["opacities"].state[field.opacities]
+    assert not state["exp_avg"].any() and not state["exp_avg_sq"].any()
+    assert rows.adam["means"].state[field.means]["exp_avg"].any()
+
+
+@pytest.mark.parametrize(
+    ("steps", "plan", "first_and_last"),
+    [
+        (30_000, "every 100 steps from step 600 to 14900, and resets opacities every 3000 steps until step 12000",
+         [600, 14_900]),
+        (3000, "every 100 steps from step 100 to 1400, and never resets opacities", [100, 1400]),
+        (150, "neither densifies nor prunes: its 150 steps leave no multiple of 100 between steps 2 and 75", []),
+    ],
+)  # fmt: skip
+def test_the_plan_is_what_happens(steps, plan, first_and_last):
+    strategy, (field, rows) = make_strategy(steps=steps), make_field()
+    assert plan in strategy.plan()
+    steps_done = range(50, steps + 1, 50)
+    events = [step for step in steps_done if after_backward(strategy, step, field, rows, make_output([0], [0.0]))]
+    assert events[:1] + events[-1:] == first_and_last
+
+
+def test_statistics_are_means_over_the_views_that_draw():
+    field, rows = make_field()
+    strategy = make_strategy()
+    for gradient, radius in ((0.0003, 2.0), (0.00005, 2.0), (0.9, 0.0)):
+        after_backward(strategy, 599, field, rows, make_output([8], [gradient], radii=[radius]))
+    assert strategy.drawn[8] == 2.0
+    assert (strategy.gradient_sum[8] / strategy.drawn[8]).item() == pytest.approx(0.000175)
+    other = make_strategy()
+    other.load_state_dict(strategy.state_dict())
+    assert torch.equal(other.gradient_sum, strategy.gradient_sum)
+    assert after_backward(other, 600, field, rows, make_output([8], [0.0]))["grown"] == 0
+
+
+def test_never_prunes_everything():
+    field, rows = make_field()
+    with torch.no_grad():
+        field.opacities.fill_(-9.0)
+    count = len(field.means)
+    assert after_backward(make_strategy(), 600, field, rows, make_output([0], [0.0]))["pruned"] == 0
+    assert len(field.means) == count
