@@ -20,7 +20,7 @@ from coliags_plugin.config.components import (
     SamplerNode,
     StrategyNode,
 )
-from coliags_plugin.config.method_files import method_folder, method_names
+from coliags_plugin.config.method_files import method_files
 from coliags_plugin.config.yaml_tree import Node, dump, merge, override_all, read_tree
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.settings import Settings, refuse_zero_ends
@@ -151,14 +151,14 @@ def _find(method: str, folder: Path) -> Path:
         if not path.is_file():
             raise InputError(f"no file {path}", "a method config", "See `coliags list methods`")
         return path
-    path = method_folder() / f"{method}.yaml"
-    if method not in method_names():
+    files = method_files()
+    if method not in files:
         raise InputError(
             f"no method '{method}'",
-            f"one of {', '.join(method_names())}, or the path of a .yaml file",
-            did_you_mean(method, method_names()),
+            f"one of {', '.join(sorted(files))}, or the path of a .yaml file",
+            did_you_mean(method, files),
         )
-    return path
+    return files[method]
 
 
 def _resolve(path: Path, seen: tuple[Path, ...]) -> Node:

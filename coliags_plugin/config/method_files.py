@@ -1,29 +1,67 @@
-"""Where the shipped method configs lie, and what they are called."""
+"""Method configs by name: those shipped with the package, and those of other installed packages."""
 
 from __future__ import annotations
 
+from importlib.metadata import entry_points
+from importlib.util import find_spec
 from pathlib import Path
 
 from coliags_plugin.config.yaml_tree import read_tree
+from coliags_plugin.core.errors import InputError
+
+#: Entry points whose name is a method's, and whose value is the package that holds ``<name>.yaml``.
+ENTRY_POINTS = "coliags_plugin.methods"
 
 
 def method_names() -> list[str]:
-    """Every shipped method, ablations included."""
+    """Every method, ablations included."""
+    return sorted(method_files())
+
+
+def method_files() -> dict[str, Path]:
+    """Files of all methods by name.
+
+    Raises:
+        InputError: Another package's file is missing, or its name is taken.
+    """
     root = method_folder()
-    return sorted(path.relative_to(root).with_suffix("").as_posix() for path in root.rglob("*.yaml"))
+    files = {path.relative_to(root).with_suffix("").as_posix(): path for path in root.rglob("*.yaml")}
+    for entry in entry_points(group=ENTRY_POINTS):
+        if entry.name in files:
+            raise InputError(
+                f"method '{entry.name}' of package {entry.value} is already there: {files[entry.name]}",
+                "one method per name",
+                "Rename one of the two",
+            )
+        files[entry.name] = _file_in(entry.value, entry.name)
+    return files
 
 
 def method_folder() -> Path:
-    """Where the shipped method configs lie: inside the wheel, or beside the package in a checkout."""
+    """Folder of the shipped method configs: inside the wheel, or beside the package in a checkout."""
     package = Path(__file__).parents[1]
     installed = package / "method_configs"
     return installed if installed.is_dir() else package.parent / "method_configs"
 
 
 def method_descriptions() -> dict[str, str]:
-    """One line on every shipped method, by name."""
+    """One line on every method, by name."""
     found = {}
-    for name in method_names():
-        description = read_tree(method_folder() / f"{name}.yaml").value.get("description")
+    for name, path in sorted(method_files().items()):
+        description = read_tree(path).value.get("description")
         found[name] = str(description.value) if description is not None else ""
     return found
+
+
+def _file_in(package: str, name: str) -> Path:
+    """The file of a method in another package, which is not imported."""
+    spec = find_spec(package)
+    folders = list(spec.submodule_search_locations or []) if spec is not None else []
+    for folder in folders:
+        if (Path(folder) / f"{name}.yaml").is_file():
+            return Path(folder) / f"{name}.yaml"
+    raise InputError(
+        f"entry point '{name}' in {ENTRY_POINTS} names package {package}, which has no {name}.yaml",
+        "a package with that file",
+        "Mend or uninstall it",
+    )

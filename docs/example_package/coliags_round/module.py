@@ -1,0 +1,37 @@
+"""A vignette shared by all views."""
+
+from dataclasses import replace
+
+import torch
+from torch import nn
+
+from coliags_plugin.contracts import ViewModule
+from coliags_plugin.core.settings import Settings
+
+
+class Vignette(ViewModule):
+    """Darkens colours with the square of the distance to the principal point, by a learnt factor."""
+
+    Settings = Settings
+    untrained_views = "all views have the same vignette"
+
+    def __init__(self):
+        super().__init__()
+        self.falloff = nn.Parameter(torch.zeros(()))
+
+    @classmethod
+    def from_scene(cls, scene, settings, generator):
+        """No vignette yet."""
+        return cls()
+
+    def parameter_groups(self):
+        """One number."""
+        return {"falloff": [self.falloff]}
+
+    def shade(self, output, view):
+        """Multiply the colours by 1 / (1 + falloff * tan^2 of the angle to the optical axis)."""
+        camera = output.camera
+        columns = (torch.arange(camera.width, device=output.rgb.device) + 0.5 - camera.cx) / camera.fx
+        rows = (torch.arange(camera.height, device=output.rgb.device) + 0.5 - camera.cy) / camera.fy
+        squared = columns.square() + rows.square()[:, None]
+        return replace(output, rgb=output.rgb / (1.0 + self.falloff.exp() * squared)[..., None].to(output.rgb))
