@@ -52,7 +52,13 @@ class UnavailableError(Exception):
     """
 
 
+#: Former names of options and what they are called now ("Renamed options" in the changelog); hints name the new ones.
+RENAMED_OPTIONS = {"near": "near_plane", "far": "far_plane", "low_pass": "eps2d"}
+
+
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """The nearest known words as a hint, or an empty string."""
-    near = get_close_matches(word, list(known), n=1, cutoff=0.5)
-    return f"Did you mean '{near[0]}'?" if near else ""
+    """Hint that names the known word nearest to an unknown one; empty where none is near."""
+    words = list(known)
+    renamed = RENAMED_OPTIONS.get(word, "")
+    close = [renamed] if renamed in words else get_close_matches(word, words, n=1, cutoff=0.5)
+    return f"Did you mean '{close[0]}'?" if close else ""

@@ -13,7 +13,7 @@ class AutoSettings(Settings):
     """Preferences, and the options every splatting renderer shares."""
 
     prefer: tuple[str, ...] = ("gsplat", "cpu", "torch")
-    near: float = Field(default=0.2, ge=0)  # scene units
+    near_plane: float = Field(default=0.2, ge=0)  # scene units
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 

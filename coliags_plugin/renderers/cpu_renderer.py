@@ -139,7 +139,7 @@ def _view_table(camera: Camera, pose: Tensor, settings: CpuRendererSettings) -> 
         *matrix[:3].T.ravel(),
         *(camera.fx, camera.fy, camera.cx, camera.cy),
         *limits,
-        *(settings.near, settings.low_pass, camera.width, camera.height),
+        *(settings.near_plane, settings.eps2d, camera.width, camera.height),
         *(math.log2(settings.alpha_min), settings.alpha_max, settings.transmittance_min),
         *settings.background,
     ]

@@ -41,7 +41,7 @@ _NEEDS = {
 class GsplatRendererSettings(SplattingSettings):
     """Options of :class:`GsplatRenderer`. gsplat's other constants are fixed (docs/rendering.md).
 
-    It draws what lies at z = ``near``, too; surfels have gsplat's own filter instead of ``low_pass``.
+    It draws what lies at z = ``near_plane``, too; surfels have gsplat's own filter instead of ``eps2d``.
     """
 
 
@@ -153,8 +153,8 @@ def _draw_gaussians(gaussians: Gaussians, camera: Camera, needs: set[str], setti
         view[None],
         intrinsics[None],
         *size,
-        eps2d=settings.low_pass,
-        near_plane=settings.near,
+        eps2d=settings.eps2d,
+        near_plane=settings.near_plane,
         opacities=gaussians.opacities,
     )
     # Of what is not drawn gsplat leaves everything but the radii uninitialised.
@@ -199,7 +199,7 @@ def _draw_surfels(gaussians: Gaussians, camera: Camera, needs: set[str], setting
         view[None],
         intrinsics[None],
         *size,
-        near_plane=settings.near,
+        near_plane=settings.near_plane,
     )
     # Of what is not drawn gsplat leaves everything but the radii uninitialised.
     visible = (radii[0] > 0).all(-1)
@@ -311,7 +311,7 @@ def _median_by_definition(
     gaussians: Gaussians, camera: Camera, settings: GsplatRendererSettings
 ) -> Float[Tensor, "H W"]:
     """The definition's own: gsplat has none of 3D Gaussians, and no gradient goes through it. [H, W]"""
-    options = TorchRendererSettings(near=settings.near, low_pass=settings.low_pass)
+    options = TorchRendererSettings(near_plane=settings.near_plane, eps2d=settings.eps2d)
     return render_gaussians(gaussians, camera, ("depth_median",), options)["depth_median"]
 
 

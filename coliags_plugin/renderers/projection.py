@@ -46,14 +46,14 @@ class ProjectedGaussians:
     in_front: Bool[Tensor, "N"]
 
 
-def project_gaussians(gaussians: Gaussians, camera: Camera, near: float, low_pass: float) -> ProjectedGaussians:
+def project_gaussians(gaussians: Gaussians, camera: Camera, near_plane: float, eps2d: float) -> ProjectedGaussians:
     """Project Gaussians; differentiable in all of them and in ``camera.camera_to_world``.
 
     Args:
         gaussians: With three scales each. Their dtype and device are those of the result.
         camera: Where from.
-        near: Gaussians whose centre has z <= near are not drawn. Scene units.
-        low_pass: Added to both diagonal terms of the 2D covariance. Square pixels.
+        near_plane: Gaussians whose centre has z <= near_plane are not drawn. Scene units.
+        eps2d: Added to both diagonal terms of the 2D covariance. Square pixels.
 
     Raises:
         InputError: The Gaussians are surfels.
@@ -68,7 +68,7 @@ def project_gaussians(gaussians: Gaussians, camera: Camera, near: float, low_pas
     camera_axes = camera.camera_to_world[:3, :3]
     # Subtracting the centre before rotating keeps float32 accurate far from the world's origin.
     local = (gaussians.means - camera.center) @ camera_axes
-    in_front = local[:, 2] > near
+    in_front = local[:, 2] > near_plane
     # A stand-in depth keeps 0 * inf out of the backward pass of what is not drawn.
     x, y, z = torch.where(in_front[:, None], local, local.new_tensor([0.0, 0.0, 1.0])).unbind(-1)
     means2d = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=-1)
@@ -81,11 +81,9 @@ def project_gaussians(gaussians: Gaussians, camera: Camera, near: float, low_pas
     row_x = (camera.fx / z)[:, None] * (axes[:, 0] - slope_x[:, None] * axes[:, 2])
     row_y = (camera.fy / z)[:, None] * (axes[:, 1] - slope_y[:, None] * axes[:, 2])
     sharp_xx, sharp_yy = row_x.square().sum(-1), row_y.square().sum(-1)
-    xx, xy, yy = sharp_xx + low_pass, (row_x * row_y).sum(-1), sharp_yy + low_pass
+    xx, xy, yy = sharp_xx + eps2d, (row_x * row_y).sum(-1), sharp_yy + eps2d
     # xx yy - xy^2 cancels for needles; this sum of squares is the same number (Cauchy-Binet) and does not.
-    determinant = (
-        torch.linalg.cross(row_x, row_y).square().sum(-1) + low_pass * (sharp_xx + sharp_yy) + low_pass * low_pass
-    )
+    determinant = torch.linalg.cross(row_x, row_y).square().sum(-1) + eps2d * (sharp_xx + sharp_yy) + eps2d * eps2d
     u_xx, u_yy = xx.rsqrt(), (xx / determinant).sqrt()
     return ProjectedGaussians(
         means_camera=local,

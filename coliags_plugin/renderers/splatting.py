@@ -20,9 +20,9 @@ from coliags_plugin.core.settings import Settings
 class SplattingSettings(Settings):
     """Options of every splatting renderer. The defaults are the lineage's constants (docs/methods.md 2.1, 2.2)."""
 
-    near: float = pydantic.Field(default=0.2, ge=0)
-    """Gaussians with a centre at z <= near are not drawn. Scene units."""
-    low_pass: float = pydantic.Field(default=0.3, gt=0)
+    near_plane: float = pydantic.Field(default=0.2, ge=0)
+    """Gaussians with a centre at z <= near_plane are not drawn. Scene units."""
+    eps2d: float = pydantic.Field(default=0.3, gt=0)
     """Added to the diagonal of every 2D covariance, so that nothing is thinner than a pixel. Square pixels."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """RGB behind everything."""

@@ -79,7 +79,7 @@ def render_gaussians(
     check_outputs(wants, gaussians)
     grid = TileGrid(camera.width, camera.height, settings.tile_size)
     cuts = Cuts(settings.alpha_max, settings.alpha_min, settings.transmittance_min)
-    projected = project_gaussians(gaussians, camera, settings.near, settings.low_pass)
+    projected = project_gaussians(gaussians, camera, settings.near_plane, settings.eps2d)
     if projected.means2d.requires_grad:
         projected.means2d.retain_grad()
     extents = gaussian_extents(projected, gaussians.opacities, grid, settings.alpha_min)

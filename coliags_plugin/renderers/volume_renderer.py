@@ -24,9 +24,9 @@ _OUTPUTS = frozenset(OUTPUTS) - {"normals"}
 class VolumeRendererSettings(Settings):
     """Options of :class:`VolumeRenderer`."""
 
-    near: float = Field(default=0.2, gt=0)
+    near_plane: float = Field(default=0.2, gt=0)
     """z-depth of the first interval's beginning, scene units."""
-    far: float = Field(default=100.0, gt=0)
+    far_plane: float = Field(default=100.0, gt=0)
     """z-depth of the last interval's end, scene units."""
     samples: int = Field(default=128, ge=2)
     """Intervals along each ray; the field is asked in their middles."""
@@ -37,8 +37,8 @@ class VolumeRendererSettings(Settings):
 
     @model_validator(mode="after")
     def _near_before_far(self) -> Self:
-        if self.far <= self.near:
-            raise ValueError(f"far {self.far} does not lie beyond near {self.near}")
+        if self.far_plane <= self.near_plane:
+            raise ValueError(f"far_plane {self.far_plane} does not lie beyond near_plane {self.near_plane}")
         return self
 
 
@@ -104,7 +104,8 @@ class VolumeRenderer(Renderer):
     ) -> RenderOutput:
         """Composite along rays that reach z-depth 1 in one length."""
         options = self.settings
-        edges = torch.linspace(options.near, options.far, options.samples + 1, dtype=rays.dtype, device=rays.device)
+        ends = (options.near_plane, options.far_plane)
+        edges = torch.linspace(*ends, options.samples + 1, dtype=rays.dtype, device=rays.device)
         depths = 0.5 * (edges[1:] + edges[:-1])
         lengths = rays.norm(dim=-1, keepdim=True)
         samples = field.query(camera.center + depths[:, None] * rays[:, None], rays / lengths, camera)
