@@ -33,12 +33,12 @@ class Evaluate:
         from coliags_plugin.engine.backends import choose_device
         from coliags_plugin.engine.evaluator import evaluate
         from coliags_plugin.engine.trained import load_trained
-        from coliags_plugin.reporting.metrics_table import figures_table
+        from coliags_plugin.reporting.metrics_table import metrics_table
 
         trained = load_trained(self.path, choose_device(self.device), self.data)
         folder = evaluate(trained, self.protocol or trained.config.protocol)
         summary = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
-        Console().print(figures_table(summary))
+        Console().print(metrics_table(summary))
         for reason in dict.fromkeys(summary["reasons"].values()):
             names = [name for name, text in summary["reasons"].items() if text == reason]
             print(f"{', '.join(names)}: {reason}")

@@ -1,4 +1,4 @@
-"""The errors a user is meant to see."""
+"""Exceptions that are reported to the user."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from difflib import get_close_matches
 
 
 class ReportedError(Exception):
-    """The command line prints it as one line, without a traceback, and exits with its status."""
+    """Error that the command line prints as one line, without a traceback; it exits with ``exit_status``."""
 
     exit_status = 1
 
 
 class InputError(ReportedError):
-    """Something the user gave cannot be used.
+    """Invalid input: a file, option or value that cannot be used.
 
     Args:
         seen: What was found, naming the file, key or value.
-        expected: What would have been right.
-        do: The next thing to try.
+        expected: What would have been valid.
+        do: What the user can do about it.
     """
 
     exit_status = 2
@@ -36,19 +36,19 @@ class InputError(ReportedError):
 
 
 class InterruptedRunError(ReportedError):
-    """The user asked to stop, and what was done is saved."""
+    """Training was interrupted by the user, after its state was saved."""
 
     exit_status = 130
 
 
 class NotFiniteError(ReportedError):
-    """A loss became NaN or infinite."""
+    """A loss or parameter became NaN or infinite."""
 
 
 class UnavailableError(Exception):
-    """A quantity cannot be had here (missing weights, missing truth); the text is the reason.
+    """A quantity cannot be computed (missing weights, missing ground truth); the message is the reason.
 
-    Not a fault: whoever asked records the reason beside a null.
+    Not a failure: the caller records null with the reason.
     """
 
 

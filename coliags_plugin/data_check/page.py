@@ -15,9 +15,9 @@ from coliags_plugin.data_check.facts import video_of
 from coliags_plugin.data_check.reprojection import carried_picture
 from coliags_plugin.data_check.text import fact_rows, reading_rows
 from coliags_plugin.outputs.charts import Series, line_chart
-from coliags_plugin.outputs.figures import depth_picture, rgb_error_picture
+from coliags_plugin.outputs.colormaps import depth_picture, rgb_error_picture
+from coliags_plugin.outputs.image_files import encode_png
 from coliags_plugin.outputs.page import fact_list, picture, record, table, write_page
-from coliags_plugin.outputs.pictures import encode_png
 
 #: Pairs that are shown.
 _SHOWN = 3

@@ -82,7 +82,7 @@ class Align:
             write_json(self.json, result.to_json(unit))
             print(self.json)
         if self.plot is not None:
-            from coliags_plugin.outputs.pictures import write_png
+            from coliags_plugin.outputs.image_files import write_png
             from coliags_plugin.outputs.trajectory_plot import trajectory_picture
 
             write_png(self.plot, trajectory_picture(result, unit))
