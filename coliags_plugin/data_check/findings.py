@@ -1,4 +1,4 @@
-"""What is suspect about a scene, with the figures that say so and what to do."""
+"""Rules that turn the measured statistics into suspected problems, with evidence and advice."""
 
 from __future__ import annotations
 
@@ -12,34 +12,34 @@ from coliags_plugin.data_check.hypotheses import ADVICE, GIVEN, NO_MOTION
 from coliags_plugin.data_check.matches import EpipolarAgreement
 from coliags_plugin.data_check.reprojection import Agreement
 
-#: Frames agree when their surfaces differ by no more than this part of the depth, in the median.
+#: Largest median depth difference of agreeing frames, relative to the depth.
 DEPTH_AGREES = 0.02
-#: Another reading is believed when it makes the error so many times smaller.
+#: A pose hypothesis is reported when it reduces the error by this factor.
 CLEARLY_BETTER = 2.0
-#: A factor on depth nearer to 1 than this says nothing.
+#: Factors on depth closer to 1 than this (in the logarithm) are ignored.
 SCALE_TOLERANCE = 0.1
-#: Share of pixels that must land in the other picture.
+#: Smallest share of pixels that must project into the other image.
 SHARE_LANDS = 0.3
-#: Matches agree with poses within this median distance, px.
+#: Largest median epipolar distance of matches that agree with the poses, px.
 EPIPOLAR_AGREES = 2.0
-#: Below this the pictures' own sharpness decides, px.
+#: Epipolar distances below this are limited by image sharpness, px.
 EPIPOLAR_SURE = 0.5
-#: Share of good matches that must lie in front of both cameras.
+#: Smallest share of good matches in front of both cameras.
 IN_FRONT = 0.6
-#: Steps beyond so many median ones are jumps.
+#: Steps longer than this many median steps are jumps.
 JUMP = 10.0
-#: What the renderers' default near plane hides, scene units.
+#: The renderers' default near plane, scene units.
 NEAR = 0.2
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One suspect thing.
+    """One suspected problem.
 
     Attributes:
-        what: In a few words.
-        evidence: The figures behind it.
-        do: The next thing to try.
+        what: Short description.
+        evidence: The numbers behind it.
+        do: What the user can do about it.
     """
 
     what: str
@@ -48,7 +48,7 @@ class Finding:
 
 
 def depth_findings(depth: DepthFacts | None) -> Iterator[Finding]:
-    """Depth that cannot be what it says."""
+    """Implausible depth: mostly unknown, constant, or in another unit."""
     if depth is None:
         return
     if depth.invalid_share > 0.5:
@@ -83,7 +83,7 @@ def depth_findings(depth: DepthFacts | None) -> Iterator[Finding]:
 def agreement_findings(
     readings: Mapping[str, Agreement], scale: tuple[float, float] | None, path: PathFacts | None
 ) -> Iterator[Finding]:
-    """Poses and depth that contradict each other, and the change that would set them right."""
+    """Contradictions of poses and depth, and the pose convention or unit that would resolve them."""
     given = readings.get(GIVEN)
     if given is None or path is None or path.length == 0.0:
         return
@@ -119,7 +119,7 @@ def agreement_findings(
 
 
 def match_findings(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Finding]:
-    """Poses that features contradict."""
+    """Contradictions of poses and matched features."""
     given = readings.get(GIVEN)
     if given is None:
         return
@@ -155,7 +155,7 @@ def match_findings(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Findin
 
 
 def path_findings(path: PathFacts | None) -> Iterator[Finding]:
-    """A camera that jumps or stands still."""
+    """Jumps and standstill of the camera."""
     if path is None:
         return
     if path.length == 0.0:
@@ -169,7 +169,7 @@ def path_findings(path: PathFacts | None) -> Iterator[Finding]:
 
 
 def calibration_findings(frames: Sequence[Frame]) -> Iterator[Finding]:
-    """Intrinsics of another picture size, mostly."""
+    """Implausible intrinsics, mostly those of another image size."""
     seen: set[tuple[float, ...]] = set()
     for frame in frames:
         camera = frame.camera
@@ -201,7 +201,7 @@ def calibration_findings(frames: Sequence[Frame]) -> Iterator[Finding]:
 
 
 def picture_findings(pictures: PictureFacts) -> Iterator[Finding]:
-    """Pictures that show nothing, or the same thing twice."""
+    """Black, overexposed, mostly masked or repeated images."""
     if pictures.darkest_frame < 4.0:
         yield Finding(
             "a picture is black", f"{pictures.darkest_at}: mean {pictures.darkest_frame:.2g} of 255", "Leave it out"
