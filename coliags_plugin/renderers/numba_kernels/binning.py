@@ -1,7 +1,7 @@
-"""Records -> which blocks of which tiles each Gaussian touches, by tile and front to back.
+"""Binning of Gaussians into tiles and their blocks, by tile and front to back.
 
 Tiles and blocks only save work: what is listed here is a superset of the pairs of pixel and Gaussian with
-alpha >= alpha_min, and the sweeps decide about each of those again. The list of Gaussians is cut into stretches that
+alpha >= alpha_min, and the sweeps test each of those again. The list of Gaussians is cut into stretches that
 threads handle on their own; the result is the same however many there are.
 """
 
@@ -27,7 +27,7 @@ from coliags_plugin.renderers.numba_kernels.sorting import NUMBER
 from coliags_plugin.renderers.numba_kernels.threads import take
 from coliags_plugin.renderers.numba_kernels.tiles import order_tiles
 
-#: How many Gaussians before its turn memory is asked for.
+#: Prefetch distance, Gaussians.
 _AHEAD = 8
 
 
@@ -120,7 +120,7 @@ def _find_stretch(first, last, pair, counted, projections, view, grid, keys, pai
 
 @kernel
 def place_entries(grid, pairs, bins):
-    """Find out where the pairs of each tile go.
+    """Compute the offset of each tile's pairs.
 
     Args:
         grid: The tiles.
@@ -145,7 +145,7 @@ def place_entries(grid, pairs, bins):
 
 @kernel
 def sort_pairs(counters, grid, pairs, bins):
-    """Put the pairs where their tiles belong.
+    """Sort the pairs by tile.
 
     Args:
         counters: For sharing; entry 2 must be 0.

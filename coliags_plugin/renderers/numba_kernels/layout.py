@@ -1,4 +1,4 @@
-"""What the stages hand on to one another: tables, all of them flat arrays, and what is in their columns.
+"""Data layout of the tables that the stages share: flat arrays and the meaning of their columns.
 
 Gaussians are handled in groups of sixteen, one vector; where it says "groups filled up" a table goes on to the end of
 the last group. Tiles are 16 x 16 pixels, blocks 4 x 4: one vector again.
@@ -99,7 +99,7 @@ class Parameters(NamedTuple):
 
 
 class Extras(NamedTuple):
-    """What is composited besides colour, in this order."""
+    """Channels composited besides colour, in this order."""
 
     depth: bool
     inverse_depth: bool
@@ -126,7 +126,7 @@ class Grid(NamedTuple):
 
 
 class Projections(NamedTuple):
-    """What projection leaves, groups filled up.
+    """Output of the projection, groups filled up.
 
     Attributes:
         records: One row for each Gaussian; anything where it is not drawn.
@@ -201,7 +201,7 @@ class Images(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Memory of the sweeps, so much for each thread."""
+    """Working memory of the sweeps, per thread."""
 
     numbers: Any
     integers: Any

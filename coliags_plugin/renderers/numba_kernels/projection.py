@@ -53,12 +53,12 @@ SMALLEST_SQUARED_NORM = 1e-24
 
 @kernel
 def project(counters, count, gaussians, tail, view, extras, projections, means2d, radii):
-    """Project all Gaussians and find out how far they reach.
+    """Project all Gaussians and compute their extents.
 
     Args:
         counters: For sharing; entry 0 must be 0.
         count: How many Gaussians.
-        gaussians: They. [layout.Parameters]
+        gaussians: The Gaussians. [layout.Parameters]
         tail: Those behind the last full group, filled up with ones that are not drawn. [layout.Parameters]
         view: See ``layout``.
         extras: What is composited besides colour.

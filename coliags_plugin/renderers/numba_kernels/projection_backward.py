@@ -43,13 +43,13 @@ from coliags_plugin.renderers.numba_kernels.threads import take
 #: Turn products of two (or four) factors of the scaled U into those of the plain one.
 _PLAIN_SQUARE = 1.0 / layout.U_FACTOR_SQUARED
 _PLAIN_FOURTH = _PLAIN_SQUARE * _PLAIN_SQUARE
-#: How many Gaussians before its turn memory is asked for.
+#: Prefetch distance, Gaussians.
 _AHEAD = 16
 
 
 @kernel
 def gather(counters, projections, bins, entry_sums, gaussian_sums, of_means2d):
-    """Add up the sums of each Gaussian's entries.
+    """Sum the gradient sums of each Gaussian's entries.
 
     Args:
         counters: For sharing; entries 0 and 1 must be 0.
@@ -113,7 +113,7 @@ def _gather_stretch(first, last, entry, records, bins, entry_sums, gaussian_sums
 def project_backward(
     counters, count, gaussians, tail, view, extras, projections, gaussian_sums, given_means2d, of_gaussians, of_pose
 ):
-    """From the sums of each Gaussian to the derivatives of the loss.
+    """Derivatives of the loss with respect to Gaussians and pose, from the sums of each Gaussian.
 
     Args:
         counters: For sharing; entry 0 must be 0.

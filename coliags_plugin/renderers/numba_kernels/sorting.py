@@ -1,7 +1,7 @@
-"""Gaussians drawn -> their numbers, nearest first. Those of equal depth keep the order they came in.
+"""Stable radix sort of the drawn Gaussians by depth, nearest first.
 
-A radix sort, lowest digit first. The list is cut into stretches that threads count and move on their own; the
-stretches' counts are added up in order, so the result is the same however many there are.
+Least significant digit first. The list is divided into stretches that threads count and move independently; their
+counts are summed in order, so the result does not depend on their number.
 """
 
 from __future__ import annotations
@@ -11,17 +11,17 @@ from coliags_plugin.renderers.numba_kernels.compilation import kernel
 from coliags_plugin.renderers.numba_kernels.lanes import lowest_bit
 from coliags_plugin.renderers.numba_kernels.threads import take
 
-#: Bits of a digit at most.
+#: Largest number of bits of a digit.
 DIGIT_BITS = 11
-#: Places for the counts of one stretch.
+#: Number of counters of one stretch.
 DIGITS = 1 << DIGIT_BITS
-#: Takes the number of the Gaussian out of a key.
+#: Mask of the Gaussian's index in a key.
 NUMBER = (1 << 32) - 1
 
 
 @kernel
 def collect(counters, depth_bits, drawn, places, keys, lowest, highest):
-    """Write the keys: bits of the depth above, number of the Gaussian below.
+    """Write the sort keys: depth bits in the upper half, index of the Gaussian in the lower.
 
     Args:
         counters: For sharing; entry 0 must be 0.
@@ -52,7 +52,7 @@ def collect(counters, depth_bits, drawn, places, keys, lowest, highest):
 
 @kernel
 def count_digits(counters, stretches, keys, lowest, shift, mask, digits):
-    """How often each digit occurs in each stretch.
+    """Histogram of the digits of each stretch.
 
     Args:
         counters: For sharing; entry 0 must be 0.
@@ -75,7 +75,7 @@ def count_digits(counters, stretches, keys, lowest, shift, mask, digits):
 
 @kernel
 def place_digits(stretches, mask, digits):
-    """Turn counts of digits into places: where the first key of each digit and stretch goes."""
+    """Turn the histograms into offsets of the first key of each digit and stretch."""
     total = 0
     for digit in range(mask + 1):
         for stretch in range(stretches):
@@ -85,7 +85,7 @@ def place_digits(stretches, mask, digits):
 
 @kernel
 def move_by_digit(counters, stretches, keys, lowest, shift, mask, digits, moved):
-    """Put keys where their digit belongs.
+    """Scatter the keys by digit.
 
     Args:
         counters: For sharing; entry 1 must be 0.

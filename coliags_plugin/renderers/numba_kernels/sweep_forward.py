@@ -97,7 +97,7 @@ def _sweep_tile(tile, projections, bins, view, grid, channels, median, rows, sta
     """Sweep through one tile's entries; leaves its pixels in ``state``.
 
     Returns:
-        Where it stopped.
+        The entry at which it stopped.
     """
     corner_x, corner_y, across, down = tile_corner(tile, grid)
     listed = blocks[CHUNK:]
@@ -126,7 +126,7 @@ def _sweep_tile(tile, projections, bins, view, grid, channels, median, rows, sta
 
 @part
 def _list_by_block(count, blocks, listed, counts):
-    """Which rows of a chunk touch each block, front to back.
+    """List the rows of a chunk that touch each block, front to back.
 
     Without a branch, for none could be foreseen, and four blocks at a time: every row is written to every list, and
     stays there where the list grows.
@@ -155,7 +155,7 @@ def _sweep_block(block, count, listed, rows, channels, median, view, state):
     """Composite the first ``count`` rows listed into one block.
 
     Returns:
-        Whether any pixel still lets light through.
+        Whether any pixel has transmittance left.
     """
     block_x, block_y = block_corner(block)
     half = 0.5 * layout.TILE - 0.5
@@ -183,7 +183,7 @@ def _sweep_block(block, count, listed, rows, channels, median, view, state):
         if len(median) > 0:
             crosses = both(both(drawn, greater(transmittance, 0.5)), at_most(behind, 0.5))
             medians = select(crosses, broadcast_all(rows, row + MEDIAN_DEPTH, median), medians)
-        # Once zero it stays so: the stop is for good.
+        # Once zero it stays zero, so compositing does not resume.
         transmittance = select(drawn, behind, 0.0)
         running = bits(drawn)
         if not running:
