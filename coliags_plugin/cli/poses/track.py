@@ -62,7 +62,7 @@ class Track:
 
 
 def _warn_of_losses(found: Tracking) -> None:
-    """Log a warning that names the poses extrapolated at constant velocity."""
+    """Log a warning that names the lost frames, whose poses are guesses."""
     import logging
 
     import numpy as np
