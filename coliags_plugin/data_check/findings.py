@@ -55,7 +55,7 @@ def depth_findings(depth: DepthFacts | None) -> Iterator[Finding]:
         yield Finding(
             "most of the depth is unknown",
             f"{depth.invalid_share:.0%} of the unmasked pixels",
-            "Check that the depth files belong to these pictures and are read with the right number of bits",
+            "Check that the depth files belong to these images and are read with the right number of bits",
         )
     if math.isnan(depth.median):
         return
@@ -63,7 +63,7 @@ def depth_findings(depth: DepthFacts | None) -> Iterator[Finding]:
         yield Finding(
             "depth is the same everywhere",
             f"{depth.nearest:.4g} to {depth.farthest:.4g}",
-            "Check the depth files: pictures of one value are what a failed export leaves",
+            "Check the depth files: images of one value are what a failed export leaves",
         )
     if depth.median < 1.0:
         yield Finding(
@@ -114,7 +114,7 @@ def agreement_findings(
         yield Finding(
             "frames do not agree on the surface",
             f"{told}; with no motion at all, {_percent(still)}",
-            "Check that pictures, depth and poses belong together frame by frame, and the calibration",
+            "Check that images, depth and poses belong together frame by frame, and the calibration",
         )
 
 
@@ -142,15 +142,15 @@ def match_findings(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Findin
     if best is not None:
         reading = readings[best]
         yield Finding(
-            f"poses agree with the pictures when read as: {best}",
+            f"poses agree with the images when read as: {best}",
             f"as they are, {told}; read so, {reading.error:.2g} px, {reading.in_front:.0%} in front",
             ADVICE[best],
         )
     elif given.error > EPIPOLAR_AGREES or not in_front:
         yield Finding(
-            "pictures do not agree with the poses",
+            "images do not agree with the poses",
             told,
-            "Check that pictures and poses belong together frame by frame, and the calibration",
+            "Check that images and poses belong together frame by frame, and the calibration",
         )
 
 
@@ -182,7 +182,7 @@ def calibration_findings(frames: Sequence[Frame]) -> Iterator[Finding]:
             yield Finding(
                 "the principal point is far from the middle",
                 f"{frame.name}: ({camera.cx:.4g}, {camera.cy:.4g}) of {camera.width} x {camera.height} px",
-                "Check that the intrinsics are for pictures of this size",
+                "Check that the intrinsics are for images of this size",
             )
         ratio = camera.fx / camera.fy
         if not 1 / 1.15 < ratio < 1.15:
@@ -196,7 +196,7 @@ def calibration_findings(frames: Sequence[Frame]) -> Iterator[Finding]:
             yield Finding(
                 "the view is no endoscope's",
                 f"{frame.name}: {angle:.3g} degrees across",
-                "Check the focal length and the picture size it is for",
+                "Check the focal length and the image size it is for",
             )
 
 
@@ -204,10 +204,10 @@ def picture_findings(pictures: PictureFacts) -> Iterator[Finding]:
     """Black, overexposed, mostly masked or repeated images."""
     if pictures.darkest_frame < 4.0:
         yield Finding(
-            "a picture is black", f"{pictures.darkest_at}: mean {pictures.darkest_frame:.2g} of 255", "Leave it out"
+            "an image is black", f"{pictures.darkest_at}: mean {pictures.darkest_frame:.2g} of 255", "Leave it out"
         )
     if pictures.overexposed_share > 0.25:
-        yield Finding("pictures are overexposed", f"{pictures.overexposed_share:.0%} of the pixels are white", "")
+        yield Finding("images are overexposed", f"{pictures.overexposed_share:.0%} of the pixels are white", "")
     if pictures.masked_share > 0.75:
         yield Finding(
             "masks leave little",
@@ -217,11 +217,11 @@ def picture_findings(pictures: PictureFacts) -> Iterator[Finding]:
     if pictures.repeated:
         count = len(pictures.repeated)
         yield Finding(
-            "pictures repeat",
+            "images repeat",
             f"{pictures.repeated[0]}"
             + (f" and {count - 1} more equal" if count > 1 else " equals")
-            + " the picture before",
-            "Leave repeated pictures and their poses out: the video was captured at a higher rate than the scope's",
+            + " the image before",
+            "Leave repeated images and their poses out: the video was captured at a higher rate than the scope's",
         )
 
 

@@ -23,10 +23,10 @@ def fact_rows(check: SceneCheck) -> Iterator[tuple[str, str]]:
     yield "split", str(data.get("split", {}).get("name", "unknown"))
     stored = data.get("stored_size")
     yield (
-        "picture size",
+        "image size",
         f"{camera.width} x {camera.height} px" + (f", stored {stored[0]} x {stored[1]}" if stored else ""),
     )
-    yield "lens", str(data["lens"]) if data.get("lens") else "pinhole pictures"
+    yield "lens", str(data["lens"]) if data.get("lens") else "pinhole images"
     angle = 2.0 * math.degrees(math.atan(0.5 * camera.width / camera.fx))
     yield (
         "calibration",
@@ -66,7 +66,7 @@ def reading_rows(check: SceneCheck) -> tuple[list[str], list[list[str]]]:
             "depth error, %",
             "depth error, mm",
             "colour error, grey levels",
-            "lands in the picture, %",
+            "lands in the image, %",
         ]
         rows = [
             [
