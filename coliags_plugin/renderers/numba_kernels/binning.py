@@ -36,7 +36,7 @@ def find_pairs(counters, projections, view, grid, keys, pairs, entry_counts):
     """Pair the Gaussians with the tiles they touch.
 
     Args:
-        counters: For sharing; entries 0 and 1 must be 0.
+        counters: Work counters for dynamic scheduling; entries 0 and 1 must be 0.
         projections: What projection wrote.
         view: See ``layout``.
         grid: The tiles.
@@ -59,7 +59,7 @@ def find_pairs(counters, projections, view, grid, keys, pairs, entry_counts):
 
 @part
 def _tiles_within_bounds(first, last, keys, bounds):
-    """How many pairs the Gaussians in places ``first`` to ``last`` of the sorted list can make."""
+    """Upper bound of the number of pairs of the Gaussians with indices ``first`` to ``last`` in the sorted list."""
     total = 0
     for place in range(first, last):
         at = 4 * (keys[place] & NUMBER)
@@ -70,12 +70,12 @@ def _tiles_within_bounds(first, last, keys, bounds):
 
 @part
 def _find_stretch(first, last, pair, counted, projections, view, grid, keys, pairs, entry_counts):
-    """Pair the Gaussians in places ``first`` to ``last`` of the sorted list.
+    """Pair the Gaussians with indices ``first`` to ``last`` in the sorted list.
 
     Writes the pairs from ``pair`` on, and counts those of each tile from ``counted`` on.
 
     Returns:
-        Where the pairs end.
+        Index after the last pair.
     """
     records, bounds = projections.records, projections.bounds
     for tile in range(counted, counted + grid.tiles):
@@ -124,7 +124,7 @@ def place_entries(grid, pairs, bins):
 
     Args:
         grid: The tiles.
-        pairs: What :func:`find_pairs` wrote; the counts of tiles are turned into places.
+        pairs: What :func:`find_pairs` wrote; the counts of tiles are turned into offsets.
         bins: Out: ``stretch_entries``, ``starts`` and ``order``.
     """
     stretches = len(pairs.begins)
@@ -148,9 +148,9 @@ def sort_pairs(counters, grid, pairs, bins):
     """Sort the pairs by tile.
 
     Args:
-        counters: For sharing; entry 2 must be 0.
+        counters: Work counters for dynamic scheduling; entry 2 must be 0.
         grid: The tiles.
-        pairs: What :func:`place_entries` left; the places are counted up.
+        pairs: What :func:`place_entries` left; the offsets are incremented.
         bins: Out: ``cells``.
     """
     cells, places = bins.cells, pairs.tile_counts

@@ -48,11 +48,11 @@ def kernel(function: _Function) -> _Function:
 
 
 class _KernelCache(FunctionCache):
-    """numba's cache on disk, except that
+    """numba's on-disk cache with three changes.
 
-    - it knows that a kernel changes when any file of this folder does (numba looks at the kernel's own file only),
-    - a cache that cannot be read or written costs a compilation, never the run,
-    - it says so when compilation is about to begin.
+    - A kernel is invalidated when any file of this folder changes (numba checks the kernel's own file only).
+    - A cache that cannot be read or written causes a compilation, never an error.
+    - A message is logged before compilation.
     """
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:

@@ -71,7 +71,7 @@ class Pipeline:
         """Project Gaussians.
 
         Returns:
-            Projected centres in pixels, radii in pixels, and the records, groups filled up. [N, 2], [N], [16 each]
+            Projected centres in pixels, radii in pixels, and the records, padded to whole groups. [N, 2], [N], [16 each]
 
         Raises:
             UnusableGaussianError: One is not finite, has no direction or a negative scale.
@@ -295,7 +295,7 @@ class Pipeline:
         run(binning.sort_pairs, grid, pairs, bins)
 
     def _sorted_keys(self, run: _Run, drawn: int) -> Array:
-        """Numbers of the Gaussians drawn, nearest first."""
+        """Indices of the Gaussians drawn, nearest first."""
         take = self._arena.take
         keys, moved = take("keys", drawn, np.int64), take("moved", drawn, np.int64)
         if not drawn:
@@ -337,7 +337,7 @@ class _Run:
 
 @contextmanager
 def _workers() -> Iterator[_Run]:
-    """Wait for the turn, for one view takes all cores; then there are as many threads as torch uses."""
+    """Lock the thread pool, as one view uses all cores; with as many threads as torch uses."""
     with _crew.turn:
         yield _Run(torch.get_num_threads())
 
@@ -354,7 +354,7 @@ def _joined(images: layout.Images) -> Array:
 
 
 def _part_into(channels: Array, images: layout.Images) -> None:
-    """Put up to eight channels into images; the reverse of :func:`_joined`. [H, W, C]"""
+    """Split up to eight channels into images; the inverse of :func:`_joined`. [H, W, C]"""
     filled = np.zeros((*channels.shape[:2], layout.MAX_CHANNELS), np.float32)
     filled[..., : channels.shape[2]] = channels
     images.rgb[:] = filled[..., :3]

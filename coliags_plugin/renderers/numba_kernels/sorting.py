@@ -24,10 +24,10 @@ def collect(counters, depth_bits, drawn, places, keys, lowest, highest):
     """Write the sort keys: depth bits in the upper half, index of the Gaussian in the lower.
 
     Args:
-        counters: For sharing; entry 0 must be 0.
-        depth_bits: The depths' bits, which order positive numbers as the numbers do. [groups filled up]
+        counters: Work counters for dynamic scheduling; entry 0 must be 0.
+        depth_bits: The depths' bits, which order positive numbers as the numbers do. [padded to whole groups]
         drawn: One bit for each Gaussian of a group. [groups]
-        places: Of the first key of each parcel of Gaussians. [parcels]
+        places: Offset of the first key of each parcel of Gaussians. [parcels]
         keys: Out. [Gaussians drawn]
         lowest, highest: Out: the range of depth bits in each parcel. [parcels]
     """
@@ -55,9 +55,9 @@ def count_digits(counters, stretches, keys, lowest, shift, mask, digits):
     """Histogram of the digits of each stretch.
 
     Args:
-        counters: For sharing; entry 0 must be 0.
-        stretches: How many.
-        keys: What to sort.
+        counters: Work counters for dynamic scheduling; entry 0 must be 0.
+        stretches: Number of stretches.
+        keys: Keys to sort.
         lowest: Least depth bits.
         shift, mask: Where the digit is in depth bits less ``lowest``.
         digits: Out. [DIGITS for each stretch]
@@ -88,9 +88,9 @@ def move_by_digit(counters, stretches, keys, lowest, shift, mask, digits, moved)
     """Scatter the keys by digit.
 
     Args:
-        counters: For sharing; entry 1 must be 0.
+        counters: Work counters for dynamic scheduling; entry 1 must be 0.
         stretches, keys, lowest, shift, mask: As for :func:`count_digits`.
-        digits: Places; they are counted up.
+        digits: Offsets, which are incremented.
         moved: Out.
     """
     while True:

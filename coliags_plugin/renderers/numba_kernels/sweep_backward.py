@@ -79,7 +79,7 @@ def sweep_backward(
     """Compute the gradient sums over the pixels of each entry.
 
     Args:
-        counters: For sharing; entries 0 and 1 must be 0.
+        counters: Work counters for dynamic scheduling; entries 0 and 1 must be 0.
         projections, bins, composited: As the forward sweep left them.
         view: See ``layout``.
         grid: The image and its tiles.
@@ -148,7 +148,7 @@ def _copy_from_image(image, depth, channel, tile, grid, vector, state):
 
 @part
 def _prepare_tile(tile, channels, view, has_depth, composited, state):
-    """From derivatives with respect to images to those with respect to sums, and to what all of a pixel shows."""
+    """Turn derivatives with respect to images into those with respect to sums, and initialise the running difference."""
     size = 16 * (1 + len(channels))
     background = broadcast_all(view, layout.VIEW_BACKGROUND, (0, 0, 0))
     for block in range(layout.BLOCKS):

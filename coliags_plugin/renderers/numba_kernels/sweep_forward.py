@@ -1,6 +1,6 @@
-"""Compositing, tile by tile and block by block, front to back.
+"""Forward pass of compositing, tile by tile and block by block, front to back.
 
-A block of 4 x 4 pixels is one vector, and what a block has gathered stays in registers while its Gaussians pass. The
+A block of 4 x 4 pixels is one vector, and its accumulators stay in registers while its Gaussians are composited. The
 formulas are those of ``docs/rendering.md``, section "Compositing".
 """
 
@@ -66,7 +66,7 @@ def sweep_forward(counters, projections, bins, view, grid, extras, channels, med
     """Composite all tiles.
 
     Args:
-        counters: For sharing; entries 0 and 1 must be 0.
+        counters: Work counters for dynamic scheduling; entries 0 and 1 must be 0.
         projections, bins: What projection and binning wrote; ``bins.reached`` is written here.
         view: See ``layout``.
         grid: The image and its tiles.
@@ -128,8 +128,8 @@ def _sweep_tile(tile, projections, bins, view, grid, channels, median, rows, sta
 def _list_by_block(count, blocks, listed, counts):
     """List the rows of a chunk that touch each block, front to back.
 
-    Without a branch, for none could be foreseen, and four blocks at a time: every row is written to every list, and
-    stays there where the list grows.
+    Branch-free, as branches would be unpredictable, and four blocks at a time: every row is written to every list, and
+    kept where the length of the list is incremented.
 
     Args:
         count: Entries of the chunk.
@@ -197,7 +197,7 @@ def _sweep_block(block, count, listed, rows, channels, median, view, state):
 
 @part
 def _finish_tile(tile, channels, view, has_depth, state, composited):
-    """Keep what the blocks have gathered in ``composited``; then add the background, and divide depth by alpha."""
+    """Store the blocks' sums in ``composited``; then add the background, and divide depth by alpha."""
     size = 16 * (1 + len(channels))
     background = broadcast_all(view, layout.VIEW_BACKGROUND, (0, 0, 0))
     for block in range(layout.BLOCKS):
