@@ -1,4 +1,4 @@
-"""The ``coliags`` command: one small file per subcommand; nothing heavy is imported before a command runs."""
+"""The ``coliags`` command line, one module per subcommand; heavy libraries are imported when a command runs."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ Command = (
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
 )
 
-DESCRIPTION = "Gaussian splatting for colonoscopy: reconstruct, compare, take the result away."
+DESCRIPTION = "Gaussian splatting for colonoscopy: training, evaluation and comparison of reconstruction methods."
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of the ``coliags`` script. Exits with 0, 2 (bad input), 1 (failure) or 130 (interrupted)."""
     # OpenMP threads spin for milliseconds while they wait, which stalls a busy machine: beside other jobs on two cores,
-    # decoding took up to 2000 ms instead of 40. A short spin keeps the speed of a quiet machine and loses little on a
+    # decoding took up to 2000 ms instead of 40. A short spin keeps the speed of an idle machine and loses little on a
     # busy one. It is read when torch is first imported.
     os.environ.setdefault("GOMP_SPINCOUNT", "10000")
     try:
@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             args=argv,
             config=(tyro.conf.FlagCreatePairsOff,),
         )
-    except BrokenPipeError:  # the reader of the help has gone, as `head` does
+    except BrokenPipeError:  # the reader of the help has closed the pipe, as `head` does
         sys.stderr.close()
         sys.exit(1)
     sys.exit(run_command(command))

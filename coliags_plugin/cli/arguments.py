@@ -1,4 +1,4 @@
-"""Arguments that several commands share, and how they are written."""
+"""Argument types and parsers shared by several commands."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import tyro
 
 from coliags_plugin.core.errors import InputError
 
-#: ``--set key=value``, as often as needed.
+#: ``--set key=value``, repeatable.
 Assignments = Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="KEY=VALUE"), tyro.conf.UseAppendAction]
 
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH")]
 OptionalText = Annotated[str | None, tyro.conf.arg(metavar="TEXT")]
-#: Name of a data manager; None: found out from the files.
+#: Name of a data manager; None: recognised from the files.
 DataFormat = Annotated[str | None, tyro.conf.arg(name="format", metavar="NAME")]
 OptionalInt = Annotated[int | None, tyro.conf.arg(metavar="INT")]
 
@@ -23,7 +23,7 @@ def parse_size(text: str) -> tuple[int, int]:
     """``WxH`` -> (width, height), pixels.
 
     Raises:
-        InputError: It is something else.
+        InputError: The text has another form.
     """
     width, _, height = text.lower().partition("x")
     if not (width.isdecimal() and height.isdecimal()):
@@ -35,7 +35,7 @@ def parse_vector(option: str, text: str) -> tuple[float, float, float]:
     """``X,Y,Z`` -> three numbers.
 
     Raises:
-        InputError: It is something else.
+        InputError: The text has another form.
     """
     try:
         x, y, z = (float(part) for part in text.split(","))

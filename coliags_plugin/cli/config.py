@@ -1,4 +1,4 @@
-"""``coliags config show``: a method config, resolved."""
+"""``coliags config show``: print a resolved method config."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Config:
     method: tyro.conf.Positional[str]
     """Name of a method or path of a YAML file."""
     origin: bool = False
-    """Say behind each value which file and line, option or default it comes from."""
+    """Also print the file and line, option or default that each value comes from."""
     set: Assignments = ()
     """Change a value, as for train."""
 

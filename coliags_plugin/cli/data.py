@@ -1,4 +1,4 @@
-"""``coliags data check``: what a scene is, and whether its parts agree."""
+"""``coliags data check``: check the consistency of a scene's images, poses, depth and calibration."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from coliags_plugin.cli.arguments import Assignments, DataFormat, OptionalPath
 
 @dataclass(frozen=True)
 class Data:
-    """Say what a scene holds and whether pictures, poses, depth and calibration agree; exit status 1 if suspect."""
+    """Describe a scene and check that images, poses, depth and calibration agree; exit status 1 if suspect."""
 
     action: tyro.conf.Positional[Literal["check"]]
     """What to do."""
@@ -23,14 +23,14 @@ class Data:
     format: DataFormat = None
     """How the scene is laid out (`coliags list datamanagers`); default: what its files show."""
     html: OptionalPath = None
-    """Also write one page with pictures and the trajectory."""
+    """Also write an HTML page with images and the trajectory."""
     json: OptionalPath = None
-    """Also write the same facts for a program."""
+    """Also write the results as JSON."""
     set: Assignments = ()
     """An option of the data manager, for instance split=block."""
 
     def run(self) -> None:
-        """Print what was found."""
+        """Run the checks and print the results."""
         from coliags_plugin.core.files import write_json
         from coliags_plugin.data_check.check import check_scene
         from coliags_plugin.data_check.page import write_check_page

@@ -1,4 +1,4 @@
-"""``coliags doctor``: what this machine has, and what would be used."""
+"""``coliags doctor``: report versions, devices and the renderer in use."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Doctor:
-    """Say which versions and devices are here, and which renderer would be used and why."""
+    """Report versions and devices, and which renderer would be used and why."""
 
     def run(self) -> None:
-        """Print the findings; exit with status 1 where something needed is missing."""
+        """Print the findings; exit with status 1 where a requirement is missing."""
         import sys
 
         from coliags_plugin.engine.doctor import examine

@@ -1,4 +1,4 @@
-"""``coliags eval``: figures of a run's held-out views."""
+"""``coliags eval``: evaluate a run on its held-out frames."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from coliags_plugin.cli.arguments import OptionalPath, OptionalText
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Take the figures of a run's held-out views under a protocol."""
+    """Evaluate a run on its held-out frames under a protocol."""
 
     path: tyro.conf.Positional[Path]
     """Run folder."""
@@ -22,10 +22,10 @@ class Evaluate:
     data: OptionalPath = None
     """The scene's folder, where it has moved since training."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where to compute."""
+    """Device to compute on."""
 
     def run(self) -> None:
-        """Evaluate, print a table, and say where the figures are."""
+        """Evaluate, print a table, and print the path of the metrics."""
         import json
 
         from rich.console import Console
@@ -33,12 +33,12 @@ class Evaluate:
         from coliags_plugin.engine.backends import choose_device
         from coliags_plugin.engine.evaluator import evaluate
         from coliags_plugin.engine.trained import load_trained
-        from coliags_plugin.reporting.metrics_table import figures_table
+        from coliags_plugin.reporting.metrics_table import metrics_table
 
         trained = load_trained(self.path, choose_device(self.device), self.data)
         folder = evaluate(trained, self.protocol or trained.config.protocol)
         summary = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
-        Console().print(figures_table(summary))
+        Console().print(metrics_table(summary))
         for reason in dict.fromkeys(summary["reasons"].values()):
             names = [name for name, text in summary["reasons"].items() if text == reason]
             print(f"{', '.join(names)}: {reason}")

@@ -1,4 +1,4 @@
-"""``coliags list``: what there is to choose from."""
+"""``coliags list``: list methods and components."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class List:
     """A kind (methods, datamanagers, fields, renderers, ...); default: all of them."""
 
     def run(self) -> None:
-        """Print names by kind, with where they come from unless built in."""
+        """Print names by kind, with the source of those that are not built in."""
         from coliags_plugin.config.method_files import method_descriptions
         from coliags_plugin.config.registry import REGISTRIES
         from coliags_plugin.core.errors import InputError, did_you_mean

@@ -1,4 +1,4 @@
-"""``coliags phantom``: write a synthetic colon."""
+"""``coliags phantom``: generate a synthetic colon dataset."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from coliags_plugin.phantom.layouts import LayoutName
 
 @dataclass(frozen=True)
 class Phantom:
-    """Write a synthetic, physically lit colon with exact truth, in the layout of a data set."""
+    """Generate a synthetic, physically lit colon with exact ground truth, in the layout of a dataset."""
 
     output: tyro.conf.Positional[Path]
-    """Folder to make."""
+    """Folder to create."""
     seed: int = 0
-    """The whole phantom follows from it."""
+    """Random seed of the whole phantom."""
     layout: LayoutName = "c3vd"
     """Files and folders to write; docs/phantom.md 5 lists the layouts."""
     trajectory: Literal["pullback", "rotation"] = "pullback"
@@ -37,14 +37,14 @@ class Phantom:
     polyps: int = 4
     """Sessile polyps, 3 to 10 mm wide."""
     rotation_views: int = 12
-    """Extra test views turned 15 to 30 degrees beyond the path; none in layouts without a place for them."""
+    """Extra test views turned 15 to 30 degrees off the path; none in layouts that cannot store them."""
     set: Assignments = ()
     """Any other phantom setting, for instance roughness=0.4 (docs/phantom.md 6 lists them)."""
     overwrite: bool = False
     """Replace the output folder where it exists."""
 
     def run(self) -> None:
-        """Generate and say where."""
+        """Generate the dataset and print its path."""
         from coliags_plugin.config.yaml_tree import parse_value
         from coliags_plugin.core.errors import InputError
         from coliags_plugin.engine.progress import progress_callback

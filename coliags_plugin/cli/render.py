@@ -1,4 +1,4 @@
-"""``coliags render``: pictures and a video of a run."""
+"""``coliags render``: render images and a video of a run."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from coliags_plugin.cli.arguments import OptionalPath
 
 @dataclass(frozen=True)
 class Render:
-    """Write rgb, depth and error pictures of a run, and a video of its trajectory."""
+    """Render rgb, depth and error images of a run, and a video along its trajectory."""
 
     path: tyro.conf.Positional[Path]
     """Run folder."""
     output: OptionalPath = None
-    """Folder to make; default RUN/renders."""
+    """Folder to create; default RUN/renders."""
     frames: str = "test"
     """Which frames: train, all, or the name of a test set."""
     video: bool = True
     """Also write trajectory.mp4, rgb beside depth."""
     fps: float = 15.0
-    """Frames a second of the video."""
+    """Frames per second of the video."""
     data: OptionalPath = None
     """The scene's folder, where it has moved since training."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where to compute."""
+    """Device to compute on."""
     overwrite: bool = False
     """Replace the output folder where it exists."""
 
     def run(self) -> None:
-        """Render, and say where."""
+        """Render and print the output folder."""
         from coliags_plugin.engine.backends import choose_device
         from coliags_plugin.engine.rendering import render_run
         from coliags_plugin.engine.trained import load_trained

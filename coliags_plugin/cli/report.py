@@ -1,4 +1,4 @@
-"""``coliags report``: runs side by side in one HTML file."""
+"""``coliags report``: compare runs in one HTML file."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from coliags_plugin.cli.arguments import OptionalText
 
 @dataclass(frozen=True)
 class Report:
-    """Put evaluated runs of one scene side by side in one self-contained HTML file."""
+    """Compare evaluated runs of one scene in one self-contained HTML file."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
     """Run folders, each evaluated with `coliags eval`."""
     output: Path = Path("report.html")
     """File to write."""
     protocol: str = "paper"
-    """Which evaluation to show."""
+    """Evaluation protocol to show."""
     frames: int = 4
-    """Held-out views to show from each test set."""
+    """Held-out frames to show per test set."""
     title: OptionalText = None
     """Heading; default: the scene."""
     note: OptionalText = None
     """A remark shown at the top."""
 
     def run(self) -> None:
-        """Write the report, and say where."""
+        """Write the report and print its path."""
         from coliags_plugin.reporting.html_report import write_report
 
         write_report(self.runs, self.output, self.protocol, self.frames, self.title, self.note)

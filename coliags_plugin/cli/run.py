@@ -1,4 +1,4 @@
-"""Running a command: its log, its errors, its exit status."""
+"""Execution of a command: logging, error reporting and exit status."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from coliags_plugin.core.errors import ReportedError
 
 
 class Runnable(Protocol):
-    """A parsed command."""
+    """Protocol of a parsed command."""
 
     def run(self) -> None:
-        """Do it."""
+        """Execute the command."""
 
 
 def run_command(command: Runnable) -> int:
-    """Run a command and turn what stops it into one line and an exit status."""
+    """Execute a command; reported errors become one line on stderr and an exit status."""
     from rich.console import Console
     from rich.logging import RichHandler
 

@@ -1,4 +1,4 @@
-"""``coliags train``: reconstruct a scene with a method."""
+"""``coliags train``: train a method on a scene."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from coliags_plugin.cli.arguments import Assignments, DataFormat, OptionalInt, O
 
 @dataclass(frozen=True)
 class Train:
-    """Reconstruct a scene with a method and write a run folder."""
+    """Train a method on a scene and write a run folder."""
 
     method: tyro.conf.Positional[str]
     """Name of a method (`coliags list methods`) or path of a YAML file."""
@@ -24,22 +24,22 @@ class Train:
     output: OptionalPath = None
     """Run folder; default runs/SCENE/METHOD/STAMP."""
     steps: OptionalInt = None
-    """Training steps; schedules are compressed to them. A resumed run keeps its own unless they are given."""
+    """Training steps; schedules are scaled to them. A resumed run keeps its own unless given."""
     seed: OptionalInt = None
-    """Seed of every random stream; default 0, and a resumed run's own."""
+    """Seed of all random generators; default 0, for a resumed run its own."""
     renderer: OptionalText = None
     """Renderer by name (`coliags list renderers`); default: the method's."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where to compute."""
+    """Device to compute on."""
     set: Assignments = ()
     """Change a value of the method config, for instance field.voxel_size=1.0."""
     resume: bool = False
-    """Go on from the run's latest checkpoint (without --output: of the newest run of this method on this scene)."""
+    """Continue from the run's latest checkpoint (without --output: the newest run of this method on this scene)."""
     overwrite: bool = False
     """Replace an existing run folder."""
 
     def run(self) -> None:
-        """Train, and say where the run is."""
+        """Train and print the run folder."""
         import logging
 
         from coliags_plugin.config.method_config import method_name

@@ -1,4 +1,4 @@
-"""The errors a user is meant to see."""
+"""Exceptions that are reported to the user."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from difflib import get_close_matches
 
 
 class ReportedError(Exception):
-    """The command line prints it as one line, without a traceback, and exits with its status."""
+    """Error that the command line prints as one line, without a traceback; it exits with ``exit_status``."""
 
     exit_status = 1
 
 
 class InputError(ReportedError):
-    """Something the user gave cannot be used.
+    """Invalid input: a file, option or value that cannot be used.
 
     Args:
         seen: What was found, naming the file, key or value.
-        expected: What would have been right.
-        do: The next thing to try.
+        expected: What would have been valid.
+        do: What the user can do about it.
     """
 
     exit_status = 2
@@ -36,23 +36,29 @@ class InputError(ReportedError):
 
 
 class InterruptedRunError(ReportedError):
-    """The user asked to stop, and what was done is saved."""
+    """Training was interrupted by the user, after its state was saved."""
 
     exit_status = 130
 
 
 class NotFiniteError(ReportedError):
-    """A loss became NaN or infinite."""
+    """A loss or parameter became NaN or infinite."""
 
 
 class UnavailableError(Exception):
-    """A quantity cannot be had here (missing weights, missing truth); the text is the reason.
+    """A quantity cannot be computed (missing weights, missing ground truth); the message is the reason.
 
-    Not a fault: whoever asked records the reason beside a null.
+    Not a failure: the caller records null with the reason.
     """
 
 
+#: Former names of options and what they are called now ("Renamed options" in the changelog); hints name the new ones.
+RENAMED_OPTIONS = {"near": "near_plane", "far": "far_plane", "low_pass": "eps2d"}
+
+
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """The nearest known words as a hint, or an empty string."""
-    near = get_close_matches(word, list(known), n=1, cutoff=0.5)
-    return f"Did you mean '{near[0]}'?" if near else ""
+    """Hint that names the known word nearest to an unknown one; empty where none is near."""
+    words = list(known)
+    renamed = RENAMED_OPTIONS.get(word, "")
+    close = [renamed] if renamed in words else get_close_matches(word, words, n=1, cutoff=0.5)
+    return f"Did you mean '{close[0]}'?" if close else ""

@@ -1,4 +1,4 @@
-"""Writing without losing: every file and folder is written beside its place and then renamed."""
+"""Atomic writes: files and folders are written under a temporary name and then renamed."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from coliags_plugin.core.errors import InputError
 
 @contextmanager
 def atomic_folder(target: Path, overwrite: bool = False) -> Iterator[Path]:
-    """A scratch folder that takes the place of ``target`` when the block ends without an error.
+    """Temporary folder that is renamed to ``target`` when the block ends without an error.
 
     Args:
-        target: The folder to make. Its parents are made too.
-        overwrite: Replace what is there.
+        target: The folder to create, with its parents.
+        overwrite: Replace an existing folder.
 
     Raises:
         InputError: ``target`` exists and ``overwrite`` is off, or its parent cannot be written.
@@ -48,7 +48,7 @@ def atomic_folder(target: Path, overwrite: bool = False) -> Iterator[Path]:
 
 
 def atomic_write(target: Path, data: bytes | str) -> None:
-    """Write a file beside ``target``, then rename it there.
+    """Write a file under a temporary name, then rename it to ``target``.
 
     Raises:
         InputError: The folder cannot be written.
@@ -65,15 +65,15 @@ def atomic_write(target: Path, data: bytes | str) -> None:
 
 
 def write_json(target: Path, data: Any) -> None:
-    """Write JSON for people and programs; NaN is refused, so that any reader can read it."""
+    """Write indented JSON atomically; NaN and infinity are refused, as the JSON standard has neither."""
     atomic_write(target, json.dumps(data, indent=2, allow_nan=False) + "\n")
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and its parents.
+    """Create a folder and its parents.
 
     Raises:
-        InputError: It cannot be made.
+        InputError: It cannot be created.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -82,7 +82,7 @@ def make_folder(folder: Path) -> None:
 
 
 def not_writable(folder: Path, error: OSError) -> InputError:
-    """The error for a place that cannot be written."""
+    """The error for a folder that cannot be written."""
     return InputError(
         f"cannot write to {folder}: {error.strerror or error}", "a writable folder", "Choose another output"
     )

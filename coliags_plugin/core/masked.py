@@ -1,4 +1,4 @@
-"""Leaving pixels out: of values, of means, and of the gradients of both."""
+"""Masking of values and means, with exactly zero gradients at ignored pixels."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from torch import Tensor
 def zero_outside(values: Float[Tensor, "H W *C"], mask: Bool[Tensor, "H W"] | None) -> Float[Tensor, "H W *C"]:
     """The values where the mask is True, 0 elsewhere.
 
-    A choice, not a product: what lies outside may be NaN or infinite and still yields 0, and a gradient of exactly 0.
+    Selected with ``torch.where``, not multiplied: NaN or infinity outside still yields 0 and a gradient of exactly 0.
 
     Args:
         values: An image or a map. [H, W] or [H, W, C]
-        mask: False where a pixel is to be ignored; None keeps every pixel. [H, W]
+        mask: False where a pixel is ignored; None keeps every pixel. [H, W]
     """
     if mask is None:
         return values
@@ -25,13 +25,13 @@ def zero_outside(values: Float[Tensor, "H W *C"], mask: Bool[Tensor, "H W"] | No
 def masked_mean(values: Float[Tensor, "H W *C"], mask: Bool[Tensor, "H W"] | None) -> Float[Tensor, ""]:
     """Mean over the pixels (and channels) where the mask is True; 0, still part of the graph, where there are none.
 
-    A full mask gives the plain mean to the bit.
+    A full mask gives the unmasked mean to the bit.
 
     Args:
         values: An image or a map. [H, W] or [H, W, C]
-        mask: False where a pixel is to be ignored; None counts every pixel. [H, W]
+        mask: False where a pixel is ignored; None counts every pixel. [H, W]
     """
-    # Sums run in the order of memory, and a choice may lay its result out differently from its input.
+    # Sums run in memory order, and ``torch.where`` may lay its result out differently from its input.
     values = values.contiguous()
     if mask is None:
         return values.sum() / max(values.numel(), 1)

@@ -1,8 +1,8 @@
-"""How long jobs tell how far they are."""
+"""Type of the progress callbacks that long jobs call."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-#: Told what is being done, how much of it is done, and how much there is.
+#: Called with a description of the work, the number of units done, and their total.
 Progress = Callable[[str, int, int], None]

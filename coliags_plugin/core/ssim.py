@@ -1,4 +1,4 @@
-"""Structural similarity as the splatting papers compute it, with a mask that reaches inside the windows.
+"""Structural similarity (SSIM) as the splatting papers compute it, with masking inside the windows.
 
 An 11x11 Gaussian window of sigma 1.5 with zero padding, C1 = 0.01^2, C2 = 0.03^2, data range 1, per channel
 (docs/methods.md 2.4). Away from the border this is Wang et al. 2004, and scikit-image's ``structural_similarity`` with
@@ -33,7 +33,7 @@ def ssim(
     Args:
         rendered: In [0, 1]. [H, W, C]
         truth: In [0, 1]. [H, W, C]
-        mask: False where a pixel is to be ignored; None means every pixel counts. [H, W]
+        mask: False where a pixel is ignored; None means every pixel counts. [H, W]
     """
     return masked_mean(ssim_map(rendered, truth, mask), mask)
 
@@ -47,14 +47,14 @@ def ssim_map(
     up to the total that the window has without a mask. So an ignored pixel influences neither the value nor the
     gradient of any other; a window without ignored pixels is what it is without a mask, to the bit; and two equal
     images score 1 whatever the mask. (Setting ignored pixels to one common value in both images would do the first,
-    but would also put a strong edge that both share into all windows around them and so flatter the score there.)
-    The values at the ignored pixels themselves mean nothing: average with
+    but would also put a strong common edge into all windows around them and so raise the score there.) The values at
+    the ignored pixels themselves are meaningless: average with
     :func:`coliags_plugin.core.masked.masked_mean`.
 
     Args:
         rendered: In [0, 1]. [H, W, C]
         truth: In [0, 1]. [H, W, C]
-        mask: False where a pixel is to be ignored; None means every pixel counts. [H, W]
+        mask: False where a pixel is ignored; None means every pixel counts. [H, W]
 
     Raises:
         ValueError: The images differ in size.
@@ -62,8 +62,8 @@ def ssim_map(
     if rendered.shape != truth.shape or rendered.dim() != 3:
         raise ValueError(f"SSIM of images of shapes {tuple(rendered.shape)} and {tuple(truth.shape)}: both [H, W, C]")
     a, b = zero_outside(rendered, mask), zero_outside(truth, mask)
-    # Only the sum of the two variances is ever used, so one blur serves both. The truth is blurred apart, which spares
-    # the backward pass a blur of a gradient that nobody asked for.
+    # Only the sum of the two variances is used, so one blur serves both. The ground truth is blurred separately, which
+    # saves the backward pass the blur of a gradient that is not needed.
     mean_a, squares, products = _blur(torch.cat([a, a * a + b * b, a * b], dim=2)).chunk(3, dim=2)
     mean_b = _blur(b)
     if mask is not None:
@@ -77,20 +77,20 @@ def ssim_map(
 
 
 def _coverage_gain(mask: Bool[Tensor, "H W"], dtype: torch.dtype) -> Float[Tensor, "H W 1"]:
-    """By how much each window's weights grow to make up for its ignored pixels; 0 around an ignored pixel."""
+    """Factor that renormalises each window over its valid pixels; 0 at an ignored pixel. [H, W, 1]"""
     inside = mask[..., None]
     covered, whole = _blur(inside.to(dtype)), _blur(torch.ones_like(inside, dtype=dtype))
     return torch.where(inside, whole, 0.0) / torch.where(inside, covered, 1.0)
 
 
 def _blur(images: Float[Tensor, "H W C"]) -> Float[Tensor, "H W C"]:
-    """The Gaussian window with zero padding."""
+    """Gaussian blur with zero padding. [H, W, C]"""
     blurred: Tensor = _Blur.apply(images)  # type: ignore[no-untyped-call]
     return blurred
 
 
 class _Blur(torch.autograd.Function):
-    """The window is symmetric and the padding zero, so the blur is its own adjoint."""
+    """Blur with an analytic backward: with a symmetric window and zero padding it is its own adjoint."""
 
     @staticmethod
     def forward(ctx: Any, images: Tensor) -> Tensor:
@@ -102,7 +102,7 @@ class _Blur(torch.autograd.Function):
 
 
 def _blur_by_opencv(images: Float[Tensor, "H W C"]) -> Float[Tensor, "H W C"]:
-    """An eighth of the time of banded matrix products, and far less of ``conv2d``."""
+    """Blur by OpenCV on the CPU: an eighth of the time of banded matrix products, far less than ``conv2d``'s."""
     pixels = images.detach().contiguous().numpy()
     weights = _window().numpy()
     blurred = cv2.sepFilter2D(pixels, -1, weights, weights, borderType=cv2.BORDER_CONSTANT)
@@ -110,7 +110,7 @@ def _blur_by_opencv(images: Float[Tensor, "H W C"]) -> Float[Tensor, "H W C"]:
 
 
 def _blur_by_torch(images: Float[Tensor, "H W C"]) -> Float[Tensor, "H W C"]:
-    """The same on any device."""
+    """Blur by ``conv2d``, on any device."""
     weights = _window().to(images)
     planes = images.permute(2, 0, 1)[:, None]
     planes = conv2d(planes, weights[None, None, :, None], padding=(REACH, 0))
@@ -119,7 +119,7 @@ def _blur_by_torch(images: Float[Tensor, "H W C"]) -> Float[Tensor, "H W C"]:
 
 @lru_cache(maxsize=1)
 def _window() -> Float[Tensor, "11"]:
-    """The window along one axis."""
+    """The Gaussian window along one axis. [11]"""
     # Kept between calls, so it must not be an inference tensor: those cannot take part in a later backward pass.
     with torch.inference_mode(False):
         weights = torch.exp(-0.5 * ((torch.arange(2 * REACH + 1, dtype=torch.float64) - REACH) / SIGMA) ** 2)

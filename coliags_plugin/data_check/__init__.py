@@ -1,1 +1,1 @@
-"""What a scene is, and whether its pictures, poses, depth and calibration agree: ``coliags data check``."""
+"""Consistency checks of a dataset's images, poses, depth and calibration: ``coliags data check``."""

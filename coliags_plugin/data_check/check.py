@@ -1,4 +1,4 @@
-"""A scene looked at from all sides."""
+"""Runs all consistency checks on a scene."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from coliags_plugin.data_check.reprojection import Agreement, Pair, agreement, b
 
 @dataclass(frozen=True)
 class SceneCheck:
-    """What was found.
+    """Result of the consistency checks.
 
     Attributes:
-        scene: What was looked at.
-        pairs: The frames that were carried into one another.
-        depth, path, pictures: Figures; None where there is nothing to measure.
-        agreement: How frames with depth agree, by the reading of the poses.
-        scale: The factor on depth with which they agree best, and the relative depth error then.
-        matches: How matched features agree with the poses, by the reading; empty where depth tells more.
-        findings: What is suspect.
+        scene: The scene checked.
+        pairs: Source and target frames of the reprojection or matching.
+        depth, path, pictures: Statistics; None where there is nothing to measure.
+        agreement: Reprojection errors of frames with depth, by pose hypothesis.
+        scale: The factor on depth with the smallest reprojection error, and the relative depth error with it.
+        matches: Epipolar errors of matched features, by pose hypothesis; empty where there is depth.
+        findings: Suspected problems.
     """
 
     scene: Scene
@@ -50,7 +50,7 @@ class SceneCheck:
     findings: list[Finding]
 
     def as_json(self) -> dict[str, Any]:
-        """The same facts for a program; what cannot be had is null."""
+        """The same as JSON values; unavailable ones are null."""
         plain = {
             "scene": self.scene.name,
             "suspect": bool(self.findings),
@@ -70,11 +70,11 @@ class SceneCheck:
 
 
 def check_scene(scene: Scene, progress: Progress | None = None) -> SceneCheck:
-    """Look at a scene.
+    """Run all checks on a scene.
 
     Args:
-        scene: As a data manager gave it.
-        progress: Told how far the comparison of frames is.
+        scene: As loaded by a data manager.
+        progress: Called during the comparison of frames.
     """
     video = video_of(scene)
     looked = looked_at(video)
@@ -88,7 +88,7 @@ def check_scene(scene: Scene, progress: Progress | None = None) -> SceneCheck:
             readings[name] = agreement(with_depth, name)
         scale = best_scale(with_depth)
     else:
-        # A pixel off a line is little: farther frames show more.
+        # Epipolar errors grow with the baseline, so frames further apart are compared.
         pairs = video_pairs(video, farther=3)
         matches = match(pairs)
         found = {name: epipolar_agreement(matches, name) for name in CHANGES}

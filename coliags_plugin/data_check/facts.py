@@ -1,4 +1,4 @@
-"""What a scene holds, in figures."""
+"""Statistics of a scene's depth, camera path and images."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import torch
 
 from coliags_plugin.core.scenes import Frame, Scene
 
-#: Frames whose depth and colours are looked at, at most.
+#: Largest number of frames sampled for depth and image statistics.
 _LOOKED_AT = 64
 
 
 @dataclass(frozen=True)
 class DepthFacts:
-    """z-depth of the frames looked at, scene units; shares of the unmasked pixels."""
+    """z-depth of the sampled frames, scene units; shares of the unmasked pixels."""
 
     nearest: float
     median: float
@@ -28,7 +28,7 @@ class DepthFacts:
 
 @dataclass(frozen=True)
 class PathFacts:
-    """The way of the camera: lengths in scene units, turns in degrees."""
+    """Camera path: lengths in scene units, rotation in degrees."""
 
     length: float
     mean_step: float
@@ -41,7 +41,7 @@ class PathFacts:
 
 @dataclass(frozen=True)
 class PictureFacts:
-    """Colours of the frames looked at, grey levels; shares of the unmasked pixels."""
+    """Intensities of the sampled frames, grey levels; shares of the unmasked pixels."""
 
     mean: float
     darkest_frame: float
@@ -53,7 +53,7 @@ class PictureFacts:
 
 
 def looked_at(frames: Sequence[Frame]) -> list[Frame]:
-    """At most so many of the frames, evenly chosen."""
+    """Evenly spaced sample of the frames, at most 64."""
     places = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), _LOOKED_AT)).astype(int))
     return [frames[place] for place in places]
 
@@ -64,7 +64,7 @@ def video_of(scene: Scene) -> list[Frame]:
 
 
 def depth_facts(frames: Sequence[Frame]) -> DepthFacts | None:
-    """None where no frame has depth."""
+    """Depth statistics, None where no frame has depth."""
     known, pixels, clipped = [], 0, 0
     for frame in frames:
         depth, bound = frame.depth, frame.depth_at_least
@@ -84,13 +84,13 @@ def depth_facts(frames: Sequence[Frame]) -> DepthFacts | None:
 
 
 def path_facts(video: Sequence[Frame]) -> PathFacts | None:
-    """None where there are fewer than two frames."""
+    """Path statistics, None for fewer than two frames."""
     if len(video) < 2:
         return None
     poses = np.stack([frame.camera.camera_to_world.double().numpy() for frame in video])
     centers = poses[:, :3, 3]
     lengths = np.linalg.norm(np.diff(centers, axis=0), axis=1)
-    # Frames left out make a longer step, not a jump.
+    # Divided by the index difference, so that skipped frames do not look like jumps.
     steps = lengths / np.maximum(1, np.diff([frame.index for frame in video]))
     relative = poses[:-1, :3, :3].transpose(0, 2, 1) @ poses[1:, :3, :3]
     cosines = np.clip((np.trace(relative, axis1=1, axis2=2) - 1.0) / 2.0, -1.0, 1.0)
@@ -106,7 +106,7 @@ def path_facts(video: Sequence[Frame]) -> PathFacts | None:
 
 
 def picture_facts(frames: Sequence[Frame]) -> PictureFacts:
-    """Of frames in video order."""
+    """Image statistics of frames in video order."""
     means, over, masked, repeated = [], [], [], []
     before: torch.Tensor | None = None
     for frame in frames:

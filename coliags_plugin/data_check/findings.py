@@ -1,4 +1,4 @@
-"""What is suspect about a scene, with the figures that say so and what to do."""
+"""Rules that turn the measured statistics into suspected problems, with evidence and advice."""
 
 from __future__ import annotations
 
@@ -12,34 +12,34 @@ from coliags_plugin.data_check.hypotheses import ADVICE, GIVEN, NO_MOTION
 from coliags_plugin.data_check.matches import EpipolarAgreement
 from coliags_plugin.data_check.reprojection import Agreement
 
-#: Frames agree when their surfaces differ by no more than this part of the depth, in the median.
+#: Largest median depth difference of agreeing frames, relative to the depth.
 DEPTH_AGREES = 0.02
-#: Another reading is believed when it makes the error so many times smaller.
+#: A pose hypothesis is reported when it reduces the error by this factor.
 CLEARLY_BETTER = 2.0
-#: A factor on depth nearer to 1 than this says nothing.
+#: Factors on depth closer to 1 than this (in the logarithm) are ignored.
 SCALE_TOLERANCE = 0.1
-#: Share of pixels that must land in the other picture.
+#: Smallest share of pixels that must project into the other image.
 SHARE_LANDS = 0.3
-#: Matches agree with poses within this median distance, px.
+#: Largest median epipolar distance of matches that agree with the poses, px.
 EPIPOLAR_AGREES = 2.0
-#: Below this the pictures' own sharpness decides, px.
+#: Epipolar distances below this are limited by image sharpness, px.
 EPIPOLAR_SURE = 0.5
-#: Share of good matches that must lie in front of both cameras.
+#: Smallest share of good matches in front of both cameras.
 IN_FRONT = 0.6
-#: Steps beyond so many median ones are jumps.
+#: Steps longer than this many median steps are jumps.
 JUMP = 10.0
-#: What the renderers' default near plane hides, scene units.
+#: The renderers' default near plane, scene units.
 NEAR = 0.2
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One suspect thing.
+    """One suspected problem.
 
     Attributes:
-        what: In a few words.
-        evidence: The figures behind it.
-        do: The next thing to try.
+        what: Short description.
+        evidence: The numbers behind it.
+        do: What the user can do about it.
     """
 
     what: str
@@ -48,14 +48,14 @@ class Finding:
 
 
 def depth_findings(depth: DepthFacts | None) -> Iterator[Finding]:
-    """Depth that cannot be what it says."""
+    """Implausible depth: mostly unknown, constant, or in another unit."""
     if depth is None:
         return
     if depth.invalid_share > 0.5:
         yield Finding(
             "most of the depth is unknown",
             f"{depth.invalid_share:.0%} of the unmasked pixels",
-            "Check that the depth files belong to these pictures and are read with the right number of bits",
+            "Check that the depth files belong to these images and are read with the right number of bits",
         )
     if math.isnan(depth.median):
         return
@@ -63,7 +63,7 @@ def depth_findings(depth: DepthFacts | None) -> Iterator[Finding]:
         yield Finding(
             "depth is the same everywhere",
             f"{depth.nearest:.4g} to {depth.farthest:.4g}",
-            "Check the depth files: pictures of one value are what a failed export leaves",
+            "Check the depth files: images of one value are what a failed export leaves",
         )
     if depth.median < 1.0:
         yield Finding(
@@ -83,7 +83,7 @@ def depth_findings(depth: DepthFacts | None) -> Iterator[Finding]:
 def agreement_findings(
     readings: Mapping[str, Agreement], scale: tuple[float, float] | None, path: PathFacts | None
 ) -> Iterator[Finding]:
-    """Poses and depth that contradict each other, and the change that would set them right."""
+    """Contradictions of poses and depth, and the pose convention or unit that would resolve them."""
     given = readings.get(GIVEN)
     if given is None or path is None or path.length == 0.0:
         return
@@ -114,12 +114,12 @@ def agreement_findings(
         yield Finding(
             "frames do not agree on the surface",
             f"{told}; with no motion at all, {_percent(still)}",
-            "Check that pictures, depth and poses belong together frame by frame, and the calibration",
+            "Check that images, depth and poses belong together frame by frame, and the calibration",
         )
 
 
 def match_findings(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Finding]:
-    """Poses that features contradict."""
+    """Contradictions of poses and matched features."""
     given = readings.get(GIVEN)
     if given is None:
         return
@@ -142,20 +142,20 @@ def match_findings(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Findin
     if best is not None:
         reading = readings[best]
         yield Finding(
-            f"poses agree with the pictures when read as: {best}",
+            f"poses agree with the images when read as: {best}",
             f"as they are, {told}; read so, {reading.error:.2g} px, {reading.in_front:.0%} in front",
             ADVICE[best],
         )
     elif given.error > EPIPOLAR_AGREES or not in_front:
         yield Finding(
-            "pictures do not agree with the poses",
+            "images do not agree with the poses",
             told,
-            "Check that pictures and poses belong together frame by frame, and the calibration",
+            "Check that images and poses belong together frame by frame, and the calibration",
         )
 
 
 def path_findings(path: PathFacts | None) -> Iterator[Finding]:
-    """A camera that jumps or stands still."""
+    """Jumps and standstill of the camera."""
     if path is None:
         return
     if path.length == 0.0:
@@ -169,7 +169,7 @@ def path_findings(path: PathFacts | None) -> Iterator[Finding]:
 
 
 def calibration_findings(frames: Sequence[Frame]) -> Iterator[Finding]:
-    """Intrinsics of another picture size, mostly."""
+    """Implausible intrinsics, mostly those of another image size."""
     seen: set[tuple[float, ...]] = set()
     for frame in frames:
         camera = frame.camera
@@ -182,7 +182,7 @@ def calibration_findings(frames: Sequence[Frame]) -> Iterator[Finding]:
             yield Finding(
                 "the principal point is far from the middle",
                 f"{frame.name}: ({camera.cx:.4g}, {camera.cy:.4g}) of {camera.width} x {camera.height} px",
-                "Check that the intrinsics are for pictures of this size",
+                "Check that the intrinsics are for images of this size",
             )
         ratio = camera.fx / camera.fy
         if not 1 / 1.15 < ratio < 1.15:
@@ -196,18 +196,18 @@ def calibration_findings(frames: Sequence[Frame]) -> Iterator[Finding]:
             yield Finding(
                 "the view is no endoscope's",
                 f"{frame.name}: {angle:.3g} degrees across",
-                "Check the focal length and the picture size it is for",
+                "Check the focal length and the image size it is for",
             )
 
 
 def picture_findings(pictures: PictureFacts) -> Iterator[Finding]:
-    """Pictures that show nothing, or the same thing twice."""
+    """Black, overexposed, mostly masked or repeated images."""
     if pictures.darkest_frame < 4.0:
         yield Finding(
-            "a picture is black", f"{pictures.darkest_at}: mean {pictures.darkest_frame:.2g} of 255", "Leave it out"
+            "an image is black", f"{pictures.darkest_at}: mean {pictures.darkest_frame:.2g} of 255", "Leave it out"
         )
     if pictures.overexposed_share > 0.25:
-        yield Finding("pictures are overexposed", f"{pictures.overexposed_share:.0%} of the pixels are white", "")
+        yield Finding("images are overexposed", f"{pictures.overexposed_share:.0%} of the pixels are white", "")
     if pictures.masked_share > 0.75:
         yield Finding(
             "masks leave little",
@@ -217,11 +217,11 @@ def picture_findings(pictures: PictureFacts) -> Iterator[Finding]:
     if pictures.repeated:
         count = len(pictures.repeated)
         yield Finding(
-            "pictures repeat",
+            "images repeat",
             f"{pictures.repeated[0]}"
             + (f" and {count - 1} more equal" if count > 1 else " equals")
-            + " the picture before",
-            "Leave repeated pictures and their poses out: the video was captured at a higher rate than the scope's",
+            + " the image before",
+            "Leave repeated images and their poses out: the video was captured at a higher rate than the scope's",
         )
 
 

@@ -1,4 +1,4 @@
-"""What may be wrong with poses, as changes of them that would set it right."""
+"""Hypotheses of wrong pose conventions, as the transforms that would correct them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Change = Callable[[Float[Tensor, "4 4"]], Float[Tensor, "4 4"]]
 
 #: The poses as they are.
 GIVEN = "given"
-#: No motion at all: what poses must beat to say anything.
+#: Identity poses, the baseline that the given poses must beat.
 NO_MOTION = "no motion"
 
 
@@ -45,7 +45,7 @@ CHANGES: dict[str, Change] = {
     "camera axes y up, z backward": _flipped,
 }
 
-#: What to do where a change sets things right.
+#: Advice where a hypothesis fits.
 ADVICE = {
     "world-to-camera": "The poses look like world-to-camera transforms; write camera-to-world, their inverses",
     "rotation transposed": "The rotations look transposed: rows were taken for columns where the file was written",

@@ -1,4 +1,4 @@
-"""Scenes without depth: features matched between frames must lie on each other's epipolar lines, in front of both."""
+"""Epipolar check of poses without depth: matched features must lie on epipolar lines, in front of both cameras."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from jaxtyping import Float
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.data_check.hypotheses import CHANGES, GIVEN
 
-#: Matches a pair needs to say anything.
+#: Smallest number of matches of a usable pair.
 _ENOUGH = 8
-#: A match within so many pixels of its line speaks for the poses.
+#: Largest epipolar distance of a good match, px.
 _NEAR = 3.0
 
 
 @dataclass(frozen=True)
 class Matches:
-    """Features matched between two frames: (column, row), centres at integers + 0.5. [K, 2] each."""
+    """Matched features of two frames: (column, row), pixel centres at integers + 0.5. [K, 2] each."""
 
     source: Frame
     target: Frame
@@ -31,12 +31,12 @@ class Matches:
 
 @dataclass(frozen=True)
 class EpipolarAgreement:
-    """How well matches obey one reading of the poses.
+    """Agreement of matches with one pose hypothesis.
 
     Attributes:
         error: Median distance from the epipolar line, px.
-        in_front: Share of the matches near their line whose point lies in front of both cameras.
-        count: Matches.
+        in_front: Share of the good matches whose point lies in front of both cameras.
+        count: Number of matches.
     """
 
     error: float
@@ -45,7 +45,7 @@ class EpipolarAgreement:
 
 
 def match(pairs: Sequence[tuple[Frame, Frame]]) -> list[Matches]:
-    """Match SIFT features of local-contrast pictures, those that are each other's best; pairs with few are left out."""
+    """Mutual best matches of SIFT features on CLAHE images; pairs with few matches are left out."""
     import cv2
 
     detector: Any = cv2.SIFT.create(nfeatures=2000, contrastThreshold=0.01)
@@ -65,7 +65,7 @@ def match(pairs: Sequence[tuple[Frame, Frame]]) -> list[Matches]:
         mutual = [m for m in forward if back.get(m.trainIdx) == m.queryIdx]
         if len(mutual) < _ENOUGH:
             continue
-        # OpenCV counts centres at integers.
+        # OpenCV has pixel centres at integers.
         here = np.array([points[m.queryIdx].pt for m in mutual]) + 0.5
         there = np.array([points_there[m.trainIdx].pt for m in mutual]) + 0.5
         found.append(Matches(source, target, here, there))
@@ -73,7 +73,7 @@ def match(pairs: Sequence[tuple[Frame, Frame]]) -> list[Matches]:
 
 
 def epipolar_agreement(matches: Sequence[Matches], change: str = GIVEN) -> EpipolarAgreement | None:
-    """Judge matches by the poses as ``change`` reads them; None where there are none or the cameras do not move."""
+    """Epipolar errors under the hypothesis ``change``; None without matches or camera motion."""
     errors, in_front = [], []
     for pair in matches:
         judged = _judge(pair, change)
@@ -115,7 +115,7 @@ def _rays(pixels: np.ndarray, intrinsics: torch.Tensor) -> np.ndarray:
 
 
 def _in_front(turned: np.ndarray, there: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    """Whether ``a turned + translation = b there`` has a, b > 0, in the sense of least squares."""
+    """Whether the least-squares solution of ``a turned + translation = b there`` has a, b > 0. [K]"""
     aa, bb, ab = (turned**2).sum(1), (there**2).sum(1), (turned * there).sum(1)
     at, bt = turned @ translation, there @ translation
     determinant = np.maximum(aa * bb - ab**2, 1e-30)

@@ -1,4 +1,4 @@
-"""One page about a scene: what was found, what is suspect, and frames painted with one another."""
+"""HTML page of the consistency checks: statistics, findings, and frames reprojected into each other."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from coliags_plugin.data_check.facts import video_of
 from coliags_plugin.data_check.reprojection import carried_picture
 from coliags_plugin.data_check.text import fact_rows, reading_rows
 from coliags_plugin.outputs.charts import Series, line_chart
-from coliags_plugin.outputs.figures import depth_picture, rgb_error_picture
+from coliags_plugin.outputs.colormaps import depth_picture, rgb_error_picture
+from coliags_plugin.outputs.image_files import encode_png
 from coliags_plugin.outputs.page import fact_list, picture, record, table, write_page
-from coliags_plugin.outputs.pictures import encode_png
 
-#: Pairs that are shown.
+#: Number of pairs shown.
 _SHOWN = 3
 _AXES = "xyz"
 
 
 def write_check_page(check: SceneCheck, output: Path) -> None:
-    """Write the page.
+    """Write the HTML page of a check.
 
     Raises:
         InputError: ``output`` is a folder, or cannot be written.
@@ -87,7 +87,7 @@ def _pictures(check: SceneCheck) -> str:
 
 
 def _checkered(shown: torch.Tensor) -> torch.Tensor:
-    """Every other square, where there is something to show. [H, W]"""
+    """Checkerboard mask within the pixels shown. [H, W]"""
     height, width = shown.shape
     side = max(8, width // 10)
     rows, columns = torch.arange(height)[:, None] // side, torch.arange(width)[None] // side

@@ -1,4 +1,4 @@
-"""One frame's surface in another frame: where depth, poses and calibration agree, it lies on that frame's surface."""
+"""Reprojection check: the back-projected surface of one frame must lie on the surface seen in another."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.data_check.hypotheses import CHANGES, GIVEN, Change
 
-#: Pixels of a frame that are carried over at most.
+#: Largest number of pixels reprojected per frame.
 _PIXELS = 4000
-#: Pairs of frames looked at.
+#: Number of frame pairs.
 PAIRS = 12
-#: Factors on depth that are tried, before the best is refined.
+#: Factors on depth of the coarse search.
 _SCALES = np.logspace(-4.0, 4.0, 65)
-#: For those, every so-many-th pixel will do.
+#: Stride of the pixels used in that search.
 _THINNED = 8
-#: Share of pixels that must land in the other picture for a factor to count.
+#: Smallest share of pixels that project into the other image for a factor to count.
 _LAND = 0.2
 
 
 @dataclass(frozen=True)
 class Landing:
-    """Pixels of one frame, carried into another.
+    """Pixels of a source frame reprojected into a target frame.
 
     Attributes:
-        share: Share of the pixels that land in the other picture, in front of it.
-        depth_errors: |z - z there| / z there, of those that land on known depth. [K]
-        depth_errors_mm: |z - z there|, scene units. [K]
+        share: Share of the pixels that project into the target image, in front of its camera.
+        depth_errors: |z - z_target| / z_target, of those that hit known depth. [K]
+        depth_errors_mm: |z - z_target|, scene units. [K]
         color_errors: Mean absolute difference of the channels, grey levels, brightness matched. [K]
     """
 
@@ -44,11 +44,11 @@ class Landing:
 
 
 class Pair:
-    """Two frames with depth, one of which is carried into the other under several readings of their poses.
+    """Two frames with depth, the first of which is reprojected into the second under several pose hypotheses.
 
     Args:
-        source: The frame whose pixels are carried.
-        target: Where to.
+        source: The frame whose pixels are back-projected.
+        target: The frame that they are projected into.
     """
 
     def __init__(self, source: Frame, target: Frame) -> None:
@@ -63,12 +63,12 @@ class Pair:
         self._colors_there = target.image.reshape(-1, 3).double()
 
     def carried(self, change: Change, scale: float = 1.0, every: int = 1) -> Landing:
-        """Carry pixels over.
+        """Reproject the source's pixels.
 
         Args:
-            change: Of both poses.
+            change: Transform of both poses.
             scale: Factor on both depths.
-            every: Take only every so-many-th pixel.
+            every: Stride of the pixels used.
         """
         points = self._points[::every] * scale
         if not len(points):
@@ -93,13 +93,13 @@ class Pair:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well frames agree under one reading of the poses: medians over all pairs' pixels.
+    """Agreement of frames under one pose hypothesis: medians over the pixels of all pairs.
 
     Attributes:
-        depth_error: Relative, of z-depth; None where too little lands on known depth.
+        depth_error: Relative error of z-depth; None where no pixel hits known depth.
         depth_error_mm: The same in scene units.
         color_error: Grey levels.
-        share: Share of pixels that land in the other picture.
+        share: Share of pixels that project into the target image.
     """
 
     depth_error: float | None
@@ -109,12 +109,12 @@ class Agreement:
 
 
 def video_pairs(frames: Sequence[Frame], farther: int = 1, count: int = PAIRS) -> list[tuple[Frame, Frame]]:
-    """Frames a little apart: far enough that a wrong pose shows, near enough to see the same wall.
+    """Pairs of frames with a short baseline: long enough to reveal wrong poses, short enough to overlap.
 
     Args:
-        frames: Of the video.
-        farther: How many times the usual distance.
-        count: Pairs, at most.
+        frames: Frames of the video.
+        farther: Factor on the default distance in frames.
+        count: Largest number of pairs.
     """
     video = sorted(frames, key=lambda frame: frame.index)
     apart = min(farther * min(max(1, round(len(video) / 30)), 10), max(1, len(video) - 1))
@@ -125,7 +125,7 @@ def video_pairs(frames: Sequence[Frame], farther: int = 1, count: int = PAIRS) -
 
 
 def agreement(pairs: Sequence[Pair], change: str = GIVEN, scale: float = 1.0, every: int = 1) -> Agreement:
-    """Carry every pair's first frame into its second; the arguments are those of :meth:`Pair.carried`."""
+    """Reproject the first frame of every pair into the second; arguments as in :meth:`Pair.carried`."""
     landings = [pair.carried(CHANGES[change], scale, every) for pair in pairs]
     return Agreement(
         _median([landing.depth_errors for landing in landings]),
@@ -136,7 +136,7 @@ def agreement(pairs: Sequence[Pair], change: str = GIVEN, scale: float = 1.0, ev
 
 
 def best_scale(pairs: Sequence[Pair]) -> tuple[float, float] | None:
-    """The factor on depth with which frames agree best, and the relative depth error then; None where none does."""
+    """Factor on depth with the smallest reprojection error, and the relative depth error with it; None if none fits."""
 
     def error(scale: float) -> float:
         found = agreement(pairs, scale=float(scale), every=_THINNED)
@@ -153,7 +153,7 @@ def best_scale(pairs: Sequence[Pair]) -> tuple[float, float] | None:
 
 
 def carried_picture(source: Frame, target: Frame) -> tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"]]:
-    """The target's view painted with the source's colours, and where it could be: each pixel looked up by its depth."""
+    """The source image warped into the target view by the target's depth, and the mask of warped pixels."""
     depth = _known_depth(target)
     pixels, z = _changed(source.camera).project(_changed(target.camera).unproject(depth).reshape(-1, 3))
     camera = source.camera
@@ -164,7 +164,7 @@ def carried_picture(source: Frame, target: Frame) -> tuple[Float[Tensor, "H W 3"
         _known_depth(source)[None, None].nan_to_num(0.0), grid.nan_to_num(2.0), mode="nearest", align_corners=False
     )[0, 0]
     z = z.reshape(depth.shape)
-    # What another fold hides in the source picture has no colour there.
+    # Points occluded in the source image are left out.
     shown = (grid[0].abs() <= 1).all(-1) & (z > 0) & ((z_there - z).abs() < 0.05 * z)
     return painted / 255.0, shown
 
@@ -181,13 +181,13 @@ def _changed(camera: Camera, change: Change = CHANGES[GIVEN]) -> Camera:
 
 
 def _some(known: Bool[Tensor, "H W"]) -> Tensor:
-    """Flat places of known pixels, evenly thinned."""
+    """Flat indices of an even sample of the known pixels. [K]"""
     places = known.reshape(-1).nonzero()[:, 0]
     return places[:: max(1, len(places) // _PIXELS)]
 
 
 def _color_difference(colors: Tensor, colors_there: Tensor) -> Tensor:
-    """The lamp and the gain change between frames; so brightness is matched, channel by channel."""
+    """Mean absolute colour difference after matching the channels' medians, as lamp and gain change. [K]"""
     if not len(colors):
         return torch.zeros(0, dtype=torch.float64)
     factor = (colors_there.median(dim=0).values + 1.0) / (colors.median(dim=0).values + 1.0)

@@ -1,4 +1,4 @@
-"""What was found, in words and figures, for the terminal and the page."""
+"""Text of the check results, for the terminal and the HTML page."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any
 
 from coliags_plugin.data_check.check import SceneCheck
 
-#: What a reading of the poses did not answer.
+#: Cell of an unavailable value.
 _NONE = "-"
 
 
 def fact_rows(check: SceneCheck) -> Iterator[tuple[str, str]]:
-    """Named facts, the most telling first."""
+    """Names and values of the scene's statistics, the most important first."""
     scene = check.scene
     data = scene.provenance
     camera = scene.train[0].camera
@@ -23,10 +23,10 @@ def fact_rows(check: SceneCheck) -> Iterator[tuple[str, str]]:
     yield "split", str(data.get("split", {}).get("name", "unknown"))
     stored = data.get("stored_size")
     yield (
-        "picture size",
+        "image size",
         f"{camera.width} x {camera.height} px" + (f", stored {stored[0]} x {stored[1]}" if stored else ""),
     )
-    yield "lens", str(data["lens"]) if data.get("lens") else "pinhole pictures"
+    yield "lens", str(data["lens"]) if data.get("lens") else "pinhole images"
     angle = 2.0 * math.degrees(math.atan(0.5 * camera.width / camera.fx))
     yield (
         "calibration",
@@ -59,14 +59,14 @@ def fact_rows(check: SceneCheck) -> Iterator[tuple[str, str]]:
 
 
 def reading_rows(check: SceneCheck) -> tuple[list[str], list[list[str]]]:
-    """Head and rows of the table of readings of the poses; no rows where nothing could be compared."""
+    """Heading and rows of the table of pose hypotheses; no rows where nothing could be compared."""
     if check.agreement:
         head = [
             "poses read as",
             "depth error, %",
             "depth error, mm",
             "colour error, grey levels",
-            "lands in the picture, %",
+            "lands in the image, %",
         ]
         rows = [
             [
@@ -91,7 +91,7 @@ def reading_rows(check: SceneCheck) -> tuple[list[str], list[list[str]]]:
 
 
 def lines(check: SceneCheck) -> Iterator[str]:
-    """Everything, for a terminal."""
+    """All results as lines for the terminal."""
     yield from aligned([list(row) for row in fact_rows(check)])
     head, rows = reading_rows(check)
     if rows:
@@ -105,7 +105,7 @@ def lines(check: SceneCheck) -> Iterator[str]:
 
 
 def aligned(rows: list[list[str]]) -> Iterator[str]:
-    """Lines with their columns under one another."""
+    """Rows as lines with aligned columns."""
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     for row in rows:
         yield "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()

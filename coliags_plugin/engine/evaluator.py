@@ -19,8 +19,8 @@ from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.provenance import software
 from coliags_plugin.engine.scoring import Scorer, Scores, within_seen
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.outputs.figures import DEPTH_ERROR_LIMIT_MM, depth_error_picture
-from coliags_plugin.outputs.pictures import eight_bit, write_depth_tiff, write_png
+from coliags_plugin.outputs.colormaps import DEPTH_ERROR_LIMIT_MM, depth_error_picture
+from coliags_plugin.outputs.image_files import eight_bit, write_depth_tiff, write_png
 
 #: The main test set: its figures stand at the top of metrics.json.
 MAIN_SET = "test"

@@ -14,14 +14,14 @@ from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.outputs.figures import (
+from coliags_plugin.outputs.colormaps import (
     DEPTH_ERROR_LIMIT_MM,
     color_bar,
     depth_error_picture,
     depth_picture,
     rgb_error_picture,
 )
-from coliags_plugin.outputs.pictures import eight_bit, write_png
+from coliags_plugin.outputs.image_files import eight_bit, write_png
 from coliags_plugin.outputs.video import write_video
 
 #: Full scale of the colour error pictures, parts of full scale.

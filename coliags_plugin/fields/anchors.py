@@ -39,7 +39,7 @@ class AnchorFieldSettings(Settings):
     voxel_size: float | None = Option(default=None, gt=0)
     # Four pixels with ten children per anchor, about half of them transparent, put a Gaussian about every two pixels.
     voxel_pixels: float = Option(default=4.0, gt=0)
-    near: float = Option(default=0.2, ge=0)  # scene units; anchors wholly before it are not decoded
+    near_plane: float = Option(default=0.2, ge=0)  # scene units; anchors wholly before it are not decoded
 
 
 class AnchorField(GaussianField):
@@ -143,7 +143,7 @@ class AnchorField(GaussianField):
         """Anchors of which any child can touch the image; the others draw nothing. [V]"""
         reach = (self.offsets * self.scalings[:, None, :3].exp()).norm(dim=2).amax(dim=1)
         size = DRAWN_SIGMAS * self.scalings[:, 3:].amax(dim=1).exp()
-        inside = spheres_in_frustum(self.anchors, reach + size, camera, self.settings.near)
+        inside = spheres_in_frustum(self.anchors, reach + size, camera, self.settings.near_plane)
         return inside.nonzero().squeeze(1)
 
     def _distances(self, camera: Camera) -> Float[Tensor, "V"]:

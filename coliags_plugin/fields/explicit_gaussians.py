@@ -28,7 +28,7 @@ class ExplicitGaussiansSettings(Settings):
     sh_degree: int = Option(default=3, ge=0, le=spherical_harmonics.MAX_DEGREE)
     sh_every: int = Option(default=1000, ge=1)  # steps after which one more degree counts
     initial_opacity: float = Option(default=0.1, gt=0, lt=1)
-    near: float = Option(default=0.2, ge=0)  # scene units; Gaussians nearer are not looked at
+    near_plane: float = Option(default=0.2, ge=0)  # scene units; Gaussians nearer are not looked at
 
 
 class ExplicitGaussians(GaussianField):
@@ -115,4 +115,4 @@ class ExplicitGaussians(GaussianField):
     @torch.no_grad()
     def _visible(self, camera: Camera) -> Tensor:
         reach = DRAWN_SIGMAS * self.scales.amax(dim=1).exp()
-        return spheres_in_frustum(self.means, reach, camera, self.settings.near).nonzero().squeeze(1)
+        return spheres_in_frustum(self.means, reach, camera, self.settings.near_plane).nonzero().squeeze(1)

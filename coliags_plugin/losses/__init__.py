@@ -1,1 +1,1 @@
-"""Losses: scalar terms that training makes small."""
+"""Losses: the scalar terms that training minimises."""

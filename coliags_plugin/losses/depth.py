@@ -1,4 +1,4 @@
-"""How far the rendered depth is from the true one."""
+"""L1 loss of the rendered depth against a ground-truth depth map."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from coliags_plugin.contracts import Loss, LossSettings, TrainingStep
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.masked import masked_mean, zero_outside
 
-#: :data:`coliags_plugin.core.render_output.DEPTH_KINDS`, spelt out for the type checker; a test holds the two together.
+#: :data:`coliags_plugin.core.render_output.DEPTH_KINDS`, spelt out for the type checker; a test compares the two.
 DepthKind = Literal["depth_accumulated", "depth_expected", "depth_median", "inverse_depth_accumulated"]
 
 
@@ -24,7 +24,7 @@ class DepthL1Settings(LossSettings):
         default="depth_accumulated", description="Which rendered depth is compared; the paper's D is depth_accumulated."
     )
     empty_depth: float = Field(
-        default=100.0, gt=0.0, description="inverse_depth_accumulated only: depth of a pixel nothing was drawn on, mm."
+        default=100.0, gt=0.0, description="inverse_depth_accumulated only: depth of a pixel without Gaussians, mm."
     )
 
 
@@ -69,6 +69,6 @@ class DepthL1Loss(Loss):
 
 
 def _reciprocal(inverse_depth: Float[Tensor, "H W"], empty_depth: float) -> Float[Tensor, "H W"]:
-    """1/E where E > 0, else ``empty_depth``; chosen on both sides of the division so that no gradient becomes NaN."""
+    """1/E where E > 0, else ``empty_depth``; both operands are masked so that no gradient becomes NaN. [H, W]"""
     drawn = inverse_depth > 0
     return torch.where(drawn, 1.0 / torch.where(drawn, inverse_depth, 1.0), empty_depth)

@@ -1,4 +1,4 @@
-"""How far the rendered colours are from the picture."""
+"""Photometric losses of the rendered against the ground-truth image: L1 and D-SSIM."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class L1Loss(Loss):
 class DSSIMLoss(Loss):
     """1 - SSIM over valid pixels (the paper's L_D-SSIM; docs/methods.md 2.4, 4.1).
 
-    Ignored pixels are kept out of the windows too, see :func:`coliags_plugin.core.ssim.ssim_map`.
+    Ignored pixels do not enter the windows either, see :func:`coliags_plugin.core.ssim.ssim_map`.
     """
 
     Settings: ClassVar[type[LossSettings]] = LossSettings

@@ -1,4 +1,4 @@
-"""Regularization of the volume of Gaussians."""
+"""Regularization loss on the volume of the Gaussians."""
 
 from __future__ import annotations
 
@@ -20,6 +20,6 @@ class ScaleVolumeLoss(Loss):
     needs_splats: ClassVar[bool] = True
 
     def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
-        """The unweighted term; 0 where the view has no Gaussians."""
+        """The unweighted term; 0 where the camera sees no Gaussians."""
         scales = step.output.drawn.gaussians.scales
         return scales.prod(dim=-1).sum() / max(len(scales), 1)

@@ -1,4 +1,4 @@
-"""How far the rendered depth is from depth known at single points."""
+"""L1 loss of the rendered depth against sparse depth, such as that of structure-from-motion points."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class SparseDepthSettings(LossSettings):
     huber: float | None = Field(
         default=None,
         gt=0.0,
-        description="Differences below this, scene units, count by their square (over twice this), so that noise of "
-        "that size pulls less; null counts all by their length.",
+        description="Huber threshold, scene units: smaller differences count by their square over twice this; null: "
+        "absolute differences.",
     )
 
 
@@ -32,9 +32,8 @@ class SparseDepthLoss(Loss):
     """Mean |D(p) - z| in scene units over the points p of a frame whose z-depth is known (docs/methods.md 4.5).
 
     The idea is DS-NeRF's (Deng et al., "Depth-supervised NeRF: Fewer Views and Faster Training for Free", CVPR 2022):
-    structure from motion has already found how far its points are. D is interpolated between the four pixels around a
-    point; at the picture's border those that are there stand for those that are not. A point counts where all pixels
-    that enter are valid and show something (alpha > 0).
+    structure from motion already gives the depth of its points. D is interpolated bilinearly at a point, with border
+    pixels replicated. A point counts where all pixels that enter are valid and have alpha > 0.
     """
 
     Settings: ClassVar[type[LossSettings]] = SparseDepthSettings
@@ -66,14 +65,14 @@ class SparseDepthLoss(Loss):
 def _interpolated(
     values: Float[Tensor, "H W"], usable: Bool[Tensor, "H W"], points: SparseDepth
 ) -> tuple[Float[Tensor, "K"], Bool[Tensor, "K"]]:
-    """A map at points between its pixels, and whether all pixels that enter a point are usable.
+    """Bilinear samples of a map at points, and whether all pixels that enter a sample are usable.
 
-    What is not usable may be NaN; it moves no value and no gradient. Points outside the map count as not usable.
+    Unusable pixels may be NaN; they affect no value and no gradient. Points outside the map count as not usable.
     """
     height, width = values.shape
     size = points.pixels.new_tensor([width, height])
     inside = ((points.pixels >= 0) & (points.pixels <= size)).all(dim=1)
-    # Centres at integers now; beyond the outermost centres the map goes on as it ends.
+    # Pixel centres at integers from here on; the border is replicated.
     place = torch.minimum((torch.where(inside[:, None], points.pixels, 0.5) - 0.5).clamp_min(0.0), size - 1)
     corner = torch.minimum(place.floor(), (size - 2).clamp_min(0))
     share = (place - corner).to(values.dtype)

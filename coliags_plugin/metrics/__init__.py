@@ -1,1 +1,1 @@
-"""Metrics and the protocols that say how they are measured."""
+"""Image and depth metrics, and the evaluation protocols that fix how they are computed."""

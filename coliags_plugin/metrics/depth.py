@@ -1,6 +1,6 @@
-"""How far the rendered depth is from the true one, mm.
+"""Depth error metrics of a rendered depth map against ground truth.
 
-All figures are over the pixels of ``Comparison.depth_valid`` in float64, without aligning scale or shift.
+All are computed over the pixels of ``Comparison.depth_valid`` in float64, mm, without aligning scale or shift.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch import Tensor
 from coliags_plugin.contracts import Comparison, Metric
 from coliags_plugin.core.errors import UnavailableError
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.metrics.depth_steps import depth_steps, near
+from coliags_plugin.metrics.depth_steps import depth_steps, dilated
 
 
 class DepthSettings(Settings):
@@ -24,14 +24,14 @@ class DepthSettings(Settings):
 
 
 class DepthMetric(Metric):
-    """What all depth metrics share: which pixels count, and what makes the figure unavailable."""
+    """Base class of the depth metrics: pixel selection and the reasons for an unavailable value."""
 
     Settings: ClassVar[type[Settings]] = DepthSettings
     higher_is_better: ClassVar[bool] = False
     unit: ClassVar[str] = "mm"
 
     def __call__(self, comparison: Comparison) -> float:
-        """The figure of one frame.
+        """The metric of one frame.
 
         Raises:
             UnavailableError: The frame has no true depth, no pixel counts, or the rendered depth is not finite.
@@ -46,32 +46,32 @@ class DepthMetric(Metric):
         broken = torch.isfinite(rendered).logical_not().sum()
         if broken:
             raise UnavailableError(f"the rendered depth is not finite at {int(broken)} pixels")
-        return float(self.figure(rendered, truth))
+        return float(self.error(rendered, truth))
 
     def select(self, truth: Float[Tensor, "H W"], counts: Bool[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
-        """Which of the pixels that count this metric looks at: all, unless overridden. At least one."""
+        """Mask of the pixels that enter the metric: all valid ones unless overridden; at least one. [H, W]"""
         return counts
 
     @abstractmethod
-    def figure(self, rendered: Float[Tensor, "P"], truth: Float[Tensor, "P"]) -> Float[Tensor, ""]:
-        """The figure from the chosen pixels' depths, mm."""
+    def error(self, rendered: Float[Tensor, "P"], truth: Float[Tensor, "P"]) -> Float[Tensor, ""]:
+        """The metric over the selected pixels, whose depths are in mm."""
 
 
 class DepthMSE(DepthMetric):
     """Mean squared error, the paper's Depth MSE.
 
-    An edge metric: most of it comes from the few pixels beside depth steps. Read it beside the other depth figures.
+    Dominated by the few pixels beside depth steps; read it together with the other depth metrics.
     """
 
     unit: ClassVar[str] = "mm^2"
 
-    def figure(self, rendered: Float[Tensor, "P"], truth: Float[Tensor, "P"]) -> Float[Tensor, ""]:
+    def error(self, rendered: Float[Tensor, "P"], truth: Float[Tensor, "P"]) -> Float[Tensor, ""]:
         """Mean of (D - D_true)^2, mm^2."""
         return (rendered - truth).square().mean()
 
 
 class DepthMSEInnerSettings(Settings):
-    """What counts as a depth step, and how far its influence reaches."""
+    """Threshold of a depth step, and the width of the margin left out around it."""
 
     relative_step: float = Field(default=0.12, gt=0.0, description="(max - min) / min of a 3x3 window of true depth.")
     margin: int = Field(
@@ -80,18 +80,18 @@ class DepthMSEInnerSettings(Settings):
 
 
 class DepthMSEInner(DepthMSE):
-    """Mean squared error away from depth steps: how good the surfaces are, silhouettes left aside."""
+    """Mean squared error of the pixels away from depth steps, so without silhouettes."""
 
     Settings: ClassVar[type[Settings]] = DepthMSEInnerSettings
 
     def select(self, truth: Float[Tensor, "H W"], counts: Bool[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
-        """The pixels that count and lie further than ``margin`` from any step.
+        """Valid pixels further than ``margin`` from any depth step. [H, W]
 
         Raises:
             UnavailableError: There are none.
         """
         steps = depth_steps(truth, counts, self.settings.relative_step)
-        inner = counts & ~near(steps, self.settings.margin)
+        inner = counts & ~dilated(steps, self.settings.margin)
         if not inner.any():
             raise UnavailableError("no pixel of this frame lies away from depth steps")
         return inner
@@ -100,7 +100,7 @@ class DepthMSEInner(DepthMSE):
 class DepthRMSE(DepthMetric):
     """Root of the mean squared error."""
 
-    def figure(self, rendered: Float[Tensor, "P"], truth: Float[Tensor, "P"]) -> Float[Tensor, ""]:
+    def error(self, rendered: Float[Tensor, "P"], truth: Float[Tensor, "P"]) -> Float[Tensor, ""]:
         """Square root of the mean of (D - D_true)^2, mm."""
         return (rendered - truth).square().mean().sqrt()
 
@@ -108,16 +108,16 @@ class DepthRMSE(DepthMetric):
 class DepthMAE(DepthMetric):
     """Mean absolute error."""
 
-    def figure(self, rendered: Float[Tensor, "P"], truth: Float[Tensor, "P"]) -> Float[Tensor, ""]:
+    def error(self, rendered: Float[Tensor, "P"], truth: Float[Tensor, "P"]) -> Float[Tensor, ""]:
         """Mean of |D - D_true|, mm."""
         return (rendered - truth).abs().mean()
 
 
 class DepthMedianError(DepthMetric):
-    """Median absolute error: hardly moved by silhouettes and floaters."""
+    """Median absolute error, robust to silhouettes and floaters."""
 
-    def figure(self, rendered: Float[Tensor, "P"], truth: Float[Tensor, "P"]) -> Float[Tensor, ""]:
-        """Median of |D - D_true|, the mean of the middle two where their number is even, mm."""
+    def error(self, rendered: Float[Tensor, "P"], truth: Float[Tensor, "P"]) -> Float[Tensor, ""]:
+        """Median of |D - D_true|, the mean of the middle two for an even number of pixels, mm."""
         errors = (rendered - truth).abs().sort().values
         middle = len(errors) // 2
         return errors[middle] if len(errors) % 2 else (errors[middle - 1] + errors[middle]) / 2
@@ -128,7 +128,7 @@ class DepthAbsRel(DepthMetric):
 
     unit: ClassVar[str] = ""
 
-    def figure(self, rendered: Float[Tensor, "P"], truth: Float[Tensor, "P"]) -> Float[Tensor, ""]:
+    def error(self, rendered: Float[Tensor, "P"], truth: Float[Tensor, "P"]) -> Float[Tensor, ""]:
         """Mean of |D - D_true| / D_true.
 
         Raises:

@@ -1,4 +1,4 @@
-"""Where the true depth jumps: silhouettes of folds against the lumen behind them."""
+"""Detection of depth discontinuities in the ground truth: silhouettes of folds against the lumen behind them."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from torch.nn.functional import max_pool2d
 
 
 def depth_steps(depth: Float[Tensor, "H W"], known: Bool[Tensor, "H W"], relative_step: float) -> Bool[Tensor, "H W"]:
-    """Pixels whose 3x3 window holds a depth step: (max - min) / min of its known depths beyond a threshold.
+    """Mask of pixels whose 3x3 window holds a depth step: (max - min) / min of its known depths above a threshold.
 
-    Unknown pixels make no step themselves; two known surfaces on either side of one do.
+    Unknown pixels make no step themselves; two known surfaces on either side of one do. [H, W]
 
     Args:
         depth: z-depth, mm. [H, W]
-        known: Where the depth counts. [H, W]
+        known: True where the depth is known. [H, W]
         relative_step: Threshold, for instance 0.12.
     """
     farthest = _window_max(torch.where(known, depth, -torch.inf), 1)
@@ -23,11 +23,11 @@ def depth_steps(depth: Float[Tensor, "H W"], known: Bool[Tensor, "H W"], relativ
     return farthest - nearest > relative_step * nearest
 
 
-def near(marked: Bool[Tensor, "H W"], reach: int) -> Bool[Tensor, "H W"]:
-    """Pixels within ``reach`` rows and columns of a marked one, itself included."""
+def dilated(marked: Bool[Tensor, "H W"], reach: int) -> Bool[Tensor, "H W"]:
+    """The mask dilated by ``reach`` rows and columns. [H, W]"""
     return _window_max(marked.to(torch.float32), reach) > 0
 
 
 def _window_max(values: Float[Tensor, "H W"], reach: int) -> Float[Tensor, "H W"]:
-    """Maximum of the square window around every pixel; what lies outside the image counts as -infinity."""
+    """Maximum over the square window around every pixel; outside the image counts as -infinity. [H, W]"""
     return max_pool2d(values[None, None], kernel_size=2 * reach + 1, stride=1, padding=reach)[0, 0]

@@ -1,4 +1,4 @@
-"""How alike two pictures are, pixel by pixel and window by window."""
+"""Image quality metrics PSNR and SSIM."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class PSNRSettings(Settings):
 
 
 class PSNR(Metric):
-    """Peak signal-to-noise ratio, 10 log10(1 / mse), the error taken over all channels of the valid pixels together.
+    """Peak signal-to-noise ratio, 10 log10(1 / mse), the mse over all channels of the valid pixels together.
 
-    (The authors' in-training report averages one figure per channel instead; docs/methods.md 2.4.)
+    (The authors' in-training report averages one PSNR per channel instead; docs/methods.md 2.4.)
     """
 
     Settings: ClassVar[type[Settings]] = PSNRSettings
@@ -28,7 +28,7 @@ class PSNR(Metric):
     unit: ClassVar[str] = "dB"
 
     def __call__(self, comparison: Comparison) -> float:
-        """The figure of one frame, dB.
+        """PSNR of one frame, dB.
 
         Raises:
             UnavailableError: No pixel is valid, the rendered image is not finite, or the images are identical.
@@ -46,14 +46,14 @@ class SSIMSettings(Settings):
 
 
 class SSIM(Metric):
-    """Structural similarity of :func:`coliags_plugin.core.ssim.ssim`, ignored pixels kept out of the windows."""
+    """Structural similarity by :func:`coliags_plugin.core.ssim.ssim`; ignored pixels do not enter the windows."""
 
     Settings: ClassVar[type[Settings]] = SSIMSettings
     higher_is_better: ClassVar[bool] = True
     unit: ClassVar[str] = ""
 
     def __call__(self, comparison: Comparison) -> float:
-        """The figure of one frame, at most 1.
+        """SSIM of one frame, at most 1.
 
         Raises:
             UnavailableError: No pixel is valid, or the rendered image is not finite.
@@ -63,7 +63,7 @@ class SSIM(Metric):
 
 
 def require_image(comparison: Comparison) -> None:
-    """Refuse what no image metric can score.
+    """Raise where no image metric can be computed.
 
     Raises:
         UnavailableError: No pixel is valid, or a valid pixel of the rendered image is not finite.

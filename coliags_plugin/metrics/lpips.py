@@ -1,4 +1,4 @@
-"""Learned perceptual distance between two pictures."""
+"""LPIPS, a learned perceptual distance between two images."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ from coliags_plugin.metrics.lpips_weights import find_weights, load_network
 
 _log = logging.getLogger(__name__)
 
-# AlexNet's last tap still has one cell from 31 pixels on; below, none of the three nets says anything worth having.
+# AlexNet's last tap has one cell from 31 pixels on; smaller images give no meaningful value with any of the three.
 _SMALLEST = 32
 
 
 class LPIPSSettings(Settings):
-    """Which flavour of LPIPS: figures of different flavours cannot be compared."""
+    """Backbone and input range of LPIPS; values of different variants are not comparable."""
 
     net: Literal["vgg", "alex", "squeeze"] = Field(default="vgg", description="The backbone.")
     input_range: Literal["zero-one", "minus-one-one"] = Field(
         default="zero-one",
-        description="What the net is fed. LPIPS was made for minus-one-one; the tables of the splatting papers, this "
-        "one's included, feed [0, 1] unmapped.",
+        description="Range of the network's input. LPIPS was trained on minus-one-one; the splatting papers, this one "
+        "included, feed [0, 1] unmapped.",
     )
-    weights: str | None = Field(default=None, description="A folder to look for weights in before the usual places.")
+    weights: str | None = Field(default=None, description="A folder searched for weights before the default ones.")
 
 
 class LPIPS(Metric):
     """LPIPS v0.1 (Zhang et al. 2018; docs/methods.md 2.4) without torchvision.
 
-    Ignored pixels are black in both pictures, as outside an endoscope's aperture, and the distance is averaged over
-    what is left, so that nothing at an ignored pixel can move the figure.
+    Ignored pixels are black in both images, as outside an endoscope's aperture, and the distance is averaged over the
+    valid ones, so the content of an ignored pixel has no influence.
     """
 
     Settings: ClassVar[type[Settings]] = LPIPSSettings
@@ -55,11 +55,11 @@ class LPIPS(Metric):
             raise InputError(f"lpips: weights = '{settings.weights}' is not a folder", "a folder with LPIPS weights")
 
     def __call__(self, comparison: Comparison) -> float:
-        """The figure of one frame, 0 for equal pictures.
+        """LPIPS of one frame, 0 for equal images.
 
         Raises:
-            UnavailableError: The weights are not on this machine, the picture is too small or not finite, or no pixel
-                is valid.
+            UnavailableError: The weights are not on this machine, the image is too small or not finite, or no pixel is
+                valid.
         """
         require_image(comparison)
         height, width = comparison.valid.shape

@@ -21,13 +21,13 @@ TAPS: dict[str, dict[int, int]] = {
     "squeeze": {1: 64, 4: 128, 7: 256, 9: 384, 10: 384, 11: 512, 12: 512},
 }
 
-# LPIPS's own standardisation, made for images in [-1, 1].
+# LPIPS's own input normalisation, for images in [-1, 1].
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
 
 
 class LPIPSNetwork(nn.Module):
-    """Backbone and linear heads of one flavour, frozen.
+    """Frozen backbone and linear heads of one LPIPS variant.
 
     Args:
         net: A key of :data:`TAPS`.
@@ -35,7 +35,7 @@ class LPIPSNetwork(nn.Module):
         heads: One non-negative weight per channel and tap, in the order of the taps. Each [1, C, 1, 1]
 
     Raises:
-        RuntimeError: The backbone's weights do not fit; torch's text says which.
+        RuntimeError: The backbone's weights do not fit; the message names them.
     """
 
     def __init__(self, net: str, backbone: Mapping[str, Tensor], heads: list[Tensor]) -> None:
@@ -54,11 +54,11 @@ class LPIPSNetwork(nn.Module):
     def forward(
         self, first: Float[Tensor, "1 3 H W"], second: Float[Tensor, "1 3 H W"], mask: Bool[Tensor, "H W"]
     ) -> Float[Tensor, ""]:
-        """The distance: 0 for equal images.
+        """Distance between two images, 0 for equal ones.
 
         Args:
-            first: In the range the flavour wants. [1, 3, H, W]
-            second: Likewise. [1, 3, H, W]
+            first: In the input range of the variant. [1, 3, H, W]
+            second: In the same range. [1, 3, H, W]
             mask: Where the distance is averaged; at each tap, a cell counts by the share of it that is True. [H, W]
         """
         shares = mask.to(first.dtype)[None, None]
@@ -78,7 +78,7 @@ class LPIPSNetwork(nn.Module):
 
 
 def _unit(x: Float[Tensor, "1 C h w"]) -> Float[Tensor, "1 C h w"]:
-    """Every pixel's channels scaled to length 1."""
+    """Channels normalised to unit length at every pixel."""
     return x / (x.square().sum(dim=1, keepdim=True).sqrt() + 1e-10)
 
 
@@ -135,7 +135,7 @@ def _squeezenet() -> nn.Sequential:
 
 
 class Fire(nn.Module):
-    """SqueezeNet's block: squeeze by 1x1, expand by 1x1 and 3x3 side by side.
+    """SqueezeNet's fire module: a 1x1 squeeze, then 1x1 and 3x3 expansions in parallel.
 
     Args:
         inputs: Channels in.

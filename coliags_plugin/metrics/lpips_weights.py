@@ -1,4 +1,4 @@
-"""Finding and reading the weights of LPIPS on this machine. Nothing is ever downloaded."""
+"""Search for and loading of LPIPS weights on this machine. Nothing is ever downloaded."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from coliags_plugin.metrics.lpips_network import TAPS, LPIPSNetwork
 
 WEIGHTS_VARIABLE = "COLIAGS_LPIPS_WEIGHTS"
 
-#: What torchvision's weights are called where torch keeps its downloads; the second names are older copies of the same.
+#: File names of torchvision's weights in torch's download folder; the second names are older copies of the same.
 BACKBONE_FILES: dict[str, tuple[str, ...]] = {
     "vgg": ("vgg16-397923af.pth",),
     "alex": ("alexnet-owt-7be5be79.pth", "alexnet-owt-4df8aa71.pth"),
@@ -25,15 +25,15 @@ BACKBONE_FILES: dict[str, tuple[str, ...]] = {
 
 
 def find_weights(net: str, folder: str | None = None) -> tuple[Path, Path]:
-    """The files of backbone and linear heads.
+    """Paths of the backbone and linear head weights.
 
-    Looked for in ``folder``, then in the folder that ``COLIAGS_LPIPS_WEIGHTS`` names, then where ``torch.hub`` keeps
+    Searched in ``folder``, then in the folder that ``COLIAGS_LPIPS_WEIGHTS`` names, then where ``torch.hub`` keeps
     downloads, and the heads also in an installed ``lpips`` package. A backbone is a file under torchvision's name, or
     any ``.pth`` with the net's name and "backbone" in its own; heads are ``{net}.pth`` or ``lpips_{net}.pth``, directly
     or in ``v0.1/``.
 
     Raises:
-        UnavailableError: One is missing; says what was looked for and where.
+        UnavailableError: One is missing; names the file and the folders searched.
     """
     folders = list(_folders(folder))
     backbone = next((file for place in folders for file in _backbones(net, place)), None)
@@ -55,7 +55,7 @@ def find_weights(net: str, folder: str | None = None) -> tuple[Path, Path]:
 
 
 def load_network(net: str, backbone: Path, heads: Path) -> LPIPSNetwork:
-    """The network with these weights.
+    """Load the network with these weights.
 
     Raises:
         UnavailableError: A file cannot be read or holds something else.

@@ -1,4 +1,4 @@
-"""Evaluation protocols: everything that decides what a figure means, under one name and version.
+"""Evaluation protocols: all choices that define a metric, under one name and version.
 
 A protocol's name and version are written into every result; results whose name or version differ are not comparable.
 ``docs/protocols.md`` sets the protocols side by side.
@@ -15,18 +15,18 @@ import torch
 from coliags_plugin.contracts import Comparison, Protocol
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.metrics.roundtrips import through_8_bit, through_16_bit
+from coliags_plugin.metrics.quantization import through_8_bit, through_16_bit
 
 MetricTable = Mapping[str, tuple[str, Mapping[str, Any]]]
 
-# The splatting papers' flavour: VGG fed [0, 1] unmapped (docs/methods.md 2.4).
+# The splatting papers' variant: VGG fed [0, 1] unmapped (docs/methods.md 2.4).
 _LPIPS_OF_THE_PAPERS = {"net": "vgg", "input_range": "zero-one"}
 
 
 class PaperProtocol(Protocol):
-    """The quantities the paper defines, measured without rounding and where there is something to measure.
+    """The metrics as the paper defines them, on float images and valid pixels.
 
-    Depth is Eq. 2's sum of w z; it is scored where the truth is known.
+    Depth is Eq. 2's sum of w z; it is scored where the ground truth is known.
     """
 
     name: ClassVar[str] = "paper"
@@ -41,7 +41,7 @@ class PaperProtocol(Protocol):
             "psnr": ("psnr", {}),
             "ssim": ("ssim", {}),
             "lpips": ("lpips", _LPIPS_OF_THE_PAPERS),
-            # Not in the paper: its weights are small enough to come by where VGG's are not.
+            # Not in the paper: its weights are small and easier to obtain than VGG's.
             "lpips_squeeze": ("lpips", {"net": "squeeze", "input_range": "zero-one"}),
             "depth_mse": ("depth_mse", {}),
             "depth_mse_inner": ("depth_mse_inner", {}),
@@ -53,7 +53,7 @@ class PaperProtocol(Protocol):
     )
 
     def compare(self, output: RenderOutput, frame: Frame) -> Comparison:
-        """The rendered image clamped to [0, 1] and the rendered depth as it is, beside the frame."""
+        """Pair the rendered image, clamped to [0, 1], and the unchanged rendered depth with the frame."""
         image = Comparison(rgb=output.rgb.detach().clamp(0.0, 1.0), true_rgb=frame.rgb, valid=frame.valid)
         if frame.depth is None:
             return image
@@ -68,7 +68,7 @@ class PaperProtocol(Protocol):
 
 
 class AuthorsCodeProtocol(Protocol):
-    """The figures the authors' released code prints (docs/methods.md 5.4): through PNG files, and without any mask.
+    """The metrics as the authors' released code computes them (docs/methods.md 5.4): from PNG files, without a mask.
 
     The rendered depth is 1 / (sum w/z) through 16 bit over 150 mm; where nothing was drawn that is infinite, which the
     cast turns into 0. The true depth goes through 16 bit over 100 mm with unknown pixels at 0 and the sensor's clipped
@@ -97,7 +97,7 @@ class AuthorsCodeProtocol(Protocol):
     true_full_scale: ClassVar[float] = 100.0
 
     def compare(self, output: RenderOutput, frame: Frame) -> Comparison:
-        """Rendered and true image and depth as they come back from the files; every pixel counts."""
+        """Rendered and true image and depth as read back from the files; every pixel counts."""
         everywhere = torch.ones_like(frame.valid)
         image = Comparison(rgb=through_8_bit(output.rgb.detach()), true_rgb=through_8_bit(frame.rgb), valid=everywhere)
         if frame.depth is None:

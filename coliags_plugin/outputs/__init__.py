@@ -1,1 +1,1 @@
-"""Pictures, charts and video of what was rendered."""
+"""Image files, colour-mapped images, charts, video and HTML pages."""

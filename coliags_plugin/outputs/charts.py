@@ -1,6 +1,6 @@
-"""Line charts and colour bars as inline SVG, for a page that styles them.
+"""Line charts and colour bars as inline SVG, styled by the page.
 
-The SVG names CSS classes and never a colour, so one chart is readable on a light and on a dark page. The page defines
+The SVG uses CSS classes and no colours, so a chart is readable on a light and on a dark page. The page defines
 ``.chart .frame``, ``.grid``, ``.tick``, ``.axis`` and, for each series style, ``.s0`` to ``.s7`` with a ``color``;
 line, band and marker take the current colour. A ninth series takes the first colour again, dashed.
 """
@@ -12,15 +12,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
-from coliags_plugin.outputs.figures import ColorMap, color_table
-from coliags_plugin.outputs.scales import linear_ticks, log_ticks, tick_label
+from coliags_plugin.outputs.axis_ticks import linear_ticks, log_ticks, tick_label
+from coliags_plugin.outputs.colormaps import ColorMap, color_table
 
 COLORS = 8
 
 _WIDTH, _HEIGHT = 600, 300
 _LEFT, _RIGHT, _TOP, _BOTTOM = 68, 14, 12, 50
 _STOPS = 16
-#: Room for one tick label of the x axis, in the units of the view box.
+#: Width of one character of an x tick label, view box units.
 _LABEL_ROOM = 7.5
 
 
@@ -29,10 +29,10 @@ class Series:
     """One line of a chart.
 
     Attributes:
-        name: What a reader calls it.
-        style: Number of its colour, the same for one method in every chart of a page.
+        name: Label.
+        style: Colour index, the same for one method in every chart of a page.
         x: Increasing.
-        y: As many; what is not finite (or not positive on a logarithmic axis) interrupts the line.
+        y: As many; values that are not finite (or not positive on a logarithmic axis) interrupt the line.
         low: Lower edge of a band around the line, or empty.
         high: Upper edge of the band.
     """
@@ -59,15 +59,15 @@ def line_chart(
     x_names: Sequence[str] | None = None,
     markers: bool = False,
 ) -> str:
-    """A line chart with labelled axes, or an empty string where no series has a point to draw.
+    """SVG line chart with labelled axes, or an empty string where no series has a point to draw.
 
     Args:
         series: Lines over one x axis.
         x_label: Quantity and unit of the x axis.
         y_label: Quantity and unit of the y axis.
-        log_y: Logarithmic y axis.
+        log_y: Whether the y axis is logarithmic.
         x_names: For a categorical x axis: the names of x = 0, 1, ...
-        markers: A dot at every point, with its value as a tooltip.
+        markers: Whether to draw a dot with a tooltip at every point.
     """
     points = [
         (x, y)
@@ -100,12 +100,12 @@ def line_chart(
 
 
 def color_bar_svg(limits: tuple[float, float], unit: str, color_map: ColorMap, label: str, name: str) -> str:
-    """A horizontal colour scale with ticks and its unit.
+    """SVG colour bar with ticks and unit.
 
     Args:
         limits: Values of the first and the last colour.
         unit: For instance ``"mm"``.
-        color_map: Which map it explains.
+        color_map: The colour map to show.
         label: The quantity.
         name: Identifier of its gradient, unique on the page.
     """
@@ -137,7 +137,7 @@ def _drawable(value: float, log_y: bool) -> bool:
 
 @dataclass(frozen=True)
 class _Axes:
-    """Where values fall inside the view box."""
+    """Mapping from values to view box coordinates, and the axes' SVG."""
 
     x_low: float
     x_high: float
@@ -202,18 +202,18 @@ class _Axes:
         return [(float(index), self.x_names[index]) for index in range(0, len(self.x_names), stride)]
 
     def paths(self, line: Series) -> list[str]:
-        """One path for each uninterrupted stretch of a line."""
+        """One path per uninterrupted segment of a line."""
         stretches: list[list[str]] = [[]]
         for x, y in zip(line.x, line.y, strict=True):
             if math.isfinite(x) and _drawable(y, self.log_y):
                 stretches[-1].append(f"{self.x(x):.1f} {self.y(y):.1f}")
             else:
                 stretches.append([])
-        # A stretch of one point still shows: round caps draw a line of no length as a dot.
+        # A segment of one point is visible too: round caps draw a line of no length as a dot.
         return ["M" + "L".join(s if len(s) > 1 else s * 2) for s in stretches if s]
 
     def bands(self, line: Series) -> list[str]:
-        """One closed path for each uninterrupted stretch of a band."""
+        """One closed path per uninterrupted segment of a band."""
         stretches: list[list[tuple[float, float, float]]] = [[]]
         for x, low, high in zip(line.x, line.low, line.high, strict=True):
             if _drawable(low, self.log_y) and _drawable(high, self.log_y):

@@ -1,4 +1,4 @@
-"""Self-contained HTML pages of one look."""
+"""Self-contained HTML pages in a common style."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 from coliags_plugin import __version__
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
-from coliags_plugin.outputs.scales import tick_label
+from coliags_plugin.outputs.axis_ticks import tick_label
 
 _TEMPLATE = Path(__file__).with_name("page_template.html")
 _LONGEST_LIST = 6
@@ -22,11 +22,11 @@ _ABSOLUTE_PATH = re.compile(r"^(/|~|[A-Za-z]:[\\/]|\\\\|file:)")
 
 
 def write_page(output: Path, title: str, header: str, sections: Iterable[str]) -> None:
-    """Write a page.
+    """Write an HTML page.
 
     Args:
-        output: The file; replaced if it is there.
-        title: Of the browser's tab, plain text.
+        output: The file; an existing one is replaced.
+        title: Page title, plain text.
         header: HTML of the heading.
         sections: HTML; empty ones are left out.
 
@@ -44,19 +44,19 @@ def write_page(output: Path, title: str, header: str, sections: Iterable[str]) -
 
 
 def refuse_folder(output: Path) -> None:
-    """Raise InputError where a page is to be written over a folder."""
+    """Raise InputError where the output path is a folder."""
     if output.is_dir():
         raise InputError(f"{output} is a folder", "a file", f"Write to {output / 'report.html'}")
 
 
 def fact_list(facts: Mapping[str, str]) -> str:
-    """A row of named facts under a heading; empty ones are left out."""
+    """HTML list of names and values; empty values are left out."""
     items = "".join(f"<div><dt>{escape(k)}</dt><dd>{escape(v)}</dd></div>" for k, v in facts.items() if v)
     return f'<dl class="facts">{items}</dl>'
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """A table; cells are plain text, the first of each row names it."""
+    """HTML table; cells are plain text, the first of each row is its header."""
     columns = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in head)
     lines = []
     for first, *others in rows:
@@ -66,7 +66,7 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 def picture(png: bytes, caption: str) -> str:
-    """A cell of a ``view`` row: a picture under its name."""
+    """HTML figure of an image and its caption, a cell of a ``view`` row."""
     source = base64.b64encode(png).decode()
     name = escape(caption, quote=True)
     return (
@@ -76,7 +76,7 @@ def picture(png: bytes, caption: str) -> str:
 
 
 def record(title: str, values: Mapping[str, Any]) -> str:
-    """Nested values, folded away."""
+    """Collapsible HTML list of nested values."""
     texts = ((key, plain(value)) for key, value in leaves(values))
     rows = "".join(f"<dt>{escape(key)}</dt><dd>{escape(text)}</dd>" for key, text in texts if text)
     body = f'<dl class="record">{rows}</dl>' if rows else '<p class="record">nothing recorded</p>'
@@ -84,7 +84,7 @@ def record(title: str, values: Mapping[str, Any]) -> str:
 
 
 def leaves(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    """Values under dotted keys, large mappings kept whole; paths, which say nothing elsewhere, are left out."""
+    """Leaf values by dotted keys; large mappings are kept whole, and paths of this machine are left out."""
     found: list[tuple[str, Any]] = []
     for key, value in values.items():
         if isinstance(value, Mapping) and len(value) <= _LARGEST_MAPPING:
@@ -95,7 +95,7 @@ def leaves(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]
 
 
 def plain(value: Any) -> str:
-    """A JSON value in words; long lists by their ends."""
+    """JSON value as text; long lists are abbreviated to their ends."""
     if isinstance(value, Mapping):
         return f"{len(value)} entries"
     if isinstance(value, (list, tuple)):

@@ -1,4 +1,4 @@
-"""Two aligned trajectories as a picture: from above, from the side, and the errors along the frames."""
+"""Plot of two aligned trajectories: views from above and from the side, and errors over frames."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from coliags_plugin.outputs.scales import linear_ticks, tick_label
+from coliags_plugin.outputs.axis_ticks import linear_ticks, tick_label
 from coliags_plugin.poses.alignment import Alignment
 
-#: Two hues that people with any colour vision tell apart, and their greys differ too.
+#: Colours distinguishable with any colour vision, and in greyscale.
 REFERENCE_RGB = (86, 160, 211)
 ESTIMATE_RGB = (213, 94, 0)
 
@@ -26,7 +26,7 @@ _BITS = 4
 
 @dataclass(frozen=True)
 class _Panel:
-    """A chart's box in the picture, px, and the values at its edges: left, right, bottom, top."""
+    """Axes rectangle in the image, px, and the values at its edges: left, right, bottom, top."""
 
     left: int
     top: int
@@ -35,7 +35,7 @@ class _Panel:
     values: tuple[float, float, float, float]
 
     def place(self, points: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
-        """Pixel positions of values. [N, 2]"""
+        """Pixel positions of values, (x, y). [N, 2]"""
         left, right, bottom, top = self.values
         x = self.left + (points[:, 0] - left) / (right - left) * self.width
         y = self.top + (top - points[:, 1]) / (top - bottom) * self.height
@@ -43,14 +43,14 @@ class _Panel:
 
 
 def trajectory_picture(alignment: Alignment, unit: str) -> UInt8[np.ndarray, "900 1200 3"]:
-    """Draw an aligned estimate over its reference.
+    """Plot an aligned estimate over its reference.
 
     The views look along the axes of the reference's world, both at one scale: from above x over z, from the side y over
     z with y downwards. A circle marks the first frame.
 
     Args:
-        alignment: What to draw.
-        unit: What to call the unit of length; ASCII.
+        alignment: The aligned trajectories and their errors.
+        unit: Name of the unit of length; ASCII.
     """
     picture = np.full((_HEIGHT, _WIDTH, 3), 255, np.uint8)
     paths = (alignment.reference[:, :3, 3], alignment.estimate[:, :3, 3])
@@ -72,12 +72,12 @@ def trajectory_picture(alignment: Alignment, unit: str) -> UInt8[np.ndarray, "90
 
 
 def _views(picture: np.ndarray, paths: tuple[np.ndarray, np.ndarray], unit: str) -> None:
-    """Both paths from above and from the side, at one scale."""
+    """Draw both paths from above and from the side, at one scale."""
     points = np.concatenate(paths)
     low, high = points.min(axis=0), points.max(axis=0)
     center = 0.5 * (low + high)
     width, height = 510, 430
-    # Room around the larger path; any scale where nothing moves.
+    # A margin around the larger path; an arbitrary scale where nothing moves.
     per_pixel = 1.12 * max((high[2] - low[2]) / width, max(high[:2] - low[:2]) / height)
     if per_pixel <= 1e-9 * max(1.0, float(np.abs(points).max())):
         per_pixel = 1.0 / width
@@ -102,14 +102,14 @@ def _errors(
     picture: np.ndarray, box: tuple[int, int, int, int], errors: np.ndarray, y_label: str, x_label: str
 ) -> None:
     top = 1.1 * float(errors.max()) or 1.0
-    # A little below 0, so that no error is still a line to see.
+    # From slightly below 0, so that a line at zero error is visible.
     panel = _Panel(*box, (0.0, len(errors) - 1.0, -0.06 * top, top))
     _axes(picture, panel, x_label, y_label)
     _line(picture, panel.place(np.column_stack([np.arange(len(errors)), errors])), ESTIMATE_RGB, 1)
 
 
 def _axes(picture: np.ndarray, panel: _Panel, x_label: str, y_label: str) -> None:
-    """Frame, grid, ticks and labels; the name of the upright axis stands above it."""
+    """Draw frame, grid, ticks and labels; the label of the y axis is above it."""
     left, right, bottom, top = panel.values
     end_x, end_y = panel.left + panel.width, panel.top + panel.height
     for tick in linear_ticks(left, right):
@@ -144,6 +144,6 @@ def _fixed(points: np.ndarray) -> np.ndarray:
 
 
 def _text(picture: np.ndarray, text: str, origin: tuple[int, int], scale: float, align: float = 0.0) -> None:
-    """Write a text whose start (0), middle (0.5) or end (1) is at the origin."""
+    """Draw text whose start (``align`` 0), middle (0.5) or end (1) is at the origin."""
     (width, _), _ = cv2.getTextSize(text, _FONT, scale, 1)
     cv2.putText(picture, text, (round(origin[0] - align * width), origin[1]), _FONT, scale, _INK, 1, cv2.LINE_AA)

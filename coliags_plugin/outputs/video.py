@@ -1,4 +1,4 @@
-"""Frames -> an MP4 file, with whichever codec OpenCV's wheel brings."""
+"""MP4 video writing with the codecs of OpenCV's wheel."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from jaxtyping import UInt8
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import make_folder, not_writable
-from coliags_plugin.outputs.pictures import as_array
+from coliags_plugin.outputs.image_files import as_array
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 _LOG = logging.getLogger(__name__)
 
-#: By preference. OpenCV's wheels have no H.264 encoder; VP9 plays in every browser, MPEG-4 part 2 in players only.
+#: In order of preference. OpenCV's wheels have no H.264 encoder; VP9 plays in browsers, MPEG-4 part 2 in players only.
 CODECS = ("vp09", "mp4v")
 
 
 def write_video(frames: Iterable[UInt8[np.ndarray, "H W 3"] | Tensor], path: Path, fps: float) -> None:
-    """Write a video, whole or not at all.
+    """Write an MP4 video atomically.
 
-    An odd width or height is made even by repeating the last column or row: the codecs halve the chroma planes, and
-    OpenCV would cut a line off instead.
+    An odd width or height is padded by repeating the last column or row: the codecs halve the chroma planes, and
+    OpenCV would crop a line instead.
 
     Args:
-        frames: uint8 RGB, all of one size; taken one at a time, so a generator may render them. [H, W, 3] each
-        path: Ends in ``.mp4``; its folder is made.
-        fps: Frames a second.
+        frames: uint8 RGB, all of one size; consumed one at a time, so a generator may render them. [H, W, 3] each
+        path: Output file, ends in ``.mp4``; its folder is created.
+        fps: Frames per second.
 
     Raises:
         InputError: No frames, frames that differ in size or are not 8-bit RGB, another suffix, no codec, or a folder
@@ -48,7 +48,7 @@ def write_video(frames: Iterable[UInt8[np.ndarray, "H W 3"] | Tensor], path: Pat
         raise InputError(f"{fps} frames a second", "a positive number")
     make_folder(path.parent)
     try:
-        # The suffix has to stay: FFmpeg chooses the container by it.
+        # The suffix is kept: FFmpeg chooses the container by it.
         handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=".mp4", dir=path.parent)
         os.close(handle)
     except OSError as error:

@@ -1,1 +1,1 @@
-"""Renderers: a field, seen by a camera."""
+"""Renderers: images, depth maps and normals of a field from a camera."""

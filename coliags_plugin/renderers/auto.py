@@ -1,4 +1,4 @@
-"""``renderer: auto``: the quickest renderer that this machine has."""
+"""``renderer: auto``: automatic choice of the fastest renderer available."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from coliags_plugin.core.settings import Settings
 
 
 class AutoSettings(Settings):
-    """Preferences, and the options every splatting renderer shares."""
+    """Order of preference, and options common to all splatting renderers."""
 
     prefer: tuple[str, ...] = ("gsplat", "cpu", "torch")
-    near: float = Field(default=0.2, ge=0)  # scene units
+    near_plane: float = Field(default=0.2, ge=0)  # scene units
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 class AutoRenderer:
-    """Stands for the first of its preferences that can serve; the engine chooses and records why."""
+    """Placeholder that the engine replaces by the first renderer of ``prefer`` that can run, recording the reason."""
 
     Settings: ClassVar[type[Settings]] = AutoSettings

@@ -1,9 +1,9 @@
 """Front-to-back alpha compositing of 2D Gaussians, tile by tile.
 
-The recursion and its derivative are written out in ``docs/rendering.md``, section "Compositing". Two things make plain
-tensor operations quick at it. Within a tile the logarithm of alpha is a quadratic polynomial of the pixel's place, so
+The recursion and its derivative are written out in ``docs/rendering.md``, section "Compositing". Two properties make
+plain tensor operations fast. Within a tile the logarithm of alpha is a quadratic polynomial of the pixel position, so
 all pixels of all pairs come from one matrix product with six monomials, and the gradients of the six coefficients from
-its transpose. And the backward pass sweeps front to back once more instead of keeping anything per pixel and pair.
+its transpose. And the backward pass sweeps front to back once more instead of storing anything per pixel and pair.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-#: Elements of the largest temporary tensors, by device type: within the second-level caches, or filling the device.
+#: Elements of the largest temporary tensors, by device type: to fit the L2 caches, or to fill the device.
 _CHUNK_ELEMENTS = {"cpu": 2**18, "cuda": 2**24}
 #: Fewest and most pairs of one tile composited at a time.
 _MIN_RANKS, _MAX_RANKS = 32, 128
-#: Stands for the logarithm of zero where it is multiplied: far below every alpha_min, and finite.
+#: Finite stand-in for log(0), far below every alpha_min.
 _LOG_ZERO = -1e4
 
 
 @dataclass(frozen=True)
 class Cuts:
-    """Constants of the splatting lineage (docs/methods.md 2.2).
+    """Thresholds of compositing (docs/methods.md 2.2).
 
     Attributes:
-        alpha_max: No Gaussian is more opaque than this.
-        alpha_min: Fainter contributions are skipped.
-        transmittance_min: Compositing stops before the Gaussian that would leave less light than this.
+        alpha_max: Upper bound of alpha.
+        alpha_min: Contributions of smaller alpha are skipped.
+        transmittance_min: Compositing stops before the Gaussian that would bring the transmittance below this.
     """
 
     alpha_max: float
@@ -48,7 +48,7 @@ def log_alpha_polynomials(
     Args:
         log_opacities: [M]
         whitenings: u_xx, u_yx, u_yy of the lower triangular U, 1 / pixels. [M, 3]
-        offsets: From the Gaussian's centre to the point that p is counted from, pixels. [M, 2]
+        offsets: From the Gaussian's centre to the origin of p, pixels. [M, 2]
     """
     u_xx, u_yx, u_yy = whitenings.unbind(-1)
     x, y = offsets.unbind(-1)
@@ -89,7 +89,7 @@ def composite(
         features: What to composite. [M, F]
         starts: First pair of each tile, and M. [tiles + 1]
         pixels: :func:`monomials` of the pixel centres of a tile. [6, P]
-        cuts: What is drawn at all.
+        cuts: Thresholds.
     """
     composited: Tensor = _Composite.apply(polynomials, features, starts, pixels, cuts)  # type: ignore[no-untyped-call]
     return composited
@@ -120,7 +120,7 @@ class _Chunk(NamedTuple):
 
     Attributes:
         tiles: Which tiles, no two the same. [G]
-        rows: Place of each pair in the list of pairs; M, one past its end, where a tile has fewer. [G * C]
+        rows: Index of each pair in the list of pairs; M, one past its end, where a tile has fewer. [G * C]
         before: Transmittance in front of the chunk; 0 where compositing has stopped. [G, P]
         transmittances: The same behind each pair. [G, C, P]
         alphas: [G, C, P]
@@ -138,14 +138,14 @@ class _Chunk(NamedTuple):
 
 
 def _sweep(padded: Tensor, starts: Tensor, pixels: Tensor, cuts: Cuts) -> Iterator[_Chunk]:
-    """Walk through every tile's pairs front to back until they end or no pixel lets light through any more.
+    """Iterate over every tile's pairs front to back until they end or no pixel has transmittance left.
 
     The arguments are those of :func:`composite`, the polynomials :func:`_padded`. [M + 1, 6], [tiles + 1], [6, P]
     """
     budget = _CHUNK_ELEMENTS.get(padded.device.type, _CHUNK_ELEMENTS["cuda"]) // pixels.shape[1]
     alpha_below = _just_below(cuts.alpha_min, padded)
     transmittance_below = _just_below(cuts.transmittance_min, padded)
-    # Tiles of like length go together, so that few rows are padding.
+    # Tiles with similar numbers of pairs are grouped, so that few rows are padding.
     counts, occupied = starts.diff().sort(descending=True, stable=True)
     occupied = occupied[: int((counts > 0).sum())]
     for group in torch.split(occupied, max(1, budget // _MIN_RANKS)):
@@ -164,7 +164,7 @@ def _sweep(padded: Tensor, starts: Tensor, pixels: Tensor, cuts: Cuts) -> Iterat
             ratios = alphas / through
             through[:, 0] *= before
             transmittances = through.cumprod_(1)
-            # It only falls, so what is below the bound stays below: zero from there on is the stop.
+            # Transmittance only falls, so setting it to zero below the bound stops compositing for good.
             torch.threshold_(transmittances, transmittance_below, 0.0)
             # alpha T in front = alpha / (1 - alpha) T behind, which is 0 for the pair that would cross the bound.
             yield _Chunk(tiles, rows, before, transmittances, alphas, ratios, ratios * transmittances)
@@ -193,7 +193,7 @@ class _Composite(torch.autograd.Function):
         padded, padded_features, starts, pixels, composited = ctx.saved_tensors
         of_polynomials, of_features = torch.zeros_like(padded), torch.zeros_like(padded_features)
         gradient = gradient.contiguous()
-        # What the pairs not yet swept add to the loss, to first order.
+        # First-order contribution to the loss of the pairs not yet swept.
         behind = (composited * gradient).sum(1)
         for chunk in _sweep(padded, starts, pixels, ctx.cuts):
             tile_gradient = gradient[chunk.tiles]
@@ -203,8 +203,8 @@ class _Composite(torch.autograd.Function):
             gained = (chunk_features @ tile_gradient).mul_(chunk.weights)
             hidden = behind[chunk.tiles][:, None] - gained.cumsum(1)
             behind[chunk.tiles] = hidden[:, -1]
-            # d loss / d log(alpha) = alpha (T g - hidden / (1 - alpha)): what it shows less what it hides. Behind the
-            # stop, and where alpha is clamped, it is 0.
+            # d loss / d log(alpha) = alpha (T g - hidden / (1 - alpha)): its own contribution less what it occludes.
+            # Behind the stop, and where alpha is clamped, it is 0.
             of_log_alphas = gained.sub_(hidden.mul_(chunk.ratios))
             of_log_alphas.mul_(chunk.weights > 0).mul_(chunk.alphas < ctx.cuts.alpha_max)
             of_polynomials[chunk.rows] = of_log_alphas.flatten(0, 1) @ pixels.T
@@ -212,7 +212,7 @@ class _Composite(torch.autograd.Function):
 
 
 def _padded(polynomials: Tensor) -> Tensor:
-    """With one more row, whose alpha is 0 everywhere. [M + 1, 6]"""
+    """Polynomials with one more row, whose alpha is 0 everywhere. [M + 1, 6]"""
     padded = torch.nn.functional.pad(polynomials, (0, 0, 0, 1))
     padded[-1, 0] = _LOG_ZERO
     return padded

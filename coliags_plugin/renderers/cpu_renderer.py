@@ -1,4 +1,4 @@
-"""Gaussian splatting on the CPU with compiled kernels: the numbers of the torch renderer, much sooner."""
+"""Numba CPU rasterizer with the same outputs as the torch reference."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from coliags_plugin.core.render_output import RenderOutput, Splats
 from coliags_plugin.renderers.projection import JACOBIAN_MARGIN
 from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer, check_outputs
 
-#: Tensors of the Gaussians and the width of their rows; None for none.
+#: Tensors of the Gaussians and the width of their rows; None for one-dimensional ones.
 _SHAPES = {"means": 3, "quats_wxyz": 4, "scales": 3, "opacities": None, "colors": 3}
 #: Names of the images in the order of the kernels.
 _IMAGES = (
@@ -38,7 +38,7 @@ class CpuRendererSettings(CutSettings):
 
 
 class CpuRenderer(SplattingRenderer):
-    """Splats float32 Gaussians on the CPU by numba kernels. See ``docs/rendering.md``, section "The cpu backend"."""
+    """CPU renderer of float32 Gaussians by numba kernels. See ``docs/rendering.md``, section "The cpu backend"."""
 
     Settings = CpuRendererSettings
     primitives: ClassVar[frozenset[str]] = frozenset({"gaussians3d"})
@@ -49,7 +49,7 @@ class CpuRenderer(SplattingRenderer):
 
     @classmethod
     def availability(cls) -> Availability:
-        """Where numba is installed; does not import it."""
+        """Available where numba is installed, which is not imported here."""
         if find_spec("numba") is None:
             return Availability(False, "numba is not installed: pip install numba")
         return Availability(True, f"numba kernels on {torch.get_num_threads()} threads")
@@ -65,21 +65,21 @@ def render_gaussians(
     wants: Sequence[str] = ("rgb", "alpha"),
     settings: CpuRendererSettings | None = None,
 ) -> RenderOutput:
-    """Render Gaussians as the camera sees them.
+    """Render 3D Gaussians from a camera.
 
     Everything but ``depth_median`` and ``radii`` is differentiable, once, in the Gaussians and in
-    ``camera.camera_to_world``; ``means2d.grad`` is there after ``backward``. The first call on a machine compiles the
+    ``camera.camera_to_world``; ``means2d.grad`` is set by ``backward``. The first call on a machine compiles the
     kernels, which takes about half a minute.
 
     Args:
         gaussians: 3D Gaussians, float32, on the CPU.
-        camera: Where from; its pose is cast to float32.
-        wants: Names from :data:`coliags_plugin.core.render_output.OUTPUTS`; rgb and alpha always come.
-        settings: The defaults where None.
+        camera: Camera of the view; its pose is cast to float32.
+        wants: Names from :data:`coliags_plugin.core.render_output.OUTPUTS`; rgb and alpha are always included.
+        settings: Defaults if None.
 
     Raises:
         InputError: An output is unknown; a tensor is of the wrong shape, dtype or device; a Gaussian is not finite, has
-            a quaternion of length 0 or a negative scale; the camera's numbers are unusable.
+            a quaternion of length 0 or a negative scale; the camera's parameters are not usable.
     """
     from coliags_plugin.renderers.numba_kernels import autograd, layout, pipeline
 
@@ -122,7 +122,7 @@ def render_gaussians(
 
 
 def _view_table(camera: Camera, pose: Tensor, settings: CpuRendererSettings) -> np.ndarray:
-    """Camera and options as the kernels want them (``numba_kernels/layout.py``)."""
+    """Camera and options as the float32 table of the kernels (``numba_kernels/layout.py``)."""
     matrix = pose.detach().double().numpy()
     if matrix.shape != (4, 4):
         raise InputError(f"camera_to_world of shape {list(matrix.shape)}", "[4, 4]")
@@ -139,7 +139,7 @@ def _view_table(camera: Camera, pose: Tensor, settings: CpuRendererSettings) -> 
         *matrix[:3].T.ravel(),
         *(camera.fx, camera.fy, camera.cx, camera.cy),
         *limits,
-        *(settings.near, settings.low_pass, camera.width, camera.height),
+        *(settings.near_plane, settings.eps2d, camera.width, camera.height),
         *(math.log2(settings.alpha_min), settings.alpha_max, settings.transmittance_min),
         *settings.background,
     ]
@@ -149,7 +149,7 @@ def _view_table(camera: Camera, pose: Tensor, settings: CpuRendererSettings) -> 
 
 
 def _check_tensors(gaussians: Gaussians) -> None:
-    """Shape, dtype and device; values are checked while they are projected."""
+    """Check shape, dtype and device; values are checked during projection."""
     count = len(gaussians.means) if gaussians.means.ndim else 0
     checked = [(name, getattr(gaussians, name), width) for name, width in _SHAPES.items()]
     checked += [(f"feature {name}", value, max(1, *value.shape[1:])) for name, value in gaussians.features.items()]
@@ -175,7 +175,7 @@ def _check_tensors(gaussians: Gaussians) -> None:
 
 
 def _unusable(gaussians: Gaussians) -> InputError:
-    """What is wrong with the first Gaussian that has something wrong."""
+    """The error for the first invalid Gaussian."""
     for name in _SHAPES:
         values = getattr(gaussians, name).detach()
         wrong = ~values.isfinite().reshape(len(values), -1).all(dim=1)

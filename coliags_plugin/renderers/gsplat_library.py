@@ -1,8 +1,7 @@
-"""Finding gsplat, and trying its kernels once before anything relies on them.
+"""Lazy import of gsplat, with one test of its kernels per process.
 
-gsplat compiles its kernels when they are first called. Without a CUDA device or a compiler it goes on without them and
-fails later with an attribute of None; so nothing here imports it before PyTorch sees a device, and nothing elsewhere
-imports it at all.
+gsplat compiles its kernels when they are first called. Without a CUDA device or a compiler it continues without them
+and fails later with an attribute error on None; so it is imported only here, and only where PyTorch has a device.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ logger = logging.getLogger(__name__)
 #: The first version whose radii come per axis, [..., 2].
 OLDEST = (1, 5)
 INSTALL = "pip install coliags_plugin[cuda]"
-#: Where the kernels are tried.
+#: Device of the test.
 PROBE_DEVICE = "cuda"
 
 
@@ -41,10 +40,10 @@ def availability() -> Availability:
 
 @functools.cache
 def load() -> ModuleType:
-    """The library, known to work.
+    """Import gsplat after testing that it works.
 
     Raises:
-        InputError: It cannot be used here; says why.
+        InputError: It cannot be used here, with the reason.
     """
     found = availability()
     if not found.ok:
@@ -58,11 +57,11 @@ def load() -> ModuleType:
 
 @functools.cache
 def _trial() -> Availability:
-    """Import gsplat, which is installed, and draw with it on the device, which is there."""
+    """Import the installed gsplat and test it on the device."""
     logger.info("loading gsplat; the first time on a machine it compiles its CUDA kernels, which takes minutes")
     try:
         library = importlib.import_module("gsplat")
-    except Exception as error:  # whatever it is, it is the reason
+    except Exception as error:  # any failure is the reason
         return Availability(False, f"gsplat does not load: {_one_line(error)}")
     named = f"gsplat {getattr(library, '__version__', 'of unknown version')}"
     if _release(named) < OLDEST:
@@ -78,7 +77,7 @@ def _trial() -> Availability:
 
 
 def _project_one(library: ModuleType) -> None:
-    """Project a Gaussian on the optical axis; it has to land on the principal point."""
+    """Check that a Gaussian on the optical axis projects to the principal point."""
     like = torch.eye(4, device=PROBE_DEVICE)
     intrinsics = torch.tensor([[8.0, 0.0, 4.0], [0.0, 8.0, 4.0], [0.0, 0.0, 1.0]], device=PROBE_DEVICE)
     mean, quat, scale = like[None, 2, :3], like[None, 0], like.new_full((1, 3), 0.1)
@@ -89,12 +88,12 @@ def _project_one(library: ModuleType) -> None:
 
 
 def _release(text: str) -> tuple[int, int]:
-    """Major and minor version in a text; what has none is taken for new."""
+    """Major and minor version in a text; a text without one counts as the oldest supported."""
     match = re.search(r"(\d+)\.(\d+)", text)
     return (int(match[1]), int(match[2])) if match else OLDEST
 
 
 def _one_line(error: Exception) -> str:
-    """Kind and first line of an error: compilers write pages."""
+    """Type and first line of an error, as compiler messages are long."""
     first = next((line.strip() for line in str(error).splitlines() if line.strip()), "")
     return f"{type(error).__name__}: {first[:300]}" if first else type(error).__name__

@@ -1,6 +1,6 @@
-"""The torch renderer's contract through the CUDA kernels of gsplat (Apache-2.0).
+"""CUDA renderer by gsplat (Apache-2.0), with the outputs of the torch reference.
 
-What differs from the definition is listed in ``docs/rendering.md``, section "The gsplat backend".
+Differences from the reference are listed in ``docs/rendering.md``, section "The gsplat backend".
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from coliags_plugin.renderers import gsplat_library
 from coliags_plugin.renderers.splatting import SplattingRenderer, SplattingSettings, check_outputs
 from coliags_plugin.renderers.torch_renderer import TorchRendererSettings, render_gaussians
 
-#: Edge of gsplat's tiles, pixels: the one size it is tested with.
+#: Edge of gsplat's tiles, pixels: the only size it is tested with.
 _TILE_SIZE = 16
-#: Up to so many channels gsplat composites any number of.
+#: gsplat composites up to this many channels without padding to a power of two.
 _ANY_CHANNELS = 4
-#: What each output beyond rgb and alpha needs composited or read off.
+#: Quantity composited or read for each output beyond rgb and alpha.
 _NEEDS = {
     "depth_accumulated": "depth",
     "depth_expected": "depth",
@@ -41,12 +41,12 @@ _NEEDS = {
 class GsplatRendererSettings(SplattingSettings):
     """Options of :class:`GsplatRenderer`. gsplat's other constants are fixed (docs/rendering.md).
 
-    It draws what lies at z = ``near``, too; surfels have gsplat's own filter instead of ``low_pass``.
+    Gaussians exactly at z = ``near_plane`` are drawn too; surfels have gsplat's own filter instead of ``eps2d``.
     """
 
 
 class GsplatRenderer(SplattingRenderer):
-    """Splats 3D Gaussians and surfels on CUDA, in float32. See ``docs/rendering.md``."""
+    """Renderer of 3D Gaussians and surfels on CUDA, in float32. See ``docs/rendering.md``."""
 
     Settings = GsplatRendererSettings
     primitives: ClassVar[frozenset[str]] = frozenset({"gaussians3d", "surfels"})
@@ -57,7 +57,7 @@ class GsplatRenderer(SplattingRenderer):
 
     @classmethod
     def availability(cls) -> Availability:
-        """Where there is a CUDA device and gsplat's kernels work on it, tried once per process."""
+        """Available where gsplat's kernels work on a CUDA device, tested once per process."""
         return gsplat_library.availability()
 
     def draw(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> RenderOutput:
@@ -81,16 +81,16 @@ def render_with_gsplat(
     wants: Sequence[str] = ("rgb", "alpha"),
     settings: GsplatRendererSettings | None = None,
 ) -> RenderOutput:
-    """Render Gaussians, or surfels where they have two scales, as the camera sees them.
+    """Render 3D Gaussians, or surfels where they have two scales, from a camera.
 
     Everything but ``depth_median`` and ``radii`` is differentiable, once, in the Gaussians and in
-    ``camera.camera_to_world``; ``means2d.grad`` is there after ``backward``.
+    ``camera.camera_to_world``; ``means2d.grad`` is set by ``backward``.
 
     Args:
         gaussians: float32, on a CUDA device.
-        camera: Where from; its pose is cast to the Gaussians' dtype and device.
-        wants: Names from :data:`coliags_plugin.core.render_output.OUTPUTS`; rgb and alpha always come.
-        settings: The defaults where None.
+        camera: Camera of the view; its pose is cast to the Gaussians' dtype and device.
+        wants: Names from :data:`coliags_plugin.core.render_output.OUTPUTS`; rgb and alpha are always included.
+        settings: Defaults if None.
 
     Raises:
         InputError: An output is unknown, the Gaussians are not float32, or gsplat cannot be used here.
@@ -105,7 +105,7 @@ def render_with_gsplat(
         )
     needs = {_NEEDS.get(name, name) for name in wants if name not in ("rgb", "alpha")}
     camera = camera.to(gaussians.means.device, gaussians.means.dtype)
-    # gsplat 1.5 divides by the number of Gaussians, and the process dies of it.
+    # gsplat 1.5 divides by the number of Gaussians, which crashes the process if there are none.
     draw = _draw_nothing if len(gaussians) == 0 else _draw_surfels if _are_surfels(gaussians) else _draw_gaussians
     drawn = draw(gaussians, camera, needs, settings)
     maps = {}
@@ -123,12 +123,12 @@ def render_with_gsplat(
 
 @dataclass(frozen=True)
 class _Drawn:
-    """One view, before it is sorted into outputs.
+    """Composited images of one view, by quantity.
 
     Attributes:
         rgb: Over the background. [H, W, 3]
         alpha: [H, W]
-        sums: At least what was needed beyond those, by the names in ``_NEEDS``. [H, W] or [H, W, 3]
+        sums: The other quantities needed, by the names in ``_NEEDS``. [H, W] or [H, W, 3]
         means2d: Retains its gradient; 0 where not drawn. [N, 2]
         radii: [N]
     """
@@ -141,7 +141,7 @@ class _Drawn:
 
 
 def _draw_gaussians(gaussians: Gaussians, camera: Camera, needs: set[str], settings: GsplatRendererSettings) -> _Drawn:
-    """3D Gaussians: one projection, one pass of compositing for all outputs."""
+    """Render 3D Gaussians in one projection and one compositing pass for all outputs."""
     library = gsplat_library.load()
     sight, view, intrinsics = _view(gaussians, camera)
     size = (camera.width, camera.height)
@@ -153,8 +153,8 @@ def _draw_gaussians(gaussians: Gaussians, camera: Camera, needs: set[str], setti
         view[None],
         intrinsics[None],
         *size,
-        eps2d=settings.low_pass,
-        near_plane=settings.near,
+        eps2d=settings.eps2d,
+        near_plane=settings.near_plane,
         opacities=gaussians.opacities,
     )
     # Of what is not drawn gsplat leaves everything but the radii uninitialised.
@@ -187,11 +187,11 @@ def _draw_gaussians(gaussians: Gaussians, camera: Camera, needs: set[str], setti
 
 
 def _draw_surfels(gaussians: Gaussians, camera: Camera, needs: set[str], settings: GsplatRendererSettings) -> _Drawn:
-    """Surfels, by gsplat's rendition of 2D Gaussian splatting."""
+    """Render surfels by gsplat's implementation of 2D Gaussian splatting."""
     library = gsplat_library.load()
     sight, view, intrinsics = _view(gaussians, camera)
     size = (camera.width, camera.height)
-    thickness = torch.ones_like(gaussians.scales[:, :1])  # asked for, and not used
+    thickness = torch.ones_like(gaussians.scales[:, :1])  # required by the interface, not used
     radii, boxes, depths, transforms, normals = library.fully_fused_projection_2dgs(
         sight,
         gaussians.quats_wxyz,
@@ -199,7 +199,7 @@ def _draw_surfels(gaussians: Gaussians, camera: Camera, needs: set[str], setting
         view[None],
         intrinsics[None],
         *size,
-        near_plane=settings.near,
+        near_plane=settings.near_plane,
     )
     # Of what is not drawn gsplat leaves everything but the radii uninitialised.
     visible = (radii[0] > 0).all(-1)
@@ -214,10 +214,10 @@ def _draw_surfels(gaussians: Gaussians, camera: Camera, needs: set[str], setting
     if needs & {"depth", "median"}:
         width = 1 + sum(part.shape[1] for part in parts.values())
         if width > _ANY_CHANNELS:
-            # gsplat would fill them up to a power of two with uninitialised memory, of which a NaN would spread into
-            # the gradients.
+            # gsplat pads channels to a power of two with uninitialised memory, from which NaN would reach the
+            # gradients.
             parts["filling"] = depths.new_zeros(len(depths), (1 << (width - 1).bit_length()) - width)
-        parts["depth"] = depths[:, None]  # the last channel: gsplat reads the median off it
+        parts["depth"] = depths[:, None]  # the last channel, from which gsplat takes the median
     features = torch.cat(list(parts.values()), dim=-1)
     image, alpha, normals, _, medians = library.rasterize_to_pixels_2dgs(
         boxes[None],
@@ -240,7 +240,7 @@ def _draw_surfels(gaussians: Gaussians, camera: Camera, needs: set[str], setting
 
 
 def _draw_nothing(gaussians: Gaussians, camera: Camera, needs: set[str], settings: GsplatRendererSettings) -> _Drawn:
-    """The background, in a graph that ``backward`` accepts."""
+    """Render no Gaussians: the background, connected to the graph so that ``backward`` works."""
     means2d = _retaining(gaussians.means[:, :2].clone())
     others = (gaussians.quats_wxyz, gaussians.scales, gaussians.opacities, gaussians.colors, camera.camera_to_world)
     zero = 0.0 * torch.stack([value.sum() for value in (means2d, *others)]).sum()
@@ -260,9 +260,9 @@ def _are_surfels(gaussians: Gaussians) -> bool:
 def _view(
     gaussians: Gaussians, camera: Camera
 ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "4 4"], Float[Tensor, "3 3"]]:
-    """Centres as seen from the camera, in world axes; the matrix that turns these into camera axes; K.
+    """Centres relative to the camera's in world axes, the rotation into camera axes, and K.
 
-    Subtracting the camera's centre before gsplat rotates keeps float32, and the pose's gradient, accurate far from the
+    Subtracting the camera's centre before gsplat rotates keeps float32 and the pose gradient accurate far from the
     world's origin.
     """
     view = torch.eye(4, dtype=gaussians.means.dtype, device=gaussians.means.device)
@@ -273,7 +273,7 @@ def _view(
 def _tiles(
     library: ModuleType, centers: Tensor, radii: Tensor, depths: Tensor, size: tuple[int, int]
 ) -> tuple[Tensor, Tensor]:
-    """Where each tile's list begins, and the lists: Gaussians by tile, front to back. [1, rows, columns], [M]"""
+    """Start of each tile's list, and Gaussian indices by tile, front to back. [1, rows, columns], [M]"""
     columns, rows = (-(-pixels // _TILE_SIZE) for pixels in size)
     _, keys, lists = library.isect_tiles(centers[None], radii, depths[None], _TILE_SIZE, columns, rows)
     return library.isect_offset_encode(keys, 1, columns, rows), lists
@@ -282,23 +282,23 @@ def _tiles(
 def _pass_through_centers(
     boxes: Float[Tensor, "N 2"], transforms: Float[Tensor, "N 3 3"]
 ) -> tuple[Float[Tensor, "N 2"], Float[Tensor, "N 2"], Float[Tensor, "N 3 3"]]:
-    """The surfels' projected centres, put into the graph so that they receive its gradient. [N, 2]
+    """Projected centres of the surfels, inserted into the graph so that they receive gradients. [N, 2]
 
-    gsplat has no such tensor: the image of a surfel's plane is ``transforms``, whose last column is the centre's, and
-    ``boxes`` are the middles of the surfels' boxes, which its low-pass filter is drawn around. Both come back
-    unchanged, but made from the centres.
+    gsplat has no such tensor: ``transforms`` maps a surfel's plane to the image, with the centre in its last column,
+    and ``boxes`` are the centres of the bounding boxes, around which its low-pass filter is drawn. Both are returned
+    with unchanged values, but computed from the projected centres.
     """
     place = transforms[:, :, 2]
     centers = place[:, :2] / place[:, 2:]
     means2d = _retaining(centers.clone())
     column = torch.cat([means2d * place[:, 2:], place[:, 2:]], dim=-1)
-    # This difference is zero and takes the centres' own share of the boxes' gradient back again.
+    # This difference is zero; it removes the centres' own share from the gradient of the boxes.
     boxes = boxes + (means2d - centers)
     return means2d, boxes, torch.cat([transforms[:, :, :2], column[:, :, None]], dim=-1)
 
 
 def _facing_normals(gaussians: Gaussians, sight: Float[Tensor, "N 3"], camera: Camera) -> Float[Tensor, "N 3"]:
-    """The shortest axis of each Gaussian, camera axes, turned so that it looks at the camera. [N, 3]"""
+    """Shortest axis of each Gaussian in camera axes, oriented towards the camera. [N, 3]"""
     shortest = gaussians.scales.argmin(-1)
     axes = rotation_matrices(gaussians.quats_wxyz)
     normals = axes.gather(2, shortest[:, None, None].expand(-1, 3, 1)).squeeze(-1)
@@ -310,20 +310,20 @@ def _facing_normals(gaussians: Gaussians, sight: Float[Tensor, "N 3"], camera: C
 def _median_by_definition(
     gaussians: Gaussians, camera: Camera, settings: GsplatRendererSettings
 ) -> Float[Tensor, "H W"]:
-    """The definition's own: gsplat has none of 3D Gaussians, and no gradient goes through it. [H, W]"""
-    options = TorchRendererSettings(near=settings.near, low_pass=settings.low_pass)
+    """Median depth by the torch reference, as gsplat has none for 3D Gaussians; without gradient. [H, W]"""
+    options = TorchRendererSettings(near_plane=settings.near_plane, eps2d=settings.eps2d)
     return render_gaussians(gaussians, camera, ("depth_median",), options)["depth_median"]
 
 
 def _backgrounds(features: Float[Tensor, "N F"], settings: GsplatRendererSettings) -> Float[Tensor, "1 F"] | None:
-    """The background behind the colours, nothing behind the other channels. [1, F]"""
+    """Background of the colour channels, 0 for the others. [1, F]"""
     if not any(settings.background):
         return None
     return features.new_tensor([[*settings.background, *[0.0] * (features.shape[-1] - 3)]])
 
 
 def _split(image: Float[Tensor, "H W F"], parts: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Composited channels by the names of what they were composited from; single ones without a last dimension."""
+    """Composited channels by quantity; single channels without the last dimension."""
     channels = torch.split(image, [part.shape[-1] for part in parts.values()], dim=-1)
     return {
         name: channel[..., 0] if channel.shape[-1] == 1 else channel

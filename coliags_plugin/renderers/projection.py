@@ -1,4 +1,4 @@
-"""3D Gaussians -> 2D Gaussians on the image plane: the affine (EWA) approximation of perspective.
+"""EWA projection of 3D Gaussians to 2D Gaussians on the image plane.
 
 The formulas are written out in ``docs/rendering.md``, section "Projection".
 """
@@ -16,15 +16,15 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.rotations import rotation_matrices
 
-#: Share of the half field of view by which a centre may leave the image before the Jacobian stops following it.
+#: Margin beyond the image, relative to half the field of view, within which the Jacobian is not clamped.
 JACOBIAN_MARGIN = 0.3
 
 
 @dataclass(frozen=True)
 class ProjectedGaussians:
-    """What is left of N Gaussians on the image plane.
+    """N projected Gaussians.
 
-    Every entry is finite; those of Gaussians not ``in_front`` mean nothing and pass no gradient on.
+    Every entry is finite; those of Gaussians not ``in_front`` are meaningless and pass no gradient.
 
     Attributes:
         means_camera: Centres, camera axes, scene units. [N, 3]
@@ -34,7 +34,7 @@ class ProjectedGaussians:
         covariances: xx, xy, yy of the 2D covariance with its low-pass term, square pixels. [N, 3]
         whitenings: u_xx, u_yx, u_yy of the lower triangular U with U^T U the inverse of the covariance, so that the
             Mahalanobis distance of an offset d is |U d|. 1 / pixels. [N, 3]
-        in_front: Beyond the near plane. [N]
+        in_front: Whether beyond the near plane. [N]
     """
 
     means_camera: Float[Tensor, "N 3"]
@@ -46,14 +46,14 @@ class ProjectedGaussians:
     in_front: Bool[Tensor, "N"]
 
 
-def project_gaussians(gaussians: Gaussians, camera: Camera, near: float, low_pass: float) -> ProjectedGaussians:
+def project_gaussians(gaussians: Gaussians, camera: Camera, near_plane: float, eps2d: float) -> ProjectedGaussians:
     """Project Gaussians; differentiable in all of them and in ``camera.camera_to_world``.
 
     Args:
         gaussians: With three scales each. Their dtype and device are those of the result.
-        camera: Where from.
-        near: Gaussians whose centre has z <= near are not drawn. Scene units.
-        low_pass: Added to both diagonal terms of the 2D covariance. Square pixels.
+        camera: Camera of the view.
+        near_plane: Gaussians whose centre has z <= near_plane are not drawn. Scene units.
+        eps2d: Added to both diagonal terms of the 2D covariance. Square pixels.
 
     Raises:
         InputError: The Gaussians are surfels.
@@ -68,7 +68,7 @@ def project_gaussians(gaussians: Gaussians, camera: Camera, near: float, low_pas
     camera_axes = camera.camera_to_world[:3, :3]
     # Subtracting the centre before rotating keeps float32 accurate far from the world's origin.
     local = (gaussians.means - camera.center) @ camera_axes
-    in_front = local[:, 2] > near
+    in_front = local[:, 2] > near_plane
     # A stand-in depth keeps 0 * inf out of the backward pass of what is not drawn.
     x, y, z = torch.where(in_front[:, None], local, local.new_tensor([0.0, 0.0, 1.0])).unbind(-1)
     means2d = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=-1)
@@ -81,11 +81,9 @@ def project_gaussians(gaussians: Gaussians, camera: Camera, near: float, low_pas
     row_x = (camera.fx / z)[:, None] * (axes[:, 0] - slope_x[:, None] * axes[:, 2])
     row_y = (camera.fy / z)[:, None] * (axes[:, 1] - slope_y[:, None] * axes[:, 2])
     sharp_xx, sharp_yy = row_x.square().sum(-1), row_y.square().sum(-1)
-    xx, xy, yy = sharp_xx + low_pass, (row_x * row_y).sum(-1), sharp_yy + low_pass
+    xx, xy, yy = sharp_xx + eps2d, (row_x * row_y).sum(-1), sharp_yy + eps2d
     # xx yy - xy^2 cancels for needles; this sum of squares is the same number (Cauchy-Binet) and does not.
-    determinant = (
-        torch.linalg.cross(row_x, row_y).square().sum(-1) + low_pass * (sharp_xx + sharp_yy) + low_pass * low_pass
-    )
+    determinant = torch.linalg.cross(row_x, row_y).square().sum(-1) + eps2d * (sharp_xx + sharp_yy) + eps2d * eps2d
     u_xx, u_yy = xx.rsqrt(), (xx / determinant).sqrt()
     return ProjectedGaussians(
         means_camera=local,
@@ -99,9 +97,9 @@ def project_gaussians(gaussians: Gaussians, camera: Camera, near: float, low_pas
 
 
 def facing_normals(projected: ProjectedGaussians, scales: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-    """The shortest axis of each Gaussian, camera axes, turned so that it looks at the camera. [N, 3]
+    """Shortest axis of each Gaussian in camera axes, oriented towards the camera. [N, 3]
 
-    Differentiable in the rotations; which axis is shortest, and which way it is turned, are not.
+    Differentiable in the rotations; the choice of axis and sign is not.
     """
     shortest = scales.argmin(-1)
     normals = projected.rotations.gather(2, shortest[:, None, None].expand(-1, 3, 1)).squeeze(-1)
@@ -110,6 +108,6 @@ def facing_normals(projected: ProjectedGaussians, scales: Float[Tensor, "N 3"]) 
 
 
 def _slope_limits(focal: float, principal: float, size: int) -> tuple[float, float]:
-    """The range of x/z (or y/z) the Jacobian is taken in: the image's own, widened on both sides."""
+    """Range of x/z (or y/z) to which the Jacobian is clamped: the image's, widened on both sides."""
     margin = JACOBIAN_MARGIN * 0.5 * size / focal
     return -principal / focal - margin, (size - principal) / focal + margin

@@ -1,4 +1,4 @@
-"""What every splatting renderer shares: options, checks, and whole images only."""
+"""Base class and options of the splatting renderers."""
 
 from __future__ import annotations
 
@@ -18,32 +18,32 @@ from coliags_plugin.core.settings import Settings
 
 
 class SplattingSettings(Settings):
-    """Options of every splatting renderer. The defaults are the lineage's constants (docs/methods.md 2.1, 2.2)."""
+    """Options common to all splatting renderers; the defaults are 3DGS's (docs/methods.md 2.1, 2.2)."""
 
-    near: float = pydantic.Field(default=0.2, ge=0)
-    """Gaussians with a centre at z <= near are not drawn. Scene units."""
-    low_pass: float = pydantic.Field(default=0.3, gt=0)
-    """Added to the diagonal of every 2D covariance, so that nothing is thinner than a pixel. Square pixels."""
+    near_plane: float = pydantic.Field(default=0.2, ge=0)
+    """Gaussians with a centre at z <= near_plane are not drawn. Scene units."""
+    eps2d: float = pydantic.Field(default=0.3, gt=0)
+    """Low-pass term added to the diagonal of every 2D covariance, square pixels."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """RGB behind everything."""
+    """Background RGB."""
 
 
 class CutSettings(SplattingSettings):
-    """Options of the renderers that have the lineage's cuts as options too."""
+    """Options of renderers whose alpha and transmittance thresholds are configurable."""
 
     alpha_max: float = pydantic.Field(default=0.99, gt=0, lt=1)
-    """No Gaussian is more opaque than this at any pixel."""
+    """Upper bound of alpha at any pixel."""
     alpha_min: float = pydantic.Field(default=1 / 255, gt=0, lt=1)
-    """Fainter contributions are skipped."""
+    """Contributions of smaller alpha are skipped."""
     transmittance_min: float = pydantic.Field(default=1e-4, ge=0, lt=1)
-    """Compositing stops before the Gaussian that would leave less light than this."""
+    """Compositing stops before the Gaussian that would bring the transmittance below this."""
 
 
 class SplattingRenderer(Renderer):
-    """Draws whole images of what a :class:`GaussianField` shows to a camera."""
+    """Base class of renderers that splat a :class:`GaussianField` into whole images."""
 
     outputs: ClassVar[frozenset[str]] = frozenset(OUTPUTS)
-    #: For messages.
+    #: Name in messages.
     name: ClassVar[str]
 
     def render(
@@ -57,9 +57,9 @@ class SplattingRenderer(Renderer):
 
         Args:
             field: A field of a primitive that this renderer serves.
-            camera: Where from.
+            camera: Camera of the view.
             wants: Names from :data:`coliags_plugin.core.render_output.OUTPUTS` or of the Gaussians' features; rgb and
-                alpha always come.
+                alpha are always included.
             pixels: Must be None: a splatting renderer draws whole images.
 
         Raises:
@@ -81,14 +81,14 @@ class SplattingRenderer(Renderer):
 
     @abstractmethod
     def draw(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> RenderOutput:
-        """Draw Gaussians as the camera sees them."""
+        """Render the Gaussians from the camera."""
 
 
 def check_outputs(wants: Sequence[str], gaussians: Gaussians) -> None:
-    """Refuse outputs that neither are a renderer's nor features of the Gaussians.
+    """Check the names of requested outputs.
 
     Raises:
-        InputError: See above.
+        InputError: A name is neither a renderer output nor a feature of the Gaussians.
     """
     known = (*OUTPUTS, *gaussians.features)
     for name in wants:

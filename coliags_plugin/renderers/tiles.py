@@ -1,7 +1,7 @@
-"""Which Gaussians touch which tile of the image, front to back.
+"""Binning of Gaussians into image tiles, front to back.
 
-Tiles only save work: they change no result, because the pairs kept here are a superset of the (pixel, Gaussian) pairs
-with alpha >= alpha_min, and compositing decides about each of those again.
+Tiles only save work and do not change the result, because the pairs kept here are a superset of the (pixel, Gaussian)
+pairs with alpha >= alpha_min, and compositing tests each of those again.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _RADIUS_SLACK = 1e-2
 
 @dataclass(frozen=True)
 class TileGrid:
-    """An image cut into square tiles; the last column and row may hang over its edge.
+    """An image divided into square tiles; the last column and row may extend beyond its edge.
 
     Attributes:
         width, height: Image size, pixels.
@@ -33,22 +33,22 @@ class TileGrid:
 
     @property
     def columns(self) -> int:
-        """Tiles side by side."""
+        """Number of tile columns."""
         return -(-self.width // self.size)
 
     @property
     def rows(self) -> int:
-        """Tiles one above the other."""
+        """Number of tile rows."""
         return -(-self.height // self.size)
 
     @property
     def count(self) -> int:
-        """All tiles, counted row by row."""
+        """Number of tiles, which are numbered row by row."""
         return self.columns * self.rows
 
     @property
     def pixels(self) -> int:
-        """Pixels of one tile."""
+        """Number of pixels of a tile."""
         return self.size * self.size
 
     def centers(self, tiles: Int[Tensor, "M"], dtype: torch.dtype) -> Float[Tensor, "M 2"]:
@@ -62,7 +62,7 @@ class TileGrid:
         return torch.stack([axis.repeat(self.size), axis.repeat_interleave(self.size)], dim=-1)
 
     def to_image(self, values: Float[Tensor, "tiles F P"]) -> Float[Tensor, "H W F"]:
-        """Put tiles together and cut off what hangs over. [H, W, F]"""
+        """Assemble tiles into an image, cropped to its size. [H, W, F]"""
         split = values.view(self.rows, self.columns, -1, self.size, self.size)
         whole = split.permute(0, 3, 1, 4, 2).reshape(self.rows * self.size, self.columns * self.size, -1)
         return whole[: self.height, : self.width]
@@ -85,13 +85,13 @@ class TilePairs:
 
 @dataclass(frozen=True)
 class Extents:
-    """How far the Gaussians reach: exactly to where alpha falls to alpha_min.
+    """Exact extents of the Gaussians, to where alpha falls to alpha_min.
 
     Attributes:
         squared_radii: tau: the squared Mahalanobis distance at which alpha = alpha_min; negative where it never
             reaches it. [N]
         halves: Half-extents of the ellipse along x and y, pixels. [N, 2]
-        drawn: In front of the camera and reaching at least as far as the rectangle of pixel centres. [N]
+        drawn: Whether beyond the near plane and overlapping the rectangle of pixel centres. [N]
     """
 
     squared_radii: Float[Tensor, "N"]
@@ -103,7 +103,7 @@ class Extents:
 def gaussian_extents(
     projected: ProjectedGaussians, opacities: Float[Tensor, "N"], grid: TileGrid, alpha_min: float
 ) -> Extents:
-    """Where each Gaussian ends, and whether that is inside the image."""
+    """Compute the extent of each Gaussian, and whether it overlaps the image."""
     tau = 2 * torch.log(opacities / alpha_min)
     halves = (tau.clamp_min(0)[:, None] * projected.covariances[:, ::2]).sqrt()
     low = torch.full_like(projected.means2d, 0.5)
@@ -154,7 +154,7 @@ def _squared_distance_to_box(
     low: Float[Tensor, "M 2"],
     high: Float[Tensor, "M 2"],
 ) -> Float[Tensor, "M"]:
-    """Smallest squared Mahalanobis distance from a Gaussian's centre to an axis-aligned box, exactly. [M]
+    """Exact smallest squared Mahalanobis distance from a Gaussian's centre to an axis-aligned box. [M]
 
     A convex quadratic has its minimum over a box at the centre if that is inside, else on an edge that faces it; along
     the edge of given dx the best dy is dx * cov_xy / cov_xx, clamped to the edge's ends (and likewise with x and y

@@ -1,4 +1,4 @@
-"""Gaussian splatting in plain PyTorch: the written definition every other backend is tested against."""
+"""Gaussian splatting in plain PyTorch, the reference that all other backends are tested against."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from coliags_plugin.renderers.projection import ProjectedGaussians, facing_norma
 from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer, check_outputs
 from coliags_plugin.renderers.tiles import TileGrid, bin_gaussians, gaussian_extents
 
-#: What each output beyond rgb and alpha is composited from. The median depth is no weighted sum.
+#: Per-Gaussian quantity composited for each output beyond rgb and alpha. The median depth is not a weighted sum.
 _SUMMED = {
     "depth_accumulated": "depth",
     "depth_expected": "depth",
@@ -36,7 +36,7 @@ class TorchRendererSettings(CutSettings):
 
 
 class TorchRenderer(SplattingRenderer):
-    """Splats 3D Gaussians on whatever device, and in whatever precision, they come. See ``docs/rendering.md``."""
+    """Reference renderer of 3D Gaussians, on any device, in float32 or float64. See ``docs/rendering.md``."""
 
     Settings = TorchRendererSettings
     primitives: ClassVar[frozenset[str]] = frozenset({"gaussians3d"})
@@ -47,7 +47,7 @@ class TorchRenderer(SplattingRenderer):
 
     @classmethod
     def availability(cls) -> Availability:
-        """Always: it needs nothing but PyTorch."""
+        """Always available: PyTorch only."""
         return Availability(True, "plain PyTorch, runs wherever PyTorch does")
 
     def draw(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> RenderOutput:
@@ -61,16 +61,16 @@ def render_gaussians(
     wants: Sequence[str] = ("rgb", "alpha"),
     settings: TorchRendererSettings | None = None,
 ) -> RenderOutput:
-    """Render Gaussians as the camera sees them.
+    """Render 3D Gaussians from a camera.
 
     Everything but ``depth_median`` and ``radii`` is differentiable, once, in the Gaussians and in
-    ``camera.camera_to_world``; ``means2d.grad`` is there after ``backward``.
+    ``camera.camera_to_world``; ``means2d.grad`` is set by ``backward``.
 
     Args:
         gaussians: 3D Gaussians, all of one dtype (float32 or float64) on one device. The result is of that dtype.
-        camera: Where from; its pose is cast to the Gaussians' dtype and device.
-        wants: Names from :data:`coliags_plugin.core.render_output.OUTPUTS`; rgb and alpha always come.
-        settings: The defaults where None.
+        camera: Camera of the view; its pose is cast to the Gaussians' dtype and device.
+        wants: Names from :data:`coliags_plugin.core.render_output.OUTPUTS`; rgb and alpha are always included.
+        settings: Defaults if None.
 
     Raises:
         InputError: An output is unknown or the Gaussians are surfels.
@@ -79,13 +79,13 @@ def render_gaussians(
     check_outputs(wants, gaussians)
     grid = TileGrid(camera.width, camera.height, settings.tile_size)
     cuts = Cuts(settings.alpha_max, settings.alpha_min, settings.transmittance_min)
-    projected = project_gaussians(gaussians, camera, settings.near, settings.low_pass)
+    projected = project_gaussians(gaussians, camera, settings.near_plane, settings.eps2d)
     if projected.means2d.requires_grad:
         projected.means2d.retain_grad()
     extents = gaussian_extents(projected, gaussians.opacities, grid, settings.alpha_min)
     pairs = bin_gaussians(projected, extents, grid)
 
-    # One table and one lookup: the gradient of a lookup is the dearest step outside compositing.
+    # One table and one lookup: the gradient of a lookup is the most expensive step outside compositing.
     opacities = torch.where(extents.drawn, gaussians.opacities, 1.0)
     features, columns = _features(gaussians, projected, wants)
     table = torch.cat([projected.means2d, projected.whitenings, opacities.log()[:, None], features], dim=-1)
@@ -114,7 +114,7 @@ def render_gaussians(
 def _features(
     gaussians: Gaussians, projected: ProjectedGaussians, wants: Sequence[str]
 ) -> tuple[Float[Tensor, "N F"], dict[str, int | slice]]:
-    """What to composite, and in which columns: colour, 1 (its sum is alpha), then what the outputs asked for need."""
+    """Channels to composite and their columns: colour, 1 (its sum is alpha), then what the outputs need."""
     parts = [gaussians.colors, torch.ones_like(projected.depths)[:, None]]
     columns: dict[str, int | slice] = {}
     width = 4
@@ -137,6 +137,6 @@ def _features(
 
 
 def _expected(depth_accumulated: Float[Tensor, "H W"], alpha: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
-    """Mean depth of what is drawn; 0, and no gradient, where nothing is."""
+    """Expected depth; 0, and no gradient, where alpha is 0. [H, W]"""
     covered = alpha > 0
     return torch.where(covered, depth_accumulated / torch.where(covered, alpha, 1.0), 0.0)

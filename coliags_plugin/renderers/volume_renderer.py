@@ -24,26 +24,26 @@ _OUTPUTS = frozenset(OUTPUTS) - {"normals"}
 class VolumeRendererSettings(Settings):
     """Options of :class:`VolumeRenderer`."""
 
-    near: float = Field(default=0.2, gt=0)
-    """z-depth of the first interval's beginning, scene units."""
-    far: float = Field(default=100.0, gt=0)
-    """z-depth of the last interval's end, scene units."""
+    near_plane: float = Field(default=0.2, gt=0)
+    """z-depth of the start of the first interval, scene units."""
+    far_plane: float = Field(default=100.0, gt=0)
+    """z-depth of the end of the last interval, scene units."""
     samples: int = Field(default=128, ge=2)
-    """Intervals along each ray; the field is asked in their middles."""
+    """Intervals per ray; the field is evaluated at their midpoints."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """RGB behind everything."""
+    """Background RGB."""
     rays_at_once: int = Field(default=8192, ge=1)
-    """Of whole images; bounds memory."""
+    """Rays per batch when rendering whole images; bounds memory."""
 
     @model_validator(mode="after")
     def _near_before_far(self) -> Self:
-        if self.far <= self.near:
-            raise ValueError(f"far {self.far} does not lie beyond near {self.near}")
+        if self.far_plane <= self.near_plane:
+            raise ValueError(f"far_plane {self.far_plane} does not lie beyond near_plane {self.near_plane}")
         return self
 
 
 class VolumeRenderer(Renderer):
-    """Composites density and colour along rays, of whole images or of some pixels."""
+    """Volume renderer of radiance fields, for whole images or selected pixels."""
 
     Settings: ClassVar[type[Settings]] = VolumeRendererSettings
     primitives: ClassVar[frozenset[str]] = frozenset({"radiance"})
@@ -55,7 +55,7 @@ class VolumeRenderer(Renderer):
 
     @classmethod
     def availability(cls) -> Availability:
-        """Always: it needs nothing but PyTorch."""
+        """Always available: PyTorch only."""
         return Availability(True, "plain PyTorch, runs wherever PyTorch does")
 
     def render(
@@ -69,9 +69,9 @@ class VolumeRenderer(Renderer):
 
         Args:
             field: A radiance field.
-            camera: Where from.
-            wants: Names from :data:`coliags_plugin.core.render_output.OUTPUTS`, normals excepted; rgb and alpha always
-                come. Depths are z-depths.
+            camera: Camera of the view.
+            wants: Names from :data:`coliags_plugin.core.render_output.OUTPUTS`, normals excepted; rgb and alpha are
+                always included. Depths are z-depths.
             pixels: Columns and rows of the only pixels to render. [P, 2]
 
         Raises:
@@ -102,9 +102,10 @@ class VolumeRenderer(Renderer):
     def _march(
         self, field: RadianceField, camera: Camera, rays: Float[Tensor, "P 3"], wants: Sequence[str]
     ) -> RenderOutput:
-        """Composite along rays that reach z-depth 1 in one length."""
+        """Composite along rays normalised to z = 1."""
         options = self.settings
-        edges = torch.linspace(options.near, options.far, options.samples + 1, dtype=rays.dtype, device=rays.device)
+        ends = (options.near_plane, options.far_plane)
+        edges = torch.linspace(*ends, options.samples + 1, dtype=rays.dtype, device=rays.device)
         depths = 0.5 * (edges[1:] + edges[:-1])
         lengths = rays.norm(dim=-1, keepdim=True)
         samples = field.query(camera.center + depths[:, None] * rays[:, None], rays / lengths, camera)
@@ -123,7 +124,7 @@ class VolumeRenderer(Renderer):
 def _depth_map(
     name: str, weights: Float[Tensor, "P S"], depths: Float[Tensor, "S"], transmittance: Float[Tensor, "P S+1"]
 ) -> Float[Tensor, "P 1"]:
-    """A z-depth output by its name."""
+    """A z-depth output by name. [P, 1]"""
     if name == "inverse_depth_accumulated":
         return (weights / depths).sum(1, keepdim=True)
     if name == "depth_median":

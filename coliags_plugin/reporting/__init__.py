@@ -1,1 +1,1 @@
-"""Reports: figures, charts and pictures of runs on one page."""
+"""HTML report of evaluated runs: metrics, charts and images."""

@@ -1,4 +1,4 @@
-"""Methods by metrics: which columns, how many decimals, who is best."""
+"""Comparison table of methods by metrics: columns, decimals and ranks."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ class Column:
     """One metric of one test set over the runs.
 
     Attributes:
-        metric: Its name in the run folders.
+        metric: Name in the run folders.
         unit: As recorded; empty for a plain number.
-        direction: Which way is better; None where no run says, and then nothing is ranked.
-        values: One for each run; None where unavailable.
+        direction: Whether higher or lower is better; None where no run says, then nothing is ranked.
+        values: One per run; None where unavailable.
     """
 
     metric: str
@@ -45,12 +45,12 @@ class Column:
 
     @property
     def title(self) -> str:
-        """Name for people."""
+        """Column heading."""
         return metric_title(self.metric)
 
     @property
     def decimals(self) -> int:
-        """Decimals of every value of the column: 2 for dB, 4 for plain numbers, else 3 figures of the smallest."""
+        """Decimals of every value of the column: 2 for dB, 4 for plain numbers, else 3 digits of the smallest."""
         if self.unit == "dB":
             return 2
         if self.unit in ("", "1"):
@@ -61,13 +61,13 @@ class Column:
         return min(max(_SIGNIFICANT - 1 - math.floor(math.log10(min(sizes))), 0), _MOST_DECIMALS)
 
     def text(self, value: float) -> str:
-        """A value as the table prints it."""
+        """Value formatted for the table."""
         return f"{value:.{self.decimals}f}"
 
     def ranks(self) -> list[int | None]:
-        """Places from 1 on, by the printed value; equal values share a place and the next one is skipped.
+        """Rank of each run from 1 on, by the printed value; equal values share a rank and the next one is skipped.
 
-        None where a value is unavailable, and everywhere when fewer than two values are there to compare.
+        None where a value is unavailable, and everywhere with fewer than two values.
         """
         if self.direction is None:
             return [None] * len(self.values)
@@ -80,9 +80,9 @@ class Column:
 
 
 def columns(runs: Sequence[EvaluatedRun], set_name: str) -> list[Column]:
-    """The columns of a test set's table, each metric followed by its figure over the seen pixels.
+    """Columns of a test set's table, each metric followed by the same over the seen pixels.
 
-    A figure over the seen pixels that only other sets have is not missing here, and has no column.
+    A metric over the seen pixels that only other sets have gets no column.
     """
     directions: dict[str, Direction] = {}
     units: dict[str, str] = {}
@@ -90,8 +90,8 @@ def columns(runs: Sequence[EvaluatedRun], set_name: str) -> list[Column]:
     for run in runs:
         directions.update(run.record.directions)
         units.update(run.record.units)
-        figures = run.record.sets.get(set_name, {})
-        present.update(dict.fromkeys(name for name, value in figures.items() if name != "frames" and _is_figure(value)))
+        means = run.record.sets.get(set_name, {})
+        present.update(dict.fromkeys(name for name, value in means.items() if name != "frames" and _is_value(value)))
     listed = [name for base in directions for name in (base, base + SEEN_SUFFIX) if name in present]
     ordered = [name for name in dict.fromkeys([*listed, *present]) if not _belongs_elsewhere(runs, set_name, name)]
     return [
@@ -99,7 +99,7 @@ def columns(runs: Sequence[EvaluatedRun], set_name: str) -> list[Column]:
             metric=name,
             unit=units.get(name, units.get(name.removesuffix(SEEN_SUFFIX), "")),
             direction=directions.get(name, directions.get(name.removesuffix(SEEN_SUFFIX))),
-            values=[run.figure(set_name, name) for run in runs],
+            values=[run.mean(set_name, name) for run in runs],
         )
         for name in ordered
     ]
@@ -108,21 +108,21 @@ def columns(runs: Sequence[EvaluatedRun], set_name: str) -> list[Column]:
 def _belongs_elsewhere(runs: Sequence[EvaluatedRun], set_name: str, metric: str) -> bool:
     if not metric.endswith(SEEN_SUFFIX):
         return False
-    having = {name for run in runs for name in run.record.sets if run.figure(name, metric) is not None}
+    having = {name for run in runs for name in run.record.sets if run.mean(name, metric) is not None}
     return bool(having) and set_name not in having
 
 
 def metric_title(metric: str) -> str:
-    """A metric's name for people."""
+    """Title of a metric, for instance "PSNR, seen pixels"."""
     base = metric.removesuffix(SEEN_SUFFIX)
     title = _NAMES.get(base) or base.replace("_", " ").capitalize()
     return f"{title}, seen pixels" if metric != base else title
 
 
 def unit_text(unit: str) -> str:
-    """A unit in type: ``mm^2`` as mm²."""
+    """Unit with typographic exponents: ``mm^2`` as mm²."""
     return "" if unit == "1" else unit.replace("^2", "²").replace("^3", "³")
 
 
-def _is_figure(value: object) -> bool:
+def _is_value(value: object) -> bool:
     return value is None or (isinstance(value, (int, float)) and not isinstance(value, bool))

@@ -1,6 +1,6 @@
-"""Finished runs of one scene -> one HTML file that carries its own pictures and needs no script and no network.
+"""Self-contained HTML report that compares runs of one scene, with embedded images and no scripts.
 
-The same runs give the same bytes: nothing of the hour or the machine that writes the report is in it.
+The same runs give the same bytes: the file contains neither the time nor the machine it was written on.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from typing import Any
 import numpy as np
 
 from coliags_plugin.outputs.charts import Series, color_bar_svg, line_chart, style_classes
-from coliags_plugin.outputs.figures import hatch
+from coliags_plugin.outputs.colormaps import hatch
+from coliags_plugin.outputs.image_files import encode_png
 from coliags_plugin.outputs.page import leaves, plain, record, refuse_folder, write_page
-from coliags_plugin.outputs.pictures import encode_png
 from coliags_plugin.reporting.comparison_table import Column, columns, metric_title, unit_text
 from coliags_plugin.reporting.run_data import SEEN_SUFFIX, EvaluatedRun, read_runs
 from coliags_plugin.reporting.views import SCALE_PERCENTILE, Picture, RunView, View, Views, read_views
 
 _SET_TITLES = {"test": "test: held out along the path", "rotation": "rotation: beyond the path"}
-#: Figures under a picture, where the evaluator has them.
+#: Metrics shown under an image, where available.
 _CAPTION_METRICS = ("psnr", "psnr_seen", "ssim", "ssim_seen", "depth_mae", "depth_mae_seen", "depth_mse")
 _DASH = "\N{EN DASH}"
-#: A curve of more logged steps is drawn through the means of this many stretches.
+#: Curves of more logged steps are averaged over this many intervals.
 _MOST_POINTS = 120
-#: Bands of more runs than this only hide one another.
+#: Minimum-maximum bands are drawn for at most this many runs.
 _MOST_BANDS = 3
-#: A loss that falls by less is easier to read on a linear axis.
+#: Ratio of largest to smallest loss from which on the axis is logarithmic.
 _LOG_FROM = 8.0
 
 
@@ -42,15 +42,15 @@ def write_report(
     title: str | None = None,
     note: str | None = None,
 ) -> None:
-    """Compare runs of one scene on one page: figures, held-out views, depth errors, curves and costs.
+    """Write an HTML comparison of runs of one scene: metrics, held-out views, depth errors, curves and costs.
 
     Args:
         runs: Run folders, evaluated by one protocol in one version.
         output: The HTML file to write; replaced if it is there.
-        protocol: Which evaluation of each run.
-        frames: Held-out views to show of each test set.
+        protocol: Name of the evaluation to read from each run.
+        frames: Held-out views to show per test set.
         title: Heading; made from scene and methods if None.
-        note: Shown prominently under the heading, for instance what the runs are too short to prove.
+        note: Remark shown under the heading.
 
     Raises:
         InputError: A run is missing, not evaluated, damaged, or not comparable with the others; or ``output`` cannot
@@ -81,7 +81,7 @@ def _header(runs: Sequence[EvaluatedRun], views: Views, heading: str, note: str 
         ("Scene", record.scene),
         ("Methods", ", ".join(dict.fromkeys(run.record.method for run in runs))),
         ("Held-out frames", sets),
-        ("Picture size", f"{views.size[0]} \N{MULTIPLICATION SIGN} {views.size[1]} px"),
+        ("Image size", f"{views.size[0]} \N{MULTIPLICATION SIGN} {views.size[1]} px"),
         ("Protocol", f"{record.protocol.name}, version {record.protocol.version}"),
         ("Trained with", _versions(runs)),
     ]
@@ -91,9 +91,8 @@ def _header(runs: Sequence[EvaluatedRun], views: Views, heading: str, note: str 
     parts.append('<dl class="facts">')
     parts += [f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in facts if value]
     if record.protocol.description:
-        parts.append(
-            f'<div class="wide"><dt>How the figures are made</dt><dd>{escape(record.protocol.description)}</dd></div>'
-        )
+        description = escape(record.protocol.description)
+        parts.append(f'<div class="wide"><dt>How the metrics are computed</dt><dd>{description}</dd></div>')
     parts.append("</dl>")
     cautions = _cautions(runs)
     if cautions:
@@ -108,7 +107,7 @@ def _versions(runs: Sequence[EvaluatedRun]) -> str:
 
 
 def _cautions(runs: Sequence[EvaluatedRun]) -> list[str]:
-    """What a reader has to know before holding these runs against one another."""
+    """Differences between the runs that limit their comparison: steps, versions, data."""
     cautions = []
     steps = {run.label: run.record.step for run in runs if run.record.step is not None}
     if len(set(steps.values())) > 1:
@@ -126,22 +125,22 @@ def _cautions(runs: Sequence[EvaluatedRun]) -> list[str]:
 
 
 def _recorded_scenes(runs: Sequence[EvaluatedRun]) -> dict[str, Mapping[str, Any]]:
-    """What each run says about its data, by label, where it says anything."""
+    """Scene provenance of each run by label, where recorded."""
     scenes = {run.label: run.provenance.get("scene") for run in runs}
     return {label: scene for label, scene in scenes.items() if isinstance(scene, Mapping)}
 
 
-# ---------------------------------------------------------------------------------------------------- figures
+# ---------------------------------------------------------------------------------------------------- metrics
 
 
 def _results(runs: Sequence[EvaluatedRun]) -> str:
     how = (
         "Means over the frames of each set. ↑ higher is better, ↓ lower is better. "
-        "Best in <b>bold</b>, second <u>underlined</u>, by the printed digits; equal values share a place."
+        "Best in <b>bold</b>, second <u>underlined</u>, by the printed digits; equal values share a rank."
         if len(runs) > 1
         else "Means over the frames of each set. ↑ higher is better, ↓ lower is better."
     )
-    parts = ["<section><h2>Figures</h2>", f'<p class="hint">{how}</p>']
+    parts = ["<section><h2>Metrics</h2>", f'<p class="hint">{how}</p>']
     parts += [_result_table(runs, name) for name in runs[0].per_frame]
     return "\n".join([*parts, "</section>"])
 
@@ -171,7 +170,7 @@ def _result_table(runs: Sequence[EvaluatedRun], set_name: str) -> str:
 def _result_head(column: Column) -> str:
     arrow = {"higher": "↑", "lower": "↓", None: ""}[column.direction]
     title = f' title="{column.direction} is better"' if arrow else ""
-    # Arrow and unit share the second line, so that every head breaks alike.
+    # Arrow and unit share the second line, so that all headings have two lines.
     under = f"{arrow} {escape(unit_text(column.unit))}".strip() or "&nbsp;"
     return f'<th scope="col">{escape(column.title)}<span class="unit"{title}>{under}</span></th>'
 
@@ -194,7 +193,7 @@ def _result_cell(
 
 
 def _footnote(footnotes: dict[str, str], text: str) -> str:
-    """The mark of a footnote; the same text has one mark."""
+    """Superscript mark of a footnote; equal texts share one."""
     return f"<sup>{footnotes.setdefault(text, _mark(len(footnotes)))}</sup>"
 
 
@@ -203,7 +202,7 @@ def _mark(index: int) -> str:
     return (letters[index // 26 - 1] if index >= 26 else "") + letters[index % 26]
 
 
-# ---------------------------------------------------------------------------------------------------- pictures
+# ---------------------------------------------------------------------------------------------------- images
 
 
 def _held_out(runs: Sequence[EvaluatedRun], views: Views) -> str:
@@ -231,7 +230,7 @@ def _how_drawn(views: Views) -> str:
             f"and blue. One scale serves every run and every frame of this page: {rule}."
         )
     if views.reduction > 1:
-        text += f" Pictures are shown at 1/{views.reduction} of their size."
+        text += f" Images are shown at 1/{views.reduction} of their size."
     return f"{text} Photographs are JPEG here; the run folders keep them as PNG."
 
 
@@ -255,11 +254,11 @@ def _view(runs: Sequence[EvaluatedRun], view: View, error_kind: str) -> str:
         f'<h4>{escape(where)} <span class="count">{view.position + 1} of {view.frames_in_set}</span></h4>',
         f'<div class="view" style="--cells: {1 + len(runs)}">',
         '<figure class="cell"><div class="name">truth</div>',
-        _img(view.truth, f"{where}, true picture"),
+        _img(view.truth, f"{where}, true image"),
     ]
     if view.depth is not None:
         parts.append(_img(view.depth, f"{where}, true depth"))
-        parts.append("<figcaption><span>above: camera picture</span><span>below: true depth</span></figcaption>")
+        parts.append("<figcaption><span>above: camera image</span><span>below: true depth</span></figcaption>")
     elif error_kind == "depth":
         parts.append(_missing(view.truth, "no true depth"))
     parts.append("</figure>")
@@ -271,22 +270,22 @@ def _view(runs: Sequence[EvaluatedRun], view: View, error_kind: str) -> str:
             parts.append(_img(part.error, f"{where}, absolute {kind} error of {run.label}"))
         else:
             parts.append(_missing(part.render, "no depth to compare"))
-        parts.append(f"<figcaption>{_view_figures(run, part)}</figcaption></figure>")
+        parts.append(f"<figcaption>{_view_metrics(run, part)}</figcaption></figure>")
     return "\n".join([*parts, "</div>"])
 
 
-def _view_figures(run: EvaluatedRun, part: RunView) -> str:
+def _view_metrics(run: EvaluatedRun, part: RunView) -> str:
     texts = []
     for metric in _CAPTION_METRICS:
-        value = part.figures.figures.get(metric)
-        if value is None or (metric == "depth_mse" and "depth_mae" in part.figures.figures):
+        value = part.metrics.values.get(metric)
+        if value is None or (metric == "depth_mse" and "depth_mae" in part.metrics.values):
             continue
         unit = run.record.units.get(metric, run.record.units.get(metric.removesuffix(SEEN_SUFFIX), ""))
         column = Column(metric, unit, None, [value])
         texts.append(
             f"<span>{escape(f'{metric_title(metric)} {column.text(value)} {unit_text(unit)}'.rstrip())}</span>"
         )
-    return "".join(texts) or "no figures for this frame"
+    return "".join(texts) or "no metrics for this frame"
 
 
 def _img(picture: Picture, alt: str) -> str:
@@ -376,7 +375,7 @@ def _cost_table(runs: Sequence[EvaluatedRun]) -> str:
 
 
 def _costs(run: EvaluatedRun) -> list[str]:
-    """Steps, time, time of a step, Gaussians and anchors at the end."""
+    """Table cells of a run: steps, time, time per step, final numbers of Gaussians and anchors."""
     step, planned = run.record.step, run.provenance.get("steps")
     steps = _DASH if step is None else f"{step:,}"
     if isinstance(planned, int) and step is not None and planned != step:
@@ -396,7 +395,7 @@ def _pace(seconds: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """A length of time for people: two units at most."""
+    """Duration in at most two units, for instance ``2 min 05 s``."""
     if seconds < 60.0:
         return f"{seconds:.1f} s"
     minutes, rest = divmod(round(seconds), 60)
@@ -415,7 +414,7 @@ def _per_frame(runs: Sequence[EvaluatedRun]) -> str:
                 run.label,
                 index,
                 list(map(float, range(len(names)))),
-                [frame.figures.get("psnr", math.nan) for frame in run.per_frame[set_name]],
+                [frame.values.get("psnr", math.nan) for frame in run.per_frame[set_name]],
             )
             for index, run in enumerate(runs)
         ]

@@ -1,4 +1,4 @@
-"""Finished run folders, read and held against one another for a report."""
+"""Reading of evaluated run folders, and the checks that they are comparable."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from coliags_plugin.core.errors import InputError
 
-#: Figures over the pixels that a training frame also sees carry the metric's name and this.
+#: Suffix of metrics over the pixels that a training frame also sees.
 SEEN_SUFFIX = "_seen"
 
 
 class ProtocolRecord(BaseModel):
-    """Which protocol made the figures."""
+    """Name and version of an evaluation protocol."""
 
     name: str
     version: int
@@ -28,7 +28,7 @@ class ProtocolRecord(BaseModel):
 
 
 class EvaluationRecord(BaseModel):
-    """The parts of ``eval/<protocol>/metrics.json`` a report uses; what else is there is left alone."""
+    """The parts of ``eval/<protocol>/metrics.json`` that a report uses; other keys are ignored."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -43,11 +43,11 @@ class EvaluationRecord(BaseModel):
 
 
 @dataclass(frozen=True)
-class FrameFigures:
-    """One held-out frame's figures; unavailable ones are absent."""
+class FrameMetrics:
+    """Metrics of one held-out frame; unavailable ones are absent."""
 
     name: str
-    figures: Mapping[str, float]
+    values: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,8 @@ class EvaluatedRun:
     Attributes:
         folder: The run folder.
         evaluation: The evaluation's folder.
-        label: What the report calls the run: its method, and its stamp where another run has the same method.
-        record: Figures and what made them.
+        label: Name of the run in the report: its method, and its stamp where another run has the same method.
+        record: Metrics, protocol and method.
         per_frame: Frames of each test set in the evaluator's order.
         provenance: As recorded; any key may be missing.
         history: Training log by column; ``seconds`` counts from the start of training. NaN where a line lacks the
@@ -69,20 +69,20 @@ class EvaluatedRun:
     evaluation: Path
     label: str
     record: EvaluationRecord
-    per_frame: Mapping[str, Sequence[FrameFigures]]
+    per_frame: Mapping[str, Sequence[FrameMetrics]]
     provenance: Mapping[str, Any]
     history: Mapping[str, np.ndarray] = field(default_factory=dict)
 
-    def figure(self, set_name: str, metric: str) -> float | None:
-        """A test set's mean figure, None where it is unavailable."""
+    def mean(self, set_name: str, metric: str) -> float | None:
+        """Mean of a metric over a test set, None where it is unavailable."""
         return _number(self.record.sets.get(set_name, {}).get(metric))
 
     def frames_with(self, set_name: str, metric: str) -> int:
-        """How many frames of a set have a figure."""
-        return sum(metric in frame.figures for frame in self.per_frame[set_name])
+        """Number of frames of a set that have the metric."""
+        return sum(metric in frame.values for frame in self.per_frame[set_name])
 
     def reason(self, metric: str) -> str:
-        """Why a figure is unavailable."""
+        """Why a metric is unavailable."""
         reasons = self.record.reasons
         return reasons.get(metric) or reasons.get(metric.removesuffix(SEEN_SUFFIX)) or "no reason was recorded"
 
@@ -96,7 +96,7 @@ class EvaluatedRun:
 
 
 def read_runs(folders: Sequence[Path], protocol: str) -> list[EvaluatedRun]:
-    """Read runs that may share a table.
+    """Read runs and check that they are comparable.
 
     Args:
         folders: Run folders.
@@ -121,7 +121,7 @@ def read_runs(folders: Sequence[Path], protocol: str) -> list[EvaluatedRun]:
 
 
 def _labels(names: Sequence[tuple[str, str]]) -> list[str]:
-    """Methods, told apart by their stamps where two are alike, and by number where the stamps are alike too."""
+    """Unique labels: the method, with the stamp where two are alike, and a number where the stamps are alike too."""
     methods = [method for method, _ in names]
     labels = [f"{method} · {stamp}" if methods.count(method) > 1 else method for method, stamp in names]
     return [
@@ -193,8 +193,8 @@ def _read_history(path: Path) -> dict[str, np.ndarray]:
     return {name: values for name, values in table.items() if np.isfinite(values).any()}
 
 
-def _read_per_frame(path: Path, folder: Path, protocol: str) -> dict[str, list[FrameFigures]]:
-    sets: dict[str, list[FrameFigures]] = {}
+def _read_per_frame(path: Path, folder: Path, protocol: str) -> dict[str, list[FrameMetrics]]:
+    sets: dict[str, list[FrameMetrics]] = {}
     try:
         with path.open(newline="", encoding="utf-8") as file:
             for number, row in enumerate(csv.DictReader(file), start=2):
@@ -204,13 +204,13 @@ def _read_per_frame(path: Path, folder: Path, protocol: str) -> dict[str, list[F
                         "columns set, frame, ...",
                         _again(folder, protocol),
                     )
-                figures = {
+                values = {
                     name: float(cell) for name, cell in row.items() if name not in ("set", "frame", None) and cell
                 }
-                finite = {name: value for name, value in figures.items() if math.isfinite(value)}
-                sets.setdefault(row["set"], []).append(FrameFigures(row["frame"], finite))
+                finite = {name: value for name, value in values.items() if math.isfinite(value)}
+                sets.setdefault(row["set"], []).append(FrameMetrics(row["frame"], finite))
     except (OSError, ValueError, csv.Error) as error:
-        raise InputError(f"{path} cannot be read: {error}", "a table of figures", _again(folder, protocol)) from error
+        raise InputError(f"{path} cannot be read: {error}", "a table of metrics", _again(folder, protocol)) from error
     if not sets:
         raise InputError(f"{path} lists no frames", "one line for each held-out frame", _again(folder, protocol))
     return sets
@@ -222,7 +222,7 @@ def _refuse_mismatch(first: EvaluatedRun, other: EvaluatedRun) -> None:
         raise InputError(
             f"{first.folder} was evaluated by protocol {one.protocol.name} version {one.protocol.version}, "
             f"{other.folder} by {two.protocol.name} version {two.protocol.version}",
-            "one protocol and version for every run: figures of two protocols do not share a table",
+            "one protocol and version for every run: metrics of two protocols are not comparable",
             "Run `coliags eval` again on the older run",
         )
     if one.scene != two.scene:

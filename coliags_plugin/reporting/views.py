@@ -1,4 +1,4 @@
-"""The held-out views a report shows: chosen, read, and drawn on common scales."""
+"""Held-out views of a report: selection, reading, and error maps on a common colour scale."""
 
 from __future__ import annotations
 
@@ -12,21 +12,27 @@ import cv2
 import numpy as np
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.outputs.figures import depth_error, depth_error_picture, depth_picture, rgb_error, rgb_error_picture
-from coliags_plugin.outputs.pictures import encode_jpeg, encode_png, read_depth_tiff, read_rgb
-from coliags_plugin.outputs.scales import linear_ticks, round_up
-from coliags_plugin.reporting.run_data import EvaluatedRun, FrameFigures
+from coliags_plugin.outputs.axis_ticks import linear_ticks, round_up
+from coliags_plugin.outputs.colormaps import (
+    depth_error,
+    depth_error_picture,
+    depth_picture,
+    rgb_error,
+    rgb_error_picture,
+)
+from coliags_plugin.outputs.image_files import encode_jpeg, encode_png, read_depth_tiff, read_rgb
+from coliags_plugin.reporting.run_data import EvaluatedRun, FrameMetrics
 
-#: Wider pictures are reduced by a whole number, so that a report stays something to mail.
+#: Wider images are reduced by an integer factor, to limit the size of the report, px.
 _WIDEST = 640
-#: Of the errors shown, this part lies within the common scale.
+#: Percentile of the errors shown at which the common scale ends, before rounding up.
 SCALE_PERCENTILE = 95.0
 _SMALLEST_SCALE = 1e-6
 
 
 @dataclass(frozen=True)
 class Picture:
-    """An encoded picture.
+    """An encoded image.
 
     Attributes:
         mime: ``image/png`` or ``image/jpeg``.
@@ -43,16 +49,16 @@ class Picture:
 
 @dataclass(frozen=True)
 class RunView:
-    """One run's part of a view. ``error`` is None where the run wrote no depth for the frame."""
+    """Rendering, error map and metrics of one run; ``error`` is None where the run has no depth of the frame."""
 
     render: Picture
     error: Picture | None
-    figures: FrameFigures
+    metrics: FrameMetrics
 
 
 @dataclass(frozen=True)
 class View:
-    """One held-out frame: the truth, and what each run made of it. ``depth`` is None where the data have none."""
+    """One held-out frame: ground truth and every run's rendering; ``depth`` is None where the data have none."""
 
     set_name: str
     frame: str
@@ -69,11 +75,11 @@ class Views:
 
     Attributes:
         views: In the order of the sets and the video.
-        size: Width and height of the evaluated pictures, px.
-        reduction: Pictures are shown at one part in this many of their size.
-        error_kind: What the error pictures show.
-        error_limit: End of the common error scale: mm for depth, levels of 255 for colour.
-        depth_limits: Ends of the common scale of the true depth, mm; None without depth.
+        size: Width and height of the evaluated images, px.
+        reduction: Integer factor by which the images are reduced.
+        error_kind: Whether the error maps show depth or colour errors.
+        error_limit: Upper end of the common error scale: mm for depth, levels of 255 for colour.
+        depth_limits: Range of the common scale of the true depth, mm; None without depth.
     """
 
     views: Sequence[View]
@@ -86,7 +92,7 @@ class Views:
 
 @dataclass(frozen=True)
 class _Pixels:
-    """A chosen frame's pixels, reduced. Depths and errors are mm."""
+    """Pixels of a selected frame, reduced. Depths are in mm."""
 
     set_name: str
     position: int
@@ -97,14 +103,14 @@ class _Pixels:
 
 
 def read_views(runs: Sequence[EvaluatedRun], count: int) -> Views:
-    """Choose frames evenly over every test set, first and last included, and draw them.
+    """Select frames evenly over every test set, first and last included, and draw them.
 
     Args:
         runs: Runs evaluated on the same frames.
-        count: Frames of each set; a smaller set is shown whole.
+        count: Frames per set; a smaller set is shown whole.
 
     Raises:
-        InputError: ``count`` is not positive; or a picture is missing, damaged, or of another size than its truth.
+        InputError: ``count`` is not positive; or an image is missing, damaged, or not of the ground truth's size.
     """
     if count < 1:
         raise InputError(f"{count} frames to show", "at least one")
@@ -136,7 +142,7 @@ def read_views(runs: Sequence[EvaluatedRun], count: int) -> Views:
 
 
 def evenly(length: int, count: int) -> list[int]:
-    """``count`` places spread over ``length``, first and last included; the middle for one."""
+    """``count`` indices spread evenly over ``length``, first and last included; the middle one for one."""
     if count >= length:
         return list(range(length))
     if count == 1:
@@ -216,7 +222,7 @@ def _reduced_rgb(rgb: np.ndarray, reduction: int) -> np.ndarray:
 
 
 def _reduced_map(values: np.ndarray, reduction: int) -> np.ndarray:
-    """Every n-th value: a mean over an edge would be a depth that nothing has."""
+    """Subsampled map: averaging across an edge would give depths of no surface."""
     height, width = values.shape[0] // reduction, values.shape[1] // reduction
     middle = reduction // 2
     return values[middle::reduction, middle::reduction][:height, :width]
@@ -236,7 +242,7 @@ def _errors(pixels: Iterable[_Pixels], kind: Literal["depth", "rgb"]) -> list[np
 
 
 def _depth_limits(frames: Sequence[_Pixels]) -> tuple[float, float] | None:
-    """The range of the true depths shown, widened to the next ticks."""
+    """Range of the true depths shown, widened to the next ticks."""
     finite = [depth[np.isfinite(depth)] for frame in frames if (depth := frame.true_depth) is not None]
     values = np.concatenate(finite) if finite else np.zeros(0)
     if not values.size:

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coliags_plugin.outputs.pictures import read_depth_tiff, read_rgb
+from coliags_plugin.outputs.image_files import read_depth_tiff, read_rgb
 from tests.commands import refused, run
 from tests.scenes import SMALL, write_wall
 
@@ -65,7 +65,7 @@ def test_eval_means_are_the_means_of_the_per_frame_table(trained):
         assert np.mean([float(row[name]) for row in rows]) == pytest.approx(summary[name])
 
 
-def test_eval_figures_agree_with_its_pictures(trained):
+def test_eval_metrics_agree_with_its_images(trained):
     """PSNR and depth MSE taken again from the files, the former through 8 bits."""
     folder = trained / "eval/paper"
     with (folder / "per_frame.csv").open() as file:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from coliags_plugin.outputs.pictures import read_rgb, write_png
+from coliags_plugin.outputs.image_files import read_rgb, write_png
 from coliags_plugin.poses.formats import FORMATS, format_of, write_trajectory
 from coliags_plugin.poses.trajectory import Trajectory
 from tests.commands import refused, run
@@ -114,7 +114,7 @@ def test_convert_replaces_only_when_asked_and_never_its_input(truth, tmp_path, c
     assert "no file or folder" in refused(capsys, "poses", "convert", tmp_path / "x", tmp_path / "y", "--to", "tum")
 
 
-def test_align_prints_figures_and_writes_them(estimate, truth, tmp_path, capsys):
+def test_align_prints_errors_and_writes_them(estimate, truth, tmp_path, capsys):
     figures, plot = tmp_path / "out" / "figures.json", tmp_path / "out" / "plot.png"
     assert run("poses", "align", estimate, truth, "--scale", "--json", figures, "--plot", plot) == 0
     shown = capsys.readouterr().out

@@ -132,6 +132,8 @@ def test_bases_may_be_paths_beside_the_file(method_file):
     [
         ("base: coliags\nfield:\n  geometry_head: {frequences: 4}\n", ["mine.yaml:3", "frequences", "'frequencies'"]),
         ("base: coliags\nfeild: {}\n", ["mine.yaml:2", "unknown key 'feild'", "Did you mean 'field'"]),
+        ("base: coliags\nrenderer: {name: cpu, near: 1.0}\n", ["unknown key 'near'", "Did you mean 'near_plane'"]),
+        ("base: coliags\nrenderer: {name: cpu, low_pass: 1.0}\n", ["unknown key 'low_pass'", "Did you mean 'eps2d'"]),
         ("base: coliags\nschedule:\n  steps: many\n", ["mine.yaml:3", "schedule.steps", "'many'"]),
         ("base: coliags\nschedule:\n  steps: 1.5\n", ["mine.yaml:3", "schedule.steps", "1.5"]),
         ("base: coliags\nschedule:\n  steps: 0\n", ["mine.yaml:3", "greater than or equal to 1"]),

@@ -93,7 +93,7 @@ def test_so_they_are_without_depth(scene, reading):
         for name in ("given", reading)
     )
     assert whats(sound) == ""
-    assert "poses agree with the pictures when read as" in whats(wrong)
+    assert "poses agree with the images when read as" in whats(wrong)
 
 
 @pytest.mark.parametrize(("factor", "told"), [(0.001, "0.001 times"), (0.5, "0.5 times"), (25.4, "25.4 times")])
@@ -111,7 +111,7 @@ def test_everything_in_metres(scene):
     assert "different units" not in whats(metres)
 
 
-def test_pictures_of_other_frames(scene):
+def test_images_of_other_frames(scene):
     turned = changed(scene, depth=lambda depth: depth.flip(1))
     assert "frames do not agree on the surface" in whats(turned)
 
@@ -121,7 +121,7 @@ def test_intrinsics_of_another_size(scene):
     assert "principal point is far from the middle" in whats(doubled)
 
 
-def test_a_jump_a_standstill_black_and_repeated_pictures(scene):
+def test_a_jump_a_standstill_black_and_repeated_images(scene):
     middle = torch.stack([frame.camera.center for frame in scene.train])[:, 2].median()
 
     def jumping(pose):
@@ -131,10 +131,10 @@ def test_a_jump_a_standstill_black_and_repeated_pictures(scene):
 
     assert "the camera jumps" in whats(changed(scene, pose=jumping))
     assert "the camera does not move" in whats(changed(scene, pose=lambda pose: torch.eye(4)))
-    assert "a picture is black" in whats(changed(scene, image=lambda image, index: image * (index != 5)))
+    assert "an image is black" in whats(changed(scene, image=lambda image, index: image * (index != 5)))
     first = scene.train[0].image
     repeated = changed(scene, image=lambda image, index: first if index in (1, 2, 3) else image)
-    assert "pictures repeat" in whats(repeated)
+    assert "images repeat" in whats(repeated)
 
 
 def test_constant_and_unknown_depth(scene):

@@ -201,7 +201,7 @@ def test_spheres_that_touch_the_pyramid_are_kept(x, y, z, radius, yaw):
 
 
 def test_anchors_behind_the_camera_have_cosine_zero():
-    field = make_field(COLIAGS, near=0.0)
+    field = make_field(COLIAGS, near_plane=0.0)
     seen = {}
     head = field.appearance_head
     embed = head.embed

@@ -9,7 +9,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from skimage.metrics import mean_squared_error
 
 from coliags_plugin.core.errors import UnavailableError
-from coliags_plugin.metrics.depth_steps import depth_steps, near
+from coliags_plugin.metrics.depth_steps import depth_steps, dilated
 
 ALL = ["depth_mse", "depth_mse_inner", "depth_rmse", "depth_mae", "depth_median_error", "depth_abs_rel"]
 
@@ -49,7 +49,7 @@ def test_the_median_of_an_odd_number_is_the_middle_one(make, depths):
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_only_the_pixels_that_count_count(name, make, depths, truth, errors):
+def test_only_valid_pixels_enter(name, make, depths, truth, errors):
     counts = torch.rand(25, 30, generator=torch.Generator().manual_seed(2)) < 0.5
     rendered, unknown = truth + errors, truth.clone()
     broken = rendered.clone()
@@ -58,7 +58,7 @@ def test_only_the_pixels_that_count_count(name, make, depths, truth, errors):
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_what_makes_a_figure_unavailable(name, make, depths, pictures, truth):
+def test_unavailable_depth_metrics_give_the_reason(name, make, depths, pictures, truth):
     with pytest.raises(UnavailableError, match="this frame has no ground-truth depth"):
         make(name)(pictures(torch.zeros(4, 4, 3), torch.zeros(4, 4, 3)))
     with pytest.raises(UnavailableError, match="no pixel of this frame has a valid ground-truth depth"):
@@ -87,7 +87,7 @@ def test_a_step_marks_both_sides_and_the_margin_two_more(make, depths):
     truth = two_walls()
     steps = depth_steps(truth, torch.isfinite(truth), 0.12)
     assert steps.all(0).nonzero().flatten().tolist() == [9, 10]
-    assert near(steps, 2).all(0).nonzero().flatten().tolist() == [7, 8, 9, 10, 11, 12]
+    assert dilated(steps, 2).all(0).nonzero().flatten().tolist() == [7, 8, 9, 10, 11, 12]
     rendered = truth.clone()
     rendered[:, 7:13] += 100.0
     assert make("depth_mse_inner")(depths(rendered, truth)) == 0.0
@@ -101,7 +101,7 @@ def test_the_step_is_relative_to_the_nearer_side(far, is_step):
     assert bool(depth_steps(truth, torch.isfinite(truth), 0.12).any()) is is_step
 
 
-def test_the_numbers_are_settings(make, depths):
+def test_threshold_and_margin_are_settings(make, depths):
     truth = two_walls()
     rendered = truth.clone()
     rendered[:, 9:11] += 3.0
@@ -119,7 +119,7 @@ def test_unknown_pixels_make_no_step_but_hide_none(make, depths):
     assert depth_steps(across, torch.isfinite(across), 0.12).all(0).nonzero().flatten().tolist() == [10]
 
 
-def test_nothing_but_steps_has_no_inner_figure(make, depths):
+def test_inner_mse_is_unavailable_where_every_pixel_is_near_a_step(make, depths):
     board = 20 + 10 * ((torch.arange(8)[:, None] + torch.arange(8)) % 2).float()
     with pytest.raises(UnavailableError, match="away from depth steps"):
         make("depth_mse_inner")(depths(board, board))
@@ -137,4 +137,4 @@ def test_steps_and_margin_against_scipy(seed, step, reach):
     steps = depth_steps(torch.where(known, depth, torch.nan), known, step)
     np.testing.assert_array_equal(steps.numpy(), expected)
     grown = maximum_filter(expected.astype(np.uint8), 2 * reach + 1, mode="constant")
-    np.testing.assert_array_equal(near(steps, reach).numpy(), grown > 0)
+    np.testing.assert_array_equal(dilated(steps, reach).numpy(), grown > 0)

@@ -46,7 +46,7 @@ def test_ssim_is_the_masked_flavour_in_double_precision(make, pictures, pair, ma
 
 
 @pytest.mark.parametrize("name", ["psnr", "ssim"])
-def test_what_the_mask_hides_cannot_move_a_figure(name, make, pictures, pair, mask):
+def test_ignored_pixels_do_not_change_a_metric(name, make, pictures, pair, mask):
     a, b = pair
     hidden = a.clone()
     hidden[~mask] = torch.nan
@@ -55,7 +55,7 @@ def test_what_the_mask_hides_cannot_move_a_figure(name, make, pictures, pair, ma
 
 
 @pytest.mark.parametrize("name", ["psnr", "ssim", "lpips"])
-def test_no_pixel_or_a_broken_render_has_no_figure(name, make, pictures, pair, mask):
+def test_metrics_of_no_pixel_or_of_a_render_that_is_not_finite_are_unavailable(name, make, pictures, pair, mask):
     a, b = pair
     with pytest.raises(UnavailableError, match="the mask leaves no pixel"):
         make(name)(pictures(a, b, torch.zeros_like(mask)))

@@ -95,7 +95,7 @@ def test_the_example_pictures_score_as_the_lpips_package_scores_them(squeeze, pi
     assert metric(pictures(examples["p1"], examples["ref"])) == pytest.approx(0.1479016, abs=2e-6)
 
 
-def test_unmapped_pictures_give_other_figures_in_the_same_order(squeeze, pictures, examples):
+def test_unmapped_images_give_other_values_in_the_same_order(squeeze, pictures, examples):
     blurred, warped = (squeeze()(pictures(examples[name], examples["ref"])) for name in ("p0", "p1"))
     assert 0 < warped < blurred
     mapped = squeeze(input_range="minus-one-one")(pictures(examples["p0"], examples["ref"]))
@@ -108,7 +108,7 @@ def test_equal_pictures_are_at_zero_and_distance_has_no_direction(squeeze, pictu
     assert squeeze()(pictures(examples["ref"], examples["p0"])) == there
 
 
-def test_what_the_mask_hides_cannot_move_the_figure(squeeze, pictures, examples):
+def test_ignored_pixels_do_not_change_lpips(squeeze, pictures, examples):
     mask = torch.ones(64, 64, dtype=torch.bool)
     mask[:, 40:] = False
     hidden, truth = examples["p1"].clone(), examples["ref"].clone()
@@ -273,12 +273,12 @@ def test_weights_that_do_not_fit_name_the_file(damage, nowhere, make, pair):
     assert str(culprit) in str(caught.value)
 
 
-def test_a_folder_that_is_none_is_the_user_s_mistake(make, tmp_path):
+def test_a_missing_weights_folder_is_an_input_error(make, tmp_path):
     with pytest.raises(InputError, match="is not a folder"):
         make("lpips", weights=str(tmp_path / "nothing"))
 
 
-def test_a_picture_too_small_has_no_figure(make, pictures, nowhere):
+def test_lpips_of_too_small_images_is_unavailable(make, pictures, nowhere):
     with pytest.raises(UnavailableError, match="40x31"):
         make("lpips")(pictures(torch.zeros(31, 40, 3), torch.ones(31, 40, 3)))
 

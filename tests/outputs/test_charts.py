@@ -5,7 +5,7 @@ import xml.etree.ElementTree as ET
 import pytest
 
 from coliags_plugin.outputs.charts import Series, color_bar_svg, line_chart, style_classes
-from coliags_plugin.outputs.figures import color_table
+from coliags_plugin.outputs.colormaps import color_table
 
 
 def texts(svg):

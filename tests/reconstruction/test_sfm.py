@@ -12,7 +12,7 @@ import pytest
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.data_formats import open_scene
-from coliags_plugin.outputs.pictures import read_rgb, write_png
+from coliags_plugin.outputs.image_files import read_rgb, write_png
 from coliags_plugin.poses import colmap
 from coliags_plugin.poses.alignment import align, associate
 from coliags_plugin.poses.trajectory import Trajectory

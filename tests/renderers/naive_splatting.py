@@ -7,7 +7,7 @@ import math
 import torch
 
 
-def splat(gaussians, camera, background=(0.0, 0.0, 0.0), near=0.2, low_pass=0.3):
+def splat(gaussians, camera, background=(0.0, 0.0, 0.0), near_plane=0.2, eps2d=0.3):
     """All outputs of one view, by name, and the projected centres; float64 and differentiable throughout."""
     means, quats, scales, opacities, colors = (
         getattr(gaussians, name).double() for name in ("means", "quats_wxyz", "scales", "opacities", "colors")
@@ -31,7 +31,7 @@ def splat(gaussians, camera, background=(0.0, 0.0, 0.0), near=0.2, low_pass=0.3)
     centers = {}
     for i in order:
         x, y, z = in_camera[i]
-        if z.item() <= near:
+        if z.item() <= near_plane:
             continue
         w, axis = (quats[i] / quats[i].norm()).split([1, 3])
         zero = torch.zeros((), dtype=torch.float64)
@@ -56,7 +56,7 @@ def splat(gaussians, camera, background=(0.0, 0.0, 0.0), near=0.2, low_pass=0.3)
         )
         covariance = rotation @ torch.diag(scales[i] ** 2) @ rotation.T
         linear = jacobian @ world_to_camera[:, :3]
-        flat = linear @ covariance @ linear.T + low_pass * torch.eye(2, dtype=torch.float64)
+        flat = linear @ covariance @ linear.T + eps2d * torch.eye(2, dtype=torch.float64)
         centers[i] = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
         offset = pixels - centers[i]
         power = -0.5 * torch.einsum("hwi,ij,hwj->hw", offset, torch.linalg.inv(flat), offset)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.outputs.figures import color_table
-from coliags_plugin.outputs.pictures import write_depth_tiff, write_png
+from coliags_plugin.outputs.colormaps import color_table
+from coliags_plugin.outputs.image_files import write_depth_tiff, write_png
 from coliags_plugin.reporting.comparison_table import Column
 from coliags_plugin.reporting.html_report import duration, write_report
 from coliags_plugin.reporting.views import error_limit, evenly
@@ -34,11 +34,11 @@ def make_run(
     version=1,
     frames=None,
     with_depth=True,
-    figures=None,
+    metrics=None,
     provenance=None,
     steps=40,
 ):
-    """A finished and evaluated run; ``figures`` overrides figures of the test set."""
+    """A finished and evaluated run; ``metrics`` overrides metrics of the test set."""
     frames = FRAMES if frames is None else frames
     folder = root / scene / method / stamp
     evaluation = folder / "eval" / "paper"
@@ -60,7 +60,7 @@ def make_run(
                 write_depth_tiff(evaluation / "depth" / name / f"{frame}.tiff", np.nan_to_num(depth) + depth_offset)
             row = {"set": name, "frame": frame, "psnr": psnr + index, "ssim": 0.9, "depth_mse": depth_offset**2}
             rows.append(row | ({"psnr_seen": psnr + index + 2.0} if name == "rotation" else {}))
-    sets["test"] |= figures or {}
+    sets["test"] |= metrics or {}
     if any(name == "rotation" for name in sets):
         sets["test"].setdefault("psnr_seen", None)
     with (evaluation / "per_frame.csv").open("w", newline="") as file:
@@ -204,7 +204,7 @@ def test_heading(tmp_path, two_runs):
     assert "My <title>" in report(tmp_path, two_runs, title="My <title>").words
 
 
-def test_table_of_figures(tmp_path, two_runs):
+def test_table_of_metrics(tmp_path, two_runs):
     table = report(tmp_path, two_runs).tables[0]
     head = [" ".join(cell) for cell in table[0]]
     assert head == ["Method", "PSNR ↑ dB", "SSIM ↑", "LPIPS ↓", "Depth MSE ↓ mm²"]
@@ -227,7 +227,7 @@ def test_footnotes_give_reasons_once(tmp_path, two_runs):
 
 
 def test_a_null_without_a_reason_and_a_partial_mean_are_said(tmp_path):
-    run = make_run(tmp_path, "coliags", figures={"ssim": None})
+    run = make_run(tmp_path, "coliags", metrics={"ssim": None})
     path = run / "eval" / "paper" / "per_frame.csv"
     text = path.read_text()
     path.write_text(text.replace("30.0,", ",", 1))
@@ -333,7 +333,7 @@ def test_large_pictures_are_reduced(tmp_path):
     for kind in ("truth", "renders"):
         write_png(run / "eval" / "paper" / kind / "test" / "0001.png", np.zeros((101, 1281, 3), np.uint8))
     page = report(tmp_path, [run])
-    assert page.pictures("true picture")[0].shape == (33, 427, 3)
+    assert page.pictures("true image")[0].shape == (33, 427, 3)
     assert f"1281 {TIMES} 101 px" in page.words
     assert "1/3 of their size" in page.words
 

@@ -1,4 +1,4 @@
-"""``coliags poses``: one small file per subcommand. To add one, add its class to ``Subcommand``."""
+"""``coliags poses``: one module per subcommand. To add one, add its class to ``Subcommand``."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ Subcommand = (
 
 @dataclass(frozen=True)
 class Poses:
-    """Camera poses: convert and compare them, find surface points under them, or find them from pictures or depth."""
+    """Convert and compare camera poses, triangulate points, or estimate poses from images or depth."""
 
     subcommand: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Subcommand]]
-    """What to do."""
+    """Subcommand."""
 
     def run(self) -> None:
-        """Do it."""
+        """Execute the subcommand."""
         self.subcommand.run()

@@ -1,4 +1,4 @@
-"""``coliags poses align``: how far an estimated trajectory is from a reference."""
+"""``coliags poses align``: trajectory errors of an estimate against a reference (ATE, RPE)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from coliags_plugin.cli.arguments import OptionalPath, OptionalText
-from coliags_plugin.cli.poses.arguments import OptionalFormat, read_aloud
+from coliags_plugin.cli.poses.arguments import OptionalFormat, read_and_log
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -19,35 +19,35 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Align:
-    """Align an estimated trajectory with a reference, and take its absolute and relative errors."""
+    """Align an estimated trajectory with a reference and compute its absolute and relative errors."""
 
     estimate: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="ESTIMATE")]
-    """Poses to judge, in any format."""
+    """Estimated poses, in any format."""
     reference: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="REFERENCE")]
-    """Poses to judge them by, in any format."""
+    """Reference poses, in any format."""
     scale: bool = False
-    """Also find a scale (Sim(3) instead of SE(3)), for an estimate in units of its own."""
+    """Also estimate a scale (Sim(3) instead of SE(3)), for an estimate in another unit."""
     delta: int = 1
     """Matched frames between the two poses of a relative error."""
     match: Literal["auto", "name", "time", "index", "endogslam-train"] = "auto"
-    """Which frames belong together; auto: by name, else by time, else by index."""
+    """How frames are matched; auto: by name, else by time, else by index."""
     tolerance: float = 0.02
-    """How far timestamps of one frame may be apart, s."""
+    """Largest difference of matched timestamps, s."""
     estimate_format: OptionalFormat = None
-    """Format of the estimate; default: told by its content."""
+    """Format of the estimate; default: recognised from its content."""
     reference_format: OptionalFormat = None
-    """Format of the reference; default: told by its content."""
+    """Format of the reference; default: recognised from its content."""
     unit: OptionalText = None
-    """What to call the reference's unit of length; default: mm where its format says so."""
+    """Name of the reference's unit of length; default: mm where its format is metric."""
     json: OptionalPath = None
-    """File to write all figures to."""
+    """JSON file to write all errors to."""
     plot: OptionalPath = None
-    """PNG to write: both trajectories from above and from the side, and the errors along the frames."""
+    """PNG to write: both trajectories from above and from the side, and the errors over frames."""
     overwrite: bool = False
     """Replace the files where they exist."""
 
     def run(self) -> None:
-        """Align, print a table, and say where the files are."""
+        """Align, print a table and the paths of the files written."""
         import logging
 
         from rich.console import Console
@@ -64,8 +64,8 @@ class Align:
                 raise InputError(f"{path} already exists", "a new file", "Choose another, or pass --overwrite")
             if path is not None and (path.is_dir() or path in (self.estimate, self.reference)):
                 raise InputError(f"{path} is a folder or one of the inputs", "a file of its own")
-        _, estimate = read_aloud(self.estimate, self.estimate_format)
-        kind, reference = read_aloud(self.reference, self.reference_format)
+        _, estimate = read_and_log(self.estimate, self.estimate_format)
+        kind, reference = read_and_log(self.reference, self.reference_format)
         unit = self.unit or kind.unit
         matches = associate(estimate, reference, self.match, self.tolerance)
         if matches.passed_over:
@@ -82,7 +82,7 @@ class Align:
             write_json(self.json, result.to_json(unit))
             print(self.json)
         if self.plot is not None:
-            from coliags_plugin.outputs.pictures import write_png
+            from coliags_plugin.outputs.image_files import write_png
             from coliags_plugin.outputs.trajectory_plot import trajectory_picture
 
             write_png(self.plot, trajectory_picture(result, unit))

@@ -1,4 +1,4 @@
-"""What the ``poses`` subcommands share: reading a trajectory aloud, and their arguments."""
+"""Arguments of the ``poses`` subcommands, and reading of trajectories with a log of their conventions."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 S = TypeVar("S", bound="Settings")
 
-#: How to train on a scene whose only depth is that of its points.
+#: Override that trains on the sparse depth of a scene's points.
 SPARSE_DEPTH = "losses.depth={name: sparse-depth, weight: 0.2, final_weight: 0.01}"
 
 OptionalFormat = Annotated[str | None, tyro.conf.arg(metavar="FORMAT")]
 
 
-def read_aloud(path: Path, name: str | None) -> tuple[Format, Trajectory]:
-    """Read poses, and log what they are: a wrong convention shows in the path's length and direction first."""
+def read_and_log(path: Path, name: str | None) -> tuple[Format, Trajectory]:
+    """Read poses and log format, path length and direction, which reveal a wrong convention."""
     import logging
 
     from coliags_plugin.poses.formats import format_of
@@ -44,7 +44,7 @@ def parse_intrinsics(intrinsics: str | None, size: str | None) -> Intrinsics | N
     """``fx,fy,cx,cy`` and ``WxH`` -> intrinsics; None where neither is given.
 
     Raises:
-        InputError: Only one is given, or one is something else.
+        InputError: Only one is given, or one has another form.
     """
     from coliags_plugin.poses.text import placed
     from coliags_plugin.poses.trajectory import Intrinsics
@@ -68,7 +68,7 @@ def settings_of(kind: type[S], assignments: Sequence[str], prefix: str = "") -> 
     Args:
         kind: The class.
         assignments: ``key.path=value``.
-        prefix: What stood before each of the keys, for messages.
+        prefix: Prefix of the keys in messages.
 
     Raises:
         InputError: An assignment is none, or a key or value is not valid; naming it.
@@ -79,7 +79,7 @@ def settings_of(kind: type[S], assignments: Sequence[str], prefix: str = "") -> 
 
     tree = override_all(Node({}, "options"), assignments)
     try:
-        # Upon the defaults, as those of a part may differ from the part's own.
+        # Laid over the defaults, as those of a nested part may differ from the part's own.
         return kind.model_validate(_upon(kind().model_dump(), tree.plain()))
     except ValidationError as error:
         first = error.errors()[0]
@@ -104,10 +104,10 @@ def _upon(base: Any, over: Any) -> Any:
 
 
 def refuse_output(out: Path, source: Path, overwrite: bool) -> None:
-    """Refuse a folder to make before the work rather than after it.
+    """Check an output folder before the work starts.
 
     Raises:
-        InputError: It is the input or around or within it, or holds something and is not to be replaced.
+        InputError: It is, contains or is inside the input, or is not empty and ``overwrite`` is off.
     """
     made, read = out.resolve(), source.resolve()
     if made == read or made in read.parents or read in made.parents:
@@ -117,6 +117,6 @@ def refuse_output(out: Path, source: Path, overwrite: bool) -> None:
 
 
 def train_command(out: Path, *assignments: str) -> str:
-    """The command that trains on a scene, for a shell."""
+    """Shell command that trains on a scene."""
     words = ["coliags", "train", "coliags", "--data", str(out)]
     return shlex.join([*words, *(word for assignment in assignments for word in ("--set", assignment))])

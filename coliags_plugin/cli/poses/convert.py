@@ -1,4 +1,4 @@
-"""``coliags poses convert``: poses from one format to another."""
+"""``coliags poses convert``: convert poses between file formats."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from coliags_plugin.cli.arguments import OptionalPath, OptionalText
-from coliags_plugin.cli.poses.arguments import OptionalFormat, parse_intrinsics, read_aloud
+from coliags_plugin.cli.poses.arguments import OptionalFormat, parse_intrinsics, read_and_log
 
 
 @dataclass(frozen=True)
@@ -19,22 +19,22 @@ class Convert:
     input: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IN")]
     """File with poses, or the folder of a COLMAP model."""
     output: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
-    """File to write; for COLMAP, folder to make."""
+    """File to write; for COLMAP, folder to create."""
     to: Annotated[str, tyro.conf.arg(metavar="FORMAT")]
     """Format to write."""
     from_format: Annotated[OptionalFormat, tyro.conf.arg(name="from")] = None
-    """Format of the input; default: told by its content."""
+    """Format of the input; default: recognised from its content."""
     intrinsics: Annotated[OptionalText, tyro.conf.arg(metavar="FX,FY,CX,CY")] = None
-    """Pinhole of all pictures, pixels, pixel centres at integers + 0.5; default: the input's."""
+    """Pinhole intrinsics of all images, px, pixel centres at integers + 0.5; default: the input's."""
     size: Annotated[OptionalText, tyro.conf.arg(metavar="WxH")] = None
-    """Picture size, pixels; with --intrinsics."""
+    """Image size, px; with --intrinsics."""
     images: OptionalPath = None
-    """Folder whose pictures, in order of number, give the poses their names; default: the input's names."""
+    """Folder whose images, in natural order, give the poses their names; default: the input's names."""
     overwrite: bool = False
     """Replace the output where it exists."""
 
     def run(self) -> None:
-        """Convert, and say where."""
+        """Convert and print the output path."""
         import logging
         from dataclasses import replace
 
@@ -44,7 +44,7 @@ class Convert:
         log = logging.getLogger(__name__)
         target = format_named(self.to)
         pinhole = parse_intrinsics(self.intrinsics, self.size)
-        _, trajectory = read_aloud(self.input, self.from_format)
+        _, trajectory = read_and_log(self.input, self.from_format)
         if self.output.exists() and self.output.samefile(self.input):
             raise InputError(f"{self.output} is the input itself", "another place for the output")
         if pinhole is not None:
@@ -67,7 +67,7 @@ class Convert:
 
 
 def _picture_names(folder: Path, count: int) -> tuple[str, ...]:
-    """Names of a folder's pictures as people count, one for each pose."""
+    """Names of a folder's images in natural order, one per pose."""
     from coliags_plugin.core.errors import InputError
     from coliags_plugin.poses.trajectory import natural_order
 

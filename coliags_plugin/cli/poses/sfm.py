@@ -1,4 +1,4 @@
-"""``coliags poses sfm``: poses and points from pictures alone."""
+"""``coliags poses sfm``: structure from motion, poses and points from images alone."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from coliags_plugin.cli.arguments import Assignments, OptionalInt, OptionalPath,
 
 @dataclass(frozen=True)
 class Sfm:
-    """Find poses, camera and surface points from a video's pictures alone; write them as a scene."""
+    """Estimate poses, intrinsics and surface points from a video's images alone; write them as a scene."""
 
     frames: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FRAMES")]
-    """Folder of pictures; their order is that of the numbers in their names."""
+    """Folder of images, ordered by the numbers in their names."""
     out: Path
-    """Folder to make, in COLMAP's layout."""
+    """Folder to create, in COLMAP's layout."""
     camera: OptionalText = None
     """COLMAP's camera model, for instance PINHOLE or OPENCV_FISHEYE; default SIMPLE_RADIAL."""
     params: Annotated[OptionalText, tyro.conf.arg(metavar="P1,P2,...")] = None
-    """Its parameters in COLMAP's order, pixel centres at integers + 0.5, taken for exact; default: found out."""
+    """Its parameters in COLMAP's order, pixel centres at integers + 0.5, kept fixed; default: estimated."""
     mask: OptionalPath = None
-    """Picture that is black where pixels are to be ignored, or a folder with one for each picture."""
+    """Mask image, black where pixels are ignored, or a folder with one per image."""
     every: int = 1
-    """Use every so-many-th picture."""
+    """Use every n-th image."""
     max_frames: OptionalInt = None
-    """Use at most so many pictures, the first ones."""
+    """Use at most the first n images."""
     set: Assignments = ()
     """An option of matching or mapping, for instance overlap=12 or features.max_features=2000."""
     overwrite: bool = False
     """Replace the output folder where it exists."""
 
     def run(self) -> None:
-        """Reconstruct, write, and say what came out."""
+        """Reconstruct, write the scene and print a summary."""
         from coliags_plugin.cli.poses.arguments import SPARSE_DEPTH, refuse_output, settings_of, train_command
         from coliags_plugin.core.errors import InputError
         from coliags_plugin.engine.progress import progress_callback

@@ -1,4 +1,4 @@
-"""``coliags poses track``: poses from pictures and depth."""
+"""``coliags poses track``: RGB-D odometry, poses from images and depth."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ if TYPE_CHECKING:
     from coliags_plugin.core.scenes import Scene
     from coliags_plugin.reconstruction.odometry.tracking import Tracking
 
-#: Options of tracking begin with this; all others are the data manager's.
+#: Prefix of the tracking options; all others are the data manager's.
 _OWN = "tracking."
 
 
 @dataclass(frozen=True)
 class Track:
-    """Find the poses of a video from its pictures and depth, whatever poses it comes with; write it as a scene."""
+    """Estimate the poses of a video from its images and depth, ignoring given poses; write it as a scene."""
 
     scene: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCENE")]
-    """A scene, or a folder with colour, depth and intrinsics of which nobody knows the poses."""
+    """A scene, or a folder with colour, depth and intrinsics but without poses."""
     out: Path
-    """Folder to make, in the layout of `rgbd`."""
+    """Folder to create, in the layout of `rgbd`."""
     format: DataFormat = None
     """How the scene is laid out (`coliags list datamanagers`); default: what its files show."""
     set: Assignments = ()
@@ -34,7 +34,7 @@ class Track:
     """Replace the output folder where it exists."""
 
     def run(self) -> None:
-        """Track, write, and say what came out."""
+        """Track, write the scene and print a summary."""
         from coliags_plugin.cli.poses.arguments import refuse_output, settings_among, train_command
         from coliags_plugin.datamanagers.rgbd.writer import write_rgbd_scene
         from coliags_plugin.engine.data_formats import open_video
@@ -62,7 +62,7 @@ class Track:
 
 
 def _warn_of_losses(found: Tracking) -> None:
-    """Say which poses are guesses."""
+    """Log a warning that names the lost frames, whose poses are guesses."""
     import logging
 
     import numpy as np
@@ -97,7 +97,7 @@ def _described(found: Tracking) -> list[str]:
 
 
 def _errors(found: Tracking, scene: Scene) -> str:
-    """How far the found path is from the scene's own poses, which had no part in finding it."""
+    """Trajectory errors against the scene's own poses, which the tracking did not use."""
     import numpy as np
 
     from coliags_plugin.poses.alignment import FEWEST_MATCHES, align, associate

@@ -1,4 +1,4 @@
-"""``coliags poses triangulate``: surface points of a scene whose poses are known."""
+"""``coliags poses triangulate``: triangulate surface points of a scene with known poses."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ if TYPE_CHECKING:
     from coliags_plugin.core.scenes import Frame, Scene
     from coliags_plugin.datamanagers.splits import Split
 
-#: Options of triangulation begin with this; all others are the data manager's.
+#: Prefix of the triangulation options; all others are the data manager's.
 _OWN = "triangulation."
 
 
 @dataclass(frozen=True)
 class Triangulate:
-    """Find surface points of a posed video; write it as a scene with initial points and sparse depth."""
+    """Triangulate surface points of a posed video; write it as a scene with initial points and sparse depth."""
 
     scene: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCENE")]
     """The scene's folder."""
     out: Path
-    """Folder to make, in COLMAP's layout."""
+    """Folder to create, in COLMAP's layout."""
     format: DataFormat = None
     """How the scene is laid out (`coliags list datamanagers`); default: what its files show."""
     set: Assignments = ()
@@ -34,7 +34,7 @@ class Triangulate:
     """Replace the output folder where it exists."""
 
     def run(self) -> None:
-        """Triangulate the training frames, write all frames, and say what came out."""
+        """Triangulate the training frames, write all frames and print a summary."""
         import logging
 
         from coliags_plugin.cli.poses.arguments import SPARSE_DEPTH, refuse_output, settings_among, train_command
@@ -46,7 +46,7 @@ class Triangulate:
         refuse_output(self.out, self.scene, self.overwrite)
         settings, options = settings_among(TriangulationSettings, self.set, _OWN)
         with progress_callback() as progress:
-            # Whatever initial points there are is not wanted here, unless it is asked for.
+            # Initial points are not needed here unless requested.
             scene = open_scene(self.scene, self.format, ["initial_points=none", *options], progress)
             found = triangulate(scene.train, settings, progress)
         test, split = _held_out(scene)
@@ -60,7 +60,7 @@ class Triangulate:
 
 
 def _held_out(scene: Scene) -> tuple[list[Frame], list[str]]:
-    """Test frames that the written scene keeps, and the options under which they are its test frames again."""
+    """Test frames kept in the written scene, and the options that restore its split."""
     import logging
 
     from coliags_plugin.datamanagers.splits import held_out

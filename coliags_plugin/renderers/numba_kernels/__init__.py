@@ -1,4 +1,4 @@
 """The kernels of the cpu renderer, one stage per file. Importing any of them imports numba.
 
-They meet in the tables that ``layout`` describes, and ``pipeline`` calls them in order.
+They share the tables that ``layout`` describes, and ``pipeline`` calls them in order.
 """

@@ -1,4 +1,4 @@
-"""The pipeline as differentiable functions: Gaussians -> records, records -> images, records -> feature images."""
+"""Autograd functions of the pipeline: Gaussians -> records, records -> images, records -> feature images."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def render(
         gaussians: Float32 tensors on the CPU, checked for shape.
         features: Further channels to composite, likewise. [N, C] each
         pose: camera_to_world; its values are those that the pipeline was made with.
-        pipeline: A fresh one.
+        pipeline: A new pipeline.
 
     Returns:
         means2d, which holds its gradient after ``backward``; radii; the images, None where not wanted; and the features'
@@ -47,8 +47,8 @@ def render(
 class _Project(torch.autograd.Function):
     """Gaussians -> projected centres, records, radii.
 
-    What comes back for ``records`` are sums that ``layout`` describes, not derivatives of its columns: they lead to the
-    derivatives of the Gaussians by a shorter way, on which nothing cancels.
+    The gradients received for ``records`` are sums that ``layout`` describes, not derivatives of its columns: the
+    derivatives of the Gaussians follow from them more directly and without cancellation.
     """
 
     @staticmethod
@@ -73,7 +73,7 @@ class _Project(torch.autograd.Function):
 
 
 class _Composite(torch.autograd.Function):
-    """Projected centres and records -> images. The centres' values are in the records, too."""
+    """Projected centres and records -> images. The records contain the centres' values, too."""
 
     @staticmethod
     def forward(ctx: Any, means2d: Tensor, records: Tensor, pipeline: Pipeline) -> tuple[Tensor | None, ...]:

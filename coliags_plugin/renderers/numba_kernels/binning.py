@@ -1,7 +1,7 @@
-"""Records -> which blocks of which tiles each Gaussian touches, by tile and front to back.
+"""Binning of Gaussians into tiles and their blocks, by tile and front to back.
 
 Tiles and blocks only save work: what is listed here is a superset of the pairs of pixel and Gaussian with
-alpha >= alpha_min, and the sweeps decide about each of those again. The list of Gaussians is cut into stretches that
+alpha >= alpha_min, and the sweeps test each of those again. The list of Gaussians is cut into stretches that
 threads handle on their own; the result is the same however many there are.
 """
 
@@ -27,7 +27,7 @@ from coliags_plugin.renderers.numba_kernels.sorting import NUMBER
 from coliags_plugin.renderers.numba_kernels.threads import take
 from coliags_plugin.renderers.numba_kernels.tiles import order_tiles
 
-#: How many Gaussians before its turn memory is asked for.
+#: Prefetch distance, Gaussians.
 _AHEAD = 8
 
 
@@ -36,7 +36,7 @@ def find_pairs(counters, projections, view, grid, keys, pairs, entry_counts):
     """Pair the Gaussians with the tiles they touch.
 
     Args:
-        counters: For sharing; entries 0 and 1 must be 0.
+        counters: Work counters for dynamic scheduling; entries 0 and 1 must be 0.
         projections: What projection wrote.
         view: See ``layout``.
         grid: The tiles.
@@ -59,7 +59,7 @@ def find_pairs(counters, projections, view, grid, keys, pairs, entry_counts):
 
 @part
 def _tiles_within_bounds(first, last, keys, bounds):
-    """How many pairs the Gaussians in places ``first`` to ``last`` of the sorted list can make."""
+    """Upper bound of the number of pairs of the Gaussians with indices ``first`` to ``last`` in the sorted list."""
     total = 0
     for place in range(first, last):
         at = 4 * (keys[place] & NUMBER)
@@ -70,12 +70,12 @@ def _tiles_within_bounds(first, last, keys, bounds):
 
 @part
 def _find_stretch(first, last, pair, counted, projections, view, grid, keys, pairs, entry_counts):
-    """Pair the Gaussians in places ``first`` to ``last`` of the sorted list.
+    """Pair the Gaussians with indices ``first`` to ``last`` in the sorted list.
 
     Writes the pairs from ``pair`` on, and counts those of each tile from ``counted`` on.
 
     Returns:
-        Where the pairs end.
+        Index after the last pair.
     """
     records, bounds = projections.records, projections.bounds
     for tile in range(counted, counted + grid.tiles):
@@ -120,11 +120,11 @@ def _find_stretch(first, last, pair, counted, projections, view, grid, keys, pai
 
 @kernel
 def place_entries(grid, pairs, bins):
-    """Find out where the pairs of each tile go.
+    """Compute the offset of each tile's pairs.
 
     Args:
         grid: The tiles.
-        pairs: What :func:`find_pairs` wrote; the counts of tiles are turned into places.
+        pairs: What :func:`find_pairs` wrote; the counts of tiles are turned into offsets.
         bins: Out: ``stretch_entries``, ``starts`` and ``order``.
     """
     stretches = len(pairs.begins)
@@ -145,12 +145,12 @@ def place_entries(grid, pairs, bins):
 
 @kernel
 def sort_pairs(counters, grid, pairs, bins):
-    """Put the pairs where their tiles belong.
+    """Sort the pairs by tile.
 
     Args:
-        counters: For sharing; entry 2 must be 0.
+        counters: Work counters for dynamic scheduling; entry 2 must be 0.
         grid: The tiles.
-        pairs: What :func:`place_entries` left; the places are counted up.
+        pairs: What :func:`place_entries` left; the offsets are incremented.
         bins: Out: ``cells``.
     """
     cells, places = bins.cells, pairs.tile_counts

@@ -1,4 +1,4 @@
-"""Memory that is used again: fresh pages cost more than the kernels that fill them."""
+"""Reuse of memory buffers, as allocating new pages costs more than the kernels that fill them."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ _KEPT = 2
 
 
 def aligned(size: int) -> npt.NDArray[np.uint8]:
-    """Fresh memory for at least ``size`` bytes."""
+    """Allocate aligned memory of at least ``size`` bytes."""
     raw = np.empty(size + 2 * _ALIGNMENT, np.uint8)
     start = -raw.ctypes.data % _ALIGNMENT
     return raw[start : start + -(-size // _ALIGNMENT) * _ALIGNMENT]
 
 
 class Arena:
-    """Named buffers of one view. What is in them when they are taken is not defined."""
+    """Named buffers of one view, with undefined initial content."""
 
     def __init__(self) -> None:
         self._bytes: dict[str, npt.NDArray[np.uint8]] = {}
 
     def take(self, name: str, size: int, dtype: npt.DTypeLike = np.float32) -> npt.NDArray[Any]:
-        """A flat array. It shares its memory with whatever was taken under this name before."""
+        """Take a flat array, which shares its memory with earlier ones of this name."""
         wanted = size * np.dtype(dtype).itemsize
         buffer = self._bytes.get(name)
         if buffer is None or len(buffer) < wanted:
@@ -43,7 +43,7 @@ class Arena:
 
 
 class ArenaPool:
-    """Arenas lent to whoever needs one, for as long as that lives.
+    """Pool of arenas, each lent for the lifetime of its borrower.
 
     Safe to use from several threads, and without a lock: arenas come back whenever Python collects garbage, which may
     be in the middle of :meth:`lend`.
@@ -53,7 +53,7 @@ class ArenaPool:
         self._free: deque[Arena] = deque(maxlen=_KEPT)
 
     def lend(self, borrower: object) -> Arena:
-        """An arena that comes back when ``borrower`` is collected."""
+        """Lend an arena until ``borrower`` is garbage collected."""
         try:
             arena = self._free.pop()
         except IndexError:
@@ -63,13 +63,13 @@ class ArenaPool:
 
 
 class Results:
-    """Arrays to hand out. Their memory comes back when nobody holds them any longer."""
+    """Allocator of result arrays, whose memory is reused after they are garbage collected."""
 
     def __init__(self) -> None:
         self._free: deque[npt.NDArray[np.uint8]] = deque(maxlen=_KEPT_RESULTS)
 
     def take(self, *shape: int) -> npt.NDArray[np.float32]:
-        """A float32 array; what is in it is not defined."""
+        """Take a float32 array with undefined content."""
         wanted = 4 * math.prod(shape)
         buffer = None
         for _ in range(len(self._free)):

@@ -1,4 +1,4 @@
-"""How the kernels are compiled, kept and announced."""
+"""Compilation and on-disk caching of the kernels."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ _OPTIONS = {"nogil": True, "error_model": "numpy", "boundscheck": False}
 
 
 def inline(function: _Function) -> _Function:
-    """A piece of a kernel that is compiled into its callers."""
+    """Compile a function that is inlined into its callers."""
     return numba.njit(function, forceinline=True, **_OPTIONS)  # type: ignore[no-any-return]
 
 
 def part(function: _Function) -> _Function:
-    """What one thread does of a kernel."""
+    """Compile a function that kernels call, on one thread."""
     return numba.njit(function, **_OPTIONS)  # type: ignore[no-any-return]
 
 
 def kernel(function: _Function) -> _Function:
-    """What Python calls, from several threads at once where ``threads.Crew`` runs it. It is kept on disk once compiled.
+    """Compile a function that Python calls, on several threads by ``threads.Crew``; cached on disk.
 
     numba's own parallel loops are not used. They wait for every thread at their end, also for those that the system has
     not let run yet, which on a shared machine costs more than the loop; two of them at once, or one in a forked process,
@@ -48,11 +48,11 @@ def kernel(function: _Function) -> _Function:
 
 
 class _KernelCache(FunctionCache):
-    """numba's cache on disk, except that
+    """numba's on-disk cache with three changes.
 
-    - it knows that a kernel changes when any file of this folder does (numba looks at the kernel's own file only),
-    - a cache that cannot be read or written costs a compilation, never the run,
-    - it says so when compilation is about to begin.
+    - A kernel is invalidated when any file of this folder changes (numba checks the kernel's own file only).
+    - A cache that cannot be read or written causes a compilation, never an error.
+    - A message is logged before compilation.
     """
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
@@ -77,13 +77,13 @@ class _KernelCache(FunctionCache):
 
 @cache
 def _announce(where: str) -> None:
-    """Say once for each place that kernels are being compiled."""
+    """Log once per cache location that kernels are being compiled."""
     _logger.info("cpu renderer: compiling kernels for this machine, about half a minute, once (%s)", where)
 
 
 @cache
 def _fingerprint() -> str:
-    """Of the sources of all kernels."""
+    """Hash of the sources of all kernels."""
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(path.read_bytes())

@@ -1,4 +1,4 @@
-"""What projection and its derivative both need: camera axes, rotations, and the rows of V.
+"""Geometry shared by projection and its derivative: camera axes, rotations, and the rows of V.
 
 Sixteen Gaussians at a time; a vector in space is a tuple of three lanes.
 """
@@ -32,10 +32,10 @@ from coliags_plugin.renderers.numba_kernels.lanes import (
 
 
 class Projected(NamedTuple):
-    """Sixteen Gaussians as the camera sees them; those not ``in_front`` have a stand-in position.
+    """Sixteen Gaussians in camera coordinates; those not ``in_front`` have a stand-in position.
 
     Attributes:
-        in_front: Beyond the near plane.
+        in_front: Whether beyond the near plane.
         offset: From the camera's centre, world axes.
         x, y, z: The same in camera axes.
         inverse_z: 1 / z

@@ -1,9 +1,8 @@
-"""Sixteen float32 numbers side by side, as a type that numba kernels compute with.
+"""SIMD vectors of sixteen float32 numbers as a numba type.
 
-A loop that is written for one number is at the mercy of the vectoriser, which gives up without a word. Here the vector
-is spelled out: every operation below becomes the LLVM instruction for ``<16 x float>``, which LLVM maps to one AVX-512
-register, two AVX registers or four NEON ones. Nothing is reassociated and nothing assumes finite numbers; ``fma`` is
-fused where the machine can.
+Automatic vectorisation of scalar loops fails without notice. Here the vector is explicit: every operation below
+becomes the LLVM instruction for ``<16 x float>``, which LLVM maps to one AVX-512 register, two AVX registers or four
+NEON ones. Nothing is reassociated and nothing assumes finite numbers; ``fma`` is fused where the machine supports it.
 
 ``Lanes`` holds numbers and ``LaneMask`` truth values. A scalar operand is repeated in all lanes. Operands of arithmetic
 may also be tuples of lanes of one length; the operation then goes through the tuple. Lengths are part of numba's types,
@@ -369,7 +368,7 @@ def _prefetching(name: str, writes: int) -> Any:
     return intrinsic(typed)
 
 
-#: Have the line of memory with ``table[index]`` brought nearer, without waiting for it
+#: Prefetch the cache line of ``table[index]``
 prefetch = _prefetching("prefetch", 0)
 #: The same where it is to be written
 prefetch_to_write = _prefetching("prefetch_to_write", 1)

@@ -1,7 +1,7 @@
-"""What the stages hand on to one another: tables, all of them flat arrays, and what is in their columns.
+"""Data layout of the tables that the stages share: flat arrays and the meaning of their columns.
 
-Gaussians are handled in groups of sixteen, one vector; where it says "groups filled up" a table goes on to the end of
-the last group. Tiles are 16 x 16 pixels, blocks 4 x 4: one vector again.
+Gaussians are processed in groups of sixteen, one vector; tables "padded to whole groups" extend to the end of the last
+group. Tiles are 16 x 16 pixels, blocks 4 x 4: one vector again.
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-#: Pixels along the edge of a tile.
+#: Edge of a tile, pixels.
 TILE = 16
-#: Pixels along the edge of a block.
+#: Edge of a block, pixels.
 BLOCK = 4
 #: Blocks of a tile.
 BLOCKS = 16
@@ -53,11 +53,11 @@ SUM_EF = 4
 SUM_FF = 5
 SUM_CHANNELS = 6
 
-#: Integers for each entry of ``cells``: the number of the Gaussian; which of the tile's blocks it touches, one bit each;
+#: Integers for each entry of ``cells``: the index of the Gaussian; which of the tile's blocks it touches, one bit each;
 #: and the number of the entry when they are counted by Gaussian, nearest first.
 CELL = 3
 
-# Places in ``view``, the camera and the options as float32.
+# Indices into ``view``, the camera and the options as float32.
 VIEW_RIGHT = 0  # the camera's axes and centre in the world
 VIEW_DOWN = 3
 VIEW_FORWARD = 6
@@ -99,7 +99,7 @@ class Parameters(NamedTuple):
 
 
 class Extras(NamedTuple):
-    """What is composited besides colour, in this order."""
+    """Channels composited besides colour, in this order."""
 
     depth: bool
     inverse_depth: bool
@@ -126,7 +126,7 @@ class Grid(NamedTuple):
 
 
 class Projections(NamedTuple):
-    """What projection leaves, groups filled up.
+    """Output of the projection, padded to whole groups.
 
     Attributes:
         records: One row for each Gaussian; anything where it is not drawn.
@@ -165,7 +165,7 @@ class Bins(NamedTuple):
     """The same pairs by tile and front to back; they are called entries there.
 
     Attributes:
-        keys: Gaussians drawn, nearest first; the number of the Gaussian is in the lower 32 bits.
+        keys: Gaussians drawn, nearest first; the index of the Gaussian is in the lower 32 bits.
         entry_counts: Entries of each of them. [Gaussians drawn]
         stretch_entries: Number of the first entry of each stretch of ``keys``, and how many there are. [stretches + 1]
         cells: See ``CELL``. [3 for each entry]
@@ -201,7 +201,7 @@ class Images(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Memory of the sweeps, so much for each thread."""
+    """Working memory of the sweeps, per thread."""
 
     numbers: Any
     integers: Any

@@ -1,4 +1,4 @@
-"""The stages in their order, and the memory they work in."""
+"""Execution of the kernels in order, and their memory."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from coliags_plugin.renderers.numba_kernels.threads import Crew
 
 Array = npt.NDArray[Any]
 
-#: Pieces of work per thread where pieces differ in cost.
+#: Pieces of work per thread where their costs differ.
 _PIECES = 8
 #: Fewer Gaussians are sorted by one thread: bringing others in several times over costs more than they gain.
 _WORTH_SHARING_SORT = 1 << 17
-#: What lists of pairs can hold.
+#: Largest number of pairs of the lists.
 _MOST_PAIRS = 2**31 - 1
 
 _crew = Crew()
@@ -31,15 +31,15 @@ _results = Results()
 
 
 class UnusableGaussianError(Exception):
-    """A Gaussian that cannot be projected; which and why is for the caller to find out."""
+    """A Gaussian cannot be projected; the caller determines which and why."""
 
 
 class TooManyPairsError(Exception):
-    """Gaussians that together cover more tiles than the lists can hold; the argument is how many."""
+    """The Gaussians cover more tiles than the lists can hold; the argument is the number of tiles."""
 
 
 class Pipeline:
-    """One camera's view of N Gaussians, stage by stage, and what the stages leave for one another.
+    """Rendering of N Gaussians from one camera, stage by stage, with the intermediate tables.
 
     Args:
         view: Camera and options, see ``layout``.
@@ -71,7 +71,7 @@ class Pipeline:
         """Project Gaussians.
 
         Returns:
-            Projected centres in pixels, radii in pixels, and the records, groups filled up. [N, 2], [N], [16 each]
+            Projected centres in pixels, radii in pixels, and the records, padded to whole groups. [N, 2], [N], [16 each]
 
         Raises:
             UnusableGaussianError: One is not finite, has no direction or a negative scale.
@@ -295,7 +295,7 @@ class Pipeline:
         run(binning.sort_pairs, grid, pairs, bins)
 
     def _sorted_keys(self, run: _Run, drawn: int) -> Array:
-        """Numbers of the Gaussians drawn, nearest first."""
+        """Indices of the Gaussians drawn, nearest first."""
         take = self._arena.take
         keys, moved = take("keys", drawn, np.int64), take("moved", drawn, np.int64)
         if not drawn:
@@ -326,7 +326,7 @@ class Pipeline:
 
 
 class _Run:
-    """Runs kernels on so many threads."""
+    """Runs kernels on a given number of threads."""
 
     def __init__(self, workers: int) -> None:
         self.workers = workers
@@ -337,7 +337,7 @@ class _Run:
 
 @contextmanager
 def _workers() -> Iterator[_Run]:
-    """Wait for the turn, for one view takes all cores; then there are as many threads as torch uses."""
+    """Lock the thread pool, as one view uses all cores; with as many threads as torch uses."""
     with _crew.turn:
         yield _Run(torch.get_num_threads())
 
@@ -354,7 +354,7 @@ def _joined(images: layout.Images) -> Array:
 
 
 def _part_into(channels: Array, images: layout.Images) -> None:
-    """Put up to eight channels into images; the reverse of :func:`_joined`. [H, W, C]"""
+    """Split up to eight channels into images; the inverse of :func:`_joined`. [H, W, C]"""
     filled = np.zeros((*channels.shape[:2], layout.MAX_CHANNELS), np.float32)
     filled[..., : channels.shape[2]] = channels
     images.rgb[:] = filled[..., :3]

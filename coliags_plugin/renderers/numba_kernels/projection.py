@@ -1,4 +1,4 @@
-"""3D Gaussians -> records: projected centre, whitening of the 2D covariance, and what is composited.
+"""Projection of 3D Gaussians to records: centre, whitening of the 2D covariance, and composited channels.
 
 The formulas are those of ``docs/rendering.md``, section "Projection", for sixteen Gaussians at a time.
 """
@@ -53,18 +53,18 @@ SMALLEST_SQUARED_NORM = 1e-24
 
 @kernel
 def project(counters, count, gaussians, tail, view, extras, projections, means2d, radii):
-    """Project all Gaussians and find out how far they reach.
+    """Project all Gaussians and compute their extents.
 
     Args:
-        counters: For sharing; entry 0 must be 0.
-        count: How many Gaussians.
-        gaussians: They. [layout.Parameters]
+        counters: Work counters for dynamic scheduling; entry 0 must be 0.
+        count: Number of Gaussians.
+        gaussians: The Gaussians. [layout.Parameters]
         tail: Those behind the last full group, filled up with ones that are not drawn. [layout.Parameters]
         view: See ``layout``.
         extras: What is composited besides colour.
         projections: Out.
-        means2d: Out: projected centres, pixels, groups filled up. [2 for each Gaussian]
-        radii: Out: pixels, 0 where not drawn, groups filled up. [1 for each Gaussian]
+        means2d: Out: projected centres, pixels, padded to whole groups. [2 for each Gaussian]
+        radii: Out: pixels, 0 where not drawn, padded to whole groups. [1 for each Gaussian]
     """
     whole_groups = count // layout.GROUP
     per_parcel = layout.PARCEL // layout.GROUP
@@ -88,7 +88,7 @@ def _project_groups(first, last, source, gaussians, view, extras, projections, m
     """Project groups ``first`` to ``last``, reading from group ``source`` of the Gaussians on.
 
     Returns:
-        How many are drawn, -1 where one cannot be used; and how many tiles are within their bounds.
+        The number of Gaussians drawn, -1 where one is invalid; and the number of tiles within their bounds.
     """
     drawn, tiles, usable = 0, 0, True
     three = (0, 0, 0)
@@ -156,7 +156,7 @@ def _project_groups(first, last, source, gaussians, view, extras, projections, m
 @inline
 def _are_usable(mean, squared_norm, scale, opacity, color):
     """Whether all numbers are finite, scales are not negative, and the quaternion has a direction."""
-    # Zero times anything but a finite number is not a number.
+    # 0 times infinity or NaN is NaN.
     none = (0.0, 0.0, 0.0)
     finite = dot(mean, none, dot(scale, none, dot(color, none, mul(opacity, 0.0))))
     finite = fma(squared_norm, 0.0, finite)
@@ -172,7 +172,7 @@ def _tile(position, edge):
 
 @inline
 def _facing_normals(at, scale, view):
-    """The shortest axes, camera axes, turned so that they look at the camera."""
+    """The shortest axes, camera axes, oriented towards the camera."""
     second, third = shortest_axes(scale)
     axis = shortest_column(at.rotation, second, third)
     # The line of sight and the axis may be compared in the world as well as in the camera.
@@ -185,7 +185,7 @@ def _facing_normals(at, scale, view):
 
 @inline
 def _without_gaps(depth, inverse_depth, normal, extras):
-    """The extras that are composited; what stands behind them does not matter."""
+    """The composited extras without gaps; the remaining entries are ignored."""
     if extras.depth:
         if extras.inverse_depth:
             return depth, inverse_depth, normal[0], normal[1], normal[2]

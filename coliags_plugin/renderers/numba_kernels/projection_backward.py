@@ -1,4 +1,4 @@
-"""Sums over entries -> derivatives of the loss with respect to the Gaussians and the camera's pose.
+"""Backward pass of the projection: gradients of Gaussians and camera pose from sums over entries.
 
 ``gather`` adds up the entries of each Gaussian, tile by tile, and finds the derivative with respect to means2d;
 ``project_backward`` takes it from there through the formulas of ``docs/rendering.md``, section "Projection".
@@ -43,19 +43,19 @@ from coliags_plugin.renderers.numba_kernels.threads import take
 #: Turn products of two (or four) factors of the scaled U into those of the plain one.
 _PLAIN_SQUARE = 1.0 / layout.U_FACTOR_SQUARED
 _PLAIN_FOURTH = _PLAIN_SQUARE * _PLAIN_SQUARE
-#: How many Gaussians before its turn memory is asked for.
+#: Prefetch distance, Gaussians.
 _AHEAD = 16
 
 
 @kernel
 def gather(counters, projections, bins, entry_sums, gaussian_sums, of_means2d):
-    """Add up the sums of each Gaussian's entries.
+    """Sum the gradient sums of each Gaussian's entries.
 
     Args:
-        counters: For sharing; entries 0 and 1 must be 0.
+        counters: Work counters for dynamic scheduling; entries 0 and 1 must be 0.
         projections, bins: What projection and binning wrote.
         entry_sums: What the backward sweep wrote.
-        gaussian_sums: Out: see ``layout``; 0 where not drawn, groups filled up. [16 for each Gaussian]
+        gaussian_sums: Out: see ``layout``; 0 where not drawn, padded to whole groups. [16 for each Gaussian]
         of_means2d: Out: derivative with respect to the projected centres, likewise. [2 for each Gaussian]
     """
     groups, count, stretches = len(projections.drawn), len(bins.keys), len(bins.stretch_entries) - 1
@@ -89,7 +89,7 @@ def _clear_undrawn(first, last, drawn, gaussian_sums, of_means2d):
 
 @part
 def _gather_stretch(first, last, entry, records, bins, entry_sums, gaussian_sums, of_means2d):
-    """Gaussians in places ``first`` to ``last`` of the sorted list, whose entries are those from ``entry`` on."""
+    """Gaussians with indices ``first`` to ``last`` in the sorted list, whose entries are those from ``entry`` on."""
     square = np.float32(_PLAIN_SQUARE)
     for place in range(first, last):
         ahead = bins.keys[min(place + _AHEAD, last - 1)] & NUMBER
@@ -113,15 +113,15 @@ def _gather_stretch(first, last, entry, records, bins, entry_sums, gaussian_sums
 def project_backward(
     counters, count, gaussians, tail, view, extras, projections, gaussian_sums, given_means2d, of_gaussians, of_pose
 ):
-    """From the sums of each Gaussian to the derivatives of the loss.
+    """Derivatives of the loss with respect to Gaussians and pose, from the sums of each Gaussian.
 
     Args:
-        counters: For sharing; entry 0 must be 0.
+        counters: Work counters for dynamic scheduling; entry 0 must be 0.
         count, gaussians, tail, view, extras: As for ``project``.
         projections: What that wrote.
         gaussian_sums: What :func:`gather` wrote.
-        given_means2d: Derivative with respect to the projected centres, groups filled up. [2 for each Gaussian]
-        of_gaussians: Out, groups filled up. [layout.Parameters]
+        given_means2d: Derivative with respect to the projected centres, padded to whole groups. [2 for each Gaussian]
+        of_gaussians: Out, padded to whole groups. [layout.Parameters]
         of_pose: Out: derivative with respect to the camera's three axes and its centre in the world, one row for each
             parcel. [16 for each parcel]
     """
@@ -246,7 +246,7 @@ def _covariance_derivative(record, sums):
 
 @inline
 def _extra_sums(sums, extras):
-    """The sums of depth, inverse depth and normal, which lie without gaps behind those of colour."""
+    """The sums of depth, inverse depth and normal, stored consecutively after those of colour."""
     zero = splat(0.0)
     if extras.depth:
         if extras.inverse_depth:

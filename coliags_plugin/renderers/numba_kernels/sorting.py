@@ -1,7 +1,7 @@
-"""Gaussians drawn -> their numbers, nearest first. Those of equal depth keep the order they came in.
+"""Stable radix sort of the drawn Gaussians by depth, nearest first.
 
-A radix sort, lowest digit first. The list is cut into stretches that threads count and move on their own; the
-stretches' counts are added up in order, so the result is the same however many there are.
+Least significant digit first. The list is divided into stretches that threads count and move independently; their
+counts are summed in order, so the result does not depend on their number.
 """
 
 from __future__ import annotations
@@ -11,23 +11,23 @@ from coliags_plugin.renderers.numba_kernels.compilation import kernel
 from coliags_plugin.renderers.numba_kernels.lanes import lowest_bit
 from coliags_plugin.renderers.numba_kernels.threads import take
 
-#: Bits of a digit at most.
+#: Largest number of bits of a digit.
 DIGIT_BITS = 11
-#: Places for the counts of one stretch.
+#: Number of counters of one stretch.
 DIGITS = 1 << DIGIT_BITS
-#: Takes the number of the Gaussian out of a key.
+#: Mask of the Gaussian's index in a key.
 NUMBER = (1 << 32) - 1
 
 
 @kernel
 def collect(counters, depth_bits, drawn, places, keys, lowest, highest):
-    """Write the keys: bits of the depth above, number of the Gaussian below.
+    """Write the sort keys: depth bits in the upper half, index of the Gaussian in the lower.
 
     Args:
-        counters: For sharing; entry 0 must be 0.
-        depth_bits: The depths' bits, which order positive numbers as the numbers do. [groups filled up]
+        counters: Work counters for dynamic scheduling; entry 0 must be 0.
+        depth_bits: The depths' bits, which order positive numbers as the numbers do. [padded to whole groups]
         drawn: One bit for each Gaussian of a group. [groups]
-        places: Of the first key of each parcel of Gaussians. [parcels]
+        places: Offset of the first key of each parcel of Gaussians. [parcels]
         keys: Out. [Gaussians drawn]
         lowest, highest: Out: the range of depth bits in each parcel. [parcels]
     """
@@ -52,12 +52,12 @@ def collect(counters, depth_bits, drawn, places, keys, lowest, highest):
 
 @kernel
 def count_digits(counters, stretches, keys, lowest, shift, mask, digits):
-    """How often each digit occurs in each stretch.
+    """Histogram of the digits of each stretch.
 
     Args:
-        counters: For sharing; entry 0 must be 0.
-        stretches: How many.
-        keys: What to sort.
+        counters: Work counters for dynamic scheduling; entry 0 must be 0.
+        stretches: Number of stretches.
+        keys: Keys to sort.
         lowest: Least depth bits.
         shift, mask: Where the digit is in depth bits less ``lowest``.
         digits: Out. [DIGITS for each stretch]
@@ -75,7 +75,7 @@ def count_digits(counters, stretches, keys, lowest, shift, mask, digits):
 
 @kernel
 def place_digits(stretches, mask, digits):
-    """Turn counts of digits into places: where the first key of each digit and stretch goes."""
+    """Turn the histograms into offsets of the first key of each digit and stretch."""
     total = 0
     for digit in range(mask + 1):
         for stretch in range(stretches):
@@ -85,12 +85,12 @@ def place_digits(stretches, mask, digits):
 
 @kernel
 def move_by_digit(counters, stretches, keys, lowest, shift, mask, digits, moved):
-    """Put keys where their digit belongs.
+    """Scatter the keys by digit.
 
     Args:
-        counters: For sharing; entry 1 must be 0.
+        counters: Work counters for dynamic scheduling; entry 1 must be 0.
         stretches, keys, lowest, shift, mask: As for :func:`count_digits`.
-        digits: Places; they are counted up.
+        digits: Offsets, which are incremented.
         moved: Out.
     """
     while True:

@@ -1,4 +1,4 @@
-"""Derivatives of compositing, tile by tile, front to back once more.
+"""Backward pass of compositing, tile by tile, front to back.
 
 With g the derivative of the loss with respect to a pixel's composited channels, what a Gaussian of weight w and
 channels c shows is w (g . c). A running difference, first the whole pixel's (g . composited), tells what everything
@@ -68,7 +68,7 @@ _STATE = _CHANNELS + 16 * layout.MAX_CHANNELS
 NUMBERS = CHUNK * layout.ROW + layout.BLOCKS * _STATE
 #: Scratch of one thread: blocks of a chunk's entries.
 INTEGERS = CHUNK
-#: How many entries before its turn memory for its sums is asked for.
+#: Prefetch distance of the memory of the sums, entries.
 _AHEAD = 12
 
 
@@ -76,10 +76,10 @@ _AHEAD = 12
 def sweep_backward(
     counters, projections, bins, view, grid, extras, channels, scratch, composited, of_images, entry_sums
 ):
-    """Sums over the pixels of each entry.
+    """Compute the gradient sums over the pixels of each entry.
 
     Args:
-        counters: For sharing; entries 0 and 1 must be 0.
+        counters: Work counters for dynamic scheduling; entries 0 and 1 must be 0.
         projections, bins, composited: As the forward sweep left them.
         view: See ``layout``.
         grid: The image and its tiles.
@@ -148,7 +148,7 @@ def _copy_from_image(image, depth, channel, tile, grid, vector, state):
 
 @part
 def _prepare_tile(tile, channels, view, has_depth, composited, state):
-    """From derivatives with respect to images to those with respect to sums, and to what all of a pixel shows."""
+    """Turn derivatives with respect to images into those with respect to sums, and initialise the running difference."""
     size = 16 * (1 + len(channels))
     background = broadcast_all(view, layout.VIEW_BACKGROUND, (0, 0, 0))
     for block in range(layout.BLOCKS):
@@ -189,13 +189,13 @@ def _sweep_tile(tile, projections, bins, view, grid, channels, rows, state, bloc
 
 @inline
 def _sweep_entry(row, blocks, alive, rows, channels, view, state, target, entry_sums):
-    """Add up one entry's sums over its blocks.
+    """Accumulate one entry's sums over its blocks.
 
     Broadcasting the row's numbers again for each block costs nothing, for the processor does it as it reads them; kept
     in registers they would crowd out the sums.
 
     Returns:
-        Which blocks still let light through.
+        Mask of the blocks with transmittance left.
     """
     zero = splat(0.0)
     sum_v, sum_e, sum_f, sum_ee, sum_ef, sum_ff = zero, zero, zero, zero, zero, zero

@@ -1,6 +1,6 @@
-"""Compositing, tile by tile and block by block, front to back.
+"""Forward pass of compositing, tile by tile and block by block, front to back.
 
-A block of 4 x 4 pixels is one vector, and what a block has gathered stays in registers while its Gaussians pass. The
+A block of 4 x 4 pixels is one vector, and its accumulators stay in registers while its Gaussians are composited. The
 formulas are those of ``docs/rendering.md``, section "Compositing".
 """
 
@@ -66,7 +66,7 @@ def sweep_forward(counters, projections, bins, view, grid, extras, channels, med
     """Composite all tiles.
 
     Args:
-        counters: For sharing; entries 0 and 1 must be 0.
+        counters: Work counters for dynamic scheduling; entries 0 and 1 must be 0.
         projections, bins: What projection and binning wrote; ``bins.reached`` is written here.
         view: See ``layout``.
         grid: The image and its tiles.
@@ -97,7 +97,7 @@ def _sweep_tile(tile, projections, bins, view, grid, channels, median, rows, sta
     """Sweep through one tile's entries; leaves its pixels in ``state``.
 
     Returns:
-        Where it stopped.
+        The entry at which it stopped.
     """
     corner_x, corner_y, across, down = tile_corner(tile, grid)
     listed = blocks[CHUNK:]
@@ -126,10 +126,10 @@ def _sweep_tile(tile, projections, bins, view, grid, channels, median, rows, sta
 
 @part
 def _list_by_block(count, blocks, listed, counts):
-    """Which rows of a chunk touch each block, front to back.
+    """List the rows of a chunk that touch each block, front to back.
 
-    Without a branch, for none could be foreseen, and four blocks at a time: every row is written to every list, and
-    stays there where the list grows.
+    Branch-free, as branches would be unpredictable, and four blocks at a time: every row is written to every list, and
+    kept where the length of the list is incremented.
 
     Args:
         count: Entries of the chunk.
@@ -155,7 +155,7 @@ def _sweep_block(block, count, listed, rows, channels, median, view, state):
     """Composite the first ``count`` rows listed into one block.
 
     Returns:
-        Whether any pixel still lets light through.
+        Whether any pixel has transmittance left.
     """
     block_x, block_y = block_corner(block)
     half = 0.5 * layout.TILE - 0.5
@@ -183,7 +183,7 @@ def _sweep_block(block, count, listed, rows, channels, median, view, state):
         if len(median) > 0:
             crosses = both(both(drawn, greater(transmittance, 0.5)), at_most(behind, 0.5))
             medians = select(crosses, broadcast_all(rows, row + MEDIAN_DEPTH, median), medians)
-        # Once zero it stays so: the stop is for good.
+        # Once zero it stays zero, so compositing does not resume.
         transmittance = select(drawn, behind, 0.0)
         running = bits(drawn)
         if not running:
@@ -197,7 +197,7 @@ def _sweep_block(block, count, listed, rows, channels, median, view, state):
 
 @part
 def _finish_tile(tile, channels, view, has_depth, state, composited):
-    """Keep what the blocks have gathered in ``composited``; then add the background, and divide depth by alpha."""
+    """Store the blocks' sums in ``composited``; then add the background, and divide depth by alpha."""
     size = 16 * (1 + len(channels))
     background = broadcast_all(view, layout.VIEW_BACKGROUND, (0, 0, 0))
     for block in range(layout.BLOCKS):

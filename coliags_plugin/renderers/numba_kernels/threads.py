@@ -1,4 +1,4 @@
-"""Sharing out work among threads while they run."""
+"""Thread pool and dynamic distribution of work for the kernels."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from numba.extending import intrinsic
 
 @intrinsic
 def take(typingctx: Any, counters: Any, index: Any, amount: Any) -> Any:
-    """Add to ``counters[index]`` in one step that no other thread can interrupt, and give what was there before."""
+    """Atomically add to ``counters[index]`` and return the previous value."""
     if not (isinstance(counters, types.Array) and counters.dtype == types.int64 and counters.ndim == 1):
         return None
 
@@ -28,16 +28,16 @@ def take(typingctx: Any, counters: Any, index: Any, amount: Any) -> Any:
 
 
 class Crew:
-    """Threads that run one kernel together.
+    """Thread pool that runs one kernel on several threads.
 
     Every thread calls the kernel with the same arguments, and the kernel takes pieces of work with :func:`take` until
-    none are left. Whoever asks works too and waits only for those who have begun: a thread that the system has not let
-    run by then is not needed.
+    none are left. The calling thread works too and waits only for threads that have started: those that the system has
+    not scheduled by then are cancelled.
 
-    A fork leaves threads behind, and takes locks along as they are. The forked process begins with a fresh crew.
+    A fork does not copy threads, but copies locks in their current state; so a forked process creates a new pool.
 
     Attributes:
-        turn: To be held while the crew is at work for one caller.
+        turn: Lock to hold while a caller uses the pool.
     """
 
     def __init__(self) -> None:
@@ -50,11 +50,11 @@ class Crew:
         self._threads = ThreadPoolExecutor(max_workers=max(1, os.cpu_count() or 1), thread_name_prefix="splatting")
 
     def run(self, size: int, kernel: Callable[..., Any], *arguments: Any) -> None:
-        """Run a kernel on ``size`` threads, this one among them."""
+        """Run a kernel on ``size`` threads, including the calling one."""
         helpers = [self._threads.submit(kernel, *arguments) for _ in range(size - 1)]
         try:
             kernel(*arguments)
-        finally:  # also on Ctrl-C: nobody may go on writing to memory that is about to be given away
+        finally:  # also on Ctrl-C: no thread may still write to memory that is about to be released
             for helper in helpers:
                 if not helper.cancel():
                     helper.result()

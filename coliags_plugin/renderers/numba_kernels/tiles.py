@@ -1,4 +1,4 @@
-"""What both sweeps do with a tile: where it is, in which order tiles are begun, and fetching its Gaussians."""
+"""Tile handling of both sweeps: position, processing order, and fetching of its Gaussians."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from coliags_plugin.renderers.numba_kernels.lanes import (
 
 #: Entries of a tile fetched at a time: their rows fit into the first-level cache beside the blocks' state.
 CHUNK = 128
-#: How many entries before its turn a record is asked for.
+#: Prefetch distance of records, entries.
 _AHEAD = 32
 
 # A fetched row is one of ``records`` with other columns where that holds the centre and a slope: with (x, y) counted
@@ -35,7 +35,7 @@ def fetch_chunk(first, last, alive, corner_x, corner_y, projections, cells, rows
 
     Args:
         first, last: Among ``cells``.
-        alive: Blocks that still let light through, one bit each.
+        alive: Blocks with transmittance left, one bit each.
         corner_x, corner_y: First pixel of the tile.
         projections, cells: See ``layout``.
         rows: Out. [16 for each entry]
@@ -87,9 +87,9 @@ def place_in_blocks(x, y, stride):
 
 @part
 def order_tiles(starts, order):
-    """Tiles with long lists first, so that in the end no thread is left with one.
+    """Order tiles by decreasing length of their lists, to balance the threads.
 
-    By the number of binary digits of the number of entries, which is near enough.
+    Sorted approximately, by the bit length of the number of entries.
     """
     place = 0
     for digits in range(32, -1, -1):

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.outputs.figures import (
+from coliags_plugin.outputs.colormaps import (
     HATCH_GREYS,
     UNKNOWN_GREY,
     color_bar,

@@ -1,4 +1,4 @@
-"""PNG, JPEG and float TIFF: pixels to bytes and back, nothing silently converted."""
+"""Reading and writing of PNG, JPEG and float32 TIFF images, without silent conversions."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _TIFF_NO_PREDICTOR = 1
 
 
 def as_array(values: np.ndarray | Tensor) -> np.ndarray:
-    """A NumPy view or copy of an array or tensor, whatever device it is on and whether or not it has a gradient."""
+    """NumPy array of an array or tensor on any device, with or without a gradient; shares memory where possible."""
     if isinstance(values, np.ndarray):
         return values
     return np.asarray(values.detach().cpu().numpy())
@@ -33,26 +33,26 @@ def eight_bit(rgb: Tensor) -> Tensor:
 
 
 def encode_png(rgb: UInt8[np.ndarray, "H W 3"] | Tensor) -> bytes:
-    """A lossless 8-bit RGB PNG.
+    """Encode an 8-bit RGB image as PNG.
 
     Args:
         rgb: uint8. [H, W, 3]
 
     Raises:
-        InputError: Not an 8-bit RGB picture.
+        InputError: Not an 8-bit RGB image.
     """
     return _encode(".png", _bgr(rgb), [])
 
 
 def encode_jpeg(rgb: UInt8[np.ndarray, "H W 3"] | Tensor, quality: int = 95) -> bytes:
-    """An 8-bit RGB JPEG without chroma subsampling: red mucosa suffers visibly under 4:2:0.
+    """Encode an 8-bit RGB image as JPEG without chroma subsampling, which visibly degrades red mucosa.
 
     Args:
         rgb: uint8. [H, W, 3]
         quality: 1 to 100.
 
     Raises:
-        InputError: Not an 8-bit RGB picture.
+        InputError: Not an 8-bit RGB image.
     """
     sampling = int(cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
     options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, sampling]
@@ -60,20 +60,20 @@ def encode_jpeg(rgb: UInt8[np.ndarray, "H W 3"] | Tensor, quality: int = 95) -> 
 
 
 def write_png(path: Path, rgb: UInt8[np.ndarray, "H W 3"] | Tensor) -> None:
-    """Write an 8-bit RGB PNG, whole or not at all.
+    """Write an 8-bit RGB PNG atomically.
 
     Args:
-        path: Where to; its folder is made.
+        path: Output file; its folder is created.
         rgb: uint8. [H, W, 3]
 
     Raises:
-        InputError: Not an 8-bit RGB picture, or the folder cannot be written.
+        InputError: Not an 8-bit RGB image, or the folder cannot be written.
     """
     atomic_write(path, encode_png(rgb))
 
 
 def read_rgb(path: Path) -> UInt8[np.ndarray, "H W 3"]:
-    """Read an 8-bit RGB picture. [H, W, 3]
+    """Read an 8-bit RGB image. [H, W, 3]
 
     Raises:
         InputError: Missing, unreadable, or of another depth or channel count.
@@ -85,10 +85,10 @@ def read_rgb(path: Path) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def write_depth_tiff(path: Path, depth_mm: Float32[np.ndarray, "H W"] | Tensor) -> None:
-    """Write a depth map of any kind as a one-channel float32 TIFF, whole or not at all. NaN survives.
+    """Write a depth map of any kind as a one-channel float32 TIFF, atomically. NaN is preserved.
 
     Args:
-        path: Where to; its folder is made.
+        path: Output file; its folder is created.
         depth_mm: mm; float64 is rounded to float32. [H, W]
 
     Raises:
@@ -97,7 +97,7 @@ def write_depth_tiff(path: Path, depth_mm: Float32[np.ndarray, "H W"] | Tensor) 
     depth = as_array(depth_mm)
     if depth.ndim != 2 or depth.size == 0 or not np.issubdtype(depth.dtype, np.floating):
         raise InputError(f"{path} was to hold {_kind(depth)}", "a depth map: floating point, [H, W]")
-    # cv2's own choice, LZW with a floating-point predictor, is beyond many readers (tifffile needs a plug-in for it).
+    # cv2's default, LZW with a floating-point predictor, is not read by many libraries (tifffile needs a plug-in).
     options = [cv2.IMWRITE_TIFF_COMPRESSION, _TIFF_DEFLATE, cv2.IMWRITE_TIFF_PREDICTOR, _TIFF_NO_PREDICTOR]
     atomic_write(path, _encode(".tiff", np.ascontiguousarray(depth, dtype=np.float32), options))
 

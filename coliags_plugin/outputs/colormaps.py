@@ -1,7 +1,6 @@
-"""Pictures of numbers: depth, errors, colour bars and contact sheets. Arrays in, 8-bit RGB out.
+"""Colour-mapped images of depth and errors, colour bars and rows of images. Arrays in, 8-bit RGB out.
 
-Depth is drawn with viridis and errors with inferno, both perceptually uniform: equal steps of the quantity are equal
-steps to the eye, and neither can be taken for the other.
+Depth is drawn with viridis and errors with inferno, both perceptually uniform and easy to tell apart.
 """
 
 from __future__ import annotations
@@ -16,19 +15,19 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.outputs.pictures import as_array
-from coliags_plugin.outputs.scales import linear_ticks, tick_label
+from coliags_plugin.outputs.axis_ticks import linear_ticks, tick_label
+from coliags_plugin.outputs.image_files import as_array
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 ColorMap = Literal["depth", "error"]
 
-#: Full scale of depth error pictures that stand alone, mm: one for all, so that any two can be compared.
+#: Full scale of stand-alone depth error maps, mm; the same for all, so that they are comparable.
 DEPTH_ERROR_LIMIT_MM = 2.0
-#: Pixels of a depth picture that hold no depth.
+#: Grey level of pixels of unknown depth.
 UNKNOWN_GREY = 128
-#: The two greys of the hatch over error pixels that have no truth.
+#: Grey levels of the hatching over error pixels without ground truth.
 HATCH_GREYS = (150, 108)
 
 _HATCH_PERIOD = 8
@@ -39,7 +38,7 @@ _INK = (32, 32, 32)
 
 @cache
 def color_table(color_map: ColorMap) -> UInt8[np.ndarray, "256 3"]:
-    """The 256 RGB colours of a map, from the lowest value to the highest. [256, 3]"""
+    """The 256 RGB colours of a colour map, from the lowest value to the highest. [256, 3]"""
     code = cv2.COLORMAP_VIRIDIS if color_map == "depth" else cv2.COLORMAP_INFERNO
     table: np.ndarray = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[None], code)[0, :, ::-1].copy()
     table.setflags(write=False)
@@ -49,11 +48,11 @@ def color_table(color_map: ColorMap) -> UInt8[np.ndarray, "256 3"]:
 def depth_picture(
     depth_mm: Float[np.ndarray, "H W"] | Tensor, limits: tuple[float, float]
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Depth by colour; near is dark, far is bright, unknown is grey.
+    """Colour-mapped depth: near is dark, far is bright, unknown is grey.
 
     Args:
         depth_mm: Depth of any kind, mm; NaN and infinities are unknown. [H, W]
-        limits: The depths of the first and the last colour, mm; values beyond them are clipped.
+        limits: Depths of the first and the last colour, mm; values beyond them are clipped.
 
     Raises:
         InputError: ``depth_mm`` is not [H, W], or the limits are not an interval.
@@ -72,10 +71,9 @@ def depth_error_picture(
     valid: Bool[np.ndarray, "H W"] | Tensor | None,
     limit_mm: float,
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Absolute depth error on one fixed scale; pixels without truth are hatched in grey.
+    """Colour-mapped absolute depth error on a fixed scale; pixels without ground truth are hatched in grey.
 
-    A pixel where truth is known and the rendering is not finite takes the last colour: a method is not excused by
-    rendering nothing.
+    A pixel whose ground truth is known and whose rendering is not finite takes the last colour.
 
     Args:
         rendered_mm: Rendered depth, mm. [H, W]
@@ -95,7 +93,7 @@ def depth_error(
     true_mm: Float[np.ndarray, "H W"] | Tensor,
     valid: Bool[np.ndarray, "H W"] | Tensor | None = None,
 ) -> tuple[Float[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
-    """What :func:`depth_error_picture` draws.
+    """Absolute depth error, as drawn by :func:`depth_error_picture`.
 
     Returns:
         |rendered - true| in mm, infinite where the truth is known and the rendering is not finite, 0 where the truth is
@@ -123,13 +121,13 @@ def rgb_error_picture(
     valid: Bool[np.ndarray, "H W"] | Tensor | None = None,
     limit: float = 0.2,
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Absolute colour error, the mean of the three channels, on one fixed scale; ignored pixels are hatched in grey.
+    """Colour-mapped absolute RGB error (channel mean) on a fixed scale; ignored pixels are hatched in grey.
 
     Args:
         rendered: uint8, or floating point in [0, 1]. [H, W, 3]
         true: The same kind. [H, W, 3]
         valid: Pixels that count; None means all. [H, W]
-        limit: The error of the last colour, as a part of full scale; larger errors take it too.
+        limit: The error of the last colour, as a fraction of full scale; larger errors take it too.
 
     Raises:
         InputError: The shapes differ, or the limit is not positive.
@@ -141,7 +139,7 @@ def rgb_error_picture(
 
 
 def rgb_error(rendered: np.ndarray | Tensor, true: np.ndarray | Tensor) -> Float[np.ndarray, "H W"]:
-    """Mean over the channels of |rendered - true|, as a part of full scale. [H, W]
+    """Mean over the channels of |rendered - true|, as a fraction of full scale. [H, W]
 
     Raises:
         InputError: The shapes differ.
@@ -155,16 +153,16 @@ def rgb_error(rendered: np.ndarray | Tensor, true: np.ndarray | Tensor) -> Float
 def color_bar(
     limits: tuple[float, float], unit: str, color_map: ColorMap = "error", width: int = 480
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """A horizontal scale with ticks and its unit, on white.
+    """Horizontal colour bar with ticks and unit, on white.
 
     Args:
         limits: Values of the first and the last colour.
-        unit: For instance ``"mm"``; ASCII, as OpenCV's font draws nothing else.
-        color_map: Which map it explains.
+        unit: For instance ``"mm"``; ASCII, as OpenCV's font has no other characters.
+        color_map: The colour map to show.
         width: px.
 
     Raises:
-        InputError: The limits are not an interval, or there is no room.
+        InputError: The limits are not an interval, or the width is below 120.
     """
     low, high = _interval(limits)
     if width < 120:
@@ -187,15 +185,15 @@ def color_bar(
 def side_by_side(
     pictures: Sequence[UInt8[np.ndarray, "H W 3"] | Tensor], labels: Sequence[str], gap: int = 8
 ) -> UInt8[np.ndarray, "Hs Ws 3"]:
-    """Pictures of one height in a row on white, each under its label.
+    """Images of equal height in a row on white, each under its label.
 
     Args:
         pictures: uint8 RGB. [H, W, 3] each
-        labels: One each; ASCII; shortened where it is wider than its picture.
-        gap: White pixels between the pictures.
+        labels: One per image; ASCII; shortened where wider than its image.
+        gap: White pixels between the images.
 
     Raises:
-        InputError: No picture, another number of labels, or heights that differ.
+        InputError: No image, another number of labels, or heights that differ.
     """
     arrays = [as_array(picture) for picture in pictures]
     if not arrays or len(arrays) != len(labels):
@@ -216,7 +214,7 @@ def side_by_side(
     for label, array in zip(labels, arrays, strict=True):
         column = sheet[:, x : x + array.shape[1]]
         column[band:] = array
-        # A column is written into on its own, so that a label cannot run into its neighbour's.
+        # Drawn into a strip of its own, so that a label cannot overlap the next one.
         strip = np.ascontiguousarray(column[:band])
         _text(strip, _shortened(label, array.shape[1] - 4, scale), (2, 16), scale)
         column[:band] = strip
@@ -225,7 +223,7 @@ def side_by_side(
 
 
 def hatch(height: int, width: int) -> UInt8[np.ndarray, "H W 3"]:
-    """Diagonal stripes of two greys: "nothing is known here". [H, W, 3]"""
+    """Diagonal grey stripes, for pixels without ground truth. [H, W, 3]"""
     rows, columns = np.indices((height, width))
     stripe = (rows + columns) % _HATCH_PERIOD < _HATCH_WIDTH
     grey = np.where(stripe, HATCH_GREYS[1], HATCH_GREYS[0]).astype(np.uint8)

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coliags_plugin.outputs.scales import linear_ticks, log_ticks, round_up, tick_label
+from coliags_plugin.outputs.axis_ticks import linear_ticks, log_ticks, round_up, tick_label
 
 
 @pytest.mark.parametrize(

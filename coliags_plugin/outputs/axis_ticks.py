@@ -1,11 +1,11 @@
-"""Round numbers for axes and colour bars."""
+"""Tick positions and labels for axes and colour bars."""
 
 from __future__ import annotations
 
 import math
 
 _STEPS = (1.0, 2.0, 5.0, 10.0)
-#: Rounding errors must not push 0.2 up to 0.5.
+#: Relative tolerance, so that rounding errors do not round 0.2 up to 0.5.
 _SLACK = 1e-9
 
 
@@ -57,6 +57,6 @@ def log_ticks(low: float, high: float) -> list[float]:
 
 
 def tick_label(value: float) -> str:
-    """A tick's text: as short as the number allows, without an exponent between 0.0001 and 999 999."""
+    """Shortest label of a tick, without an exponent between 0.0001 and 999 999."""
     text = f"{value:.6g}"
     return "0" if text == "-0" else text

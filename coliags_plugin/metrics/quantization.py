@@ -1,4 +1,4 @@
-"""What becomes of a picture and of a depth map that pass through the authors' PNG files (docs/methods.md 5.4)."""
+"""Quantisation of images and depth maps by the authors' 8-bit and 16-bit PNG files (docs/methods.md 5.4)."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ _LEVELS = 65535
 
 
 def through_8_bit(rgb: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
-    """Written as 8 bit by torchvision's ``save_image`` (times 255, plus one half, clamped, truncated), read back.
+    """Image written as 8 bit by torchvision's ``save_image`` (times 255, plus 0.5, clamped, truncated) and read back.
 
-    NaN stays NaN, for the metrics to refuse.
+    NaN stays NaN, so that the metrics refuse it.
 
     Args:
         rgb: In [0, 1]; beyond that it is clamped. [H, W, 3]
@@ -21,11 +21,11 @@ def through_8_bit(rgb: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
 
 
 def through_16_bit(depth: Float[Tensor, "H W"], full_scale: float) -> Float[Tensor, "H W"]:
-    """Written as ``(depth / full_scale * 65535).astype(uint16)`` in float32, read back with the same scale.
+    """Depth written as ``(depth / full_scale * 65535).astype(uint16)`` in float32 and read back, mm.
 
     The cast truncates. It does not clamp: beyond full scale it keeps the lower 16 bits, so 151 mm at a scale of 150 mm
     comes back as 1 mm. That, and 0 for what a 32-bit integer cannot hold (infinity, NaN), is what numpy gives on
-    x86-64, where the figures were made; C leaves both undefined.
+    x86-64, where the published values were computed; C leaves both undefined.
 
     Args:
         depth: mm. [H, W]

@@ -8,7 +8,7 @@ import tifffile
 import torch
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.outputs.pictures import (
+from coliags_plugin.outputs.image_files import (
     encode_jpeg,
     encode_png,
     read_depth_tiff,
