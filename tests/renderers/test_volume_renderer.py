@@ -53,7 +53,7 @@ def make(**options):
 
 def test_even_fog_absorbs_exponentially():
     camera = camera_at(0, 0, 0)
-    output = make(near=1.0, far=9.0, samples=7, background=(0.0, 1.0, 0.0)).render(Fog(0.2), camera)
+    output = make(near_plane=1.0, far_plane=9.0, samples=7, background=(0.0, 1.0, 0.0)).render(Fog(0.2), camera)
     lengths = camera.rays().norm(dim=-1)
     alpha = 1 - torch.exp(-0.2 * 8.0 * lengths)
     torch.testing.assert_close(output.alpha, alpha)
@@ -63,11 +63,13 @@ def test_even_fog_absorbs_exponentially():
 
 def test_depths_of_a_hard_surface_are_z_depths():
     kinds = ("depth_accumulated", "depth_expected", "depth_median", "inverse_depth_accumulated")
-    output = make(near=1.0, far=21.0, samples=2000).render(Fog(500.0, start=12.0), camera_at(0, 0, 0), kinds)
+    output = make(near_plane=1.0, far_plane=21.0, samples=2000).render(
+        Fog(500.0, start=12.0), camera_at(0, 0, 0), kinds
+    )
     for kind in kinds[:3]:
         torch.testing.assert_close(output[kind], torch.full_like(output.alpha, 12.0), rtol=0, atol=0.02)
     torch.testing.assert_close(output[kinds[3]], torch.full_like(output.alpha, 1 / 12), rtol=2e-3, atol=0)
-    empty = make(near=1.0, far=5.0).render(Fog(0.0), camera_at(0, 0, 0), kinds)
+    empty = make(near_plane=1.0, far_plane=5.0).render(Fog(0.0), camera_at(0, 0, 0), kinds)
     assert not any(empty[kind].any() for kind in kinds)
 
 
@@ -85,8 +87,8 @@ def test_some_pixels_are_those_of_the_whole_image():
 def test_refusals():
     with pytest.raises(InputError, match="no output 'normals' of the volume renderer"):
         make().render(Fog(1.0), camera_at(0, 0, 0), ("normals",))
-    with pytest.raises(ValueError, match=r"far 1\.0 does not lie beyond near 2\.0"):
-        make(near=2.0, far=1.0)
+    with pytest.raises(ValueError, match=r"far_plane 1\.0 does not lie beyond near_plane 2\.0"):
+        make(near_plane=2.0, far_plane=1.0)
 
 
 # --- a radiance field as a third party would add one ------------------------------------------------------------------
@@ -151,7 +153,7 @@ METHOD = """
 description: a grid of density and colour
 datamanager: {name: auto}
 field: {name: test-grid}
-renderer: {name: volume, near: 3.0, far: 9.0, samples: 64}
+renderer: {name: volume, near_plane: 3.0, far_plane: 9.0, samples: 64}
 sampler: {name: pixels, pixels: 512, frames: 3}
 strategy: {name: none}
 losses: {l1: {name: l1, weight: 1.0}}
