@@ -28,10 +28,12 @@ class Registry:
     Args:
         kind: Plural noun, for instance ``"renderers"``.
         builtins: Name to ``"module:Class"``.
+        noun: What errors call one of them; default: the kind and "component".
     """
 
-    def __init__(self, kind: str, builtins: Mapping[str, str]) -> None:
+    def __init__(self, kind: str, builtins: Mapping[str, str], noun: str = "") -> None:
         self.kind = kind
+        self.noun = noun or f"{kind} component"
         self._targets: dict[str, Any] = {}
         self._sources: dict[str, str] = {}
         self._complete = False
@@ -77,7 +79,7 @@ class Registry:
         self._discover()
         if name not in self._targets:
             raise InputError(
-                f"no {self.kind} component '{name}'",
+                f"no {self.noun} '{name}'",
                 f"one of {', '.join(self.names())}",
                 did_you_mean(name, self._targets),
             )
@@ -223,6 +225,22 @@ protocols = Registry(
         "authors-code": "coliags_plugin.metrics.protocols:AuthorsCodeProtocol",
     },
 )
+phantom_layouts = Registry(
+    "phantom_layouts",
+    {
+        "c3vd": "coliags_plugin.phantom.layouts.c3vd:C3VDLayout",
+        "c3vd-raw": "coliags_plugin.phantom.layouts.c3vd_raw:C3VDRawLayout",
+        "c3vd-v2": "coliags_plugin.phantom.layouts.c3vd_v2:C3VDv2Layout",
+        "colmap": "coliags_plugin.phantom.layouts.colmap:ColmapLayout",
+        "endogslam": "coliags_plugin.phantom.layouts.endogslam:EndoGSLAMLayout",
+        "nerfstudio": "coliags_plugin.phantom.layouts.nerfstudio:NerfstudioLayout",
+        "pr-endo": "coliags_plugin.phantom.layouts.pr_endo:PREndoLayout",
+        "reim-nerf": "coliags_plugin.phantom.layouts.reim_nerf:ReimNerfLayout",
+        "rgbd": "coliags_plugin.phantom.layouts.rgbd:RGBDLayout",
+        "rotatecolon": "coliags_plugin.phantom.layouts.rotatecolon:RotateColonLayout",
+    },
+    noun="phantom layout",
+)
 
 REGISTRIES: dict[str, Registry] = {
     registry.kind: registry
@@ -238,5 +256,6 @@ REGISTRIES: dict[str, Registry] = {
         losses,
         metrics,
         protocols,
+        phantom_layouts,
     )
 }

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from coliags_plugin.lenses.models import LENSES, octagon_mask
-from coliags_plugin.phantom.imaging import Optics
+from coliags_plugin.lenses.models import LENSES, Lens, octagon_mask
 from coliags_plugin.phantom.layouts.base import Layout, Part, place
 from coliags_plugin.phantom.layouts.pictures import write_image
 
@@ -17,14 +16,14 @@ from coliags_plugin.phantom.layouts.pictures import write_image
 DEPTH_RANGE = 100.0
 
 
-class C3vdRawLayout(Layout):
+class C3VDRawLayout(Layout):
     """The release's own files: distorted frames with black corners, TIFF depth and normals, pose.txt."""
 
     default_size = (1350, 1080)
     has_rotation = True
     has_coverage_mesh = True
 
-    def optics(self, width: int, height: int) -> tuple[Optics, Bool[np.ndarray, "H W"]]:
+    def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
         """C3VD's omnidirectional lens behind its octagonal mask."""
         return LENSES["omnidirectional"].scaled(width, height), octagon_mask(width, height)
 
@@ -42,9 +41,7 @@ class C3vdRawLayout(Layout):
         write_image(place(folder, part) / f"{index:04d}_depth.tiff", encode_depth(z_depth))
         write_image(place(folder, part) / f"{index:04d}_normals.tiff", encode_normals(normals))
 
-    def write_sequence(
-        self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], optics: Optics
-    ) -> None:
+    def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
         """See :class:`Layout`."""
         write_poses(place(folder, part) / "pose.txt", poses)
 

@@ -10,21 +10,20 @@ from jaxtyping import Bool, Float, UInt8
 
 from coliags_plugin.datamanagers.c3vd_v2.files import INTRINSICS
 from coliags_plugin.datamanagers.c3vd_v2.lens import CANDIDATE_LENS, ORDER
-from coliags_plugin.lenses.models import octagon_mask
-from coliags_plugin.phantom.imaging import Optics
+from coliags_plugin.lenses.models import Lens, octagon_mask
 from coliags_plugin.phantom.layouts.base import Layout, Part, place
 from coliags_plugin.phantom.layouts.c3vd_raw import encode_depth, encode_normals, write_poses
 from coliags_plugin.phantom.layouts.pictures import write_image
 
 
-class C3vdV2Layout(Layout):
+class C3VDv2Layout(Layout):
     """Distorted frames with black corners in folders by kind, pose.txt, and the lens in camera_intrinsics.txt."""
 
     default_size = (1350, 1080)
     has_rotation = True
     has_coverage_mesh = True
 
-    def optics(self, width: int, height: int) -> tuple[Optics, Bool[np.ndarray, "H W"]]:
+    def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
         """The candidate for C3VDv2's lens, behind C3VD's octagonal mask."""
         return CANDIDATE_LENS.scaled(width, height), octagon_mask(width, height)
 
@@ -42,9 +41,7 @@ class C3vdV2Layout(Layout):
         write_image(place(folder, part) / "depth" / f"{index:04d}_depth.tiff", encode_depth(z_depth))
         write_image(place(folder, part) / "normals" / f"{index:04d}_normals.tiff", encode_normals(normals))
 
-    def write_sequence(
-        self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], optics: Optics
-    ) -> None:
+    def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
         """See :class:`Layout`. The lens is described at the size it is calibrated for."""
         write_poses(place(folder, part) / "pose.txt", poses)
         values = {"a1": 0.0, **vars(CANDIDATE_LENS)}

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from coliags_plugin.phantom.imaging import Optics
+from coliags_plugin.lenses.models import Lens
 from coliags_plugin.phantom.layouts.base import Layout, Part, WallPoints, pinhole_of
 from coliags_plugin.phantom.layouts.pictures import write_image
 from coliags_plugin.poses.colmap import posed_model
@@ -36,19 +36,17 @@ class ColmapLayout(Layout):
         """See :class:`Layout`; depth and normals are not part of this layout."""
         write_image(folder / "images" / _name(index), color)
 
-    def write_sequence(
-        self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], optics: Optics
-    ) -> None:
+    def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
         """See :class:`Layout`; poses are part of the model."""
 
     def write_points(
-        self, folder: Path, points: WallPoints, poses: Sequence[Float[np.ndarray, "4 4"]], optics: Optics
+        self, folder: Path, points: WallPoints, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens
     ) -> None:
         """See :class:`Layout`. Points seen in fewer than two pictures are left out, as COLMAP leaves them out."""
         import pycolmap
 
         names = tuple(_name(index) for index in range(len(poses)))
-        model = posed_model(Trajectory(np.stack(poses), names=names), pinhole_of(optics))
+        model = posed_model(Trajectory(np.stack(poses), names=names), pinhole_of(lens))
         numbers = np.arange(len(points.positions))
         seen = [points.seen_in(index) & ((numbers + index) % _FOUND_IN_ONE_OF == 0) for index in range(len(poses))]
         kept = np.sum(seen, axis=0) >= 2
@@ -58,7 +56,7 @@ class ColmapLayout(Layout):
             local = points.positions[found] @ matrix[:3, :3].T + matrix[:3, 3]
             for place, found_number in enumerate(found.tolist()):
                 tracks[found_number].append(pycolmap.TrackElement(index + 1, place))
-            pixels = [pycolmap.Point2D(pixel) for pixel in optics.project(local) + 0.5]
+            pixels = [pycolmap.Point2D(pixel) for pixel in lens.project(local) + 0.5]
             model.images[index + 1].points2D = pycolmap.Point2DList(pixels)
         for number, track in tracks.items():
             model.add_point3D(points.positions[number], pycolmap.Track(track), points.colors[number])

@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float, UInt8
 
 from coliags_plugin.datamanagers.c3vd_endogslam.files import PARAMS
 from coliags_plugin.datamanagers.c3vd_endogslam.manager import PREPARED_DEPTH, PREPARED_PINHOLE, PREPARED_SIZE
-from coliags_plugin.phantom.imaging import Optics, PinholeOptics
+from coliags_plugin.lenses.models import Lens
+from coliags_plugin.lenses.pinhole import PinholeLens
 from coliags_plugin.phantom.layouts.base import Layout, Part, WallPoints, pinhole_of, place
 from coliags_plugin.phantom.layouts.c3vd_raw import write_poses
 from coliags_plugin.phantom.layouts.pictures import write_image
@@ -23,7 +24,7 @@ from coliags_plugin.poses.trajectory import Trajectory
 _SIZE = 0.3
 
 
-class EndoGslamLayout(Layout):
+class EndoGSLAMLayout(Layout):
     """color/, 8-bit depth/, pose.txt, and params.npz of a flawless EndoGSLAM run on the training frames."""
 
     default_size = PREPARED_SIZE
@@ -34,10 +35,10 @@ class EndoGslamLayout(Layout):
         """EndoGSLAM's: 7, 15, 23, ..."""
         return index % TEST_EVERY == TEST_EVERY - 1
 
-    def optics(self, width: int, height: int) -> tuple[Optics, Bool[np.ndarray, "H W"]]:
+    def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
         """The camera that EndoGSLAM takes undistorted frames for, stretched to the size. All pixels are lit."""
         pinhole = PREPARED_PINHOLE.scaled(width / PREPARED_SIZE[0], height / PREPARED_SIZE[1])
-        return PinholeOptics(pinhole, width, height), np.ones((height, width), bool)
+        return PinholeLens.of(pinhole, width, height), np.ones((height, width), bool)
 
     def write_frame(
         self,
@@ -51,18 +52,16 @@ class EndoGslamLayout(Layout):
         """See :class:`Layout`; normals are not part of this layout."""
         write_prepared_frame(place(folder, part), index, color, z_depth)
 
-    def write_sequence(
-        self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], optics: Optics
-    ) -> None:
+    def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
         """See :class:`Layout`."""
         write_poses(place(folder, part) / "pose.txt", poses)
 
     def write_points(
-        self, folder: Path, points: WallPoints, poses: Sequence[Float[np.ndarray, "4 4"]], optics: Optics
+        self, folder: Path, points: WallPoints, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens
     ) -> None:
         """See :class:`Layout`."""
         training = [pose for index, pose in enumerate(poses) if not self.is_test(index)]
-        write_params(folder / PARAMS, points, training, optics)
+        write_params(folder / PARAMS, points, training, lens)
 
 
 def write_prepared_frame(
@@ -75,7 +74,7 @@ def write_prepared_frame(
 
 
 def write_params(
-    path: Path, points: WallPoints, poses: Sequence[Float[np.ndarray, "4 4"]], optics: Optics
+    path: Path, points: WallPoints, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens
 ) -> Float[np.ndarray, "N 3"]:
     """EndoGSLAM's result, had it found the true poses and the wall.
 
@@ -83,12 +82,12 @@ def write_params(
         path: Of the ``params.npz``.
         points: What becomes the map.
         poses: Of the frames it was given; their first is its world. Each [4, 4]
-        optics: Of all frames; a pinhole.
+        lens: Of all frames; a pinhole.
 
     Returns:
         The map's points in its world, mm. [N, 3]
     """
-    endogslam.write(path, Trajectory(np.stack(poses), intrinsics=pinhole_of(optics)))
+    endogslam.write(path, Trajectory(np.stack(poses), intrinsics=pinhole_of(lens)))
     with np.load(path) as file:
         arrays = dict(file)
     count = len(points.positions)

@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from coliags_plugin.core.files import write_json
+from coliags_plugin.lenses.models import Lens
 from coliags_plugin.lenses.opencv import OpenCVLens
-from coliags_plugin.phantom.imaging import Optics, PinholeOptics
+from coliags_plugin.lenses.pinhole import PinholeLens
 from coliags_plugin.phantom.layouts.base import Layout, Part
 from coliags_plugin.phantom.layouts.pictures import write_image
 from coliags_plugin.poses.rigid import FLIP_Y_AND_Z
@@ -24,10 +25,10 @@ _BENDS = {"k1": -0.2, "k2": 0.05, "p1": 0.001, "p2": -0.002}
 class NerfstudioLayout(Layout):
     """images/, depth/ and a transforms.json in millimetres with an OPENCV camera."""
 
-    def optics(self, width: int, height: int) -> tuple[Optics, Bool[np.ndarray, "H W"]]:
+    def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
         """The usual camera, behind a lens that OpenCV's model describes."""
-        plain, lit = super().optics(width, height)
-        if not isinstance(plain, PinholeOptics):
+        plain, lit = super().lens(width, height)
+        if not isinstance(plain, PinholeLens):
             raise TypeError("a lens needs a pinhole to stand before")
         fx, fy, cx, cy = plain.pinhole
         k1, k2, p1, p2 = _BENDS.values()
@@ -47,11 +48,9 @@ class NerfstudioLayout(Layout):
         steps = np.rint(z_depth / DEPTH_UNIT).clip(0.0, 65535.0)
         write_image(folder / "depth" / _name(index), steps.astype(np.uint16))
 
-    def write_sequence(
-        self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], optics: Optics
-    ) -> None:
+    def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
         """See :class:`Layout`."""
-        if not isinstance(optics, OpenCVLens):
+        if not isinstance(lens, OpenCVLens):
             raise TypeError("the nerfstudio layout is taken through OpenCV's lens")
         frames = [
             {
@@ -61,9 +60,9 @@ class NerfstudioLayout(Layout):
             }
             for index, pose in enumerate(poses)
         ]
-        k = optics.pinhole
+        k = lens.pinhole
         camera = {"camera_model": "OPENCV", "fl_x": k.fx, "fl_y": k.fy, "cx": k.cx + 0.5, "cy": k.cy + 0.5}
-        size = {"w": optics.width, "h": optics.height}
+        size = {"w": lens.width, "h": lens.height}
         unit = {"depth_unit_scale_factor": DEPTH_UNIT}
         write_json(folder / "transforms.json", {**camera, **size, **_BENDS, **unit, "frames": frames})
 

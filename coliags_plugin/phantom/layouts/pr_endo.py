@@ -9,27 +9,27 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from coliags_plugin.datamanagers.c3vd_endogslam.files import OPTIMIZED, PARAMS
-from coliags_plugin.phantom.imaging import Optics
+from coliags_plugin.lenses.models import Lens
 from coliags_plugin.phantom.layouts.base import Layout, Part, WallPoints
-from coliags_plugin.phantom.layouts.endogslam import EndoGslamLayout, write_params, write_prepared_frame
+from coliags_plugin.phantom.layouts.endogslam import EndoGSLAMLayout, write_params, write_prepared_frame
 
 _DATA, _SCENE, _ITERATION = "C3VD", "phantom", 30_000
 _SH0 = 0.28209479177387814
 
 
-class PrEndoLayout(Layout):
+class PREndoLayout(Layout):
     """C3VD/phantom without poses, and beside it what EndoGSLAM, given all frames, made of it, as 3DGS PLY too."""
 
-    default_size = EndoGslamLayout.default_size
+    default_size = EndoGSLAMLayout.default_size
     has_points = True
 
     def is_test(self, index: int) -> bool:
         """PR-Endo's: 7, 15, 23, ..."""
-        return EndoGslamLayout().is_test(index)
+        return EndoGSLAMLayout().is_test(index)
 
-    def optics(self, width: int, height: int) -> tuple[Optics, Bool[np.ndarray, "H W"]]:
+    def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
         """As in EndoGSLAM's layout."""
-        return EndoGslamLayout().optics(width, height)
+        return EndoGSLAMLayout().lens(width, height)
 
     def write_frame(
         self,
@@ -43,17 +43,15 @@ class PrEndoLayout(Layout):
         """See :class:`Layout`; normals are not part of this layout."""
         write_prepared_frame(folder / _DATA / _SCENE, index, color, z_depth)
 
-    def write_sequence(
-        self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], optics: Optics
-    ) -> None:
+    def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
         """See :class:`Layout`; poses stand in params.npz."""
 
     def write_points(
-        self, folder: Path, points: WallPoints, poses: Sequence[Float[np.ndarray, "4 4"]], optics: Optics
+        self, folder: Path, points: WallPoints, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens
     ) -> None:
         """See :class:`Layout`."""
         results = folder / f"{_DATA}{OPTIMIZED}" / _SCENE
-        means = write_params(results / PARAMS, points, poses, optics)
+        means = write_params(results / PARAMS, points, poses, lens)
         _write_gaussians(results / "point_cloud" / f"iteration_{_ITERATION}" / "point_cloud.ply", means, points.colors)
 
     def seen_mask(self, folder: Path, part: Part, index: int) -> Path:

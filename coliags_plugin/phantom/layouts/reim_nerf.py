@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float, UInt8
 
 from coliags_plugin.datamanagers.reim_nerf.files import C3VD_RANGE, ray_cosines
 from coliags_plugin.lenses.models import LENSES, FisheyeLens, Lens
-from coliags_plugin.phantom.imaging import Optics
 from coliags_plugin.phantom.layouts.base import Layout, Part
 from coliags_plugin.phantom.layouts.pictures import write_image
 from coliags_plugin.poses.rigid import FLIP_Y_AND_Z
@@ -33,7 +32,7 @@ class ReimNerfLayout(Layout):
 
     default_size = (1350, 1080)
 
-    def optics(self, width: int, height: int) -> tuple[Optics, Bool[np.ndarray, "H W"]]:
+    def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
         """REIM-NeRF's lens, and the circle that its preprocessing keeps."""
         lens = _lens(width, height)
         k = lens.pinhole
@@ -63,16 +62,14 @@ class ReimNerfLayout(Layout):
         write_image(folder / "images" / _name(index), color)
         write_image(folder / "distmaps" / _name(index), np.clip(steps, 0.0, 65535.0).astype(np.uint16))
 
-    def write_sequence(
-        self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], optics: Optics
-    ) -> None:
+    def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
         """See :class:`Layout`."""
-        _, shows = self.optics(optics.width, optics.height)
+        _, shows = self.lens(lens.width, lens.height)
         write_image(folder / "rgb_mask.png", np.where(shows, 0, 255).astype(np.uint8))
         stacked = np.stack(poses)
         shift = np.eye(4)
         shift[:3, 3] = -(stacked[:, :3, 3] + _AHEAD * stacked[:, :3, 2]).mean(axis=0)
-        camera = _camera(_lens(optics.width, optics.height)) | {"scene_T": shift.tolist()}
+        camera = _camera(_lens(lens.width, lens.height)) | {"scene_T": shift.tolist()}
         frames = [_frame(folder, index, pose, shift[:3, 3]) for index, pose in enumerate(poses)]
         for name, places in _parts(len(poses)).items():
             content = {**camera, "frames": [frames[place] for place in places]}

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from coliags_plugin.datamanagers.rotatecolon.files import POINTS, TEST, TRAIN, TRAIN_DEPTH, TRAIN_VIEWS
-from coliags_plugin.lenses.models import Pinhole
-from coliags_plugin.phantom.imaging import Optics, PinholeOptics
+from coliags_plugin.lenses.models import Lens, Pinhole
+from coliags_plugin.lenses.pinhole import PinholeLens
 from coliags_plugin.phantom.layouts.base import Layout, Part, WallPoints
 from coliags_plugin.phantom.layouts.meshes import write_points
 from coliags_plugin.phantom.layouts.pictures import write_image
@@ -35,11 +35,11 @@ class RotateColonLayout(Layout):
         """None: the test views are the rotation views."""
         return False
 
-    def optics(self, width: int, height: int) -> tuple[Optics, Bool[np.ndarray, "H W"]]:
+    def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
         """Square pixels, the principal point in the middle. All pixels are lit."""
         focal = 0.5 * width / math.tan(0.5 * _ANGLE)
         pinhole = Pinhole(focal, focal, 0.5 * width - 0.5, 0.5 * height - 0.5)
-        return PinholeOptics(pinhole, width, height), np.ones((height, width), bool)
+        return PinholeLens.of(pinhole, width, height), np.ones((height, width), bool)
 
     def write_frame(
         self,
@@ -58,9 +58,7 @@ class RotateColonLayout(Layout):
         stored = np.where(z_depth > 0.0, z_depth * _DEPTH_FACTOR, _NOTHING).astype(np.float32)
         _write_exr(folder / TRAIN_DEPTH / f"{index:04d}.exr", color, stored)
 
-    def write_sequence(
-        self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], optics: Optics
-    ) -> None:
+    def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
         """See :class:`Layout`."""
         frames = [
             {"file_path": str(index), "transform_matrix": (pose @ FLIP_Y_AND_Z).tolist()}
@@ -70,7 +68,7 @@ class RotateColonLayout(Layout):
         (folder / (TRAIN if part == "video" else TEST)).write_text(json.dumps(content, indent=2) + "\n")
 
     def write_points(
-        self, folder: Path, points: WallPoints, poses: Sequence[Float[np.ndarray, "4 4"]], optics: Optics
+        self, folder: Path, points: WallPoints, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens
     ) -> None:
         """See :class:`Layout`."""
         write_points(folder / POINTS, points.positions, points.colors)
