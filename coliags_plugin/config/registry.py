@@ -131,14 +131,14 @@ datamanagers = Registry(
     "datamanagers",
     {
         "auto": "coliags_plugin.datamanagers.auto:AutoDataManager",
-        "c3vd": "coliags_plugin.datamanagers.c3vd.manager:C3VDDataManager",
-        "c3vd-endogslam": "coliags_plugin.datamanagers.c3vd_endogslam.manager:C3VDEndoGSLAMDataManager",
-        "c3vd-v2": "coliags_plugin.datamanagers.c3vd_v2.manager:C3VDv2DataManager",
-        "colmap": "coliags_plugin.datamanagers.colmap.manager:ColmapDataManager",
-        "nerfstudio": "coliags_plugin.datamanagers.nerfstudio.manager:NerfstudioDataManager",
-        "reim-nerf": "coliags_plugin.datamanagers.reim_nerf.manager:ReimNerfDataManager",
-        "rgbd": "coliags_plugin.datamanagers.rgbd.manager:RGBDDataManager",
-        "rotatecolon": "coliags_plugin.datamanagers.rotatecolon.manager:RotateColonDataManager",
+        "c3vd": "coliags_plugin.datamanagers.c3vd.reader:C3VDDataManager",
+        "c3vd-endogslam": "coliags_plugin.datamanagers.c3vd_endogslam.reader:C3VDEndoGSLAMDataManager",
+        "c3vd-v2": "coliags_plugin.datamanagers.c3vd_v2.reader:C3VDv2DataManager",
+        "colmap": "coliags_plugin.datamanagers.colmap.reader:ColmapDataManager",
+        "nerfstudio": "coliags_plugin.datamanagers.nerfstudio.reader:NerfstudioDataManager",
+        "reim-nerf": "coliags_plugin.datamanagers.reim_nerf.reader:ReimNerfDataManager",
+        "rgbd": "coliags_plugin.datamanagers.rgbd.reader:RGBDDataManager",
+        "rotatecolon": "coliags_plugin.datamanagers.rotatecolon.reader:RotateColonDataManager",
     },
 )
 fields = Registry(

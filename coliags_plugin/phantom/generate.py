@@ -16,13 +16,13 @@ from coliags_plugin import __version__
 from coliags_plugin.config.registry import phantom_layouts
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder
+from coliags_plugin.core.images import write_image
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.phantom.colon import ColonSurface, build_surface, grow_anatomy
 from coliags_plugin.phantom.imaging import Exposure, Sensor, World, expose, meter
 from coliags_plugin.phantom.interreflection import IndirectLight, indirect_lights
 from coliags_plugin.phantom.layouts import meshes
 from coliags_plugin.phantom.layouts.base import Layout, Part, WallPoints
-from coliags_plugin.phantom.layouts.pictures import write_image
 from coliags_plugin.phantom.light import Lamp
 from coliags_plugin.phantom.mucosa import Mucosa, paint_mucosa
 from coliags_plugin.phantom.response import KNEE, develop, exposure_for, exposures, white_balances
@@ -291,7 +291,7 @@ def _write_truth(
     surface, settings = phantom.world.surface, phantom.settings
     folder.mkdir(parents=True, exist_ok=True)
     albedo = phantom.vertex_albedo
-    meshes.write_ply(folder / "mesh.ply", surface, albedo)
+    meshes.write_mesh(folder / "mesh.ply", surface, albedo)
     vertices = surface.vertices.astype(np.float64)
     seen = seen_from(vertices, phantom.training_poses, phantom.sensor.lens, phantom.sensor.mask, phantom.world.tracer)
     np.savez(folder / "mesh_seen.npz", vertex_seen=seen, face_seen=trained_on, face_seen_by_any_frame=observed)

@@ -13,14 +13,14 @@ import pytest
 import torch
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.datamanagers.fusion import load_points
-from coliags_plugin.datamanagers.nerfstudio.manager import NerfstudioDataManager, NerfstudioSettings
+from coliags_plugin.datamanagers.nerfstudio.reader import NerfstudioDataManager, NerfstudioSettings
 from coliags_plugin.datamanagers.reading.images import read_rgb
 from coliags_plugin.engine.data_formats import find_format
 from coliags_plugin.lenses.models import FisheyeLens, Lens
 from coliags_plugin.lenses.opencv import OpenCVLens
 from coliags_plugin.lenses.undistortion import Undistortion
-from coliags_plugin.phantom.layouts.meshes import write_points
 from coliags_plugin.poses.rigid import FLIP_Y_AND_Z
 from tests.datamanagers.real_frames import real_lens
 from tests.datamanagers.wall_scenes import PINHOLE, look, off_wall, poses
@@ -70,7 +70,7 @@ def write(folder: Path, lens: Lens | None = None, names: list[str] | None = None
         frame = {"file_path": name, "transform_matrix": (pose @ FLIP_Y_AND_Z).tolist()}
         frames.append({**frame, **(frame_keys(index, depth) if frame_keys else {})})
         points = pose[:3, 3] + depth.reshape(-1, 1) * rays(lens).reshape(-1, 3) @ pose[:3, :3].T
-    write_points(folder / "points3D.ply", points, np.full(points.shape, 128, np.uint8))
+    write_ply(folder / "points3D.ply", point_properties(points, np.full(points.shape, 128, np.uint8)))
     content = {"camera_model": "OPENCV", **CAMERA, "frames": frames, **content}
     content = {key: value for key, value in content.items() if value is not None}
     (folder / "transforms.json").write_text(json.dumps(content))
@@ -182,7 +182,7 @@ def test_nerfstudios_change_of_the_world_is_undone_for_poses_and_points(wall, fo
         frame["transform_matrix"] = moved.tolist()
     points = load_points(folder / "points3D.ply").positions.double().numpy()
     moved_points = 0.5 * (points @ applied[:, :3].T + applied[:, 3])
-    write_points(folder / "sparse_pc.ply", moved_points, np.zeros(points.shape, np.uint8))
+    write_ply(folder / "sparse_pc.ply", point_properties(moved_points, np.zeros(points.shape, np.uint8)))
     changed(
         folder,
         frames=content["frames"],
@@ -236,7 +236,7 @@ def test_metres_become_millimetres(tmp_path):
         for row in frame["transform_matrix"][:3]:
             row[3] /= 1000.0
     points = load_points(tmp_path / "points3D.ply").positions.numpy() / 1000.0
-    write_points(tmp_path / "metres.ply", points, np.zeros(points.shape, np.uint8))
+    write_ply(tmp_path / "metres.ply", point_properties(points, np.zeros(points.shape, np.uint8)))
     changed(tmp_path, frames=content["frames"], ply_file_path="metres.ply")
     scene = load(tmp_path, scale=1000.0, initial_points="data")
     for frame in scene.train:

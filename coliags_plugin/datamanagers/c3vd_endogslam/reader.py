@@ -42,7 +42,7 @@ PREPARED_DEPTH = DepthSteps(100.0 / 255.0, 8, 255)
 #: How far a principal point may be from the middle, as a share of the picture; prepared pictures have 0.7 %.
 MIDDLE_TOLERANCE = 0.1
 #: Value of the first spherical harmonic: the colour of a 3DGS PLY is this times f_dc, plus a half.
-_SH0 = 0.28209479177387814
+SH0 = 0.28209479177387814
 
 
 class C3VDEndoGSLAMSettings(SceneSettings):
@@ -181,7 +181,7 @@ def _map_points(cloud: Path | None, params: EndoGslamParams | None, placement: P
         names = tuple(f"f_dc_{channel}" for channel in range(3))
         vertices = read_vertices(cloud, ("x", "y", "z", *names))
         positions = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float64)
-        shares = _SH0 * np.stack([vertices[name] for name in names], axis=1) + 0.5
+        shares = SH0 * np.stack([vertices[name] for name in names], axis=1) + 0.5
     elif params is not None:
         positions, shares = params.means, params.rgb_colors
     else:
