@@ -45,7 +45,7 @@ class Registry:
 
         Args:
             name: The name method configs use.
-            target: The class, or ``"module:Class"`` to import it when first asked for.
+            target: The class or object, or ``"module:Class"`` to import it when first asked for.
             source: Where it comes from, for listings and errors.
 
         Raises:
@@ -71,7 +71,7 @@ class Registry:
         return self._sources[name]
 
     def get(self, name: str) -> Any:
-        """The class registered under a name, imported now if it was not yet.
+        """What is registered under a name, imported now if it was not yet.
 
         Raises:
             InputError: No such name; says which are known and which was probably meant.
@@ -225,6 +225,19 @@ protocols = Registry(
         "authors-code": "coliags_plugin.metrics.protocols:AuthorsCodeProtocol",
     },
 )
+pose_formats = Registry(
+    "pose_formats",
+    {
+        "c3vd": "coliags_plugin.poses.c3vd:FORMAT",
+        "colmap": "coliags_plugin.poses.colmap:FORMAT",
+        "colmap-text": "coliags_plugin.poses.colmap:TEXT_FORMAT",
+        "endogslam": "coliags_plugin.poses.endogslam:FORMAT",
+        "endogslam-truth": "coliags_plugin.poses.endogslam:TRUTH_FORMAT",
+        "nerfstudio": "coliags_plugin.poses.nerfstudio:FORMAT",
+        "tum": "coliags_plugin.poses.tum:FORMAT",
+    },
+    noun="pose format",
+)
 phantom_layouts = Registry(
     "phantom_layouts",
     {
@@ -256,6 +269,7 @@ REGISTRIES: dict[str, Registry] = {
         losses,
         metrics,
         protocols,
+        pose_formats,
         phantom_layouts,
     )
 }

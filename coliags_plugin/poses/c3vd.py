@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
+from coliags_plugin.poses.format import Format
 from coliags_plugin.poses.rigid import RIGID_TOLERANCE, check_rigid
 from coliags_plugin.poses.text import count_first_numbers, read_numbers
 from coliags_plugin.poses.trajectory import Trajectory
@@ -116,3 +117,6 @@ def matrix_lines(camera_to_world: Float[np.ndarray, "N 4 4"], digits: int | None
 def recognise(path: Path) -> bool:
     """Whether a file's first line holds sixteen numbers."""
     return count_first_numbers(path) == 16
+
+
+FORMAT = Format("c3vd", read, write, recognise, unit="mm")

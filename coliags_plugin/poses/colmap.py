@@ -16,6 +16,7 @@ import numpy as np
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder
+from coliags_plugin.poses.format import Format
 from coliags_plugin.poses.rigid import inverse, rigid, rotations_from_wxyz, wxyz_from_rotations
 from coliags_plugin.poses.text import placed, read_text, shortened
 from coliags_plugin.poses.trajectory import Intrinsics, Trajectory, natural_order, refuse_repeated
@@ -278,3 +279,8 @@ def _common(cameras: dict[int, Intrinsics | str], used: set[int]) -> tuple[Intri
     if len(pinholes) > 1:
         return None, f"no intrinsics: the pictures have {len(pinholes)} different cameras"
     return pinholes.pop(), ""
+
+
+_KEEPS = frozenset({"names", "intrinsics"})
+FORMAT = Format("colmap", read, write, recognise, keeps=_KEEPS, folder=True)
+TEXT_FORMAT = Format("colmap-text", read, write_text, None, keeps=_KEEPS, folder=True)
