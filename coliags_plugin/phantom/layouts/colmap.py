@@ -11,9 +11,8 @@ from jaxtyping import Float, UInt8
 from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points, write_model, write_picture
 from coliags_plugin.lenses.models import Lens
 from coliags_plugin.phantom.layouts.base import Layout, Part, WallPoints, pinhole_of
-from coliags_plugin.poses.colmap import posed_model
+from coliags_plugin.poses.colmap import colmap_poses, posed_model
 from coliags_plugin.poses.rigid import inverse
-from coliags_plugin.poses.trajectory import Trajectory
 
 #: A feature detector finds a point in one of so many of the pictures that show it.
 _FOUND_IN_ONE_OF = 3
@@ -43,8 +42,8 @@ class ColmapLayout(Layout):
         self, folder: Path, points: WallPoints, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens
     ) -> None:
         """See :class:`Layout`. Points seen in fewer than two pictures are left out, as COLMAP leaves them out."""
-        names = tuple(_name(index) for index in range(len(poses)))
-        model = posed_model(Trajectory(np.stack(poses), names=names), pinhole_of(lens))
+        names = [_name(index) for index in range(len(poses))]
+        model = posed_model(colmap_poses(np.stack(poses)), names, [pinhole_of(lens)], [0] * len(poses))
         numbers = np.arange(len(points.positions))
         seen = [points.seen_in(index) & ((numbers + index) % _FOUND_IN_ONE_OF == 0) for index in range(len(poses))]
         kept = np.flatnonzero(np.sum(seen, axis=0) >= 2)

@@ -11,7 +11,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points, write_model, write_picture
-from coliags_plugin.reconstruction.structure.colmap_model import posed_model
+from coliags_plugin.reconstruction.structure.colmap_model import frame_model
 from coliags_plugin.reconstruction.structure.pictures import file_names
 from coliags_plugin.reconstruction.structure.triangulation import Triangulation
 
@@ -48,7 +48,7 @@ def write_colmap_scene(
     video.sort(key=lambda pair: pair[0].index)
     posed = [frame for frame, _ in video]
     names = file_names([frame.name for frame in posed], ".png")
-    model = posed_model(posed, names)
+    model = frame_model(posed, names)
     points = triangulation.positions, triangulation.colors, triangulation.errors
     add_points(model, [points_seen for _, points_seen in video], *points)
     with atomic_folder(folder, overwrite) as scratch:
