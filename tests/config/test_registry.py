@@ -26,6 +26,11 @@ def test_unknown_name_says_what_was_meant():
         REGISTRIES["renderers"].get("troch")
 
 
+def test_a_registry_says_what_its_components_are_called():
+    with pytest.raises(InputError, match=r"^no pose format 'tumm'\. Expected one of c3vd, .*Did you mean 'tum'"):
+        REGISTRIES["pose_formats"].get("tumm")
+
+
 def test_duplicate_name_is_refused():
     registry = Registry("things", {"one": "math:pi"})
     with pytest.raises(InputError, match="already taken by built in"):
