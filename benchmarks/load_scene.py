@@ -68,7 +68,7 @@ def write_sequence(folder: Path, frames: int, width: int, height: int) -> Path:
 
 def load(scene: Path, keep_pixels: bool) -> tuple[float, float, float]:
     """Resident memory before reading and at the peak, MiB; and seconds of reading."""
-    from coliags_plugin.datamanagers.c3vd.manager import C3VDDataManager, C3VDSettings
+    from coliags_plugin.datamanagers.c3vd.reader import C3VDDataManager, C3VDSettings
 
     before = peak_mib()
     began = time.perf_counter()

@@ -35,10 +35,10 @@ every_source = pytest.mark.parametrize("name", [name for name in SOURCES if name
 
 
 def imports(path: Path, top_level_only: bool = False) -> set[str]:
-    """Every module that a file imports, absolute; what only type checkers import is left out."""
+    """Every module that a file imports, absolute: at the top, within functions, and for type checkers alone."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     found = set()
-    for node in tree.body if top_level_only else _run(tree):
+    for node in tree.body if top_level_only else ast.walk(tree):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -50,13 +50,13 @@ def imports(path: Path, top_level_only: bool = False) -> set[str]:
     return found
 
 
-def _run(tree: ast.AST):
-    """The nodes below one, without those under ``if TYPE_CHECKING``."""
-    for node in ast.iter_child_nodes(tree):
-        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
-            continue
-        yield node
-        yield from _run(node)
+def targets(path: Path) -> set[str]:
+    """Modules of this package that a file names in strings, ``"module:Class"``, for them to be imported later."""
+    constants = (
+        node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.Constant)
+    )
+    texts = {node.value for node in constants if isinstance(node.value, str)}
+    return {text.partition(":")[0] for text in texts if ":" in text} & set(SOURCES)
 
 
 def package_of(name: str) -> str:
@@ -79,6 +79,12 @@ def test_no_import_circle():
         TopologicalSorter(graph).prepare()
     except CycleError as error:
         pytest.fail(" <- ".join(error.args[1]))
+
+
+@every_source
+def test_only_the_registry_names_modules_in_strings(name):
+    """What a module imports by name closes circles that no import statement shows; components are the one exception."""
+    assert name == f"{ROOT}.config.registry" or not targets(SOURCES[name])
 
 
 @every_source

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from coliags_plugin.cli.arguments import Assignments, OptionalText, parse_size, parse_vector
-from coliags_plugin.phantom.layouts import LayoutName
 
 
 @dataclass(frozen=True)
@@ -20,8 +19,8 @@ class Phantom:
     """Folder to create."""
     seed: int = 0
     """Random seed of the whole phantom."""
-    layout: LayoutName = "c3vd"
-    """Files and folders to write; docs/phantom.md 5 lists the layouts."""
+    layout: Annotated[str, tyro.conf.arg(metavar="NAME")] = "c3vd"
+    """Files and folders to write (`coliags list phantom_layouts`)."""
     trajectory: Literal["pullback", "rotation"] = "pullback"
     """Withdrawal along the lumen, or mostly turning on the spot."""
     frames: int = 120

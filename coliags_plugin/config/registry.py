@@ -28,10 +28,12 @@ class Registry:
     Args:
         kind: Plural noun, for instance ``"renderers"``.
         builtins: Name to ``"module:Class"``.
+        noun: What errors call one of them; default: the kind and "component".
     """
 
-    def __init__(self, kind: str, builtins: Mapping[str, str]) -> None:
+    def __init__(self, kind: str, builtins: Mapping[str, str], noun: str = "") -> None:
         self.kind = kind
+        self.noun = noun or f"{kind} component"
         self._targets: dict[str, Any] = {}
         self._sources: dict[str, str] = {}
         self._complete = False
@@ -43,7 +45,7 @@ class Registry:
 
         Args:
             name: The name method configs use.
-            target: The class, or ``"module:Class"`` to import it when first asked for.
+            target: The class or object, or ``"module:Class"`` to import it when first asked for.
             source: Where it comes from, for listings and errors.
 
         Raises:
@@ -69,7 +71,7 @@ class Registry:
         return self._sources[name]
 
     def get(self, name: str) -> Any:
-        """The class registered under a name, imported now if it was not yet.
+        """What is registered under a name, imported now if it was not yet.
 
         Raises:
             InputError: No such name; says which are known and which was probably meant.
@@ -77,7 +79,7 @@ class Registry:
         self._discover()
         if name not in self._targets:
             raise InputError(
-                f"no {self.kind} component '{name}'",
+                f"no {self.noun} '{name}'",
                 f"one of {', '.join(self.names())}",
                 did_you_mean(name, self._targets),
             )
@@ -129,14 +131,14 @@ datamanagers = Registry(
     "datamanagers",
     {
         "auto": "coliags_plugin.datamanagers.auto:AutoDataManager",
-        "c3vd": "coliags_plugin.datamanagers.c3vd.manager:C3VDDataManager",
-        "c3vd-endogslam": "coliags_plugin.datamanagers.c3vd_endogslam.manager:C3VDEndoGSLAMDataManager",
-        "c3vd-v2": "coliags_plugin.datamanagers.c3vd_v2.manager:C3VDv2DataManager",
-        "colmap": "coliags_plugin.datamanagers.colmap.manager:ColmapDataManager",
-        "nerfstudio": "coliags_plugin.datamanagers.nerfstudio.manager:NerfstudioDataManager",
-        "reim-nerf": "coliags_plugin.datamanagers.reim_nerf.manager:ReimNerfDataManager",
-        "rgbd": "coliags_plugin.datamanagers.rgbd.manager:RGBDDataManager",
-        "rotatecolon": "coliags_plugin.datamanagers.rotatecolon.manager:RotateColonDataManager",
+        "c3vd": "coliags_plugin.datamanagers.c3vd.reader:C3VDDataManager",
+        "c3vd-endogslam": "coliags_plugin.datamanagers.c3vd_endogslam.reader:C3VDEndoGSLAMDataManager",
+        "c3vd-v2": "coliags_plugin.datamanagers.c3vd_v2.reader:C3VDv2DataManager",
+        "colmap": "coliags_plugin.datamanagers.colmap.reader:ColmapDataManager",
+        "nerfstudio": "coliags_plugin.datamanagers.nerfstudio.reader:NerfstudioDataManager",
+        "reim-nerf": "coliags_plugin.datamanagers.reim_nerf.reader:ReimNerfDataManager",
+        "rgbd": "coliags_plugin.datamanagers.rgbd.reader:RGBDDataManager",
+        "rotatecolon": "coliags_plugin.datamanagers.rotatecolon.reader:RotateColonDataManager",
     },
 )
 fields = Registry(
@@ -223,6 +225,35 @@ protocols = Registry(
         "authors-code": "coliags_plugin.metrics.protocols:AuthorsCodeProtocol",
     },
 )
+pose_formats = Registry(
+    "pose_formats",
+    {
+        "c3vd": "coliags_plugin.poses.c3vd:FORMAT",
+        "colmap": "coliags_plugin.poses.colmap:FORMAT",
+        "colmap-text": "coliags_plugin.poses.colmap:TEXT_FORMAT",
+        "endogslam": "coliags_plugin.poses.endogslam:FORMAT",
+        "endogslam-truth": "coliags_plugin.poses.endogslam:TRUTH_FORMAT",
+        "nerfstudio": "coliags_plugin.poses.nerfstudio:FORMAT",
+        "tum": "coliags_plugin.poses.tum:FORMAT",
+    },
+    noun="pose format",
+)
+phantom_layouts = Registry(
+    "phantom_layouts",
+    {
+        "c3vd": "coliags_plugin.phantom.layouts.c3vd:C3VDLayout",
+        "c3vd-raw": "coliags_plugin.phantom.layouts.c3vd_raw:C3VDRawLayout",
+        "c3vd-v2": "coliags_plugin.phantom.layouts.c3vd_v2:C3VDv2Layout",
+        "colmap": "coliags_plugin.phantom.layouts.colmap:ColmapLayout",
+        "endogslam": "coliags_plugin.phantom.layouts.endogslam:EndoGSLAMLayout",
+        "nerfstudio": "coliags_plugin.phantom.layouts.nerfstudio:NerfstudioLayout",
+        "pr-endo": "coliags_plugin.phantom.layouts.pr_endo:PREndoLayout",
+        "reim-nerf": "coliags_plugin.phantom.layouts.reim_nerf:ReimNerfLayout",
+        "rgbd": "coliags_plugin.phantom.layouts.rgbd:RGBDLayout",
+        "rotatecolon": "coliags_plugin.phantom.layouts.rotatecolon:RotateColonLayout",
+    },
+    noun="phantom layout",
+)
 
 REGISTRIES: dict[str, Registry] = {
     registry.kind: registry
@@ -238,5 +269,7 @@ REGISTRIES: dict[str, Registry] = {
         losses,
         metrics,
         protocols,
+        pose_formats,
+        phantom_layouts,
     )
 }

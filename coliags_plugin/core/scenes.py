@@ -80,7 +80,7 @@ class Frame:
 
     Attributes:
         name: Unique within the scene; the file's stem where there is one.
-        index: Place in the video, counted from 0.
+        index: Of the frame in the video, counted from 0.
         image: RGB. [H, W, 3]
         camera: Where it was taken from.
         depth: z-depth, mm; NaN where unknown. None where the dataset has none. [H, W]

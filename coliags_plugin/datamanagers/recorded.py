@@ -19,11 +19,11 @@ from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.datamanagers.fusion import fuse_depth, read_points, thinned
 from coliags_plugin.datamanagers.recording import Recording, Shot
+from coliags_plugin.datamanagers.rectification import PAPER_SIZE, fitted
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
 from coliags_plugin.datamanagers.seen import with_valid_marks
 from coliags_plugin.datamanagers.splits import Split, divide
 from coliags_plugin.datamanagers.stored_frames import StoredFrame, read_side_by_side
-from coliags_plugin.datamanagers.views import PAPER_SIZE, fitted
 
 log = logging.getLogger(__name__)
 
@@ -73,17 +73,17 @@ class RecordedDataManager(DataManager):
         """
         path, settings = Path(path), self.settings
         recording = self.open(path)
-        for doubt in dict.fromkeys(shot.view.doubt() for shot in recording.shots):
+        for doubt in dict.fromkeys(shot.rectification.doubt() for shot in recording.shots):
             if doubt is not None:
                 log.warning("%s", doubt)
         self._tell_of_smaller_pictures(recording, path)
-        train_places, test_places = self._split(recording, path)
-        recording = with_valid_marks(recording, self.seen_split, train_places, test_places, path)
-        train = self._frames(recording.shots, train_places)
-        test_sets = {"test": self._frames(recording.shots, test_places)} if test_places else {}
+        train_indices, test_indices = self._split(recording, path)
+        recording = with_valid_marks(recording, self.seen_split, train_indices, test_indices, path)
+        train = self._frames(recording.shots, train_indices)
+        test_sets = {"test": self._frames(recording.shots, test_indices)} if test_indices else {}
         for name, shots in recording.test_sets.items():
             test_sets[name] = self._frames(shots, range(len(shots)))
-        video = sorted([*train, *(test_sets["test"] if test_places else [])], key=lambda frame: frame.index)
+        video = sorted([*train, *(test_sets["test"] if test_indices else [])], key=lambda frame: frame.index)
         if settings.keep_pixels:
             others = (frame for name in recording.test_sets for frame in test_sets[name])
             read_side_by_side([*video, *others], progress)
@@ -118,32 +118,32 @@ class RecordedDataManager(DataManager):
         """Log that pictures are made smaller than they are stored, where nobody asked for it."""
         if self.settings.size is not None:
             return
-        for view in (shot.view for shot in recording.shots):
-            if (view.width, view.height) != (view.source_width, view.source_height):
+        for rectification in (shot.rectification for shot in recording.shots):
+            if (rectification.width, rectification.height) != (rectification.source_width, rectification.source_height):
                 log.info(
                     "%s: pictures stored at %d x %d are used at %d x %d; datamanager.width and datamanager.height set "
                     "another size",
                     path,
-                    view.source_width,
-                    view.source_height,
-                    view.width,
-                    view.height,
+                    rectification.source_width,
+                    rectification.source_height,
+                    rectification.width,
+                    rectification.height,
                 )
                 return
 
-    def _frames(self, shots: Sequence[Shot], places: Sequence[int]) -> list[Frame]:
-        return [StoredFrame(shots[place], place, self.settings.keep_pixels) for place in places]
+    def _frames(self, shots: Sequence[Shot], indices: Sequence[int]) -> list[Frame]:
+        return [StoredFrame(shots[index], index, self.settings.keep_pixels) for index in indices]
 
     def _split(self, recording: Recording, path: Path) -> tuple[list[int], list[int]]:
-        """Places of training and of test frames."""
+        """Indices of training and of test frames."""
         settings = self.settings
-        places = list(range(0, len(recording.shots), settings.frame_step))[: settings.max_frames]
+        indices = list(range(0, len(recording.shots), settings.frame_step))[: settings.max_frames]
         if settings.split == "own" and recording.own_split is None:
             raise InputError(f"{path} does not say which of its frames are for testing", "a split of another name", "")
-        train, test = divide(settings.split, places, recording.own_split, settings.block)
+        train, test = divide(settings.split, indices, recording.own_split, settings.block)
         if not train:
             raise InputError(
-                f"split '{settings.split}' of {len(places)} frames of {path} leaves none to train on",
+                f"split '{settings.split}' of {len(indices)} frames of {path} leaves none to train on",
                 "at least one training frame",
                 "Use more frames, or another split ('all-train' holds none out)",
             )

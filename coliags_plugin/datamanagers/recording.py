@@ -14,7 +14,7 @@ from jaxtyping import Float
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud, SparseDepth
 from coliags_plugin.datamanagers.reading.depth_formats import DepthFormat
-from coliags_plugin.datamanagers.views import View
+from coliags_plugin.datamanagers.rectification import Rectification
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Shot:
 
     name: str
     image: Path
-    view: View
+    rectification: Rectification
     camera_to_world: Float[np.ndarray, "4 4"]
     depth: Path | None = None
     depth_format: DepthFormat | None = None
@@ -54,7 +54,7 @@ class Recording:
         facts: For provenance: layout, lens, sizes, pose convention and whatever else was found out.
         fingerprint: Of the files; see :func:`fingerprint`.
         test_sets: Test sets that come with the data, apart from the video, by name.
-        own_split: Places in ``shots`` that the data themselves train and test on, ``{"train": ..., "test": ...}``.
+        own_split: Indices in ``shots`` that the data themselves train and test on, ``{"train": ..., "test": ...}``.
         own_points: Reads the data's own initial points; None where there are none.
         points_source: The file or folder these come from.
     """

@@ -47,14 +47,14 @@ def with_valid_marks(
     Args:
         recording: With every mask that was found.
         split: The masks say what its training frames see, of all frames.
-        train: Places of the frames that the run trains on.
-        test: Places of the frames of the video that it tests on.
+        train: Indices of the frames that the run trains on.
+        test: Indices of the frames of the video that it tests on.
         path: The scene, for the log.
     """
     meant, _ = divide(split, range(len(recording.shots)), recording.own_split)
     trained = set(train)
     if set(meant) == trained:
-        shots = [_unmarked(shot) if place in trained else shot for place, shot in enumerate(recording.shots)]
+        shots = [_unmarked(shot) if index in trained else shot for index, shot in enumerate(recording.shots)]
         return replace(recording, shots=shots)
     tested = bool(test or recording.test_sets)
     if tested and any(shot.seen for shots in (recording.shots, *recording.test_sets.values()) for shot in shots):

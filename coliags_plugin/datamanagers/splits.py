@@ -26,36 +26,36 @@ def held_out(split: Split, count: int, block: tuple[float, float] = (0.4, 0.6)) 
     Returns:
         True for test frames. [N]
     """
-    place = np.arange(count)
+    index = np.arange(count)
     if split == "every-8th":
-        return np.asarray(place % EVERY == 0)
+        return np.asarray(index % EVERY == 0)
     if split == "endogslam":
-        return np.asarray(place % EVERY == EVERY - 1)
+        return np.asarray(index % EVERY == EVERY - 1)
     if split == "block":
-        return np.asarray((place >= round(block[0] * count)) & (place < round(block[1] * count)))
+        return np.asarray((index >= round(block[0] * count)) & (index < round(block[1] * count)))
     return np.zeros(count, bool)
 
 
 def divide(
     split: Split,
-    places: Sequence[int],
+    indices: Sequence[int],
     own: Mapping[str, Sequence[int]] | None = None,
     block: tuple[float, float] = (0.4, 0.6),
 ) -> tuple[list[int], list[int]]:
-    """Places to train on and places to test on, among those of a video that are used.
+    """Indices to train on and indices to test on, among those of a video that are used.
 
     Args:
         split: As for :func:`held_out`.
-        places: Of the frames used, in video order.
+        indices: Of the frames used, in video order.
         own: What the data say, ``{"train": ..., "test": ...}``; there must be some for split ``own``.
         block: As for :func:`held_out`.
     """
     if split == "own":
         if own is None:
             raise ValueError("split 'own' of data that have none")
-        used = set(places)
-        train, test = ([place for place in own[part] if place in used] for part in ("train", "test"))
+        used = set(indices)
+        train, test = ([index for index in own[part] if index in used] for part in ("train", "test"))
         return train, test
-    is_test = held_out(split, len(places), block)
-    train = [place for place, held in zip(places, is_test, strict=True) if not held]
-    return train, [place for place, held in zip(places, is_test, strict=True) if held]
+    is_test = held_out(split, len(indices), block)
+    train = [index for index, held in zip(indices, is_test, strict=True) if not held]
+    return train, [index for index, held in zip(indices, is_test, strict=True) if held]

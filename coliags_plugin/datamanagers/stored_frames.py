@@ -35,7 +35,7 @@ class StoredFrame(Frame):
 
     Args:
         shot: The picture.
-        index: Place in the video, counted from 0.
+        index: Of the frame in the video, counted from 0.
         keep: Whether pixels stay in memory once read. Otherwise every attribute reads its own file each time, so that
             whoever wants several takes them from one :meth:`to`.
     """
@@ -44,7 +44,7 @@ class StoredFrame(Frame):
         values = {
             "name": shot.name,
             "index": index,
-            "camera": shot.view.camera(shot.camera_to_world),
+            "camera": shot.rectification.camera(shot.camera_to_world),
             "sparse_depth": shot.sparse_depth,
             "_shot": shot,
             "_keep": keep,
@@ -145,26 +145,30 @@ def _read_pixels(shot: Shot) -> _Pixels:
 
 
 def _image(shot: Shot) -> UInt8[np.ndarray, "H W 3"]:
-    return shot.view.image(shot.view.checked(shot.image, read_rgb(shot.image)))
+    return shot.rectification.image(shot.rectification.checked(shot.image, read_rgb(shot.image)))
 
 
 def _mask(shot: Shot) -> Bool[np.ndarray, "H W"] | None:
-    valid = shot.view.valid
+    valid = shot.rectification.valid
     if shot.mask is None:
         return valid
-    own = shot.view.nearest(shot.view.checked(shot.mask, read_mask(shot.mask)))
+    own = shot.rectification.nearest(shot.rectification.checked(shot.mask, read_mask(shot.mask)))
     return own if valid is None else own & valid
 
 
 def _depth(shot: Shot, mask: Bool[np.ndarray, "H W"] | None) -> Shaped[np.ndarray, "H W"] | None:
     if shot.depth is None or shot.depth_format is None:
         return None
-    depth = shot.view.nearest(shot.view.checked(shot.depth, shot.depth_format.read(shot.depth)))
+    depth = shot.rectification.nearest(shot.rectification.checked(shot.depth, shot.depth_format.read(shot.depth)))
     return depth if mask is None else np.where(mask, depth, np.zeros((), depth.dtype))
 
 
 def _seen(shot: Shot) -> Bool[np.ndarray, "H W"] | None:
-    return None if shot.seen is None else shot.view.nearest(shot.view.checked(shot.seen, read_mask(shot.seen)))
+    return (
+        None
+        if shot.seen is None
+        else shot.rectification.nearest(shot.rectification.checked(shot.seen, read_mask(shot.seen)))
+    )
 
 
 def _tensor(array: np.ndarray | None) -> Tensor | None:

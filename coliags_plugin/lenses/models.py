@@ -41,32 +41,24 @@ class Pinhole(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Lens(ABC):
-    """A calibrated lens, seen through an image that may be a scaled or cropped copy of the calibrated one.
-
-    The calibration itself is never rescaled: pixels are first carried back to the calibrated image, so that
-    scaling and cropping are exact for every model.
+    """A camera without its pose: between pixels of one image and viewing directions.
 
     Attributes:
-        width, height: Size of the image at hand, pixels.
-        stretch: Pixels of the calibrated image per pixel of this one, (x, y).
-        origin: Where this image's top left corner lies in the calibrated image, pixels from its corner, (x, y).
+        width, height: Size of the image, pixels.
     """
 
     width: int
     height: int
-    stretch: tuple[float, float] = (1.0, 1.0)
-    origin: tuple[float, float] = (0.0, 0.0)
 
+    @abstractmethod
     def scaled(self, width: int, height: int) -> Self:
         """The lens of the same image resampled to another size; the image's edges stay where they are."""
-        x, y = self.width / width, self.height / height
-        return replace(self, width=width, height=height, stretch=(self.stretch[0] * x, self.stretch[1] * y))
 
+    @abstractmethod
     def cropped(self, x0: int, y0: int, width: int, height: int) -> Self:
         """The lens of the part of the image whose top left pixel is (x0, y0)."""
-        origin = (self.origin[0] + self.stretch[0] * x0, self.origin[1] + self.stretch[1] * y0)
-        return replace(self, width=width, height=height, origin=origin)
 
+    @abstractmethod
     def unproject(self, pixels: ArrayLike) -> Float[np.ndarray, "N 3"]:
         """Viewing directions of pixels.
 
@@ -77,10 +69,8 @@ class Lens(ABC):
             Directions with z = 1, so that a point at z-depth ``z`` is ``z * direction``; NaN where the model does not
             reach (a direction at or beyond 90 degrees, or past its turning point). [N, 3]
         """
-        calibrated = (np.asarray(pixels, np.float64) + 0.5) * self.stretch + self.origin - 0.5
-        xy = self._tangents(calibrated)
-        return np.concatenate([xy, np.where(np.isnan(xy[:, :1]), np.nan, 1.0)], axis=1)
 
+    @abstractmethod
     def project(self, points: ArrayLike) -> Float[np.ndarray, "N 2"]:
         """Pixels of points.
 
@@ -91,6 +81,46 @@ class Lens(ABC):
             (column, row), centres at integers, inside the image or not; NaN where the model does not reach and for
             points not in front of the camera. [N, 2]
         """
+
+    @property
+    @abstractmethod
+    def pinhole(self) -> Pinhole:
+        """The pinhole camera this lens nominally is: what an undistorted image of the same size is given."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibratedLens(Lens):
+    """A lens with distortion, seen through an image that may be a scaled or cropped copy of the calibrated one.
+
+    The calibration itself is never rescaled: pixels are first carried back to the calibrated image, so that
+    scaling and cropping are exact for every model.
+
+    Attributes:
+        stretch: Pixels of the calibrated image per pixel of this one, (x, y).
+        origin: Where this image's top left corner lies in the calibrated image, pixels from its corner, (x, y).
+    """
+
+    stretch: tuple[float, float] = (1.0, 1.0)
+    origin: tuple[float, float] = (0.0, 0.0)
+
+    def scaled(self, width: int, height: int) -> Self:
+        """See :class:`Lens`."""
+        x, y = self.width / width, self.height / height
+        return replace(self, width=width, height=height, stretch=(self.stretch[0] * x, self.stretch[1] * y))
+
+    def cropped(self, x0: int, y0: int, width: int, height: int) -> Self:
+        """See :class:`Lens`."""
+        origin = (self.origin[0] + self.stretch[0] * x0, self.origin[1] + self.stretch[1] * y0)
+        return replace(self, width=width, height=height, origin=origin)
+
+    def unproject(self, pixels: ArrayLike) -> Float[np.ndarray, "N 3"]:
+        """See :class:`Lens`."""
+        calibrated = (np.asarray(pixels, np.float64) + 0.5) * self.stretch + self.origin - 0.5
+        xy = self._tangents(calibrated)
+        return np.concatenate([xy, np.where(np.isnan(xy[:, :1]), np.nan, 1.0)], axis=1)
+
+    def project(self, points: ArrayLike) -> Float[np.ndarray, "N 2"]:
+        """See :class:`Lens`."""
         points = np.asarray(points, np.float64)
         z = points[:, 2:]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -99,7 +129,7 @@ class Lens(ABC):
 
     @property
     def pinhole(self) -> Pinhole:
-        """The pinhole camera this lens nominally is: what an undistorted image of the same size is given."""
+        """See :class:`Lens`."""
         k = self._calibrated_pinhole
         cornered = k._replace(cx=k.cx - self.origin[0], cy=k.cy - self.origin[1])
         return cornered.scaled(1.0 / self.stretch[0], 1.0 / self.stretch[1])
@@ -119,7 +149,7 @@ class Lens(ABC):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OmnidirectionalLens(Lens):
+class OmnidirectionalLens(CalibratedLens):
     """Scaramuzza's polynomial model, with which C3VD's ground truth was rendered (docs/layouts/c3vd.md 2).
 
     A pixel (u, v) lies at ``A q + (cx, cy)``, and its ray is ``(q_x, q_y, a0 + a2 rho^2 + a3 rho^3 + a4 rho^4)`` with
@@ -185,7 +215,7 @@ class OmnidirectionalLens(Lens):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _FocalLens(Lens):
+class _FocalLens(CalibratedLens):
     """A radial distortion in front of a pinhole camera: fx, fy, cx, cy in pixels."""
 
     fx: float

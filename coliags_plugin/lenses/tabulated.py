@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
-from coliags_plugin.lenses.models import Array, Lens
+from coliags_plugin.lenses.models import Array, CalibratedLens
 
 #: Directions further from the optical axis than this are not looked at, radians. A pinhole picture never shows them.
 _WIDEST = np.deg2rad(89.9)
@@ -23,7 +23,7 @@ _TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
-class MappedLens(Lens):
+class MappedLens(CalibratedLens):
     """A lens given as a map from directions to pixels; where it may be used, and its inverse, are found from that map.
 
     Distortion polynomials are fitted inside a picture and turn back somewhere beyond it, where one pixel gets a second,

@@ -11,6 +11,7 @@ from jaxtyping import Float32, UInt8
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
+from coliags_plugin.core.images import encode_image
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -41,7 +42,7 @@ def encode_png(rgb: UInt8[np.ndarray, "H W 3"] | Tensor) -> bytes:
     Raises:
         InputError: Not an 8-bit RGB image.
     """
-    return _encode(".png", _bgr(rgb), [])
+    return encode_image(_checked(rgb))
 
 
 def encode_jpeg(rgb: UInt8[np.ndarray, "H W 3"] | Tensor, quality: int = 95) -> bytes:
@@ -56,7 +57,7 @@ def encode_jpeg(rgb: UInt8[np.ndarray, "H W 3"] | Tensor, quality: int = 95) -> 
     """
     sampling = int(cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
     options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, sampling]
-    return _encode(".jpg", _bgr(rgb), options)
+    return encode_image(_checked(rgb), ".jpg", options)
 
 
 def write_png(path: Path, rgb: UInt8[np.ndarray, "H W 3"] | Tensor) -> None:
@@ -99,7 +100,7 @@ def write_depth_tiff(path: Path, depth_mm: Float32[np.ndarray, "H W"] | Tensor) 
         raise InputError(f"{path} was to hold {_kind(depth)}", "a depth map: floating point, [H, W]")
     # cv2's default, LZW with a floating-point predictor, is not read by many libraries (tifffile needs a plug-in).
     options = [cv2.IMWRITE_TIFF_COMPRESSION, _TIFF_DEFLATE, cv2.IMWRITE_TIFF_PREDICTOR, _TIFF_NO_PREDICTOR]
-    atomic_write(path, _encode(".tiff", np.ascontiguousarray(depth, dtype=np.float32), options))
+    atomic_write(path, encode_image(depth.astype(np.float32), ".tiff", options))
 
 
 def read_depth_tiff(path: Path) -> Float32[np.ndarray, "H W"]:
@@ -114,25 +115,15 @@ def read_depth_tiff(path: Path) -> Float32[np.ndarray, "H W"]:
     return depth
 
 
-def _bgr(rgb: np.ndarray | Tensor) -> np.ndarray:
+def _checked(rgb: np.ndarray | Tensor) -> np.ndarray:
     pixels = as_array(rgb)
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.size == 0:
         raise InputError(f"a picture is {_kind(pixels)}", "8-bit RGB, uint8 [H, W, 3]")
-    return np.ascontiguousarray(pixels[:, :, ::-1])
+    return pixels
 
 
 def _kind(pixels: np.ndarray) -> str:
     return f"{pixels.dtype} {list(pixels.shape)}"
-
-
-def _encode(suffix: str, pixels: np.ndarray, options: list[int]) -> bytes:
-    try:
-        ok, data = cv2.imencode(suffix, pixels, options)
-    except cv2.error as error:
-        raise InputError(f"a {_kind(pixels)} picture cannot be written as {suffix}: {error}") from error
-    if not ok:
-        raise InputError(f"a {_kind(pixels)} picture cannot be written as {suffix}")
-    return bytes(data)
 
 
 def _decode(path: Path) -> Any:

@@ -13,15 +13,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from coliags_plugin import __version__
+from coliags_plugin.config.registry import phantom_layouts
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder
+from coliags_plugin.core.images import write_image
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.phantom.colon import ColonSurface, build_surface, grow_anatomy
 from coliags_plugin.phantom.imaging import Exposure, Sensor, World, expose, meter
 from coliags_plugin.phantom.interreflection import IndirectLight, indirect_lights
-from coliags_plugin.phantom.layouts import layout_of, meshes
-from coliags_plugin.phantom.layouts.base import Part, WallPoints
-from coliags_plugin.phantom.layouts.pictures import write_image
+from coliags_plugin.phantom.layouts import meshes
+from coliags_plugin.phantom.layouts.base import Layout, Part, WallPoints
 from coliags_plugin.phantom.light import Lamp
 from coliags_plugin.phantom.mucosa import Mucosa, paint_mucosa
 from coliags_plugin.phantom.response import KNEE, develop, exposure_for, exposures, white_balances
@@ -47,6 +48,7 @@ class Phantom:
 
     Attributes:
         settings: Resolved.
+        layout: What it is to be written in.
         world: Wall, material, lamp.
         sensor: Of every picture.
         poses: Of the sequence. Each [4, 4]
@@ -56,6 +58,7 @@ class Phantom:
     """
 
     settings: PhantomSettings
+    layout: Layout
     world: World
     sensor: Sensor
     poses: list[Float[np.ndarray, "4 4"]]
@@ -66,8 +69,7 @@ class Phantom:
     @property
     def training_poses(self) -> list[Float[np.ndarray, "4 4"]]:
         """Poses of the frames that are not held out."""
-        is_test = layout_of(self.settings.layout).is_test
-        return [pose for index, pose in enumerate(self.poses) if not is_test(index)]
+        return [pose for index, pose in enumerate(self.poses) if not self.layout.is_test(index)]
 
     @property
     def vertex_albedo(self) -> Float[np.ndarray, "V 3"]:
@@ -95,7 +97,20 @@ class Phantom:
     ) -> Bool[np.ndarray, "N"]:
         """Which points of the wall, seen from this pose, a training frame sees too. [N]"""
         order = likeliest_first(camera_to_world, self.training_poses)
-        return seen_from(points, order, self.sensor.optics, self.sensor.mask, self.world.tracer)
+        return seen_from(points, order, self.sensor.lens, self.sensor.mask, self.world.tracer)
+
+
+def image_size(settings: PhantomSettings, layout: Layout) -> tuple[int, int]:
+    """Width and height of the pictures, pixels: the layout's own where none are chosen."""
+    width, height = layout.default_size
+    return either(settings.width, width), either(settings.height, height)
+
+
+def resolve(settings: PhantomSettings, layout: Layout) -> PhantomSettings:
+    """The same settings with every None replaced, and without rotation views where the layout has no place for them."""
+    width, height = image_size(settings, layout)
+    views = settings.rotation_views if layout.has_rotation else 0
+    return settings.model_copy(update={"width": width, "height": height, "rotation_views": views}).resolved()
 
 
 def prepare(settings: PhantomSettings, progress: Progress | None = None) -> Phantom:
@@ -105,7 +120,8 @@ def prepare(settings: PhantomSettings, progress: Progress | None = None) -> Phan
         InputError: The seed's colon has no room for the path, or open3d is missing.
     """
     tell = progress or _silent
-    settings = settings.resolved()
+    layout: Layout = phantom_layouts.get(settings.layout)()
+    settings = resolve(settings, layout)
     tell("colon", 0, 4)
     anatomy = grow_anatomy(settings)
     surface = build_surface(anatomy, settings)
@@ -116,7 +132,6 @@ def prepare(settings: PhantomSettings, progress: Progress | None = None) -> Phan
     lamp = Lamp.of(settings)
     world = World(surface, mucosa, tracer, lamp, either(settings.vignetting, settings.preset.vignetting))
     poses = list(travel(anatomy.centre_line, settings, tracer.clearance))
-    layout = layout_of(settings.layout)
     views = turn_away(np.stack(poses), settings, layout.is_test) if layout.has_rotation else []
     everywhere = [*poses, *(view.camera_to_world for view in views)]
     indirect: list[IndirectLight | None] = [None] * len(everywhere)
@@ -132,15 +147,15 @@ def prepare(settings: PhantomSettings, progress: Progress | None = None) -> Phan
             generator,
         )
     tell("colon", 3, 4)
-    optics, mask = layout.optics(*settings.size)
-    sensor = Sensor.behind(optics, mask, settings.supersampling)
+    lens, mask = layout.lens(*image_size(settings, layout))
+    sensor = Sensor.behind(lens, mask, settings.supersampling)
     thin = sensor.thinned(_METERED)
     ideal = []
     for index, pose in enumerate(poses):
         ideal.append(exposure_for(meter(world, thin, pose, indirect[index]), settings.target_grey, settings.gamma))
     gains = exposures(ideal, settings)[:, None] * white_balances(settings)
     tell("colon", 4, 4)
-    return Phantom(settings, world, sensor, poses, views, indirect, gains)
+    return Phantom(settings, layout, world, sensor, poses, views, indirect, gains)
 
 
 def generate(
@@ -178,8 +193,7 @@ def generate(
 
 
 def _write(phantom: Phantom, folder: Path, tell: Progress) -> None:
-    layout = layout_of(phantom.settings.layout)
-    frames, optics = len(phantom.poses), phantom.sensor.optics
+    layout, lens, frames = phantom.layout, phantom.sensor.lens, len(phantom.poses)
     turned = [view.camera_to_world for view in phantom.rotation_views]
     total = frames + len(turned)
     # Coverage as C3VD counts it: triangles that are the first hit of any pixel ray of any frame.
@@ -203,11 +217,11 @@ def _write(phantom: Phantom, folder: Path, tell: Progress) -> None:
             seen = image(_seen_mask(phantom, exposure, pose))
             write_image(layout.seen_mask(folder, part, index), seen)
         tell("frames", number + 1, total)
-    layout.write_sequence(folder, "video", phantom.poses, optics)
+    layout.write_sequence(folder, "video", phantom.poses, lens)
     if turned:
-        layout.write_sequence(folder, "rotation", turned, optics)
+        layout.write_sequence(folder, "rotation", turned, lens)
     if layout.has_points:
-        layout.write_points(folder, _wall_points(phantom, drawn), phantom.poses, optics)
+        layout.write_points(folder, _wall_points(phantom, drawn), phantom.poses, lens)
     if layout.has_coverage_mesh:
         meshes.write_coverage_obj(folder / "coverage_mesh.obj", phantom.world.surface, observed)
     tell("truth", 0, 1)
@@ -266,7 +280,7 @@ def _wall_points(
 
     def seen_in(index: int) -> Bool[np.ndarray, "N"]:
         sensor = phantom.sensor
-        return seen_from(positions, [phantom.poses[index]], sensor.optics, sensor.mask, phantom.world.tracer)
+        return seen_from(positions, [phantom.poses[index]], sensor.lens, sensor.mask, phantom.world.tracer)
 
     return WallPoints(positions, np.concatenate([colors for _, colors in drawn]), seen_in)
 
@@ -277,9 +291,9 @@ def _write_truth(
     surface, settings = phantom.world.surface, phantom.settings
     folder.mkdir(parents=True, exist_ok=True)
     albedo = phantom.vertex_albedo
-    meshes.write_ply(folder / "mesh.ply", surface, albedo)
+    meshes.write_mesh(folder / "mesh.ply", surface, albedo)
     vertices = surface.vertices.astype(np.float64)
-    seen = seen_from(vertices, phantom.training_poses, phantom.sensor.optics, phantom.sensor.mask, phantom.world.tracer)
+    seen = seen_from(vertices, phantom.training_poses, phantom.sensor.lens, phantom.sensor.mask, phantom.world.tracer)
     np.savez(folder / "mesh_seen.npz", vertex_seen=seen, face_seen=trained_on, face_seen_by_any_frame=observed)
     np.savez(
         folder / "albedo.npz",

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numpy.typing import ArrayLike
 
-from coliags_plugin.lenses.models import Pinhole
+from coliags_plugin.lenses.models import Lens
 from coliags_plugin.phantom.colon import ColonSurface
 from coliags_plugin.phantom.interreflection import IndirectLight
 from coliags_plugin.phantom.light import Lamp
@@ -20,84 +18,38 @@ from coliags_plugin.phantom.tracing import Hits, Tracer, turned
 _CHUNK = 1 << 15
 
 
-class Optics(Protocol):
-    """What a picture is taken through. Pixel centres lie at integers; directions have z = 1."""
-
-    @property
-    def width(self) -> int:
-        """Pixels."""
-
-    @property
-    def height(self) -> int:
-        """Pixels."""
-
-    def unproject(self, pixels: ArrayLike) -> Float[np.ndarray, "N 3"]:
-        """Viewing directions, camera axes. [N, 3]"""
-
-    def project(self, points: ArrayLike) -> Float[np.ndarray, "N 2"]:
-        """Pixels of points in camera axes; NaN for points not in front of the camera. [N, 2]"""
-
-
-@dataclass(frozen=True)
-class PinholeOptics:
-    """A camera without distortion.
-
-    Attributes:
-        pinhole: Intrinsics, pixels, centres at integers.
-        width, height: Pixels.
-    """
-
-    pinhole: Pinhole
-    width: int
-    height: int
-
-    def unproject(self, pixels: ArrayLike) -> Float[np.ndarray, "N 3"]:
-        """See :class:`Optics`."""
-        pixels = np.asarray(pixels, np.float64)
-        k = self.pinhole
-        x, y = (pixels[:, 0] - k.cx) / k.fx, (pixels[:, 1] - k.cy) / k.fy
-        return np.stack([x, y, np.ones_like(x)], axis=1)
-
-    def project(self, points: ArrayLike) -> Float[np.ndarray, "N 2"]:
-        """See :class:`Optics`."""
-        points = np.asarray(points, np.float64)
-        z = np.where(points[:, 2] > 0.0, points[:, 2], np.nan)
-        k = self.pinhole
-        return np.stack([k.fx * points[:, 0] / z + k.cx, k.fy * points[:, 1] / z + k.cy], axis=1)
-
-
 @dataclass(frozen=True)
 class Sensor:
     """The pixels that see something, and the directions they sample.
 
     Attributes:
-        optics: The lens.
+        lens: What pictures are taken through.
         mask: Pixels that the lens lights. [H, W]
         centers: Direction through each such pixel's centre. [P, 3]
         samples: Directions of its K colour samples. [P, K, 3]
     """
 
-    optics: Optics
+    lens: Lens
     mask: Bool[np.ndarray, "H W"]
     centers: Float[np.ndarray, "P 3"]
     samples: Float[np.ndarray, "P K 3"]
 
     @classmethod
-    def behind(cls, optics: Optics, mask: Bool[np.ndarray, "H W"], supersampling: int) -> Sensor:
+    def behind(cls, lens: Lens, mask: Bool[np.ndarray, "H W"], supersampling: int) -> Sensor:
         """A sensor with ``supersampling`` x ``supersampling`` colour samples a pixel."""
         row, column = np.nonzero(mask)
         pixels = np.stack([column, row], axis=1).astype(np.float64)
-        reached = ~np.isnan(optics.unproject(pixels)[:, 0])
+        reached = ~np.isnan(lens.unproject(pixels)[:, 0])
         mask = mask.copy()
         mask[row, column] = reached
         pixels = pixels[reached]
         offsets = (np.arange(supersampling) + 0.5) / supersampling - 0.5
         sub = np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(-1, 2)
-        centers = optics.unproject(pixels)
-        samples = np.stack([optics.unproject(pixels + offset) for offset in sub], axis=1)
+        centers = lens.unproject(pixels)
+        samples = np.stack([lens.unproject(pixels + offset) for offset in sub], axis=1)
         # A sub-sample past the lens's reach looks where its pixel's centre does.
         samples = np.where(np.isnan(samples), centers[:, None, :], samples)
-        return cls(optics, mask, centers.astype(np.float32), samples.astype(np.float32))
+        return cls(lens, mask, centers.astype(np.float32), samples.astype(np.float32))
 
     def thinned(self, most: int) -> Sensor:
         """An exposure meter: about ``most`` of the pixels, evenly spread, one sample each."""
@@ -106,7 +58,7 @@ class Sensor:
         grid[stride // 2 :: stride, stride // 2 :: stride] = True
         mask = self.mask & grid
         chosen = self.centers[mask[self.mask]]
-        return Sensor(self.optics, mask, chosen, chosen[:, None, :])
+        return Sensor(self.lens, mask, chosen, chosen[:, None, :])
 
     def image(self, values: np.ndarray) -> np.ndarray:
         """Values of the lit pixels as an image that is 0 elsewhere. [P, ...] -> [H, W, ...]"""
@@ -236,8 +188,8 @@ def shade(
 
 def _pixel_solid_angle(sensor: Sensor) -> float:
     """Mean area that a pixel covers at z-depth 1, seen near the middle of the image."""
-    middle = np.array([0.5 * sensor.optics.width, 0.5 * sensor.optics.height])
-    corner = sensor.optics.unproject(middle + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
+    middle = np.array([0.5 * sensor.lens.width, 0.5 * sensor.lens.height])
+    corner = sensor.lens.unproject(middle + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
     return float(np.linalg.norm(np.cross(corner[1] - corner[0], corner[2] - corner[0])))
 
 

@@ -9,9 +9,9 @@ from typing import Any, Literal, TypeVar
 
 from pydantic import Field, ValidationError, field_validator
 
+from coliags_plugin.config.registry import phantom_layouts
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.phantom.layouts import LayoutName, layout_of
 
 _T = TypeVar("_T")
 
@@ -101,7 +101,7 @@ class PhantomSettings(Settings):
     """
 
     seed: int = Field(0, ge=0, description="The whole phantom follows from it.")
-    layout: LayoutName = Field("c3vd", description="Files and folders to write; docs/phantom.md 5 lists the layouts.")
+    layout: str = Field("c3vd", description="Files and folders to write; docs/phantom.md 5 lists the layouts.")
     trajectory: Literal["pullback", "rotation"] = Field(
         "pullback", description="pullback: withdrawal along the lumen. rotation: the camera mostly turns on the spot."
     )
@@ -177,6 +177,13 @@ class PhantomSettings(Settings):
     mesh_spacing: float = Field(0.42, ge=0.2, le=4.0, description="Distance of mesh vertices, mm.")
     texture_spacing: float = Field(0.1, ge=0.05, le=2.0, description="Size of a texel of the mucosa, mm.")
 
+    @field_validator("layout")
+    @classmethod
+    def _layout_is_known(cls, name: str) -> str:
+        if name not in phantom_layouts:
+            raise ValueError(f"there is no such layout; known are {', '.join(phantom_layouts)}")
+        return name
+
     @field_validator("light_offset")
     @classmethod
     def _lamp_near_lens(cls, offset: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
@@ -197,21 +204,10 @@ class PhantomSettings(Settings):
         """The preset behind the settings left at None."""
         return PRESETS[self.light]
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """Image width and height, pixels."""
-        width, height = layout_of(self.layout).default_size
-        return either(self.width, width), either(self.height, height)
-
     def resolved(self) -> PhantomSettings:
-        """The same settings with every None replaced by what it stands for."""
-        width, height = self.size
-        chosen: dict[str, Any] = {"width": width, "height": height}
-        if not layout_of(self.layout).has_rotation:
-            chosen["rotation_views"] = 0
-        for name in ("light_offset", "spread_law", "spread", "vignetting", "tilt", "gain", "white_balance_drift"):
-            chosen[name] = either(getattr(self, name), getattr(self.preset, name))
-        return self.model_copy(update=chosen)
+        """The same settings with every None that the preset stands in for replaced; sizes are the layout's to say."""
+        names = ("light_offset", "spread_law", "spread", "vignetting", "tilt", "gain", "white_balance_drift")
+        return self.model_copy(update={name: either(getattr(self, name), getattr(self.preset, name)) for name in names})
 
 
 def phantom_settings(options: Mapping[str, Any]) -> PhantomSettings:

@@ -7,14 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from coliags_plugin.phantom.imaging import Optics
+from coliags_plugin.lenses.models import Lens
 from coliags_plugin.phantom.tracing import Tracer
 
 
 def seen_from(
     points: Float[np.ndarray, "N 3"],
     cameras_to_world: Sequence[Float[np.ndarray, "4 4"]],
-    optics: Optics,
+    lens: Lens,
     mask: Bool[np.ndarray, "H W"],
     tracer: Tracer,
 ) -> Bool[np.ndarray, "N"]:
@@ -25,7 +25,7 @@ def seen_from(
     Args:
         points: On the wall, world, mm. [N, 3]
         cameras_to_world: Poses; the likeliest to see the points first, as a point once seen is done with.
-        optics: Of all of them.
+        lens: Of all of them.
         mask: Lit pixels. [H, W]
         tracer: The wall.
     """
@@ -35,10 +35,10 @@ def seen_from(
         if not len(open_points):
             break
         local = (points[open_points] - camera_to_world[:3, 3]) @ camera_to_world[:3, :3]
-        pixels = optics.project(local)
+        pixels = lens.project(local)
         with np.errstate(invalid="ignore"):
             column, row = np.floor(pixels[:, 0] + 0.5), np.floor(pixels[:, 1] + 0.5)
-            framed = (column >= 0) & (row >= 0) & (column < optics.width) & (row < optics.height) & (local[:, 2] > 0.0)
+            framed = (column >= 0) & (row >= 0) & (column < lens.width) & (row < lens.height) & (local[:, 2] > 0.0)
         inside = np.flatnonzero(framed)
         inside = inside[mask[row[inside].astype(int), column[inside].astype(int)]]
         candidates = open_points[inside]

@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
+from coliags_plugin.poses.format import Format
 from coliags_plugin.poses.rigid import RIGID_TOLERANCE, check_rigid
 from coliags_plugin.poses.text import count_first_numbers, read_numbers
 from coliags_plugin.poses.trajectory import Trajectory
@@ -101,11 +102,21 @@ def write(path: Path, trajectory: Trajectory) -> None:
     Raises:
         InputError: The folder cannot be written.
     """
-    columns = trajectory.camera_to_world.transpose(0, 2, 1).reshape(-1, 16)
-    lines = [",".join(repr(float(number)) for number in line) for line in columns]
-    atomic_write(path, "\n".join(lines) + "\n")
+    atomic_write(path, matrix_lines(trajectory.camera_to_world))
+
+
+def matrix_lines(camera_to_world: Float[np.ndarray, "N 4 4"], digits: int | None = None) -> str:
+    """A pose file's text: sixteen numbers a line, column by column; ``digits`` significant ones, None for all."""
+    columns = np.asarray(camera_to_world, np.float64).transpose(0, 2, 1).reshape(-1, 16).tolist()
+    lines = [
+        ",".join(repr(number) if digits is None else f"{number:.{digits}g}" for number in line) for line in columns
+    ]
+    return "\n".join(lines) + "\n"
 
 
 def recognise(path: Path) -> bool:
     """Whether a file's first line holds sixteen numbers."""
     return count_first_numbers(path) == 16
+
+
+FORMAT = Format("c3vd", read, write, recognise, unit="mm")

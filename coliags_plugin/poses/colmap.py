@@ -7,15 +7,17 @@ it abort the whole process (4.2.1), which nothing here could turn into a message
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder
+from coliags_plugin.poses.format import Format
 from coliags_plugin.poses.rigid import inverse, rigid, rotations_from_wxyz, wxyz_from_rotations
 from coliags_plugin.poses.text import placed, read_text, shortened
 from coliags_plugin.poses.trajectory import Intrinsics, Trajectory, natural_order, refuse_repeated
@@ -113,28 +115,43 @@ def _suffix(path: Path) -> str | None:
     return None
 
 
-def posed_model(trajectory: Trajectory, pinhole: Intrinsics) -> pycolmap.Reconstruction:
-    """A model without points, of pictures that one pinhole camera took: pose i is image i + 1, of camera 1."""
+def colmap_poses(camera_to_world: Float[np.ndarray, "N 4 4"]) -> list[pycolmap.Rigid3d]:
+    """World-to-camera transforms of camera-to-world matrices. [N, 4, 4]"""
+    import pycolmap
+
+    world_to_camera = inverse(camera_to_world)
+    quats_xyzw = wxyz_from_rotations(world_to_camera[:, :3, :3])[:, [1, 2, 3, 0]]
+    return [
+        pycolmap.Rigid3d(pycolmap.Rotation3d(quat), matrix[:3, 3])
+        for quat, matrix in zip(quats_xyzw, world_to_camera, strict=True)
+    ]
+
+
+def posed_model(
+    world_to_camera: Sequence[pycolmap.Rigid3d],
+    names: Sequence[str],
+    cameras: Sequence[Intrinsics],
+    taken_by: Sequence[int],
+) -> pycolmap.Reconstruction:
+    """A model of posed pictures without points: picture i becomes COLMAP's image i + 1, camera k its camera k + 1.
+
+    Args:
+        world_to_camera: Of each picture, OpenCV axes.
+        names: Of the pictures.
+        cameras: Undistorted pinholes.
+        taken_by: Which of them took each picture.
+    """
     import pycolmap
 
     model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(
-        pycolmap.Camera(
-            camera_id=1,
-            model="PINHOLE",
-            width=pinhole.width,
-            height=pinhole.height,
-            params=[pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy],
+    for number, k in enumerate(cameras, start=1):
+        params = [k.fx, k.fy, k.cx, k.cy]
+        model.add_camera_with_trivial_rig(
+            pycolmap.Camera(camera_id=number, model="PINHOLE", width=k.width, height=k.height, params=params)
         )
-    )
-    world_to_camera = inverse(trajectory.camera_to_world)
-    quats_wxyz = wxyz_from_rotations(world_to_camera[:, :3, :3])
-    for index, name in enumerate(trajectory.names_or_numbers()):
-        rotation = pycolmap.Rotation3d(quats_wxyz[index, [1, 2, 3, 0]])
-        model.add_image_with_trivial_frame(
-            pycolmap.Image(name=name, camera_id=1, image_id=index + 1),
-            pycolmap.Rigid3d(rotation, world_to_camera[index, :3, 3]),
-        )
+    for index, (pose, name, camera) in enumerate(zip(world_to_camera, names, taken_by, strict=True)):
+        image = pycolmap.Image(name=name, camera_id=camera + 1, image_id=index + 1)
+        model.add_image_with_trivial_frame(image, pose)
     return model
 
 
@@ -149,7 +166,8 @@ def _write(path: Path, trajectory: Trajectory, text: bool) -> None:
     others = sorted(found.name for found in path.iterdir() if found.name not in _MODEL_FILES) if path.is_dir() else []
     if others:
         raise InputError(f"{path} holds {others[0]}, which is no part of a COLMAP model", "a folder to itself")
-    model = posed_model(trajectory, trajectory.intrinsics)
+    names = trajectory.names_or_numbers()
+    model = posed_model(colmap_poses(trajectory.camera_to_world), names, [trajectory.intrinsics], [0] * len(names))
     with atomic_folder(path, overwrite=True) as scratch:
         (model.write_text if text else model.write_binary)(str(scratch))
 
@@ -278,3 +296,8 @@ def _common(cameras: dict[int, Intrinsics | str], used: set[int]) -> tuple[Intri
     if len(pinholes) > 1:
         return None, f"no intrinsics: the pictures have {len(pinholes)} different cameras"
     return pinholes.pop(), ""
+
+
+_KEEPS = frozenset({"names", "intrinsics"})
+FORMAT = Format("colmap", read, write, recognise, keeps=_KEEPS, folder=True)
+TEXT_FORMAT = Format("colmap-text", read, write_text, None, keeps=_KEEPS, folder=True)

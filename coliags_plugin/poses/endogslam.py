@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
+from coliags_plugin.poses.format import Format
 from coliags_plugin.poses.rigid import check_rigid, inverse, rigid, rotations_from_wxyz, wxyz_from_rotations
 from coliags_plugin.poses.text import head, placed
 from coliags_plugin.poses.trajectory import Intrinsics, Trajectory
@@ -279,3 +280,8 @@ def _fault(key: str, array: np.ndarray, sizes: dict[str, int]) -> str:
 
 def _shape(shape: tuple[int | str, ...], sizes: dict[str, int]) -> str:
     return f"[{', '.join(str(sizes.get(size, size)) if isinstance(size, str) else str(size) for size in shape)}]"
+
+
+_KEEPS = frozenset({"intrinsics"})
+FORMAT = Format("endogslam", read, write, recognise, unit="mm", keeps=_KEEPS)
+TRUTH_FORMAT = Format("endogslam-truth", read_truth, None, None, unit="mm", keeps=_KEEPS)

@@ -1,55 +1,14 @@
-"""The pose formats by name, and which of them a file is in."""
+"""Which format a pose file is in, and writing one."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
-from coliags_plugin.core.errors import InputError, did_you_mean
-from coliags_plugin.poses import c3vd, colmap, endogslam, nerfstudio, tum
+from coliags_plugin.config.registry import pose_formats
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.poses.format import Format
 from coliags_plugin.poses.text import count_first_numbers
 from coliags_plugin.poses.trajectory import Trajectory
-
-
-@dataclass(frozen=True)
-class Format:
-    """One kind of pose file.
-
-    Attributes:
-        name: What it is called on the command line.
-        read: Reads a file, or a folder, of the kind.
-        write: Writes one in place of what is there, or None where the kind is only read.
-        recognise: Whether a path is of this kind, by content; None where another format answers for it.
-        unit: Its unit of length, or ``"units"`` where the format fixes none.
-        keeps: What it keeps beside the poses: ``names``, ``timestamps``, ``intrinsics``.
-        folder: Whether it is a folder of files.
-    """
-
-    name: str
-    read: Callable[[Path], Trajectory]
-    write: Callable[[Path, Trajectory], None] | None
-    recognise: Callable[[Path], bool] | None
-    unit: str
-    keeps: frozenset[str]
-    folder: bool = False
-
-
-_PINHOLE = frozenset({"intrinsics"})
-_NAMED = frozenset({"names", "intrinsics"})
-
-FORMATS: dict[str, Format] = {
-    kind.name: kind
-    for kind in (
-        Format("c3vd", c3vd.read, c3vd.write, c3vd.recognise, "mm", frozenset()),
-        Format("tum", tum.read, tum.write, tum.recognise, "units", frozenset({"timestamps"})),
-        Format("endogslam", endogslam.read, endogslam.write, endogslam.recognise, "mm", _PINHOLE),
-        Format("endogslam-truth", endogslam.read_truth, None, None, "mm", _PINHOLE),
-        Format("colmap", colmap.read, colmap.write, colmap.recognise, "units", _NAMED, folder=True),
-        Format("colmap-text", colmap.read, colmap.write_text, None, "units", _NAMED, folder=True),
-        Format("nerfstudio", nerfstudio.read, nerfstudio.write, nerfstudio.recognise, "units", _NAMED),
-    )
-}
 
 
 def format_named(name: str) -> Format:
@@ -58,9 +17,8 @@ def format_named(name: str) -> Format:
     Raises:
         InputError: There is none.
     """
-    if name not in FORMATS:
-        raise InputError(f"no pose format '{name}'", f"one of {', '.join(FORMATS)}", did_you_mean(name, FORMATS))
-    return FORMATS[name]
+    known: Format = pose_formats.get(name)
+    return known
 
 
 def format_of(path: Path, name: str | None = None) -> Format:
@@ -81,7 +39,7 @@ def format_of(path: Path, name: str | None = None) -> Format:
         if path.is_dir() and not known.folder:
             raise InputError(f"{path} is a folder", f"the {known.name} file itself")
         return known
-    for known in FORMATS.values():
+    for known in map(format_named, pose_formats):
         if known.recognise is not None and known.recognise(path):
             return known
     if path.is_dir():
@@ -111,7 +69,7 @@ def write_trajectory(path: Path, trajectory: Trajectory, name: str, overwrite: b
     """
     known = format_named(name)
     if known.write is None:
-        writable = [other.name for other in FORMATS.values() if other.write is not None]
+        writable = [other for other in pose_formats if format_named(other).write is not None]
         raise InputError(f"'{name}' is only read", f"one of {', '.join(writable)}")
     if path.exists() and path.is_dir() != known.folder:
         raise InputError(

@@ -11,6 +11,7 @@ import numpy as np
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
+from coliags_plugin.poses.format import Format
 from coliags_plugin.poses.rigid import FLIP_Y_AND_Z, check_rigid
 from coliags_plugin.poses.text import head, placed, read_text
 from coliags_plugin.poses.trajectory import Intrinsics, Trajectory, natural_order, refuse_repeated
@@ -158,3 +159,6 @@ def _number(path: Path, values: dict[str, Any], key: str) -> float:
     if not math.isfinite(value):
         raise InputError(f"{path}: {key} is {value}", "a finite number")
     return float(value)
+
+
+FORMAT = Format("nerfstudio", read, write, recognise, keeps=frozenset({"names", "intrinsics"}))

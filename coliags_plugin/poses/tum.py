@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from coliags_plugin.core.files import atomic_write
+from coliags_plugin.poses.format import Format
 from coliags_plugin.poses.rigid import rigid, rotations_from_wxyz, wxyz_from_rotations
 from coliags_plugin.poses.text import count_first_numbers, read_numbers
 from coliags_plugin.poses.trajectory import Trajectory
@@ -52,3 +53,6 @@ def write(path: Path, trajectory: Trajectory) -> None:
 def recognise(path: Path) -> bool:
     """Whether a file's first line, comments apart, holds eight numbers."""
     return count_first_numbers(path) == 8
+
+
+FORMAT = Format("tum", read, write, recognise, keeps=frozenset({"timestamps"}))

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from coliags_plugin.config.registry import pose_formats
 from coliags_plugin.outputs.image_files import read_rgb, write_png
-from coliags_plugin.poses.formats import FORMATS, format_of, write_trajectory
+from coliags_plugin.poses.formats import format_named, format_of, write_trajectory
 from coliags_plugin.poses.trajectory import Trajectory
 from tests.commands import refused, run
 
@@ -47,7 +48,7 @@ def estimate(tmp_path):
 
 
 def test_convert_through_every_format(truth, tmp_path, capsys):
-    steps = [name for name, known in FORMATS.items() if known.write is not None and name != "endogslam"]
+    steps = [name for name in pose_formats if format_named(name).write is not None and name != "endogslam"]
     source = truth
     for name in steps:
         target = tmp_path / f"as-{name}"
@@ -76,7 +77,7 @@ def test_pictures_give_names(truth, tmp_path, capsys):
         write_png(tmp_path / "images" / f"{index}_color.png", np.zeros((2, 2, 3), np.uint8))
     argv = ("poses", "convert", truth, tmp_path / "model", "--to", "colmap-text", *PINHOLE)
     assert run(*argv, "--images", tmp_path / "images") == 0
-    assert FORMATS["colmap"].read(tmp_path / "model").names == tuple(f"{index}_color.png" for index in range(20))
+    assert format_named("colmap").read(tmp_path / "model").names == tuple(f"{index}_color.png" for index in range(20))
     (tmp_path / "images" / "7_color.png").unlink()
     assert "holds 19 pictures for 20 poses" in refused(capsys, *argv, "--images", tmp_path / "images", "--overwrite")
     assert "a folder of pictures" in refused(capsys, *argv, "--images", truth)

@@ -10,17 +10,25 @@ from coliags_plugin.config import registry as registry_module
 from coliags_plugin.config.registry import REGISTRIES, Registry
 from coliags_plugin.core.errors import InputError
 
+#: Kinds that no config has options for.
+WITHOUT_SETTINGS = {"protocols", "pose_formats", "phantom_layouts"}
 
-def test_every_builtin_can_be_imported_and_has_settings_or_is_a_protocol():
+
+def test_every_builtin_can_be_imported_and_has_settings_where_its_kind_has_some():
     for kind, registry in REGISTRIES.items():
         for name in registry:
             component = registry.get(name)
-            assert kind == "protocols" or component.Settings is not None
+            assert kind in WITHOUT_SETTINGS or component.Settings is not None
 
 
 def test_unknown_name_says_what_was_meant():
     with pytest.raises(InputError, match="Did you mean 'torch'"):
         REGISTRIES["renderers"].get("troch")
+
+
+def test_a_registry_says_what_its_components_are_called():
+    with pytest.raises(InputError, match=r"^no pose format 'tumm'\. Expected one of c3vd, .*Did you mean 'tum'"):
+        REGISTRIES["pose_formats"].get("tumm")
 
 
 def test_duplicate_name_is_refused():

@@ -16,7 +16,7 @@ from coliags_plugin.data_check.matches import epipolar_agreement, match
 from coliags_plugin.data_check.page import write_check_page
 from coliags_plugin.data_check.reprojection import Pair, agreement, best_scale, video_pairs
 from coliags_plugin.data_check.text import lines
-from coliags_plugin.datamanagers.c3vd.manager import C3VDDataManager, C3VDSettings
+from coliags_plugin.datamanagers.c3vd.reader import C3VDDataManager, C3VDSettings
 from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
 from coliags_plugin.lenses.models import Pinhole
 from coliags_plugin.phantom.generate import generate

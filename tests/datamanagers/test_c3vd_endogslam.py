@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.datamanagers.c3vd.writer import depth_steps
-from coliags_plugin.datamanagers.c3vd_endogslam.manager import (
+from coliags_plugin.datamanagers.c3vd_endogslam.reader import (
     PREPARED_DEPTH,
     PREPARED_PINHOLE,
     C3VDEndoGSLAMDataManager,

@@ -10,7 +10,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.c3vd.writer import depth_steps
 from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH
 from coliags_plugin.datamanagers.reading.images import read_mask, read_rgb, resize_nearest, resize_rgb
-from coliags_plugin.datamanagers.views import PAPER_SIZE, fitted
+from coliags_plugin.datamanagers.rectification import PAPER_SIZE, fitted
 
 
 def test_millimetres():

@@ -12,10 +12,10 @@ import pytest
 import torch
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.scenes import PointCloud, Scene
-from coliags_plugin.datamanagers.c3vd.writer import _write_ply
+from coliags_plugin.core.ply import point_properties, write_ply
+from coliags_plugin.core.scenes import Scene
 from coliags_plugin.datamanagers.c3vd_v2.lens import CANDIDATE_LENS, ORDER, read_camera_intrinsics
-from coliags_plugin.datamanagers.c3vd_v2.manager import C3VDv2DataManager, C3VDv2Settings
+from coliags_plugin.datamanagers.c3vd_v2.reader import C3VDv2DataManager, C3VDv2Settings
 from coliags_plugin.lenses.models import LENSES, Lens
 from tests.datamanagers.wall_scenes import off_wall, poses, write_raw
 from tests.phantom.phantom_layouts import depth_gap, in_video_order, read, true_poses, write_phantom
@@ -177,7 +177,7 @@ class TestIntrinsicsFile:
 class TestVideosWithoutDepth:
     def test_pictures_and_poses_are_enough_where_points_are_given(self, mine):
         shutil.rmtree(mine / "depth")
-        _write_ply(mine / "points3D.ply", PointCloud(torch.rand(50, 3)))
+        write_ply(mine / "points3D.ply", point_properties(torch.rand(50, 3).numpy()))
         scene = load(mine)
         assert scene.train[0].depth is None
         assert len(scene.points) == 50

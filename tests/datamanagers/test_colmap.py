@@ -14,7 +14,7 @@ import torch
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.colmap.files import find_models, read_model
-from coliags_plugin.datamanagers.colmap.manager import ColmapDataManager, ColmapSettings
+from coliags_plugin.datamanagers.colmap.reader import ColmapDataManager, ColmapSettings
 from coliags_plugin.engine.data_formats import find_format
 from coliags_plugin.poses import colmap as colmap_poses
 from tests.datamanagers.colmap_scenes import CAMERAS, HEIGHT, POINTS, WIDTH, camera, taken, wall_model, write_colmap
@@ -505,11 +505,11 @@ def test_points_fall_where_they_were_seen_in_the_loaders_undistorted_pictures(sh
     assert {lens.model for lens in data.cameras.values()} == {model}
     errors, numbers = [], []
     for shot, picture in zip(shots, data.pictures, strict=True):
-        camera = shot.view.camera(shot.camera_to_world).to(dtype=torch.float64)
+        camera = shot.rectification.camera(shot.camera_to_world).to(dtype=torch.float64)
         found, depth = camera.project(torch.from_numpy(data.positions[picture.points]))
         assert (depth > 0).all()
-        seen = shot.view.pixels(picture.observed - 0.5) + 0.5
-        stored = data.cameras[picture.camera].pinhole.fx / shot.view.pinhole.fx
+        seen = shot.rectification.pixels(picture.observed - 0.5) + 0.5
+        stored = data.cameras[picture.camera].pinhole.fx / shot.rectification.pinhole.fx
         errors.append(stored * np.linalg.norm(found.numpy() - seen, axis=1))
         numbers.append(picture.points)
     by_point = np.concatenate(numbers)

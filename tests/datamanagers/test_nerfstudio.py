@@ -13,14 +13,14 @@ import pytest
 import torch
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.datamanagers.fusion import load_points
-from coliags_plugin.datamanagers.nerfstudio.manager import NerfstudioDataManager, NerfstudioSettings
+from coliags_plugin.datamanagers.nerfstudio.reader import NerfstudioDataManager, NerfstudioSettings
 from coliags_plugin.datamanagers.reading.images import read_rgb
 from coliags_plugin.engine.data_formats import find_format
 from coliags_plugin.lenses.models import FisheyeLens, Lens
 from coliags_plugin.lenses.opencv import OpenCVLens
 from coliags_plugin.lenses.undistortion import Undistortion
-from coliags_plugin.phantom.layouts.meshes import write_points
 from coliags_plugin.poses.rigid import FLIP_Y_AND_Z
 from tests.datamanagers.real_frames import real_lens
 from tests.datamanagers.wall_scenes import PINHOLE, look, off_wall, poses
@@ -70,7 +70,7 @@ def write(folder: Path, lens: Lens | None = None, names: list[str] | None = None
         frame = {"file_path": name, "transform_matrix": (pose @ FLIP_Y_AND_Z).tolist()}
         frames.append({**frame, **(frame_keys(index, depth) if frame_keys else {})})
         points = pose[:3, 3] + depth.reshape(-1, 1) * rays(lens).reshape(-1, 3) @ pose[:3, :3].T
-    write_points(folder / "points3D.ply", points, np.full(points.shape, 128, np.uint8))
+    write_ply(folder / "points3D.ply", point_properties(points, np.full(points.shape, 128, np.uint8)))
     content = {"camera_model": "OPENCV", **CAMERA, "frames": frames, **content}
     content = {key: value for key, value in content.items() if value is not None}
     (folder / "transforms.json").write_text(json.dumps(content))
@@ -132,28 +132,30 @@ def test_a_frames_own_camera_goes_before_the_files(tmp_path):
     frames = in_video_order(load(write(tmp_path, frame_keys=keys)))
     assert [frame.camera.fx for frame in frames] == [61.0, 61.0, 61.0, 70.0, *[61.0] * 5]
     shots = opened(tmp_path).shots
-    assert len({id(shot.view) for shot in shots}) == 2
+    assert len({id(shot.rectification) for shot in shots}) == 2
 
 
 @pytest.mark.parametrize("axis", ["x", "y"])
 def test_an_angle_of_view_stands_for_a_focal_length(tmp_path, axis):
     half = 0.5 * (WIDTH if axis == "x" else HEIGHT)
     angle = {f"camera_angle_{axis}": 2.0 * math.atan(half / 61.0)}
-    cam = opened(write(tmp_path, fl_x=None, fl_y=None, cx=None, cy=None, w=None, h=None, **angle)).shots[0].view
+    cam = (
+        opened(write(tmp_path, fl_x=None, fl_y=None, cx=None, cy=None, w=None, h=None, **angle)).shots[0].rectification
+    )
     assert cam.pinhole == pytest.approx((61.0, 61.0, 31.5, 23.5))
     assert (cam.width, cam.height) == (WIDTH, HEIGHT)
 
 
 def test_where_pixel_centres_are_counted(wall):
-    half, whole = (opened(wall, pixel_centers=kind).shots[0].view.pinhole for kind in ("half", "integer"))
+    half, whole = (opened(wall, pixel_centers=kind).shots[0].rectification.pinhole for kind in ("half", "integer"))
     assert half == pytest.approx(PINHOLE)
     assert whole[2:] == pytest.approx((PINHOLE.cx + 0.5, PINHOLE.cy + 0.5))
     assert whole[:2] == half[:2]
 
 
 def test_instant_ngps_word_for_a_fisheye(tmp_path):
-    view = opened(write(tmp_path, camera_model=None, is_fisheye=True, **FISHEYE)).shots[0].view
-    assert view.lens == FisheyeLens(**SIZE, **FISHEYE)
+    rectification = opened(write(tmp_path, camera_model=None, is_fisheye=True, **FISHEYE)).shots[0].rectification
+    assert rectification.lens == FisheyeLens(**SIZE, **FISHEYE)
 
 
 # Poses and files
@@ -182,7 +184,7 @@ def test_nerfstudios_change_of_the_world_is_undone_for_poses_and_points(wall, fo
         frame["transform_matrix"] = moved.tolist()
     points = load_points(folder / "points3D.ply").positions.double().numpy()
     moved_points = 0.5 * (points @ applied[:, :3].T + applied[:, 3])
-    write_points(folder / "sparse_pc.ply", moved_points, np.zeros(points.shape, np.uint8))
+    write_ply(folder / "sparse_pc.ply", point_properties(moved_points, np.zeros(points.shape, np.uint8)))
     changed(
         folder,
         frames=content["frames"],
@@ -236,7 +238,7 @@ def test_metres_become_millimetres(tmp_path):
         for row in frame["transform_matrix"][:3]:
             row[3] /= 1000.0
     points = load_points(tmp_path / "points3D.ply").positions.numpy() / 1000.0
-    write_points(tmp_path / "metres.ply", points, np.zeros(points.shape, np.uint8))
+    write_ply(tmp_path / "metres.ply", point_properties(points, np.zeros(points.shape, np.uint8)))
     changed(tmp_path, frames=content["frames"], ply_file_path="metres.ply")
     scene = load(tmp_path, scale=1000.0, initial_points="data")
     for frame in scene.train:
@@ -457,13 +459,13 @@ def test_the_real_sequence_opens_with_the_poses_and_the_lens_of_its_other_file(s
     for shot, frame in zip(recording.shots, data["frames"], strict=True):
         assert shot.image.name == frame["file_path"]
         np.testing.assert_allclose(shot.camera_to_world, frame["c2w"], atol=1e-12)
-    view = recording.shots[0].view
-    assert view.lens == real_lens(shared_data)
-    assert (view.width, view.height) == (270, 270)
-    undistortion = Undistortion(real_lens(shared_data), view.pinhole, 270, 270)
+    rectification = recording.shots[0].rectification
+    assert rectification.lens == real_lens(shared_data)
+    assert (rectification.width, rectification.height) == (270, 270)
+    undistortion = Undistortion(real_lens(shared_data), rectification.pinhole, 270, 270)
     picture = read_rgb(recording.shots[100].image)
-    np.testing.assert_array_equal(view.image(picture), undistortion.image(picture))
-    assert view.valid is None
+    np.testing.assert_array_equal(rectification.image(picture), undistortion.image(picture))
+    assert rectification.valid is None
 
 
 def test_the_real_sequence_loads_once_it_has_points(shared_data, tmp_path):

@@ -15,7 +15,7 @@ import torch
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.datamanagers import stored_frames
-from coliags_plugin.datamanagers.c3vd.manager import C3VDDataManager, C3VDSettings
+from coliags_plugin.datamanagers.c3vd.reader import C3VDDataManager, C3VDSettings
 from coliags_plugin.datamanagers.reading.side_by_side import side_by_side
 from coliags_plugin.datamanagers.stored_frames import StoredFrame
 from tests.datamanagers.wall_scenes import write_undistorted

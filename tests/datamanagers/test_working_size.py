@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from coliags_plugin.config.registry import datamanagers
-from coliags_plugin.datamanagers.c3vd.manager import C3VDDataManager, C3VDSettings
+from coliags_plugin.datamanagers.c3vd.reader import C3VDDataManager, C3VDSettings
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from tests.datamanagers.wall_scenes import write_undistorted
 

@@ -9,7 +9,6 @@ from coliags_plugin.config.components import make_component
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.data_formats import chosen_datamanager, find_format, load_method_for, open_scene
 from coliags_plugin.phantom.generate import generate
-from coliags_plugin.phantom.layouts import LAYOUTS
 from coliags_plugin.phantom.settings import phantom_settings
 from tests.scenes import write_wall
 
@@ -22,7 +21,7 @@ def wall(tmp_path_factory):
     return write_wall(tmp_path_factory.mktemp("data") / "wall", frames=9)
 
 
-@pytest.mark.parametrize("layout", sorted(LAYOUTS))
+@pytest.mark.parametrize("layout", registry.phantom_layouts)
 def test_every_layout_is_recognised_by_one_format_and_loads(layout, tmp_path):
     # REIM-NeRF validates on every 25th frame: so short a video has none.
     settings = {"layout": layout, "width": 64, "height": 52, "frames": 9, "rotation_views": 2, "path_length": 5.0}
@@ -39,7 +38,7 @@ def test_every_layout_is_recognised_by_one_format_and_loads(layout, tmp_path):
 
 def test_every_format_has_a_phantom_layout():
     formats = {name for name in registry.datamanagers if registry.datamanagers.source(name) == "built in"}
-    assert {FORMAT_OF.get(layout, layout) for layout in LAYOUTS} == formats - {"auto"}
+    assert {FORMAT_OF.get(layout, layout) for layout in registry.phantom_layouts} == formats - {"auto"}
 
 
 def test_nothing_and_two_things_are_refused(wall, tmp_path, monkeypatch):

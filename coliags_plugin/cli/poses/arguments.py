@@ -14,7 +14,7 @@ from coliags_plugin.core.errors import InputError
 
 if TYPE_CHECKING:
     from coliags_plugin.core.settings import Settings
-    from coliags_plugin.poses.formats import Format
+    from coliags_plugin.poses.format import Format
     from coliags_plugin.poses.trajectory import Intrinsics, Trajectory
 
 S = TypeVar("S", bound="Settings")

@@ -12,9 +12,9 @@ from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, check_pose_count, fingerprint
+from coliags_plugin.datamanagers.rectification import Rectification, whole_frame
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE
 from coliags_plugin.datamanagers.seen import ROTATION, seen_marks
-from coliags_plugin.datamanagers.views import View, whole_frame
 from coliags_plugin.lenses.models import Lens, octagon_mask
 from coliags_plugin.poses.c3vd import read_poses
 
@@ -60,7 +60,7 @@ class SequenceDataManager(RecordedDataManager):
         """
 
     @abstractmethod
-    def view(self, files: SequenceFiles) -> tuple[View, dict[str, Any]]:
+    def rectification(self, files: SequenceFiles) -> tuple[Rectification, dict[str, Any]]:
         """How its pictures become working pictures, and what provenance says about that.
 
         Raises:
@@ -87,8 +87,8 @@ class SequenceDataManager(RecordedDataManager):
             points_source=points,
         )
 
-    def octagon_view(self, lens: Lens, image: Path, mask: bool) -> View:
-        """The view of raw frames, of which one is ``image``: undistorted, and masked outside the octagon if wanted.
+    def octagon_rectification(self, lens: Lens, image: Path, mask: bool) -> Rectification:
+        """How raw frames, of which one is ``image``, are undistorted, and masked outside the octagon if wanted.
 
         Raises:
             InputError: The picture is a crop, so that the lens's calibration does not apply to it.
@@ -96,23 +96,23 @@ class SequenceDataManager(RecordedDataManager):
         lens = whole_frame(lens, image)
         shows = octagon_mask(lens.width, lens.height) if mask else None
         size = self.working_size(lens.width, lens.height)
-        return View.through(lens, image, size, self.settings.focal_scale, shows)
+        return Rectification.through(lens, image, size, self.settings.focal_scale, shows)
 
     def _shots(
         self, files: SequenceFiles, seen: Mapping[int, Path], prefix: str = ""
     ) -> tuple[list[Shot], dict[str, Any]]:
         poses = read_poses(files.poses)
         check_pose_count(files.poses, len(poses.camera_to_world), len(files.images))
-        view, described = self.view(files)
+        rectification, described = self.rectification(files)
         depths = files.depths or (None,) * len(files.images)
         shots = [
-            Shot(prefix + image.stem, image, view, pose, depth, C3VD_DEPTH, seen=seen.get(place))
-            for place, (image, depth, pose) in enumerate(zip(files.images, depths, poses.camera_to_world, strict=True))
+            Shot(prefix + image.stem, image, rectification, pose, depth, C3VD_DEPTH, seen=seen.get(index))
+            for index, (image, depth, pose) in enumerate(zip(files.images, depths, poses.camera_to_world, strict=True))
         ]
         facts: dict[str, Any] = {
             "layout": files.kind,
             **described,
-            **view.facts(),
+            **rectification.facts(),
             "pose_convention": {"order": poses.convention, **poses.evidence},
         }
         return shots, facts

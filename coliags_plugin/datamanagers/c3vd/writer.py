@@ -1,4 +1,4 @@
-"""Writing frames in C3VD's undistorted layout, for tests and for data that come from elsewhere."""
+"""Writing C3VD's layouts: frames, poses and camera of the raw release and of undistorted scenes."""
 
 from __future__ import annotations
 
@@ -9,10 +9,61 @@ import numpy as np
 from jaxtyping import Float, UInt8, UInt16
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import atomic_folder, write_json
+from coliags_plugin.core.files import atomic_folder, atomic_write
+from coliags_plugin.core.images import write_image
+from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.core.scenes import PointCloud
+from coliags_plugin.datamanagers.reading.camera_json import write_camera_json
 from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH
+from coliags_plugin.datamanagers.scene_settings import POINTS_FILE
 from coliags_plugin.lenses.models import Pinhole
+from coliags_plugin.poses.c3vd import matrix_lines
+
+POSES, CAMERA = "camera_pose.txt", "camera.json"
+#: 100 mm in 16 bits.
+_STEPS_PER_MM = 65535.0 / 100.0
+
+
+def write_frame(
+    folder: Path, index: int, image: UInt8[np.ndarray, "H W 3"], z_depth: Float[np.ndarray, "H W"] | None
+) -> None:
+    """Write a frame of an undistorted scene (docs/layouts/c3vd.md 3).
+
+    Args:
+        folder: Of the scene.
+        index: Of the frame, counted from 0.
+        image: RGB. [H, W, 3]
+        z_depth: mm, as for :func:`depth_steps`; None where there is none. [H, W]
+    """
+    write_image(folder / "images" / f"{index:04d}_color.png", image)
+    if z_depth is not None:
+        write_image(folder / "depths" / f"{index:04d}_depth.png", depth_steps(z_depth))
+
+
+def write_raw_frame(
+    folder: Path,
+    index: int,
+    image: UInt8[np.ndarray, "H W 3"],
+    z_depth: Float[np.ndarray, "H W"],
+    normals: Float[np.ndarray, "H W 3"],
+) -> None:
+    """Write a frame of the raw release (docs/layouts/c3vd.md 1).
+
+    Args:
+        folder: Of the sequence.
+        index: Of the frame, counted from 0.
+        image: RGB, as the lens shows it. [H, W, 3]
+        z_depth: mm, as for :func:`depth_steps`. [H, W]
+        normals: As for :func:`normal_steps`. [H, W, 3]
+    """
+    write_image(folder / f"{index:04d}_color.png", image)
+    write_image(folder / f"{index:04d}_depth.tiff", depth_steps(z_depth))
+    write_image(folder / f"{index:04d}_normals.tiff", normal_steps(normals))
+
+
+def write_poses(path: Path, camera_to_world: Float[np.ndarray, "N 4 4"]) -> None:
+    """Write a pose file of the release's precision, nine digits; OpenCV axes, mm. [N, 4, 4]"""
+    atomic_write(path, matrix_lines(camera_to_world, digits=9))
 
 
 def write_c3vd_scene(
@@ -25,7 +76,7 @@ def write_c3vd_scene(
     points: PointCloud | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write a scene that the ``c3vd`` data manager reads (docs/layouts/c3vd.md 3).
+    """Write a whole undistorted scene, its poses unrounded (docs/layouts/c3vd.md 3).
 
     Args:
         folder: The folder to make.
@@ -46,45 +97,24 @@ def write_c3vd_scene(
         )
     height, width = images[0].shape[:2]
     with atomic_folder(folder, overwrite) as scratch:
-        (scratch / "images").mkdir()
         for index, image in enumerate(images):
-            _write_png(scratch / "images" / f"{index:04d}_color.png", image[..., ::-1])
-        if depths is not None:
-            (scratch / "depths").mkdir()
-            for index, depth in enumerate(depths):
-                _write_png(scratch / "depths" / f"{index:04d}_depth.png", depth_steps(depth))
-        # Sixteen numbers a line, column by column, as the current release has them.
-        columns = np.asarray(camera_to_world, np.float64).transpose(0, 2, 1).reshape(-1, 16)
-        lines = [",".join(repr(float(number)) for number in line) for line in columns]
-        (scratch / "camera_pose.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
-        write_json(scratch / "camera.json", {**pinhole._asdict(), "w": width, "h": height})
+            write_frame(scratch, index, image, None if depths is None else depths[index])
+        atomic_write(scratch / POSES, matrix_lines(camera_to_world))
+        write_camera_json(scratch / CAMERA, pinhole, w=width, h=height)
         if points is not None:
-            _write_ply(scratch / "points3D.ply", points)
+            colors = None if points.colors is None else points.colors.numpy()
+            write_ply(scratch / POINTS_FILE, point_properties(points.positions.numpy(), colors))
 
 
-def depth_steps(depth: Float[np.ndarray, "H W"]) -> UInt16[np.ndarray, "H W"]:
-    """z-depth, mm, as C3VD stores it: 16 bit, 0 where unknown, 65535 from 100 mm on. [H, W]"""
-    known = np.isfinite(depth) & (depth > 0.0)
-    steps = np.rint(np.where(known, depth, 0.0) / C3VD_DEPTH.size)
+def depth_steps(z_depth: Float[np.ndarray, "H W"]) -> UInt16[np.ndarray, "H W"]:
+    """z-depth, mm, as C3VD stores it: 65535 / 100 steps a mm, 0 where unknown, 65535 from 100 mm on. [H, W]"""
+    known = np.isfinite(z_depth) & (z_depth > 0.0)
+    steps = np.rint(np.where(known, z_depth, 0.0) * _STEPS_PER_MM)
     return np.where(known, np.clip(steps, 1, C3VD_DEPTH.far), 0).astype(np.uint16)
 
 
-def _write_png(path: Path, pixels: np.ndarray) -> None:
-    import cv2
-
-    path.write_bytes(cv2.imencode(".png", pixels)[1].tobytes())
-
-
-def _write_ply(path: Path, points: PointCloud) -> None:
-    fields = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
-    if points.colors is not None:
-        fields += [("red", "u1"), ("green", "u1"), ("blue", "u1")]
-    vertices = np.empty(len(points), fields)
-    for axis, name in enumerate("xyz"):
-        vertices[name] = points.positions[:, axis].numpy()
-    if points.colors is not None:
-        for channel, name in enumerate(("red", "green", "blue")):
-            vertices[name] = points.colors[:, channel].numpy()
-    properties = "".join(f"property {'uchar' if kind == 'u1' else 'float'} {name}\n" for name, kind in fields)
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n{properties}end_header\n"
-    path.write_bytes(header.encode() + vertices.tobytes())
+def normal_steps(normals: Float[np.ndarray, "H W 3"]) -> UInt16[np.ndarray, "H W 3"]:
+    """Unit normals, camera axes, as C3VD stores them: -1 to 1 becomes 0 to 65535; 0, 0, 0 stays. [H, W, 3]"""
+    encoded = np.rint((normals + 1.0) * (0.5 * 65535.0)).clip(0.0, 65535.0).astype(np.uint16)
+    encoded[~normals.any(axis=-1)] = 0
+    return encoded

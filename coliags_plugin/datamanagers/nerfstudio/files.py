@@ -102,7 +102,7 @@ class Transforms:
         return np.asarray(back @ applied[:, :3])
 
     def split(self, names: Sequence[str]) -> dict[str, list[int]] | None:
-        """Places of training and of test frames among ``names``; None where the file does not say.
+        """Indices of training and of test frames among ``names``; None where the file does not say.
 
         The file's test frames are those of ``test_filenames`` or, where there are none, of ``val_filenames``.
 
@@ -112,11 +112,11 @@ class Transforms:
         listed = {part: self.content.get(f"{part}_filenames") for part in ("train", "val", "test")}
         if not listed["train"]:
             return None
-        place = {posixpath.normpath(name): index for index, name in enumerate(names)}
+        index_of = {posixpath.normpath(name): index for index, name in enumerate(names)}
         test = "test" if listed["test"] else "val"
         chosen = {
-            "train": self._places("train_filenames", listed["train"], place),
-            "test": self._places(f"{test}_filenames", listed[test] or [], place),
+            "train": self._indices("train_filenames", listed["train"], index_of),
+            "test": self._indices(f"{test}_filenames", listed[test] or [], index_of),
         }
         if both := set(chosen["train"]) & set(chosen["test"]):
             name = names[min(both)]
@@ -132,14 +132,14 @@ class Transforms:
             raise InputError(f"{self.path}: depth_unit_scale_factor is {factor:g}", "a number above 0")
         return factor
 
-    def _places(self, key: str, listed: Any, place: Mapping[str, int]) -> list[int]:
+    def _indices(self, key: str, listed: Any, index_of: Mapping[str, int]) -> list[int]:
         if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
             raise InputError(f"{self.path}: {key} is no list of names", "file_paths of frames")
-        unknown = [name for name in listed if posixpath.normpath(name) not in place]
+        unknown = [name for name in listed if posixpath.normpath(name) not in index_of]
         if unknown:
-            hint = did_you_mean(unknown[0], place)
+            hint = did_you_mean(unknown[0], index_of)
             raise InputError(f"{self.path}: {key} names {unknown[0]}", "a file_path of a frame", hint)
-        return sorted({place[posixpath.normpath(name)] for name in listed})
+        return sorted({index_of[posixpath.normpath(name)] for name in listed})
 
     def _pictures(self, names: Sequence[str]) -> list[Path]:
         folder = self.path.parent

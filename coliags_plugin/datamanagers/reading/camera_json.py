@@ -1,4 +1,4 @@
-"""The pinhole that a ``camera.json`` describes (docs/layouts/c3vd.md 3)."""
+"""``camera.json``, which describes a pinhole (docs/layouts/c3vd.md 3)."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import write_json
 from coliags_plugin.lenses.models import Pinhole
 
 
@@ -36,3 +37,14 @@ def read_intrinsics(path: Path) -> tuple[Pinhole, int, int]:
     if width != int(width) or height != int(height):
         raise InputError(f"{path}: w = {width}, h = {height}", "whole pixels")
     return Pinhole(float(fx), float(fy), float(cx), float(cy)), int(width), int(height)
+
+
+def write_camera_json(path: Path, pinhole: Pinhole, **more: float) -> None:
+    """Write a ``camera.json``.
+
+    Args:
+        path: Where to.
+        pinhole: Intrinsics, pixels, centres at integers.
+        more: ``w`` and ``h``, the picture's size in pixels, and whatever else a format keeps there, in this order.
+    """
+    write_json(path, {**pinhole._asdict(), **more})

@@ -103,7 +103,7 @@ def _ascii(path: Path, body: bytes, vertex: _Element, layout: np.dtype) -> dict[
     except ValueError as error:
         expected = f"rows of {len(vertex.properties)} numbers"
         raise InputError(f"{path}: a vertex is no row of numbers", expected) from error
-    return {name: rows[:, place].astype(layout[name]) for place, name in enumerate(layout.names or ())}
+    return {name: rows[:, index].astype(layout[name]) for index, name in enumerate(layout.names or ())}
 
 
 def _cut_short(path: Path, expected: int, found: int) -> InputError:

@@ -56,7 +56,7 @@ class Sequence:
         scene_shift: What is added to positions in mm before they are scaled. [3]
         distmap_scale: Normalised distance of the number 65535.
         frames: In video order.
-        parts: Places in ``frames``, by part.
+        parts: Indices in ``frames``, by part.
     """
 
     files: Mapping[str, Path]
@@ -162,7 +162,7 @@ def read_sequence(folder: Path) -> Sequence:
             named[part].append(name)
     names = list(found)
     names = [names[index] for index in natural_order(names)]
-    place = {name: index for index, name in enumerate(names)}
+    index_of = {name: index for index, name in enumerate(names)}
     if sum(frame.distances is not None for frame in found.values()) not in (0, len(found)):
         lone = next(name for name in names if found[name].distances is None)
         raise InputError(f"{folder}: {lone} has no distmap_path, but others have", "one for every frame, or for none")
@@ -173,7 +173,7 @@ def read_sequence(folder: Path) -> Sequence:
         shift,
         _positive(files["train"], first, "distmap_scale", math.pi),
         tuple(found[name] for name in names),
-        {part: tuple(sorted(place[name] for name in names)) for part, names in named.items()},
+        {part: tuple(sorted(index_of[name] for name in names)) for part, names in named.items()},
     )
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from coliags_plugin.datamanagers.rgbd.association import times
-from coliags_plugin.datamanagers.rgbd.manager import RGBDDataManager
+from coliags_plugin.datamanagers.rgbd.reader import RGBDDataManager
 from coliags_plugin.poses.trajectory import Trajectory
 
 

@@ -6,19 +6,53 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt16
+from jaxtyping import Bool, Float, UInt8, UInt16
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import atomic_folder, write_json
+from coliags_plugin.core.files import atomic_folder, atomic_write
+from coliags_plugin.core.images import write_image, write_mask
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame
+from coliags_plugin.datamanagers.reading.camera_json import write_camera_json
 from coliags_plugin.datamanagers.rgbd.association import is_time, times
+from coliags_plugin.lenses.models import Pinhole
 from coliags_plugin.poses import tum
 from coliags_plugin.poses.trajectory import Trajectory
 
 #: The largest number of 16 bits.
 _LARGEST = 65_535
-TRAJECTORY = "trajectory.txt"
+TRAJECTORY, CAMERA = "trajectory.txt", "camera.json"
+
+
+def write_frame(
+    folder: Path,
+    picture: str,
+    image: UInt8[np.ndarray, "H W 3"],
+    z_depth: Float[np.ndarray, "H W"],
+    scale: float,
+    mask: Bool[np.ndarray, "H W"] | None = None,
+) -> None:
+    """Write a picture, its depth and, where there is one, its mask, all under one file name.
+
+    Args:
+        folder: Of the scene.
+        picture: The file name, a time in seconds or a number.
+        image: RGB. [H, W, 3]
+        z_depth: As for :func:`depth_steps`. [H, W]
+        scale: Steps per unit of length.
+        mask: True where a pixel counts. [H, W]
+    """
+    write_image(folder / "rgb" / picture, image)
+    write_image(folder / "depth" / picture, depth_steps(z_depth, scale))
+    if mask is not None:
+        write_mask(folder / "mask" / picture, mask)
+
+
+def write_lists(folder: Path, stamps: Sequence[str]) -> None:
+    """Write ``rgb.txt`` and ``depth.txt``, which TUM's tools read: pictures named by their times in seconds."""
+    for kind in ("rgb", "depth"):
+        lines = ["# timestamp filename", *(f"{stamp} {kind}/{stamp}.png" for stamp in stamps)]
+        atomic_write(folder / f"{kind}.txt", "\n".join(lines) + "\n")
 
 
 def write_rgbd_scene(
@@ -61,19 +95,12 @@ def write_rgbd_scene(
     if not timed:
         pictures = [f"{index:04d}.png" for index in range(len(frames))]
     with atomic_folder(folder, overwrite) as scratch:
-        for name in ("rgb", "depth"):
-            (scratch / name).mkdir()
         for index, frame in enumerate(frames):
             other = frame.camera
             if (other.fx, other.fy, other.cx, other.cy, other.width, other.height) != pinhole:
                 raise InputError(f"frame {frame.name} has a camera of its own", "one pinhole for all frames")
-            picture = pictures[index]
-            _write_png(scratch / "rgb" / picture, frame.image.numpy()[..., ::-1])
-            _write_png(scratch / "depth" / picture, depth_steps(_depth(frame), scale))
-            mask = frame.mask
-            if mask is not None:
-                (scratch / "mask").mkdir(exist_ok=True)
-                _write_png(scratch / "mask" / picture, mask.numpy().astype(np.uint8) * 255)
+            mask = None if frame.mask is None else frame.mask.numpy()
+            write_frame(scratch, pictures[index], frame.image.numpy(), _depth(frame), scale, mask)
             if progress is not None:
                 progress("write frames", index + 1, len(frames))
         tum.write(
@@ -81,8 +108,8 @@ def write_rgbd_scene(
         )
         # Pixel centres at integers, as all of this format's cameras.
         fx, fy, cx, cy, width, height = pinhole
-        record = {"fx": fx, "fy": fy, "cx": cx - 0.5, "cy": cy - 0.5, "w": width, "h": height, "depth_scale": scale}
-        write_json(scratch / "camera.json", record)
+        integers = Pinhole(fx, fy, cx - 0.5, cy - 0.5)
+        write_camera_json(scratch / CAMERA, integers, w=width, h=height, depth_scale=scale)
     return folder / TRAJECTORY
 
 
@@ -94,10 +121,10 @@ def depth_scale(farthest: float) -> float:
 
 
 def depth_steps(depth: Float[np.ndarray, "H W"], scale: float) -> UInt16[np.ndarray, "H W"]:
-    """z-depth as stored; 0 where unknown. [H, W]"""
+    """z-depth as stored; 0 where it is unknown, or too far for 16 bits. [H, W]"""
     known = np.isfinite(depth) & (depth > 0.0)
-    steps = np.rint(np.where(known, depth, 0.0) * scale)
-    return np.where(known, np.clip(steps, 1, _LARGEST), 0).astype(np.uint16)
+    steps = np.maximum(np.rint(np.where(known, depth, 0.0) * scale), 1)
+    return np.where(known & (steps <= _LARGEST), steps, 0).astype(np.uint16)
 
 
 def _depth(frame: Frame) -> Float[np.ndarray, "H W"]:
@@ -111,9 +138,3 @@ def _farthest(frame: Frame) -> float:
     depth = _depth(frame)
     known = depth[np.isfinite(depth)]
     return float(known.max(initial=1e-9))
-
-
-def _write_png(path: Path, pixels: np.ndarray) -> None:
-    import cv2
-
-    path.write_bytes(cv2.imencode(".png", pixels)[1].tobytes())

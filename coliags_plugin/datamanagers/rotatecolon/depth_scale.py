@@ -58,11 +58,11 @@ def fit_scale(shots: Sequence[Shot], points: Float[np.ndarray, "N 3"]) -> ScaleF
 
     points = points[np.isfinite(points).all(axis=1)]
     with_depth = [shot for shot in shots if shot.depth is not None]
-    places = np.unique(np.linspace(0, len(with_depth) - 1, min(_FRAMES, len(with_depth))).round().astype(int))
+    indices = np.unique(np.linspace(0, len(with_depth) - 1, min(_FRAMES, len(with_depth))).round().astype(int))
     generator = np.random.default_rng(0)
     centers, rays, depths = [], [], []
-    for place in places:
-        center, ray, depth = _sampled(with_depth[place], generator)
+    for index in indices:
+        center, ray, depth = _sampled(with_depth[index], generator)
         centers.append(np.broadcast_to(center, ray.shape))
         rays.append(ray)
         depths.append(depth)
@@ -90,11 +90,13 @@ def _sampled(
     """Some pixels of known depth: the camera's centre, world directions with z = 1 in the camera, z-depths."""
     if shot.depth is None or shot.depth_format is None:
         raise InputError(f"{shot.name} has no depth", "a frame with depth")
-    view = shot.view
-    depth = shot.depth_format.z_depth(view.nearest(view.checked(shot.depth, shot.depth_format.read(shot.depth))))
+    rectification = shot.rectification
+    depth = shot.depth_format.z_depth(
+        rectification.nearest(rectification.checked(shot.depth, shot.depth_format.read(shot.depth)))
+    )
     known = np.flatnonzero(np.isfinite(depth))
     pixels = generator.choice(known, min(_PIXELS, len(known)), replace=False)
-    row, column = np.divmod(pixels, view.width)
-    fx, fy, cx, cy = view.pinhole
+    row, column = np.divmod(pixels, rectification.width)
+    fx, fy, cx, cy = rectification.pinhole
     local = np.stack([(column - cx) / fx, (row - cy) / fy, np.ones(len(pixels))], axis=1)
     return shot.camera_to_world[:3, 3], local @ shot.camera_to_world[:3, :3].T, depth.ravel()[pixels].astype(np.float64)

@@ -11,8 +11,8 @@ from typing import ClassVar, Literal
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from coliags_plugin.lenses.models import Pinhole
-from coliags_plugin.phantom.imaging import Optics, PinholeOptics
+from coliags_plugin.lenses.models import Lens, Pinhole
+from coliags_plugin.lenses.pinhole import PinholeLens
 from coliags_plugin.phantom.trajectory import every_8th
 from coliags_plugin.poses.trajectory import Intrinsics
 
@@ -55,7 +55,7 @@ class Layout(ABC):
     #: Whether the mesh and its coverage belong to the layout, as ``coverage_mesh.obj``.
     has_coverage_mesh: ClassVar[bool] = False
 
-    def optics(self, width: int, height: int) -> tuple[Optics, Bool[np.ndarray, "H W"]]:
+    def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
         """The lens of frames of this size, and which of their pixels are lit. The mask is [H, W].
 
         Unless a layout says otherwise: C3VD's undistorted camera, scaled by width; its principal point keeps its
@@ -69,7 +69,7 @@ class Layout(ABC):
             0.5 * width - 0.5 + (k.cx + 0.5 - 169.0) * scale,
             0.5 * height - 0.5 + (k.cy + 0.5 - 135.0) * scale,
         )
-        return PinholeOptics(pinhole, width, height), np.ones((height, width), bool)
+        return PinholeLens.of(pinhole, width, height), np.ones((height, width), bool)
 
     def is_test(self, index: int) -> bool:
         """Whether a frame of the video is held out by the split that goes with the layout.
@@ -101,20 +101,18 @@ class Layout(ABC):
         """
 
     @abstractmethod
-    def write_sequence(
-        self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], optics: Optics
-    ) -> None:
+    def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
         """Write what belongs to all frames of a part: poses and, where the layout has one, the camera.
 
         Args:
             folder: Of the phantom.
             part: What the frames belong to.
             poses: Camera-to-world, OpenCV axes, mm. Each [4, 4]
-            optics: Of all of them, from :meth:`optics`.
+            lens: Of all of them, from :meth:`lens`.
         """
 
     def write_points(
-        self, folder: Path, points: WallPoints, poses: Sequence[Float[np.ndarray, "4 4"]], optics: Optics
+        self, folder: Path, points: WallPoints, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens
     ) -> None:
         """Write initial points; called where :attr:`has_points`. ``poses`` are those of the video."""
         raise NotImplementedError(f"{type(self).__name__} has no place for points")
@@ -124,16 +122,16 @@ class Layout(ABC):
         return folder / ("truth" if part == "video" else part) / "seen" / f"{index:04d}_seen.png"
 
 
-def pinhole_of(optics: Optics) -> Intrinsics:
+def pinhole_of(lens: Lens) -> Intrinsics:
     """Intrinsics of frames that are a pinhole's, pixel centres at integers + 0.5.
 
     Raises:
         TypeError: They are taken through another lens.
     """
-    if not isinstance(optics, PinholeOptics):
-        raise TypeError(f"{type(optics).__name__} is no pinhole, and the layout holds a pinhole camera")
-    k = optics.pinhole
-    return Intrinsics(k.fx, k.fy, k.cx + 0.5, k.cy + 0.5, optics.width, optics.height)
+    if not isinstance(lens, PinholeLens):
+        raise TypeError(f"{type(lens).__name__} is no pinhole, and the layout holds a pinhole camera")
+    k = lens.pinhole
+    return Intrinsics(k.fx, k.fy, k.cx + 0.5, k.cy + 0.5, lens.width, lens.height)
 
 
 def place(folder: Path, part: Part) -> Path:

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from coliags_plugin.phantom.imaging import Optics, PinholeOptics
+from coliags_plugin.datamanagers.c3vd.writer import CAMERA, POSES, write_frame, write_poses
+from coliags_plugin.datamanagers.reading.camera_json import write_camera_json
+from coliags_plugin.lenses.models import Lens
 from coliags_plugin.phantom.layouts.base import Layout, Part, place
-from coliags_plugin.phantom.layouts.c3vd_raw import encode_depth, write_poses
-from coliags_plugin.phantom.layouts.pictures import write_image
 
 
-class C3vdLayout(Layout):
+class C3VDLayout(Layout):
     """Undistorted frames as ColIAGS reads them: images/, depths/, camera_pose.txt, camera.json."""
 
     has_rotation = True
@@ -30,21 +29,9 @@ class C3vdLayout(Layout):
         normals: Float[np.ndarray, "H W 3"],
     ) -> None:
         """See :class:`Layout`; normals are not part of this layout."""
-        write_image(place(folder, part) / "images" / f"{index:04d}_color.png", color)
-        write_image(place(folder, part) / "depths" / f"{index:04d}_depth.png", encode_depth(z_depth))
+        write_frame(place(folder, part), index, color, z_depth)
 
-    def write_sequence(
-        self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], optics: Optics
-    ) -> None:
+    def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
         """See :class:`Layout`."""
-        write_poses(place(folder, part) / "camera_pose.txt", poses)
-        write_camera_json(place(folder, part) / "camera.json", optics)
-
-
-def write_camera_json(path: Path, optics: Optics, **more: float) -> None:
-    """Intrinsics (pixel centres at integers) and picture size of pinhole optics, and whatever else is given."""
-    if not isinstance(optics, PinholeOptics):
-        raise TypeError(f"{path.name} holds a pinhole camera")
-    k = optics.pinhole
-    camera = {"fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy, "h": optics.height, "w": optics.width, **more}
-    path.write_text(json.dumps(camera, indent=2) + "\n")
+        write_poses(place(folder, part) / POSES, np.stack(poses))
+        write_camera_json(place(folder, part) / CAMERA, lens.pinhole, h=lens.height, w=lens.width)

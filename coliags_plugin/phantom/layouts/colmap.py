@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from coliags_plugin.phantom.imaging import Optics
+from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points, write_model, write_picture
+from coliags_plugin.lenses.models import Lens
 from coliags_plugin.phantom.layouts.base import Layout, Part, WallPoints, pinhole_of
-from coliags_plugin.phantom.layouts.pictures import write_image
-from coliags_plugin.poses.colmap import posed_model
+from coliags_plugin.poses.colmap import colmap_poses, posed_model
 from coliags_plugin.poses.rigid import inverse
-from coliags_plugin.poses.trajectory import Trajectory
 
 #: A feature detector finds a point in one of so many of the pictures that show it.
 _FOUND_IN_ONE_OF = 3
@@ -34,38 +33,27 @@ class ColmapLayout(Layout):
         normals: Float[np.ndarray, "H W 3"],
     ) -> None:
         """See :class:`Layout`; depth and normals are not part of this layout."""
-        write_image(folder / "images" / _name(index), color)
+        write_picture(folder, _name(index), color)
 
-    def write_sequence(
-        self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], optics: Optics
-    ) -> None:
+    def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
         """See :class:`Layout`; poses are part of the model."""
 
     def write_points(
-        self, folder: Path, points: WallPoints, poses: Sequence[Float[np.ndarray, "4 4"]], optics: Optics
+        self, folder: Path, points: WallPoints, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens
     ) -> None:
         """See :class:`Layout`. Points seen in fewer than two pictures are left out, as COLMAP leaves them out."""
-        import pycolmap
-
-        names = tuple(_name(index) for index in range(len(poses)))
-        model = posed_model(Trajectory(np.stack(poses), names=names), pinhole_of(optics))
+        names = [_name(index) for index in range(len(poses))]
+        model = posed_model(colmap_poses(np.stack(poses)), names, [pinhole_of(lens)], [0] * len(poses))
         numbers = np.arange(len(points.positions))
         seen = [points.seen_in(index) & ((numbers + index) % _FOUND_IN_ONE_OF == 0) for index in range(len(poses))]
-        kept = np.sum(seen, axis=0) >= 2
-        tracks: dict[int, list[pycolmap.TrackElement]] = {int(number): [] for number in np.flatnonzero(kept)}
+        kept = np.flatnonzero(np.sum(seen, axis=0) >= 2)
+        found = []
         for index, matrix in enumerate(inverse(np.stack(poses))):
-            found = np.flatnonzero(seen[index] & kept)
-            local = points.positions[found] @ matrix[:3, :3].T + matrix[:3, 3]
-            for place, found_number in enumerate(found.tolist()):
-                tracks[found_number].append(pycolmap.TrackElement(index + 1, place))
-            pixels = [pycolmap.Point2D(pixel) for pixel in optics.project(local) + 0.5]
-            model.images[index + 1].points2D = pycolmap.Point2DList(pixels)
-        for number, track in tracks.items():
-            model.add_point3D(points.positions[number], pycolmap.Track(track), points.colors[number])
-        model.update_point_3d_errors()
-        place_of_model = folder / "sparse" / "0"
-        place_of_model.mkdir(parents=True)
-        model.write_binary(str(place_of_model))
+            here = np.flatnonzero(seen[index][kept])
+            local = points.positions[kept[here]] @ matrix[:3, :3].T + matrix[:3, 3]
+            found.append(SeenPoints(lens.project(local) + 0.5, here))
+        add_points(model, found, points.positions[kept], points.colors[kept])
+        write_model(folder, model)
 
 
 def _name(index: int) -> str:

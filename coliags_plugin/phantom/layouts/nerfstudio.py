@@ -8,30 +8,26 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from coliags_plugin.core.files import write_json
+from coliags_plugin.datamanagers.nerfstudio.writer import write_frame, write_transforms
+from coliags_plugin.lenses.models import Lens
 from coliags_plugin.lenses.opencv import OpenCVLens
-from coliags_plugin.phantom.imaging import Optics, PinholeOptics
 from coliags_plugin.phantom.layouts.base import Layout, Part
-from coliags_plugin.phantom.layouts.pictures import write_image
-from coliags_plugin.poses.rigid import FLIP_Y_AND_Z
 
 #: Millimetres in a depth step: up to 655 mm.
 DEPTH_UNIT = 0.01
 #: A mild barrel, so that whoever forgets to undistort is found out.
-_BENDS = {"k1": -0.2, "k2": 0.05, "p1": 0.001, "p2": -0.002}
+_K1, _K2, _P1, _P2 = -0.2, 0.05, 0.001, -0.002
 
 
 class NerfstudioLayout(Layout):
     """images/, depth/ and a transforms.json in millimetres with an OPENCV camera."""
 
-    def optics(self, width: int, height: int) -> tuple[Optics, Bool[np.ndarray, "H W"]]:
+    def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
         """The usual camera, behind a lens that OpenCV's model describes."""
-        plain, lit = super().optics(width, height)
-        if not isinstance(plain, PinholeOptics):
-            raise TypeError("a lens needs a pinhole to stand before")
+        plain, lit = super().lens(width, height)
         fx, fy, cx, cy = plain.pinhole
-        k1, k2, p1, p2 = _BENDS.values()
-        return OpenCVLens(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, k1=k1, k2=k2, p1=p1, p2=p2), lit
+        bent = OpenCVLens(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, k1=_K1, k2=_K2, p1=_P1, p2=_P2)
+        return bent, lit
 
     def write_frame(
         self,
@@ -43,30 +39,10 @@ class NerfstudioLayout(Layout):
         normals: Float[np.ndarray, "H W 3"],
     ) -> None:
         """See :class:`Layout`; normals are not part of this layout."""
-        write_image(folder / "images" / _name(index), color)
-        steps = np.rint(z_depth / DEPTH_UNIT).clip(0.0, 65535.0)
-        write_image(folder / "depth" / _name(index), steps.astype(np.uint16))
+        write_frame(folder, index, color, z_depth, DEPTH_UNIT)
 
-    def write_sequence(
-        self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], optics: Optics
-    ) -> None:
+    def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
         """See :class:`Layout`."""
-        if not isinstance(optics, OpenCVLens):
+        if not isinstance(lens, OpenCVLens):
             raise TypeError("the nerfstudio layout is taken through OpenCV's lens")
-        frames = [
-            {
-                "file_path": f"images/{_name(index)}",
-                "depth_file_path": f"depth/{_name(index)}",
-                "transform_matrix": (pose @ FLIP_Y_AND_Z).tolist(),
-            }
-            for index, pose in enumerate(poses)
-        ]
-        k = optics.pinhole
-        camera = {"camera_model": "OPENCV", "fl_x": k.fx, "fl_y": k.fy, "cx": k.cx + 0.5, "cy": k.cy + 0.5}
-        size = {"w": optics.width, "h": optics.height}
-        unit = {"depth_unit_scale_factor": DEPTH_UNIT}
-        write_json(folder / "transforms.json", {**camera, **size, **_BENDS, **unit, "frames": frames})
-
-
-def _name(index: int) -> str:
-    return f"frame_{index + 1:05d}.png"
+        write_transforms(folder, np.stack(poses), lens, DEPTH_UNIT)

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from coliags_plugin.phantom.imaging import Optics
+from coliags_plugin.datamanagers.reading.camera_json import write_camera_json
+from coliags_plugin.datamanagers.rgbd.writer import CAMERA, write_frame, write_lists
+from coliags_plugin.lenses.models import Lens
 from coliags_plugin.phantom.layouts.base import Layout, Part
-from coliags_plugin.phantom.layouts.c3vd import write_camera_json
-from coliags_plugin.phantom.layouts.pictures import write_image
 from coliags_plugin.poses import tum
 from coliags_plugin.poses.trajectory import Trajectory
 
@@ -21,7 +21,7 @@ DEPTH_SCALE = 500.0
 _START, _RATE = 1_305_031_102.0, 30.0
 
 
-class RgbdLayout(Layout):
+class RGBDLayout(Layout):
     """Pictures and depth named by their time, groundtruth.txt, camera.json, and the lists that TUM's tools read."""
 
     def write_frame(
@@ -34,26 +34,15 @@ class RgbdLayout(Layout):
         normals: Float[np.ndarray, "H W 3"],
     ) -> None:
         """See :class:`Layout`; normals are not part of this layout."""
-        write_image(folder / "rgb" / f"{_time(index)}.png", color)
-        write_image(folder / "depth" / f"{_time(index)}.png", _encode(z_depth))
+        write_frame(folder, f"{_time(index)}.png", color, z_depth, DEPTH_SCALE)
 
-    def write_sequence(
-        self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], optics: Optics
-    ) -> None:
+    def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
         """See :class:`Layout`."""
         times = [_time(index) for index in range(len(poses))]
         tum.write(folder / "groundtruth.txt", Trajectory(np.stack(poses), timestamps=np.array(times, np.float64)))
-        write_camera_json(folder / "camera.json", optics, depth_scale=DEPTH_SCALE)
-        for kind in ("rgb", "depth"):
-            lines = ["# timestamp filename", *(f"{time} {kind}/{time}.png" for time in times)]
-            (folder / f"{kind}.txt").write_text("\n".join(lines) + "\n")
+        write_camera_json(folder / CAMERA, lens.pinhole, h=lens.height, w=lens.width, depth_scale=DEPTH_SCALE)
+        write_lists(folder, times)
 
 
 def _time(index: int) -> str:
     return f"{_START + index / _RATE:.6f}"
-
-
-def _encode(z_depth: Float[np.ndarray, "H W"]) -> np.ndarray:
-    """16 bits; 0 for none and for what is too far. [H, W]"""
-    steps = np.rint(z_depth * DEPTH_SCALE)
-    return np.where(steps > 65535.0, 0.0, steps).astype(np.uint16)

@@ -1,4 +1,4 @@
-"""Pictures and masks as the scenes made here hold them, and reading pictures that have no poses yet."""
+"""Pictures that have no poses yet."""
 
 from __future__ import annotations
 
@@ -72,20 +72,3 @@ def file_names(names: Sequence[str], suffix: str) -> list[str]:
     if natural_order(plain) != list(range(len(plain))) or len(set(plain)) < len(plain):
         plain = [f"{index:05d}_{name}" for index, name in enumerate(plain)]
     return [f"{name}{suffix}" for name in plain]
-
-
-def write_picture(path: Path, image: UInt8[np.ndarray, "H W 3"]) -> None:
-    """Write RGB as PNG, losslessly, with the folder it is in."""
-    _write_png(path, image[..., ::-1])
-
-
-def write_mask(path: Path, mask: Bool[np.ndarray, "H W"]) -> None:
-    """Write a mask as a black and white PNG."""
-    _write_png(path, mask.astype(np.uint8) * 255)
-
-
-def _write_png(path: Path, pixels: np.ndarray) -> None:
-    import cv2
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(cv2.imencode(".png", np.ascontiguousarray(pixels))[1].tobytes())

@@ -16,15 +16,16 @@ from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder
+from coliags_plugin.core.images import write_mask
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.datamanagers.colmap.writer import write_model
 from coliags_plugin.poses.rigid import inverse
 from coliags_plugin.poses.trajectory import Trajectory
 from coliags_plugin.reconstruction.structure.colmap_database import write_database
-from coliags_plugin.reconstruction.structure.colmap_scene import write_model
 from coliags_plugin.reconstruction.structure.features import Features, FeatureSettings, feature_extractor
 from coliags_plugin.reconstruction.structure.matching import Pairs, all_pairs, mutual_matches, video_pairs
-from coliags_plugin.reconstruction.structure.pictures import file_names, read_mask, read_picture, write_mask
+from coliags_plugin.reconstruction.structure.pictures import file_names, read_mask, read_picture
 from coliags_plugin.reconstruction.structure.quiet import quiet_colmap
 
 if TYPE_CHECKING:
@@ -206,7 +207,7 @@ def write_sfm_scene(
             mask = _mask_of(found.pictures[place], masks)
             if mask is not None:
                 write_mask(scratch / "masks" / f"{found.names[place]}.png", mask)
-        write_model(scratch / "sparse" / "0", found.model)
+        write_model(scratch, found.model)
 
 
 def masks_for(path: Path, pictures: Sequence[Path]) -> Mapping[Path, np.ndarray] | np.ndarray:

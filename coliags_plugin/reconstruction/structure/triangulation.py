@@ -18,7 +18,7 @@ from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.reconstruction.structure.colmap_database import write_database
-from coliags_plugin.reconstruction.structure.colmap_model import colmap_cameras, posed_model
+from coliags_plugin.reconstruction.structure.colmap_model import frame_model
 from coliags_plugin.reconstruction.structure.features import FeatureSettings, feature_extractor
 from coliags_plugin.reconstruction.structure.matching import Pairs, all_pairs, epipolar_matches, video_pairs
 from coliags_plugin.reconstruction.structure.quiet import quiet_colmap
@@ -193,16 +193,17 @@ def triangulate(
             )
         with tempfile.TemporaryDirectory() as scratch:
             database = Path(scratch) / "database.db"
-            cameras, which = colmap_cameras(frames)
+            posed = frame_model(frames)
+            images = [posed.images[number] for number in sorted(posed.images)]
             write_database(
                 database,
-                cameras,
-                [(f"{index}.png", camera) for index, camera in enumerate(which)],
+                [posed.cameras[number] for number in sorted(posed.cameras)],
+                [(image.name, image.camera_id - 1) for image in images],
                 features,
                 matches,
                 verified=True,
             )
-            model = _triangulated(posed_model(frames), database, Path(scratch), frames, settings)
+            model = _triangulated(posed, database, Path(scratch), frames, settings)
     return _result(frames, Tracks.of(model, len(frames)), settings, count)
 
 

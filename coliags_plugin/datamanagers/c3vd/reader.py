@@ -10,8 +10,8 @@ from pydantic import Field
 from coliags_plugin.datamanagers.c3vd.layouts import find_layout, recognise
 from coliags_plugin.datamanagers.c3vd.sequences import SequenceDataManager, SequenceFiles
 from coliags_plugin.datamanagers.reading.camera_json import read_intrinsics
+from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
-from coliags_plugin.datamanagers.views import View
 from coliags_plugin.lenses.models import LENSES
 
 
@@ -47,7 +47,7 @@ class C3VDDataManager(SequenceDataManager):
         """See :class:`SequenceDataManager`."""
         return find_layout(folder)
 
-    def view(self, files: SequenceFiles) -> tuple[View, dict[str, Any]]:
+    def rectification(self, files: SequenceFiles) -> tuple[Rectification, dict[str, Any]]:
         """See :class:`SequenceDataManager`."""
         settings = self.settings
         raw = files.camera is None
@@ -59,5 +59,5 @@ class C3VDDataManager(SequenceDataManager):
         if files.camera is not None:
             pinhole, width, height = read_intrinsics(files.camera)
             size = self.working_size(width, height)
-            return View.of_pinhole(pinhole, width, height, files.camera, size), facts
-        return self.octagon_view(LENSES[settings.lens], files.images[0], settings.mask), facts
+            return Rectification.of_pinhole(pinhole, width, height, files.camera, size), facts
+        return self.octagon_rectification(LENSES[settings.lens], files.images[0], settings.mask), facts

@@ -43,7 +43,7 @@ def fitted(width: int, height: int, within: tuple[int, int] | None) -> tuple[int
 
 
 @dataclass(frozen=True)
-class View:
+class Rectification:
     """How the stored pictures of one camera become working pictures.
 
     Attributes:
@@ -70,8 +70,8 @@ class View:
         size: tuple[int, int],
         focal_scale: float = 1.0,
         shows: Bool[np.ndarray, "H W"] | None = None,
-    ) -> View:
-        """The view of pictures taken through a lens, undistorted to its nominal pinhole.
+    ) -> Rectification:
+        """The rectification of pictures taken through a lens: undistorted to its nominal pinhole.
 
         Args:
             lens: Of the stored pictures, at their size.
@@ -87,8 +87,10 @@ class View:
         return cls(lens.width, lens.height, width, height, pinhole, described_by, undistortion)
 
     @classmethod
-    def of_pinhole(cls, pinhole: Pinhole, width: int, height: int, described_by: Path, size: tuple[int, int]) -> View:
-        """The view of pinhole pictures of a width and height; ``size`` as for :meth:`through`."""
+    def of_pinhole(
+        cls, pinhole: Pinhole, width: int, height: int, described_by: Path, size: tuple[int, int]
+    ) -> Rectification:
+        """The rectification of pinhole pictures of a width and height; ``size`` as for :meth:`through`."""
         working_width, working_height = size
         scaled = pinhole.scaled(working_width / width, working_height / height)
         return cls(width, height, working_width, working_height, scaled, described_by)

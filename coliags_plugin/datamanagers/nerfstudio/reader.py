@@ -12,16 +12,16 @@ from pydantic import Field
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.fusion import load_points
-from coliags_plugin.datamanagers.lens_views import LensView, undistorter
+from coliags_plugin.datamanagers.lens_rectification import LensRectification, undistorter
 from coliags_plugin.datamanagers.nerfstudio.cameras import PinholeCamera, PixelCenters
 from coliags_plugin.datamanagers.nerfstudio.files import FILE, Entry, Transforms
 from coliags_plugin.datamanagers.reading.depth_arrays import depth_format
 from coliags_plugin.datamanagers.reading.picture_names import others_beside, short_names, warn_of_others
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
+from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
 from coliags_plugin.datamanagers.seen import seen_marks
-from coliags_plugin.datamanagers.views import View
 from coliags_plugin.lenses.models import Lens
 from coliags_plugin.poses import nerfstudio as nerfstudio_poses
 
@@ -76,7 +76,7 @@ class NerfstudioDataManager(RecordedDataManager):
         camera_to_world = trajectory.camera_to_world.copy()
         camera_to_world[:, :3, 3] *= settings.scale
         depth_unit = self._depth_unit(transforms)
-        views = self._views(entries, file)
+        rectifications = self._rectifications(entries, file)
         images = [entry.image for entry in entries]
         others = [found for entry in entries for found in (entry.depth, entry.mask)]
         unposed = others_beside(images, others)
@@ -86,22 +86,22 @@ class NerfstudioDataManager(RecordedDataManager):
             Shot(
                 short,
                 entry.image,
-                views[entry.camera],
+                rectifications[entry.camera],
                 pose,
                 entry.depth,
                 None if entry.depth is None else depth_format(entry.depth, depth_unit),
                 entry.mask,
-                seen.get(place),
+                seen.get(index),
             )
-            for place, (short, entry, pose) in enumerate(zip(short_names(names), entries, camera_to_world, strict=True))
+            for index, (short, entry, pose) in enumerate(zip(short_names(names), entries, camera_to_world, strict=True))
         ]
-        lenses = sorted({type(camera).__name__ for camera in views})
+        lenses = sorted({type(camera).__name__ for camera in rectifications})
         facts: dict[str, Any] = {
             "layout": "nerfstudio",
             "lens": ", ".join(lenses),
-            "focal_scale": settings.focal_scale if any(isinstance(camera, Lens) for camera in views) else None,
-            "cameras": len(views),
-            **next(iter(views.values())).facts(),
+            "focal_scale": settings.focal_scale if any(isinstance(camera, Lens) for camera in rectifications) else None,
+            "cameras": len(rectifications),
+            **next(iter(rectifications.values())).facts(),
             "scale": settings.scale,
             "depth_unit": depth_unit if shots[0].depth is not None else None,
             "pixel_centers_in_file": settings.pixel_centers,
@@ -129,16 +129,16 @@ class NerfstudioDataManager(RecordedDataManager):
                 return factor * self.settings.scale
         return 1.0
 
-    def _views(self, entries: list[Entry], file: Path) -> dict[Lens | PinholeCamera, View]:
+    def _rectifications(self, entries: list[Entry], file: Path) -> dict[Lens | PinholeCamera, Rectification]:
         focal_scale, undistort = self.settings.focal_scale, undistorter()
 
-        def view(camera: Lens | PinholeCamera) -> View:
+        def rectification(camera: Lens | PinholeCamera) -> Rectification:
             size = self.working_size(camera.width, camera.height)
             if isinstance(camera, PinholeCamera):
-                return View.of_pinhole(camera.pinhole, camera.width, camera.height, file, size)
-            return LensView.of(camera, file, size, focal_scale, undistort)
+                return Rectification.of_pinhole(camera.pinhole, camera.width, camera.height, file, size)
+            return LensRectification.of(camera, file, size, focal_scale, undistort)
 
-        return {camera: view(camera) for camera in dict.fromkeys(entry.camera for entry in entries)}
+        return {camera: rectification(camera) for camera in dict.fromkeys(entry.camera for entry in entries)}
 
     def _own_points(self, path: Path, transforms: Transforms) -> tuple[Callable[[], PointCloud] | None, Path | None]:
         """The points of ``ply_file_path``, in the file's world, or else of ``points3D.ply``, in the scene's."""

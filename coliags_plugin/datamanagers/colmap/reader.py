@@ -14,14 +14,14 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud, SparseDepth
 from coliags_plugin.datamanagers.colmap.files import Model, Picture, beside, find_models, read_model
 from coliags_plugin.datamanagers.colmap.lens import PINHOLES, ColmapLens
-from coliags_plugin.datamanagers.lens_views import LensView, undistorter
+from coliags_plugin.datamanagers.lens_rectification import LensRectification, undistorter
 from coliags_plugin.datamanagers.reading.depth_arrays import depth_format
 from coliags_plugin.datamanagers.reading.picture_names import first_few, others_beside, short_names, warn_of_others
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
+from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
 from coliags_plugin.datamanagers.seen import seen_marks
-from coliags_plugin.datamanagers.views import View
 
 log = logging.getLogger(__name__)
 
@@ -88,28 +88,28 @@ class ColmapDataManager(RecordedDataManager):
         images = _pictures_on_disk(path / settings.images_folder, model)
         masks = [beside(path / "masks", picture.name, (".png",)) for picture in model.pictures]
         depths = _depths(path / "depths", model)
-        views = self._views(model)
+        rectifications = self._rectifications(model)
         names = short_names([picture.name for picture in model.pictures])
         others = others_beside(images, (*masks, *depths))
         warn_of_others(model.files[1], others)
         seen = seen_marks(path / "truth", len(images), complete=not others)
         shots, used = [], 0
-        for place, picture in enumerate(model.pictures):
-            camera_to_world = model.camera_to_world[place].copy()
+        for index, picture in enumerate(model.pictures):
+            camera_to_world = model.camera_to_world[index].copy()
             camera_to_world[:3, 3] *= settings.scale
-            view, depth = views[picture.camera], depths[place]
-            sparse = self._sparse_depth(model, picture, camera_to_world, view)
+            rectification, depth = rectifications[picture.camera], depths[index]
+            sparse = self._sparse_depth(model, picture, camera_to_world, rectification)
             used += 0 if sparse is None else len(sparse.depth)
             shots.append(
                 Shot(
-                    names[place],
-                    images[place],
-                    view,
+                    names[index],
+                    images[index],
+                    rectification,
                     camera_to_world,
                     depth,
                     None if depth is None else depth_format(depth, settings.depth_unit),
-                    masks[place],
-                    seen.get(place),
+                    masks[index],
+                    seen.get(index),
                     sparse,
                 )
             )
@@ -119,8 +119,8 @@ class ColmapDataManager(RecordedDataManager):
             "model": str(model.folder),
             "lens": ", ".join(kinds),
             "focal_scale": settings.focal_scale if set(kinds) - PINHOLES else None,
-            "cameras": len(views),
-            **next(iter(views.values())).facts(),
+            "cameras": len(rectifications),
+            **next(iter(rectifications.values())).facts(),
             "scale": settings.scale,
             "sparse_points": len(model.positions),
             "observations": sum(len(picture.points) for picture in model.pictures),
@@ -152,19 +152,19 @@ class ColmapDataManager(RecordedDataManager):
             log.warning("reading %s; there are further models, which datamanager.model chooses: %s", found[0], others)
         return found[0]
 
-    def _views(self, model: Model) -> dict[int, View]:
+    def _rectifications(self, model: Model) -> dict[int, Rectification]:
         focal_scale, undistort = self.settings.focal_scale, undistorter()
 
-        def view(lens: ColmapLens) -> View:
+        def rectification(lens: ColmapLens) -> Rectification:
             size = self.working_size(lens.width, lens.height)
             if lens.model in PINHOLES:
-                return View.of_pinhole(lens.pinhole, lens.width, lens.height, model.cameras_file, size)
-            return LensView.of(lens, model.cameras_file, size, focal_scale, undistort)
+                return Rectification.of_pinhole(lens.pinhole, lens.width, lens.height, model.cameras_file, size)
+            return LensRectification.of(lens, model.cameras_file, size, focal_scale, undistort)
 
-        return {number: view(lens) for number, lens in model.cameras.items()}
+        return {number: rectification(lens) for number, lens in model.cameras.items()}
 
     def _sparse_depth(
-        self, model: Model, picture: Picture, camera_to_world: np.ndarray, view: View
+        self, model: Model, picture: Picture, camera_to_world: np.ndarray, rectification: Rectification
     ) -> SparseDepth | None:
         """Depth where the points project to, which many pictures agree on, not where this one picture saw them."""
         settings, lens = self.settings, model.cameras[picture.camera]
@@ -172,10 +172,14 @@ class ColmapDataManager(RecordedDataManager):
         local = (points - camera_to_world[:3, 3]) @ camera_to_world[:3, :3]
         with np.errstate(divide="ignore", invalid="ignore"):
             error = np.linalg.norm(lens.project(local) + 0.5 - picture.observed, axis=1)
-            fx, fy, cx, cy = view.pinhole
+            fx, fy, cx, cy = rectification.pinhole
             pixels = local[:, :2] / local[:, 2:] * (fx, fy) + (cx + 0.5, cy + 0.5)
             kept = (error <= settings.max_reprojection_error) & (local[:, 2] > 0.0)
-            kept &= (pixels >= 0.0).all(axis=1) & (pixels[:, 0] < view.width) & (pixels[:, 1] < view.height)
+            kept &= (
+                (pixels >= 0.0).all(axis=1)
+                & (pixels[:, 0] < rectification.width)
+                & (pixels[:, 1] < rectification.height)
+            )
         kept &= model.track_lengths[picture.points] >= settings.min_track_length
         # A point that was seen twice in one picture still has one depth there.
         kept[kept] = _first_of_each(picture.points[kept])

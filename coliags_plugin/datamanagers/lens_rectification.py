@@ -1,7 +1,7 @@
-"""Views of pictures from many lenses, each undistorted when it is read.
+"""Rectification of pictures from many lenses, each undistorted when it is read.
 
-A :class:`View` of its own for every camera would hold its undistortion maps for as long as the scene lives: some 10 MB
-each, and COLMAP likes to give every picture a camera.
+A :class:`Rectification` of its own for every camera would hold its undistortion maps for as long as the scene lives:
+some 10 MB each, and COLMAP likes to give every picture a camera.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Shaped, UInt8
 
-from coliags_plugin.datamanagers.views import View
+from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.lenses.models import Lens, Pinhole
 from coliags_plugin.lenses.undistortion import Undistortion
 
@@ -30,12 +30,12 @@ def undistorter() -> Undistorter:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LensView(View):
-    """A view through a lens that holds no maps.
+class LensRectification(Rectification):
+    """A rectification of pictures through a lens that holds no maps.
 
     Attributes:
         lens: Of the stored pictures.
-        undistort: Where its undistortion comes from, shared by the views of a scene.
+        undistort: Where its undistortion comes from, shared by those of a scene.
     """
 
     lens: Lens
@@ -44,8 +44,8 @@ class LensView(View):
     @classmethod
     def of(
         cls, lens: Lens, described_by: Path, size: tuple[int, int], focal_scale: float, undistort: Undistorter
-    ) -> LensView:
-        """As :meth:`View.through`."""
+    ) -> LensRectification:
+        """As :meth:`Rectification.through`."""
         width, height = size
         nominal = lens.scaled(width, height).pinhole
         return cls(
@@ -60,21 +60,21 @@ class LensView(View):
         )
 
     def image(self, rgb: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w 3"]:
-        """See :class:`View`."""
+        """See :class:`Rectification`."""
         return self._made.image(rgb)
 
     def nearest(self, values: Shaped[np.ndarray, "H W"]) -> Shaped[np.ndarray, "h w"]:
-        """See :class:`View`."""
+        """See :class:`Rectification`."""
         return self._made.nearest(values, 0)
 
     def pixels(self, stored: Float[np.ndarray, "K 2"]) -> Float[np.ndarray, "K 2"]:
-        """See :class:`View`."""
+        """See :class:`Rectification`."""
         fx, fy, cx, cy = self.pinhole
         return np.asarray(self.lens.unproject(stored)[:, :2] * (fx, fy) + (cx, cy))
 
     @property
     def valid(self) -> Bool[np.ndarray, "h w"] | None:
-        """See :class:`View`."""
+        """See :class:`Rectification`."""
         valid = self._made.valid
         return None if valid.all() else valid
 

@@ -26,10 +26,10 @@ from coliags_plugin.datamanagers.reading.images import bits_of, size_of
 from coliags_plugin.datamanagers.reading.ply_vertices import read_vertices
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, check_pose_count
+from coliags_plugin.datamanagers.rectification import ASPECT_TOLERANCE, Rectification
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
 from coliags_plugin.datamanagers.seen import ROTATION, seen_marks
 from coliags_plugin.datamanagers.splits import Split
-from coliags_plugin.datamanagers.views import ASPECT_TOLERANCE, View
 from coliags_plugin.lenses.models import Pinhole
 from coliags_plugin.poses.c3vd import read_poses
 from coliags_plugin.poses.endogslam import EndoGslamParams, read_params
@@ -42,7 +42,7 @@ PREPARED_DEPTH = DepthSteps(100.0 / 255.0, 8, 255)
 #: How far a principal point may be from the middle, as a share of the picture; prepared pictures have 0.7 %.
 MIDDLE_TOLERANCE = 0.1
 #: Value of the first spherical harmonic: the colour of a 3DGS PLY is this times f_dc, plus a half.
-_SH0 = 0.28209479177387814
+SH0 = 0.28209479177387814
 
 
 class C3VDEndoGSLAMSettings(SceneSettings):
@@ -87,7 +87,7 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
         files = find_sequence(folder, self.settings.params_file)
         params = None if files.params is None else read_params(files.params)
         placement = place_sequence(files, params, self.settings.poses)
-        view = self._view(files, params)
+        rectification = self._rectification(files, params)
         depth_format = _depth_format(files)
         facts: dict[str, Any] = {
             "layout": "endogslam" if files.cloud is None else "pr-endo",
@@ -95,13 +95,13 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
             **placement.facts,
             "intrinsics_from": "EndoGSLAM's table" if files.params is None else str(files.params),
             "depth_step_mm": None if depth_format is None else depth_format.size,
-            **view.facts(),
+            **rectification.facts(),
         }
         seen = seen_marks(folder / "truth", len(files.images))
-        shots = _shots(files, view, placement.camera_to_world, depth_format, seen)
+        shots = _shots(files, rectification, placement.camera_to_world, depth_format, seen)
         test_sets = {}
         if (folder / ROTATION).is_dir():
-            test_sets[ROTATION] = self._rotation(folder / ROTATION, view, placement)
+            test_sets[ROTATION] = self._rotation(folder / ROTATION, rectification, placement)
         points_source = files.cloud or (files.params if params is not None and len(params.means) else None)
         return Recording(
             kind=f"{facts['layout']} layout, {self.settings.poses} poses",
@@ -113,7 +113,7 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
             points_source=points_source or folder / PARAMS,
         )
 
-    def _view(self, files: PreparedFiles, params: EndoGslamParams | None) -> View:
+    def _rectification(self, files: PreparedFiles, params: EndoGslamParams | None) -> Rectification:
         width, height = size_of(files.images[0])
         pinhole, (calibrated_width, calibrated_height) = PREPARED_PINHOLE, PREPARED_SIZE
         described_by: Path | str = "EndoGSLAM's calibration"
@@ -137,9 +137,9 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
                 "intrinsics of the size that org_width and org_height say",
                 "They are of another resolution: mend org_width and org_height, or the intrinsics",
             )
-        return View.of_pinhole(pinhole, width, height, files.images[0], self.working_size(width, height))
+        return Rectification.of_pinhole(pinhole, width, height, files.images[0], self.working_size(width, height))
 
-    def _rotation(self, folder: Path, view: View, placement: Placement) -> list[Shot]:
+    def _rotation(self, folder: Path, rectification: Rectification, placement: Placement) -> list[Shot]:
         files = find_sequence(folder, None)
         if files.poses is None or placement.from_file is None:
             raise InputError(
@@ -150,12 +150,12 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
         poses = read_poses(files.poses).camera_to_world
         check_pose_count(files.poses, len(poses), len(files.images))
         seen = seen_marks(folder, len(files.images))
-        return _shots(files, view, placement.from_file @ poses, _depth_format(files), seen, f"{ROTATION}-")
+        return _shots(files, rectification, placement.from_file @ poses, _depth_format(files), seen, f"{ROTATION}-")
 
 
 def _shots(
     files: PreparedFiles,
-    view: View,
+    rectification: Rectification,
     camera_to_world: Float[np.ndarray, "N 4 4"],
     depth_format: DepthFormat | None,
     seen: Mapping[int, Path],
@@ -163,8 +163,8 @@ def _shots(
 ) -> list[Shot]:
     depths: Sequence[Path | None] = files.depths or (None,) * len(files.images)
     return [
-        Shot(prefix + image.stem, image, view, pose, depth, depth_format, seen=seen.get(place))
-        for place, (image, depth, pose) in enumerate(zip(files.images, depths, camera_to_world, strict=True))
+        Shot(prefix + image.stem, image, rectification, pose, depth, depth_format, seen=seen.get(index))
+        for index, (image, depth, pose) in enumerate(zip(files.images, depths, camera_to_world, strict=True))
     ]
 
 
@@ -181,7 +181,7 @@ def _map_points(cloud: Path | None, params: EndoGslamParams | None, placement: P
         names = tuple(f"f_dc_{channel}" for channel in range(3))
         vertices = read_vertices(cloud, ("x", "y", "z", *names))
         positions = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float64)
-        shares = _SH0 * np.stack([vertices[name] for name in names], axis=1) + 0.5
+        shares = SH0 * np.stack([vertices[name] for name in names], axis=1) + 0.5
     elif params is not None:
         positions, shares = params.means, params.rgb_colors
     else:

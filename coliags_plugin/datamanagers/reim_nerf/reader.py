@@ -14,11 +14,11 @@ from coliags_plugin.datamanagers.reading.images import read_mask
 from coliags_plugin.datamanagers.reading.picture_names import others_beside, warn_of_others
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
+from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.datamanagers.reim_nerf.files import RayDistance, Sequence, ray_cosines, read_sequence, recognise
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
 from coliags_plugin.datamanagers.seen import seen_marks
 from coliags_plugin.datamanagers.splits import Split
-from coliags_plugin.datamanagers.views import View
 
 MASK_FILE = "rgb_mask.png"
 
@@ -63,15 +63,23 @@ class ReimNerfDataManager(RecordedDataManager):
         file, lens = sequence.files["train"], sequence.lens
         mask = path / MASK_FILE if settings.mask else None
         shows = None if mask is None else _shows(mask, lens.width, lens.height)
-        view = View.through(lens, file, self.working_size(lens.width, lens.height), settings.focal_scale, shows)
+        rectification = Rectification.through(
+            lens, file, self.working_size(lens.width, lens.height), settings.focal_scale, shows
+        )
         size = sequence.distmap_scale / 65535.0 / sequence.scene_scale
-        form = RayDistance(size, view.nearest(ray_cosines(lens)))
+        form = RayDistance(size, rectification.nearest(ray_cosines(lens)))
         seen = seen_marks(path / "truth", len(sequence.frames))
         shots = [
             Shot(
-                frame.image.stem, frame.image, view, frame.camera_to_world, frame.distances, form, seen=seen.get(place)
+                frame.image.stem,
+                frame.image,
+                rectification,
+                frame.camera_to_world,
+                frame.distances,
+                form,
+                seen=seen.get(index),
             )
-            for place, frame in enumerate(sequence.frames)
+            for index, frame in enumerate(sequence.frames)
         ]
         large = [found for frame in sequence.frames for found in (frame.image, frame.distances)]
         warn_of_others(path, others_beside([frame.image for frame in sequence.frames], large))
@@ -79,19 +87,19 @@ class ReimNerfDataManager(RecordedDataManager):
         return Recording(
             kind="REIM-NeRF layout",
             shots=shots,
-            facts=self._facts(sequence, view),
+            facts=self._facts(sequence, rectification),
             fingerprint=fingerprint(path, large, (*sequence.files.values(), mask)),
             own_split={"train": parts["train"], "test": parts.get("true_test", ())},
         )
 
-    def _facts(self, sequence: Sequence, view: View) -> dict[str, Any]:
+    def _facts(self, sequence: Sequence, rectification: Rectification) -> dict[str, Any]:
         return {
             "layout": "REIM-NeRF",
             "lens": "fisheye of the JSON files",
             "focal_scale": self.settings.focal_scale,
             "mask": MASK_FILE if self.settings.mask else None,
-            **view.facts(),
-            "parts": {part: len(places) for part, places in sequence.parts.items()},
+            **rectification.facts(),
+            "parts": {part: len(indices) for part, indices in sequence.parts.items()},
             "pose_convention": {
                 "order": "camera-to-world, OpenGL axes, normalised",
                 "scene_scale": sequence.scene_scale,

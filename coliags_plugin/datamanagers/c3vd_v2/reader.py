@@ -11,9 +11,9 @@ from pydantic import Field
 from coliags_plugin.datamanagers.c3vd.sequences import SequenceDataManager, SequenceFiles
 from coliags_plugin.datamanagers.c3vd_v2.files import INTRINSICS, find_sequence, recognise
 from coliags_plugin.datamanagers.c3vd_v2.lens import CANDIDATE_LENS, read_camera_intrinsics
+from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
 from coliags_plugin.datamanagers.seen import ROTATION
-from coliags_plugin.datamanagers.views import View
 from coliags_plugin.lenses.models import LENSES, Lens
 
 log = logging.getLogger(__name__)
@@ -50,7 +50,7 @@ class C3VDv2DataManager(SequenceDataManager):
         """See :class:`SequenceDataManager`."""
         return find_sequence(folder)
 
-    def view(self, files: SequenceFiles) -> tuple[View, dict[str, Any]]:
+    def rectification(self, files: SequenceFiles) -> tuple[Rectification, dict[str, Any]]:
         """See :class:`SequenceDataManager`."""
         settings = self.settings
         lens, source = self._lens(files)
@@ -60,7 +60,7 @@ class C3VDv2DataManager(SequenceDataManager):
             "focal_scale": settings.focal_scale,
             "mask": "octagon" if settings.mask else None,
         }
-        return self.octagon_view(lens, files.images[0], settings.mask), facts
+        return self.octagon_rectification(lens, files.images[0], settings.mask), facts
 
     def _lens(self, files: SequenceFiles) -> tuple[Lens, str]:
         """The lens, and where its numbers come from."""

@@ -17,6 +17,7 @@ from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.reading.depth_formats import DepthSteps
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
+from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.datamanagers.rgbd.association import by_number, is_time, nearest_in_time, times
 from coliags_plugin.datamanagers.rgbd.files import (
     CameraFile,
@@ -31,7 +32,6 @@ from coliags_plugin.datamanagers.rgbd.files import (
 )
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
 from coliags_plugin.datamanagers.seen import seen_marks
-from coliags_plugin.datamanagers.views import View
 from coliags_plugin.poses import tum
 from coliags_plugin.poses.trajectory import Trajectory
 
@@ -101,7 +101,7 @@ class RGBDDataManager(RecordedDataManager):
         scale = self._depth_scale(camera, path) if depths else None
         form = None if scale is None else DepthSteps(1.0 / scale)
         size = self.working_size(camera.width, camera.height)
-        view = View.of_pinhole(camera.pinhole, camera.width, camera.height, camera.path, size)
+        rectification = Rectification.of_pinhole(camera.pinhole, camera.width, camera.height, camera.path, size)
         complete = len(frames.pictures) == len(pictures) == len(trajectory)
         seen = seen_marks(path / "truth", len(pictures), complete)
         masks = find_masks(path, frames.pictures)
@@ -109,14 +109,14 @@ class RGBDDataManager(RecordedDataManager):
             Shot(
                 picture.stem,
                 picture,
-                view,
+                rectification,
                 trajectory.camera_to_world[pose],
                 depth,
                 form,
                 mask=masks.get(picture.stem),
-                seen=seen.get(place),
+                seen=seen.get(index),
             )
-            for place, (picture, depth, pose) in enumerate(
+            for index, (picture, depth, pose) in enumerate(
                 zip(frames.pictures, frames.depths, frames.poses, strict=True)
             )
         ]
@@ -127,7 +127,7 @@ class RGBDDataManager(RecordedDataManager):
             "depth_scale": scale,
             "association": frames.facts,
             "masks": len(masks),
-            **view.facts(),
+            **rectification.facts(),
             "pose_convention": None
             if file is None
             else {
@@ -250,10 +250,10 @@ class RGBDDataManager(RecordedDataManager):
         named = np.array([key[0] if len(key) == 1 else -1 for key in numbered], np.float64)
         agrees = named == trajectory.timestamps
         if 0.5 < agrees.mean() < 1.0 or (set(named) == set(trajectory.timestamps) and not agrees.all()):
-            place = int(np.argmin(agrees))
+            index = int(np.argmin(agrees))
             raise InputError(
-                f"{file}: pose {place} is of time {trajectory.timestamps[place]:g}, but picture {place} is "
-                f"{list(numbered.values())[place].name}",
+                f"{file}: pose {index} is of time {trajectory.timestamps[index]:g}, but picture {index} is "
+                f"{list(numbered.values())[index].name}",
                 "line n for picture n, or the times as names",
                 "Set association: time if the names are the times, or order if the times mean nothing",
             )

@@ -15,13 +15,13 @@ from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
+from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.datamanagers.rotatecolon.depth_scale import fit_scale
 from coliags_plugin.datamanagers.rotatecolon.exr_depth import ExrDepth
 from coliags_plugin.datamanagers.rotatecolon.files import POINTS, ViewFiles, find_test, find_train, recognise
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
 from coliags_plugin.datamanagers.seen import ROTATION, seen_marks
 from coliags_plugin.datamanagers.splits import Split
-from coliags_plugin.datamanagers.views import View
 from coliags_plugin.lenses.models import Pinhole
 
 log = logging.getLogger(__name__)
@@ -108,19 +108,21 @@ class RotateColonDataManager(RecordedDataManager):
         focal = 0.5 * width / math.tan(0.5 * files.angle)
         # In the middle of the picture; the corner of its first pixel lies at -0.5.
         pinhole = Pinhole(focal, focal, 0.5 * width - 0.5, 0.5 * height - 0.5)
-        view = View.of_pinhole(pinhole, width, height, files.images[0], self.working_size(width, height))
+        rectification = Rectification.of_pinhole(
+            pinhole, width, height, files.images[0], self.working_size(width, height)
+        )
         depth_format = ExrDepth(settings.depth_channel, settings.depth_divisor)
         depths = files.depths or (None,) * len(files.images)
         shots = [
-            Shot(prefix + image.stem, image, view, pose, depth, depth_format, seen=(seen or {}).get(place))
-            for place, (image, depth, pose) in enumerate(zip(files.images, depths, files.camera_to_world, strict=True))
+            Shot(prefix + image.stem, image, rectification, pose, depth, depth_format, seen=(seen or {}).get(index))
+            for index, (image, depth, pose) in enumerate(zip(files.images, depths, files.camera_to_world, strict=True))
         ]
         facts = {
             "layout": "rotatecolon",
             "transforms": files.transforms.name,
             "pictures_without_pose": files.unposed,
             "depth_divisor": None if files.depths is None else settings.depth_divisor,
-            **view.facts(),
+            **rectification.facts(),
             "pose_convention": "camera-to-world, OpenGL axes",
         }
         return shots, facts

@@ -1,0 +1,85 @@
+"""Writing C3VD as EndoGSLAM prepares it, and EndoGSLAM's and 3DGS's results (docs/layouts/c3vd-endogslam.md)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from coliags_plugin.core.images import write_image
+from coliags_plugin.core.ply import point_properties, write_ply
+from coliags_plugin.datamanagers.c3vd_endogslam.reader import PREPARED_DEPTH, SH0
+from coliags_plugin.poses import endogslam
+from coliags_plugin.poses.rigid import inverse
+from coliags_plugin.poses.trajectory import Trajectory
+
+#: Standard deviation of the map's Gaussians, scene units (mm).
+_SIZE = 0.3
+
+
+def write_frame(folder: Path, index: int, image: UInt8[np.ndarray, "H W 3"], z_depth: Float[np.ndarray, "H W"]) -> None:
+    """Write a picture and its depth, in 8 bits, cut off below as EndoGSLAM's script does it.
+
+    Args:
+        folder: Of the sequence.
+        index: Of the frame, counted from 0.
+        image: RGB. [H, W, 3]
+        z_depth: mm; 0 where unknown. [H, W]
+    """
+    steps = np.clip(np.floor(z_depth / PREPARED_DEPTH.size), 0.0, 255.0).astype(np.uint8)
+    write_image(folder / "color" / f"{index:04d}_color.png", image)
+    write_image(folder / "depth" / f"{index:04d}_depth.tiff", steps)
+
+
+def write_params(
+    path: Path, trajectory: Trajectory, positions: Float[np.ndarray, "N 3"], colors: UInt8[np.ndarray, "N 3"]
+) -> Float[np.ndarray, "N 3"]:
+    """Write ``params.npz``: EndoGSLAM's result, had it found these poses and a round Gaussian at every point.
+
+    Args:
+        path: Where to.
+        trajectory: Poses, mm, with intrinsics; the first is EndoGSLAM's world.
+        positions: What becomes the map, world frame, mm. [N, 3]
+        colors: RGB. [N, 3]
+
+    Returns:
+        The map's points in its world, mm. [N, 3]
+
+    Raises:
+        InputError: The trajectory has no intrinsics, or the folder cannot be written.
+    """
+    endogslam.write(path, trajectory)
+    with np.load(path) as file:
+        arrays = dict(file)
+    to_first = inverse(trajectory.camera_to_world[:1])[0]
+    means = positions @ to_first[:3, :3].T + to_first[:3, 3]
+    count = len(means)
+    arrays |= {
+        "means3D": means.astype(np.float32),
+        "rgb_colors": (colors / 255.0).astype(np.float32),
+        "unnorm_rotations": np.tile(np.array([1.0, 0.0, 0.0, 0.0], np.float32), (count, 1)),
+        "logit_opacities": np.full((count, 1), 4.0, np.float32),
+        "log_scales": np.full((count, 1), np.log(_SIZE), np.float32),
+        "timestep": np.zeros(count, np.float32),
+    }
+    np.savez(path, allow_pickle=False, **arrays)
+    return np.asarray(means)
+
+
+def write_gaussians(path: Path, positions: Float[np.ndarray, "N 3"], colors: UInt8[np.ndarray, "N 3"]) -> None:
+    """Write equal, round Gaussians as a PLY of 3D Gaussian splatting, of the lowest degree.
+
+    Args:
+        path: Where to.
+        positions: Means, in the world of ``params.npz``, mm. [N, 3]
+        colors: RGB. [N, 3]
+    """
+    count = len(positions)
+    properties = point_properties(positions)
+    properties |= {f"n{name}": np.zeros(count) for name in "xyz"}
+    properties |= {f"f_dc_{channel}": (colors[:, channel] / 255.0 - 0.5) / SH0 for channel in range(3)}
+    properties |= {"opacity": np.full(count, 4.0)}
+    properties |= {f"scale_{axis}": np.full(count, -1.2) for axis in range(3)}
+    properties |= {f"rot_{axis}": np.full(count, float(axis == 0)) for axis in range(4)}
+    write_ply(path, properties)

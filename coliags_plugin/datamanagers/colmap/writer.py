@@ -1,0 +1,85 @@
+"""Writing COLMAP's layout: pictures, masks and a sparse model (docs/layouts/colmap.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from coliags_plugin.core.files import make_folder
+from coliags_plugin.core.images import write_image, write_mask
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+class SeenPoints(NamedTuple):
+    """What one picture sees of a model's points.
+
+    Attributes:
+        pixels: Column and row, pixel centres at integers + 0.5. [K, 2]
+        points: Which points, counted from 0. [K]
+    """
+
+    pixels: Float[np.ndarray, "K 2"]
+    points: Int[np.ndarray, "K"]
+
+
+def write_picture(
+    folder: Path, name: str, image: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"] | None = None
+) -> None:
+    """Write a picture and, where there is one, its mask.
+
+    Args:
+        folder: Of the scene.
+        name: The picture's file name, ending in ``.png``.
+        image: RGB. [H, W, 3]
+        mask: True where a pixel counts. [H, W]
+    """
+    write_image(folder / "images" / name, image)
+    if mask is not None:
+        write_mask(folder / "masks" / name, mask)
+
+
+def add_points(
+    model: pycolmap.Reconstruction,
+    seen: Sequence[SeenPoints],
+    positions: Float[np.ndarray, "N 3"],
+    colors: UInt8[np.ndarray, "N 3"],
+    errors: Float[np.ndarray, "N"] | None = None,
+) -> None:
+    """Add points to a model of posed pictures; point k becomes COLMAP's k + 1.
+
+    Args:
+        model: Whose image i + 1 is picture i.
+        seen: By each picture.
+        positions: World, scene units. [N, 3]
+        colors: RGB. [N, 3]
+        errors: Mean reprojection errors, pixels; None: to be computed. [N]
+    """
+    import pycolmap
+
+    tracks = [pycolmap.Track() for _ in range(len(positions))]
+    for number, here in enumerate(seen, start=1):
+        model.images[number].points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in here.pixels])
+        for index, point in enumerate(here.points):
+            tracks[point].add_element(number, index)
+    numbers = [
+        model.add_point3D(position, track, color)
+        for position, track, color in zip(positions, tracks, colors, strict=True)
+    ]
+    if errors is None:
+        model.update_point_3d_errors()
+        return
+    for number, error in zip(numbers, errors, strict=True):
+        model.points3D[number].error = float(error)
+
+
+def write_model(folder: Path, model: pycolmap.Reconstruction) -> None:
+    """Write a binary model into ``sparse/0`` of a scene's folder."""
+    place = folder / "sparse" / "0"
+    make_folder(place)
+    model.write_binary(str(place))
