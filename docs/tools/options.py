@@ -146,7 +146,7 @@ def default_text(field: FieldInfo) -> str:
     """The default as YAML writes it; nothing where a value must be given."""
     if field.is_required():
         return "required"
-    value = field.get_default(call_default_factory=True)
+    value = field.default if field.default_factory is None else {}  # of entries, the only ones with a factory
     if isinstance(value, Settings):
         return "as below"
     if isinstance(value, str):
