@@ -13,6 +13,7 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "coliags_plugin"
 #: Pages of the repository's root, by their place in the site.
 FROM_ROOT = {"index.md": "README.md", "contributing.md": "CONTRIBUTING.md", "changelog.md": "CHANGELOG.md"}
+STYLE = ".md-typeset td:first-child code { white-space: nowrap; }\n"
 
 
 def on_config(config: Any, **_: Any) -> Any:
@@ -28,6 +29,7 @@ def on_files(files: Files, config: Any, **_: Any) -> Files:
     """Called by mkdocs when it has found the pages of docs/."""
     for page, name in FROM_ROOT.items():
         files.append(File.generated(config, page, content=for_site((ROOT / name).read_text(encoding="utf-8"))))
+    files.append(File.generated(config, "site.css", content=STYLE))
     for page, content in reference():
         files.append(File.generated(config, page, content=content))
     return files
