@@ -2,11 +2,12 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
+PYTHONS ?= 3.10 3.11 3.12 3.13
 DEMO ?= demo
 DEMO_STEPS ?= 1200
 DEMO_FLAGS := --data $(DEMO)/phantom --steps $(DEMO_STEPS) --overwrite
 
-.PHONY: demo test test-slow lint install system clean
+.PHONY: demo test test-slow lint docs options matrix install system clean
 
 demo: install
 	$(BIN)/coliags phantom $(DEMO)/phantom --seed 0 --overwrite
@@ -29,12 +30,35 @@ lint: install
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# The site, from docs/, README, CONTRIBUTING and docstrings, in build/site.
+docs: install $(VENV)/installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict --config-file docs/tools/mkdocs.yml
+	@echo "built build/site/index.html"
+
+# docs/options.md, from the settings classes.
+options: install
+	$(BIN)/python docs/tools/options.py
+
+# The test suite on every Python that is here.
+matrix:
+	@for version in $(PYTHONS); do \
+	  if command -v python$$version >/dev/null && python$$version -V >/dev/null 2>&1; then \
+	    $(MAKE) test PYTHON=python$$version VENV=build/venv-$$version || exit 1; \
+	  else \
+	    echo "python$$version is not here: not tested"; \
+	  fi; \
+	done
+
 install: system $(VENV)/installed
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit("Python 3.10 or newer is needed, not " + sys.version.split()[0] + "; try make PYTHON=python3.11" if sys.version_info < (3, 10) else 0)'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+$(VENV)/installed-docs: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
 	@touch $@
 
 # open3d loads the system's libusb; no Python package brings it.

@@ -9,6 +9,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from runpy import run_path
 from typing import Any
 
 import pytest
@@ -30,12 +31,12 @@ from tests.scenes import SMALL, write_wall
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
 SOURCES = sorted(
     path
     for folder in ("coliags_plugin", "tests", "method_configs", "benchmarks", "docs")
     for path in (ROOT / folder).rglob("*")
-    if path.suffix in (".py", ".yaml", ".md") and path != Path(__file__)
+    if path.suffix in (".py", ".yaml", ".md") and path != Path(__file__) and path.parent != DOCS / "tools"
 )
 
 
@@ -253,7 +254,6 @@ def as_written(value: Any) -> str:
 OPTIONS = "| option | default | values | what |"
 FORMATS = [name for name in datamanagers if datamanagers.source(name) == "built in" and name != "auto"]
 OPTION_TABLES = [
-    (SceneSettings, "data.md", OPTIONS),
     (PhantomSettings, "phantom.md", "| setting | default | range | what |"),
     *((datamanagers.get(name).Settings, f"layouts/{name}.md", OPTIONS) for name in FORMATS),
 ]
@@ -302,17 +302,6 @@ def test_the_table_of_presets_is_the_presets():
         assert told["sideways, mm"][column] == f"{preset.wobble[0]:g} to {preset.wobble[1]:g}"
 
 
-def test_every_component_is_named_in_the_table_of_kinds():
-    told = {row[0]: set(row[1].split(", ")) for row in table_rows("configs.md", "| kind | names |")}
-    assert told.pop("renderers") == {"auto and what it may choose from"}
-    builtin = {
-        kind: {name for name in registry if registry.source(name) == "built in"}
-        for kind, registry in REGISTRIES.items()
-        if kind != "renderers"
-    }
-    assert told == builtin
-
-
 def test_every_key_of_a_method_is_in_the_table():
     told = [row[0] for row in table_rows("configs.md", "| key | what |")]
     assert sorted(told) == sorted(["base", *MethodConfig.model_fields])
@@ -346,6 +335,11 @@ def test_test_frames_of_the_sequences_are_counted_rightly():
     assert sum(frames for frames, _ in counts) == 10_015
     for frames, test in counts:
         assert held_out("every-8th", frames).sum() == test
+
+
+def test_the_page_of_options_is_what_the_settings_say():
+    page = run_path(str(DOCS / "tools" / "options.py"))["page"]()
+    assert (DOCS / "options.md").read_text() == page, "make options"
 
 
 def test_protocols_page_names_every_protocol_metric_and_version():

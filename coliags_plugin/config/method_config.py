@@ -32,8 +32,8 @@ class OptimizerSettings(Settings):
     A constant rate of 0 freezes the group; one that falls needs both ends above 0.
     """
 
-    lr: float = Field(ge=0)
-    final_lr: float | None = Field(default=None, ge=0)
+    lr: float = Field(ge=0)  # at the first step
+    final_lr: float | None = Field(default=None, ge=0)  # at the last step; None: as at the first
     times_extent: bool = False  # multiply both rates by the scene's extent (docs/methods.md 2.1)
 
     @model_validator(mode="after")
@@ -45,26 +45,26 @@ class OptimizerSettings(Settings):
 class ScheduleSettings(Settings):
     """How long to train and how often to write."""
 
-    steps: int = Field(default=30_000, ge=1)
+    steps: int = Field(default=30_000, ge=1)  # of the run
     written_for: int = Field(default=30_000, ge=1)  # run length that step numbers elsewhere in the config mean
-    log_every: int = Field(default=10, ge=1)
-    checkpoint_every: int = Field(default=5_000, ge=1)
+    log_every: int = Field(default=10, ge=1)  # steps between lines of metrics.jsonl
+    checkpoint_every: int = Field(default=5_000, ge=1)  # steps between checkpoints; the last step has one, too
 
 
 class MethodConfig(Settings):
     """A method: named components and their settings. What a run folder's ``config.yaml`` holds."""
 
-    description: str = ""
-    datamanager: DataManagerNode
-    field: FieldNode
-    renderer: RendererNode
-    modules: dict[str, ModuleNode] = Field(default_factory=dict)
-    sampler: SamplerNode = Field(default="frames", validate_default=True)
-    strategy: StrategyNode
-    losses: dict[str, LossNode] = Field(min_length=1)
-    optimizers: dict[str, OptimizerSettings]
-    schedule: ScheduleSettings = ScheduleSettings()
-    protocol: str = "paper"
+    description: str = ""  # one line; not inherited
+    datamanager: DataManagerNode  # reads the data
+    field: FieldNode  # what is trained
+    renderer: RendererNode  # draws it
+    modules: dict[str, ModuleNode] = Field(default_factory=dict)  # what adjusts cameras and shades views, in this order
+    sampler: SamplerNode = Field(default="frames", validate_default=True)  # what each step looks at
+    strategy: StrategyNode  # grows and prunes
+    losses: dict[str, LossNode] = Field(min_length=1)  # terms by a key of your choice
+    optimizers: dict[str, OptimizerSettings]  # rates by parameter group, of all of them
+    schedule: ScheduleSettings = ScheduleSettings()  # how long to train and how often to write
+    protocol: str = "paper"  # how figures are made
 
     @field_validator("losses", "optimizers", "modules", mode="before")
     @classmethod

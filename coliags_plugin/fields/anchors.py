@@ -33,7 +33,7 @@ class AnchorFieldSettings(Settings):
 
     geometry_head: GeometryHeadNode
     appearance_head: AppearanceHeadNode
-    features: int = Option(default=32, ge=1)
+    features: int = Option(default=32, ge=1)  # numbers per anchor that the heads read
     children: int = Option(default=10, ge=1)
     # Edge of a voxel in scene units (mm); null: voxel_pixels times the size of a training pixel on the surface.
     voxel_size: float | None = Option(default=None, gt=0)

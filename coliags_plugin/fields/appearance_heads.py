@@ -22,8 +22,8 @@ class AppearanceSettings(Settings):
     kink over the distances that occur (docs/methods.md 3.4), "pytorch" leaves PyTorch's default start, the paper's.
     """
 
-    hidden: int = Field(default=32, ge=1)
-    bias_init: Literal["scene_distances", "pytorch"] = "scene_distances"
+    hidden: int = Field(default=32, ge=1)  # units of each hidden layer
+    bias_init: Literal["scene_distances", "pytorch"] = "scene_distances"  # as above
 
 
 class PlainAppearanceSettings(AppearanceSettings):
@@ -96,7 +96,7 @@ class PlainAppearanceHead(AppearanceHead):
 class IMIAAppearanceSettings(AppearanceSettings):
     """Options of IMIA."""
 
-    frequencies: int = Field(default=5, ge=0)
+    frequencies: int = Field(default=5, ge=0)  # of gamma, for the cosine
 
 
 class IMIAAppearanceHead(PlainAppearanceHead):

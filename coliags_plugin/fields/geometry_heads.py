@@ -18,7 +18,7 @@ from coliags_plugin.fields.perceptron import first_layer, perceptron
 class PlainGeometrySettings(Settings):
     """Options of the plain geometry head."""
 
-    hidden: int = Field(default=32, ge=1)
+    hidden: int = Field(default=32, ge=1)  # units of each hidden layer
 
 
 class PlainGeometryHead(GeometryHead):
@@ -62,7 +62,7 @@ class PlainGeometryHead(GeometryHead):
 class IMVEGeometrySettings(PlainGeometrySettings):
     """Options of IMVE."""
 
-    frequencies: int = Field(default=10, ge=0)
+    frequencies: int = Field(default=10, ge=0)  # of gamma, per component of the direction
 
 
 class IMVEGeometryHead(PlainGeometryHead):

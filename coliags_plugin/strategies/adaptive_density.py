@@ -22,14 +22,14 @@ _SPLIT_SHRINK = 0.8 * _SPLIT_PARTS
 class AdaptiveDensitySettings(Settings):
     """Options of adaptive density control; the defaults are 3DGS's (docs/methods.md 7.2). Steps scale with the run."""
 
-    densify_from: int = Field(default=500, ge=0)
-    until: int = Field(default=15_000, ge=0)
+    densify_from: int = Field(default=500, ge=0)  # step after which events clone, split and prune
+    until: int = Field(default=15_000, ge=0)  # step before which the last event is
     every: int = Field(default=100, ge=1)  # steps between events, whatever the run's length
     gradient_threshold: float = Field(default=0.0002, gt=0)  # of the centres' gradient, normalised image units
     dense_share: float = Field(default=0.01, gt=0)  # of the extent: larger Gaussians are split, smaller ones cloned
-    min_opacity: float = Field(default=0.005, ge=0)
+    min_opacity: float = Field(default=0.005, ge=0)  # of a Gaussian that stays
     reset_every: int = Field(default=3000, ge=1)  # steps between resets of the opacities, whatever the run's length
-    reset_opacity: float = Field(default=0.01, gt=0, lt=1)
+    reset_opacity: float = Field(default=0.01, gt=0, lt=1)  # the most that a reset leaves
     max_radius: float | None = Field(default=20.0, gt=0)  # pixels; larger ones go after the first reset
     max_scale_share: float | None = Field(default=0.1, gt=0)  # of the extent; likewise
 

@@ -20,12 +20,14 @@ class AnchorGrowthSettings(Settings):
     """Options of anchor growth (docs/methods.md 4.3 says which are Scaffold-GS's). Steps scale with the run."""
 
     statistics_from: int = Field(default=500, ge=0)  # steps; first and last are themselves left out
-    growth_from: int = Field(default=1500, ge=0)
-    until: int = Field(default=15_000, ge=0)
+    growth_from: int = Field(default=1500, ge=0)  # step after which events grow and prune
+    until: int = Field(default=15_000, ge=0)  # step before which the last event is
     every: int = Field(default=100, ge=1)  # steps between events, whatever the run's length
     gradient_threshold: float = Field(default=0.0002, gt=0)  # of the centres' gradient, normalised image units
-    success_share: float = Field(default=0.8, gt=0, le=1)
-    min_opacity: float = Field(default=0.005, ge=0)
+    success_share: float = Field(
+        default=0.8, gt=0, le=1
+    )  # of ``every``: how often seen, to be judged (docs/methods.md 4.3)
+    min_opacity: float = Field(default=0.005, ge=0)  # mean of an anchor's that stays
     levels: int = Field(default=3, ge=1)  # cells of the anchors' spacing, and each further level a quarter of that
     finest_cell: float = Field(default=0.25, ge=0)  # in voxels; finer levels are left out
     pixels_per_birth: int = Field(default=500, ge=1)  # pixels of a view for each birth of an event, strongest first

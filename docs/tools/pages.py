@@ -1,0 +1,68 @@
+"""Pages of the site that are not in docs/: README, CONTRIBUTING, CHANGELOG, and a reference page for every module."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).parents[2]
+PACKAGE = ROOT / "coliags_plugin"
+#: Pages of the repository's root, by their place in the site.
+FROM_ROOT = {"index.md": "README.md", "contributing.md": "CONTRIBUTING.md", "changelog.md": "CHANGELOG.md"}
+STYLE = ".md-typeset td:first-child code { white-space: nowrap; }\n"
+
+
+def on_config(config: Any, **_: Any) -> Any:
+    """Called by mkdocs first: a section of the reference for each package."""
+    parts: dict[str, list[str]] = {}
+    for name in modules():
+        parts.setdefault(".".join(name.split(".")[:2]), []).append(f"reference/{name}.md")
+    config.nav.append({"Reference": ["reference/index.md", *({part: pages} for part, pages in parts.items())]})
+    return config
+
+
+def on_files(files: Files, config: Any, **_: Any) -> Files:
+    """Called by mkdocs when it has found the pages of docs/."""
+    for page, name in FROM_ROOT.items():
+        files.append(File.generated(config, page, content=for_site((ROOT / name).read_text(encoding="utf-8"))))
+    files.append(File.generated(config, "site.css", content=STYLE))
+    for page, content in reference():
+        files.append(File.generated(config, page, content=content))
+    return files
+
+
+def for_site(text: str) -> str:
+    """A page of the root with links as they are inside docs/."""
+    text = re.sub(r"\]\(docs/([^)]+)\)", r"](\1)", text)
+    for page, name in FROM_ROOT.items():
+        text = text.replace(f"]({name}", f"]({page}")
+    return text
+
+
+def modules() -> list[str]:
+    """Public modules, dotted, each package before what is in it."""
+    paths = [path.relative_to(ROOT).with_suffix("") for path in PACKAGE.rglob("*.py")]
+    names = [".".join(path.parts).removesuffix(".__init__") for path in paths]
+    return sorted(name for name in names if not any(part.startswith("_") for part in name.split(".")))
+
+
+def reference() -> Iterator[tuple[str, str]]:
+    """A page for each module, and one that lists them."""
+    listed = ["# Reference\n", "Every public module, from its docstrings.\n"]
+    for name in modules():
+        page = f"{name}.md"
+        yield f"reference/{page}", f"---\ntitle: {name}\nsearch:\n  boost: 0.5\n---\n\n# {name}\n\n::: {name}\n"
+        listed.append(f"- [{name}]({page}): {first_sentence(name)}")
+    yield "reference/index.md", "\n".join(listed) + "\n"
+
+
+def first_sentence(name: str) -> str:
+    """What the module's docstring begins with."""
+    path = ROOT.joinpath(*name.split("."))
+    source = (path / "__init__.py" if path.is_dir() else path.with_suffix(".py")).read_text(encoding="utf-8")
+    found = re.match(r'"""(.+?)(?:"""|\n\n)', source, re.DOTALL)
+    return re.sub(r":\w+:`~?([^`]+)`", r"`\1`", " ".join(found[1].split()).replace("``", "`")) if found else ""
