@@ -108,7 +108,7 @@ def timed_step(trainer: Trainer, clock: Clock) -> int:
     clock.start()
     decoded = trainer.model.field.gaussians(frame.camera)
     clock.stop("decode")
-    names = [f.name for f in fields(Gaussians) if getattr(decoded, f.name).requires_grad]
+    names = [f.name for f in fields(Gaussians) if getattr(getattr(decoded, f.name), "requires_grad", False)]
     leaves = replace(decoded, **{name: cut(getattr(decoded, name)) for name in names})
     clock.start()
     output = trainer.chosen.renderer.render(Handed(leaves, trainer.model.field.primitive), frame.camera, trainer.wants)

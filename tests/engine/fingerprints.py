@@ -20,6 +20,7 @@ from pathlib import Path
 
 from safetensors.torch import load_file
 
+from coliags_plugin.config.method_config import load_method
 from coliags_plugin.config.method_files import method_names
 
 STEPS = 60
@@ -27,9 +28,18 @@ STEPS = 60
 SETTINGS = (
     *("datamanager.width=84", "datamanager.height=67", "datamanager.points_count=5000"),
     *(f"schedule.written_for={STEPS}", "schedule.checkpoint_every=30", "schedule.log_every=1"),
-    *("strategy.statistics_from=0", "strategy.growth_from=2", "strategy.until=50", "strategy.every=10"),
-    *("strategy.gradient_threshold=1e-6", "strategy.pixels_per_birth=100"),
 )
+#: Growth within so few steps, by strategy.
+GROWTH = {
+    "anchor-growth": (
+        *("strategy.statistics_from=0", "strategy.growth_from=2", "strategy.until=50", "strategy.every=10"),
+        *("strategy.gradient_threshold=1e-6", "strategy.pixels_per_birth=100"),
+    ),
+    "adaptive-density": (
+        *("strategy.densify_from=2", "strategy.until=50", "strategy.every=10", "strategy.reset_every=25"),
+        "strategy.gradient_threshold=1e-4",
+    ),
+}
 RENDERERS = ("torch",)
 
 
@@ -51,7 +61,8 @@ def fingerprint(data: Path, method: str, seed: int, changes: tuple[str, ...], fo
     """What one run ends in, and whether it ends in the same when resumed."""
     run = folder / "run"
     shutil.rmtree(run, ignore_errors=True)
-    words = [word for change in (*SETTINGS, *changes) for word in ("--set", change)]
+    growth = GROWTH[load_method(method).config.strategy.name]
+    words = [word for change in (*SETTINGS, *growth, *changes) for word in ("--set", change)]
     coliags("train", method, "--data", data, "--seed", seed, "--steps", STEPS, "--output", run, *words)
     straight = digests(run)
     shutil.rmtree(run / "checkpoints" / f"step-{STEPS:06d}")
@@ -81,10 +92,10 @@ def main() -> None:
         for method, seed, changes in jobs:
             key = " ".join([method, str(seed), *changes])
             found[key] = fingerprint(options.data, method, seed, changes, Path(folder))
-            verdict = "" if key not in before else "same" if found[key] == before[key] else "DIFFERENT"
+            verdict = "new" if key not in before else "same" if found[key] == before[key] else "DIFFERENT"
             print(f"{key}: grown {found[key]['grown']}, resumed {found[key]['resumed_alike']} {verdict}", flush=True)
     options.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
-    sys.exit(any(key not in found or found[key] != before[key] for key in before))
+    sys.exit(any(found[key] != before[key] for key in before.keys() & found.keys()))
 
 
 if __name__ == "__main__":
