@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Shaped, UInt8
 
+from coliags_plugin.core.morphology import eroded
 from coliags_plugin.lenses.models import Lens, Pinhole, undistortion_map
 
 
@@ -44,7 +45,8 @@ class Undistortion:
         if s > 1:
             fine = pinhole.scaled(s, s)
             self._fine_columns, self._fine_rows = undistortion_map(lens, *fine, width * s, height * s)
-        shows = np.ones((lens.height, lens.width), bool) if source_mask is None else _eroded(source_mask)
+        # Bilinear neighbours of the outermost pixels show nothing.
+        shows = np.ones((lens.height, lens.width), bool) if source_mask is None else eroded(source_mask, 1)
         fine_valid = self._pick(shows, self._fine_columns, self._fine_rows, False)
         self.valid: np.ndarray = np.all(fine_valid.reshape(height, s, width, s), axis=(1, 3))
 
@@ -74,11 +76,3 @@ def _longest_step(columns: np.ndarray, rows: np.ndarray) -> float:
     """Source pixels per result pixel where the map is coarsest, leaving out the rim it does not reach."""
     steps = [np.hypot(np.diff(columns, axis=axis), np.diff(rows, axis=axis)).ravel() for axis in (0, 1)]
     return float(np.quantile(np.concatenate(steps), 0.95)) if columns.size > 1 else 1.0
-
-
-def _eroded(mask: np.ndarray) -> np.ndarray:
-    """The mask less its outermost pixels, whose bilinear neighbours show nothing."""
-    import cv2
-
-    kernel = np.ones((3, 3), np.uint8)
-    return np.asarray(cv2.erode(mask.astype(np.uint8), kernel, borderType=cv2.BORDER_REPLICATE)).astype(bool)

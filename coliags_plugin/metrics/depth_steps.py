@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 
 def depth_steps(depth: Float[Tensor, "H W"], known: Bool[Tensor, "H W"], relative_step: float) -> Bool[Tensor, "H W"]:
@@ -29,5 +28,9 @@ def dilated(marked: Bool[Tensor, "H W"], reach: int) -> Bool[Tensor, "H W"]:
 
 
 def _window_max(values: Float[Tensor, "H W"], reach: int) -> Float[Tensor, "H W"]:
-    """Maximum over the square window around every pixel; outside the image counts as -infinity. [H, W]"""
-    return max_pool2d(values[None, None], kernel_size=2 * reach + 1, stride=1, padding=reach)[0, 0]
+    """Maximum over the square window around every pixel; pixels outside the image do not count. [H, W]"""
+    from kornia.morphology import dilation
+
+    square = torch.ones(2 * reach + 1, 2 * reach + 1, dtype=values.dtype, device=values.device)
+    largest: Tensor = dilation(values[None, None], square, max_val=torch.finfo(values.dtype).max)
+    return largest[0, 0]

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.morphology import dilated
 from coliags_plugin.core.scenes import Frame
 
 #: Frames that a scene's unit of length is found from.
@@ -128,10 +129,7 @@ def prepare(frame: RgbdFrame, unit: float) -> PreparedFrame:
     image, width = frame.image, frame.image.shape[1]
     valid = np.ones(image.shape[:2], bool) if frame.mask is None else frame.mask
     margin = max(1, round(_HIGHLIGHT_MARGIN * width))
-    highlight = cv2.dilate(
-        (image.min(axis=2) > _HIGHLIGHT).astype(np.uint8), np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
-    )
-    valid = valid & (highlight == 0)
+    valid = valid & ~dilated(image.min(axis=2) > _HIGHLIGHT, margin)
     weight = valid.astype(np.float32)
     logarithm = np.log(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255.0 + _DARK)
     blurred = _local_mean(weight, max(3.0, _WINDOW * width))

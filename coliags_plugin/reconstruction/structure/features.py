@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 from pydantic import Field
 
+from coliags_plugin.core.morphology import dilated
 from coliags_plugin.core.settings import Settings
 
 
@@ -104,14 +105,10 @@ def usable(
     image: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"] | None, settings: FeatureSettings
 ) -> Bool[np.ndarray, "H W"]:
     """Where features may lie: away from highlights, which move with the lamp, and from what is masked. [H, W]"""
-    import cv2
-
     excluded = highlights(image, settings)
     if mask is not None:
         excluded |= ~mask
-    kernel = np.ones((2 * settings.margin + 1, 2 * settings.margin + 1), np.uint8)
-    grown = cv2.dilate(excluded.astype(np.uint8), kernel, borderType=cv2.BORDER_REPLICATE)
-    return ~np.asarray(grown).astype(bool)
+    return ~dilated(excluded, settings.margin)
 
 
 def highlights(image: UInt8[np.ndarray, "H W 3"], settings: FeatureSettings) -> Bool[np.ndarray, "H W"]:
