@@ -37,6 +37,18 @@ class DataManager(ABC):
         """What in the folder says that it is this manager's to read; None where nothing does. Reads no pixels."""
         return None
 
+    @classmethod
+    def recognise_unposed(cls, path: Path) -> bool:
+        """Whether a folder is of this format but for its poses. Reads no pixels."""
+        return False
+
+    def without_poses(self) -> DataManager:
+        """The data manager, with the same options, that puts every camera of such a folder at the origin.
+
+        Itself where the options say where poses are.
+        """
+        return self
+
     @abstractmethod
     def load(self, path: Path, progress: Progress | None = None) -> Scene:
         """Read the scene.

@@ -14,12 +14,11 @@ from coliags_plugin.config import registry
 from coliags_plugin.config.components import Component, make_component
 from coliags_plugin.config.method_config import LoadedMethod, MethodConfig, load_method, method_tree
 from coliags_plugin.config.yaml_tree import Node, override_all
+from coliags_plugin.contracts import DataManager
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.datamanagers.recorded import NoPointsError
-from coliags_plugin.datamanagers.rgbd.files import lacks_trajectory
-from coliags_plugin.datamanagers.rgbd.unposed import UnposedRGBDDataManager
 from coliags_plugin.engine.progress import progress_callback
 
 log = logging.getLogger(__name__)
@@ -137,7 +136,7 @@ def open_video(
     """Read all frames of a video as training frames, for whoever finds their poses himself.
 
     Args:
-        path: Its folder: a scene, or one in the ``rgbd`` format that lacks a trajectory.
+        path: Its folder: a scene, or one of a format that can do without poses (``rgbd``).
         data_format: See :func:`open_scene`.
         options: See :func:`open_scene`; the split and initial points are not to be chosen.
         progress: Told how far reading is.
@@ -149,13 +148,23 @@ def open_video(
         InputError: See :func:`open_scene`.
     """
     options = (*options, "split=all-train", "initial_points=none")
-    given = override_all(Node({}, "options"), options).plain()
-    unposed = lacks_trajectory(path) and "trajectory" not in given
-    # Other formats have pictures and depth too, and their poses elsewhere.
-    if data_format not in (None, "rgbd") or not unposed or (data_format is None and _recognised(path)):
-        return open_scene(path, data_format, options, progress), True
-    log.info("%s: pictures and depth without a trajectory", path)
-    return UnposedRGBDDataManager(_component("rgbd", given).settings).load(path, progress), False
+    name = data_format or _unposed_format(path)
+    if name is not None and registry.datamanagers.get(name).recognise_unposed(path):
+        component = _component(name, override_all(Node({}, "options"), options).plain())
+        manager: DataManager = component.target(component.settings)
+        unposed = manager.without_poses()
+        if unposed is not manager:
+            log.info("%s: format %s without poses", path, name)
+            return unposed.load(path, progress), False
+    return open_scene(path, data_format, options, progress), True
+
+
+def _unposed_format(path: Path) -> str | None:
+    """The format of a folder that lacks its poses; None where a format recognises it with them, or none does."""
+    if not path.exists() or _recognised(path):
+        return None
+    known = (name for name in registry.datamanagers if name != AUTO)
+    return next((name for name in known if registry.datamanagers.get(name).recognise_unposed(path)), None)
 
 
 def _opened(path: Path, name: str, options: Mapping[str, Any], progress: Progress | None) -> Scene:

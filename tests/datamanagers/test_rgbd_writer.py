@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.rgbd.files import lacks_trajectory
-from coliags_plugin.datamanagers.rgbd.reader import RGBDDataManager, RGBDSettings
-from coliags_plugin.datamanagers.rgbd.unposed import UnposedRGBDDataManager
+from coliags_plugin.datamanagers.rgbd.reader import RGBDDataManager, RGBDSettings, UnposedRGBDDataManager
 from coliags_plugin.datamanagers.rgbd.writer import depth_scale, depth_steps, write_rgbd_scene
 from coliags_plugin.engine.data_formats import find_format
 from coliags_plugin.poses import tum

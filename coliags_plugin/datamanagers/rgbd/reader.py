@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
+from coliags_plugin.contracts import DataManager
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.fusion import load_points
@@ -27,6 +28,7 @@ from coliags_plugin.datamanagers.rgbd.files import (
     find_mesh,
     find_pictures,
     find_trajectory,
+    lacks_trajectory,
     read_obj_points,
     recognise,
 )
@@ -87,6 +89,15 @@ class RGBDDataManager(RecordedDataManager):
     def recognise(cls, path: Path) -> str | None:
         """See :class:`DataManager`."""
         return recognise(path)
+
+    @classmethod
+    def recognise_unposed(cls, path: Path) -> bool:
+        """See :class:`DataManager`."""
+        return lacks_trajectory(path)
+
+    def without_poses(self) -> DataManager:
+        """See :class:`DataManager`."""
+        return self if self.settings.trajectory is not None else UnposedRGBDDataManager(self.settings)
 
     def open(self, path: Path) -> Recording:
         """See :class:`RecordedDataManager`."""
@@ -278,3 +289,15 @@ class RGBDDataManager(RecordedDataManager):
 
 def _points(path: Path) -> PointCloud:
     return read_obj_points(path) if path.suffix == ".obj" else load_points(path)
+
+
+class UnposedRGBDDataManager(RGBDDataManager):
+    """Reads what :class:`RGBDDataManager` does, without a trajectory: every camera is at the origin.
+
+    Registered under no name, so that nothing trains on such poses.
+    """
+
+    def _trajectory(self, path: Path, pictures: Sequence[Path]) -> tuple[Path | None, Trajectory]:
+        nowhere = np.tile(np.eye(4), (len(pictures), 1, 1))
+        # A pose for every image, at its own time where it has one: images are paired with depth alone.
+        return None, Trajectory(nowhere, timestamps=times(pictures) if self._by_time(pictures) else None)
