@@ -52,7 +52,7 @@ def told(page: str, header: str) -> dict[str, str]:
 
 
 def test_the_pages_say_so():
-    fits = told("docs/data.md", "| format | fits by default | who publishes at it |")
+    fits = told("docs/data.md", "| format | default size | published by |")
     splits = told("docs/layouts/c3vd.md", "| format | split |")
     for name, fit in fits.items():
         kind = datamanagers.get(name)
