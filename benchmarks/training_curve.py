@@ -79,18 +79,13 @@ def curve_row(trainer: Trainer, scorer: Scorer, taken: dict[str, Any], seconds: 
         row |= {f"{name}_{key}" if beside else key: value for key, value in scores.items()}
     return {
         **row,
-        "elements": elements(trainer.model.field),
+        "elements": trainer.model.field.element_count,
         "gaussians": taken.get("gaussians", 0),
         "train_psnr": taken["psnr"],
         "loss": taken["loss"],
         "seconds": round(seconds, 1),
         "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
     }
-
-
-def elements(field: Any) -> int:
-    """How many anchors or Gaussians a field has."""
-    return len(getattr(field, field.elements, field.parameter_groups().get("means", [[]])[0]))
 
 
 def rows_until(path: Path, step: int) -> list[dict[str, Any]]:

@@ -91,6 +91,11 @@ class Field(nn.Module, ABC):
     #: What strategies add and remove: ``anchors``, ``gaussians`` or, where the field has a fixed size, ``none``.
     elements: ClassVar[str] = "none"
 
+    @property
+    def element_count(self) -> int:
+        """How many elements there are now; 0 where the field has a fixed size."""
+        return 0
+
     @classmethod
     @abstractmethod
     def from_scene(cls, scene: Scene, settings: Any, generator: torch.Generator) -> Self:

@@ -124,6 +124,11 @@ class AnchorField(GaussianField):
         field.load_state_dict(state)
         return field
 
+    @property
+    def element_count(self) -> int:
+        """Anchors."""
+        return len(self.anchors)
+
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Offsets, features, scalings, and the three perceptrons."""
         return {

@@ -85,6 +85,11 @@ class ExplicitGaussians(GaussianField):
         field.load_state_dict(state)
         return field
 
+    @property
+    def element_count(self) -> int:
+        """Gaussians."""
+        return len(self.means)
+
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """One group for each kind of parameter."""
         return {name: [getattr(self, name)] for name in self.row_parameters}

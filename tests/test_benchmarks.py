@@ -1,0 +1,38 @@
+"""Benchmarks run, as far as a few steps on a small scene tell; what they measure is not looked at."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.scenes import write_wall
+
+ROOT = Path(__file__).parents[1]
+
+
+def run(script, *argv):
+    command = [sys.executable, str(ROOT / "benchmarks" / script), *map(str, argv)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_the_training_step_by_stages():
+    table = run("train_step.py", "--anchors", 300, "--steps", 1, "--size", "48x36", "--renderers", "cpu")
+    assert "| render ms |" in table and "| cpu | 300 |" in table
+
+
+@pytest.mark.parametrize("method", ["coliags", "3dgs"])
+def test_a_training_curve(method, tmp_path):
+    write_wall(tmp_path / "wall")
+    options = ("--steps", 4, "--every", 2, "--set", "datamanager.points_count=500")
+    run("training_curve.py", "--data", tmp_path / "wall", "--method", method, "--out", tmp_path / "run", *options)
+    rows = [json.loads(line) for line in (tmp_path / "run" / "curve.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows] == [2, 4]
+    assert all(row["elements"] > 0 and row["psnr"] > 0 and row["depth_mse"] >= 0 for row in rows)
