@@ -22,7 +22,7 @@ from coliags_plugin.phantom.colon import ColonSurface, build_surface, grow_anato
 from coliags_plugin.phantom.imaging import Exposure, Sensor, World, expose, meter
 from coliags_plugin.phantom.interreflection import IndirectLight, indirect_lights
 from coliags_plugin.phantom.layouts import meshes
-from coliags_plugin.phantom.layouts.base import Layout, Part, WallPoints
+from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints
 from coliags_plugin.phantom.light import Lamp
 from coliags_plugin.phantom.mucosa import Mucosa, paint_mucosa
 from coliags_plugin.phantom.response import KNEE, develop, exposure_for, exposures, white_balances
@@ -206,7 +206,8 @@ def _write(phantom: Phantom, folder: Path, tell: Progress) -> None:
         part: Part = "video" if number < frames else "rotation"
         index = number if part == "video" else number - frames
         pose = phantom.poses[index] if part == "video" else turned[index]
-        layout.write_frame(folder, part, index, image(color), image(exposure.z_depth), image(exposure.normals))
+        taken = PhantomFrame(part, index, image(color), image(exposure.z_depth), image(exposure.normals))
+        layout.write_frame(folder, taken)
         if part == "video":
             observed[exposure.triangles] = True
         if part == "video" and not layout.is_test(index):

@@ -24,6 +24,25 @@ _C3VD_PINHOLE = Pinhole(200.8769, 200.4713, 167.3190, 136.9333)
 
 
 @dataclass(frozen=True)
+class PhantomFrame:
+    """One frame of a phantom.
+
+    Attributes:
+        part: What the frame belongs to.
+        index: Within its part, counted from 0.
+        color: RGB. [H, W, 3]
+        z_depth: mm; 0 where there is no wall. [H, W]
+        normals: Unit, camera axes, towards the camera; 0 where there is no wall. [H, W, 3]
+    """
+
+    part: Part
+    index: int
+    color: UInt8[np.ndarray, "H W 3"]
+    z_depth: Float[np.ndarray, "H W"]
+    normals: Float[np.ndarray, "H W 3"]
+
+
+@dataclass(frozen=True)
 class WallPoints:
     """Points of the wall that training frames see, as structure from motion would have found them.
 
@@ -80,24 +99,12 @@ class Layout(ABC):
         return every_8th(index)
 
     @abstractmethod
-    def write_frame(
-        self,
-        folder: Path,
-        part: Part,
-        index: int,
-        color: UInt8[np.ndarray, "H W 3"],
-        z_depth: Float[np.ndarray, "H W"],
-        normals: Float[np.ndarray, "H W 3"],
-    ) -> None:
+    def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
         """Write one frame.
 
         Args:
             folder: Of the phantom.
-            part: What the frame belongs to.
-            index: Place in its part, counted from 0.
-            color: RGB. [H, W, 3]
-            z_depth: mm; 0 where there is no wall. [H, W]
-            normals: Unit, camera axes, towards the camera; 0 where there is no wall. [H, W, 3]
+            frame: What was taken.
         """
 
     @abstractmethod

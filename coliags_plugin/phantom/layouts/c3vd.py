@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from coliags_plugin.datamanagers.c3vd.writer import CAMERA, POSES, write_frame, write_poses
 from coliags_plugin.datamanagers.reading.camera_json import write_camera_json
 from coliags_plugin.lenses.models import Lens
-from coliags_plugin.phantom.layouts.base import Layout, Part, place
+from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, place
 
 
 class C3VDLayout(Layout):
@@ -19,17 +19,9 @@ class C3VDLayout(Layout):
 
     has_rotation = True
 
-    def write_frame(
-        self,
-        folder: Path,
-        part: Part,
-        index: int,
-        color: UInt8[np.ndarray, "H W 3"],
-        z_depth: Float[np.ndarray, "H W"],
-        normals: Float[np.ndarray, "H W 3"],
-    ) -> None:
+    def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
         """See :class:`Layout`; normals are not part of this layout."""
-        write_frame(place(folder, part), index, color, z_depth)
+        write_frame(place(folder, frame.part), frame.index, frame.color, frame.z_depth)
 
     def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
         """See :class:`Layout`."""

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 
 from coliags_plugin.datamanagers.c3vd.writer import write_poses, write_raw_frame
 from coliags_plugin.lenses.models import LENSES, Lens, octagon_mask
-from coliags_plugin.phantom.layouts.base import Layout, Part, place
+from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, place
 
 
 class C3VDRawLayout(Layout):
@@ -24,17 +24,9 @@ class C3VDRawLayout(Layout):
         """C3VD's omnidirectional lens behind its octagonal mask."""
         return LENSES["omnidirectional"].scaled(width, height), octagon_mask(width, height)
 
-    def write_frame(
-        self,
-        folder: Path,
-        part: Part,
-        index: int,
-        color: UInt8[np.ndarray, "H W 3"],
-        z_depth: Float[np.ndarray, "H W"],
-        normals: Float[np.ndarray, "H W 3"],
-    ) -> None:
+    def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
         """See :class:`Layout`."""
-        write_raw_frame(place(folder, part), index, color, z_depth, normals)
+        write_raw_frame(place(folder, frame.part), frame.index, frame.color, frame.z_depth, frame.normals)
 
     def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
         """See :class:`Layout`."""

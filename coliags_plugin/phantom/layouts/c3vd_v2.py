@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 
 from coliags_plugin.datamanagers.c3vd.writer import write_poses
 from coliags_plugin.datamanagers.c3vd_v2.lens import CANDIDATE_LENS
 from coliags_plugin.datamanagers.c3vd_v2.writer import write_frame, write_lens
 from coliags_plugin.lenses.models import Lens, octagon_mask
-from coliags_plugin.phantom.layouts.base import Layout, Part, place
+from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, place
 
 
 class C3VDv2Layout(Layout):
@@ -26,17 +26,9 @@ class C3VDv2Layout(Layout):
         """The candidate for C3VDv2's lens, behind C3VD's octagonal mask."""
         return CANDIDATE_LENS.scaled(width, height), octagon_mask(width, height)
 
-    def write_frame(
-        self,
-        folder: Path,
-        part: Part,
-        index: int,
-        color: UInt8[np.ndarray, "H W 3"],
-        z_depth: Float[np.ndarray, "H W"],
-        normals: Float[np.ndarray, "H W 3"],
-    ) -> None:
+    def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
         """See :class:`Layout`."""
-        write_frame(place(folder, part), index, color, z_depth, normals)
+        write_frame(place(folder, frame.part), frame.index, frame.color, frame.z_depth, frame.normals)
 
     def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
         """See :class:`Layout`. The lens is described at the size it is calibrated for."""

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points, write_model, write_picture
 from coliags_plugin.lenses.models import Lens
-from coliags_plugin.phantom.layouts.base import Layout, Part, WallPoints, pinhole_of
+from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints, pinhole_of
 from coliags_plugin.poses.colmap import colmap_poses, posed_model
 from coliags_plugin.poses.rigid import inverse
 
@@ -23,17 +23,9 @@ class ColmapLayout(Layout):
 
     has_points = True
 
-    def write_frame(
-        self,
-        folder: Path,
-        part: Part,
-        index: int,
-        color: UInt8[np.ndarray, "H W 3"],
-        z_depth: Float[np.ndarray, "H W"],
-        normals: Float[np.ndarray, "H W 3"],
-    ) -> None:
+    def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
         """See :class:`Layout`; depth and normals are not part of this layout."""
-        write_picture(folder, _name(index), color)
+        write_picture(folder, _name(frame.index), frame.color)
 
     def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
         """See :class:`Layout`; poses are part of the model."""

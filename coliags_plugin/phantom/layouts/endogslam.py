@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 
 from coliags_plugin.datamanagers.c3vd.writer import write_poses
 from coliags_plugin.datamanagers.c3vd_endogslam.files import PARAMS
@@ -14,7 +14,7 @@ from coliags_plugin.datamanagers.c3vd_endogslam.reader import PREPARED_PINHOLE, 
 from coliags_plugin.datamanagers.c3vd_endogslam.writer import write_frame, write_params
 from coliags_plugin.lenses.models import Lens
 from coliags_plugin.lenses.pinhole import PinholeLens
-from coliags_plugin.phantom.layouts.base import Layout, Part, WallPoints, pinhole_of, place
+from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints, pinhole_of, place
 from coliags_plugin.phantom.trajectory import TEST_EVERY
 from coliags_plugin.poses.trajectory import Trajectory
 
@@ -35,17 +35,9 @@ class EndoGSLAMLayout(Layout):
         pinhole = PREPARED_PINHOLE.scaled(width / PREPARED_SIZE[0], height / PREPARED_SIZE[1])
         return PinholeLens.of(pinhole, width, height), np.ones((height, width), bool)
 
-    def write_frame(
-        self,
-        folder: Path,
-        part: Part,
-        index: int,
-        color: UInt8[np.ndarray, "H W 3"],
-        z_depth: Float[np.ndarray, "H W"],
-        normals: Float[np.ndarray, "H W 3"],
-    ) -> None:
+    def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
         """See :class:`Layout`; normals are not part of this layout."""
-        write_frame(place(folder, part), index, color, z_depth)
+        write_frame(place(folder, frame.part), frame.index, frame.color, frame.z_depth)
 
     def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
         """See :class:`Layout`."""

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 
 from coliags_plugin.datamanagers.nerfstudio.writer import write_frame, write_transforms
 from coliags_plugin.lenses.models import Lens
 from coliags_plugin.lenses.opencv import OpenCVLens
-from coliags_plugin.phantom.layouts.base import Layout, Part
+from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame
 
 #: Millimetres in a depth step: up to 655 mm.
 DEPTH_UNIT = 0.01
@@ -29,17 +29,9 @@ class NerfstudioLayout(Layout):
         bent = OpenCVLens(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, k1=_K1, k2=_K2, p1=_P1, p2=_P2)
         return bent, lit
 
-    def write_frame(
-        self,
-        folder: Path,
-        part: Part,
-        index: int,
-        color: UInt8[np.ndarray, "H W 3"],
-        z_depth: Float[np.ndarray, "H W"],
-        normals: Float[np.ndarray, "H W 3"],
-    ) -> None:
+    def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
         """See :class:`Layout`; normals are not part of this layout."""
-        write_frame(folder, index, color, z_depth, DEPTH_UNIT)
+        write_frame(folder, frame.index, frame.color, frame.z_depth, DEPTH_UNIT)
 
     def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
         """See :class:`Layout`."""

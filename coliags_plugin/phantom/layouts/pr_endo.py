@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 
 from coliags_plugin.datamanagers.c3vd_endogslam.files import OPTIMIZED, PARAMS
 from coliags_plugin.datamanagers.c3vd_endogslam.writer import write_frame, write_gaussians, write_params
 from coliags_plugin.lenses.models import Lens
-from coliags_plugin.phantom.layouts.base import Layout, Part, WallPoints, pinhole_of
+from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints, pinhole_of
 from coliags_plugin.phantom.layouts.endogslam import EndoGSLAMLayout
 from coliags_plugin.poses.trajectory import Trajectory
 
@@ -32,17 +32,9 @@ class PREndoLayout(Layout):
         """As in EndoGSLAM's layout."""
         return EndoGSLAMLayout().lens(width, height)
 
-    def write_frame(
-        self,
-        folder: Path,
-        part: Part,
-        index: int,
-        color: UInt8[np.ndarray, "H W 3"],
-        z_depth: Float[np.ndarray, "H W"],
-        normals: Float[np.ndarray, "H W 3"],
-    ) -> None:
+    def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
         """See :class:`Layout`; normals are not part of this layout."""
-        write_frame(folder / _DATA / _SCENE, index, color, z_depth)
+        write_frame(folder / _DATA / _SCENE, frame.index, frame.color, frame.z_depth)
 
     def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
         """See :class:`Layout`; poses stand in params.npz."""

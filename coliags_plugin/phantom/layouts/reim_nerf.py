@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 
 from coliags_plugin.datamanagers.reim_nerf.writer import ReimNerfWriter
 from coliags_plugin.lenses.models import LENSES, FisheyeLens, Lens
-from coliags_plugin.phantom.layouts.base import Layout, Part
+from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame
 
 #: Normalised units per mm. REIM-NeRF's own are 0.0092 to 0.0229, so that a scene lies between -1 and 1.
 SCENE_SCALE = 0.0095
@@ -41,18 +41,10 @@ class ReimNerfLayout(Layout):
         """All but REIM-NeRF's training frames, its validation frames among them."""
         return index % 5 != 0 or _validates(index)
 
-    def write_frame(
-        self,
-        folder: Path,
-        part: Part,
-        index: int,
-        color: UInt8[np.ndarray, "H W 3"],
-        z_depth: Float[np.ndarray, "H W"],
-        normals: Float[np.ndarray, "H W 3"],
-    ) -> None:
+    def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
         """See :class:`Layout`; normals are not part of this layout."""
-        height, width = z_depth.shape
-        self._of(folder, width, height).write_frame(index, color, z_depth)
+        height, width = frame.z_depth.shape
+        self._of(folder, width, height).write_frame(frame.index, frame.color, frame.z_depth)
 
     def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
         """See :class:`Layout`."""

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from coliags_plugin.datamanagers.reading.camera_json import write_camera_json
 from coliags_plugin.datamanagers.rgbd.writer import CAMERA, write_frame, write_lists
 from coliags_plugin.lenses.models import Lens
-from coliags_plugin.phantom.layouts.base import Layout, Part
+from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame
 from coliags_plugin.poses import tum
 from coliags_plugin.poses.trajectory import Trajectory
 
@@ -24,17 +24,9 @@ _START, _RATE = 1_305_031_102.0, 30.0
 class RGBDLayout(Layout):
     """Pictures and depth named by their time, groundtruth.txt, camera.json, and the lists that TUM's tools read."""
 
-    def write_frame(
-        self,
-        folder: Path,
-        part: Part,
-        index: int,
-        color: UInt8[np.ndarray, "H W 3"],
-        z_depth: Float[np.ndarray, "H W"],
-        normals: Float[np.ndarray, "H W 3"],
-    ) -> None:
+    def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
         """See :class:`Layout`; normals are not part of this layout."""
-        write_frame(folder, f"{_time(index)}.png", color, z_depth, DEPTH_SCALE)
+        write_frame(folder, f"{_time(frame.index)}.png", frame.color, frame.z_depth, DEPTH_SCALE)
 
     def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
         """See :class:`Layout`."""

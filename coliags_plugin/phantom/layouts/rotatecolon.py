@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 
 from coliags_plugin.datamanagers.rotatecolon.writer import write_points, write_test_view, write_transforms, write_view
 from coliags_plugin.lenses.models import Lens, Pinhole
 from coliags_plugin.lenses.pinhole import PinholeLens
-from coliags_plugin.phantom.layouts.base import Layout, Part, WallPoints
+from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints
 
 #: Horizontal field of view, radians: that of C3VD's undistorted frames.
 _ANGLE = 2.0 * math.atan(169.0 / 200.8769)
@@ -34,20 +34,12 @@ class RotateColonLayout(Layout):
         pinhole = Pinhole(focal, focal, 0.5 * width - 0.5, 0.5 * height - 0.5)
         return PinholeLens.of(pinhole, width, height), np.ones((height, width), bool)
 
-    def write_frame(
-        self,
-        folder: Path,
-        part: Part,
-        index: int,
-        color: UInt8[np.ndarray, "H W 3"],
-        z_depth: Float[np.ndarray, "H W"],
-        normals: Float[np.ndarray, "H W 3"],
-    ) -> None:
+    def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
         """See :class:`Layout`; normals are not part of this layout, nor is the depth of test views."""
-        if part == "rotation":
-            write_test_view(folder, index, color)
+        if frame.part == "rotation":
+            write_test_view(folder, frame.index, frame.color)
         else:
-            write_view(folder, index, color, z_depth)
+            write_view(folder, frame.index, frame.color, frame.z_depth)
 
     def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
         """See :class:`Layout`."""
