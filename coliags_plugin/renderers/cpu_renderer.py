@@ -16,8 +16,9 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput, Splats
+from coliags_plugin.renderers.checks import check_gaussian_outputs
 from coliags_plugin.renderers.projection import JACOBIAN_MARGIN
-from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer, check_outputs
+from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer
 
 #: Tensors of the Gaussians and the width of their rows; None for one-dimensional ones.
 _SHAPES = {"means": 3, "quats_wxyz": 4, "scales": 3, "opacities": None, "colors": 3}
@@ -84,7 +85,7 @@ def render_gaussians(
     from coliags_plugin.renderers.numba_kernels import autograd, layout, pipeline
 
     settings = settings or CpuRendererSettings()
-    check_outputs(wants, gaussians)
+    check_gaussian_outputs(wants, gaussians)
     _check_tensors(gaussians)
     pose = camera.camera_to_world.to(device="cpu", dtype=torch.float32)
     view = pipeline.Pipeline(
@@ -152,7 +153,7 @@ def _check_tensors(gaussians: Gaussians) -> None:
     """Check shape, dtype and device; values are checked during projection."""
     count = len(gaussians.means) if gaussians.means.ndim else 0
     checked = [(name, getattr(gaussians, name), width) for name, width in _SHAPES.items()]
-    checked += [(f"feature {name}", value, max(1, *value.shape[1:])) for name, value in gaussians.features.items()]
+    checked += [(f"feature {name}", value, value.shape[1]) for name, value in gaussians.features.items()]
     for name, tensor, width in checked:
         shape = (count,) if width is None else (count, width)
         if tuple(tensor.shape) != shape:

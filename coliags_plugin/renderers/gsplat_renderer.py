@@ -21,7 +21,8 @@ from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput, Splats
 from coliags_plugin.core.rotations import rotation_matrices
 from coliags_plugin.renderers import gsplat_library
-from coliags_plugin.renderers.splatting import SplattingRenderer, SplattingSettings, check_outputs
+from coliags_plugin.renderers.checks import check_gaussian_outputs
+from coliags_plugin.renderers.splatting import SplattingRenderer, SplattingSettings
 from coliags_plugin.renderers.torch_renderer import TorchRendererSettings, render_gaussians
 
 #: Edge of gsplat's tiles, pixels: the only size it is tested with.
@@ -96,7 +97,7 @@ def render_with_gsplat(
         InputError: An output is unknown, the Gaussians are not float32, or gsplat cannot be used here.
     """
     settings = settings or GsplatRendererSettings()
-    check_outputs(wants, gaussians)
+    check_gaussian_outputs(wants, gaussians)
     if gaussians.means.dtype != torch.float32:
         raise InputError(
             f"Gaussians of {gaussians.means.dtype} for the gsplat renderer",

@@ -11,10 +11,11 @@ from torch import Tensor
 
 from coliags_plugin.contracts import GaussianField, Renderer
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import OUTPUTS, RenderOutput
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.renderers.checks import check_primitive
 
 
 class SplattingSettings(Settings):
@@ -71,26 +72,9 @@ class SplattingRenderer(Renderer):
                 "whole images: it splats",
                 "Leave pixels out, or choose a renderer of radiance fields",
             )
-        if field.primitive not in self.primitives:
-            raise InputError(
-                f"a field of '{field.primitive}' for the {self.name} renderer",
-                f"one of {', '.join(sorted(self.primitives))}",
-                "Choose another renderer or another field",
-            )
+        check_primitive(field, self.primitives, self.name)
         return self.draw(field.gaussians(camera), camera, wants)
 
     @abstractmethod
     def draw(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> RenderOutput:
         """Render the Gaussians from the camera."""
-
-
-def check_outputs(wants: Sequence[str], gaussians: Gaussians) -> None:
-    """Check the names of requested outputs.
-
-    Raises:
-        InputError: A name is neither a renderer output nor a feature of the Gaussians.
-    """
-    known = (*OUTPUTS, *gaussians.features)
-    for name in wants:
-        if name not in known:
-            raise InputError(f"no renderer output '{name}'", f"some of {', '.join(known)}", did_you_mean(name, known))

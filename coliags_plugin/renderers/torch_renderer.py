@@ -14,9 +14,10 @@ from coliags_plugin.contracts import Availability
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput, Splats
+from coliags_plugin.renderers.checks import check_gaussian_outputs
 from coliags_plugin.renderers.compositing import Cuts, composite, log_alpha_polynomials, median_depths, monomials
 from coliags_plugin.renderers.projection import ProjectedGaussians, facing_normals, project_gaussians
-from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer, check_outputs
+from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer
 from coliags_plugin.renderers.tiles import TileGrid, bin_gaussians, gaussian_extents
 
 #: Per-Gaussian quantity composited for each output beyond rgb and alpha. The median depth is not a weighted sum.
@@ -76,7 +77,7 @@ def render_gaussians(
         InputError: An output is unknown or the Gaussians are surfels.
     """
     settings = settings or TorchRendererSettings()
-    check_outputs(wants, gaussians)
+    check_gaussian_outputs(wants, gaussians)
     grid = TileGrid(camera.width, camera.height, settings.tile_size)
     cuts = Cuts(settings.alpha_max, settings.alpha_min, settings.transmittance_min)
     projected = project_gaussians(gaussians, camera, settings.near_plane, settings.eps2d)

@@ -13,9 +13,9 @@ from typing_extensions import Self
 
 from coliags_plugin.contracts import Availability, RadianceField, Renderer
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.render_output import OUTPUTS, RenderOutput, concatenate_pixels
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.renderers.checks import check_outputs, check_primitive
 
 #: Every output of the splatting renderers that has a meaning without surfaces.
 _OUTPUTS = frozenset(OUTPUTS) - {"normals"}
@@ -77,16 +77,8 @@ class VolumeRenderer(Renderer):
         Raises:
             InputError: The field is of another primitive, or an output is not delivered.
         """
-        if field.primitive not in self.primitives:
-            raise InputError(
-                f"a field of '{field.primitive}' for the volume renderer", "a radiance field", "Choose another renderer"
-            )
-        for name in wants:
-            if name not in self.outputs:
-                known = sorted(self.outputs)
-                raise InputError(
-                    f"no output '{name}' of the volume renderer", ", ".join(known), did_you_mean(name, known)
-                )
+        check_primitive(field, self.primitives, "volume")
+        check_outputs(wants, sorted(self.outputs))
         like: Any = next(field.parameters())
         camera = camera.to(like.device, like.dtype)
         if pixels is not None:

@@ -85,7 +85,7 @@ def test_some_pixels_are_those_of_the_whole_image():
 
 
 def test_refusals():
-    with pytest.raises(InputError, match="no output 'normals' of the volume renderer"):
+    with pytest.raises(InputError, match="no renderer output 'normals'"):
         make().render(Fog(1.0), camera_at(0, 0, 0), ("normals",))
     with pytest.raises(ValueError, match=r"far_plane 1\.0 does not lie beyond near_plane 2\.0"):
         make(near_plane=2.0, far_plane=1.0)

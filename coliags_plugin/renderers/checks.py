@@ -1,0 +1,48 @@
+"""Checks of what a renderer is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+
+from coliags_plugin.contracts import Field
+from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.render_output import OUTPUTS
+
+
+def check_primitive(field: Field, primitives: Collection[str], renderer: str) -> None:
+    """Refuse a field that a renderer cannot draw.
+
+    Raises:
+        InputError: See above.
+    """
+    if field.primitive not in primitives:
+        raise InputError(
+            f"a field of '{field.primitive}' for the {renderer} renderer",
+            f"one of {', '.join(sorted(primitives))}",
+            "Choose another renderer or another field",
+        )
+
+
+def check_outputs(wants: Iterable[str], known: Iterable[str]) -> None:
+    """Refuse outputs that a renderer does not have.
+
+    Raises:
+        InputError: See above.
+    """
+    known = tuple(known)
+    for name in wants:
+        if name not in known:
+            raise InputError(f"no renderer output '{name}'", f"some of {', '.join(known)}", did_you_mean(name, known))
+
+
+def check_gaussian_outputs(wants: Iterable[str], gaussians: Gaussians) -> None:
+    """Refuse outputs that are neither a splatting renderer's nor features of the Gaussians, and malformed features.
+
+    Raises:
+        InputError: See above.
+    """
+    check_outputs(wants, (*OUTPUTS, *gaussians.features))
+    for name, values in gaussians.features.items():
+        if values.ndim != 2 or len(values) != len(gaussians):
+            raise InputError(f"feature {name} of shape {list(values.shape)}", f"[{len(gaussians)}, channels]")
