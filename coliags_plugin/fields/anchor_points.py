@@ -8,8 +8,26 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scenes import Scene
+
 #: Floor of the mean squared neighbour distance, scene units squared (docs/methods.md 2.2).
 MIN_SQUARED_DISTANCE = 1e-7
+
+
+def initial_positions(scene: Scene) -> Float[Tensor, "N 3"]:
+    """Positions of the scene's initial points, scene units. [N, 3]
+
+    Raises:
+        InputError: It has none.
+    """
+    if len(scene.points) == 0:
+        raise InputError(
+            "the scene has no initial points",
+            "at least one",
+            "Give the data manager points or depth; coliags poses triangulate makes points from posed images",
+        )
+    return scene.points.positions
 
 
 def voxelize(points: Float[Tensor, "N 3"], size: float) -> Float[Tensor, "M 3"]:

@@ -15,11 +15,10 @@ from typing_extensions import Self
 from coliags_plugin.config.components import AppearanceHeadNode, GeometryHeadNode
 from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.fields.anchor_points import neighbour_log_scales, voxelize
+from coliags_plugin.fields.anchor_points import initial_positions, neighbour_log_scales, voxelize
 from coliags_plugin.fields.frustum import DRAWN_SIGMAS, spheres_in_frustum
 
 logger = logging.getLogger(__name__)
@@ -88,16 +87,11 @@ class AnchorField(GaussianField):
         Raises:
             InputError: The scene has no points.
         """
-        if len(scene.points) == 0:
-            raise InputError(
-                "the scene has no initial points",
-                "at least one",
-                "Give the data manager points or depth; coliags poses triangulate makes points from posed pictures",
-            )
+        positions = initial_positions(scene)
         size = settings.voxel_size
         if size is None:
             size = settings.voxel_pixels * scene.pixel_footprint
-        anchors = voxelize(scene.points.positions, size)
+        anchors = voxelize(positions, size)
         if len(anchors) > 0.95 * len(scene.points) > 1000:
             logger.warning(
                 "voxels of %.3g scene units merge almost nothing: %d points make %d anchors",

@@ -13,12 +13,11 @@ from typing_extensions import Self
 
 from coliags_plugin.contracts import GaussianField, Schedule
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.fields import spherical_harmonics
-from coliags_plugin.fields.anchor_points import neighbour_log_scales
+from coliags_plugin.fields.anchor_points import initial_positions, neighbour_log_scales
 from coliags_plugin.fields.frustum import DRAWN_SIGMAS, spheres_in_frustum
 
 
@@ -60,13 +59,7 @@ class ExplicitGaussians(GaussianField):
         Raises:
             InputError: The scene has no points.
         """
-        positions = scene.points.positions
-        if len(positions) == 0:
-            raise InputError(
-                "the scene has no initial points",
-                "at least one",
-                "Give the data manager points or depth; coliags poses triangulate makes points from posed pictures",
-            )
+        positions = initial_positions(scene)
         field = cls(settings, len(positions))
         with torch.no_grad():
             field.means.copy_(positions)
