@@ -81,6 +81,16 @@ class Schedule:
         """The step of this run at which the config's ``step`` falls."""
         return round(step * self.steps / self.written_for)
 
+    def events(self, after: int, until: int, every: int) -> range:
+        """Steps of this run at which something happens that the config places between two of its steps.
+
+        Args:
+            after: Step of the config after which it happens.
+            until: Step of the config before which it happens.
+            every: Interval, in steps of this run: its multiples are the events.
+        """
+        return range((self.at(after) // every + 1) * every, self.at(until), every)
+
 
 class Field(nn.Module, ABC):
     """What a scene looks like from anywhere. Either a :class:`GaussianField` or a :class:`RadianceField`."""
@@ -397,6 +407,8 @@ class Strategy(ABC):
     Settings: ClassVar[type[Settings]]
     #: Kinds of :attr:`Field.elements` that it can change; None where it changes nothing.
     serves: ClassVar[frozenset[str] | None]
+    #: Attributes that are tensors of counters, saved with a checkpoint.
+    counters: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, settings: Any, generator: torch.Generator, schedule: Schedule, extent: float) -> None:
         self.settings = settings
@@ -425,10 +437,12 @@ class Strategy(ABC):
 
     def state_dict(self) -> dict[str, Tensor]:
         """Counters for the checkpoint."""
-        return {}
+        return {name: getattr(self, name) for name in self.counters}
 
-    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:  # noqa: B027 (stateless unless overridden)
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Restore what :meth:`state_dict` gave."""
+        for name in self.counters:
+            setattr(self, name, state[name])
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from coliags_plugin.contracts import ParameterRows, Schedule, Strategy, Training
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.rotations import rotation_matrices
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.strategies.image_gradients import gradient_lengths
 
 #: A split Gaussian's scales are divided by 0.8 times the number of its parts.
 _SPLIT_PARTS = 2
@@ -55,38 +56,29 @@ class AdaptiveDensity(Strategy):
 
     Settings: ClassVar[type[Settings]] = AdaptiveDensitySettings
     serves: ClassVar[frozenset[str] | None] = frozenset({"gaussians"})
+    counters: ClassVar[tuple[str, ...]] = ("gradient_sum", "drawn", "largest_radius")
 
     def __init__(self, settings: Any, generator: torch.Generator, schedule: Schedule, extent: float) -> None:
         super().__init__(settings, generator, schedule, extent)
-        self.densify_from = schedule.at(settings.densify_from)
         self.until = schedule.at(settings.until)
+        self.events = schedule.events(settings.densify_from, settings.until, settings.every)
         self.gradient_sum = torch.zeros(0)  # [N]
         self.drawn = torch.zeros(0)  # [N]
         self.largest_radius = torch.zeros(0)  # [N]
 
     def plan(self) -> str:
         """When this run densifies and resets opacities, or why it does not."""
-        every, reset = self.settings.every, self.settings.reset_every
-        events = range((self.densify_from // every + 1) * every, self.until, every)
+        every, reset, events = self.settings.every, self.settings.reset_every, self.events
         if len(events) == 0:
             return (
                 f"this run neither densifies nor prunes: its {self.schedule.steps} steps leave no multiple of {every} "
-                f"between steps {self.densify_from} and {self.until}"
+                f"between steps {self.schedule.at(self.settings.densify_from)} and {self.until}"
             )
         resets = range(reset, self.until, reset)
         told = f"resets opacities every {reset} steps until step {resets[-1]}" if resets else "never resets opacities"
         return (
             f"this run clones, splits and prunes every {every} steps from step {events[0]} to {events[-1]}, and {told}"
         )
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """The counters."""
-        return {name: getattr(self, name) for name in ("gradient_sum", "drawn", "largest_radius")}
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:  # type: ignore[override]
-        """Restore the counters."""
-        for name in self.state_dict():
-            setattr(self, name, state[name])
 
     @torch.no_grad()
     def after_backward(self, step: TrainingStep, rows: ParameterRows) -> dict[str, int]:
@@ -98,7 +90,7 @@ class AdaptiveDensity(Strategy):
             self._forget(field.means)
         self._count(step.output)
         done = {}
-        if step.step > self.densify_from and step.step % self.settings.every == 0:
+        if step.step in self.events:
             grown = self._densify(field, rows)
             done = {"grown": grown, "pruned": self._prune(field, rows, step.step)}
             self._forget(field.means)
@@ -108,20 +100,16 @@ class AdaptiveDensity(Strategy):
         return done
 
     def _forget(self, like: Tensor) -> None:
-        for name in self.state_dict():
+        for name in self.counters:
             setattr(self, name, like.new_zeros(len(like)))
 
     def _count(self, output: RenderOutput) -> None:
-        splats = output.drawn
-        gradient, slots = splats.means2d.grad, splats.gaussians.source_index
-        if gradient is None:
+        splats, lengths = output.drawn, gradient_lengths(output)
+        if lengths is None:
             return
-        height, width = output.alpha.shape
-        drawn = splats.radii > 0
-        # In units of half the image, as the thresholds of the lineage are (docs/methods.md 4.3).
-        lengths = torch.hypot(0.5 * width * gradient[:, 0], 0.5 * height * gradient[:, 1])
-        self.gradient_sum.index_add_(0, slots, torch.where(drawn, lengths, 0.0))
-        self.drawn.index_add_(0, slots, drawn.to(self.drawn.dtype))
+        slots = splats.gaussians.source_index
+        self.gradient_sum.index_add_(0, slots, lengths)
+        self.drawn.index_add_(0, slots, (splats.radii > 0).to(self.drawn.dtype))
         self.largest_radius[slots] = torch.maximum(self.largest_radius[slots], splats.radii)
 
     def _densify(self, field: ExplicitRows, rows: ParameterRows) -> int:

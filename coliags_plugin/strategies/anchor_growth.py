@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any, ClassVar, Protocol
 
 import torch
@@ -14,6 +13,7 @@ from coliags_plugin.contracts import ParameterRows, Schedule, Strategy, Training
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.strategies.births import Births, one_per_free_cell
+from coliags_plugin.strategies.image_gradients import gradient_lengths
 
 
 class AnchorGrowthSettings(Settings):
@@ -68,12 +68,13 @@ class AnchorGrowth(Strategy):
 
     Settings: ClassVar[type[Settings]] = AnchorGrowthSettings
     serves: ClassVar[frozenset[str] | None] = frozenset({"anchors"})
+    counters: ClassVar[tuple[str, ...]] = ("opacity_sum", "seen", "gradient_sum", "drawn")
 
     def __init__(self, settings: Any, generator: torch.Generator, schedule: Schedule, extent: float) -> None:
         super().__init__(settings, generator, schedule, extent)
         self.statistics_from = schedule.at(settings.statistics_from)
-        self.growth_from = schedule.at(settings.growth_from)
         self.until = schedule.at(settings.until)
+        self.events = schedule.events(settings.growth_from, settings.until, settings.every)
         self.opacity_sum = torch.zeros(0)  # [M]
         self.seen = torch.zeros(0)  # [M]
         self.gradient_sum = torch.zeros(0)  # [M * K]
@@ -81,23 +82,13 @@ class AnchorGrowth(Strategy):
 
     def plan(self) -> str:
         """When this run grows and prunes, or why it does not."""
-        every = self.settings.every
-        events = range((self.growth_from // every + 1) * every, self.until, every)
+        every, events = self.settings.every, self.events
         if len(events) == 0:
             return (
                 f"this run neither grows nor prunes anchors: its {self.schedule.steps} steps leave no multiple of "
-                f"{every} between steps {self.growth_from} and {self.until}"
+                f"{every} between steps {self.schedule.at(self.settings.growth_from)} and {self.until}"
             )
         return f"this run grows and prunes anchors every {every} steps from step {events[0]} to {events[-1]}"
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """The counters."""
-        return {name: getattr(self, name) for name in ("opacity_sum", "seen", "gradient_sum", "drawn")}
-
-    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restore the counters."""
-        for name in self.state_dict():
-            setattr(self, name, state[name])
 
     @torch.no_grad()
     def after_backward(self, step: TrainingStep, rows: ParameterRows) -> dict[str, int]:
@@ -108,7 +99,7 @@ class AnchorGrowth(Strategy):
         children = field.offsets.shape[1]
         self._resize(len(field.anchors), children, field.anchors.device)
         self._count(step.output, children)
-        if step.step <= self.growth_from or step.step % self.settings.every:
+        if step.step not in self.events:
             return {}
         most_births = max(1, step.output.alpha.numel() // self.settings.pixels_per_birth)
         grown = self._grow(field, rows, children, most_births)
@@ -125,19 +116,13 @@ class AnchorGrowth(Strategy):
             setattr(self, name, torch.cat([old, old.new_zeros(anchors * per_anchor - len(old))]))
 
     def _count(self, output: RenderOutput, children: int) -> None:
-        splats, gaussians = output.drawn, output.drawn.gaussians
+        gaussians, lengths = output.drawn.gaussians, gradient_lengths(output)
         self.seen[gaussians.visible_sources] += 1
         self.opacity_sum.index_add_(0, gaussians.source_index // children, gaussians.opacities)
-        gradient = splats.means2d.grad
-        if gradient is None:
+        if lengths is None:
             return
-        height, width = output.alpha.shape
-        # In units of half the image, as the thresholds of the lineage are (docs/methods.md 4.3).
-        lengths = torch.hypot(0.5 * width * gradient[:, 0], 0.5 * height * gradient[:, 1])
-        drawn = splats.radii > 0
-        # Masks rather than selections: a selection's size would have to come back from a GPU first.
-        self.gradient_sum.index_add_(0, gaussians.source_index, torch.where(drawn, lengths, 0.0))
-        self.drawn.index_add_(0, gaussians.source_index, drawn.to(self.drawn.dtype))
+        self.gradient_sum.index_add_(0, gaussians.source_index, lengths)
+        self.drawn.index_add_(0, gaussians.source_index, (output.drawn.radii > 0).to(self.drawn.dtype))
 
     def _grow(self, field: Anchors, rows: ParameterRows, children: int, most_births: int) -> int:
         options = self.settings
