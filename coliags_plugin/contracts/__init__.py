@@ -1,0 +1,44 @@
+"""Base classes of all kinds of components, which component packages implement without importing one another."""
+
+from coliags_plugin.contracts.data import DataManager
+from coliags_plugin.contracts.evaluation import Comparison, Metric, Protocol
+from coliags_plugin.contracts.fields import Field, GaussianField, RadianceField, RadianceSamples
+from coliags_plugin.contracts.heads import AppearanceHead, GeometryHead, Head
+from coliags_plugin.contracts.losses import Loss, LossSettings
+from coliags_plugin.contracts.rendering import Availability, Renderer, ViewModule
+from coliags_plugin.contracts.schedule import Schedule, log_linear
+from coliags_plugin.contracts.training import (
+    Draw,
+    ParameterRows,
+    Sampler,
+    Strategy,
+    TrainedModel,
+    TrainingStep,
+)
+
+__all__ = [
+    "AppearanceHead",
+    "Availability",
+    "Comparison",
+    "DataManager",
+    "Draw",
+    "Field",
+    "GaussianField",
+    "GeometryHead",
+    "Head",
+    "Loss",
+    "LossSettings",
+    "Metric",
+    "ParameterRows",
+    "Protocol",
+    "RadianceField",
+    "RadianceSamples",
+    "Renderer",
+    "Sampler",
+    "Schedule",
+    "Strategy",
+    "TrainedModel",
+    "TrainingStep",
+    "ViewModule",
+    "log_linear",
+]

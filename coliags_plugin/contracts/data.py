@@ -1,0 +1,49 @@
+"""Base class of data managers."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from pathlib import Path
+from typing import Any, ClassVar
+
+from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.scenes import Scene
+from coliags_plugin.core.settings import Settings
+
+
+class DataManager(ABC):
+    """Reader of one dataset format: a folder on disk -> :class:`Scene`. Never writes into the dataset."""
+
+    Settings: ClassVar[type[Settings]]
+
+    def __init__(self, settings: Any) -> None:
+        self.settings = settings
+
+    @classmethod
+    def recognise(cls, path: Path) -> str | None:
+        """Evidence in the folder that it has this format; None without. Reads no pixels."""
+        return None
+
+    @classmethod
+    def recognise_unposed(cls, path: Path) -> bool:
+        """Whether a folder is of this format but for its poses. Reads no pixels."""
+        return False
+
+    def without_poses(self) -> DataManager:
+        """The data manager, with the same options, that puts every camera of such a folder at the origin.
+
+        Itself where the options say where poses are.
+        """
+        return self
+
+    @abstractmethod
+    def load(self, path: Path, progress: Progress | None = None) -> Scene:
+        """Read the scene.
+
+        Args:
+            path: Its folder (or file, where a data set is one).
+            progress: Called with ``(what, done, total)`` while images are read.
+
+        Raises:
+            InputError: The folder is missing or does not have this format.
+        """

@@ -1,0 +1,72 @@
+"""Base classes of metrics and evaluation protocols."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from coliags_plugin.core.render_output import RenderOutput
+from coliags_plugin.core.scenes import Frame
+from coliags_plugin.core.settings import Settings
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A rendered view and its ground truth, prepared by a protocol for metrics.
+
+    Attributes:
+        rgb: Rendered, in [0, 1]. [H, W, 3]
+        true_rgb: [H, W, 3]
+        valid: Pixels that count for image metrics. [H, W]
+        depth: Rendered z-depth of the protocol's kind, mm; None where the frame has no true depth. [H, W]
+        true_depth: mm. [H, W]
+        depth_valid: Pixels that count for depth metrics. [H, W]
+    """
+
+    rgb: Float[Tensor, "H W 3"]
+    true_rgb: Float[Tensor, "H W 3"]
+    valid: Bool[Tensor, "H W"]
+    depth: Float[Tensor, "H W"] | None = None
+    true_depth: Float[Tensor, "H W"] | None = None
+    depth_valid: Bool[Tensor, "H W"] | None = None
+
+
+class Metric(ABC):
+    """One number from a :class:`Comparison`."""
+
+    Settings: ClassVar[type[Settings]]
+    higher_is_better: ClassVar[bool]
+    unit: ClassVar[str]
+
+    def __init__(self, settings: Any) -> None:
+        self.settings = settings
+
+    @abstractmethod
+    def __call__(self, comparison: Comparison) -> float:
+        """The metric of one frame.
+
+        Raises:
+            UnavailableError: It is not available; the message says why.
+        """
+
+
+class Protocol(ABC):
+    """Evaluation protocol: the depth kind, masks, quantization and metric variants that are compared."""
+
+    name: ClassVar[str]
+    #: Incremented whenever a metric that it yields could change.
+    version: ClassVar[int]
+    description: ClassVar[str]
+    #: Renderer outputs it needs beyond rgb and alpha.
+    wants: ClassVar[frozenset[str]]
+    #: Result name -> (metric name, metric options)
+    metrics: ClassVar[Mapping[str, tuple[str, Mapping[str, Any]]]]
+
+    @abstractmethod
+    def compare(self, output: RenderOutput, frame: Frame) -> Comparison:
+        """Prepare a rendered view and its frame for the metrics."""

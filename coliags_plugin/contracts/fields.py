@@ -1,0 +1,98 @@
+"""Base classes of Gaussian and radiance fields."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from typing_extensions import Self
+
+from coliags_plugin.contracts.schedule import Schedule
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.scenes import Scene
+from coliags_plugin.core.settings import Settings
+
+
+class Field(nn.Module, ABC):
+    """Trainable scene representation: a :class:`GaussianField` or a :class:`RadianceField`."""
+
+    Settings: ClassVar[type[Settings]]
+    #: ``gaussians3d``, ``surfels`` or ``radiance``; renderers declare which they support.
+    primitive: ClassVar[str]
+    #: Elements that strategies add and remove: ``anchors`` or ``gaussians``; ``none`` where the size is fixed.
+    elements: ClassVar[str] = "none"
+
+    @property
+    def element_count(self) -> int:
+        """Current number of elements; 0 where the field has a fixed size."""
+        return 0
+
+    @classmethod
+    @abstractmethod
+    def from_scene(cls, scene: Scene, settings: Any, generator: torch.Generator) -> Self:
+        """A new field, initialised from the scene's points."""
+
+    @classmethod
+    @abstractmethod
+    def from_state(cls, state: Mapping[str, Tensor], settings: Any) -> Self:
+        """The field of a checkpoint, of any number of elements."""
+
+    @abstractmethod
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Trainable parameters by the name that a method config's ``optimizers`` uses."""
+
+    def before_step(self, step: int, schedule: Schedule) -> None:
+        """Called before each training step, counted from 1, by fields that change over the run.
+
+        What it changes must be a buffer, so that checkpoints restore it.
+        """
+
+
+class GaussianField(Field):
+    """:class:`Camera` -> :class:`Gaussians`, for splatting renderers."""
+
+    @property
+    def feature_channels(self) -> frozenset[str]:
+        """Names of the feature channels of its Gaussians, each of which is an output."""
+        return frozenset()
+
+    @abstractmethod
+    def gaussians(self, camera: Camera) -> Gaussians:
+        """The Gaussians this camera sees, differentiable with respect to the field's parameters and the pose."""
+
+
+@dataclass(frozen=True)
+class RadianceSamples:
+    """Density and colour of a radiance field at points along rays.
+
+    Attributes:
+        density: Not below 0, per scene unit. [P, S]
+        rgb: In [0, 1]. [P, S, 3]
+    """
+
+    density: Float[Tensor, "P S"]
+    rgb: Float[Tensor, "P S 3"]
+
+
+class RadianceField(Field):
+    """Points and directions -> density and colour, for renderers that sample along rays."""
+
+    primitive: ClassVar[str] = "radiance"
+
+    @abstractmethod
+    def query(
+        self, positions: Float[Tensor, "P S 3"], directions: Float[Tensor, "P 3"], camera: Camera
+    ) -> RadianceSamples:
+        """Density and colour at points along the rays of one camera.
+
+        Args:
+            positions: World frame, scene units. [P, S, 3]
+            directions: Unit vectors from the camera. [P, 3]
+            camera: Camera of the rays; its centre and optical axis are the lamp's too.
+        """

@@ -1,0 +1,77 @@
+"""Base classes of the exchangeable heads of an anchor field."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import ClassVar
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from coliags_plugin.core.settings import Settings
+
+
+class Head(nn.Module, ABC):
+    """Exchangeable decoder within a field, with parameter groups of its own."""
+
+    Settings: ClassVar[type[Settings]]
+
+    @abstractmethod
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Trainable parameters by the name that ``optimizers`` uses."""
+
+
+class GeometryHead(Head):
+    """Anchor feature and viewing direction -> opacity, scale and rotation of every child.
+
+    Made by ``Head(settings, features, children, generator)``.
+    """
+
+    @abstractmethod
+    def forward(
+        self, features: Float[Tensor, "V F"], directions: Float[Tensor, "V 3"]
+    ) -> tuple[Float[Tensor, "V K"], Float[Tensor, "V K 7"]]:
+        """Decode the children of the visible anchors.
+
+        Args:
+            features: Anchor features. [V, F]
+            directions: Unit vectors from the camera to the anchors, world frame. [V, 3]
+
+        Returns:
+            Signed opacities in (-1, 1), of which only positive ones are drawn [V, K]; and three scale logits and four
+            quaternion components (w first) per child [V, K, 7].
+        """
+
+
+class AppearanceHead(Head):
+    """Anchor feature and viewing geometry -> colour of every child.
+
+    Made by ``Head(settings, features, children, generator)``.
+    """
+
+    def expect(self, distances: Float[Tensor, "D"]) -> None:
+        """Adapt the initial parameters to the distances of the scene, before training.
+
+        Args:
+            distances: From cameras to anchors in their view, scene units. [D]
+        """
+
+    @abstractmethod
+    def forward(
+        self,
+        features: Float[Tensor, "V F"],
+        directions: Float[Tensor, "V 3"],
+        distances: Float[Tensor, "V 1"],
+        cosines: Float[Tensor, "V 1"],
+    ) -> Float[Tensor, "V K 3"]:
+        """Decode the children's colours.
+
+        Args:
+            features: Anchor features. [V, F]
+            directions: Unit vectors from the camera (and lamp) to the anchors, world frame. [V, 3]
+            distances: Camera to anchor, scene units (mm), not normalised. [V, 1]
+            cosines: Of the angle between optical axis and direction, in [0, 1]. [V, 1]
+
+        Returns:
+            RGB in (0, 1). [V, K, 3]
+        """

@@ -1,0 +1,75 @@
+"""Base class of losses, and the settings of their weights."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar
+
+from jaxtyping import Float
+from pydantic import Field as Option
+from pydantic import model_validator
+from torch import Tensor
+from typing_extensions import Self
+
+from coliags_plugin.contracts.schedule import Schedule, log_linear
+from coliags_plugin.contracts.training import TrainingStep
+from coliags_plugin.core.settings import Settings, refuse_zero_ends
+
+
+class Loss(ABC):
+    """One scalar term of the loss; its weight and schedule are settings, applied by the engine."""
+
+    Settings: ClassVar[type[LossSettings]]
+    #: Attributes of :class:`Target` that at least one training frame must have (``depth``, ``sparse_depth``).
+    needs: ClassVar[frozenset[str]] = frozenset()
+    #: Whether it depends on neighbouring pixels, so that batches of single pixels cannot be used.
+    whole_image: ClassVar[bool] = False
+    #: Whether it reads ``output.splats``, which only splatting renderers deliver.
+    needs_splats: ClassVar[bool] = False
+
+    def __init__(self, settings: Any) -> None:
+        self.settings = settings
+
+    @property
+    def wants(self) -> frozenset[str]:
+        """Outputs beyond rgb and alpha that the renderer must deliver."""
+        return frozenset()
+
+    @abstractmethod
+    def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
+        """The unweighted term; pixels whose ``step.target.mask`` is False are ignored."""
+
+
+class LossSettings(Settings):
+    """Weight of a term: constant, or log-linear from ``weight`` to ``final_weight``, both above 0, over the run.
+
+    It falls no further than to ``min_weight``. The term counts from step ``from_step`` to step ``until_step``, both of
+    which keep their share of a run of another length.
+    """
+
+    weight: float
+    final_weight: float | None = None
+    min_weight: float = Option(default=0.0, ge=0.0)
+    from_step: int = Option(default=0, ge=0)
+    until_step: int | None = Option(default=None, ge=1)
+
+    @model_validator(mode="after")
+    def _ends_above_zero(self) -> Self:
+        refuse_zero_ends(self, "weight", "final_weight")
+        return self
+
+    @model_validator(mode="after")
+    def _from_before_until(self) -> Self:
+        if self.until_step is not None and self.until_step <= self.from_step:
+            raise ValueError(f"until_step {self.until_step} does not come after from_step {self.from_step}")
+        return self
+
+    def active(self, step: int, schedule: Schedule) -> bool:
+        """Whether the term counts at a step, counted from 1."""
+        return step > schedule.at(self.from_step) and (self.until_step is None or step <= schedule.at(self.until_step))
+
+    def weight_at(self, step: int, steps: int) -> float:
+        """The weight at step ``step`` (from 1) of ``steps``."""
+        if self.final_weight is None:
+            return self.weight
+        return max(self.min_weight, log_linear(self.weight, self.final_weight, step / steps))

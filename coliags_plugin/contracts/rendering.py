@@ -1,0 +1,114 @@
+"""Base classes of renderers and per-view modules."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Int
+from torch import Tensor, nn
+from typing_extensions import Self
+
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.render_output import RenderOutput
+from coliags_plugin.core.scenes import Scene, View
+from coliags_plugin.core.settings import Settings
+
+
+@dataclass(frozen=True)
+class Availability:
+    """Whether a renderer can run here, and why or why not."""
+
+    ok: bool
+    reason: str
+
+
+class Renderer(ABC):
+    """Field + Camera -> RenderOutput, with declared primitives, outputs and devices that the engine checks."""
+
+    Settings: ClassVar[type[Settings]]
+    primitives: ClassVar[frozenset[str]]
+    outputs: ClassVar[frozenset[str]]
+    #: torch device types
+    devices: ClassVar[frozenset[str]]
+    #: Whether it can render some pixels of a view; splatting renderers draw whole images.
+    renders_pixels: ClassVar[bool] = False
+
+    def __init__(self, settings: Any) -> None:
+        self.settings = settings
+
+    @classmethod
+    @abstractmethod
+    def availability(cls) -> Availability:
+        """Whether this machine can run it."""
+
+    @abstractmethod
+    def render(
+        self,
+        field: Any,
+        camera: Camera,
+        wants: Sequence[str] = ("rgb", "alpha"),
+        pixels: Int[Tensor, "P 2"] | None = None,
+    ) -> RenderOutput:
+        """Render one view, or some of its pixels.
+
+        Args:
+            field: Field to render, of one of the renderer's ``primitives``.
+            camera: Viewpoint.
+            wants: Names from :data:`coliags_plugin.core.render_output.OUTPUTS` or of the field's feature channels; rgb
+                and alpha always come.
+            pixels: Columns and rows of the only pixels to render, as an image of P rows and one column. [P, 2]
+
+        Raises:
+            InputError: The field, an output or ``pixels`` is not for this renderer.
+        """
+
+
+class ViewModule(nn.Module, ABC):
+    """Per-view module: adjusts the camera before and the output after rendering; may learn parameters per frame."""
+
+    Settings: ClassVar[type[Settings]]
+
+    @property
+    def wants(self) -> frozenset[str]:
+        """Outputs beyond rgb and alpha that :meth:`shade` needs."""
+        return frozenset()
+
+    @property
+    @abstractmethod
+    def untrained_views(self) -> str:
+        """Sentence for log and results on how views other than training frames are treated."""
+
+    @classmethod
+    @abstractmethod
+    def from_scene(cls, scene: Scene, settings: Any, generator: torch.Generator) -> Self:
+        """A new module for the scene's training frames, into which a checkpoint's state can be loaded.
+
+        Raises:
+            InputError: The settings name frames that the scene does not have.
+        """
+
+    @abstractmethod
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Trainable parameters; a method config's ``optimizers`` puts the module's own name and a dot in front."""
+
+    def adjust_camera(self, camera: Camera, view: View | None) -> Camera:
+        """The camera to render from, for instance with a corrected pose.
+
+        Args:
+            camera: The view's camera, as in the scene.
+            view: Which frame it is; None for a free camera.
+        """
+        return camera
+
+    def shade(self, output: RenderOutput, view: View | None) -> RenderOutput:
+        """The output as the camera would have recorded it, for instance with its gain.
+
+        Args:
+            output: Rendered, and shaded by the modules before this one.
+            view: See :meth:`adjust_camera`.
+        """
+        return output

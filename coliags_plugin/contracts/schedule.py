@@ -1,0 +1,47 @@
+"""Length of a run, and values that change over it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Length of a run, and the run length for which the step numbers in its config were written.
+
+    The one rule for every method (docs/configs.md): step numbers in a config keep their share of the run, so
+    ``--steps`` moves them; intervals between events do not change.
+
+    Attributes:
+        steps: Steps of this run.
+        written_for: Steps of the run that the config's step numbers mean.
+    """
+
+    steps: int
+    written_for: int
+
+    def at(self, step: int) -> int:
+        """The step of this run at which the config's ``step`` falls."""
+        return round(step * self.steps / self.written_for)
+
+    def events(self, after: int, until: int, every: int) -> range:
+        """Steps of this run at which something happens that the config places between two of its steps.
+
+        Args:
+            after: Step of the config after which it happens.
+            until: Step of the config before which it happens.
+            every: Interval, in steps of this run: its multiples are the events.
+        """
+        return range((self.at(after) // every + 1) * every, self.at(until), every)
+
+
+def log_linear(start: float, end: float, progress: float) -> float:
+    """``start`` to ``end`` on a straight line in the logarithm; progress is clipped to [0, 1] (docs/methods.md 2.3).
+
+    Raises:
+        ValueError: An end is not above 0: it has no logarithm.
+    """
+    if not (start > 0.0 and end > 0.0):
+        raise ValueError(f"log_linear({start}, {end}): expected both ends above 0")
+    u = min(max(progress, 0.0), 1.0)
+    return float(start ** (1.0 - u) * end**u)

@@ -1,0 +1,170 @@
+"""Training step, and the base classes of strategies and samplers."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+from typing import Protocol as TypingProtocol
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from coliags_plugin.contracts.schedule import Schedule
+from coliags_plugin.core.render_output import RenderOutput
+from coliags_plugin.core.scenes import Target
+from coliags_plugin.core.settings import Settings
+
+
+@dataclass(frozen=True)
+class TrainingStep:
+    """One training step, as passed to losses and strategies.
+
+    Attributes:
+        output: What was rendered.
+        target: What it is compared with.
+        model: The field, and the modules by name.
+        step: Counted from 1.
+        schedule: Of the run.
+    """
+
+    output: RenderOutput
+    target: Target
+    model: TrainedModel
+    step: int
+    schedule: Schedule
+
+
+class TrainedModel(TypingProtocol):
+    """Interface of the model that losses and strategies may use."""
+
+    @property
+    def field(self) -> Any:
+        """The :class:`Field`."""
+
+    @property
+    def view_modules(self) -> Mapping[str, Any]:
+        """View modules by their names in the method config."""
+
+
+class ParameterRows(TypingProtocol):
+    """Adds, removes and resets rows of a field's parameters together with their gradients and Adam's moments.
+
+    Parameters are named by their group, which must hold one parameter. [M, ...]
+    """
+
+    def add_rows(self, rows: Mapping[str, Tensor], parents: Int[Tensor, "B"] | None = None) -> None:
+        """Append rows, which have no gradient and no momentum.
+
+        Args:
+            rows: What to append, by group. [B, ...]
+            parents: For each new row, the row whose mean squared gradient it takes over, so that its first steps are
+                no larger than its parent's; without, new rows start with none. [B]
+        """
+
+    def keep_rows(self, groups: Sequence[str], keep: Bool[Tensor, "M"]) -> None:
+        """Keep only some rows.
+
+        Args:
+            groups: Names of the groups.
+            keep: True for rows that stay. [M]
+        """
+
+    def reset_rows(self, group: str, rows: Bool[Tensor, "M"] | None = None) -> None:
+        """Forget the moments of rows, of all of them where none are given. [M]"""
+
+    def replace_values(self, group: str, values: Tensor) -> None:
+        """Put other values in the place of a group's, and forget their moments. [M, ...]"""
+
+
+class Strategy(ABC):
+    """Densification and pruning of a field between optimizer steps, with its own counters.
+
+    Args:
+        settings: Its options.
+        generator: For its random choices.
+        schedule: Of the run.
+        extent: Of the scene (:attr:`Scene.extent`), scene units.
+    """
+
+    Settings: ClassVar[type[Settings]]
+    #: Kinds of :attr:`Field.elements` that it can change; None where it changes nothing.
+    serves: ClassVar[frozenset[str] | None]
+    #: Attributes that are tensors of counters, saved with a checkpoint.
+    counters: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(self, settings: Any, generator: torch.Generator, schedule: Schedule, extent: float) -> None:
+        self.settings = settings
+        self.generator = generator
+        self.schedule = schedule
+        self.extent = extent
+
+    @abstractmethod
+    def plan(self) -> str:
+        """One sentence for the log: the steps at which it grows or prunes, or why it will not."""
+
+    def before_step(self, step: int, field: Any, rows: ParameterRows) -> None:  # noqa: B027 (optional)
+        """Called before step ``step`` renders."""
+
+    def after_backward(self, step: TrainingStep, rows: ParameterRows) -> dict[str, int]:
+        """Called after ``backward`` and before the optimisers step.
+
+        Returns:
+            Counts of changes for the log, for instance ``{"grown": 12, "pruned": 3}``; empty without changes.
+        """
+        return {}
+
+    def after_step(self, step: TrainingStep, rows: ParameterRows) -> dict[str, int]:
+        """Called after the optimisers have stepped; returns like :meth:`after_backward`."""
+        return {}
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Counters for the checkpoint."""
+        return {name: getattr(self, name) for name in self.counters}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Restore what :meth:`state_dict` gave."""
+        for name in self.counters:
+            setattr(self, name, state[name])
+
+
+@dataclass(frozen=True)
+class Draw:
+    """A training frame, or some of its pixels, to render in a training step.
+
+    Attributes:
+        frame: Number of the training frame.
+        pixels: Columns and rows; None for the whole frame. [P, 2]
+    """
+
+    frame: int
+    pixels: Int[Tensor, "P 2"] | None = None
+
+
+class Sampler(ABC):
+    """Sequence of the frames, or pixel batches, that training steps render.
+
+    Args:
+        settings: Its options.
+        sizes: Width and height of every training frame.
+        generator: For its choices.
+
+    Attributes:
+        queue: Frames that it has planned for further steps; saved with a checkpoint and restored by assignment.
+    """
+
+    Settings: ClassVar[type[Settings]]
+    #: Whether its steps see whole images; losses with ``whole_image`` need that.
+    whole_images: ClassVar[bool]
+
+    def __init__(self, settings: Any, sizes: Sequence[tuple[int, int]], generator: torch.Generator) -> None:
+        self.settings = settings
+        self.sizes = sizes
+        self.generator = generator
+        self.queue: list[int] = []
+
+    @abstractmethod
+    def next(self) -> list[Draw]:
+        """The draws of the next step, at least one."""
