@@ -21,6 +21,7 @@ LAYERS = (
     {"outputs"},
     {"engine", "phantom", "reconstruction"},
     {"data_check", "reporting"},
+    {"api"},
     {"cli"},
 )
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}

@@ -26,20 +26,16 @@ class Evaluate:
 
     def run(self) -> None:
         """Evaluate, print a table, and print the path of the metrics."""
-        import json
-
         from rich.console import Console
 
-        from coliags_plugin.engine.backends import choose_device
-        from coliags_plugin.engine.evaluator import evaluate
-        from coliags_plugin.engine.trained import load_trained
+        from coliags_plugin.api import evaluate, load_run
         from coliags_plugin.reporting.metrics_table import metrics_table
 
-        trained = load_trained(self.path, choose_device(self.device), self.data)
-        folder = evaluate(trained, self.protocol or trained.config.protocol)
-        summary = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+        trained = load_run(self.path, data=self.data, device=self.device)
+        protocol = self.protocol or trained.config.protocol
+        summary = evaluate(trained, protocol)
         Console().print(metrics_table(summary))
         for reason in dict.fromkeys(summary["reasons"].values()):
             names = [name for name, text in summary["reasons"].items() if text == reason]
             print(f"{', '.join(names)}: {reason}")
-        print(folder / "metrics.json")
+        print(trained.run.evaluation(protocol) / "metrics.json")

@@ -34,11 +34,10 @@ class Render:
 
     def run(self) -> None:
         """Render and print the output folder."""
-        from coliags_plugin.engine.backends import choose_device
+        from coliags_plugin.api import load_run
         from coliags_plugin.engine.rendering import render_run
-        from coliags_plugin.engine.trained import load_trained
 
         output = self.output or self.path / "renders"
-        trained = load_trained(self.path, choose_device(self.device), self.data)
+        trained = load_run(self.path, data=self.data, device=self.device)
         render_run(trained, output, self.frames, self.video, self.fps, self.overwrite)
         print(output)
