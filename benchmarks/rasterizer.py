@@ -33,7 +33,7 @@ from coliags_plugin.config.registry import REGISTRIES
 from coliags_plugin.contracts import Renderer
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
-from coliags_plugin.engine.backends import choose_renderer
+from coliags_plugin.renderers.choice import choose_renderer
 
 INPUTS = ("means", "quats_wxyz", "scales", "opacities", "colors")
 WANTS = ("rgb", "alpha", "depth_accumulated")

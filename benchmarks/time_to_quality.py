@@ -17,8 +17,8 @@ import tyro
 from machine import describe_machine, markdown_table, write_results
 
 from coliags_plugin.config.method_config import load_method
-from coliags_plugin.engine.backends import choose_device
 from coliags_plugin.engine.data_formats import load_scene
+from coliags_plugin.engine.devices import choose_device
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.scoring import Scorer
 from coliags_plugin.engine.trainer import Trainer

@@ -25,7 +25,7 @@ from tube import tube_scene
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.contracts import TrainingStep
 from coliags_plugin.core.gaussians import Gaussians
-from coliags_plugin.engine.backends import choose_device
+from coliags_plugin.engine.devices import choose_device
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer
 

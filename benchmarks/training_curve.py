@@ -25,8 +25,8 @@ import tyro
 from coliags_plugin.cli.arguments import Assignments
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.engine.backends import choose_device
 from coliags_plugin.engine.data_formats import load_method_for, load_scene
+from coliags_plugin.engine.devices import choose_device
 from coliags_plugin.engine.evaluator import MAIN_SET
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.scoring import Scorer, within_seen

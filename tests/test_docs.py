@@ -23,6 +23,7 @@ from coliags_plugin.config.method_config import MethodConfig, OptimizerSettings,
 from coliags_plugin.config.registry import REGISTRIES, datamanagers
 from coliags_plugin.core.render_output import OUTPUTS
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.datamanagers.recognition import formats
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
 from coliags_plugin.datamanagers.splits import held_out
 from coliags_plugin.engine.randomness import PURPOSES
@@ -252,7 +253,7 @@ def as_written(value: Any) -> str:
 
 
 OPTIONS = "| option | default | values | what |"
-FORMATS = [name for name in datamanagers if datamanagers.source(name) == "built in" and name != "auto"]
+FORMATS = [name for name in formats() if datamanagers.source(name) == "built in"]
 OPTION_TABLES = [
     (PhantomSettings, "phantom.md", "| setting | default | range | what |"),
     *((datamanagers.get(name).Settings, f"layouts/{name}.md", OPTIONS) for name in FORMATS),

@@ -1,1 +1,1 @@
-"""Names to components, and YAML to validated method configs."""
+"""Component registries and method configs."""

@@ -1,4 +1,4 @@
-"""A component in a config: its name in a registry, and settings validated against that component's own class."""
+"""Component nodes of method configs: a registered name with validated settings."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ class OptimizerSettings(Settings):
 
 
 class ScheduleSettings(Settings):
-    """How long to train and how often to write."""
+    """Length of training, and intervals of logging and checkpoints."""
 
     steps: int = Field(default=30_000, ge=1)  # of the run
     written_for: int = Field(default=30_000, ge=1)  # run length that step numbers elsewhere in the config mean
@@ -52,7 +52,7 @@ class ScheduleSettings(Settings):
 
 
 class MethodConfig(Settings):
-    """A method: named components and their settings. What a run folder's ``config.yaml`` holds."""
+    """A method: named components and their settings, as in a run folder's ``config.yaml``."""
 
     description: str = ""  # one line; not inherited
     datamanager: DataManagerNode  # reads the data
@@ -128,12 +128,12 @@ def load_method(method: str, overrides: Iterable[str] = ()) -> LoadedMethod:
 
 
 def method_name(method: str) -> str:
-    """What a method is called: its name, or its file's without the suffix."""
+    """Name of a method, or of its file without the suffix."""
     return Path(method).stem if _is_path(method) else method
 
 
 def method_tree(method: str, overrides: Iterable[str] = ()) -> Node:
-    """What :func:`load_method` validates: inherited, merged and overridden, each value with its origin.
+    """Merged config tree of a method with overrides applied, before validation, each value with its origin.
 
     Raises:
         InputError: No such method, or a file of it is not YAML.

@@ -1,4 +1,4 @@
-"""Components by name.
+"""Registries of components by name.
 
 One :class:`Registry` per kind. Built-ins are ``"name": "module:Class"`` strings, so listing them imports
 nothing. Other packages add components through entry points in the group ``coliags_plugin.<kind>``; uninstalled
@@ -28,7 +28,7 @@ class Registry:
     Args:
         kind: Plural noun, for instance ``"renderers"``.
         builtins: Name to ``"module:Class"``.
-        noun: What errors call one of them; default: the kind and "component".
+        noun: Noun for one of them in errors; default: the kind and "component".
     """
 
     def __init__(self, kind: str, builtins: Mapping[str, str], noun: str = "") -> None:
@@ -71,7 +71,7 @@ class Registry:
         return self._sources[name]
 
     def get(self, name: str) -> Any:
-        """What is registered under a name, imported now if it was not yet.
+        """The component of a name, imported on first use.
 
         Raises:
             InputError: No such name; says which are known and which was probably meant.

@@ -1,4 +1,4 @@
-"""YAML read with the place of every key, merged by inheritance, and written back."""
+"""YAML trees with the origin of every value, merged by inheritance."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from coliags_plugin.core.errors import InputError
 
 @dataclass(frozen=True)
 class Node:
-    """A value and where it was written: a mapping of nodes, or a plain scalar or tuple.
+    """A value with its origin: a mapping of nodes, or a plain scalar or tuple.
 
     Attributes:
         value: The value.
@@ -130,7 +130,7 @@ def _tuples(value: Any) -> Any:
 
 
 def merge(base: Node, over: Node) -> Node:
-    """``over`` upon ``base``, key by key.
+    """Merge ``over`` into ``base``, key by key.
 
     A component whose ``name`` changes keeps nothing of the options inherited for the old name.
     """
@@ -150,7 +150,7 @@ _KEY = re.compile(r'"[^"]+"|[^".]+')
 
 
 def override(tree: Node, assignment: str) -> Node:
-    """Apply one ``key.path=value``; a key that holds a dot stands in double quotes.
+    """Apply one ``key.path=value``; a key with a dot is put in double quotes.
 
     Raises:
         InputError: It has no ``=`` or an empty key.

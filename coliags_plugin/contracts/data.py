@@ -15,6 +15,8 @@ class DataManager(ABC):
     """Reader of one dataset format: a folder on disk -> :class:`Scene`. Never writes into the dataset."""
 
     Settings: ClassVar[type[Settings]]
+    #: Whether it reads a format of its own; False where it stands for whichever data manager recognises a folder.
+    has_format: ClassVar[bool] = True
 
     def __init__(self, settings: Any) -> None:
         self.settings = settings

@@ -41,17 +41,16 @@ class Loss(ABC):
 
 
 class LossSettings(Settings):
-    """Weight of a term: constant, or log-linear from ``weight`` to ``final_weight``, both above 0, over the run.
+    """Weight of a loss term over the run, and the steps at which it is active.
 
-    It falls no further than to ``min_weight``. The term counts from step ``from_step`` to step ``until_step``, both of
-    which keep their share of a run of another length.
+    ``weight`` and ``final_weight`` are above 0; step numbers keep their share of a run of another length.
     """
 
-    weight: float
-    final_weight: float | None = None
-    min_weight: float = Option(default=0.0, ge=0.0)
-    from_step: int = Option(default=0, ge=0)
-    until_step: int | None = Option(default=None, ge=1)
+    weight: float  # factor of the term, at the start where final_weight is set
+    final_weight: float | None = None  # factor at the last step, approached log-linearly; null: constant weight
+    min_weight: float = Option(default=0.0, ge=0.0)  # lower bound of the decaying weight
+    from_step: int = Option(default=0, ge=0)  # the term is active after this step
+    until_step: int | None = Option(default=None, ge=1)  # and up to this one; null: to the end
 
     @model_validator(mode="after")
     def _ends_above_zero(self) -> Self:

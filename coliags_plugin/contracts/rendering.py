@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -44,6 +44,27 @@ class Renderer(ABC):
     @abstractmethod
     def availability(cls) -> Availability:
         """Whether this machine can run it."""
+
+    @classmethod
+    def alternatives(cls, settings: Any) -> Sequence[Mapping[str, Any]]:
+        """Configs of the renderers that it stands for, in order of preference; empty for a renderer of its own."""
+        return ()
+
+    @classmethod
+    def obstacle(cls, primitive: str, device: torch.device) -> str:
+        """Reason why it cannot render a field on a device, to follow its name in a message; empty without one.
+
+        Args:
+            primitive: Of the field.
+            device: Of the field.
+        """
+        if primitive not in cls.primitives:
+            return f"draws {', '.join(sorted(cls.primitives))}, the field is made of {primitive}"
+        if device.type not in cls.devices:
+            return f"runs on {', '.join(sorted(cls.devices))}, the device is {device.type}"
+        # Last, because finding out may compile something.
+        available = cls.availability()
+        return "" if available.ok else f"cannot run here: {available.reason}"
 
     @abstractmethod
     def render(

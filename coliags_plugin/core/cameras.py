@@ -1,4 +1,4 @@
-"""The pinhole camera every field and renderer works with."""
+"""Posed pinhole camera."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Camera:
         return torch.tensor(matrix, dtype=self.camera_to_world.dtype, device=self.camera_to_world.device)
 
     def rays(self) -> Float[Tensor, "H W 3"]:
-        """World directions through the pixel centres, scaled so that z-depth 1 is one direction long.
+        """World directions through the pixel centres, scaled to z-depth 1.
 
         A point at z-depth ``z`` is ``center + z * rays()``. [H, W, 3]
         """
@@ -72,7 +72,7 @@ class Camera:
         return directions @ self.camera_to_world[:3, :3].T
 
     def rays_at(self, pixels: Int[Tensor, "P 2"]) -> Float[Tensor, "P 3"]:
-        """Like :meth:`rays`, of some pixels.
+        """World directions through some pixel centres, scaled to z-depth 1.
 
         Args:
             pixels: Columns and rows. [P, 2]

@@ -1,4 +1,4 @@
-"""The Gaussians of one view, as a field hands them to a splatting renderer."""
+"""Gaussians of one view, the input of splatting renderers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Encoding pictures: the one way from pixels to PNG, JPEG and TIFF."""
+"""Encoding of images as PNG, JPEG and TIFF."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from coliags_plugin.core.files import atomic_write
 
 
 def encode_image(pixels: np.ndarray, suffix: str = ".png", options: Sequence[int] = ()) -> bytes:
-    """A picture file's bytes.
+    """Encode an image as the bytes of a file.
 
     Args:
         pixels: RGB or one channel, of a type that the format holds. [H, W, 3] or [H, W]
@@ -29,14 +29,14 @@ def encode_image(pixels: np.ndarray, suffix: str = ".png", options: Sequence[int
     try:
         encoded, data = cv2.imencode(suffix, np.ascontiguousarray(bgr), list(options))
     except cv2.error as error:
-        raise InputError(f"a {kind} picture cannot be written as {suffix}: {error}") from error
+        raise InputError(f"a {kind} image cannot be written as {suffix}: {error}") from error
     if not encoded:
-        raise InputError(f"a {kind} picture cannot be written as {suffix}")
+        raise InputError(f"a {kind} image cannot be written as {suffix}")
     return bytes(data)
 
 
 def write_image(path: Path, pixels: np.ndarray) -> None:
-    """Write a picture in the format of its suffix, whole or not at all; its folder is made.
+    """Write an image atomically in the format of its suffix; its folder is made.
 
     Args:
         path: Where to.

@@ -20,7 +20,7 @@ def write_ply(
     triangles: Int[np.ndarray, "F 3"] | None = None,
     comment: str = "",
 ) -> None:
-    """Write vertices, and the triangles between them, whole or not at all; the folder is made.
+    """Write vertices and triangles atomically; the folder is made.
 
     Args:
         path: Where to.

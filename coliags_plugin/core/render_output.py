@@ -1,4 +1,4 @@
-"""What a renderer answers."""
+"""Outputs of renderers."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ DEPTH_KINDS = tuple(name for name in OUTPUTS if "depth" in name)
 
 @dataclass(frozen=True)
 class Splats:
-    """What a splatting renderer knows of the Gaussians it has drawn.
+    """Rendered Gaussians and their projections, of splatting renderers only.
 
     Attributes:
         gaussians: What was drawn.

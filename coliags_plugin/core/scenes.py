@@ -1,10 +1,10 @@
-"""What a data manager hands to training and evaluation."""
+"""Scenes, frames and targets, which data managers produce for training and evaluation."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
@@ -15,10 +15,10 @@ from coliags_plugin.core.cameras import Camera
 
 @dataclass(frozen=True)
 class SparseDepth:
-    """z-depth known at single points of a picture, as structure from motion finds it.
+    """z-depth known at single points of an image, as from structure from motion.
 
     Attributes:
-        pixels: (column, row), centres at integers + 0.5; inside the picture. [K, 2]
+        pixels: (column, row), centres at integers + 0.5; inside the image. [K, 2]
         depth: z-depth, scene units. [K]
     """
 
@@ -32,11 +32,11 @@ class SparseDepth:
 
 @dataclass(frozen=True)
 class View:
-    """Which frame of the video is rendered, for modules that know frames by name.
+    """Identity of the rendered frame, for view modules.
 
     Attributes:
-        name: The frame's.
-        time: Of the frame: its index in the video, counted from 0.
+        name: Name of the frame.
+        time: Index of the frame in the video, counted from 0.
         trained: Whether it is among the training frames.
     """
 
@@ -45,9 +45,31 @@ class View:
     trained: bool
 
 
+class _ImageAndMask(Protocol):
+    @property
+    def image(self) -> UInt8[Tensor, "H W 3"]: ...
+    @property
+    def mask(self) -> Bool[Tensor, "H W"] | None: ...
+
+
+class _MaskedImage:
+    """Float colours and a complete mask of classes with an image and an optional mask."""
+
+    @property
+    def rgb(self: _ImageAndMask) -> Float[Tensor, "H W 3"]:
+        """The image in [0, 1], float32. [H, W, 3]"""
+        return self.image.to(torch.float32) / 255.0
+
+    @property
+    def valid(self: _ImageAndMask) -> Bool[Tensor, "H W"]:
+        """The mask, all True where there is none. [H, W]"""
+        image, mask = self.image, self.mask
+        return torch.ones(image.shape[:2], dtype=torch.bool, device=image.device) if mask is None else mask
+
+
 @dataclass(frozen=True)
-class Target:
-    """What a training step's output is compared with: a frame, or P pixels of frames as P rows and one column.
+class Target(_MaskedImage):
+    """Ground truth of a training step: a frame, or P pixels of frames as P rows and one column.
 
     Attributes:
         name: Of the frame, or of the frames.
@@ -63,26 +85,16 @@ class Target:
     depth: Float[Tensor, "H W"] | None = None
     sparse_depth: SparseDepth | None = None
 
-    @property
-    def rgb(self) -> Float[Tensor, "H W 3"]:
-        """The image in [0, 1], float32. [H, W, 3]"""
-        return _unit_range(self.image)
-
-    @property
-    def valid(self) -> Bool[Tensor, "H W"]:
-        """The mask, all True where there is none. [H, W]"""
-        return _all_true(self.image) if self.mask is None else self.mask
-
 
 @dataclass(frozen=True)
-class Frame:
-    """One posed picture. Tensors stay on the CPU until :meth:`to` moves them.
+class Frame(_MaskedImage):
+    """One posed image. Tensors stay on the CPU until :meth:`to` moves them.
 
     Attributes:
         name: Unique within the scene; the file's stem where there is one.
         index: Of the frame in the video, counted from 0.
         image: RGB. [H, W, 3]
-        camera: Where it was taken from.
+        camera: Camera that took it.
         depth: z-depth, mm; NaN where unknown. None where the dataset has none. [H, W]
         mask: False where a pixel is to be ignored. None means every pixel counts. [H, W]
         seen: For test views with ground-truth geometry: True where a training frame sees the same surface. [H, W]
@@ -102,22 +114,12 @@ class Frame:
     sparse_depth: SparseDepth | None = None
 
     @property
-    def rgb(self) -> Float[Tensor, "H W 3"]:
-        """The image in [0, 1], float32. [H, W, 3]"""
-        return _unit_range(self.image)
-
-    @property
-    def valid(self) -> Bool[Tensor, "H W"]:
-        """The mask, all True where there is none. [H, W]"""
-        return _all_true(self.image) if self.mask is None else self.mask
-
-    @property
     def target(self) -> Target:
-        """The whole frame to compare with."""
+        """The whole frame as a target."""
         return Target(self.name, self.image, self.mask, self.depth, self.sparse_depth)
 
     def target_at(self, pixels: Int[Tensor, "P 2"]) -> Target:
-        """Some pixels to compare with.
+        """Some pixels as a target.
 
         Args:
             pixels: Columns and rows. [P, 2]
@@ -159,7 +161,7 @@ class PointCloud:
 
 @dataclass(frozen=True)
 class Scene:
-    """A dataset, read and split.
+    """A dataset with its split and initial points.
 
     Attributes:
         name: Short name for folders and tables.
@@ -167,7 +169,7 @@ class Scene:
         test_sets: Held-out frames by set name; ``"test"`` is the split's own, others (``"rotation"``) come with
             the data.
         points: Initial points.
-        provenance: Where all this came from: dataset, layout, calibration, pose convention, split, fingerprints.
+        provenance: Origin of the data: dataset, layout, calibration, pose convention, split, fingerprints.
     """
 
     name: str
@@ -199,14 +201,6 @@ class Scene:
             fallback.append(size[depth > 0])
         found = torch.cat(sizes)
         return float((found if len(found) else torch.cat(fallback)).median())
-
-
-def _unit_range(image: UInt8[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
-    return image.to(torch.float32) / 255.0
-
-
-def _all_true(image: UInt8[Tensor, "H W 3"]) -> Bool[Tensor, "H W"]:
-    return torch.ones(image.shape[:2], dtype=torch.bool, device=image.device)
 
 
 def concatenate_targets(parts: Sequence[Target]) -> Target:

@@ -1,4 +1,4 @@
-"""Typed settings: the base class of every component's options."""
+"""Base class of all typed settings."""
 
 from __future__ import annotations
 

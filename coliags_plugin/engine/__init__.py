@@ -1,1 +1,1 @@
-"""Training, evaluation, checkpoints and reports: where the components meet."""
+"""Training, evaluation, checkpoints and run folders."""

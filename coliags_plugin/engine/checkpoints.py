@@ -1,4 +1,4 @@
-"""Checkpoints: safetensors for tensors, JSON for the rest; written beside, then renamed."""
+"""Checkpoints: safetensors for tensors and JSON for the rest, written atomically."""
 
 from __future__ import annotations
 
@@ -11,12 +11,14 @@ from typing import Any
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
-from torch import Tensor, nn
+from torch import Tensor
 
-from coliags_plugin.contracts import Sampler, Strategy
+from coliags_plugin.config.method_config import MethodConfig
+from coliags_plugin.contracts import Renderer, Sampler, Strategy
 from coliags_plugin.core.errors import InputError, NotFiniteError
 from coliags_plugin.core.files import atomic_folder
-from coliags_plugin.engine.model import Model
+from coliags_plugin.core.scenes import Scene
+from coliags_plugin.engine.model import Model, make_view_modules
 from coliags_plugin.engine.optimizers import Optimizers
 
 #: Written. Format 2 lacks view modules and is otherwise the same.
@@ -26,7 +28,7 @@ READABLE = (2, FORMAT)
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A checkpoint as read.
+    """Content of a checkpoint.
 
     Attributes:
         step: Steps taken.
@@ -56,7 +58,7 @@ def save_checkpoint(
     generators: Mapping[str, torch.Generator],
     sampler: Sampler,
 ) -> Path:
-    """Write ``step-<step>`` into ``folder``, so that training goes on from there to the bit.
+    """Write ``step-<step>`` into ``folder``, for bitwise identical continuation of training.
 
     Returns:
         The checkpoint's folder.
@@ -132,21 +134,35 @@ def read_checkpoint(path: Path, method: str, device: torch.device) -> Checkpoint
     return Checkpoint(step, owner, placed, queue)
 
 
-def restore_modules(checkpoint: Checkpoint, modules: Mapping[str, nn.Module]) -> None:
-    """Put the view modules' states back.
+def restore_model(checkpoint: Checkpoint, config: MethodConfig, scene: Scene, renderer: Renderer) -> Model:
+    """The model of a checkpoint.
+
+    Args:
+        checkpoint: As read.
+        config: Of the run.
+        scene: Of the run, for view modules with parameters per frame.
+        renderer: The renderer of the model.
 
     Raises:
-        InputError: The checkpoint does not hold them, or those of other frames.
+        InputError: The checkpoint's field or modules do not fit the config and the scene.
     """
+    try:
+        field = config.field.target.from_state(checkpoint.part("field"), config.field.settings)
+    except (KeyError, RuntimeError) as error:
+        raise InputError(
+            f"the checkpoint does not fit field '{config.field.name}': {error}", "one of this run"
+        ) from error
+    modules = make_view_modules(config, scene, torch.Generator())
     for name, module in modules.items():
         try:
             module.load_state_dict(checkpoint.part(f"modules/{name}"))
         except RuntimeError as error:
             raise InputError(f"the checkpoint's module '{name}' does not fit: {error}", "one of this run") from error
+    return Model(field, renderer, modules)
 
 
 def restore_optimizers(checkpoint: Checkpoint, optimizers: Optimizers) -> None:
-    """Put Adam's moments back."""
+    """Load Adam's moments."""
     for key, value in checkpoint.part("optimizer").items():
         group, index, name = key.split("/")
         adam = optimizers.adam[group]
@@ -154,6 +170,6 @@ def restore_optimizers(checkpoint: Checkpoint, optimizers: Optimizers) -> None:
 
 
 def restore_generators(checkpoint: Checkpoint, generators: Mapping[str, torch.Generator]) -> None:
-    """Put the random streams back."""
+    """Load the states of the random generators."""
     for name, state in checkpoint.part("generator").items():
         generators[name].set_state(state)

@@ -1,4 +1,4 @@
-"""Whether the components of a method fit each other and the scene; found out before anything is written."""
+"""Checks, before anything is written, that the components of a method fit each other and the scene."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from coliags_plugin.config.method_config import MethodConfig
 from coliags_plugin.contracts import Loss, Schedule
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Scene
-from coliags_plugin.engine.backends import ChosenRenderer
+from coliags_plugin.renderers.choice import ChosenRenderer
 
 #: What messages call the attributes of a target that losses need.
 _DATA = {"depth": "depth", "sparse_depth": "depth at single points"}

@@ -1,4 +1,4 @@
-"""Which data manager reads a folder."""
+"""Reading of scenes in the format of their folder."""
 
 from __future__ import annotations
 
@@ -18,61 +18,14 @@ from coliags_plugin.contracts import DataManager
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Scene
+from coliags_plugin.datamanagers.recognition import find_format, unposed_format
 from coliags_plugin.datamanagers.recorded import NoPointsError
 from coliags_plugin.engine.progress import progress_callback
 
 log = logging.getLogger(__name__)
 
-#: Seconds of reading from which on it is worth saying how far it is.
+#: Seconds of reading after which progress is reported.
 READING_IS_LONG = 2.0
-#: Stands for the format that the files show.
-AUTO = "auto"
-
-
-def find_format(path: Path) -> str:
-    """The name of the data manager that recognises a folder.
-
-    Raises:
-        InputError: The folder is missing, or none or several do.
-    """
-    known = [name for name in registry.datamanagers if name != AUTO]
-    if not path.exists():
-        raise InputError(f"no folder {path}", f"a scene in one of the formats {', '.join(known)}", "Check the path")
-    found = _recognised(path)
-    if not found:
-        shown = sorted(item.name + "/" * item.is_dir() for item in path.iterdir()) if path.is_dir() else []
-        holds = ", ".join(shown[:6]) + (f" and {len(shown) - 6} more" if len(shown) > 6 else "") or "nothing"
-        raise InputError(
-            f"{path} holds {holds}, which none of the formats {', '.join(known)} recognises",
-            "a scene's own folder",
-            "docs/data.md lists what each looks like; --format NAME chooses one and says what it misses. Pictures "
-            "without poses become a scene by coliags poses track, if there is depth, or coliags poses sfm",
-        )
-    if len(found) > 1:
-        seen = "; ".join(f"{name}: {reason}" for name, reason in found.items())
-        raise InputError(f"{path} may be of several formats ({seen})", "one of them", "Choose with --format NAME")
-    ((name, reason),) = found.items()
-    log.info("%s: format %s (%s)", path, name, reason)
-    return name
-
-
-def _recognised(path: Path) -> dict[str, str]:
-    """Why a folder is of a format, for each that recognises it."""
-    known = (name for name in registry.datamanagers if name != AUTO)
-    reasons = {name: registry.datamanagers.get(name).recognise(path) for name in known}
-    return {name: reason for name, reason in reasons.items() if reason is not None}
-
-
-def chosen_datamanager(component: Component, path: Path) -> Component:
-    """The component itself, or for ``auto`` the one that the folder asks for, with the options that were given.
-
-    Raises:
-        InputError: See :func:`find_format`.
-    """
-    if component.name != AUTO:
-        return component
-    given = component.settings.model_dump(include=component.settings.model_fields_set)
-    return make_component(component.kind, {"name": find_format(path), **given})
 
 
 def load_method_for(
@@ -89,19 +42,21 @@ def load_method_for(
     Raises:
         InputError: No such method or format, or the config is not valid, or see :func:`find_format`.
     """
-    if data_format is None and method_tree(method, overrides).find(["datamanager", "name"]).value == AUTO:
-        data_format = find_format(path)
+    if data_format is None:
+        named = method_tree(method, overrides).find(["datamanager", "name"]).value
+        if named in registry.datamanagers and not registry.datamanagers.get(named).has_format:
+            data_format = find_format(path)
     chosen = [] if data_format is None else [f"datamanager.name={data_format}"]
     return load_method(method, [*chosen, *overrides])
 
 
 def load_scene(config: MethodConfig, path: Path) -> Scene:
-    """Read the data with the method's data manager; what takes long says how far it is.
+    """Read the data with the method's data manager, reporting progress when it takes long.
 
     Raises:
         InputError: It cannot be read.
     """
-    component = chosen_datamanager(config.datamanager, path)
+    component = config.datamanager
     with progress_callback(after=READING_IS_LONG) as progress:
         scene: Scene = component.target(component.settings).load(path, progress)
     return scene
@@ -116,7 +71,7 @@ def open_scene(
         path: Its folder.
         data_format: A data manager's name; None: the one that recognises the folder.
         options: ``key=value`` options of that data manager.
-        progress: Told how far reading is.
+        progress: Called with ``(what, done, total)`` while images are read.
 
     Raises:
         InputError: See :func:`find_format`; an option is unknown; or the scene cannot be read.
@@ -133,13 +88,13 @@ def open_scene(
 def open_video(
     path: Path, data_format: str | None = None, options: Sequence[str] = (), progress: Progress | None = None
 ) -> tuple[Scene, bool]:
-    """Read all frames of a video as training frames, for whoever finds their poses himself.
+    """Read all frames of a video as training frames, to estimate their poses.
 
     Args:
         path: Its folder: a scene, or one of a format that can do without poses (``rgbd``).
         data_format: See :func:`open_scene`.
         options: See :func:`open_scene`; the split and initial points are not to be chosen.
-        progress: Told how far reading is.
+        progress: Called with ``(what, done, total)`` while images are read.
 
     Returns:
         The scene, and whether it has poses; where not, all its cameras are at the origin.
@@ -148,7 +103,7 @@ def open_video(
         InputError: See :func:`open_scene`.
     """
     options = (*options, "split=all-train", "initial_points=none")
-    name = data_format or _unposed_format(path)
+    name = data_format or unposed_format(path)
     if name is not None and registry.datamanagers.get(name).recognise_unposed(path):
         component = _component(name, override_all(Node({}, "options"), options).plain())
         manager: DataManager = component.target(component.settings)
@@ -157,14 +112,6 @@ def open_video(
             log.info("%s: format %s without poses", path, name)
             return unposed.load(path, progress), False
     return open_scene(path, data_format, options, progress), True
-
-
-def _unposed_format(path: Path) -> str | None:
-    """The format of a folder that lacks its poses; None where a format recognises it with them, or none does."""
-    if not path.exists() or _recognised(path):
-        return None
-    known = (name for name in registry.datamanagers if name != AUTO)
-    return next((name for name in known if registry.datamanagers.get(name).recognise_unposed(path)), None)
 
 
 def _opened(path: Path, name: str, options: Mapping[str, Any], progress: Progress | None) -> Scene:

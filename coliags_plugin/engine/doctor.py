@@ -1,4 +1,4 @@
-"""Looking at the machine: libraries, devices, renderers, weights."""
+"""Diagnosis of an installation: libraries, devices, renderers, weights."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from coliags_plugin import __version__
 from coliags_plugin.config import registry
 from coliags_plugin.config.components import make_component
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.engine.backends import choose_device, choose_renderer
+from coliags_plugin.engine.devices import choose_device
+from coliags_plugin.renderers.choice import choose_renderer
 
 #: Distribution -> module. Imported for real: a library that is installed may still fail to load.
 LIBRARIES = {
@@ -31,7 +32,7 @@ LIBRARIES = {
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing looked at."""
+    """One line of the diagnosis."""
 
     subject: str
     text: str
@@ -39,7 +40,7 @@ class Finding:
 
 
 def examine() -> list[Finding]:
-    """Everything that decides whether, where and with what this machine can train."""
+    """Check everything that training depends on."""
     cuda = torch.cuda.is_available()
     findings = [
         Finding("coliags_plugin", __version__),
@@ -48,12 +49,7 @@ def examine() -> list[Finding]:
         Finding("cuda", torch.cuda.get_device_name(0) if cuda else "no device: everything runs on the CPU"),
     ]
     findings += [_library(name, module) for name, module in LIBRARIES.items()]
-    for name in registry.renderers:
-        if name != "auto":
-            available = registry.renderers.get(name).availability()
-            text = f"{'can' if available.ok else 'cannot'} run here: {available.reason}"
-            findings.append(Finding(f"renderer {name}", text))
-    findings.append(_choice())
+    findings += [_renderer(name) for name in registry.renderers]
     return findings
 
 
@@ -69,9 +65,13 @@ def _library(name: str, module: str) -> Finding:
     return Finding(name, found)
 
 
-def _choice() -> Finding:
-    try:
-        chosen = choose_renderer(make_component("renderers", "auto"), "gaussians3d", choose_device("auto"))
-    except InputError as error:
-        return Finding("renderer auto", str(error), ok=False)
-    return Finding("renderer auto", f"would use {chosen.name} ({chosen.reason})")
+def _renderer(name: str) -> Finding:
+    component = make_component("renderers", name)
+    if component.target.alternatives(component.settings):
+        try:
+            chosen = choose_renderer(component, "gaussians3d", choose_device("auto"))
+        except InputError as error:
+            return Finding(f"renderer {name}", str(error), ok=False)
+        return Finding(f"renderer {name}", f"would use {chosen.name} ({chosen.reason})")
+    available = component.target.availability()
+    return Finding(f"renderer {name}", f"{'can' if available.ok else 'cannot'} run here: {available.reason}")

@@ -1,4 +1,4 @@
-"""Figures of a run's held-out views under one protocol."""
+"""Evaluation of a run's held-out views under one protocol."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ SEEN_SUFFIX = "_seen"
 
 @dataclass
 class _Figures:
-    """Per-frame figures of one test set, and why some are missing."""
+    """Per-frame metrics of one test set, and reasons for missing ones."""
 
     rows: dict[str, dict[str, float]] = field(default_factory=dict)
     reasons: dict[str, str] = field(default_factory=dict)
 
     def take(self, frame: str, scores: Scores, suffix: str = "") -> None:
-        """Note the figures of one frame, and why others cannot be had."""
+        """Add the metrics of one frame, and reasons for missing ones."""
         row = self.rows.setdefault(frame, {})
         row.update({name + suffix: value for name, value in scores.values.items()})
         for name, reason in scores.reasons.items():
             self.reasons.setdefault(name + suffix, reason)
 
     def means(self, names: list[str]) -> dict[str, float | None]:
-        """Mean over the frames that have a figure; None where none has."""
+        """Mean over the frames that have a metric; None where none has."""
         found: dict[str, float | None] = {}
         for name in names:
             values = [row[name] for row in self.rows.values() if name in row]
@@ -53,7 +53,7 @@ class _Figures:
 
 
 def evaluate(trained: TrainedRun, protocol_name: str) -> Path:
-    """Render every held-out view, take the protocol's figures, and write them with the pictures.
+    """Render every held-out view, compute the protocol's metrics, and write them with the images.
 
     Writes ``eval/<protocol>/metrics.json`` (means per test set; the main set's also at the top; null where a figure
     cannot be had, with the reason), ``per_frame.csv`` and the pictures. A former evaluation under the same protocol is

@@ -1,4 +1,4 @@
-"""A field, its renderer and the modules around them: the one thing that renders."""
+"""The model: a field, its renderer and the view modules around them."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from coliags_plugin.core.scenes import Scene, View
 
 
 class Model(nn.Module):
-    """Renders a field through its view modules, for training, evaluation and export alike.
+    """A field with its renderer and view modules, used by training, evaluation and export.
 
     Args:
-        field: What the scene looks like.
-        renderer: Draws it.
+        field: Scene representation.
+        renderer: Renderer of the field.
         view_modules: By their names in the method config; cameras pass through them in this order, outputs too.
     """
 
@@ -47,8 +47,8 @@ class Model(nn.Module):
         """Render a view.
 
         Args:
-            camera: Where the view is taken from.
-            wants: Outputs to deliver; rgb and alpha always come, and what modules need beside.
+            camera: Camera before adjustment by view modules.
+            wants: Names of outputs; rgb, alpha and the outputs that modules need are always included.
             view: Which frame of the video it is; None for a free camera.
             pixels: Columns and rows of the only pixels to render. [P, 2]
         """
@@ -70,27 +70,30 @@ class Model(nn.Module):
 
     @property
     def outputs(self) -> frozenset[str]:
-        """Every output that it can be asked for."""
+        """Names of all available outputs."""
         channels = self.field.feature_channels if isinstance(self.field, GaussianField) else frozenset()
         return self.renderer.outputs | channels
 
     def check_outputs(self, wants: Sequence[str], asking: str) -> None:
-        """Refuse outputs that it cannot deliver.
+        """Refuse outputs that the renderer does not have for this field, wanted by a caller or a view module.
 
         Args:
-            wants: Their names.
-            asking: Who wants them, for the message.
+            wants: Names of outputs.
+            asking: Subject of the message about them.
 
         Raises:
             InputError: See above.
         """
-        missing = sorted(set(wants) - self.outputs)
-        if missing:
-            name = type(self.renderer).__name__
-            raise InputError(
-                f"{asking} wants {', '.join(missing)}, which {name} does not deliver for this field",
-                f"some of {', '.join(sorted(self.outputs))}",
-            )
+        wanted = {asking: frozenset(wants)}
+        wanted |= {f"module '{name}'": module.wants for name, module in self.view_modules.items()}
+        for subject, names in wanted.items():
+            missing = sorted(names - self.outputs)
+            if missing:
+                raise InputError(
+                    f"outputs needed by {subject}: {', '.join(missing)}, which {type(self.renderer).__name__} does not "
+                    "deliver for this field",
+                    f"some of {', '.join(sorted(self.outputs))}",
+                )
 
 
 def make_view_modules(config: MethodConfig, scene: Scene, generator: torch.Generator) -> dict[str, ViewModule]:

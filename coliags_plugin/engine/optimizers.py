@@ -1,4 +1,4 @@
-"""Adam per parameter group with the rates a method config gives, and changes of parameter rows."""
+"""Adam per parameter group, with learning-rate schedules and changes of parameter rows."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _GRADIENT, _MOMENTUM, _MEAN_SQUARE = "grad", "exp_avg", "exp_avg_sq"
 
 
 class Optimizers:
-    """One Adam per parameter group of the model, and the only place where Adam's moments are cut.
+    """One Adam optimizer per parameter group of the model, with consistent changes of rows and moments.
 
     Implements :class:`coliags_plugin.contracts.ParameterRows`.
 
@@ -91,7 +91,7 @@ class Optimizers:
             self._change(name, lambda _, old: old[keep])
 
     def reset_rows(self, group: str, rows: Tensor | None = None) -> None:
-        """Forget the moments of rows, of all of them where none are given.
+        """Reset the moments of some rows, or of all.
 
         Args:
             group: Name of the group.
@@ -105,7 +105,7 @@ class Optimizers:
 
     @torch.no_grad()
     def replace_values(self, group: str, values: Tensor) -> None:
-        """Put other values in the place of a group's, and forget their moments. [M, ...]"""
+        """Replace the values of a group and reset their moments. [M, ...]"""
         self._parameter(group).copy_(values)
         self.reset_rows(group)
 
@@ -115,7 +115,7 @@ class Optimizers:
         return parameter
 
     def _change(self, group: str, change: Callable[[str, Tensor], Tensor]) -> None:
-        """Put ``change(kind, old)`` in the place of a group's parameter and of all that has its shape."""
+        """Replace a group's parameter, and its gradient and moments, by ``change(kind, old)``."""
         old = self._parameter(group)
         new = nn.Parameter(change("value", old.detach()), requires_grad=old.requires_grad)
         if old.grad is not None:

@@ -1,4 +1,4 @@
-"""How far a long job is: a bar on a terminal, plain lines elsewhere."""
+"""Progress reports: a bar on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PLAIN_LINE_EVERY = 10.0
 
 
 class ProgressReport:
-    """Counts to a total and says what else is known, with the time still to go.
+    """Progress towards a total, with facts and the remaining time.
 
     Use as a context manager; call :meth:`update` as often as you like.
 
@@ -53,7 +53,7 @@ class ProgressReport:
         return self
 
     def update(self, done: int, facts: str = "") -> None:
-        """Say that ``done`` of the total are done; ``facts`` stand behind the bar."""
+        """Report ``done`` of the total, with ``facts`` behind the bar."""
         if self.bar is not None:
             self.bar.update(self.task, completed=done, facts=facts)
             return

@@ -1,4 +1,4 @@
-"""What a run records of where it came from."""
+"""Software versions for the provenance of a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One generator per purpose, all from one seed, so that no purpose disturbs another."""
+"""Independent random generators per purpose from one seed."""
 
 from __future__ import annotations
 

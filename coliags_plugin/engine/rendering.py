@@ -1,4 +1,4 @@
-"""Pictures and a video of a trained run."""
+"""Images and a video of a trained run."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ RGB_ERROR_LIMIT = 0.2
 
 
 def render_run(trained: TrainedRun, output: Path, frames: str, video: bool, fps: float, overwrite: bool) -> None:
-    """Write rgb, depth and error pictures of a set of frames, and a video along the whole trajectory.
+    """Write colour, depth and error images of a set of frames, and a video along the trajectory.
 
     Args:
         trained: The run.

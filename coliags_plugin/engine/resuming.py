@@ -1,4 +1,4 @@
-"""Going on with a run: with its own method, its own data, and a schedule that changes only on purpose."""
+"""Resuming of runs with their own method, data and schedule."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ logger = logging.getLogger(__name__)
 
 
 def resume_command(run: RunFolder, method: str, data: str) -> str:
-    """The command that goes on with a run."""
+    """Command line that resumes a run."""
     return shlex.join(["coliags", "train", method, "--data", data, "--output", str(run.path), "--resume"])
 
 
@@ -50,7 +50,7 @@ def _check_method(run: RunFolder, name: str) -> None:
 
 
 def resumed_seed(run: RunFolder, asked: int | None) -> int:
-    """A run's own seed.
+    """Seed of a run.
 
     Raises:
         InputError: Another one was asked for.
@@ -62,7 +62,7 @@ def resumed_seed(run: RunFolder, asked: int | None) -> int:
 
 
 def check_same_run(run: RunFolder, method: LoadedMethod, scene: Scene, scene_path: str) -> None:
-    """Refuse to go on with another method, other settings (the schedule apart) or other data.
+    """Refuse to resume with another method, other settings (the schedule apart) or other data.
 
     Raises:
         InputError: See above.

@@ -1,4 +1,4 @@
-"""The folder a run lives in."""
+"""Folder of a run."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class RunFolder:
 
     @property
     def provenance_file(self) -> Path:
-        """Where the run came from."""
+        """Provenance of the run."""
         return self.path / "provenance.json"
 
     @property
@@ -42,7 +42,7 @@ class RunFolder:
         return self.path / "checkpoints"
 
     def evaluation(self, protocol: str) -> Path:
-        """Where the results of a protocol go."""
+        """Folder of the results of a protocol."""
         return self.path / "eval" / protocol
 
     @classmethod
@@ -65,7 +65,7 @@ class RunFolder:
 
     @classmethod
     def existing(cls, path: Path) -> RunFolder:
-        """A run made earlier.
+        """An existing run.
 
         Raises:
             InputError: This is no run folder.
@@ -76,7 +76,7 @@ class RunFolder:
         return folder
 
     def create(self, config_yaml: str, provenance: dict[str, Any], overwrite: bool) -> None:
-        """Make the folder and write what the run starts from; a kill leaves either no folder or all of this.
+        """Create the folder atomically with config and provenance.
 
         Raises:
             InputError: It exists and ``overwrite`` is off, or it cannot be written.
@@ -90,7 +90,7 @@ class RunFolder:
             RunFolder(scratch).rewrite(config_yaml, provenance)
 
     def rewrite(self, config_yaml: str, provenance: dict[str, Any]) -> None:
-        """Write the resolved method config, and where the run comes from."""
+        """Write config and provenance again."""
         write_json(self.provenance_file, provenance)
         atomic_write(self.config_file, config_yaml)
 
@@ -116,7 +116,7 @@ class RunFolder:
         return load_method(str(self.config_file.resolve()))
 
     def provenance(self) -> dict[str, Any]:
-        """What :meth:`create` was given.
+        """Content of the provenance file.
 
         Raises:
             InputError: The file is damaged.

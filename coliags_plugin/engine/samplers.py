@@ -1,4 +1,4 @@
-"""What each training step looks at: whole frames, or batches of pixels."""
+"""Samplers of training steps: whole frames, or batches of pixels."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class FrameSampler(Sampler):
     whole_images: ClassVar[bool] = True
 
     def next(self) -> list[Draw]:
-        """The next frame."""
+        """Draw the next frame."""
         return [Draw(_next_frame(self))]
 
 
@@ -34,7 +34,7 @@ class PixelSamplerSettings(Settings):
 
 
 class PixelSampler(Sampler):
-    """Random pixels of a few frames per step; frames take their turns as whole ones do."""
+    """Random pixels of a few frames per step, each frame once per round in random order."""
 
     Settings: ClassVar[type[Settings]] = PixelSamplerSettings
     whole_images: ClassVar[bool] = False
@@ -42,7 +42,7 @@ class PixelSampler(Sampler):
     settings: PixelSamplerSettings
 
     def next(self) -> list[Draw]:
-        """The next pixels, by frame."""
+        """Draw pixels of the next frames."""
         frames = min(self.settings.frames, self.settings.pixels)
         draws = []
         for turn in range(frames):
@@ -55,7 +55,7 @@ class PixelSampler(Sampler):
 
 
 def _next_frame(sampler: Sampler) -> int:
-    """The next frame of a round, each once; a new round is shuffled when the last has ended."""
+    """Next frame of a shuffled round."""
     if not sampler.queue:
         sampler.queue = torch.randperm(len(sampler.sizes), generator=sampler.generator).tolist()
     return sampler.queue.pop()

@@ -51,7 +51,7 @@ class Scorer:
 
     @torch.no_grad()
     def compare(self, model: Model, frame: Frame, device: torch.device) -> Comparison:
-        """A held-out frame as the model renders it, beside its truth."""
+        """Render a held-out frame for comparison with its ground truth."""
         placed = frame.to(device)
         output = model.render(placed.camera, self.wants, frame.view(trained=False))
         return self.protocol.compare(output, placed)
@@ -70,7 +70,7 @@ class Scorer:
 
 
 def within_seen(comparison: Comparison, frame: Frame) -> Comparison:
-    """A comparison of only those pixels that a training frame sees, where the frame tells."""
+    """A comparison restricted to pixels that a training frame sees, where the frame has a seen mask."""
     if frame.seen is None:
         return comparison
     seen = frame.seen.to(comparison.valid.device)

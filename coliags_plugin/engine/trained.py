@@ -1,4 +1,4 @@
-"""A finished (or interrupted) run, loaded to look at."""
+"""Loading of finished or interrupted runs."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ from typing import Any
 import torch
 
 from coliags_plugin.config.method_config import MethodConfig
-from coliags_plugin.contracts import Field
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Scene
-from coliags_plugin.engine.backends import choose_renderer
-from coliags_plugin.engine.checkpoints import latest_checkpoint, read_checkpoint, restore_modules
+from coliags_plugin.engine.checkpoints import latest_checkpoint, read_checkpoint, restore_model
 from coliags_plugin.engine.data_formats import load_scene
-from coliags_plugin.engine.model import Model, make_view_modules
+from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.run_folder import RunFolder
+from coliags_plugin.renderers.choice import choose_renderer
 
 
 @dataclass(frozen=True)
@@ -60,11 +59,8 @@ def load_trained(path: Path, device: torch.device, data: Path | None = None) -> 
     saved = read_checkpoint(latest_checkpoint(run.checkpoints), method, device)
     scene = load_scene(config, data or Path(scene_path))
     _check_same_data(scene, fingerprint, data or Path(scene_path))
-    field: Field = config.field.target.from_state(saved.part("field"), config.field.settings)
-    renderer = choose_renderer(config.renderer, field.primitive, device).renderer
-    modules = make_view_modules(config, scene, torch.Generator())
-    restore_modules(saved, modules)
-    model = Model(field, renderer, modules).to(device).eval()
+    renderer = choose_renderer(config.renderer, config.field.target.primitive, device).renderer
+    model = restore_model(saved, config, scene, renderer).to(device).eval()
     return TrainedRun(run, config, method, scene, model, saved.step, device)
 
 

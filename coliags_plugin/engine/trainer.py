@@ -1,4 +1,4 @@
-"""Training a model on a scene, step by step."""
+"""Training loop."""
 
 from __future__ import annotations
 
@@ -16,14 +16,13 @@ import torch
 from torch import Tensor
 
 from coliags_plugin.config.method_config import LoadedMethod
-from coliags_plugin.contracts import Draw, Loss, Sampler, Schedule, Strategy, TrainingStep, ViewModule
-from coliags_plugin.core.errors import InputError, InterruptedRunError, NotFiniteError
+from coliags_plugin.contracts import Draw, Loss, Sampler, Schedule, Strategy, TrainingStep
+from coliags_plugin.core.errors import InterruptedRunError, NotFiniteError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.masked import masked_mean
 from coliags_plugin.core.render_output import RenderOutput, Splats, concatenate_pixels
 from coliags_plugin.core.scenes import Frame, Scene, Target, concatenate_targets
 from coliags_plugin.engine import checkpoints
-from coliags_plugin.engine.backends import ChosenRenderer, choose_renderer
 from coliags_plugin.engine.compatibility import check_components
 from coliags_plugin.engine.model import Model, make_view_modules
 from coliags_plugin.engine.optimizers import Optimizers
@@ -32,6 +31,7 @@ from coliags_plugin.engine.provenance import software
 from coliags_plugin.engine.randomness import generators
 from coliags_plugin.engine.resuming import check_same_run, record_schedule, resume_command
 from coliags_plugin.engine.run_folder import RunFolder
+from coliags_plugin.renderers.choice import ChosenRenderer, choose_renderer
 
 logger = logging.getLogger(__name__)
 
@@ -73,9 +73,10 @@ class Trainer:
         check_components(config, self.chosen, scene, self.losses, self.schedule)
         self.frames = _resident(scene.train, device)
         field = config.field.target.from_scene(scene, config.field.settings, self.generators["initialisation"])
-        self.model = Model(field, self.chosen.renderer, self._fresh_modules()).to(device)
+        modules = make_view_modules(config, scene, self.generators["initialisation"])
+        self.model = Model(field, self.chosen.renderer, modules).to(device)
         self.wants = tuple(sorted({"rgb", "alpha"}.union(*(loss.wants for loss in self.losses.values()))))
-        self.model.check_outputs(self.wants, "a loss or module")
+        self.model.check_outputs(self.wants, "the losses")
         self.optimizers = self._optimizers()
         self.step = 0
         self.seconds = 0.0
@@ -89,7 +90,7 @@ class Trainer:
         self.run.create(self.method.config.to_yaml(), self.provenance(), overwrite)
 
     def resume(self) -> None:
-        """Go on from the run's latest checkpoint, or from the start where it has none; CPU runs continue to the bit.
+        """Resume from the run's latest checkpoint, or from the start without one; bitwise identical on the CPU.
 
         A schedule that differs from the run's own is taken as a change on purpose and recorded.
 
@@ -106,16 +107,10 @@ class Trainer:
         logger.info("resuming %s at step %d of %d", self.run.path, self.step, self.steps)
 
     def _restore(self, path: Path) -> None:
-        """Take everything up as a checkpoint left it."""
+        """Load model, optimizers, strategy, sampler and random generators from a checkpoint."""
         saved = checkpoints.read_checkpoint(path, self.method.name, self.device)
-        config = self.method.config
-        try:
-            field = config.field.target.from_state(saved.part("field"), config.field.settings)
-        except (KeyError, RuntimeError) as error:
-            raise InputError(f"checkpoint {path} does not fit the field: {error}", "one of this method") from error
-        modules = self._fresh_modules()
-        checkpoints.restore_modules(saved, modules)
-        self.model = Model(field, self.chosen.renderer, modules).to(self.device)
+        self.model = checkpoints.restore_model(saved, self.method.config, self.scene, self.chosen.renderer)
+        self.model.to(self.device)
         self.optimizers = self._optimizers()
         checkpoints.restore_optimizers(saved, self.optimizers)
         checkpoints.restore_generators(saved, self.generators)
@@ -199,7 +194,7 @@ class Trainer:
         }
 
     def _render(self, draws: list[Draw]) -> tuple[RenderOutput, Target]:
-        """What the sampler has chosen, rendered, and what it is to be compared with."""
+        """Rendered output and target of the drawn frames."""
         outputs, targets = [], []
         for draw in draws:
             frame = self.frames[draw.frame].to(self.device)
@@ -222,7 +217,7 @@ class Trainer:
         )
 
     def provenance(self) -> dict[str, Any]:
-        """What makes this run what it is."""
+        """Provenance of the run."""
         return {
             "method": self.method.name,
             "seed": self.seed,
@@ -258,14 +253,11 @@ class Trainer:
                     "The last checkpoint is whole; look for too large a learning rate or damaged data in that frame."
                 )
 
-    def _fresh_modules(self) -> dict[str, ViewModule]:
-        return make_view_modules(self.method.config, self.scene, self.generators["initialisation"])
-
     def _optimizers(self) -> Optimizers:
         return Optimizers(self.model, self.method.config.optimizers, self.steps, self.scene.extent)
 
     def _cut_log(self) -> None:
-        """Drop rows of steps that the checkpoint does not hold: they are about to be taken again."""
+        """Remove log rows of steps after the checkpoint, which will be repeated."""
         if not self.run.log_file.is_file():
             return
         rows = self.run.log_file.read_text(encoding="utf-8").splitlines()
@@ -291,17 +283,17 @@ def _parameter_sums(model: Model) -> dict[str, Tensor]:
 
 @torch.no_grad()
 def _squared_error(output: RenderOutput, target: Target) -> Tensor:
-    """Mean squared colour error of this training view. []"""
+    """Mean squared colour error of a training view. []"""
     return masked_mean((output.rgb - target.rgb).square(), target.mask)
 
 
 def _counts(drawn: Splats) -> dict[str, int]:
-    """How many Gaussians were drawn, and of how many of the field's elements."""
+    """Number of rendered Gaussians, and of the field's elements that they come from."""
     return {"gaussians": len(drawn.gaussians), "visible": len(drawn.gaussians.visible_sources)}
 
 
 def _resident(frames: list[Frame], device: torch.device) -> list[Frame]:
-    """The frames on the device where they fill at most half of its free memory; else where they are.
+    """The frames, moved to the device if they fill at most half of its free memory.
 
     Images stay uint8 there too.
     """
@@ -314,7 +306,7 @@ def _resident(frames: list[Frame], device: torch.device) -> list[Frame]:
 
 @contextmanager
 def _deferred_interrupt() -> Iterator[Any]:
-    """Ctrl-C waits for the step in hand; a second one does not."""
+    """Defer Ctrl-C to the end of the step; a second one interrupts at once."""
     asked = False
 
     def remember(number: int, frame: Any) -> None:

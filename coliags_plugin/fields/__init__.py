@@ -1,1 +1,1 @@
-"""Fields: what a scene looks like from anywhere."""
+"""Fields: trainable scene representations."""

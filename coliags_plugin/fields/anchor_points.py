@@ -1,4 +1,4 @@
-"""Where anchors start: merging points into voxels, and the size of a voxel."""
+"""Initial anchor positions: voxelization of the point cloud."""
 
 from __future__ import annotations
 

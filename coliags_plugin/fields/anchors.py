@@ -1,4 +1,4 @@
-"""The anchor field: points on the tissue that decode into Gaussians for every view."""
+"""Anchor field: anchors on the tissue that are decoded into Gaussians per view."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ _CAMERAS_ASKED = 16
 class AnchorFieldSettings(Settings):
     """Options of the anchor field. Constants: docs/methods.md 3.1 and 3.4."""
 
-    geometry_head: GeometryHeadNode
-    appearance_head: AppearanceHeadNode
-    features: int = Option(default=32, ge=1)  # numbers per anchor that the heads read
-    children: int = Option(default=10, ge=1)
+    geometry_head: GeometryHeadNode  # decoder of opacity, scale and rotation
+    appearance_head: AppearanceHeadNode  # decoder of colour
+    features: int = Option(default=32, ge=1)  # feature channels per anchor, input of the heads
+    children: int = Option(default=10, ge=1)  # Gaussians per anchor
     # Edge of a voxel in scene units (mm); null: voxel_pixels times the size of a training pixel on the surface.
     voxel_size: float | None = Option(default=None, gt=0)
     # Four pixels with ten children per anchor, about half of them transparent, put a Gaussian about every two pixels.
     voxel_pixels: float = Option(default=4.0, gt=0)
-    near_plane: float = Option(default=0.2, ge=0)  # scene units; anchors wholly before it are not decoded
+    near_plane: float = Option(default=0.2, ge=0)  # scene units; anchors entirely nearer are not decoded
 
 
 class AnchorField(GaussianField):
@@ -49,7 +49,7 @@ class AnchorField(GaussianField):
 
     Attributes:
         anchors: Positions, scene units; they never move. [M, 3]
-        offsets: Children's places in units of the anchor's first three scales. [M, K, 3]
+        offsets: Children's positions relative to the anchor, in units of its first three scales. [M, K, 3]
         features: [M, F]
         scalings: Log scales: three for the offsets, three bases of the children's sizes. [M, 6]
         voxel_size: Scene units. []
@@ -113,18 +113,18 @@ class AnchorField(GaussianField):
 
     @classmethod
     def from_state(cls, state: Mapping[str, Tensor], settings: Any) -> Self:
-        """The field of a checkpoint, with however many anchors it had grown to."""
+        """The field of a checkpoint, of any number of anchors."""
         field = cls(settings, len(state["anchors"]), torch.Generator())
         field.load_state_dict(state)
         return field
 
     @property
     def element_count(self) -> int:
-        """Anchors."""
+        """Number of anchors."""
         return len(self.anchors)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Offsets, features, scalings, and the three perceptrons."""
+        """Offsets, features, scalings, and the three MLPs."""
         return {
             "offsets": [self.offsets],
             "features": [self.features],
@@ -134,12 +134,12 @@ class AnchorField(GaussianField):
         }
 
     def child_positions(self) -> Float[Tensor, "M K 3"]:
-        """Where every child stands (paper, Eq. 3), scene units. [M, K, 3]"""
+        """Positions of all children (paper, Eq. 3), scene units. [M, K, 3]"""
         return self.anchors[:, None] + self.offsets * self.scalings[:, None, :3].exp()
 
     @torch.no_grad()
     def visible_anchors(self, camera: Camera) -> Int[Tensor, "V"]:
-        """Anchors of which any child can touch the image; the others draw nothing. [V]"""
+        """Indices of anchors of which any child may overlap the image. [V]"""
         reach = (self.offsets * self.scalings[:, None, :3].exp()).norm(dim=2).amax(dim=1)
         size = DRAWN_SIGMAS * self.scalings[:, 3:].amax(dim=1).exp()
         inside = spheres_in_frustum(self.anchors, reach + size, camera, self.settings.near_plane)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from coliags_plugin.contracts import AppearanceHead
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.fields.embedding import cosine_embedding
-from coliags_plugin.fields.perceptron import first_layer, perceptron
+from coliags_plugin.fields.mlp import first_layer, mlp
 
 
 class AppearanceSettings(Settings):
@@ -33,7 +33,7 @@ class PlainAppearanceSettings(AppearanceSettings):
 
 
 class PlainAppearanceHead(AppearanceHead):
-    """Scaffold-GS's: colour from feature and viewing direction, optionally the distance (docs/methods.md 3.6)."""
+    """Appearance head of Scaffold-GS, optionally with distance as an input (docs/methods.md 3.6)."""
 
     Settings: ClassVar[type[Settings]] = PlainAppearanceSettings
 
@@ -43,12 +43,12 @@ class PlainAppearanceHead(AppearanceHead):
         self.children_per_anchor = children
         self.features = features
         embedded = self.embed(torch.zeros(1, 3), torch.zeros(1, 1), torch.zeros(1, 1)).shape[1]
-        self.color_mlp = perceptron(features + embedded, settings.hidden, 3 * children, generator)
+        self.color_mlp = mlp(features + embedded, settings.hidden, 3 * children, generator)
 
     def embed(
         self, directions: Float[Tensor, "V 3"], distances: Float[Tensor, "V 1"], cosines: Float[Tensor, "V 1"]
     ) -> Float[Tensor, "V E"]:
-        """What the perceptron sees of where the lamp is."""
+        """Inputs of the MLP besides the feature."""
         return torch.cat([directions, distances], dim=1) if self.sees_distance else directions
 
     @property
@@ -58,7 +58,7 @@ class PlainAppearanceHead(AppearanceHead):
 
     @torch.no_grad()
     def expect(self, distances: Float[Tensor, "D"]) -> None:
-        """Move each hidden unit's kink to a distance that occurs (docs/methods.md 3.4), before training.
+        """Initialise the biases so that each hidden unit's kink is at a distance of the scene (docs/methods.md 3.4).
 
         Drawn about zero, units see millimetres that outweigh all other inputs: those with a negative weight for the
         distance, about half, are never active and never learn.
@@ -75,7 +75,7 @@ class PlainAppearanceHead(AppearanceHead):
         first.bias -= first.weight[:, self.features + 3] * kinks  # after the direction
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """The perceptron."""
+        """The MLP."""
         return {"color_mlp": list(self.color_mlp.parameters())}
 
     def forward(
@@ -102,7 +102,7 @@ class IMIAAppearanceSettings(AppearanceSettings):
 class IMIAAppearanceHead(PlainAppearanceHead):
     """Improved appearance Modelling with Illumination Attenuation (paper, Eq. 8; docs/methods.md 3.4).
 
-    The perceptron sees v, the distance d to the lamp and gamma(cos theta), the angle to the optical axis in which light
+    The MLP sees v, the distance d to the lamp and gamma(cos theta), the angle to the optical axis in which light
     spread and vignetting merge.
     """
 

@@ -24,10 +24,10 @@ from coliags_plugin.fields.frustum import DRAWN_SIGMAS, spheres_in_frustum
 class ExplicitGaussiansSettings(Settings):
     """Options of explicit Gaussians (docs/methods.md 7.1)."""
 
-    sh_degree: int = Option(default=3, ge=0, le=spherical_harmonics.MAX_DEGREE)
-    sh_every: int = Option(default=1000, ge=1)  # steps after which one more degree counts
-    initial_opacity: float = Option(default=0.1, gt=0, lt=1)
-    near_plane: float = Option(default=0.2, ge=0)  # scene units; Gaussians nearer are not looked at
+    sh_degree: int = Option(default=3, ge=0, le=spherical_harmonics.MAX_DEGREE)  # of the spherical harmonics
+    sh_every: int = Option(default=1000, ge=1)  # steps between increases of the active degree from 0
+    initial_opacity: float = Option(default=0.1, gt=0, lt=1)  # of every Gaussian
+    near_plane: float = Option(default=0.2, ge=0)  # scene units; nearer Gaussians are culled
 
 
 class ExplicitGaussians(GaussianField):
@@ -54,7 +54,7 @@ class ExplicitGaussians(GaussianField):
 
     @classmethod
     def from_scene(cls, scene: Scene, settings: Any, generator: torch.Generator) -> Self:
-        """A faint round Gaussian at every initial point, as wide as the distance to its neighbours.
+        """An isotropic Gaussian at every initial point, scaled to the distance of its neighbours.
 
         Raises:
             InputError: The scene has no points.
@@ -73,14 +73,14 @@ class ExplicitGaussians(GaussianField):
 
     @classmethod
     def from_state(cls, state: Mapping[str, Tensor], settings: Any) -> Self:
-        """The field of a checkpoint, with however many Gaussians it had grown to."""
+        """The field of a checkpoint, of any number of Gaussians."""
         field = cls(settings, len(state["means"]))
         field.load_state_dict(state)
         return field
 
     @property
     def element_count(self) -> int:
-        """Gaussians."""
+        """Number of Gaussians."""
         return len(self.means)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
@@ -88,12 +88,12 @@ class ExplicitGaussians(GaussianField):
         return {name: [getattr(self, name)] for name in self.row_parameters}
 
     def before_step(self, step: int, schedule: Schedule) -> None:
-        """Let one more degree of spherical harmonics count every so often."""
+        """Raise the active degree of spherical harmonics every ``sh_every`` steps."""
         every = max(1, schedule.at(self.settings.sh_every))
         self.degree.fill_(min(self.settings.sh_degree, step // every))
 
     def gaussians(self, camera: Camera) -> Gaussians:
-        """The Gaussians in the camera's view, coloured for it."""
+        """The Gaussians in the camera's view with their colours from there."""
         camera = camera.to(self.means.device, self.means.dtype)
         visible = self._visible(camera)
         means, scales, quats, opacities, sh0, rest = (

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from coliags_plugin.contracts import GeometryHead
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.fields.embedding import cosine_embedding
-from coliags_plugin.fields.perceptron import first_layer, perceptron
+from coliags_plugin.fields.mlp import first_layer, mlp
 
 
 class PlainGeometrySettings(Settings):
@@ -22,7 +22,7 @@ class PlainGeometrySettings(Settings):
 
 
 class PlainGeometryHead(GeometryHead):
-    """Scaffold-GS's: both perceptrons see the viewing direction as it is (docs/methods.md 3.6)."""
+    """Geometry head of Scaffold-GS (docs/methods.md 3.6)."""
 
     Settings: ClassVar[type[Settings]] = PlainGeometrySettings
 
@@ -31,15 +31,15 @@ class PlainGeometryHead(GeometryHead):
         self.settings = settings
         self.children_per_anchor = children
         inputs = features + self.embed(torch.zeros(1, 3)).shape[1]
-        self.opacity_mlp = perceptron(inputs, settings.hidden, children, generator)
-        self.covariance_mlp = perceptron(inputs, settings.hidden, 7 * children, generator)
+        self.opacity_mlp = mlp(inputs, settings.hidden, children, generator)
+        self.covariance_mlp = mlp(inputs, settings.hidden, 7 * children, generator)
 
     def embed(self, directions: Float[Tensor, "V 3"]) -> Float[Tensor, "V E"]:
-        """What the perceptrons see of the viewing direction."""
+        """Encoding of the viewing direction."""
         return directions
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """The two perceptrons."""
+        """The two MLPs."""
         return {
             "opacity_mlp": list(self.opacity_mlp.parameters()),
             "covariance_mlp": list(self.covariance_mlp.parameters()),
@@ -49,7 +49,7 @@ class PlainGeometryHead(GeometryHead):
         self, features: Float[Tensor, "V F"], directions: Float[Tensor, "V 3"]
     ) -> tuple[Float[Tensor, "V K"], Float[Tensor, "V K 7"]]:
         """Decode the children of the visible anchors."""
-        # Both perceptrons read the same input: one product for both first layers.
+        # Both MLPs read the same input: one product for both first layers.
         first: list[Any] = [self.opacity_mlp[0], self.covariance_mlp[0]]
         weight, bias = torch.cat([layer.weight for layer in first]), torch.cat([layer.bias for layer in first])
         opacity_hidden, covariance_hidden = (

@@ -1,4 +1,4 @@
-"""Real spherical harmonics to degree 3, in the order and with the signs of the splatting lineage."""
+"""Real spherical harmonics to degree 3, in the order and with the signs of 3D Gaussian Splatting."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""View modules: what happens to a camera before, and to a picture after, a view is rendered."""
+"""View modules: adjustments of camera and output per view."""

@@ -1,4 +1,4 @@
-"""One row of parameters for each training frame."""
+"""Parameter rows per training frame."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from coliags_plugin.core.scenes import Scene, View
 
 
 class FrameRows:
-    """Which row of a parameter belongs to a view.
+    """Lookup of parameter rows by view.
 
     Args:
         scene: Whose training frames have a row each, in their order.

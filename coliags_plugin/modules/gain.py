@@ -1,4 +1,4 @@
-"""A gain per frame, for cameras that choose their exposure themselves."""
+"""Gain per frame, for cameras with automatic exposure."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class FrameGainSettings(Settings):
 
 
 class FrameGain(ViewModule):
-    """Multiplies the rendered colours by one learnt factor per training frame.
+    """Learned factor on the rendered colours for each training frame.
 
     Colours and gains are only known up to a common factor, which ``reference`` settles. Free cameras have the mean
     gain.
@@ -41,7 +41,7 @@ class FrameGain(ViewModule):
 
     @classmethod
     def from_scene(cls, scene: Scene, settings: Any, generator: torch.Generator) -> Self:
-        """Gains of 1.
+        """Module with gains of 1.
 
         Raises:
             InputError: ``reference`` is no training frame.
@@ -50,7 +50,7 @@ class FrameGain(ViewModule):
 
     @property
     def untrained_views(self) -> str:
-        """What other views get."""
+        """Gain of views that are not training frames."""
         if self.settings.untrained == "mean":
             return "views without training have the mean gain of the training frames"
         return "views without training have a gain interpolated between the training frames before and after them"
@@ -59,21 +59,25 @@ class FrameGain(ViewModule):
         """The logarithms of the gains."""
         return {"gain": [self.log_gain]}
 
+    def log_gains(self) -> Tensor:
+        """Logarithm of every training frame's gain, relative to the reference. [F]"""
+        zero = self.log_gain.mean() if self._reference is None else self.log_gain[self._reference]
+        return self.log_gain - zero
+
     def gains(self) -> Tensor:
         """The gain of every training frame, in their order. [F]"""
-        zero = self.log_gain.mean() if self._reference is None else self.log_gain[self._reference]
-        return (self.log_gain - zero).exp()
+        return self.log_gains().exp()
 
     def gain(self, view: View | None) -> Tensor:
         """The gain of a view. []"""
-        gains = self.gains().log()
+        log_gains = self.log_gains()
         row = self.frames.row(view)
         if row is not None:
-            return gains[row].exp()
+            return log_gains[row].exp()
         if view is None or self.settings.untrained == "mean":
-            return gains.mean().exp()
+            return log_gains.mean().exp()
         before, after, share = self.frames.neighbours(view.time)
-        return ((1.0 - share) * gains[before] + share * gains[after]).exp()
+        return ((1.0 - share) * log_gains[before] + share * log_gains[after]).exp()
 
     def shade(self, output: RenderOutput, view: View | None) -> RenderOutput:
         """Multiply the colours."""

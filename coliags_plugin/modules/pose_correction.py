@@ -1,4 +1,4 @@
-"""A small rigid motion per frame, for poses that are not quite right."""
+"""Pose correction per frame, for inaccurate camera poses."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class PoseCorrectionSettings(Settings):
 
 
 class PoseCorrection(ViewModule):
-    """Turns and moves each training camera by a learnt rotation and translation, in world axes.
+    """Learned rotation and translation of each training camera, in world axes.
 
     It turns about the point on its optical axis at the median depth of the scene's points in view. About its own
     centre, a small rotation would shift the image almost as a translation does, and gradient descent could hardly tell
@@ -50,7 +50,7 @@ class PoseCorrection(ViewModule):
 
     @classmethod
     def from_scene(cls, scene: Scene, settings: Any, generator: torch.Generator) -> Self:
-        """No correction yet.
+        """Module with zero corrections.
 
         Raises:
             InputError: A frame in ``fixed`` is no training frame.
@@ -59,7 +59,7 @@ class PoseCorrection(ViewModule):
 
     @property
     def untrained_views(self) -> str:
-        """What other views get."""
+        """Treatment of views that are not training frames."""
         return "views without training keep their poses as given"
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:

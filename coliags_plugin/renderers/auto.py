@@ -2,22 +2,52 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 from pydantic import Field
+from torch import Tensor
 
+from coliags_plugin.contracts import Availability, Renderer
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.render_output import OUTPUTS, RenderOutput
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.renderers.choice import choose_among
 
 
 class AutoSettings(Settings):
     """Order of preference, and options common to all splatting renderers."""
 
     prefer: tuple[str, ...] = ("gsplat", "cpu", "torch")
-    near_plane: float = Field(default=0.2, ge=0)  # scene units
+    """Names of renderers, the most preferred first."""
+    near_plane: float = Field(default=0.2, ge=0)
+    """Gaussians with a centre at z <= near_plane are not drawn. Scene units."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Background RGB."""
 
 
-class AutoRenderer:
-    """Placeholder that the engine replaces by the first renderer of ``prefer`` that can run, recording the reason."""
+class AutoRenderer(Renderer):
+    """First renderer of ``prefer`` that can render the field; a run records which it is and why."""
 
     Settings: ClassVar[type[Settings]] = AutoSettings
+    primitives = frozenset({"gaussians3d", "surfels"})
+    outputs = frozenset(OUTPUTS)
+    devices = frozenset({"cpu", "cuda"})
+
+    @classmethod
+    def availability(cls) -> Availability:
+        """Always: whether one of the preferred renderers can run depends on field and device."""
+        return Availability(True, "chooses among the other renderers")
+
+    @classmethod
+    def alternatives(cls, settings: Any) -> Sequence[Mapping[str, Any]]:
+        """The preferred renderers with the common options."""
+        common = settings.model_dump(exclude={"prefer"})
+        return [{"name": name, **common} for name in settings.prefer]
+
+    def render(
+        self, field: Any, camera: Camera, wants: Sequence[str] = ("rgb", "alpha"), pixels: Tensor | None = None
+    ) -> RenderOutput:
+        """Render with the first alternative that can."""
+        chosen = choose_among(self.alternatives(self.settings), field.primitive, camera.camera_to_world.device)
+        return chosen.renderer.render(field, camera, wants, pixels)

@@ -1,4 +1,4 @@
-"""Checks of what a renderer is asked for."""
+"""Checks of the arguments of renderers."""
 
 from __future__ import annotations
 

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 import torch
 
+from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.datamanagers.rgbd.writer import write_rgbd_scene
-from coliags_plugin.engine.data_formats import find_format, open_scene
+from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.poses import tum
 from coliags_plugin.poses.trajectory import Trajectory
 from tests import commands

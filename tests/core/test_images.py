@@ -30,7 +30,7 @@ def test_masks_are_black_and_white(tmp_path):
 
 
 def test_what_a_format_cannot_hold_is_refused():
-    with pytest.raises(InputError, match=r"a uint8 \[0, 4\] picture cannot be written as \.png"):
+    with pytest.raises(InputError, match=r"a uint8 \[0, 4\] image cannot be written as \.png"):
         encode_image(np.zeros((0, 4), np.uint8))
     with pytest.raises(InputError, match=r"cannot be written as \.nothing"):
         encode_image(np.zeros((2, 2), np.uint8), ".nothing")

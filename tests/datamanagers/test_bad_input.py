@@ -20,7 +20,7 @@ from coliags_plugin.config.registry import datamanagers
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.data_check.check import check_scene
-from coliags_plugin.engine.data_formats import find_format
+from coliags_plugin.datamanagers.recognition import find_format, formats
 from tests.datamanagers.spoiling import (
     FRAMES,
     KINDS,
@@ -530,7 +530,7 @@ def test_every_fault_meets_every_layout_it_can_befall():
     # By time, there may be more poses than pictures, and what has no depth is left out with a warning.
     assert set(REFUSED["a picture that is gone"]) == set(KINDS) - {"rgbd"}
     assert set(REFUSED["depth that is missing for a frame"]) == set(WITH_DEPTH) - {"rgbd"}
-    assert {KINDS[name].format for name in KINDS} == set(datamanagers.names()) - {"auto"}
+    assert {KINDS[name].format for name in KINDS} == set(formats())
 
 
 # What is worth a warning and no more

@@ -15,7 +15,7 @@ import torch
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.colmap.files import find_models, read_model
 from coliags_plugin.datamanagers.colmap.reader import ColmapDataManager, ColmapSettings
-from coliags_plugin.engine.data_formats import find_format
+from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.poses import colmap as colmap_poses
 from tests.datamanagers.colmap_scenes import CAMERAS, HEIGHT, POINTS, WIDTH, camera, taken, wall_model, write_colmap
 from tests.datamanagers.wall_scenes import look, off_wall, poses

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Scene
+from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.datamanagers.rgbd.association import nearest_in_time
 from coliags_plugin.datamanagers.rgbd.reader import RGBDDataManager, RGBDSettings
-from coliags_plugin.engine.data_formats import find_format
 from coliags_plugin.phantom.generate import generate
 from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.poses import tum

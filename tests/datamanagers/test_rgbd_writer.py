@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.datamanagers.rgbd.files import lacks_trajectory
 from coliags_plugin.datamanagers.rgbd.reader import RGBDDataManager, RGBDSettings, UnposedRGBDDataManager
 from coliags_plugin.datamanagers.rgbd.writer import depth_scale, depth_steps, write_rgbd_scene
-from coliags_plugin.engine.data_formats import find_format
 from coliags_plugin.poses import tum
 from tests.scenes import wall_scene, write_wall
 

@@ -10,7 +10,7 @@ import pytest
 
 from coliags_plugin.config.registry import datamanagers
 from coliags_plugin.core.scenes import Frame, Scene
-from coliags_plugin.engine.data_formats import find_format
+from coliags_plugin.datamanagers.recognition import find_format
 from tests.phantom.phantom_layouts import write_phantom
 
 #: Layouts with rotation views, and the split whose training frames their masks tell of.

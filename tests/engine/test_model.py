@@ -99,5 +99,7 @@ def test_parameter_groups_carry_the_modules_names():
 
 
 def test_outputs_that_nobody_delivers_are_refused():
-    with pytest.raises(InputError, match="protocol 'x' wants albedo"):
+    with pytest.raises(InputError, match="needed by protocol 'x': albedo"):
         make_model().check_outputs(("rgb", "albedo"), "protocol 'x'")
+    with pytest.raises(InputError, match="needed by module 'lamp': albedo"):
+        make_model(lamp=Shift(0.0, 1.0, wants=("albedo",))).check_outputs(("rgb",), "the losses")

@@ -17,9 +17,9 @@ from coliags_plugin.config import registry
 from coliags_plugin.config.components import make_component
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.render_output import OUTPUTS
-from coliags_plugin.engine.backends import choose_renderer
 from coliags_plugin.engine.doctor import examine
 from coliags_plugin.renderers import gsplat_library
+from coliags_plugin.renderers.choice import choose_renderer
 from coliags_plugin.renderers.gsplat_renderer import GsplatRenderer, GsplatRendererSettings, render_with_gsplat
 from coliags_plugin.renderers.torch_renderer import render_gaussians
 from tests.renderers import fake_gsplat

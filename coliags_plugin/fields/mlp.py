@@ -1,4 +1,4 @@
-"""The small perceptron every head is made of."""
+"""Two-layer MLP of the heads."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 
-def perceptron(inputs: int, hidden: int, outputs: int, generator: torch.Generator) -> nn.Sequential:
+def mlp(inputs: int, hidden: int, outputs: int, generator: torch.Generator) -> nn.Sequential:
     """Linear -> ReLU -> Linear, initialised as torch does by default but from an explicit generator.
 
     Weights and biases are uniform within 1/sqrt(inputs) (docs/methods.md 3.4).
@@ -29,7 +29,7 @@ def first_layer(
     weight: Float[Tensor, "H F+E"],
     bias: Float[Tensor, "H"],
 ) -> Float[Tensor, "V H"]:
-    """A linear layer that sees both inputs side by side, without laying them side by side.
+    """Linear layer of two concatenated inputs, without concatenating them.
 
     What is embedded (directions, distances) has no gradient; joined with the features it would be given one.
     """

@@ -1,0 +1,56 @@
+"""Recognition of a folder's format by its files."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+from coliags_plugin.config import registry
+from coliags_plugin.core.errors import InputError
+
+log = logging.getLogger(__name__)
+
+
+def formats() -> list[str]:
+    """Names of all data managers that read a format of their own."""
+    return [name for name in registry.datamanagers if registry.datamanagers.get(name).has_format]
+
+
+def find_format(path: Path) -> str:
+    """The name of the data manager that recognises a folder.
+
+    Raises:
+        InputError: The folder is missing, or none or several do.
+    """
+    known = ", ".join(formats())
+    if not path.exists():
+        raise InputError(f"no folder {path}", f"a scene in one of the formats {known}", "Check the path")
+    found = recognised(path)
+    if not found:
+        shown = sorted(item.name + "/" * item.is_dir() for item in path.iterdir()) if path.is_dir() else []
+        holds = ", ".join(shown[:6]) + (f" and {len(shown) - 6} more" if len(shown) > 6 else "") or "nothing"
+        raise InputError(
+            f"{path} holds {holds}, which none of the formats {known} recognises",
+            "a scene's own folder",
+            "docs/data.md lists what each looks like; --format NAME chooses one and says what it misses. Images "
+            "without poses become a scene by coliags poses track, if there is depth, or coliags poses sfm",
+        )
+    if len(found) > 1:
+        seen = "; ".join(f"{name}: {reason}" for name, reason in found.items())
+        raise InputError(f"{path} may be of several formats ({seen})", "one of them", "Choose with --format NAME")
+    ((name, reason),) = found.items()
+    log.info("%s: format %s (%s)", path, name, reason)
+    return name
+
+
+def recognised(path: Path) -> dict[str, str]:
+    """Evidence in a folder for each format that recognises it, by the format's name."""
+    reasons = {name: registry.datamanagers.get(name).recognise(path) for name in formats()}
+    return {name: reason for name, reason in reasons.items() if reason is not None}
+
+
+def unposed_format(path: Path) -> str | None:
+    """The format of a folder that lacks only its poses; None where there is none, or a format recognises it as is."""
+    if not path.exists() or recognised(path):
+        return None
+    return next((name for name in formats() if registry.datamanagers.get(name).recognise_unposed(path)), None)

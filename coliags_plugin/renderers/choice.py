@@ -1,0 +1,65 @@
+"""Choice of the renderer of a field on a device."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from coliags_plugin.config.components import Component, make_component
+from coliags_plugin.contracts import Renderer
+from coliags_plugin.core.errors import InputError
+
+
+@dataclass(frozen=True)
+class ChosenRenderer:
+    """A renderer, its registered name and the reason for choosing it."""
+
+    name: str
+    renderer: Renderer
+    reason: str
+
+
+def choose_renderer(component: Component, primitive: str, device: torch.device) -> ChosenRenderer:
+    """Make the renderer of a config, or the first of its alternatives that can render the field.
+
+    Args:
+        component: The config's renderer node.
+        primitive: Of the field.
+        device: Of the field.
+
+    Raises:
+        InputError: It, or each of its alternatives, cannot render this field on this device.
+    """
+    alternatives = component.target.alternatives(component.settings)
+    if not alternatives:
+        obstacle = component.target.obstacle(primitive, device)
+        if obstacle:
+            raise InputError(f"renderer '{component.name}' {obstacle}", "a renderer that can serve the field")
+        return ChosenRenderer(component.name, component.target(component.settings), "named by the config")
+    return choose_among(alternatives, primitive, device)
+
+
+def choose_among(configs: Sequence[Mapping[str, Any]], primitive: str, device: torch.device) -> ChosenRenderer:
+    """Make the first of several renderers that can render a field.
+
+    Args:
+        configs: Name and options of each renderer, the most preferred first.
+        primitive: Of the field.
+        device: Of the field.
+
+    Raises:
+        InputError: None of them can.
+    """
+    refused: list[str] = []
+    for config in configs:
+        candidate = make_component("renderers", dict(config))
+        obstacle = candidate.target.obstacle(primitive, device)
+        if not obstacle:
+            found = candidate.target.availability().reason
+            reason = "; ".join([*refused, f"auto chose {candidate.name}: {found}"])
+            return ChosenRenderer(candidate.name, candidate.target(candidate.settings), reason)
+        refused.append(f"{candidate.name} {obstacle}")
+    raise InputError(f"no renderer can serve: {'; '.join(refused)}", f"one for {primitive} on {device.type}")
