@@ -64,7 +64,7 @@ class MethodConfig(Settings):
     losses: dict[str, LossNode] = Field(min_length=1)  # terms by a key of your choice
     optimizers: dict[str, OptimizerSettings]  # rates by parameter group, of all of them
     schedule: ScheduleSettings = ScheduleSettings()  # how long to train and how often to write
-    protocol: str = "paper"  # how figures are made
+    protocol: str = "paper"  # evaluation protocol
 
     @field_validator("losses", "optimizers", "modules", mode="before")
     @classmethod
@@ -177,7 +177,7 @@ def _resolve(path: Path, seen: tuple[Path, ...]) -> Node:
     return merge(Node(inherited, parent.origin), Node(own, tree.origin))
 
 
-#: Errors of this package's own, whose text says what was seen.
+#: Errors of this package, with messages of their own.
 _TELLING = frozenset({"no_name", "unknown_key", "unknown_component", "value_error", "zero_end"})
 
 

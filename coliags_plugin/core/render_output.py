@@ -13,7 +13,7 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 
-#: Everything a renderer can be asked for beside a field's own feature channels. "depth" alone names nothing: each kind
+#: All outputs of renderers besides a field's own feature channels. "depth" alone names nothing: each kind
 #: is a different quantity.
 OUTPUTS = (
     "rgb",
@@ -51,7 +51,7 @@ class RenderOutput:
         rgb: Composited colour over the background. [H, W, 3]
         alpha: Accumulated opacity. [H, W]
         camera: What it was rendered from, as the model's modules adjusted it; None for pixels of several cameras.
-        maps: The other outputs asked for, by name. [H, W] or [H, W, C]
+        maps: The other requested outputs by name. [H, W] or [H, W, C]
         splats: From splatting renderers only.
     """
 
@@ -73,7 +73,7 @@ class RenderOutput:
         return self.splats
 
     def __getitem__(self, name: str) -> Tensor:
-        """An output by name. Raises KeyError where it was not asked for."""
+        """An output by name. Raises KeyError if it was not requested."""
         if name == "rgb":
             return self.rgb
         if name == "alpha":

@@ -16,5 +16,5 @@ def choose_device(wanted: str) -> torch.device:
     if wanted == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if wanted == "cuda" and not torch.cuda.is_available():
-        raise InputError("device cuda was asked for, but torch sees none", "cpu, or auto", "See `coliags doctor`")
+        raise InputError("device cuda was requested, but torch finds none", "cpu, or auto", "See `coliags doctor`")
     return torch.device(wanted)

@@ -22,21 +22,21 @@ from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.outputs.colormaps import DEPTH_ERROR_LIMIT_MM, depth_error_picture
 from coliags_plugin.outputs.image_files import eight_bit, write_depth_tiff, write_png
 
-#: The main test set: its figures stand at the top of metrics.json.
+#: The main test set, whose means are at the top of metrics.json.
 MAIN_SET = "test"
-#: Figures that are also taken over only what a training frame saw, where the data tell.
+#: Metrics that are also computed over pixels seen by a training frame, where frames have a seen mask.
 SEEN_METRICS = ("psnr", "ssim", "depth_mse", "depth_median_error")
 SEEN_SUFFIX = "_seen"
 
 
 @dataclass
-class _Figures:
+class _SetScores:
     """Per-frame metrics of one test set, and reasons for missing ones."""
 
     rows: dict[str, dict[str, float]] = field(default_factory=dict)
     reasons: dict[str, str] = field(default_factory=dict)
 
-    def take(self, frame: str, scores: Scores, suffix: str = "") -> None:
+    def add(self, frame: str, scores: Scores, suffix: str = "") -> None:
         """Add the metrics of one frame, and reasons for missing ones."""
         row = self.rows.setdefault(frame, {})
         row.update({name + suffix: value for name, value in scores.values.items()})
@@ -55,9 +55,9 @@ class _Figures:
 def evaluate(trained: TrainedRun, protocol_name: str) -> Path:
     """Render every held-out view, compute the protocol's metrics, and write them with the images.
 
-    Writes ``eval/<protocol>/metrics.json`` (means per test set; the main set's also at the top; null where a figure
-    cannot be had, with the reason), ``per_frame.csv`` and the pictures. A former evaluation under the same protocol is
-    replaced once the new one is whole.
+    Writes ``eval/<protocol>/metrics.json`` (means per test set; the main set's also at the top; null where a metric
+    is not available, with the reason), ``per_frame.csv`` and the images. An earlier evaluation under the same protocol
+    is replaced once the new one is complete.
 
     Returns:
         The evaluation's folder.
@@ -72,24 +72,24 @@ def evaluate(trained: TrainedRun, protocol_name: str) -> Path:
         raise InputError(f"scene '{trained.scene.name}' has no test frames", "a split that holds some out")
     total, done = sum(map(len, sets.values())), 0
     target = trained.run.evaluation(scorer.protocol.name)
-    figures = {name: _Figures() for name in sets}
+    scores = {name: _SetScores() for name in sets}
     with atomic_folder(target, overwrite=True) as scratch, ProgressReport("evaluate", total) as progress:
         for set_name, frames in sets.items():
             for frame in frames:
                 comparison = scorer.compare(trained.model, frame, trained.device)
-                _take_figures(figures[set_name], frame, scorer, comparison)
+                _add_scores(scores[set_name], frame, scorer, comparison)
                 _write_pictures(scratch, set_name, frame, comparison)
                 done += 1
                 progress.update(done)
-        write_json(scratch / "metrics.json", _summary(trained, scorer.protocol, scorer.metrics, figures))
-        atomic_write(scratch / "per_frame.csv", _table(figures, _columns(scorer.metrics, figures)))
+        write_json(scratch / "metrics.json", _summary(trained, scorer.protocol, scorer.metrics, scores))
+        atomic_write(scratch / "per_frame.csv", _table(scores, _columns(scorer.metrics, scores)))
     return target
 
 
-def _take_figures(figures: _Figures, frame: Frame, scorer: Scorer, comparison: Comparison) -> None:
-    figures.take(frame.name, scorer.score(comparison))
+def _add_scores(scores: _SetScores, frame: Frame, scorer: Scorer, comparison: Comparison) -> None:
+    scores.add(frame.name, scorer.score(comparison))
     if frame.seen is not None:
-        figures.take(frame.name, scorer.score(within_seen(comparison, frame), SEEN_METRICS), SEEN_SUFFIX)
+        scores.add(frame.name, scorer.score(within_seen(comparison, frame), SEEN_METRICS), SEEN_SUFFIX)
 
 
 def _write_pictures(folder: Path, set_name: str, frame: Frame, comparison: Comparison) -> None:
@@ -105,18 +105,18 @@ def _write_pictures(folder: Path, set_name: str, frame: Frame, comparison: Compa
     write_png(folder / "errors" / f"{name}.png", picture)
 
 
-def _columns(metrics: Mapping[str, Metric], figures: Mapping[str, _Figures]) -> list[str]:
-    seen = {name for part in figures.values() for row in part.rows.values() for name in row if name not in metrics}
+def _columns(metrics: Mapping[str, Metric], scores: Mapping[str, _SetScores]) -> list[str]:
+    seen = {name for part in scores.values() for row in part.rows.values() for name in row if name not in metrics}
     return [*metrics, *(name + SEEN_SUFFIX for name in SEEN_METRICS if name + SEEN_SUFFIX in seen)]
 
 
 def _summary(
-    trained: TrainedRun, protocol: Protocol, metrics: Mapping[str, Metric], figures: Mapping[str, _Figures]
+    trained: TrainedRun, protocol: Protocol, metrics: Mapping[str, Metric], scores: Mapping[str, _SetScores]
 ) -> dict[str, Any]:
-    columns = _columns(metrics, figures)
+    columns = _columns(metrics, scores)
     base = {name: name.removesuffix(SEEN_SUFFIX) for name in columns}
-    main = figures.get(MAIN_SET) or next(iter(figures.values()))
-    reasons = {name: text for part in [*figures.values()][::-1] for name, text in part.reasons.items()}
+    main = scores.get(MAIN_SET) or next(iter(scores.values()))
+    reasons = {name: text for part in [*scores.values()][::-1] for name, text in part.reasons.items()}
     return {
         "protocol": {"name": protocol.name, "version": protocol.version, "description": protocol.description},
         "method": trained.method,
@@ -127,16 +127,16 @@ def _summary(
         "reasons": reasons,
         "directions": {name: "higher" if metrics[base[name]].higher_is_better else "lower" for name in columns},
         "units": {name: metrics[base[name]].unit for name in columns},
-        "sets": {name: {"frames": len(part.rows), **part.means(columns)} for name, part in figures.items()},
+        "sets": {name: {"frames": len(part.rows), **part.means(columns)} for name, part in scores.items()},
         "software": software(),
     }
 
 
-def _table(figures: Mapping[str, _Figures], columns: list[str]) -> str:
+def _table(scores: Mapping[str, _SetScores], columns: list[str]) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["set", "frame", *columns])
-    for set_name, part in figures.items():
+    for set_name, part in scores.items():
         for frame, row in part.rows.items():
             writer.writerow([set_name, frame, *(repr(row[name]) if name in row else "" for name in columns)])
     return text.getvalue()

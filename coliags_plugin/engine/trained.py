@@ -43,7 +43,7 @@ def load_trained(path: Path, device: torch.device, data: Path | None = None) -> 
     Args:
         path: The run folder.
         device: Where to compute.
-        data: The scene, where it no longer lies where the run found it.
+        data: The scene's folder, where it has moved since training.
 
     Raises:
         InputError: No run, no checkpoint, or the data are gone or have changed.

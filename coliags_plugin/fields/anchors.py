@@ -23,8 +23,8 @@ from coliags_plugin.fields.frustum import DRAWN_SIGMAS, spheres_in_frustum
 
 logger = logging.getLogger(__name__)
 
-#: About so many training cameras, evenly chosen, are asked for the distances that occur.
-_CAMERAS_ASKED = 16
+#: Approximate number of training cameras, evenly spaced, that the range of distances is computed from.
+_DISTANCE_CAMERAS = 16
 
 
 class AnchorFieldSettings(Settings):
@@ -106,7 +106,7 @@ class AnchorField(GaussianField):
         field.spacing.copy_(log_scales.exp().median())
         with torch.no_grad():
             field.scalings.copy_(log_scales[:, None].expand(-1, 6))
-            cameras = [frame.camera for frame in scene.train[:: max(1, len(scene.train) // _CAMERAS_ASKED)]]
+            cameras = [frame.camera for frame in scene.train[:: max(1, len(scene.train) // _DISTANCE_CAMERAS)]]
             field.appearance_head.expect(torch.cat([field._distances(camera) for camera in cameras]))
         logger.info("%d points in voxels of %.3g scene units make %d anchors", len(scene.points), size, len(anchors))
         return field

@@ -16,7 +16,7 @@ from coliags_plugin.core.scenes import Scene, View
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.modules.frame_rows import FrameRows
 
-#: About so many of the scene's points are asked how far away they are.
+#: Approximate number of scene points that the median depth is computed from.
 _POINTS_ASKED = 4096
 
 

@@ -101,7 +101,7 @@ def render_with_gsplat(
     if gaussians.means.dtype != torch.float32:
         raise InputError(
             f"Gaussians of {gaussians.means.dtype} for the gsplat renderer",
-            "float32: its kernels know nothing else",
+            "float32, the only type of its kernels",
             "Convert the field, or choose renderer 'torch'",
         )
     needs = {_NEEDS.get(name, name) for name in wants if name not in ("rgb", "alpha")}

@@ -68,7 +68,7 @@ class SplattingRenderer(Renderer):
         """
         if pixels is not None:
             raise InputError(
-                f"the {self.name} renderer was asked for single pixels",
+                f"the {self.name} renderer was requested to render single pixels",
                 "whole images: it splats",
                 "Leave pixels out, or choose a renderer of radiance fields",
             )

@@ -52,7 +52,7 @@ def test_an_unavailable_renderer_says_why(monkeypatch):
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
 def test_missing_cuda_is_named():
-    with pytest.raises(InputError, match="torch sees none"):
+    with pytest.raises(InputError, match="torch finds none"):
         choose_device("cuda")
     assert choose_device("auto") == CPU
 
