@@ -1,4 +1,4 @@
-"""For the reference, two habits of this package's docstrings.
+"""Griffe extension for two conventions of this package's docstrings.
 
 Sphinx's roles, as in :class:`Scene`, become links where the name can be found; comments ``#:`` above an attribute
 become its docstring.
@@ -16,17 +16,17 @@ ROLE = re.compile(r":(?:class|meth|attr|func|data|mod|exc):`~?([^`]+)`")
 
 
 class Roles(griffe.Extension):
-    """Mends docstrings once all modules are read."""
+    """Rewrites docstrings once all modules are read."""
 
     def on_object(self, *, obj: griffe.Object, **kwargs: Any) -> None:
-        """Mend one docstring; called for every object when all are loaded."""
-        if obj.is_attribute and obj.docstring is None and (told := _told_above(obj)):
-            obj.docstring = griffe.Docstring(told, parent=obj)
+        """Rewrite one docstring; called for every object when all are loaded."""
+        if obj.is_attribute and obj.docstring is None and (comment := _comment_above(obj)):
+            obj.docstring = griffe.Docstring(comment, parent=obj)
         if obj.docstring is not None:
             obj.docstring.value = ROLE.sub(lambda role: _link(obj, role[1]), obj.docstring.value)
 
 
-def _told_above(obj: griffe.Object) -> str:
+def _comment_above(obj: griffe.Object) -> str:
     """The lines that begin with ``#:`` right above an attribute."""
     if obj.lineno is None or not isinstance(obj.filepath, Path):
         return ""
@@ -49,7 +49,7 @@ def _link(obj: griffe.Object, name: str) -> str:
 def _target(obj: griffe.Object, name: str) -> str:
     first, *rest = name.split(".")
     if first == obj.package.name:
-        found = obj.package[".".join(rest)]
+        found = obj.package[".".join(rest)] if rest else obj.package
     else:
         found = obj.package[obj.resolve(first).removeprefix(f"{obj.package.name}.")]
         for part in rest:
