@@ -1,4 +1,4 @@
-"""The posed pinhole camera every field and renderer works with."""
+"""Posed pinhole camera."""
 
 from __future__ import annotations
 
