@@ -10,7 +10,6 @@ import torch
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
-from coliags_plugin.lenses.models import Pinhole
 
 
 def camera_at(x: float, y: float, z: float, width: int = 32, height: int = 24, yaw: float = 0.0) -> Camera:
@@ -52,12 +51,11 @@ def write_wall(folder: Path, frames: int = 9, width: int = 32, height: int = 24,
     """:func:`wall_scene` on disk, in C3VD's undistorted layout; without depth, its points stand in a file."""
     scene = wall_scene(frames, width, height, depth)
     ordered = sorted([*scene.train, *scene.test_sets["test"]], key=lambda frame: frame.index)
-    camera = ordered[0].camera
     write_c3vd_scene(
         folder,
         [frame.image.numpy() for frame in ordered],
         torch.stack([frame.camera.camera_to_world for frame in ordered]).numpy(),
-        Pinhole(camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5),
+        ordered[0].camera.intrinsics,
         depths=[frame.depth.numpy() for frame in ordered] if depth else None,
         points=None if depth else scene.points,
     )

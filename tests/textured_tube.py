@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
-from coliags_plugin.lenses.models import Pinhole
 
 RADIUS, END = 20.0, 60.0
 WIDTH, HEIGHT = 160, 128
@@ -66,11 +65,10 @@ def tube_frames(
 def write_tube(folder: Path, count: int = 10, step: float = 1.6) -> Path:
     """:func:`tube_frames` in C3VD's undistorted layout, without depth or points."""
     frames = tube_frames(count, step)
-    fx, fy, cx, cy = INTRINSICS
     write_c3vd_scene(
         folder,
         [frame.image.numpy() for frame in frames],
         torch.stack([frame.camera.camera_to_world for frame in frames]).numpy(),
-        Pinhole(fx, fy, cx - 0.5, cy - 0.5),
+        frames[0].camera.intrinsics,
     )
     return folder

@@ -8,28 +8,30 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from coliags_plugin.core.intrinsics import Intrinsics
+
 
 @dataclass(frozen=True)
-class Camera:
+class Camera(Intrinsics):
     """A posed pinhole camera, OpenCV axes: x right, y down, z forward.
 
-    Pixel centres lie at integers + 0.5, so pixel (column i, row j) sees image point (i + 0.5, j + 0.5). A calibration
-    whose pixel centres are integers (OpenCV, C3VD) has 0.5 added to its principal point by the loader.
-
     Attributes:
-        fx, fy: Focal lengths, pixels.
-        cx, cy: Principal point, pixels, centres at integers + 0.5. Need not be the image centre.
-        width, height: Image size, pixels.
+        fx, fy, cx, cy, width, height: See :class:`Intrinsics`.
         camera_to_world: Rigid transform. Scene units (mm for C3VD). [4, 4]
     """
 
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    width: int
-    height: int
     camera_to_world: Float[Tensor, "4 4"]
+
+    @classmethod
+    def of(cls, intrinsics: Intrinsics, camera_to_world: Float[Tensor, "4 4"]) -> Camera:
+        """The camera of these intrinsics at a pose."""
+        k = intrinsics
+        return cls(k.fx, k.fy, k.cx, k.cy, k.width, k.height, camera_to_world)
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """The camera without its pose."""
+        return Intrinsics(self.fx, self.fy, self.cx, self.cy, self.width, self.height)
 
     @property
     def center(self) -> Float[Tensor, "3"]:
@@ -52,7 +54,7 @@ class Camera:
         return inverse
 
     @property
-    def intrinsics(self) -> Float[Tensor, "3 3"]:
+    def intrinsics_matrix(self) -> Float[Tensor, "3 3"]:
         """K for pixel centres at integers + 0.5. [3, 3]"""
         matrix = [[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]]
         return torch.tensor(matrix, dtype=self.camera_to_world.dtype, device=self.camera_to_world.device)
@@ -103,8 +105,3 @@ class Camera:
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Camera:
         """The same camera with its pose on another device or of another dtype."""
         return replace(self, camera_to_world=self.camera_to_world.to(device=device, dtype=dtype))
-
-    def resized(self, width: int, height: int) -> Camera:
-        """The same view sampled at another size; the image's edges stay where they are."""
-        x, y = width / self.width, height / self.height
-        return replace(self, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y, width=width, height=height)

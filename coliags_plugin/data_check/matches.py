@@ -99,11 +99,11 @@ def _judge(pair: Matches, change: str) -> tuple[np.ndarray, np.ndarray] | None:
     length = float(np.linalg.norm(translation))
     if length == 0.0:
         return None
-    rays = _rays(pair.pixels, cameras[0].intrinsics)
-    rays_there = _rays(pair.pixels_there, cameras[1].intrinsics)
+    rays = _rays(pair.pixels, cameras[0].intrinsics_matrix)
+    rays_there = _rays(pair.pixels_there, cameras[1].intrinsics_matrix)
     x, y, z = translation / length
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
-    lines = np.linalg.inv(cameras[1].intrinsics.double().numpy()).T @ essential @ rays.T
+    lines = np.linalg.inv(cameras[1].intrinsics_matrix.double().numpy()).T @ essential @ rays.T
     homogeneous = np.concatenate([pair.pixels_there, np.ones((len(rays), 1))], axis=1)
     distance = np.abs((homogeneous * lines.T).sum(axis=1)) / np.linalg.norm(lines[:2], axis=0)
     return distance, _in_front(rays @ rotation.T, rays_there, translation)

@@ -14,14 +14,15 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Shaped, UInt8
 
-from coliags_plugin.datamanagers.rectification import Rectification
-from coliags_plugin.lenses.models import Lens, Pinhole
+from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.datamanagers.rectification import Rectification, undistorted_camera
+from coliags_plugin.lenses.models import Lens
 from coliags_plugin.lenses.undistortion import Undistortion
 
 #: Undistortions kept at a time: as many as pictures are read side by side.
 _KEPT = 8
 
-Undistorter = Callable[[Lens, Pinhole, int, int], Undistortion]
+Undistorter = Callable[[Lens, Intrinsics], Undistortion]
 
 
 def undistorter() -> Undistorter:
@@ -46,14 +47,10 @@ class LensRectification(Rectification):
         cls, lens: Lens, described_by: Path, size: tuple[int, int], focal_scale: float, undistort: Undistorter
     ) -> LensRectification:
         """As :meth:`Rectification.through`."""
-        width, height = size
-        nominal = lens.scaled(width, height).pinhole
         return cls(
             source_width=lens.width,
             source_height=lens.height,
-            width=width,
-            height=height,
-            pinhole=nominal._replace(fx=nominal.fx * focal_scale, fy=nominal.fy * focal_scale),
+            pinhole=undistorted_camera(lens, size, focal_scale),
             described_by=described_by,
             lens=lens,
             undistort=undistort,
@@ -69,8 +66,8 @@ class LensRectification(Rectification):
 
     def pixels(self, stored: Float[np.ndarray, "K 2"]) -> Float[np.ndarray, "K 2"]:
         """See :class:`Rectification`."""
-        fx, fy, cx, cy = self.pinhole
-        return np.asarray(self.lens.unproject(stored)[:, :2] * (fx, fy) + (cx, cy))
+        k = self.pinhole
+        return np.asarray(self.lens.unproject(stored)[:, :2] * (k.fx, k.fy) + (k.cx, k.cy))
 
     @property
     def valid(self) -> Bool[np.ndarray, "h w"] | None:
@@ -80,4 +77,4 @@ class LensRectification(Rectification):
 
     @property
     def _made(self) -> Undistortion:
-        return self.undistort(self.lens, self.pinhole, self.width, self.height)
+        return self.undistort(self.lens, self.pinhole)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,9 @@ from jaxtyping import Bool, Float, Shaped, UInt8
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.datamanagers.reading.images import read_rgb, resize_nearest, resize_rgb
-from coliags_plugin.lenses.models import Lens, Pinhole
+from coliags_plugin.lenses.models import Lens
 from coliags_plugin.lenses.undistortion import Undistortion
 
 #: How far a raw frame's aspect ratio may be from the lens's: rounding to whole pixels, but no cropping.
@@ -48,17 +49,14 @@ class Rectification:
 
     Attributes:
         source_width, source_height: Size of the stored pictures, pixels.
-        width, height: Working size, pixels.
-        pinhole: Intrinsics at the working size, pixels, centres at integers.
+        pinhole: The camera of the working images.
         described_by: The file that says how large the stored pictures are, for errors.
         undistortion: For pictures taken through a lens; None where they are pinhole pictures already.
     """
 
     source_width: int
     source_height: int
-    width: int
-    height: int
-    pinhole: Pinhole
+    pinhole: Intrinsics
     described_by: Path
     undistortion: Undistortion | None = None
 
@@ -80,26 +78,27 @@ class Rectification:
             focal_scale: Factor on the nominal focal length.
             shows: Stored pixels that show something; None for all. [H, W]
         """
-        width, height = size
-        nominal = lens.scaled(width, height).pinhole
-        pinhole = nominal._replace(fx=nominal.fx * focal_scale, fy=nominal.fy * focal_scale)
-        undistortion = Undistortion(lens, pinhole, width, height, shows)
-        return cls(lens.width, lens.height, width, height, pinhole, described_by, undistortion)
+        pinhole = undistorted_camera(lens, size, focal_scale)
+        return cls(lens.width, lens.height, pinhole, described_by, Undistortion(lens, pinhole, shows))
 
     @classmethod
-    def of_pinhole(
-        cls, pinhole: Pinhole, width: int, height: int, described_by: Path, size: tuple[int, int]
-    ) -> Rectification:
-        """The rectification of pinhole pictures of a width and height; ``size`` as for :meth:`through`."""
-        working_width, working_height = size
-        scaled = pinhole.scaled(working_width / width, working_height / height)
-        return cls(width, height, working_width, working_height, scaled, described_by)
+    def of_pinhole(cls, pinhole: Intrinsics, described_by: Path, size: tuple[int, int]) -> Rectification:
+        """The rectification of images of a pinhole camera; ``size`` as for :meth:`through`."""
+        return cls(pinhole.width, pinhole.height, pinhole.resized(*size), described_by)
+
+    @property
+    def width(self) -> int:
+        """Working width, pixels."""
+        return self.pinhole.width
+
+    @property
+    def height(self) -> int:
+        """Working height, pixels."""
+        return self.pinhole.height
 
     def camera(self, camera_to_world: Float[np.ndarray, "4 4"]) -> Camera:
-        """The working camera, whose pixel centres are at integers + 0.5."""
-        fx, fy, cx, cy = self.pinhole
-        matrix = torch.from_numpy(camera_to_world.astype(np.float32))
-        return Camera(fx, fy, cx + 0.5, cy + 0.5, self.width, self.height, matrix)
+        """The working camera at a pose."""
+        return Camera.of(self.pinhole, torch.from_numpy(camera_to_world.astype(np.float32)))
 
     def image(self, rgb: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w 3"]:
         """A colour picture at the working size."""
@@ -117,16 +116,16 @@ class Rectification:
         """Where places of the stored picture lie in the working one.
 
         Args:
-            stored: (column, row), centres at integers. [K, 2]
+            stored: (column, row), centres at integers + 0.5. [K, 2]
 
         Returns:
-            (column, row), centres at integers, inside the picture or not; NaN where the lens does not reach. [K, 2]
+            (column, row), centres at integers + 0.5, inside the image or not; NaN where the lens does not reach. [K, 2]
         """
         if self.undistortion is None:
             scale = np.array([self.width / self.source_width, self.height / self.source_height])
-            return np.asarray((stored + 0.5) * scale - 0.5)
-        fx, fy, cx, cy = self.pinhole
-        return np.asarray(self.undistortion.lens.unproject(stored)[:, :2] * (fx, fy) + (cx, cy))
+            return np.asarray(stored * scale)
+        k = self.pinhole
+        return np.asarray(self.undistortion.lens.unproject(stored)[:, :2] * (k.fx, k.fy) + (k.cx, k.cy))
 
     @property
     def valid(self) -> Bool[np.ndarray, "h w"] | None:
@@ -137,8 +136,7 @@ class Rectification:
 
     def doubt(self) -> str | None:
         """What looks like intrinsics of another resolution; None where nothing does."""
-        _, _, cx, cy = self.pinhole
-        off = max(abs((cx + 0.5) / self.width - 0.5), abs((cy + 0.5) / self.height - 0.5))
+        off = max(abs(self.pinhole.cx / self.width - 0.5), abs(self.pinhole.cy / self.height - 0.5))
         if off <= FAR_FROM_MIDDLE:
             return None
         return (
@@ -148,11 +146,11 @@ class Rectification:
 
     def facts(self) -> dict[str, Any]:
         """For provenance: sizes, and intrinsics at the working size."""
-        fx, fy, cx, cy = self.pinhole
+        k = self.pinhole
         return {
             "stored_size": [self.source_width, self.source_height],
             "size": [self.width, self.height],
-            "intrinsics": {"fx": fx, "fy": fy, "cx": cx + 0.5, "cy": cy + 0.5, "pixel_centers": "integers + 0.5"},
+            "intrinsics": {"fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy, "pixel_centers": "integers + 0.5"},
         }
 
     def checked(self, path: Path, picture: np.ndarray) -> np.ndarray:
@@ -172,6 +170,12 @@ class Rectification:
         return picture
 
 
+def undistorted_camera(lens: Lens, size: tuple[int, int], focal_scale: float) -> Intrinsics:
+    """The camera that images of a lens are undistorted to; arguments as for :meth:`Rectification.through`."""
+    nominal = lens.resized(*size).pinhole
+    return replace(nominal, fx=nominal.fx * focal_scale, fy=nominal.fy * focal_scale)
+
+
 def whole_frame(lens: Lens, image: Path) -> Lens:
     """The lens at the size of a picture that shows all of what the lens is calibrated for.
 
@@ -185,4 +189,4 @@ def whole_frame(lens: Lens, image: Path) -> Lens:
             f"the whole raw frame that the lens is calibrated for, {lens.width} x {lens.height} or scaled from it",
             "Undistort cropped pictures yourself and give them in the undistorted layout",
         )
-    return lens.scaled(width, height)
+    return lens.resized(width, height)

@@ -1,6 +1,6 @@
 """The lenses C3VD is read through: between pixels of the distorted image and viewing directions.
 
-Everything here is float64 and counts pixel centres at INTEGERS, as OpenCV and C3VD do; :class:`Camera` adds 0.5.
+Everything here is float64 and counts pixel centres at integers + 0.5, as :class:`Intrinsics` does.
 Directions are in camera axes: x right, y down, z forward.
 
 Three calibrations of one colonoscope are in use for the same 1350 x 1080 frames (docs/layouts/c3vd.md 2).
@@ -13,12 +13,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
+
+from coliags_plugin.core.intrinsics import Intrinsics
 
 Array = NDArray[np.float64]
 
@@ -26,20 +27,6 @@ Array = NDArray[np.float64]
 NOWHERE = -10.0
 
 
-class Pinhole(NamedTuple):
-    """Intrinsics of an undistorted image, pixels, centres at integers."""
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-
-    def scaled(self, x: float, y: float) -> Pinhole:
-        """The same view with the image stretched by ``x`` and ``y``; its edges stay where they are."""
-        return Pinhole(self.fx * x, self.fy * y, (self.cx + 0.5) * x - 0.5, (self.cy + 0.5) * y - 0.5)
-
-
-@dataclass(frozen=True, kw_only=True)
 class Lens(ABC):
     """A camera without its pose: between pixels of one image and viewing directions.
 
@@ -51,7 +38,7 @@ class Lens(ABC):
     height: int
 
     @abstractmethod
-    def scaled(self, width: int, height: int) -> Self:
+    def resized(self, width: int, height: int) -> Self:
         """The lens of the same image resampled to another size; the image's edges stay where they are."""
 
     @abstractmethod
@@ -63,7 +50,7 @@ class Lens(ABC):
         """Viewing directions of pixels.
 
         Args:
-            pixels: (column, row), centres at integers. [N, 2]
+            pixels: (column, row), centres at integers + 0.5. [N, 2]
 
         Returns:
             Directions with z = 1, so that a point at z-depth ``z`` is ``z * direction``; NaN where the model does not
@@ -78,13 +65,13 @@ class Lens(ABC):
             points: In camera axes, any unit. [N, 3]
 
         Returns:
-            (column, row), centres at integers, inside the image or not; NaN where the model does not reach and for
-            points not in front of the camera. [N, 2]
+            (column, row), centres at integers + 0.5, inside the image or not; NaN where the model does not reach and
+            for points not in front of the camera. [N, 2]
         """
 
     @property
     @abstractmethod
-    def pinhole(self) -> Pinhole:
+    def pinhole(self) -> Intrinsics:
         """The pinhole camera this lens nominally is: what an undistorted image of the same size is given."""
 
 
@@ -100,10 +87,12 @@ class CalibratedLens(Lens):
         origin: Where this image's top left corner lies in the calibrated image, pixels from its corner, (x, y).
     """
 
+    width: int
+    height: int
     stretch: tuple[float, float] = (1.0, 1.0)
     origin: tuple[float, float] = (0.0, 0.0)
 
-    def scaled(self, width: int, height: int) -> Self:
+    def resized(self, width: int, height: int) -> Self:
         """See :class:`Lens`."""
         x, y = self.width / width, self.height / height
         return replace(self, width=width, height=height, stretch=(self.stretch[0] * x, self.stretch[1] * y))
@@ -115,7 +104,7 @@ class CalibratedLens(Lens):
 
     def unproject(self, pixels: ArrayLike) -> Float[np.ndarray, "N 3"]:
         """See :class:`Lens`."""
-        calibrated = (np.asarray(pixels, np.float64) + 0.5) * self.stretch + self.origin - 0.5
+        calibrated = np.asarray(pixels, np.float64) * self.stretch + self.origin
         xy = self._tangents(calibrated)
         return np.concatenate([xy, np.where(np.isnan(xy[:, :1]), np.nan, 1.0)], axis=1)
 
@@ -125,19 +114,20 @@ class CalibratedLens(Lens):
         z = points[:, 2:]
         with np.errstate(divide="ignore", invalid="ignore"):
             tangents = np.where(z > 0.0, points[:, :2] / z, np.nan)
-        return (self._calibrated_pixels(tangents) + 0.5 - self.origin) / self.stretch - 0.5
+        return (self._calibrated_pixels(tangents) - self.origin) / self.stretch
 
     @property
-    def pinhole(self) -> Pinhole:
+    def pinhole(self) -> Intrinsics:
         """See :class:`Lens`."""
-        k = self._calibrated_pinhole
-        cornered = k._replace(cx=k.cx - self.origin[0], cy=k.cy - self.origin[1])
-        return cornered.scaled(1.0 / self.stretch[0], 1.0 / self.stretch[1])
+        fx, fy, cx, cy = self._calibrated_pinhole
+        x, y = 1.0 / self.stretch[0], 1.0 / self.stretch[1]
+        center = (cx - self.origin[0]) * x, (cy - self.origin[1]) * y
+        return Intrinsics(fx * x, fy * y, *center, self.width, self.height)
 
     @property
     @abstractmethod
-    def _calibrated_pinhole(self) -> Pinhole:
-        """The nominal pinhole at the calibrated size."""
+    def _calibrated_pinhole(self) -> tuple[float, float, float, float]:
+        """fx, fy, cx and cy of the nominal pinhole in the calibrated image."""
 
     @abstractmethod
     def _tangents(self, pixels: Array) -> Array:
@@ -177,8 +167,8 @@ class OmnidirectionalLens(CalibratedLens):
     e: float
 
     @property
-    def _calibrated_pinhole(self) -> Pinhole:
-        return Pinhole(self.a0, self.a0, self.cx, self.cy)
+    def _calibrated_pinhole(self) -> tuple[float, float, float, float]:
+        return self.a0, self.a0, self.cx, self.cy
 
     @property
     def _affine(self) -> Array:
@@ -224,8 +214,8 @@ class _FocalLens(CalibratedLens):
     cy: float
 
     @property
-    def _calibrated_pinhole(self) -> Pinhole:
-        return Pinhole(self.fx, self.fy, self.cx, self.cy)
+    def _calibrated_pinhole(self) -> tuple[float, float, float, float]:
+        return self.fx, self.fy, self.cx, self.cy
 
     @abstractmethod
     def _bent(self, radius: Array) -> Array:
@@ -325,12 +315,13 @@ class FisheyeLens(_FocalLens):
         return np.tan(radius)
 
 
+# C3VD and REIM-NeRF count pixel centres at integers: hence + 0.5.
 LENSES: dict[str, Lens] = {
     "omnidirectional": OmnidirectionalLens(
         width=1350,
         height=1080,
-        cx=678.544839263292,
-        cy=542.975887548343,
+        cx=678.544839263292 + 0.5,
+        cy=542.975887548343 + 0.5,
         a0=769.243600037458,
         a2=-0.000812770624150226,
         a3=6.25674244578925e-07,
@@ -340,15 +331,15 @@ LENSES: dict[str, Lens] = {
         e=-0.00296316513429569,
     ),
     "legacy-pinhole": BrownLens(
-        width=1350, height=1080, fx=802.319, fy=801.885, cx=668.286, cy=547.733, k1=-0.42234, k2=0.10654
+        width=1350, height=1080, fx=802.319, fy=801.885, cx=668.286 + 0.5, cy=547.733 + 0.5, k1=-0.42234, k2=0.10654
     ),
     "fisheye": FisheyeLens(
         width=1350,
         height=1080,
         fx=767.3861511125845,
         fy=767.5058656118406,
-        cx=679.054265997005,
-        cy=543.646891684636,
+        cx=679.054265997005 + 0.5,
+        cy=543.646891684636 + 0.5,
         k1=-0.18867185058223412,
         k2=-0.003927337093919806,
         k3=0.030524814153620117,
@@ -372,28 +363,22 @@ def octagon_mask(width: int, height: int) -> Bool[np.ndarray, "H W"]:
     return inside
 
 
-def undistortion_map(
-    lens: Lens, fx: float, fy: float, cx: float, cy: float, width: int, height: int
-) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
-    """Where each pixel of a pinhole image lies in the distorted image.
+def undistortion_map(lens: Lens, pinhole: Intrinsics) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
+    """Where ``cv2.remap`` finds each pixel of a pinhole image in the distorted image.
 
     Args:
         lens: The lens of the distorted image.
-        fx: The pinhole image's focal length, pixels.
-        fy: The same, downwards.
-        cx: Its principal point, pixels, centres at integers.
-        cy: The same, downwards.
-        width: Its size, pixels.
-        height: The same, downwards.
+        pinhole: The camera of the pinhole image.
 
     Returns:
-        Columns and rows in the distorted image for ``cv2.remap``, :data:`NOWHERE` where the lens does not reach;
-        they may lie outside the distorted image. Two of [H, W]
+        Columns and rows in the distorted image, as ``cv2.remap`` counts them: pixel centres at INTEGERS.
+        :data:`NOWHERE` where the lens does not reach; they may lie outside the distorted image. Two of [H, W]
     """
-    x, y = np.meshgrid((np.arange(width) - cx) / fx, (np.arange(height) - cy) / fy)
-    pixels = lens.project(np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1))
+    k = pinhole
+    x, y = np.meshgrid((np.arange(k.width) + 0.5 - k.cx) / k.fx, (np.arange(k.height) + 0.5 - k.cy) / k.fy)
+    pixels = lens.project(np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)) - 0.5
     pixels = np.where(np.isnan(pixels), NOWHERE, pixels).astype(np.float32)
-    return pixels[:, 0].reshape(height, width), pixels[:, 1].reshape(height, width)
+    return pixels[:, 0].reshape(k.height, k.width), pixels[:, 1].reshape(k.height, k.width)
 
 
 def _along(direction: Array, length: Array, new_length: Array, ratio_at_zero: float) -> Array:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from coliags_plugin.lenses.models import Array, Pinhole
+from coliags_plugin.lenses.models import Array
 from coliags_plugin.lenses.tabulated import MappedLens
 
 
@@ -21,7 +21,7 @@ class OpenCVLens(MappedLens):
     and y' likewise with p1 and p2 exchanged (OpenCV, "Camera Calibration and 3D Reconstruction").
 
     Attributes:
-        fx, fy, cx, cy: Pixels, centres at integers.
+        fx, fy, cx, cy: Pixels, centres at integers + 0.5.
         k1, k2, k3: Numerator of the radial part.
         k4, k5, k6: Its denominator.
         p1, p2: Tangential part.
@@ -41,8 +41,8 @@ class OpenCVLens(MappedLens):
     k6: float = 0.0
 
     @property
-    def _calibrated_pinhole(self) -> Pinhole:
-        return Pinhole(self.fx, self.fy, self.cx, self.cy)
+    def _calibrated_pinhole(self) -> tuple[float, float, float, float]:
+        return self.fx, self.fy, self.cx, self.cy
 
     def _bent(self, tangents: Array) -> Array:
         # Written out: cv2.projectPoints gives the same to the last digits and takes ten times as long.

@@ -9,36 +9,23 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 from typing_extensions import Self
 
-from coliags_plugin.lenses.models import Lens, Pinhole
+from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.lenses.models import Lens
 
 
-@dataclass(frozen=True, kw_only=True)
-class PinholeLens(Lens):
-    """A pinhole camera as a lens.
-
-    Attributes:
-        fx, fy: Focal lengths, pixels.
-        cx, cy: Principal point, pixels, centres at integers.
-    """
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
+@dataclass(frozen=True)
+class PinholeLens(Intrinsics, Lens):
+    """A pinhole camera as a lens; attributes as for :class:`Intrinsics`."""
 
     @classmethod
-    def of(cls, pinhole: Pinhole, width: int, height: int) -> Self:
-        """The lens of intrinsics and an image size, pixels."""
-        return cls(width=width, height=height, **pinhole._asdict())
+    def of(cls, intrinsics: Intrinsics) -> Self:
+        """The lens of intrinsics."""
+        return cls(**vars(intrinsics))
 
     @property
-    def pinhole(self) -> Pinhole:
+    def pinhole(self) -> Intrinsics:
         """See :class:`Lens`."""
-        return Pinhole(self.fx, self.fy, self.cx, self.cy)
-
-    def scaled(self, width: int, height: int) -> Self:
-        """See :class:`Lens`."""
-        return self.of(self.pinhole.scaled(width / self.width, height / self.height), width, height)
+        return Intrinsics(**vars(self))
 
     def cropped(self, x0: int, y0: int, width: int, height: int) -> Self:
         """See :class:`Lens`."""

@@ -37,7 +37,7 @@ class MappedLens(CalibratedLens):
 
     @abstractmethod
     def _bent(self, tangents: Array) -> Array:
-        """Pixels of the calibrated image, centres at integers, of (x / z, y / z). [N, 2]
+        """Pixels of the calibrated image, centres at integers + 0.5, of (x / z, y / z). [N, 2]
 
         May return anything where the model makes no sense.
         """

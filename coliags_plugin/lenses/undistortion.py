@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Shaped, UInt8
 
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.morphology import eroded
-from coliags_plugin.lenses.models import Lens, Pinhole, undistortion_map
+from coliags_plugin.lenses.models import Lens, undistortion_map
 
 
 class Undistortion:
@@ -19,9 +20,7 @@ class Undistortion:
 
     Args:
         lens: The lens of the source pictures.
-        pinhole: Intrinsics of the result, pixels, centres at integers.
-        width: Width of the result, pixels.
-        height: Its height.
+        pinhole: The camera of the result.
         source_mask: Source pixels that show something. None means all. [H_source, W_source]
 
     Attributes:
@@ -32,19 +31,17 @@ class Undistortion:
     def __init__(
         self,
         lens: Lens,
-        pinhole: Pinhole,
-        width: int,
-        height: int,
+        pinhole: Intrinsics,
         source_mask: Bool[np.ndarray, "H_source W_source"] | None = None,
     ) -> None:
         self.lens = lens
-        self.width, self.height = width, height
-        self._columns, self._rows = undistortion_map(lens, *pinhole, width, height)
+        self.width, self.height = width, height = pinhole.width, pinhole.height
+        self._columns, self._rows = undistortion_map(lens, pinhole)
         self.supersampling = s = max(1, round(_longest_step(self._columns, self._rows)))
         self._fine_columns, self._fine_rows = self._columns, self._rows
         if s > 1:
-            fine = pinhole.scaled(s, s)
-            self._fine_columns, self._fine_rows = undistortion_map(lens, *fine, width * s, height * s)
+            fine = pinhole.resized(width * s, height * s)
+            self._fine_columns, self._fine_rows = undistortion_map(lens, fine)
         # Bilinear neighbours of the outermost pixels show nothing.
         shows = np.ones((lens.height, lens.width), bool) if source_mask is None else eroded(source_mask, 1)
         fine_valid = self._pick(shows, self._fine_columns, self._fine_rows, False)

@@ -38,7 +38,7 @@ class Sensor:
     def behind(cls, lens: Lens, mask: Bool[np.ndarray, "H W"], supersampling: int) -> Sensor:
         """A sensor with ``supersampling`` x ``supersampling`` colour samples a pixel."""
         row, column = np.nonzero(mask)
-        pixels = np.stack([column, row], axis=1).astype(np.float64)
+        pixels = np.stack([column, row], axis=1) + 0.5
         reached = ~np.isnan(lens.unproject(pixels)[:, 0])
         mask = mask.copy()
         mask[row, column] = reached
@@ -188,7 +188,8 @@ def shade(
 
 def _pixel_solid_angle(sensor: Sensor) -> float:
     """Mean area that a pixel covers at z-depth 1, seen near the middle of the image."""
-    middle = np.array([0.5 * sensor.lens.width, 0.5 * sensor.lens.height])
+    # The pixel whose top left corner is the middle, and its neighbours.
+    middle = np.array([0.5 * sensor.lens.width, 0.5 * sensor.lens.height]) + 0.5
     corner = sensor.lens.unproject(middle + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
     return float(np.linalg.norm(np.cross(corner[1] - corner[0], corner[2] - corner[0])))
 

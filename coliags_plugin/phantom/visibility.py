@@ -37,7 +37,7 @@ def seen_from(
         local = (points[open_points] - camera_to_world[:3, 3]) @ camera_to_world[:3, :3]
         pixels = lens.project(local)
         with np.errstate(invalid="ignore"):
-            column, row = np.floor(pixels[:, 0] + 0.5), np.floor(pixels[:, 1] + 0.5)
+            column, row = np.floor(pixels).T
             framed = (column >= 0) & (row >= 0) & (column < lens.width) & (row < lens.height) & (local[:, 2] > 0.0)
         inside = np.flatnonzero(framed)
         inside = inside[mask[row[inside].astype(int), column[inside].astype(int)]]

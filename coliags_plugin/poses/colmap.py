@@ -17,10 +17,11 @@ from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.poses.format import Format
 from coliags_plugin.poses.rigid import inverse, rigid, rotations_from_wxyz, wxyz_from_rotations
 from coliags_plugin.poses.text import placed, read_text, shortened
-from coliags_plugin.poses.trajectory import Intrinsics, Trajectory, natural_order, refuse_repeated
+from coliags_plugin.poses.trajectory import Trajectory, natural_order, refuse_repeated
 
 if TYPE_CHECKING:
     import pycolmap

@@ -17,10 +17,11 @@ from jaxtyping import Float, Int
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.poses.format import Format
 from coliags_plugin.poses.rigid import check_rigid, inverse, rigid, rotations_from_wxyz, wxyz_from_rotations
 from coliags_plugin.poses.text import head, placed
-from coliags_plugin.poses.trajectory import Intrinsics, Trajectory
+from coliags_plugin.poses.trajectory import Trajectory
 
 #: Key -> shapes it may have; a letter is one number throughout the file, F that of the poses.
 SHAPES: dict[str, tuple[tuple[int | str, ...], ...]] = {
@@ -50,8 +51,7 @@ class EndoGslamParams:
     Attributes:
         camera_to_world: Estimated poses, rigid, OpenCV axes; world: the first camera; mm. [F, 4, 4]
         true_camera_to_world: The data set's poses of the same frames in the same world. [F, 4, 4]
-        intrinsics: K as stored, pixels, pixel centres at INTEGERS. [3, 3]
-        width, height: Picture size, pixels.
+        intrinsics: Of all images.
         means: Centres of the Gaussians, world, mm; N may be 0. float64. [N, 3]
         rgb_colors: Colours, nominally in [0, 1]; may lie a little outside. float64. [N, 3]
         log_scales: Logarithms of the standard deviations in mm; one column where Gaussians are isotropic. None where
@@ -61,39 +61,27 @@ class EndoGslamParams:
 
     camera_to_world: Float[np.ndarray, "F 4 4"]
     true_camera_to_world: Float[np.ndarray, "F 4 4"]
-    intrinsics: Float[np.ndarray, "3 3"]
-    width: int
-    height: int
+    intrinsics: Intrinsics
     means: Float[np.ndarray, "N 3"]
     rgb_colors: Float[np.ndarray, "N 3"]
     log_scales: Float[np.ndarray, "N C"] | None
     keyframes: Int[np.ndarray, "K"] | None
-
-    @property
-    def pinhole(self) -> Intrinsics:
-        """The intrinsics with pixel centres at integers + 0.5.
-
-        Raises:
-            InputError: They are those of no pinhole.
-        """
-        return _pinhole(self.intrinsics, self.width, self.height)
 
 
 def read_params(path: Path) -> EndoGslamParams:
     """Read a whole ``params.npz``.
 
     Raises:
-        InputError: It is no NPZ, or keys are missing, misshaped, not numbers or not finite (all of them are named); or
-            a pose is no rigid transform. ``log_scales`` and ``keyframe_time_indices`` may be missing.
+        InputError: It is no NPZ, or keys are missing, misshaped, not numbers or not finite (all of them are named);
+            a pose is no rigid transform; or the intrinsics are no pinhole's. ``log_scales`` and
+            ``keyframe_time_indices`` may be missing.
     """
     arrays = _arrays(path, tuple(key for key in SHAPES if key not in _SPARE), optional=_SPARE)
     keyframes = arrays.get("keyframe_time_indices")
     return EndoGslamParams(
         camera_to_world=_estimate(path, arrays),
         true_camera_to_world=_truth(path, arrays),
-        intrinsics=arrays["intrinsics"],
-        width=int(arrays["org_width"].item()),
-        height=int(arrays["org_height"].item()),
+        intrinsics=_intrinsics(path, arrays),
         means=arrays["means3D"],
         rgb_colors=arrays["rgb_colors"],
         log_scales=arrays.get("log_scales"),
@@ -140,7 +128,7 @@ def write(path: Path, trajectory: Trajectory) -> None:
             "a params.npz to hold the camera's intrinsics and picture size",
             "Pass --intrinsics fx,fy,cx,cy --size WIDTHxHEIGHT",
         )
-    pinhole = trajectory.intrinsics
+    intrinsics = trajectory.intrinsics
     # World to first camera, then first camera to each camera.
     world_to_camera = inverse(trajectory.camera_to_world) @ trajectory.camera_to_world[0]
     world_to_camera[0] = np.eye(4)
@@ -150,11 +138,9 @@ def write(path: Path, trajectory: Trajectory) -> None:
         "cam_trans": world_to_camera[:, :3, 3].T[None].astype(np.float32),
         "gt_w2c_all_frames": world_to_camera.astype(np.float32),
         "w2c": np.eye(4, dtype=np.float32),
-        "intrinsics": np.array(
-            [[pinhole.fx, 0.0, pinhole.cx - 0.5], [0.0, pinhole.fy, pinhole.cy - 0.5], [0.0, 0.0, 1.0]], np.float32
-        ),
-        "org_width": np.array(pinhole.width),
-        "org_height": np.array(pinhole.height),
+        "intrinsics": intrinsics.opencv_matrix().astype(np.float32),
+        "org_width": np.array(intrinsics.width),
+        "org_height": np.array(intrinsics.height),
         "means3D": np.zeros((0, 3), np.float32),
         "rgb_colors": np.zeros((0, 3), np.float32),
         "unnorm_rotations": np.zeros((0, 4), np.float32),
@@ -199,16 +185,17 @@ def _trajectory(
         intrinsics = None
         remarks = [*remarks, f"no intrinsics: the file has no {', '.join(missing)}"]
     else:
-        width, height = (int(arrays[key].item()) for key in ("org_width", "org_height"))
-        with placed(str(path)):
-            intrinsics = _pinhole(arrays["intrinsics"], width, height)
+        intrinsics = _intrinsics(path, arrays)
     return Trajectory(camera_to_world, intrinsics=intrinsics, stored_as=stored_as, remarks=tuple(remarks))
 
 
-def _pinhole(matrix: np.ndarray, width: int, height: int) -> Intrinsics:
+def _intrinsics(path: Path, arrays: dict[str, np.ndarray]) -> Intrinsics:
+    matrix = arrays["intrinsics"]
     fx, fy, cx, cy = (float(matrix[row, column]) for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    width, height = (int(arrays[key].item()) for key in ("org_width", "org_height"))
     # EndoGSLAM unprojects pixel u as (u - cx) / fx: its pixel centres are integers.
-    return Intrinsics(fx, fy, cx + 0.5, cy + 0.5, width, height)
+    with placed(str(path)):
+        return Intrinsics(fx, fy, cx + 0.5, cy + 0.5, width, height)
 
 
 def _estimate(path: Path, arrays: dict[str, np.ndarray]) -> np.ndarray:

@@ -11,10 +11,11 @@ import numpy as np
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.poses.format import Format
 from coliags_plugin.poses.rigid import FLIP_Y_AND_Z, check_rigid
 from coliags_plugin.poses.text import head, placed, read_text
-from coliags_plugin.poses.trajectory import Intrinsics, Trajectory, natural_order, refuse_repeated
+from coliags_plugin.poses.trajectory import Trajectory, natural_order, refuse_repeated
 
 _PINHOLE = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")

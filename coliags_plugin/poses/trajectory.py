@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,39 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.poses.rigid import check_rigid
-
-
-@dataclass(frozen=True)
-class Intrinsics:
-    """An undistorted pinhole that took every picture of a trajectory.
-
-    Attributes:
-        fx, fy: Focal lengths, pixels.
-        cx, cy: Principal point, pixels, pixel centres at integers + 0.5.
-        width, height: Picture size, pixels.
-    """
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    width: int
-    height: int
-
-    def __post_init__(self) -> None:
-        """Refuse what is no pinhole.
-
-        Raises:
-            InputError: A number is not finite, or a focal length or size not positive.
-        """
-        numbers = (self.fx, self.fy, self.cx, self.cy)
-        if not all(map(math.isfinite, numbers)) or min(self.fx, self.fy, self.width, self.height) <= 0:
-            raise InputError(
-                f"intrinsics fx {self.fx:g}, fy {self.fy:g}, cx {self.cx:g}, cy {self.cy:g} "
-                f"of a picture {self.width} x {self.height}",
-                "finite numbers in pixels, focal lengths and size positive",
-            )
 
 
 @dataclass(frozen=True, eq=False)

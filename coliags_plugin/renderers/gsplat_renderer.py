@@ -268,7 +268,7 @@ def _view(
     """
     view = torch.eye(4, dtype=gaussians.means.dtype, device=gaussians.means.device)
     view[:3, :3] = camera.camera_to_world[:3, :3].T
-    return gaussians.means - camera.center, view, camera.intrinsics
+    return gaussians.means - camera.center, view, camera.intrinsics_matrix
 
 
 def _tiles(

@@ -41,7 +41,7 @@ def test_project_agrees_with_the_matrices():
     camera = camera_at(1.0, 2.0, 3.0, yaw=0.3)
     point = torch.tensor([2.0, 1.0, 15.0], dtype=torch.float64)
     local = camera.world_to_camera[:3, :3] @ point + camera.world_to_camera[:3, 3]
-    homogeneous = camera.intrinsics @ local
+    homogeneous = camera.intrinsics_matrix @ local
     pixels, depth = camera.project(point[None])
     torch.testing.assert_close(pixels[0], homogeneous[:2] / homogeneous[2])
     torch.testing.assert_close(depth[0], local[2])

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.data_check.check import check_scene
 from coliags_plugin.data_check.hypotheses import CHANGES
@@ -18,7 +19,6 @@ from coliags_plugin.data_check.reprojection import Pair, agreement, best_scale, 
 from coliags_plugin.data_check.text import lines
 from coliags_plugin.datamanagers.c3vd.reader import C3VDDataManager, C3VDSettings
 from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
-from coliags_plugin.lenses.models import Pinhole
 from coliags_plugin.phantom.generate import generate
 from coliags_plugin.phantom.settings import phantom_settings
 from tests.commands import run
@@ -146,7 +146,7 @@ def test_constant_and_unknown_depth(scene):
 
 def test_carrying_a_plane_is_exact(tmp_path):
     """Two cameras before a plane: depth there is known in closed form."""
-    pinhole, size = Pinhole(60.0, 60.0, 39.5, 29.5), (60, 80)
+    pinhole, size = Intrinsics(60.0, 60.0, 40.0, 30.0, 80, 60), (60, 80)
     poses = np.stack([np.eye(4)] * 3)
     poses[:, 2, 3] = 0.0, 2.0, 4.0
     depths = [np.full(size, 20.0 - z) for z in poses[:, 2, 3]]
@@ -183,12 +183,11 @@ def test_command_says_it_all(folder, scene, tmp_path, capsys):
 
 def test_command_fails_on_what_is_suspect(scene, tmp_path, capsys):
     frames = sorted([*scene.train, *scene.test_sets["test"]], key=lambda frame: frame.index)
-    k = frames[0].camera
     write_c3vd_scene(
         tmp_path / "inverted",
         [frame.image.numpy() for frame in frames],
         np.stack([np.linalg.inv(frame.camera.camera_to_world.double().numpy()) for frame in frames]),
-        Pinhole(k.fx, k.fy, k.cx - 0.5, k.cy - 0.5),
+        frames[0].camera.intrinsics,
         depths=[frame.depth.numpy() for frame in frames],
     )
     status = run("data", "check", tmp_path / "inverted", "--json", tmp_path / "check.json")

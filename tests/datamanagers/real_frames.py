@@ -8,31 +8,32 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
 from coliags_plugin.datamanagers.reading.images import read_rgb
-from coliags_plugin.lenses.models import FisheyeLens, Lens, Pinhole
+from coliags_plugin.lenses.models import FisheyeLens, Lens
 from coliags_plugin.lenses.undistortion import Undistortion
 
 
 def real_lens(shared_data: Path) -> FisheyeLens:
-    """The lens of the 800 x 800 crops, as their frames.json gives it."""
+    """The lens of the 800 x 800 crops, as their frames.json gives it, pixel centres at integers."""
     data = json.loads((shared_data / "c3vd_cecum_t1_a" / "frames.json").read_text())
     bends = {name: data[name] for name in ("k1", "k2", "k3", "k4")}
     size = {"width": data["w"], "height": data["h"]}
-    return FisheyeLens(**size, fx=data["fl_x"], fy=data["fl_y"], cx=data["cx"], cy=data["cy"], **bends)
+    return FisheyeLens(**size, fx=data["fl_x"], fy=data["fl_y"], cx=data["cx"] + 0.5, cy=data["cy"] + 0.5, **bends)
 
 
-def widest_pinhole(lens: Lens, width: int, height: int) -> Pinhole:
+def widest_pinhole(lens: Lens, width: int, height: int) -> Intrinsics:
     """The widest view of which every pixel lies in the image: as wide as the middles of the image's edges see.
 
     A barrel-distorted image sees further at its corners than at its edges, so the corners need no look.
     """
     k = lens.pinhole
-    ends = [[-0.5, k.cy], [lens.width - 0.5, k.cy], [k.cx, -0.5], [k.cx, lens.height - 0.5]]
+    ends = [[0.0, k.cy], [lens.width, k.cy], [k.cx, 0.0], [k.cx, lens.height]]
     (left, _), (right, _), (_, top), (_, bottom) = lens.unproject(ends)[:, :2]
     fx, fy = width / (right - left), height / (bottom - top)
-    return Pinhole(fx, fy, -left * fx - 0.5, -top * fy - 0.5)
+    return Intrinsics(fx, fy, -left * fx, -top * fy, width, height)
 
 
 def sparse_points(shared_data: Path) -> PointCloud:
@@ -56,7 +57,7 @@ def undistort_real_frames(shared_data: Path, out: Path, width: int, height: int,
     frames = json.loads((folder / "frames.json").read_text())["frames"][::step]
     lens = real_lens(shared_data)
     pinhole = widest_pinhole(lens, width, height)
-    undistortion = Undistortion(lens, pinhole, width, height)
+    undistortion = Undistortion(lens, pinhole)
     if not undistortion.valid.all():
         raise RuntimeError("the chosen pinhole sees beyond the crop")
     images = [undistortion.image(read_rgb(folder / frame["file_path"])) for frame in frames]

@@ -13,6 +13,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.datamanagers.c3vd.writer import depth_steps
 from coliags_plugin.datamanagers.c3vd_endogslam.reader import (
@@ -21,12 +22,11 @@ from coliags_plugin.datamanagers.c3vd_endogslam.reader import (
     C3VDEndoGSLAMDataManager,
     C3VDEndoGSLAMSettings,
 )
-from coliags_plugin.lenses.models import Pinhole
 from coliags_plugin.phantom.layouts.c3vd_raw import write_poses
 from coliags_plugin.poses import endogslam
 from coliags_plugin.poses.rigid import inverse, rigid, wxyz_from_rotations
-from coliags_plugin.poses.trajectory import Intrinsics, Trajectory
-from tests.datamanagers.wall_scenes import PINHOLE, look, off_wall, poses
+from coliags_plugin.poses.trajectory import Trajectory
+from tests.datamanagers.wall_scenes import PINHOLE, look, off_wall, poses, rays
 from tests.phantom.phantom_layouts import depth_gap, distance_from_wall, in_video_order, read, true_poses, write_phantom
 
 WIDTH, HEIGHT = 64, 48
@@ -36,12 +36,9 @@ def load(folder: Path, **options) -> Scene:
     return C3VDEndoGSLAMDataManager(C3VDEndoGSLAMSettings(**options)).load(folder)
 
 
-def write_prepared(
-    folder: Path, count: int = 10, bits: int = 8, pinhole: Pinhole = PINHOLE, size: tuple[int, int] = (WIDTH, HEIGHT)
-) -> Path:
+def write_prepared(folder: Path, count: int = 10, bits: int = 8, pinhole: Intrinsics = PINHOLE) -> Path:
     """The wall in EndoGSLAM's layout, without params.npz."""
-    x, y = np.meshgrid((np.arange(size[0]) - pinhole.cx) / pinhole.fx, (np.arange(size[1]) - pinhole.cy) / pinhole.fy)
-    directions = np.stack([x, y, np.ones_like(x)], -1)
+    directions = rays(pinhole)
     (folder / "color").mkdir(parents=True)
     (folder / "depth").mkdir()
     for index, pose in enumerate(poses(count)):
@@ -67,8 +64,7 @@ def write_params(
     """EndoGSLAM's result for some pictures of the wall, with poses that wander and true ones; points in its world."""
     true = poses(max(pictures) + 1)[pictures]
     path.parent.mkdir(parents=True, exist_ok=True)
-    intrinsics = Intrinsics(PINHOLE.fx, PINHOLE.fy, PINHOLE.cx + 0.5, PINHOLE.cy + 0.5, WIDTH, HEIGHT)
-    endogslam.write(path, Trajectory(true, intrinsics=intrinsics))
+    endogslam.write(path, Trajectory(true, intrinsics=PINHOLE))
     with np.load(path) as file:
         arrays = dict(file)
     estimate = wander(inverse(true[:1])[0] @ true)
@@ -152,9 +148,9 @@ class TestPhantoms:
 
     def test_intrinsics_are_halved_c3vds(self, phantom):
         camera = read(phantom, "c3vd-endogslam").train[0].camera
-        k = PREPARED_PINHOLE.scaled(64 / 675, 51 / 540)
+        k = PREPARED_PINHOLE.resized(64, 51)
         assert (camera.fx, camera.fy) == pytest.approx((k.fx, k.fy))
-        assert (camera.cx, camera.cy) == pytest.approx((k.cx + 0.5, k.cy + 0.5))
+        assert (camera.cx, camera.cy) == pytest.approx((k.cx, k.cy))
 
     def test_split_rotation_views_and_marks(self, phantom):
         scene = read(phantom, "c3vd-endogslam")
@@ -300,8 +296,8 @@ class TestPictures:
         assert PREPARED_DEPTH.z_depth(np.array([[51]], np.uint8))[0, 0] == pytest.approx(20.0)
 
     def test_without_params_the_cameras_are_the_tables(self, tmp_path):
-        pinhole = PREPARED_PINHOLE.scaled(60 / 675, 48 / 540)
-        folder = write_prepared(tmp_path / "wall", 9, pinhole=pinhole, size=(60, 48))
+        pinhole = PREPARED_PINHOLE.resized(60, 48)
+        folder = write_prepared(tmp_path / "wall", 9, pinhole=pinhole)
         scene = load(folder, poses="ground-truth")
         assert scene.provenance["intrinsics_from"] == "EndoGSLAM's table"
         assert scene.train[0].camera.fx == pytest.approx(401.1595 * 60 / 675)

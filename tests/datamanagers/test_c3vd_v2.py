@@ -20,7 +20,7 @@ from coliags_plugin.lenses.models import LENSES, Lens
 from tests.datamanagers.wall_scenes import off_wall, poses, write_raw
 from tests.phantom.phantom_layouts import depth_gap, in_video_order, read, true_poses, write_phantom
 
-SMALL_LENS = CANDIDATE_LENS.scaled(270, 216)
+SMALL_LENS = CANDIDATE_LENS.resized(270, 216)
 
 
 def load(folder: Path, **options) -> Scene:
@@ -40,8 +40,12 @@ def write_v2(folder: Path, lens: Lens = SMALL_LENS, **options) -> Path:
     return folder
 
 
+#: As its file has it: pixel centres at integers.
+CANDIDATE = {**vars(CANDIDATE_LENS), "cx": CANDIDATE_LENS.cx - 0.5, "cy": CANDIDATE_LENS.cy - 0.5, "a1": 0.0}
+
+
 def as_text(**changes: float) -> str:
-    values = {**vars(CANDIDATE_LENS), "a1": 0.0, **changes}
+    values = {**CANDIDATE, **changes}
     return "\n".join(f"{name} = {values[name]!r}" for name in ORDER)
 
 
@@ -69,9 +73,9 @@ class TestPhantom:
         assert [frame.name for frame in scene.test_sets["test"]] == ["0000", "0008"]
         assert scene.provenance["pose_convention"]["order"] == "column-major"
         assert scene.provenance["lens_source"] == str((phantom / "camera_intrinsics.txt").resolve())
-        k, camera = CANDIDATE_LENS.scaled(90, 72).pinhole, frames[0].camera
+        k, camera = CANDIDATE_LENS.resized(90, 72).pinhole, frames[0].camera
         assert (camera.fx, camera.fy) == pytest.approx((k.fx, k.fy))
-        assert (camera.cx, camera.cy) == pytest.approx((k.cx + 0.5, k.cy + 0.5))
+        assert (camera.cx, camera.cy) == pytest.approx((k.cx, k.cy))
 
     def test_depth_agrees_from_frame_to_frame(self, phantom):
         first, second = in_video_order(read(phantom, "c3vd-v2", width=90, height=72))[3:5]
@@ -96,7 +100,7 @@ class TestLens:
         np.testing.assert_allclose(scene.train[0].camera.camera_to_world, poses(4)[1], atol=1e-5)
 
     def test_lens_v1_is_c3vds(self, tmp_path, caplog):
-        folder = write_v2(tmp_path / "wall", LENSES["omnidirectional"].scaled(270, 216), count=2)
+        folder = write_v2(tmp_path / "wall", LENSES["omnidirectional"].resized(270, 216), count=2)
         frame = load(folder, lens="v1").train[0]
         assert _worst_off_wall(frame) < 0.2
         assert frame.camera.fx == pytest.approx(769.243600037458 * 90 / 1350)
@@ -109,7 +113,7 @@ class TestLens:
 
     @pytest.mark.parametrize("up", [0, 1, 2])
     def test_the_file_decides_from_two_folders_up(self, tmp_path, up):
-        folder = write_v2(tmp_path / "registered" / "c1" / "wall", LENSES["omnidirectional"].scaled(270, 216), count=2)
+        folder = write_v2(tmp_path / "registered" / "c1" / "wall", LENSES["omnidirectional"].resized(270, 216), count=2)
         values = {**vars(LENSES["omnidirectional"]), "a1": 0.0}
         file = [folder, *folder.parents][up] / "camera_intrinsics.txt"
         file.write_text("\n".join(f"{name}: {values[name]}" for name in ORDER))
@@ -131,7 +135,7 @@ class TestIntrinsicsFile:
             as_text().replace(" = ", ": "),
             as_text().replace(" = ", "\t").upper(),
             "# calibration\n" + as_text() + "  # the last one",
-            json.dumps({**{name: vars(CANDIDATE_LENS).get(name, 0.0) for name in ORDER}}),
+            json.dumps({name: CANDIDATE[name] for name in ORDER}),
             "\n".join(line for line in as_text().splitlines() if line[:2] not in ("wi", "he", "a1", "c ", "d ", "e ")),
             ", ".join(line.split(" = ")[1] for line in as_text().splitlines()),
             "\n".join(line.split(" = ")[1] for line in as_text().splitlines()[2:]),

@@ -483,7 +483,7 @@ def test_reprojection_error_is_the_one_colmap_finds(shared_data, place):
     errors, numbers = [], []
     for picture, pose in zip(model.pictures, model.camera_to_world, strict=True):
         local = (model.positions[picture.points] - pose[:3, 3]) @ pose[:3, :3]
-        seen = model.cameras[picture.camera].project(local) + 0.5
+        seen = model.cameras[picture.camera].project(local)
         errors.append(np.linalg.norm(seen - picture.observed, axis=1))
         numbers.append(picture.points)
     by_point = np.concatenate(numbers)
@@ -508,7 +508,7 @@ def test_points_fall_where_they_were_seen_in_the_loaders_undistorted_pictures(sh
         camera = shot.rectification.camera(shot.camera_to_world).to(dtype=torch.float64)
         found, depth = camera.project(torch.from_numpy(data.positions[picture.points]))
         assert (depth > 0).all()
-        seen = shot.rectification.pixels(picture.observed - 0.5) + 0.5
+        seen = shot.rectification.pixels(picture.observed)
         stored = data.cameras[picture.camera].pinhole.fx / shot.rectification.pinhole.fx
         errors.append(stored * np.linalg.norm(found.numpy() - seen, axis=1))
         numbers.append(picture.points)
@@ -524,8 +524,8 @@ def test_undistorting_is_what_colmap_did(shared_data):
     before, after = (read_model(shared_data / "colmap_23img" / place) for place in ("distorted_sparse", "sparse"))
     for one, other in zip(before.pictures, after.pictures, strict=True):
         pinhole = after.cameras[other.camera].pinhole
-        directions = before.cameras[one.camera].unproject(one.observed - 0.5)[:, :2]
-        pixels = directions * (pinhole.fx, pinhole.fy) + (pinhole.cx + 0.5, pinhole.cy + 0.5)
+        directions = before.cameras[one.camera].unproject(one.observed)[:, :2]
+        pixels = directions * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy)
         np.testing.assert_allclose(pixels, other.observed, rtol=0, atol=1e-6)
 
 

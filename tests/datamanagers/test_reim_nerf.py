@@ -21,7 +21,7 @@ from coliags_plugin.phantom.layouts.reim_nerf import SCENE_SCALE
 from tests.phantom.phantom_layouts import depth_gap, distance_from_wall, in_video_order, read, true_poses, write_phantom
 
 WIDTH, HEIGHT, FRAMES = 90, 72, 27
-LENS = LENSES["fisheye"].scaled(WIDTH, HEIGHT)
+LENS = LENSES["fisheye"].resized(WIDTH, HEIGHT)
 #: mm a step along the ray.
 STEP = math.pi / 65535 / SCENE_SCALE
 
@@ -84,11 +84,11 @@ class TestPhantom:
     def test_intrinsics_are_the_lenss_pinhole(self, scene):
         k, camera = LENS.pinhole, scene.train[0].camera
         assert (camera.fx, camera.fy) == pytest.approx((k.fx, k.fy), rel=1e-12)
-        assert (camera.cx, camera.cy) == pytest.approx((k.cx + 0.5, k.cy + 0.5), rel=1e-12)
+        assert (camera.cx, camera.cy) == pytest.approx((k.cx, k.cy), rel=1e-12)
 
     def test_stored_distances_end_on_the_wall(self, folder):
         """Through the lens itself: no resampling between file and wall."""
-        row, column = np.mgrid[:HEIGHT, :WIDTH]
+        row, column = np.mgrid[:HEIGHT, :WIDTH] + 0.5
         rays = LENS.unproject(np.stack([column.ravel(), row.ravel()], 1))
         stored = cv2.imread(str(folder / "distmaps" / "0010_color.png"), cv2.IMREAD_UNCHANGED).ravel()
         depth = stored * STEP * ray_cosines(LENS).ravel()
@@ -103,15 +103,15 @@ class TestPhantom:
     def test_working_depth_is_that_of_the_nearest_stored_pixel(self, folder, scene):
         frame = scene.train[2]
         stored = cv2.imread(str(folder / "distmaps" / f"{frame.name}.png"), cv2.IMREAD_UNCHANGED)
-        # An independent way from distance to z: OpenCV's own fisheye, at integers + 0.5.
+        # An independent way from distance to z: OpenCV's own fisheye, which counts from integers, at integers + 0.5.
         row, column = np.mgrid[:HEIGHT, :WIDTH] + 0.5
         k, calibrated = LENS.pinhole, LENSES["fisheye"]
-        matrix = np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]])
+        matrix = k.opencv_matrix()
         bends = np.array([calibrated.k1, calibrated.k2, calibrated.k3, calibrated.k4])
         tangents = cv2.fisheye.undistortPoints(np.stack([column.ravel(), row.ravel()], 1)[None], matrix, bends)[0]
         length = np.hypot(1.0, np.linalg.norm(tangents, axis=1)).reshape(HEIGHT, WIDTH)
         depth = stored * STEP / length
-        columns, rows = (np.rint(part).astype(int) for part in undistortion_map(LENS, *k, WIDTH, HEIGHT))
+        columns, rows = (np.rint(part).astype(int) for part in undistortion_map(LENS, k))
         expected = depth[rows, columns]
         known = torch.isfinite(frame.depth).numpy()
         assert known.mean() > 0.9
@@ -157,10 +157,10 @@ class TestPhantom:
 
 
 def test_cosines_are_those_of_the_rays_the_preprocessing_takes():
-    lens = LENSES["fisheye"].scaled(45, 36)
+    lens = LENSES["fisheye"].resized(45, 36)
     cosine = ray_cosines(lens)
     assert cosine.dtype == np.float32
-    x, y, z = lens.unproject([[12.5, 7.5]])[0]
+    x, y, z = lens.unproject([[13.0, 8.0]])[0]
     assert cosine[7, 12] == pytest.approx(z / math.hypot(x, y, z), rel=1e-6)
 
 

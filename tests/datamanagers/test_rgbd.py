@@ -22,9 +22,11 @@ from coliags_plugin.phantom.generate import generate
 from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.poses import tum
 from coliags_plugin.poses.trajectory import Trajectory
-from tests.datamanagers.wall_scenes import PINHOLE, colors, look, off_wall, poses
+from tests.datamanagers.wall_scenes import PINHOLE, colors, look, off_wall, poses, rays
 
 WIDTH, HEIGHT = 64, 48
+#: As camera.json has it, pixel centres at integers.
+OPENCV = {"fx": PINHOLE.fx, "fy": PINHOLE.fy, "cx": PINHOLE.cx - 0.5, "cy": PINHOLE.cy - 0.5}
 #: Steps per mm: 0.001 mm each.
 SCALE = 1000.0
 
@@ -52,8 +54,7 @@ def write_wall(
 ) -> Path:
     """The tilted wall: picture i is taken from pose i and called ``stems[i]``."""
     count = len(stems)
-    x, y = np.meshgrid((np.arange(WIDTH) - PINHOLE.cx) / PINHOLE.fx, (np.arange(HEIGHT) - PINHOLE.cy) / PINHOLE.fy)
-    directions = np.stack([x, y, np.ones_like(x)], -1)
+    directions = rays(PINHOLE)
     for place in places:
         (folder / place).mkdir(parents=True)
     for index, pose in enumerate(poses(count)):
@@ -62,7 +63,7 @@ def write_wall(
         steps = np.rint(depth * SCALE).astype(np.uint16)
         cv2.imwrite(str(folder / places[1] / f"{(depth_stems or stems)[index]}.png"), steps)
     tum.write(folder / trajectory, Trajectory(poses(count), timestamps=np.array(pose_times or range(count), float)))
-    camera = {**PINHOLE._asdict(), "w": WIDTH, "h": HEIGHT, "depth_scale": SCALE}
+    camera = {**OPENCV, "w": WIDTH, "h": HEIGHT, "depth_scale": SCALE}
     (folder / "camera.json").write_text(json.dumps(camera))
     return folder
 
@@ -370,9 +371,8 @@ class TestPancakes:
             trajectory="rnnslam_poses.txt",
         )
         (folder / "camera.json").unlink()
-        fx, fy, cx, cy = PINHOLE
         (folder / "cameras.txt").write_text(
-            f"# Camera list\n1 PINHOLE {WIDTH} {HEIGHT} {fx} {fy} {cx + 0.5} {cy + 0.5}\n"
+            f"# Camera list\n1 PINHOLE {WIDTH} {HEIGHT} {PINHOLE.fx} {PINHOLE.fy} {PINHOLE.cx} {PINHOLE.cy}\n"
         )
         (folder / "mesh.obj").write_text("# v\nv 1 2 40 1.0 0.5 0\nv -1.5 0 41 0 0 1\nvt 0 0\nf 1/1 2/1 1/1\n")
         return folder

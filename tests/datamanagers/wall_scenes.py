@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.datamanagers.c3vd.writer import depth_steps, write_c3vd_scene
-from coliags_plugin.lenses.models import LENSES, Lens, Pinhole, octagon_mask
+from coliags_plugin.lenses.models import LENSES, Lens, octagon_mask
+from coliags_plugin.lenses.pinhole import PinholeLens
 
 #: The wall is where NORMAL . x = OFFSET (mm).
 NORMAL = np.array([0.2, -0.1, 1.0])
 OFFSET = 40.0
 #: Off-centre and not square, so that whoever confuses something is caught.
-PINHOLE = Pinhole(61.0, 55.0, 33.0, 21.0)
+PINHOLE = Intrinsics(61.0, 55.0, 33.5, 21.5, 64, 48)
 
 
 def poses(count: int) -> np.ndarray:
@@ -46,13 +49,20 @@ def off_wall(points: np.ndarray) -> np.ndarray:
     return np.abs(points @ NORMAL - OFFSET) / np.linalg.norm(NORMAL)
 
 
+def rays(camera: Lens | Intrinsics) -> np.ndarray:
+    """Directions of the pixels, z = 1. [H, W, 3]"""
+    lens = camera if isinstance(camera, Lens) else PinholeLens.of(camera)
+    columns, rows = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
+    return lens.unproject(np.stack([columns.ravel(), rows.ravel()], 1)).reshape(lens.height, lens.width, 3)
+
+
 def write_undistorted(folder: Path, count: int = 9, width: int = 64, height: int = 48, **options) -> Path:
     """The wall in the undistorted layout."""
-    x, y = np.meshgrid((np.arange(width) - PINHOLE.cx) / PINHOLE.fx, (np.arange(height) - PINHOLE.cy) / PINHOLE.fy)
-    directions = np.stack([x, y, np.ones_like(x)], -1)
+    intrinsics = replace(PINHOLE, width=width, height=height)
+    directions = rays(intrinsics)
     views = [look(pose, directions) for pose in poses(count)]
     depths = options.pop("depths", [depth for depth, _ in views])
-    write_c3vd_scene(folder, [color for _, color in views], poses(count), PINHOLE, depths=depths, **options)
+    write_c3vd_scene(folder, [color for _, color in views], poses(count), intrinsics, depths=depths, **options)
     return folder
 
 
@@ -60,9 +70,8 @@ def write_raw(
     folder: Path, lens: Lens | None = None, count: int = 9, row_major: bool = False, padded: bool = True
 ) -> Path:
     """The wall in the raw layout, dark outside the octagon."""
-    lens = lens or LENSES["omnidirectional"].scaled(270, 216)
-    columns, rows = np.meshgrid(np.arange(lens.width), np.arange(lens.height))
-    directions = lens.unproject(np.stack([columns.ravel(), rows.ravel()], 1)).reshape(lens.height, lens.width, 3)
+    lens = lens or LENSES["omnidirectional"].resized(270, 216)
+    directions = rays(lens)
     octagon = octagon_mask(lens.width, lens.height)
     folder.mkdir(parents=True)
     for index, pose in enumerate(poses(count)):

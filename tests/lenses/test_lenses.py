@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import cv2
 import numpy as np
@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.lenses.models import LENSES, NOWHERE, Pinhole, octagon_mask, undistortion_map
+from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.lenses.models import LENSES, NOWHERE, octagon_mask, undistortion_map
 
 NAMES = sorted(LENSES)
 FISHEYE = LENSES["fisheye"]
@@ -26,8 +27,9 @@ def angle(directions: np.ndarray) -> np.ndarray:
 
 
 def grid(width: int, height: int, step: int) -> np.ndarray:
+    """Centres of every ``step``-th pixel. [N, 2]"""
     columns, rows = np.meshgrid(np.arange(0, width, step), np.arange(0, height, step))
-    return np.stack([columns.ravel(), rows.ravel()], axis=1).astype(float)
+    return np.stack([columns.ravel(), rows.ravel()], axis=1) + 0.5
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -36,7 +38,7 @@ def grid(width: int, height: int, step: int) -> np.ndarray:
     x=st.floats(-1.5, 1.5), y=st.floats(-1.5, 1.5), z=st.floats(0.01, 200.0), width=st.sampled_from([1350, 338, 500])
 )
 def test_projecting_and_unprojecting_are_inverse(name, x, y, z, width):
-    lens = LENSES[name].scaled(width, 270).cropped(7, -3, width - 20, 200)
+    lens = LENSES[name].resized(width, 270).cropped(7, -3, width - 20, 200)
     pixel = lens.project([[x * z, y * z, z]])
     direction = lens.unproject(pixel)
     assert direction[0, 2] == 1.0
@@ -55,23 +57,23 @@ def test_round_trip_over_the_octagon(name):
 
 
 def test_fisheye_is_opencvs():
-    matrix = np.array([[FISHEYE.fx, 0, FISHEYE.cx], [0, FISHEYE.fy, FISHEYE.cy], [0, 0, 1]])
+    matrix = FISHEYE.pinhole.opencv_matrix()
     bending = np.array([FISHEYE.k1, FISHEYE.k2, FISHEYE.k3, FISHEYE.k4])
     points = np.random.default_rng(0).uniform([-40, -30, 20], [40, 30, 60], (500, 3))
     reference, _ = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), matrix, bending)
-    np.testing.assert_allclose(FISHEYE.project(points), reference[:, 0], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(FISHEYE.project(points), reference[:, 0] + 0.5, rtol=0, atol=1e-8)
     pixels = reference[:, 0]
     back = cv2.fisheye.undistortPoints(pixels[:, None], matrix, bending)[:, 0]
-    np.testing.assert_allclose(FISHEYE.unproject(pixels)[:, :2], back, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(FISHEYE.unproject(pixels + 0.5)[:, :2], back, rtol=0, atol=1e-7)
 
 
 def test_legacy_pinhole_is_opencvs():
-    matrix = np.array([[BROWN.fx, 0, BROWN.cx], [0, BROWN.fy, BROWN.cy], [0, 0, 1]])
+    matrix = BROWN.pinhole.opencv_matrix()
     bending = np.array([BROWN.k1, BROWN.k2, 0.0, 0.0])
     points = np.random.default_rng(0).uniform([-30, -20, 30], [30, 20, 60], (500, 3))
     reference, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, bending)
-    np.testing.assert_allclose(BROWN.project(points), reference[:, 0], rtol=0, atol=1e-8)
-    columns, rows = undistortion_map(BROWN, *BROWN.pinhole, 1350, 1080)
+    np.testing.assert_allclose(BROWN.project(points), reference[:, 0] + 0.5, rtol=0, atol=1e-8)
+    columns, rows = undistortion_map(BROWN, BROWN.pinhole)
     map_columns, map_rows = cv2.initUndistortRectifyMap(matrix, bending, None, matrix, (1350, 1080), cv2.CV_32FC1)
     np.testing.assert_allclose(columns, map_columns, rtol=0, atol=1e-3)
     np.testing.assert_allclose(rows, map_rows, rtol=0, atol=1e-3)
@@ -115,7 +117,7 @@ def test_how_far_the_lenses_are_from_the_one_that_rendered_the_truth():
 
 
 def test_the_two_readings_of_the_affine_part_differ_by_a_third_of_a_degree():
-    a, b = (lens.unproject([[1349.0, OMNI.cy], [OMNI.cx, 1079.0]]) for lens in (OMNI, OMNI_TRANSPOSED))
+    a, b = (lens.unproject([[1349.5, OMNI.cy], [OMNI.cx, 1079.5]]) for lens in (OMNI, OMNI_TRANSPOSED))
     turn = np.degrees(np.arctan2(a[:, 1], a[:, 0]) - np.arctan2(b[:, 1], b[:, 0]))
     np.testing.assert_allclose(np.abs(turn), 0.335, atol=0.005)
 
@@ -132,47 +134,46 @@ def test_the_two_readings_of_the_affine_part_differ_by_a_third_of_a_degree():
 )
 def test_scaled_pinhole_is_the_table_moved_by_half_a_pixel(width, height, scaled):
     x, y = width / 1350, height / 1080
-    fx, fy, cx, cy = BROWN.scaled(width, height).pinhole
-    np.testing.assert_allclose([fx, fy], scaled[:2], atol=6e-5)
-    # The table scales the centre as if pixel edges were pixel centres; (c + 0.5) s - 0.5 keeps the edges in place.
-    np.testing.assert_allclose([cx - 0.5 * x + 0.5, cy - 0.5 * y + 0.5], scaled[2:], atol=6e-5)
+    k = BROWN.resized(width, height).pinhole
+    np.testing.assert_allclose([k.fx, k.fy], scaled[:2], atol=6e-5)
+    # The table counts from integers and scales the centre as if these were pixel edges; here edges stay in place.
+    np.testing.assert_allclose([k.cx - 0.5 * x, k.cy - 0.5 * y], scaled[2:], atol=6e-5)
 
 
 def test_half_pixel_correct_centres_on_record():
-    assert BROWN.scaled(338, 270).pinhole[2:] == pytest.approx((166.944, 136.558), abs=5e-4)
-    assert BROWN.scaled(675, 540).pinhole[2:] == pytest.approx((333.893, 273.617), abs=6e-4)
+    for size, center in (((338, 270), (166.944, 136.558)), ((675, 540), (333.893, 273.617))):
+        k = BROWN.resized(*size).pinhole
+        assert (k.cx - 0.5, k.cy - 0.5) == pytest.approx(center, abs=6e-4)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_scaling_keeps_what_a_place_in_the_image_sees(name):
     lens = LENSES[name]
-    quarter = lens.scaled(338, 270)
+    quarter = lens.resized(338, 270)
     pixels = grid(338, 270, 20)
-    same_place = (pixels + 0.5) * (1350 / 338, 1080 / 270) - 0.5
+    same_place = pixels * (1350 / 338, 1080 / 270)
     np.testing.assert_allclose(quarter.unproject(pixels), lens.unproject(same_place), rtol=0, atol=1e-12)
-    back = quarter.scaled(1350, 1080)
+    back = quarter.resized(1350, 1080)
     np.testing.assert_allclose(back.unproject(same_place), lens.unproject(same_place), rtol=0, atol=1e-12)
 
 
 def test_scaling_a_pinhole_agrees_with_resizing_a_camera():
     import torch
 
-    k = BROWN.pinhole
-    camera = Camera(k.fx, k.fy, k.cx + 0.5, k.cy + 0.5, 1350, 1080, torch.eye(4)).resized(338, 270)
-    small = k.scaled(338 / 1350, 270 / 1080)
-    assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx(
-        (small.fx, small.fy, small.cx + 0.5, small.cy + 0.5)
-    )
-    assert BROWN.scaled(338, 270).pinhole == pytest.approx(small)
+    camera = Camera.of(BROWN.pinhole, torch.eye(4)).resized(338, 270)
+    assert camera.intrinsics == BROWN.pinhole.resized(338, 270)
+    assert astuple(BROWN.resized(338, 270).pinhole) == pytest.approx(astuple(camera.intrinsics))
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_cropping_moves_pixels(name):
-    lens = LENSES[name].scaled(675, 540)
+    lens = LENSES[name].resized(675, 540)
     crop = lens.cropped(30, 40, 300, 200)
     assert (crop.width, crop.height) == (300, 200)
     np.testing.assert_allclose(crop.unproject([[0, 0], [5, 6]]), lens.unproject([[30, 40], [35, 46]]), atol=1e-12)
-    assert crop.pinhole == pytest.approx(lens.pinhole._replace(cx=lens.pinhole.cx - 30, cy=lens.pinhole.cy - 40))
+    k = lens.pinhole
+    moved = replace(k, cx=k.cx - 30, cy=k.cy - 40, width=300, height=200)
+    assert astuple(crop.pinhole) == pytest.approx(astuple(moved))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -197,7 +198,7 @@ def test_models_end_where_they_turn_back():
 
 
 def test_undistortion_map_marks_what_the_lens_does_not_reach():
-    columns, rows = undistortion_map(FISHEYE, *FISHEYE.pinhole._replace(fx=60.0, fy=60.0), 1350, 1080)
+    columns, rows = undistortion_map(FISHEYE, replace(FISHEYE.pinhole, fx=60.0, fy=60.0))
     assert columns.dtype == rows.dtype == np.float32
     assert columns[0, 0] == NOWHERE
     assert np.isfinite(columns).all()
@@ -205,15 +206,15 @@ def test_undistortion_map_marks_what_the_lens_does_not_reach():
 
 
 def test_undistorting_with_no_lens_is_the_identity():
-    plain = replace(BROWN, k1=0.0, k2=0.0).scaled(90, 72)
-    columns, rows = undistortion_map(plain, *plain.pinhole, 90, 72)
+    plain = replace(BROWN, k1=0.0, k2=0.0).resized(90, 72)
+    columns, rows = undistortion_map(plain, plain.pinhole)
     np.testing.assert_allclose(columns, np.arange(90)[None].repeat(72, 0), atol=1e-4)
     np.testing.assert_allclose(rows, np.arange(72)[:, None].repeat(90, 1), atol=1e-4)
 
 
 def test_pinhole_scaling_is_its_own_inverse():
-    k = Pinhole(100.0, 90.0, 40.0, 31.0)
-    assert k.scaled(0.5, 0.25).scaled(2.0, 4.0) == pytest.approx(k)
+    k = Intrinsics(100.0, 90.0, 40.5, 31.5, 80, 60)
+    assert astuple(k.resized(40, 15).resized(80, 60)) == pytest.approx(astuple(k))
 
 
 def test_octagon_is_symmetric_and_scales():
@@ -263,7 +264,7 @@ def sparse_depth(shared_data):
         local = (data["points_world_mm"].astype(float) - camera_to_world[:3, 3]) @ camera_to_world[:3, :3]
         np.testing.assert_allclose(local[:, 2], data["depth_mm"], atol=1e-4)
         points.append(local)
-        pixels.append(data["uv_raw1350x1080"].astype(float))
+        pixels.append(data["uv_raw1350x1080"].astype(float) + 0.5)  # the file counts from integers
     return np.concatenate(points), np.concatenate(pixels)
 
 

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coliags_plugin.lenses.models import LENSES, BrownLens, FisheyeLens, Pinhole
+from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.lenses.models import LENSES, BrownLens, FisheyeLens
 from coliags_plugin.lenses.opencv import OpenCVLens
 from coliags_plugin.lenses.tabulated import MappedLens
 
@@ -18,7 +19,7 @@ SIZE = {"width": 1350, "height": 1080}
 VIEW = {"fx": 802.3, "fy": 790.1, "cx": 668.3, "cy": 547.7}
 FULL = {"k1": -0.42, "k2": 0.1, "p1": 1e-3, "p2": -2e-3, "k3": 0.01, "k4": 0.02, "k5": 0.03, "k6": -0.01}
 LENS = OpenCVLens(**SIZE, **VIEW, **FULL)
-MATRIX = np.array([[VIEW["fx"], 0, VIEW["cx"]], [0, VIEW["fy"], VIEW["cy"]], [0, 0, 1]])
+MATRIX = LENS.pinhole.opencv_matrix()
 #: As cv2 orders them.
 BENDS = np.array(list(FULL.values()))
 
@@ -30,8 +31,8 @@ class Copied(MappedLens):
     of: BrownLens | FisheyeLens
 
     @property
-    def _calibrated_pinhole(self) -> Pinhole:
-        return self.of.pinhole
+    def _calibrated_pinhole(self) -> tuple[float, float, float, float]:
+        return self.of._calibrated_pinhole
 
     def _bent(self, tangents):
         radius = self.of._radius_of_tangent(np.linalg.norm(tangents, axis=1))
@@ -48,7 +49,7 @@ def grid(step: int) -> np.ndarray:
 def test_projecting_is_cv2s():
     points = np.random.default_rng(0).uniform([-40, -30, 20], [40, 30, 60], (500, 3))
     reference, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), MATRIX, BENDS)
-    np.testing.assert_allclose(LENS.project(points), reference[:, 0], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(LENS.project(points), reference[:, 0] + 0.5, rtol=0, atol=1e-9)
 
 
 def test_unprojecting_is_cv2s():
@@ -58,13 +59,13 @@ def test_unprojecting_is_cv2s():
         reference = cv2.undistortPointsIter(pixels[:, None], MATRIX, BENDS, None, None, criteria)[:, 0]
     else:
         reference = cv2.undistortPoints(pixels[:, None], MATRIX, BENDS, criteria=criteria)[:, 0]
-    np.testing.assert_allclose(LENS.unproject(pixels)[:, :2], reference, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(LENS.unproject(pixels + 0.5)[:, :2], reference, rtol=0, atol=1e-8)
 
 
 @settings(max_examples=30, deadline=None)
 @given(x=st.floats(-0.9, 0.9), y=st.floats(-0.9, 0.9), z=st.floats(0.01, 200.0), width=st.sampled_from([1350, 338]))
 def test_projecting_and_unprojecting_are_inverse(x, y, z, width):
-    lens = LENS.scaled(width, 270).cropped(7, -3, width - 20, 200)
+    lens = LENS.resized(width, 270).cropped(7, -3, width - 20, 200)
     (direction,) = lens.unproject(lens.project([[x * z, y * z, z]]))
     np.testing.assert_allclose(direction, [x, y, 1.0], rtol=0, atol=1e-8)
 
@@ -76,7 +77,7 @@ def test_without_distortion_it_is_a_pinhole():
     np.testing.assert_allclose(lens.project(points), plain, rtol=1e-12)
     # At 89 degrees a pixel is no larger than the last digits of its number.
     np.testing.assert_allclose(lens.unproject(plain)[:, :2], points[:, :2] / points[:, 2:], rtol=1e-6, atol=1e-9)
-    assert lens.pinhole == Pinhole(**VIEW)
+    assert lens.pinhole == Intrinsics(**VIEW, **SIZE)
 
 
 @pytest.mark.parametrize(

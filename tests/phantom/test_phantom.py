@@ -206,9 +206,9 @@ def test_raw_layout_is_the_releases_own(raw):
     color, depth, normals = (read(raw / f"0004_{kind}") for kind in ("color.png", "depth.tiff", "normals.tiff"))
     assert not color[~lit].any() and not depth[~lit].any() and not normals[~lit].any()
     assert depth.dtype == normals.dtype == np.uint16 and depth[lit].min() > 0
-    lens = LENSES["omnidirectional"].scaled(54, 43)
+    lens = LENSES["omnidirectional"].resized(54, 43)
     row, column = np.nonzero(lit)
-    directions = lens.unproject(np.stack([column, row], axis=1))
+    directions = lens.unproject(np.stack([column, row], axis=1) + 0.5)
     z = depth[lit] * (100.0 / 65535.0)
     pose = poses(raw / "pose.txt")[4].reshape(4, 4).T
     points = (directions * z[:, None]) @ pose[:3, :3].T + pose[:3, 3]

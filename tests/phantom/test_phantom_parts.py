@@ -81,7 +81,7 @@ def plain_mucosa() -> Mucosa:
 
 def photograph_plane(distance: float, light: Lamp, vignetting: float = 0.0):
     surface = plane_at(distance)
-    lens = PinholeLens(width=25, height=19, fx=20.0, fy=20.0, cx=12.0, cy=9.0)
+    lens = PinholeLens(20.0, 20.0, 12.5, 9.5, 25, 19)
     sensor = Sensor.behind(lens, np.ones((19, 25), bool), 1)
     world = World(surface, plain_mucosa(), Tracer(surface), light, vignetting)
     exposure = expose(world, sensor, np.eye(4), None)
@@ -363,7 +363,7 @@ def test_rotation_conventions():
 def test_a_point_is_seen_only_inside_the_frame_in_front_and_unhidden():
     surface = plane_at(20.0)
     tracer = Tracer(surface)
-    lens = PinholeLens(width=25, height=19, fx=20.0, fy=20.0, cx=12.0, cy=9.0)
+    lens = PinholeLens(20.0, 20.0, 12.5, 9.5, 25, 19)
     mask = np.ones((19, 25), bool)
     mask[:, :3] = False
     points = np.array([[0.0, 0.0, 20.0], [30.0, 0.0, 20.0], [0.0, 0.0, 30.0], [0.0, 0.0, -5.0], [-11.0, 0.0, 20.0]])

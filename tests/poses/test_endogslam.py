@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.poses import endogslam
 from coliags_plugin.poses.rigid import inverse
 from tests.poses.winding import PINHOLE, winding
@@ -64,10 +65,10 @@ def test_all_of_it_is_read(tmp_path):
     np.testing.assert_array_equal(read.means, arrays["means3D"])
     np.testing.assert_array_equal(read.rgb_colors, arrays["rgb_colors"])
     np.testing.assert_array_equal(read.log_scales, arrays["log_scales"])
-    np.testing.assert_array_equal(read.intrinsics, arrays["intrinsics"])
     assert read.keyframes.tolist() == [0, 3]
-    assert (read.width, read.height) == (675, 540)
-    assert read.pinhole.cx == pytest.approx(334.6)  # pixel centres at integers become integers + 0.5
+    # Pixel centres at integers become integers + 0.5.
+    assert read.intrinsics == Intrinsics(400.0, 401.0, 334.1 + 0.5, 273.9 + 0.5, 675, 540)
+    np.testing.assert_allclose(read.intrinsics.opencv_matrix(), arrays["intrinsics"], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -87,7 +88,7 @@ def test_estimate_and_truth_as_trajectories(tmp_path):
     whole = endogslam.read_params(path)
     np.testing.assert_array_equal(endogslam.read(path).camera_to_world, whole.camera_to_world)
     np.testing.assert_array_equal(endogslam.read_truth(path).camera_to_world, whole.true_camera_to_world)
-    assert endogslam.read(path).intrinsics == whole.pinhole
+    assert endogslam.read(path).intrinsics == whole.intrinsics
 
 
 def test_poses_alone_can_be_read(tmp_path):

@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 
 from coliags_plugin.config.registry import pose_formats
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.poses.formats import format_named, format_of, write_trajectory
 from coliags_plugin.poses.rigid import inverse
-from coliags_plugin.poses.trajectory import Intrinsics, Trajectory
+from coliags_plugin.poses.trajectory import Trajectory
 from tests.poses.winding import PINHOLE, as_text, trajectories, winding
 
 WRITABLE = [name for name in pose_formats if format_named(name).write is not None]

@@ -6,8 +6,9 @@ import numpy as np
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.poses.rigid import rigid
-from coliags_plugin.poses.trajectory import Intrinsics, Trajectory
+from coliags_plugin.poses.trajectory import Trajectory
 
 PINHOLE = Intrinsics(61.0, 55.0, 33.5, 21.5, 64, 48)
 

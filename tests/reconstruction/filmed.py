@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coliags_plugin.poses.trajectory import Intrinsics
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.reconstruction.odometry.frames import RgbdFrame
 from tests.textured_tube import texture
 

@@ -12,11 +12,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.data_formats import open_video
 from coliags_plugin.poses.alignment import align, associate
 from coliags_plugin.poses.rigid import inverse, rotation_angles_deg
-from coliags_plugin.poses.trajectory import Intrinsics, Trajectory
+from coliags_plugin.poses.trajectory import Trajectory
 from coliags_plugin.reconstruction.odometry.chain import Bridge, chain, filled, power
 from coliags_plugin.reconstruction.odometry.features import motion_by_features
 from coliags_plugin.reconstruction.odometry.frames import PreparedFrame, PreparedVideo, Video, prepare, typical_depth
@@ -62,11 +61,6 @@ def pixels_off(found: np.ndarray, poses: np.ndarray, video) -> float:
             seen.append(moved[..., :2] / moved[..., 2:3] * (PINHOLE.fx, PINHOLE.fy))
         means.append(np.linalg.norm(seen[0] - seen[1], axis=-1).mean())
     return float(max(means))
-
-
-def pinhole_of(frame: Frame) -> Intrinsics:
-    camera = frame.camera
-    return Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
 
 
 # Motions that are known
@@ -170,7 +164,7 @@ def phantom_video(phantom):
 
 @pytest.fixture(scope="module")
 def phantom_tracked(phantom_video):
-    return track(Video(phantom_video), pinhole_of(phantom_video[0]), TrackingSettings())
+    return track(Video(phantom_video), phantom_video[0].camera.intrinsics, TrackingSettings())
 
 
 def test_a_phantom_of_long_steps(phantom_video, phantom_tracked):
@@ -192,7 +186,7 @@ def test_given_poses_do_not_matter():
         replace(frame, camera=replace(frame.camera, camera_to_world=torch.from_numpy(some_transform(seed))))
         for seed, frame in enumerate(frames)
     ]
-    one, other = (track(Video(video), pinhole_of(frames[0]), FAST) for video in (frames, scrambled))
+    one, other = (track(Video(video), frames[0].camera.intrinsics, FAST) for video in (frames, scrambled))
     np.testing.assert_array_equal(one.camera_to_world, other.camera_to_world)
 
 
@@ -435,4 +429,4 @@ def test_what_is_refused():
 def test_frames_without_depth_are_refused():
     frames = [replace(frame, depth=None) for frame in tube_frames(2)]
     with pytest.raises(InputError, match=r"frame 0000 has no depth.*coliags poses sfm"):
-        track(Video(frames), pinhole_of(frames[0]), FAST)
+        track(Video(frames), frames[0].camera.intrinsics, FAST)

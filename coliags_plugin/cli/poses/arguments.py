@@ -13,9 +13,10 @@ from coliags_plugin.cli.arguments import parse_size
 from coliags_plugin.core.errors import InputError
 
 if TYPE_CHECKING:
+    from coliags_plugin.core.intrinsics import Intrinsics
     from coliags_plugin.core.settings import Settings
     from coliags_plugin.poses.format import Format
-    from coliags_plugin.poses.trajectory import Intrinsics, Trajectory
+    from coliags_plugin.poses.trajectory import Trajectory
 
 S = TypeVar("S", bound="Settings")
 
@@ -46,8 +47,8 @@ def parse_intrinsics(intrinsics: str | None, size: str | None) -> Intrinsics | N
     Raises:
         InputError: Only one is given, or one has another form.
     """
+    from coliags_plugin.core.intrinsics import Intrinsics
     from coliags_plugin.poses.text import placed
-    from coliags_plugin.poses.trajectory import Intrinsics
 
     if intrinsics is None and size is None:
         return None

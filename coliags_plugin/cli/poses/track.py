@@ -39,7 +39,6 @@ class Track:
         from coliags_plugin.datamanagers.rgbd.writer import write_rgbd_scene
         from coliags_plugin.engine.data_formats import open_video
         from coliags_plugin.engine.progress import progress_callback
-        from coliags_plugin.poses.trajectory import Intrinsics
         from coliags_plugin.reconstruction.odometry.frames import Video
         from coliags_plugin.reconstruction.odometry.settings import TrackingSettings
         from coliags_plugin.reconstruction.odometry.tracking import track
@@ -48,9 +47,7 @@ class Track:
         settings, options = settings_among(TrackingSettings, self.set, _OWN)
         with progress_callback() as progress:
             scene, posed = open_video(self.scene, self.format, options, progress)
-            camera = scene.train[0].camera
-            pinhole = Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
-            found = track(Video(scene.train), pinhole, settings, progress)
+            found = track(Video(scene.train), scene.train[0].camera.intrinsics, settings, progress)
             trajectory = write_rgbd_scene(
                 self.out, scene.train, found.camera_to_world, overwrite=self.overwrite, progress=progress
             )

@@ -57,7 +57,7 @@ class C3VDDataManager(SequenceDataManager):
             "mask": "octagon" if raw and settings.mask else None,
         }
         if files.camera is not None:
-            pinhole, width, height = read_intrinsics(files.camera)
-            size = self.working_size(width, height)
-            return Rectification.of_pinhole(pinhole, width, height, files.camera, size), facts
+            pinhole = read_intrinsics(files.camera)
+            size = self.working_size(pinhole.width, pinhole.height)
+            return Rectification.of_pinhole(pinhole, files.camera, size), facts
         return self.octagon_rectification(LENSES[settings.lens], files.images[0], settings.mask), facts

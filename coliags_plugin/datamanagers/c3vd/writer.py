@@ -11,12 +11,12 @@ from jaxtyping import Float, UInt8, UInt16
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, atomic_write
 from coliags_plugin.core.images import write_image
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.reading.camera_json import write_camera_json
 from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE
-from coliags_plugin.lenses.models import Pinhole
 from coliags_plugin.poses.c3vd import matrix_lines
 
 POSES, CAMERA = "camera_pose.txt", "camera.json"
@@ -70,7 +70,7 @@ def write_c3vd_scene(
     folder: Path,
     images: Sequence[UInt8[np.ndarray, "H W 3"]],
     camera_to_world: Float[np.ndarray, "N 4 4"],
-    pinhole: Pinhole,
+    intrinsics: Intrinsics,
     *,
     depths: Sequence[Float[np.ndarray, "H W"]] | None = None,
     points: PointCloud | None = None,
@@ -82,7 +82,7 @@ def write_c3vd_scene(
         folder: The folder to make.
         images: RGB, all of one size. N of [H, W, 3]
         camera_to_world: Rigid, OpenCV axes, mm. [N, 4, 4]
-        pinhole: Intrinsics, pixels, centres at integers.
+        intrinsics: Of all images, at their size.
         depths: z-depth, mm, NaN where unknown; 100 mm and more cannot be told from unknown. N of [H, W]
         points: Initial points, world frame, mm; written to ``points3D.ply``.
         overwrite: Replace what is there.
@@ -95,12 +95,11 @@ def write_c3vd_scene(
             f"{len(images)} images, {len(camera_to_world)} poses and {'no' if depths is None else len(depths)} depths",
             "as many of each, or no depths",
         )
-    height, width = images[0].shape[:2]
     with atomic_folder(folder, overwrite) as scratch:
         for index, image in enumerate(images):
             write_frame(scratch, index, image, None if depths is None else depths[index])
         atomic_write(scratch / POSES, matrix_lines(camera_to_world))
-        write_camera_json(scratch / CAMERA, pinhole, w=width, h=height)
+        write_camera_json(scratch / CAMERA, intrinsics, w=intrinsics.width, h=intrinsics.height)
         if points is not None:
             colors = None if points.colors is None else points.colors.numpy()
             write_ply(scratch / POINTS_FILE, point_properties(points.positions.numpy(), colors))

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.c3vd_endogslam.files import (
     PARAMS,
@@ -30,13 +31,12 @@ from coliags_plugin.datamanagers.rectification import ASPECT_TOLERANCE, Rectific
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
 from coliags_plugin.datamanagers.seen import ROTATION, seen_marks
 from coliags_plugin.datamanagers.splits import Split
-from coliags_plugin.lenses.models import Pinhole
 from coliags_plugin.poses.c3vd import read_poses
 from coliags_plugin.poses.endogslam import EndoGslamParams, read_params
 
-#: K of the prepared pictures, half of the calibration behind them (docs/layouts/c3vd.md 2), as EndoGSLAM has it.
-PREPARED_PINHOLE = Pinhole(401.1595, 400.9425, 334.1430, 273.8665)
-PREPARED_SIZE = (675, 540)
+#: K of the prepared pictures, half of the calibration behind them (docs/layouts/c3vd.md 2), as EndoGSLAM has it, which
+#: counts pixel centres at integers: hence + 0.5.
+PREPARED_PINHOLE = Intrinsics(401.1595, 400.9425, 334.1430 + 0.5, 273.8665 + 0.5, 675, 540)
 #: EndoGSLAM's 8-bit depth: 2.55 steps a mm, cut off below; the last step is where C3VD's range ends.
 PREPARED_DEPTH = DepthSteps(100.0 / 255.0, 8, 255)
 #: How far a principal point may be from the middle, as a share of the picture; prepared pictures have 0.7 %.
@@ -115,21 +115,18 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
 
     def _rectification(self, files: PreparedFiles, params: EndoGslamParams | None) -> Rectification:
         width, height = size_of(files.images[0])
-        pinhole, (calibrated_width, calibrated_height) = PREPARED_PINHOLE, PREPARED_SIZE
-        described_by: Path | str = "EndoGSLAM's calibration"
+        calibrated, described_by = PREPARED_PINHOLE, "EndoGSLAM's calibration"
         if params is not None and files.params is not None:
-            k = params.pinhole
-            pinhole = Pinhole(k.fx, k.fy, k.cx - 0.5, k.cy - 0.5)
-            calibrated_width, calibrated_height, described_by = k.width, k.height, files.params
-        if abs((width / height) / (calibrated_width / calibrated_height) - 1.0) > ASPECT_TOLERANCE:
+            calibrated, described_by = params.intrinsics, str(files.params)
+        if abs((width / height) / (calibrated.width / calibrated.height) - 1.0) > ASPECT_TOLERANCE:
             raise InputError(
                 f"{files.images[0]} is {width} x {height}, but {described_by} is for "
-                f"{calibrated_width} x {calibrated_height}",
+                f"{calibrated.width} x {calibrated.height}",
                 "pictures of that size, or scaled from it",
                 "Give the params.npz that was made from these pictures",
             )
-        pinhole = pinhole.scaled(width / calibrated_width, height / calibrated_height)
-        off_middle = max(abs((pinhole.cx + 0.5) / width - 0.5), abs((pinhole.cy + 0.5) / height - 0.5))
+        pinhole = calibrated.resized(width, height)
+        off_middle = max(abs(pinhole.cx / width - 0.5), abs(pinhole.cy / height - 0.5))
         if off_middle > MIDDLE_TOLERANCE:
             raise InputError(
                 f"{described_by}: the principal point ({pinhole.cx:g}, {pinhole.cy:g}) is {100 * off_middle:.0f} % of "
@@ -137,7 +134,7 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
                 "intrinsics of the size that org_width and org_height say",
                 "They are of another resolution: mend org_width and org_height, or the intrinsics",
             )
-        return Rectification.of_pinhole(pinhole, width, height, files.images[0], self.working_size(width, height))
+        return Rectification.of_pinhole(pinhole, files.images[0], self.working_size(width, height))
 
     def _rotation(self, folder: Path, rectification: Rectification, placement: Placement) -> list[Shot]:
         files = find_sequence(folder, None)

@@ -11,12 +11,13 @@ from coliags_plugin.lenses.models import OmnidirectionalLens
 from coliags_plugin.poses.text import read_text
 
 #: From the configuration of the same group's later renderer (C3VDv3). C3VDv2's own page gives no numbers, so this is
-#: what v2 was probably rendered with, and unverified (docs/layouts/c3vd-v2.md 2).
+#: what v2 was probably rendered with, and unverified (docs/layouts/c3vd-v2.md 2). It counts pixel centres at integers:
+#: hence + 0.5.
 CANDIDATE_LENS = OmnidirectionalLens(
     width=1350,
     height=1080,
-    cx=677.739464094188,
-    cy=543.057997844875,
+    cx=677.739464094188 + 0.5,
+    cy=543.057997844875 + 0.5,
     a0=767.733695862103,
     a2=-0.000592506426558248,
     a3=-2.69440266600040e-07,
@@ -38,7 +39,8 @@ def read_camera_intrinsics(path: Path) -> OmnidirectionalLens:
 
     The file's form is not published. Two are taken for unmistakable: every number with its name (``cx = 677.7``), or
     twelve bare numbers in the order of C3VD's page, :data:`ORDER`, or its last ten (size 1350 x 1080). Either way the
-    centre must lie near the middle and the focal length be that of a wide lens.
+    centre must lie near the middle and the focal length be that of a wide lens. Its pixel centres are at integers, as
+    C3VD's.
 
     Raises:
         InputError: It cannot be read as either, or its numbers are those of no such lens.
@@ -58,7 +60,7 @@ def read_camera_intrinsics(path: Path) -> OmnidirectionalLens:
         raise _unclear(path, doubt)
     cx, cy, a0, a2, a3, a4, c, d, e = (values[name] for name in ORDER[2:] if name != "a1")
     return OmnidirectionalLens(
-        width=round(width), height=round(height), cx=cx, cy=cy, a0=a0, a2=a2, a3=a3, a4=a4, c=c, d=d, e=e
+        width=round(width), height=round(height), cx=cx + 0.5, cy=cy + 0.5, a0=a0, a2=a2, a3=a3, a4=a4, c=c, d=d, e=e
     )
 
 

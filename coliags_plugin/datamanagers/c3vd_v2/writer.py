@@ -29,6 +29,6 @@ def write_frame(
 
 
 def write_lens(folder: Path, lens: OmnidirectionalLens) -> None:
-    """Write ``camera_intrinsics.txt``: the calibration, every number with its name."""
-    values = {"a1": 0.0, **vars(lens)}
+    """Write ``camera_intrinsics.txt``: the calibration, every number with its name, pixel centres at integers."""
+    values = {"a1": 0.0, **vars(lens), "cx": lens.cx - 0.5, "cy": lens.cy - 0.5}
     atomic_write(folder / INTRINSICS, "".join(f"{name} = {values[name]!r}\n" for name in ORDER))

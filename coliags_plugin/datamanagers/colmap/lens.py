@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from coliags_plugin.lenses.models import Array, Pinhole
+from coliags_plugin.lenses.models import Array
 from coliags_plugin.lenses.tabulated import MappedLens
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ class ColmapLens(MappedLens):
 
     Attributes:
         model: Its name, for instance ``OPENCV_FISHEYE``.
-        params: As COLMAP orders them; pixels, centres at integers + 0.5, which is converted here.
+        params: As COLMAP orders them; pixels, centres at integers + 0.5.
     """
 
     model: str
@@ -37,11 +37,10 @@ class ColmapLens(MappedLens):
         return pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
 
     @property
-    def _calibrated_pinhole(self) -> Pinhole:
+    def _calibrated_pinhole(self) -> tuple[float, float, float, float]:
         camera = self._camera
-        center = camera.principal_point_x - 0.5, camera.principal_point_y - 0.5
-        return Pinhole(camera.focal_length_x, camera.focal_length_y, *center)
+        return camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y
 
     def _bent(self, tangents: Array) -> Array:
         points = np.concatenate([tangents, np.ones((len(tangents), 1))], axis=1)
-        return np.asarray(self._camera.img_from_cam(points), np.float64) - 0.5
+        return np.asarray(self._camera.img_from_cam(points), np.float64)

@@ -158,7 +158,7 @@ class ColmapDataManager(RecordedDataManager):
         def rectification(lens: ColmapLens) -> Rectification:
             size = self.working_size(lens.width, lens.height)
             if lens.model in PINHOLES:
-                return Rectification.of_pinhole(lens.pinhole, lens.width, lens.height, model.cameras_file, size)
+                return Rectification.of_pinhole(lens.pinhole, model.cameras_file, size)
             return LensRectification.of(lens, model.cameras_file, size, focal_scale, undistort)
 
         return {number: rectification(lens) for number, lens in model.cameras.items()}
@@ -171,15 +171,11 @@ class ColmapDataManager(RecordedDataManager):
         points = model.positions[picture.points] * settings.scale
         local = (points - camera_to_world[:3, 3]) @ camera_to_world[:3, :3]
         with np.errstate(divide="ignore", invalid="ignore"):
-            error = np.linalg.norm(lens.project(local) + 0.5 - picture.observed, axis=1)
-            fx, fy, cx, cy = rectification.pinhole
-            pixels = local[:, :2] / local[:, 2:] * (fx, fy) + (cx + 0.5, cy + 0.5)
+            error = np.linalg.norm(lens.project(local) - picture.observed, axis=1)
+            k = rectification.pinhole
+            pixels = local[:, :2] / local[:, 2:] * (k.fx, k.fy) + (k.cx, k.cy)
             kept = (error <= settings.max_reprojection_error) & (local[:, 2] > 0.0)
-            kept &= (
-                (pixels >= 0.0).all(axis=1)
-                & (pixels[:, 0] < rectification.width)
-                & (pixels[:, 1] < rectification.height)
-            )
+            kept &= (pixels >= 0.0).all(axis=1) & (pixels[:, 0] < k.width) & (pixels[:, 1] < k.height)
         kept &= model.track_lengths[picture.points] >= settings.min_track_length
         # A point that was seen twice in one picture still has one depth there.
         kept[kept] = _first_of_each(picture.points[kept])

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, Literal
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.lenses.models import FisheyeLens, Lens, Pinhole
+from coliags_plugin.lenses.models import FisheyeLens, Lens
 from coliags_plugin.lenses.opencv import OpenCVLens
+from coliags_plugin.lenses.pinhole import PinholeLens
 
 PixelCenters = Literal["half", "integer"]
 
@@ -23,24 +23,10 @@ _MODELS: Mapping[str, tuple[str, ...]] = {
 _BENDS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
-@dataclass(frozen=True)
-class PinholeCamera:
-    """A camera whose pictures need no undistortion.
-
-    Attributes:
-        pinhole: Pixels, centres at integers.
-        width, height: Of its pictures, pixels.
-    """
-
-    pinhole: Pinhole
-    width: int
-    height: int
-
-
 def camera_of(
     values: Mapping[str, Any], place: str, pixel_centers: PixelCenters, picture_size: Callable[[], tuple[int, int]]
-) -> Lens | PinholeCamera:
-    """The camera of one frame.
+) -> Lens:
+    """The camera of one frame: a :class:`PinholeLens` where its images need no undistortion.
 
     Args:
         values: Keys of the file, overlaid with those of the frame.
@@ -57,9 +43,9 @@ def camera_of(
     width, height = _size(values, place) if "w" in values or "h" in values else picture_size()
     fx, fy = _focal_lengths(values, place, width, height)
     # Without a principal point the middle of the picture is meant, however pixels are counted.
-    shift = 0.5 if pixel_centers == "half" else 0.0
-    cx = number(values, "cx", place) - shift if "cx" in values else 0.5 * width - 0.5
-    cy = number(values, "cy", place) - shift if "cy" in values else 0.5 * height - 0.5
+    shift = 0.0 if pixel_centers == "half" else 0.5
+    cx = number(values, "cx", place) + shift if "cx" in values else 0.5 * width
+    cy = number(values, "cy", place) + shift if "cy" in values else 0.5 * height
     if min(fx, fy, width, height) <= 0.0:
         raise InputError(f"{place}: fl_x {fx:g}, fl_y {fy:g}, w {width}, h {height}", "numbers above 0")
     bends = {key: number(values, key, place) for key in _BENDS if values.get(key)}
@@ -74,7 +60,7 @@ def camera_of(
         k1, k2, k3, k4 = (bends.get(key, 0.0) for key in _MODELS[model])
         return FisheyeLens(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, k1=k1, k2=k2, k3=k3, k4=k4)
     if not bends:
-        return PinholeCamera(Pinhole(fx, fy, cx, cy), width, height)
+        return PinholeLens(fx, fy, cx, cy, width, height)
     k1, k2, k3, p1, p2 = (bends.get(key, 0.0) for key in _MODELS[model])
     return OpenCVLens(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, k1=k1, k2=k2, p1=p1, p2=p2, k3=k3)
 

@@ -13,7 +13,7 @@ from typing import Any, cast
 import numpy as np
 
 from coliags_plugin.core.errors import InputError, did_you_mean
-from coliags_plugin.datamanagers.nerfstudio.cameras import PinholeCamera, PixelCenters, camera_of, number
+from coliags_plugin.datamanagers.nerfstudio.cameras import PixelCenters, camera_of, number
 from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.reading.picture_names import first_few
 from coliags_plugin.lenses.models import Lens
@@ -28,7 +28,7 @@ class Entry:
 
     name: str
     image: Path
-    camera: Lens | PinholeCamera
+    camera: Lens
     depth: Path | None
     mask: Path | None
 

@@ -13,7 +13,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.lens_rectification import LensRectification, undistorter
-from coliags_plugin.datamanagers.nerfstudio.cameras import PinholeCamera, PixelCenters
+from coliags_plugin.datamanagers.nerfstudio.cameras import PixelCenters
 from coliags_plugin.datamanagers.nerfstudio.files import FILE, Entry, Transforms
 from coliags_plugin.datamanagers.reading.depth_arrays import depth_format
 from coliags_plugin.datamanagers.reading.picture_names import others_beside, short_names, warn_of_others
@@ -23,6 +23,7 @@ from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
 from coliags_plugin.datamanagers.seen import seen_marks
 from coliags_plugin.lenses.models import Lens
+from coliags_plugin.lenses.pinhole import PinholeLens
 from coliags_plugin.poses import nerfstudio as nerfstudio_poses
 
 #: RotateColon's own folders and second file: its pictures are named by number, and its depth is scaled.
@@ -95,11 +96,12 @@ class NerfstudioDataManager(RecordedDataManager):
             )
             for index, (short, entry, pose) in enumerate(zip(short_names(names), entries, camera_to_world, strict=True))
         ]
-        lenses = sorted({type(camera).__name__ for camera in rectifications})
+        lenses = sorted({type(lens).__name__ for lens in rectifications})
+        bent = not all(isinstance(lens, PinholeLens) for lens in rectifications)
         facts: dict[str, Any] = {
             "layout": "nerfstudio",
             "lens": ", ".join(lenses),
-            "focal_scale": settings.focal_scale if any(isinstance(camera, Lens) for camera in rectifications) else None,
+            "focal_scale": settings.focal_scale if bent else None,
             "cameras": len(rectifications),
             **next(iter(rectifications.values())).facts(),
             "scale": settings.scale,
@@ -129,16 +131,16 @@ class NerfstudioDataManager(RecordedDataManager):
                 return factor * self.settings.scale
         return 1.0
 
-    def _rectifications(self, entries: list[Entry], file: Path) -> dict[Lens | PinholeCamera, Rectification]:
+    def _rectifications(self, entries: list[Entry], file: Path) -> dict[Lens, Rectification]:
         focal_scale, undistort = self.settings.focal_scale, undistorter()
 
-        def rectification(camera: Lens | PinholeCamera) -> Rectification:
-            size = self.working_size(camera.width, camera.height)
-            if isinstance(camera, PinholeCamera):
-                return Rectification.of_pinhole(camera.pinhole, camera.width, camera.height, file, size)
-            return LensRectification.of(camera, file, size, focal_scale, undistort)
+        def rectification(lens: Lens) -> Rectification:
+            size = self.working_size(lens.width, lens.height)
+            if isinstance(lens, PinholeLens):
+                return Rectification.of_pinhole(lens.pinhole, file, size)
+            return LensRectification.of(lens, file, size, focal_scale, undistort)
 
-        return {camera: rectification(camera) for camera in dict.fromkeys(entry.camera for entry in entries)}
+        return {lens: rectification(lens) for lens in dict.fromkeys(entry.camera for entry in entries)}
 
     def _own_points(self, path: Path, transforms: Transforms) -> tuple[Callable[[], PointCloud] | None, Path | None]:
         """The points of ``ply_file_path``, in the file's world, or else of ``points3D.ply``, in the scene's."""

@@ -50,7 +50,7 @@ def write_transforms(
         for index, pose in enumerate(camera_to_world)
     ]
     k = lens.pinhole
-    camera = {"camera_model": "OPENCV", "fl_x": k.fx, "fl_y": k.fy, "cx": k.cx + 0.5, "cy": k.cy + 0.5}
+    camera = {"camera_model": "OPENCV", "fl_x": k.fx, "fl_y": k.fy, "cx": k.cx, "cy": k.cy}
     size = {"w": lens.width, "h": lens.height}
     bends = {"k1": lens.k1, "k2": lens.k2, "p1": lens.p1, "p2": lens.p2}
     unit = {"depth_unit_scale_factor": depth_unit}

@@ -1,4 +1,4 @@
-"""``camera.json``, which describes a pinhole (docs/layouts/c3vd.md 3)."""
+"""``camera.json``, which describes a pinhole, pixel centres at integers (docs/layouts/c3vd.md 3)."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from pathlib import Path
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
-from coliags_plugin.lenses.models import Pinhole
+from coliags_plugin.core.intrinsics import Intrinsics
 
 
-def read_intrinsics(path: Path) -> tuple[Pinhole, int, int]:
-    """Intrinsics (pixel centres at integers), width and height from a ``camera.json``.
+def read_intrinsics(path: Path) -> Intrinsics:
+    """The intrinsics of a ``camera.json``.
 
     Raises:
         InputError: It is not JSON, or keys are missing, or their values are not sizes and focal lengths.
@@ -36,15 +36,16 @@ def read_intrinsics(path: Path) -> tuple[Pinhole, int, int]:
     fx, fy, cx, cy, width, height = numbers
     if width != int(width) or height != int(height):
         raise InputError(f"{path}: w = {width}, h = {height}", "whole pixels")
-    return Pinhole(float(fx), float(fy), float(cx), float(cy)), int(width), int(height)
+    return Intrinsics(float(fx), float(fy), cx + 0.5, cy + 0.5, int(width), int(height))
 
 
-def write_camera_json(path: Path, pinhole: Pinhole, **more: float) -> None:
+def write_camera_json(path: Path, intrinsics: Intrinsics, **more: float) -> None:
     """Write a ``camera.json``.
 
     Args:
         path: Where to.
-        pinhole: Intrinsics, pixels, centres at integers.
+        intrinsics: Of all images.
         more: ``w`` and ``h``, the picture's size in pixels, and whatever else a format keeps there, in this order.
     """
-    write_json(path, {**pinhole._asdict(), **more})
+    k = intrinsics
+    write_json(path, {"fx": k.fx, "fy": k.fy, "cx": k.cx - 0.5, "cy": k.cy - 0.5, **more})

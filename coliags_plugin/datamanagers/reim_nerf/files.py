@@ -109,10 +109,10 @@ class RayDistance(DepthFormat):
 def ray_cosines(lens: Lens) -> Float32[np.ndarray, "H W"]:
     """z-depth per distance at every stored pixel; 0 where the lens does not reach.
 
-    The preprocessing takes its rays at integers + 0.5, which is undone here as it was done; the half pixel is worth
-    3e-4 of the depth at most.
+    The preprocessing takes its rays at integers + 0.5 with a calibration that counts from integers, half a pixel off
+    the centres. This is undone here as it was done; the half pixel is worth 3e-4 of the depth at most.
     """
-    column, row = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
+    column, row = np.meshgrid(np.arange(lens.width) + 1.0, np.arange(lens.height) + 1.0)
     rays = lens.unproject(np.stack([column.ravel(), row.ravel()], axis=1))
     cosine = 1.0 / np.linalg.norm(rays, axis=1)
     return np.nan_to_num(cosine, nan=0.0).astype(np.float32).reshape(lens.height, lens.width)
@@ -213,6 +213,7 @@ def _lens(file: Path, content: Mapping[str, Any]) -> FisheyeLens:
         if content.get(key):
             raise InputError(f"{file}: {key} = {content[key]!r}", "0: OpenCV's fisheye has no such term")
     fx, fy, cx, cy, k1, k2, k3, k4 = (values[key] for key in ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"))
+    cx, cy = cx + 0.5, cy + 0.5  # the file counts pixel centres at integers
     return FisheyeLens(width=int(width), height=int(height), fx=fx, fy=fy, cx=cx, cy=cy, k1=k1, k2=k2, k3=k3, k4=k4)
 
 

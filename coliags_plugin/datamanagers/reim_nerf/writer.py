@@ -88,7 +88,8 @@ class ReimNerfWriter:
         lens, k = self.lens, self.lens.pinhole
         return {
             "camera_model": "FISHEYE_OPENCV",
-            **k._asdict(),
+            # Pixel centres at integers, as OpenCV calibrates.
+            **{"fx": k.fx, "fy": k.fy, "cx": k.cx - 0.5, "cy": k.cy - 0.5},
             **{"k1": lens.k1, "k2": lens.k2, "k3": lens.k3, "k4": lens.k4, "p1": 0.0, "p2": 0.0},
             "w": lens.width,
             "h": lens.height,

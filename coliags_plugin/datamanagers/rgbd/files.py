@@ -12,11 +12,11 @@ import numpy as np
 import torch
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.reading.camera_json import read_intrinsics
 from coliags_plugin.datamanagers.reading.frame_files import DEPTH_SUFFIXES, IMAGE_SUFFIXES, inventory
 from coliags_plugin.datamanagers.reading.images import size_of
-from coliags_plugin.lenses.models import Pinhole
 from coliags_plugin.poses import tum
 from coliags_plugin.poses.colmap import read_text_cameras
 from coliags_plugin.poses.text import read_text, shortened
@@ -40,15 +40,12 @@ class CameraFile:
 
     Attributes:
         path: The file.
-        pinhole: Intrinsics, pixels, centres at integers.
-        width, height: Size of the pictures they are for, pixels.
+        intrinsics: Of the images.
         depth_scale: Depth steps per scene unit; None where the file does not say.
     """
 
     path: Path
-    pinhole: Pinhole
-    width: int
-    height: int
+    intrinsics: Intrinsics
     depth_scale: float | None = None
 
 
@@ -210,13 +207,13 @@ def _trajectories(folder: Path) -> list[Path]:
 
 
 def _read_json(path: Path, picture: Path) -> CameraFile:
-    pinhole, width, height = read_intrinsics(path)
+    intrinsics = read_intrinsics(path)
     scale = json.loads(path.read_text(encoding="utf-8-sig")).get("depth_scale")
     if scale is None:
-        return CameraFile(path, pinhole, width, height)
+        return CameraFile(path, intrinsics)
     if isinstance(scale, bool) or not isinstance(scale, (int, float)) or not (math.isfinite(scale) and scale > 0):
         raise InputError(f"{path}: depth_scale = {scale!r}", "a number above 0: depth steps per scene unit")
-    return CameraFile(path, pinhole, width, height, float(scale))
+    return CameraFile(path, intrinsics, float(scale))
 
 
 def _read_intrinsics_txt(path: Path, picture: Path) -> CameraFile:
@@ -241,7 +238,8 @@ def _read_intrinsics_txt(path: Path, picture: Path) -> CameraFile:
             "intrinsics of the pictures as they are stored",
             "Scale them, or say their size in a camera.json with fx, fy, cx, cy, w, h if that is where it is",
         )
-    return CameraFile(path, Pinhole(fx, fy, cx, cy), width, height)
+    # OpenCV's K: pixel centres at integers.
+    return CameraFile(path, Intrinsics(fx, fy, cx + 0.5, cy + 0.5, width, height))
 
 
 def _read_cameras_txt(path: Path, picture: Path) -> CameraFile:
@@ -251,6 +249,4 @@ def _read_cameras_txt(path: Path, picture: Path) -> CameraFile:
     camera = cameras[0]
     if isinstance(camera, str):
         raise InputError(f"{path}: {camera}", "PINHOLE or SIMPLE_PINHOLE", "Undistort the pictures first")
-    # COLMAP counts pixel centres at integers + 0.5.
-    pinhole = Pinhole(camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5)
-    return CameraFile(path, pinhole, camera.width, camera.height)
+    return CameraFile(path, camera)

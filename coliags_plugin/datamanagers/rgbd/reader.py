@@ -111,8 +111,8 @@ class RGBDDataManager(RecordedDataManager):
         camera = find_camera(path, frames.pictures[0])
         scale = self._depth_scale(camera, path) if depths else None
         form = None if scale is None else DepthSteps(1.0 / scale)
-        size = self.working_size(camera.width, camera.height)
-        rectification = Rectification.of_pinhole(camera.pinhole, camera.width, camera.height, camera.path, size)
+        size = self.working_size(camera.intrinsics.width, camera.intrinsics.height)
+        rectification = Rectification.of_pinhole(camera.intrinsics, camera.path, size)
         complete = len(frames.pictures) == len(pictures) == len(trajectory)
         seen = seen_marks(path / "truth", len(pictures), complete)
         masks = find_masks(path, frames.pictures)

@@ -15,7 +15,6 @@ from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.reading.camera_json import write_camera_json
 from coliags_plugin.datamanagers.rgbd.association import is_time, times
-from coliags_plugin.lenses.models import Pinhole
 from coliags_plugin.poses import tum
 from coliags_plugin.poses.trajectory import Trajectory
 
@@ -85,8 +84,7 @@ def write_rgbd_scene(
     """
     if not frames or len(frames) != len(camera_to_world):
         raise InputError(f"{len(frames)} frames and {len(camera_to_world)} poses", "one pose for each frame")
-    camera = frames[0].camera
-    pinhole = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+    intrinsics = frames[0].camera.intrinsics
     scale = depth_scale(max(_farthest(frame) for frame in frames))
     pictures = [f"{frame.name}.png" for frame in frames]
     timed = all(is_time(frame.name) for frame in frames) and bool(
@@ -96,8 +94,7 @@ def write_rgbd_scene(
         pictures = [f"{index:04d}.png" for index in range(len(frames))]
     with atomic_folder(folder, overwrite) as scratch:
         for index, frame in enumerate(frames):
-            other = frame.camera
-            if (other.fx, other.fy, other.cx, other.cy, other.width, other.height) != pinhole:
+            if frame.camera.intrinsics != intrinsics:
                 raise InputError(f"frame {frame.name} has a camera of its own", "one pinhole for all frames")
             mask = None if frame.mask is None else frame.mask.numpy()
             write_frame(scratch, pictures[index], frame.image.numpy(), _depth(frame), scale, mask)
@@ -106,10 +103,8 @@ def write_rgbd_scene(
         tum.write(
             scratch / TRAJECTORY, Trajectory(camera_to_world, timestamps=times([Path(picture) for picture in pictures]))
         )
-        # Pixel centres at integers, as all of this format's cameras.
-        fx, fy, cx, cy, width, height = pinhole
-        integers = Pinhole(fx, fy, cx - 0.5, cy - 0.5)
-        write_camera_json(scratch / CAMERA, integers, w=width, h=height, depth_scale=scale)
+        size = {"w": intrinsics.width, "h": intrinsics.height}
+        write_camera_json(scratch / CAMERA, intrinsics, **size, depth_scale=scale)
     return folder / TRAJECTORY
 
 

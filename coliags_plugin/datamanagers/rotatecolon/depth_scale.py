@@ -97,6 +97,6 @@ def _sampled(
     known = np.flatnonzero(np.isfinite(depth))
     pixels = generator.choice(known, min(_PIXELS, len(known)), replace=False)
     row, column = np.divmod(pixels, rectification.width)
-    fx, fy, cx, cy = rectification.pinhole
-    local = np.stack([(column - cx) / fx, (row - cy) / fy, np.ones(len(pixels))], axis=1)
+    k = rectification.pinhole
+    local = np.stack([(column + 0.5 - k.cx) / k.fx, (row + 0.5 - k.cy) / k.fy, np.ones(len(pixels))], axis=1)
     return shot.camera_to_world[:3, 3], local @ shot.camera_to_world[:3, :3].T, depth.ravel()[pixels].astype(np.float64)

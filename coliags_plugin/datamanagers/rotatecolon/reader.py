@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from pydantic import Field
 
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.reading.images import size_of
@@ -22,7 +23,6 @@ from coliags_plugin.datamanagers.rotatecolon.files import POINTS, ViewFiles, fin
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
 from coliags_plugin.datamanagers.seen import ROTATION, seen_marks
 from coliags_plugin.datamanagers.splits import Split
-from coliags_plugin.lenses.models import Pinhole
 
 log = logging.getLogger(__name__)
 
@@ -106,11 +106,8 @@ class RotateColonDataManager(RecordedDataManager):
         settings = self.settings
         width, height = size_of(files.images[0])
         focal = 0.5 * width / math.tan(0.5 * files.angle)
-        # In the middle of the picture; the corner of its first pixel lies at -0.5.
-        pinhole = Pinhole(focal, focal, 0.5 * width - 0.5, 0.5 * height - 0.5)
-        rectification = Rectification.of_pinhole(
-            pinhole, width, height, files.images[0], self.working_size(width, height)
-        )
+        pinhole = Intrinsics(focal, focal, 0.5 * width, 0.5 * height, width, height)
+        rectification = Rectification.of_pinhole(pinhole, files.images[0], self.working_size(width, height))
         depth_format = ExrDepth(settings.depth_channel, settings.depth_divisor)
         depths = files.depths or (None,) * len(files.images)
         shots = [

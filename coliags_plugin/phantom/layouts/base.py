@@ -11,16 +11,16 @@ from typing import ClassVar, Literal
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from coliags_plugin.lenses.models import Lens, Pinhole
+from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.lenses.models import Lens
 from coliags_plugin.lenses.pinhole import PinholeLens
 from coliags_plugin.phantom.trajectory import every_8th
-from coliags_plugin.poses.trajectory import Intrinsics
 
 #: ``video``: the sequence itself. ``rotation``: the test views at its places, turned away from it.
 Part = Literal["video", "rotation"]
 
-#: Intrinsics of C3VD's undistorted frames at 338 x 270, centres at integers (docs/phantom.md 3).
-_C3VD_PINHOLE = Pinhole(200.8769, 200.4713, 167.3190, 136.9333)
+#: Intrinsics of C3VD's undistorted frames (docs/phantom.md 3); the calibration counts from integers, hence + 0.5.
+_C3VD_PINHOLE = Intrinsics(200.8769, 200.4713, 167.3190 + 0.5, 136.9333 + 0.5, 338, 270)
 
 
 @dataclass(frozen=True)
@@ -80,15 +80,11 @@ class Layout(ABC):
         Unless a layout says otherwise: C3VD's undistorted camera, scaled by width; its principal point keeps its
         distance from the middle. All of its pixels are lit.
         """
-        scale = width / 338.0
         k = _C3VD_PINHOLE
-        pinhole = Pinhole(
-            k.fx * scale,
-            k.fy * scale,
-            0.5 * width - 0.5 + (k.cx + 0.5 - 169.0) * scale,
-            0.5 * height - 0.5 + (k.cy + 0.5 - 135.0) * scale,
-        )
-        return PinholeLens.of(pinhole, width, height), np.ones((height, width), bool)
+        scale = width / k.width
+        cx = 0.5 * width + (k.cx - 0.5 * k.width) * scale
+        cy = 0.5 * height + (k.cy - 0.5 * k.height) * scale
+        return PinholeLens(k.fx * scale, k.fy * scale, cx, cy, width, height), np.ones((height, width), bool)
 
     def is_test(self, index: int) -> bool:
         """Whether a frame of the video is held out by the split that goes with the layout.
@@ -130,15 +126,14 @@ class Layout(ABC):
 
 
 def pinhole_of(lens: Lens) -> Intrinsics:
-    """Intrinsics of frames that are a pinhole's, pixel centres at integers + 0.5.
+    """Intrinsics of frames that are a pinhole's.
 
     Raises:
         TypeError: They are taken through another lens.
     """
     if not isinstance(lens, PinholeLens):
         raise TypeError(f"{type(lens).__name__} is no pinhole, and the layout holds a pinhole camera")
-    k = lens.pinhole
-    return Intrinsics(k.fx, k.fy, k.cx + 0.5, k.cy + 0.5, lens.width, lens.height)
+    return lens.pinhole
 
 
 def place(folder: Path, part: Part) -> Path:

@@ -22,7 +22,7 @@ class C3VDRawLayout(Layout):
 
     def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
         """C3VD's omnidirectional lens behind its octagonal mask."""
-        return LENSES["omnidirectional"].scaled(width, height), octagon_mask(width, height)
+        return LENSES["omnidirectional"].resized(width, height), octagon_mask(width, height)
 
     def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
         """See :class:`Layout`."""

@@ -24,7 +24,7 @@ class C3VDv2Layout(Layout):
 
     def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
         """The candidate for C3VDv2's lens, behind C3VD's octagonal mask."""
-        return CANDIDATE_LENS.scaled(width, height), octagon_mask(width, height)
+        return CANDIDATE_LENS.resized(width, height), octagon_mask(width, height)
 
     def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
         """See :class:`Layout`."""

@@ -43,7 +43,7 @@ class ColmapLayout(Layout):
         for index, matrix in enumerate(inverse(np.stack(poses))):
             here = np.flatnonzero(seen[index][kept])
             local = points.positions[kept[here]] @ matrix[:3, :3].T + matrix[:3, 3]
-            found.append(SeenPoints(lens.project(local) + 0.5, here))
+            found.append(SeenPoints(lens.project(local), here))
         add_points(model, found, points.positions[kept], points.colors[kept])
         write_model(folder, model)
 

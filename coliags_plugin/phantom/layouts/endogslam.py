@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from coliags_plugin.datamanagers.c3vd.writer import write_poses
 from coliags_plugin.datamanagers.c3vd_endogslam.files import PARAMS
-from coliags_plugin.datamanagers.c3vd_endogslam.reader import PREPARED_PINHOLE, PREPARED_SIZE
+from coliags_plugin.datamanagers.c3vd_endogslam.reader import PREPARED_PINHOLE
 from coliags_plugin.datamanagers.c3vd_endogslam.writer import write_frame, write_params
 from coliags_plugin.lenses.models import Lens
 from coliags_plugin.lenses.pinhole import PinholeLens
@@ -22,7 +22,7 @@ from coliags_plugin.poses.trajectory import Trajectory
 class EndoGSLAMLayout(Layout):
     """color/, 8-bit depth/, pose.txt, and params.npz of a flawless EndoGSLAM run on the training frames."""
 
-    default_size = PREPARED_SIZE
+    default_size = (PREPARED_PINHOLE.width, PREPARED_PINHOLE.height)
     has_rotation = True
     has_points = True
 
@@ -32,8 +32,7 @@ class EndoGSLAMLayout(Layout):
 
     def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
         """The camera that EndoGSLAM takes undistorted frames for, stretched to the size. All pixels are lit."""
-        pinhole = PREPARED_PINHOLE.scaled(width / PREPARED_SIZE[0], height / PREPARED_SIZE[1])
-        return PinholeLens.of(pinhole, width, height), np.ones((height, width), bool)
+        return PinholeLens.of(PREPARED_PINHOLE.resized(width, height)), np.ones((height, width), bool)
 
     def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
         """See :class:`Layout`; normals are not part of this layout."""

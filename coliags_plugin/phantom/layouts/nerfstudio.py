@@ -25,9 +25,7 @@ class NerfstudioLayout(Layout):
     def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
         """The usual camera, behind a lens that OpenCV's model describes."""
         plain, lit = super().lens(width, height)
-        fx, fy, cx, cy = plain.pinhole
-        bent = OpenCVLens(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, k1=_K1, k2=_K2, p1=_P1, p2=_P2)
-        return bent, lit
+        return OpenCVLens(**vars(plain.pinhole), k1=_K1, k2=_K2, p1=_P1, p2=_P2), lit
 
     def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
         """See :class:`Layout`; normals are not part of this layout."""

@@ -32,10 +32,11 @@ class ReimNerfLayout(Layout):
     def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
         """REIM-NeRF's lens, and the circle that its preprocessing keeps."""
         lens = _lens(width, height)
-        k = lens.pinhole
-        radius = max(min(k.cx, width - k.cx), min(k.cy, height - k.cy)) - 20.0 * width / 1350.0
+        # Its preprocessing counts pixel centres at integers.
+        cx, cy = lens.pinhole.cx - 0.5, lens.pinhole.cy - 0.5
+        radius = max(min(cx, width - cx), min(cy, height - cy)) - 20.0 * width / 1350.0
         column, row = np.meshgrid(np.arange(width), np.arange(height))
-        return lens, np.hypot(column - k.cx, row - k.cy) <= radius
+        return lens, np.hypot(column - cx, row - cy) <= radius
 
     def is_test(self, index: int) -> bool:
         """All but REIM-NeRF's training frames, its validation frames among them."""
@@ -61,7 +62,7 @@ class ReimNerfLayout(Layout):
 
 
 def _lens(width: int, height: int) -> FisheyeLens:
-    lens = LENSES["fisheye"].scaled(width, height)
+    lens = LENSES["fisheye"].resized(width, height)
     if not isinstance(lens, FisheyeLens):
         raise TypeError("REIM-NeRF's lens is a fisheye")
     return lens

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from coliags_plugin.datamanagers.rotatecolon.writer import write_points, write_test_view, write_transforms, write_view
-from coliags_plugin.lenses.models import Lens, Pinhole
+from coliags_plugin.lenses.models import Lens
 from coliags_plugin.lenses.pinhole import PinholeLens
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints
 
@@ -31,8 +31,8 @@ class RotateColonLayout(Layout):
     def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
         """Square pixels, the principal point in the middle. All pixels are lit."""
         focal = 0.5 * width / math.tan(0.5 * _ANGLE)
-        pinhole = Pinhole(focal, focal, 0.5 * width - 0.5, 0.5 * height - 0.5)
-        return PinholeLens.of(pinhole, width, height), np.ones((height, width), bool)
+        lens = PinholeLens(focal, focal, 0.5 * width, 0.5 * height, width, height)
+        return lens, np.ones((height, width), bool)
 
     def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
         """See :class:`Layout`; normals are not part of this layout, nor is the depth of test views."""

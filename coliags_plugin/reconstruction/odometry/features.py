@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.poses.rigid import rigid
-from coliags_plugin.poses.trajectory import Intrinsics
 from coliags_plugin.reconstruction.odometry.frames import PreparedFrame
 
 #: Of normalised pictures, whose contrast is the same everywhere: hence a low threshold.
@@ -49,9 +49,7 @@ def motion_by_features(
     seen = there[0][[match.trainIdx for match in matches]]
     column, row = np.rint(pixels).astype(int).T
     z = source.depth[row, column].astype(np.float64)
-    k = np.array(
-        [[intrinsics.fx, 0.0, intrinsics.cx - 0.5], [0.0, intrinsics.fy, intrinsics.cy - 0.5], [0.0, 0.0, 1.0]]
-    )
+    k = intrinsics.opencv_matrix()
     points = np.stack([(pixels[:, 0] - k[0, 2]) / k[0, 0] * z, (pixels[:, 1] - k[1, 2]) / k[1, 1] * z, z], axis=1)
     known = z > 0.0
     if known.sum() < _FEWEST:
@@ -71,7 +69,7 @@ def motion_by_features(
 
 
 def _features(sift: Any, frame: PreparedFrame) -> tuple[Float[np.ndarray, "K 2"], np.ndarray]:
-    """Places, pixel centres at integers, and descriptors, where depth is known."""
+    """Places, as OpenCV counts them (pixel centres at integers), and descriptors, where depth is known."""
     picture = np.rint(frame.intensity * 255.0).astype(np.uint8)
     keypoints, descriptors = sift.detectAndCompute(picture, (frame.depth > 0.0).astype(np.uint8))
     return np.array([point.pt for point in keypoints], np.float64).reshape(-1, 2), descriptors

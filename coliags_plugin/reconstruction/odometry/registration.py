@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.poses.rigid import RIGID_TOLERANCE, rigid
-from coliags_plugin.poses.trajectory import Intrinsics
 from coliags_plugin.reconstruction.odometry.frames import PreparedFrame
 
 Term = Literal["hybrid", "point-to-plane", "intensity"]
@@ -71,15 +71,7 @@ class Registrar:
             odometry.OdometryConvergenceCriteria(count, _CONVERGED, _CONVERGED) for count in _ITERATIONS[-levels:]
         ]
         # open3d counts pixel centres at integers.
-        self._k = open3d.core.Tensor(
-            np.array(
-                [
-                    [intrinsics.fx, 0.0, intrinsics.cx - 0.5],
-                    [0.0, intrinsics.fy, intrinsics.cy - 0.5],
-                    [0.0, 0.0, 1.0],
-                ]
-            )
-        )
+        self._k = open3d.core.Tensor(intrinsics.opencv_matrix())
 
     def register(
         self,

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.poses.rigid import inverse
-from coliags_plugin.poses.trajectory import Intrinsics
 from coliags_plugin.reconstruction.odometry.chain import Chain, chain, filled
 from coliags_plugin.reconstruction.odometry.features import motion_by_features
 from coliags_plugin.reconstruction.odometry.frames import PreparedVideo, RgbdFrame, typical_depth
@@ -101,7 +101,8 @@ def track(
     unit = typical_depth(video)
     with exact_open3d() as open3d:
         frames = PreparedVideo(video, unit, max((*settings.skips, 1)) + _SPARE, settings.enlarge)
-        work = _Work(open3d, frames, _enlarged(intrinsics, settings.enlarge), settings)
+        enlarged = intrinsics.resized(intrinsics.width * settings.enlarge, intrinsics.height * settings.enlarge)
+        work = _Work(open3d, frames, enlarged, settings)
         wanted = settings.method
         term: Term = work.choose_term(len(video)) if wanted == "auto" else wanted
         work.use(term)
@@ -260,17 +261,6 @@ def _check_sizes(video: Sequence[RgbdFrame], intrinsics: Intrinsics) -> None:
                     f"{width} x {height}, as the intrinsics and the other frames",
                     "Bring all to one size",
                 )
-
-
-def _enlarged(pinhole: Intrinsics, factor: int) -> Intrinsics:
-    return Intrinsics(
-        pinhole.fx * factor,
-        pinhole.fy * factor,
-        pinhole.cx * factor,
-        pinhole.cy * factor,
-        pinhole.width * factor,
-        pinhole.height * factor,
-    )
 
 
 def _tracked(path: Chain, count: int) -> Bool[np.ndarray, "N"]:

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.poses.colmap import posed_model
 from coliags_plugin.poses.rigid import inverse
-from coliags_plugin.poses.trajectory import Intrinsics
 
 if TYPE_CHECKING:
     import pycolmap
@@ -28,9 +28,6 @@ def frame_model(frames: Sequence[Frame], names: Sequence[str] | None = None) -> 
     camera_to_world = np.stack([frame.camera.camera_to_world.cpu().double().numpy() for frame in frames])
     names = [f"{index}.png" for index in range(len(frames))] if names is None else names
     cameras: dict[Intrinsics, int] = {}
-    taken_by = []
-    for camera in (frame.camera for frame in frames):
-        pinhole = Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
-        taken_by.append(cameras.setdefault(pinhole, len(cameras)))
+    taken_by = [cameras.setdefault(frame.camera.intrinsics, len(cameras)) for frame in frames]
     world_to_camera = [pycolmap.Rigid3d(matrix[:3]) for matrix in inverse(camera_to_world)]
     return posed_model(world_to_camera, names, list(cameras), taken_by)

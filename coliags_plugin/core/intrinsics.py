@@ -1,0 +1,56 @@
+"""The intrinsics of a pinhole camera: the one camera model everything else is made of."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+from typing_extensions import Self
+
+from coliags_plugin.core.errors import InputError
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """An undistorted pinhole camera without its pose.
+
+    Pixel centres lie at integers + 0.5, so pixel (column i, row j) sees image point (i + 0.5, j + 0.5). Files and
+    libraries that count them at integers are converted where they are read, written or called.
+
+    Attributes:
+        fx, fy: Focal lengths, pixels.
+        cx, cy: Principal point, pixels, centres at integers + 0.5. Need not be the image centre.
+        width, height: Image size, pixels.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        """Refuse what is no pinhole.
+
+        Raises:
+            InputError: A number is not finite, or a focal length or size not positive.
+        """
+        numbers = (self.fx, self.fy, self.cx, self.cy)
+        if not all(map(math.isfinite, numbers)) or min(self.fx, self.fy, self.width, self.height) <= 0:
+            raise InputError(
+                f"intrinsics fx {self.fx:g}, fy {self.fy:g}, cx {self.cx:g}, cy {self.cy:g} "
+                f"of an image {self.width} x {self.height}",
+                "finite numbers in pixels, focal lengths and size positive",
+            )
+
+    def resized(self, width: int, height: int) -> Self:
+        """The same view sampled at another size, pixels; the image's edges stay where they are."""
+        x, y = width / self.width, height / self.height
+        return replace(self, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y, width=width, height=height)
+
+    def opencv_matrix(self) -> Float[np.ndarray, "3 3"]:
+        """K for what counts pixel centres at integers: OpenCV, open3d, EndoGSLAM's files. float64. [3, 3]"""
+        return np.array([[self.fx, 0.0, self.cx - 0.5], [0.0, self.fy, self.cy - 0.5], [0.0, 0.0, 1.0]])
