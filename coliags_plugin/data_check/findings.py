@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.data_check.facts import DepthFacts, PathFacts, PictureFacts
+from coliags_plugin.data_check.facts import DepthFacts, ImageFacts, PathFacts
 from coliags_plugin.data_check.hypotheses import ADVICE, GIVEN, NO_MOTION
 from coliags_plugin.data_check.matches import EpipolarAgreement
 from coliags_plugin.data_check.reprojection import Agreement
@@ -200,25 +200,25 @@ def calibration_findings(frames: Sequence[Frame]) -> Iterator[Finding]:
             )
 
 
-def picture_findings(pictures: PictureFacts) -> Iterator[Finding]:
+def image_findings(images: ImageFacts) -> Iterator[Finding]:
     """Black, overexposed, mostly masked or repeated images."""
-    if pictures.darkest_frame < 4.0:
+    if images.darkest_frame < 4.0:
         yield Finding(
-            "an image is black", f"{pictures.darkest_at}: mean {pictures.darkest_frame:.2g} of 255", "Leave it out"
+            "an image is black", f"{images.darkest_at}: mean {images.darkest_frame:.2g} of 255", "Leave it out"
         )
-    if pictures.overexposed_share > 0.25:
-        yield Finding("images are overexposed", f"{pictures.overexposed_share:.0%} of the pixels are white", "")
-    if pictures.masked_share > 0.75:
+    if images.overexposed_share > 0.25:
+        yield Finding("images are overexposed", f"{images.overexposed_share:.0%} of the pixels are white", "")
+    if images.masked_share > 0.75:
         yield Finding(
             "masks leave little",
-            f"{pictures.masked_share:.0%} of the pixels are ignored",
+            f"{images.masked_share:.0%} of the pixels are ignored",
             "Check the meaning of the mask: black is ignored here",
         )
-    if pictures.repeated:
-        count = len(pictures.repeated)
+    if images.repeated:
+        count = len(images.repeated)
         yield Finding(
             "images repeat",
-            f"{pictures.repeated[0]}"
+            f"{images.repeated[0]}"
             + (f" and {count - 1} more equal" if count > 1 else " equals")
             + " the image before",
             "Leave repeated images and their poses out: the video was captured at a higher rate than the scope's",

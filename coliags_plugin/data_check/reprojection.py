@@ -152,14 +152,14 @@ def best_scale(pairs: Sequence[Pair]) -> tuple[float, float] | None:
     return float(fine[int(np.argmin(fine_errors))]), float(min(fine_errors))
 
 
-def carried_picture(source: Frame, target: Frame) -> tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"]]:
+def warp_image(source: Frame, target: Frame) -> tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"]]:
     """The source image warped into the target view by the target's depth, and the mask of warped pixels."""
     depth = _known_depth(target)
     pixels, z = _changed(source.camera).project(_changed(target.camera).unproject(depth).reshape(-1, 3))
     camera = source.camera
     grid = (pixels / pixels.new_tensor([camera.width, camera.height]) * 2 - 1).reshape(1, *depth.shape, 2)
-    picture = source.image.permute(2, 0, 1)[None].double()
-    painted = torch.nn.functional.grid_sample(picture, grid.nan_to_num(2.0), align_corners=False)[0].permute(1, 2, 0)
+    image = source.image.permute(2, 0, 1)[None].double()
+    painted = torch.nn.functional.grid_sample(image, grid.nan_to_num(2.0), align_corners=False)[0].permute(1, 2, 0)
     z_there = torch.nn.functional.grid_sample(
         _known_depth(source)[None, None].nan_to_num(0.0), grid.nan_to_num(2.0), mode="nearest", align_corners=False
     )[0, 0]

@@ -40,7 +40,7 @@ class RecordedDataManager(DataManager):
     settings: SceneSettings
     #: The name it is registered under.
     name: ClassVar[str]
-    #: Width and height, pixels, that pictures are made to fit by default: what is published for the data, or else the
+    #: Width and height, pixels, that images are made to fit by default: what is published for the data, or else the
     #: paper's (docs/data.md 2). None: they stay as large as they are stored.
     fits: ClassVar[tuple[int, int] | None] = PAPER_SIZE
     #: The split of all frames whose training frames the data's seen masks tell of (docs/layouts/c3vd.md 5).
@@ -55,7 +55,7 @@ class RecordedDataManager(DataManager):
         """
 
     def working_size(self, width: int, height: int) -> tuple[int, int]:
-        """Working width and height of pictures stored at a size, pixels: as set, or the largest in :attr:`fits`."""
+        """Working width and height of images stored at a size, pixels: as set, or the largest in :attr:`fits`."""
         return self.settings.size or fitted(width, height, self.fits)
 
     def load(self, path: Path, progress: Progress | None = None) -> Scene:
@@ -63,7 +63,7 @@ class RecordedDataManager(DataManager):
 
         Args:
             path: Its folder.
-            progress: Told ``(what, done, total)`` while pictures are read.
+            progress: Told ``(what, done, total)`` while images are read.
 
         Returns:
             Frames of the working size; the world and the units of the data.
@@ -76,7 +76,7 @@ class RecordedDataManager(DataManager):
         for doubt in dict.fromkeys(shot.rectification.doubt() for shot in recording.shots):
             if doubt is not None:
                 log.warning("%s", doubt)
-        self._tell_of_smaller_pictures(recording, path)
+        self._log_downscaling(recording, path)
         train_indices, test_indices = self._split(recording, path)
         recording = with_valid_marks(recording, self.seen_split, train_indices, test_indices, path)
         train = self._frames(recording.shots, train_indices)
@@ -114,14 +114,14 @@ class RecordedDataManager(DataManager):
         log.info("%s: %d frames, %s", path, len(recording.shots), recording.kind)
         return Scene(path.resolve().name, train, test_sets, points, provenance)
 
-    def _tell_of_smaller_pictures(self, recording: Recording, path: Path) -> None:
-        """Log that pictures are made smaller than they are stored, where nobody asked for it."""
+    def _log_downscaling(self, recording: Recording, path: Path) -> None:
+        """Log that images are made smaller than they are stored, where nobody asked for it."""
         if self.settings.size is not None:
             return
         for rectification in (shot.rectification for shot in recording.shots):
             if (rectification.width, rectification.height) != (rectification.source_width, rectification.source_height):
                 log.info(
-                    "%s: pictures stored at %d x %d are used at %d x %d; datamanager.width and datamanager.height set "
+                    "%s: images stored at %d x %d are used at %d x %d; datamanager.width and datamanager.height set "
                     "another size",
                     path,
                     rectification.source_width,

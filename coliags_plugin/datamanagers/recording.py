@@ -1,4 +1,4 @@
-"""What a data set says before any pixel is read: which pictures, from where, with what beside them."""
+"""What a data set says before any pixel is read: which images, from where, with what beside them."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from coliags_plugin.datamanagers.rectification import Rectification
 
 @dataclass(frozen=True)
 class Shot:
-    """One picture as it lies on disk.
+    """One image as it lies on disk.
 
     Attributes:
         name: Unique within the recording.
-        image: The picture.
-        view: How it becomes a working picture; shared by pictures of the same camera.
+        image: The image.
+        view: How it becomes a working image; shared by images of the same camera.
         camera_to_world: Rigid, OpenCV axes, scene units. [4, 4]
         depth: Its depth file.
         depth_format: How to read that.
-        mask: A picture, not black where a pixel counts, as large as ``image``.
-        seen: A picture, not black where training frames see the same surface, as large as ``image``.
-        sparse_depth: Depth at single points of the working picture.
+        mask: An image, not black where a pixel counts, as large as ``image``.
+        seen: An image, not black where training frames see the same surface, as large as ``image``.
+        sparse_depth: Depth at single points of the working image.
     """
 
     name: str
@@ -80,11 +80,11 @@ def fingerprint(folder: Path, large: Iterable[Path | None], small: Iterable[Path
     return digest.hexdigest()
 
 
-def check_pose_count(file: Path, poses: int, pictures: int) -> None:
-    """Raise InputError where a pose file does not have a pose for every picture."""
-    if poses != pictures:
+def check_pose_count(file: Path, poses: int, images: int) -> None:
+    """Raise InputError where a pose file does not have a pose for every image."""
+    if poses != images:
         raise InputError(
-            f"{file} has {poses} poses for {pictures} pictures",
-            "a pose for every picture, in order",
+            f"{file} has {poses} poses for {images} images",
+            "a pose for every image, in order",
             "Restore the missing ones, or remove the surplus at the end",
         )

@@ -58,7 +58,7 @@ class SceneSettings(Settings):
     seed: int = Field(0, ge=0, description="Of the draw of initial points.")
     keep_pixels: bool = Field(
         True,
-        description="Whether pictures stay in memory, as small as they were stored; otherwise they are read anew each "
+        description="Whether images stay in memory, as small as they were stored; otherwise they are read anew each "
         "time, which is slow and for videos larger than the memory.",
     )
 

@@ -23,7 +23,7 @@ def seen_marks(path: Path, count: int, complete: bool = True) -> dict[int, Path]
     Args:
         path: What holds the folder ``seen``.
         count: Number of frames.
-        complete: Whether the frames are all pictures of the data. Masks are numbered by picture, so that a picture
+        complete: Whether the frames are all images of the data. Masks are numbered by image, so that an image
             left out puts them out of step.
 
     Raises:
@@ -34,7 +34,7 @@ def seen_marks(path: Path, count: int, complete: bool = True) -> dict[int, Path]
         return marks(folder, "seen", count)
     if folder.is_dir():
         log.warning(
-            "%s: seen masks are for all pictures; some are left out, so figures on seen pixels are left out", folder
+            "%s: seen masks are for all images; some are left out, so figures on seen pixels are left out", folder
         )
     return {}
 

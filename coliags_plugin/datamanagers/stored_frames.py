@@ -19,7 +19,7 @@ from coliags_plugin.datamanagers.recording import Shot
 
 @dataclass(frozen=True)
 class _Pixels:
-    """A working picture and what lies beside it, as small as it was stored."""
+    """A working image and what lies beside it, as small as it was stored."""
 
     image: UInt8[np.ndarray, "H W 3"]
     depth: Shaped[np.ndarray, "H W"] | None
@@ -34,7 +34,7 @@ class StoredFrame(Frame):
     kind or of the wrong size.
 
     Args:
-        shot: The picture.
+        shot: The image.
         index: Of the frame in the video, counted from 0.
         keep: Whether pixels stay in memory once read. Otherwise every attribute reads its own file each time, so that
             whoever wants several takes them from one :meth:`to`.
@@ -136,7 +136,7 @@ def read_side_by_side(frames: Sequence[Frame], progress: Progress | None = None)
     Raises:
         InputError: For the first bad frame.
     """
-    side_by_side(lambda frame: frame.image.numel(), frames, "read pictures", progress)
+    side_by_side(lambda frame: frame.image.numel(), frames, "read images", progress)
 
 
 def _read_pixels(shot: Shot) -> _Pixels:

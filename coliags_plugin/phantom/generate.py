@@ -1,4 +1,4 @@
-"""Making a phantom: colon, light, path, pictures, truth."""
+"""Making a phantom: colon, light, path, images, truth."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _LOG = logging.getLogger(__name__)
 
 #: Pixels an exposure meter looks at.
 _METERED = 2500
-#: Pictures taken side by side; open3d shares the cores anyway, this fills the gaps between its calls.
+#: Images taken side by side; open3d shares the cores anyway, this fills the gaps between its calls.
 _AT_ONCE = 2
 #: Initial points of the layouts that have some: about as many as structure from motion finds in such a video.
 _POINTS = 20_000
@@ -50,7 +50,7 @@ class Phantom:
         settings: Resolved.
         layout: What it is to be written in.
         world: Wall, material, lamp.
-        sensor: Of every picture.
+        sensor: Of every image.
         poses: Of the sequence. Each [4, 4]
         rotation_views: Test views away from it.
         indirect: Light from the wall, for the sequence and then the rotation views.
@@ -77,7 +77,7 @@ class Phantom:
         return vertex_albedo(self.world.surface, self.world.mucosa)
 
     def photograph(self, number: int) -> tuple[Exposure, UInt8[np.ndarray, "P 3"]]:
-        """Take picture ``number``: the sequence's frames come first, then the rotation views.
+        """Take image ``number``: the sequence's frames come first, then the rotation views.
 
         A rotation view is taken with the exposure of the frame it turns away from, as if the camera turned faster than
         the exposure follows.
@@ -101,7 +101,7 @@ class Phantom:
 
 
 def image_size(settings: PhantomSettings, layout: Layout) -> tuple[int, int]:
-    """Width and height of the pictures, pixels: the layout's own where none are chosen."""
+    """Width and height of the images, pixels: the layout's own where none are chosen."""
     width, height = layout.default_size
     return either(settings.width, width), either(settings.height, height)
 
@@ -231,7 +231,7 @@ def _write(phantom: Phantom, folder: Path, tell: Progress) -> None:
 
 
 def _photographs(phantom: Phantom, total: int) -> Iterator[tuple[Exposure, UInt8[np.ndarray, "P 3"]]]:
-    """All pictures in order, a few ahead of whoever writes them."""
+    """All images in order, a few ahead of whoever writes them."""
     with ThreadPoolExecutor(_AT_ONCE) as pool:
         waiting = [pool.submit(phantom.photograph, number) for number in range(min(_AT_ONCE, total))]
         for number in range(total):

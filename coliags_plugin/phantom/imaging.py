@@ -1,4 +1,4 @@
-"""Taking pictures: rays through a lens, onto the mesh, and back as radiance, z-depth and normals."""
+"""Taking images: rays through a lens, onto the mesh, and back as radiance, z-depth and normals."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Sensor:
     """The pixels that see something, and the directions they sample.
 
     Attributes:
-        lens: What pictures are taken through.
+        lens: What images are taken through.
         mask: Pixels that the lens lights. [H, W]
         centers: Direction through each such pixel's centre. [P, 3]
         samples: Directions of its K colour samples. [P, K, 3]
@@ -69,7 +69,7 @@ class Sensor:
 
 @dataclass(frozen=True)
 class World:
-    """Everything a picture depends on but the camera's place."""
+    """Everything an image depends on but the camera's place."""
 
     surface: ColonSurface
     mucosa: Mucosa
@@ -98,7 +98,7 @@ class Exposure:
 def expose(
     world: World, sensor: Sensor, camera_to_world: Float[np.ndarray, "4 4"], indirect: IndirectLight | None
 ) -> Exposure:
-    """Take one picture. Colour is the mean of a pixel's samples; z-depth and normal are those of its centre alone."""
+    """Take one image. Colour is the mean of a pixel's samples; z-depth and normal are those of its centre alone."""
     pixels, per_pixel = sensor.samples.shape[:2]
     radiance = np.empty((pixels, 3), np.float32)
     met = np.zeros(len(world.surface.triangles), bool)

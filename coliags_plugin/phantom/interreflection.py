@@ -1,7 +1,7 @@
 """Light that the wall throws onto the wall.
 
 A colon is nearly a closed cavity, and its mucosa returns most of the red light: what one wall sends back lights the
-others, several times over. That is why the far lumen of a real picture is a deep red-brown and not black, and why red
+others, several times over. That is why the far lumen of a real image is a deep red-brown and not black, and why red
 falls off more slowly with distance than green and blue (linear exponents 1.4 against 2.2 and 2.4, measured on C3VD;
 docs/phantom.md 2.3). It is solved here by radiosity: the wall is cut into patches of about 5 mm, all of
 them Lambertian, with traced mutual visibility.

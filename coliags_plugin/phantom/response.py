@@ -1,4 +1,4 @@
-"""From radiance to the picture: exposure, white balance, tone curve and noise."""
+"""From radiance to the image: exposure, white balance, tone curve and noise."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def encode(linear: Float[np.ndarray, "..."], gamma: float) -> Float[np.ndarray, 
 
 
 def exposure_for(radiance: Float[np.ndarray, "N 3"], target: float, gamma: float) -> float:
-    """The gain, within a factor 1e6 of 1, that gives the encoded samples mean ``target``; 1 for a black picture."""
+    """The gain, within a factor 1e6 of 1, that gives the encoded samples mean ``target``; 1 for a black image."""
     if not np.any(radiance > 0.0):
         return 1.0
     low, high = np.log(1e-6), np.log(1e6)
@@ -82,7 +82,7 @@ def develop(
     settings: PhantomSettings,
     generator: np.random.Generator,
 ) -> UInt8[np.ndarray, "N 3"]:
-    """The 8-bit picture.
+    """The 8-bit image.
 
     Noise is added to the encoded value; half its variance at mid grey is read noise, the other half is shot noise,
     whose variance grows with the value.

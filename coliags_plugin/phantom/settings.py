@@ -119,7 +119,7 @@ class PhantomSettings(Settings):
 
     light: Literal["c3vd", "strong"] = Field("c3vd", description="Preset of light and motion; see PRESETS.")
     gain: GainMode | None = Field(
-        None, description="auto: exposure follows the picture with a lag. fixed: one exposure for the whole sequence."
+        None, description="auto: exposure follows the image with a lag. fixed: one exposure for the whole sequence."
     )
     light_offset: tuple[float, float, float] | None = Field(
         None,
@@ -156,7 +156,7 @@ class PhantomSettings(Settings):
         0.45,
         ge=0.1,
         le=0.8,
-        description="Mean of the encoded picture that the exposure aims at; C3VD has .19 to .59 (docs/phantom.md 3).",
+        description="Mean of the encoded image that the exposure aims at; C3VD has .19 to .59 (docs/phantom.md 3).",
     )
     gain_lag: float = Field(
         2.0, ge=0.0, le=100.0, description="Time constant of the automatic exposure, frames; 0 follows at once."

@@ -179,7 +179,7 @@ def associate(first: Trajectory, second: Trajectory, match: Match = "auto", tole
     Args:
         first: One trajectory, the estimate where there is one.
         second: The other.
-        match: ``name``: the same picture name, or the same last part of it without its suffix. ``time``: timestamps
+        match: ``name``: the same image name, or the same last part of it without its suffix. ``time``: timestamps
             no further apart than ``tolerance``, nearest pairs first, each frame once. ``index``: the k-th with the
             k-th, which needs equal counts. ``endogslam-train``: the k-th of the first with the k-th of those of the
             second that EndoGSLAM trains on, all but 7, 15, 23, ... ``auto``: the first of name, time and index that

@@ -44,14 +44,14 @@ class _Image:
 
 
 def read(path: Path) -> Trajectory:
-    """Read the poses of a sparse model, ordered by picture name, 2 before 10.
+    """Read the poses of a sparse model, ordered by image name, 2 before 10.
 
     Args:
         path: A folder with ``images`` and ``cameras``, both ``.bin`` or both ``.txt``; binary is preferred.
 
     Raises:
         InputError: The files are missing, damaged or empty; or a quaternion is zero or further than 1e-3 from unit
-            length, naming its line or picture; or a picture stands twice.
+            length, naming its line or image; or an image stands twice.
     """
     suffix = _suffix(path)
     if suffix is None:
@@ -65,7 +65,7 @@ def read(path: Path) -> Trajectory:
     )
     images = list(read_images(path / f"images{suffix}"))
     if not images:
-        raise InputError(f"{path / f'images{suffix}'} holds no poses", "at least one registered picture")
+        raise InputError(f"{path / f'images{suffix}'} holds no poses", "at least one registered image")
     refuse_repeated([image.name for image in images], str(path / f"images{suffix}"))
     images = [images[index] for index in natural_order([image.name for image in images])]
     quats_wxyz = np.array([image.quat_wxyz for image in images])
@@ -99,7 +99,7 @@ def write_text(path: Path, trajectory: Trajectory) -> None:
     """
     for name in trajectory.names_or_numbers():
         if name.split() != [name]:
-            raise InputError(f"the picture name '{name}'", "no blanks in a text model", "Write a binary one: colmap")
+            raise InputError(f"the image name '{name}'", "no blanks in a text model", "Write a binary one: colmap")
     _write(path, trajectory, text=True)
 
 
@@ -133,13 +133,13 @@ def posed_model(
     cameras: Sequence[Intrinsics],
     taken_by: Sequence[int],
 ) -> pycolmap.Reconstruction:
-    """A model of posed pictures without points: picture i becomes COLMAP's image i + 1, camera k its camera k + 1.
+    """A model of posed images without points: image i becomes COLMAP's image i + 1, camera k its camera k + 1.
 
     Args:
-        world_to_camera: Of each picture, OpenCV axes.
-        names: Of the pictures.
+        world_to_camera: Of each image, OpenCV axes.
+        names: Of the images.
         cameras: Undistorted pinholes.
-        taken_by: Which of them took each picture.
+        taken_by: Which of them took each image.
     """
     import pycolmap
 
@@ -159,7 +159,7 @@ def _write(path: Path, trajectory: Trajectory, text: bool) -> None:
     if trajectory.intrinsics is None:
         raise InputError(
             f"no intrinsics for {path}",
-            "a COLMAP model to hold the camera's intrinsics and picture size",
+            "a COLMAP model to hold the camera's intrinsics and image size",
             "Pass --intrinsics fx,fy,cx,cy --size WIDTHxHEIGHT",
         )
     refuse_repeated(trajectory.names_or_numbers(), str(path))
@@ -188,10 +188,10 @@ def _text_images(path: Path) -> Iterator[_Image]:
             raise InputError(
                 f"{place}: '{shortened(line)}'",
                 "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, all numbers finite",
-                "Each picture has two lines; the second lists its points and may be empty, but must be there",
+                "Each image has two lines; the second lists its points and may be empty, but must be there",
             ) from error
         yield image
-        next(lines, None)  # the picture's points
+        next(lines, None)  # the image's points
 
 
 def read_text_cameras(path: Path) -> dict[int, Intrinsics | str]:
@@ -228,7 +228,7 @@ def _binary_images(path: Path) -> Iterator[_Image]:
             at = end + 9 + _POINT_BYTES * points
             if at > len(data):
                 raise ValueError("out of bounds")
-            place = f"{path}, picture {number} ({name})"
+            place = f"{path}, image {number} ({name})"
             if not np.all(np.isfinite(values)):
                 raise InputError(f"{place}: its pose is {', '.join(f'{v:g}' for v in values)}", "seven finite numbers")
             yield _Image(place, tuple(values[:4]), tuple(values[4:]), camera, name)
@@ -247,7 +247,7 @@ def _binary_cameras(path: Path) -> dict[int, Intrinsics | str]:
         for _ in range(count):
             number, model, width, height = struct.unpack_from("<IiQQ", data, at)
             if model not in _PINHOLES:
-                # How long its parameters are is not known here, and no pinhole can be common to all pictures any more.
+                # How long its parameters are is not known here, and no pinhole can be common to all images any more.
                 cameras[number] = f"camera {number} is COLMAP's model {model}"
                 return cameras
             name, parameters = _PINHOLES[model]
@@ -286,15 +286,15 @@ def _camera(model: str, width: int, height: int, parameters: list[float]) -> Int
 
 
 def _common(cameras: dict[int, Intrinsics | str], used: set[int]) -> tuple[Intrinsics | None, str]:
-    """The pinhole that took every picture; or None, and why there is none."""
+    """The pinhole that took every image; or None, and why there is none."""
     found = [cameras[number] for number in sorted(used) if number in cameras]
     others = [camera for camera in cameras.values() if isinstance(camera, str)]
     if len(found) < len(used) or any(isinstance(camera, str) for camera in found):
-        reason = others[0] if others else "the model lacks a camera that a picture names"
+        reason = others[0] if others else "the model lacks a camera that an image names"
         return None, f"no intrinsics: {reason}, not an undistorted pinhole"
     pinholes = {camera for camera in found if isinstance(camera, Intrinsics)}
     if len(pinholes) > 1:
-        return None, f"no intrinsics: the pictures have {len(pinholes)} different cameras"
+        return None, f"no intrinsics: the images have {len(pinholes)} different cameras"
     return pinholes.pop(), ""
 
 

@@ -51,7 +51,7 @@ class EndoGslamParams:
         camera_to_world: Estimated poses, rigid, OpenCV axes; world: the first camera; mm. [F, 4, 4]
         true_camera_to_world: The data set's poses of the same frames in the same world. [F, 4, 4]
         intrinsics: K as stored, pixels, pixel centres at INTEGERS. [3, 3]
-        width, height: Picture size, pixels.
+        width, height: Image size, pixels.
         means: Centres of the Gaussians, world, mm; N may be 0. float64. [N, 3]
         rgb_colors: Colours, nominally in [0, 1]; may lie a little outside. float64. [N, 3]
         log_scales: Logarithms of the standard deviations in mm; one column where Gaussians are isotropic. None where
@@ -137,7 +137,7 @@ def write(path: Path, trajectory: Trajectory) -> None:
     if trajectory.intrinsics is None:
         raise InputError(
             f"no intrinsics for {path}",
-            "a params.npz to hold the camera's intrinsics and picture size",
+            "a params.npz to hold the camera's intrinsics and image size",
             "Pass --intrinsics fx,fy,cx,cy --size WIDTHxHEIGHT",
         )
     pinhole = trajectory.intrinsics
@@ -174,16 +174,16 @@ def recognise(path: Path) -> bool:
 
 
 def image_indices(poses: int, images: int) -> Int[np.ndarray, "F"] | None:
-    """Which pictures of a sequence EndoGSLAM's poses belong to.
+    """Which images of a sequence EndoGSLAM's poses belong to.
 
     Its default config is given only training frames, so that a file may hold 7/8 of the sequence's poses.
 
     Args:
         poses: Number of poses in the file.
-        images: Number of pictures of the sequence.
+        images: Number of images of the sequence.
 
     Returns:
-        The picture of each pose: all of them, or all but 7, 15, 23, ...; None where the numbers fit neither. [F]
+        The image of each pose: all of them, or all but 7, 15, 23, ...; None where the numbers fit neither. [F]
     """
     every = np.arange(images)
     if poses == images:

@@ -29,7 +29,7 @@ def read(path: Path) -> Trajectory:
 
     Raises:
         InputError: The file is no such JSON, or holds no frames; a frame has no file_path or no finite, rigid 4x4 or
-            3x4 matrix, naming it; a picture stands twice; or the applied change is no turn, shift and positive scale.
+            3x4 matrix, naming it; an image stands twice; or the applied change is no turn, shift and positive scale.
     """
     content = _json(path)
     frames = content.get("frames")
@@ -39,7 +39,7 @@ def read(path: Path) -> Trajectory:
     for index, frame in enumerate(frames):
         name = frame.get("file_path") if isinstance(frame, dict) else None
         if not isinstance(name, str) or not name:
-            raise InputError(f"{path}, frame {index}: no file_path", "the name of the frame's picture")
+            raise InputError(f"{path}, frame {index}: no file_path", "the name of the frame's image")
         names.append(name)
         matrices.append(_matrix(frame.get("transform_matrix"), f"{path}, frame {index} ({name}): transform_matrix"))
     refuse_repeated(names, str(path))
@@ -126,7 +126,7 @@ def _undone(path: Path, content: dict[str, Any], camera_to_world: np.ndarray) ->
 
 
 def _intrinsics(path: Path, content: dict[str, Any], frames: list[dict[str, Any]]) -> tuple[Intrinsics | None, str]:
-    """The pinhole that took every picture; or None, and why there is none."""
+    """The pinhole that took every image; or None, and why there is none."""
     found: set[Intrinsics] = set()
     for frame in frames:
         # A frame's own value goes before the file's.
@@ -148,7 +148,7 @@ def _intrinsics(path: Path, content: dict[str, Any], frames: list[dict[str, Any]
         with placed(str(path)):
             found.add(Intrinsics(fx, fy, cx, cy, round(width), round(height)))
     if len(found) > 1:
-        return None, f"no intrinsics: the pictures have {len(found)} different cameras"
+        return None, f"no intrinsics: the images have {len(found)} different cameras"
     return found.pop(), ""
 
 

@@ -53,9 +53,9 @@ class Trajectory:
     Attributes:
         camera_to_world: Rigid, OpenCV axes (x right, y down, z forward); lengths and world as in the file, unless a
             remark says otherwise. float64. [N, 4, 4]
-        names: The picture of each pose, as the file calls it, or None.
-        timestamps: When each picture was taken, s, or None. float64. [N]
-        intrinsics: The pinhole that took all pictures, or None where it is unknown or there are several.
+        names: The image of each pose, as the file calls it, or None.
+        timestamps: When each image was taken, s, or None. float64. [N]
+        intrinsics: The pinhole that took all images, or None where it is unknown or there are several.
         stored_as: How the file stored the poses, for whoever reads along.
         remarks: What was changed, or left behind, when the file was read.
     """
@@ -143,7 +143,7 @@ def refuse_repeated(names: Sequence[str], place: str) -> None:
     for index, name in enumerate(names):
         if first.setdefault(name, index) != index:
             raise InputError(
-                f"{place}: '{name}' stands twice (poses {first[name]} and {index})", "one pose for each picture"
+                f"{place}: '{name}' stands twice (poses {first[name]} and {index})", "one pose for each image"
             )
 
 

@@ -169,7 +169,9 @@ def _read_json(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise InputError(f"{path} is not JSON: {error}", "a whole JSON file", "Make it again, or restore it") from error
+        raise InputError(
+            f"{path} is not JSON: {error}", "a complete JSON file", "Make it again, or restore it"
+        ) from error
 
 
 def _read_history(path: Path) -> dict[str, np.ndarray]:

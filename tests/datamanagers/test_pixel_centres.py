@@ -21,7 +21,7 @@ def test_a_point_is_read_where_it_was_written(layout, tmp_path):
     scene = read(folder / ("C3VD/phantom" if layout == "pr-endo" else "."), FORMAT_OF.get(layout, layout))
     camera = in_video_order(scene)[3].camera
     lens, _ = phantom_layouts.get(layout)().lens(WIDTH, HEIGHT)
-    # The lens counts pixel centres at integers, the scene's camera at integers + 0.5. Pictures that a lens bends are
+    # The lens counts pixel centres at integers, the scene's camera at integers + 0.5. Images that a lens bends are
     # undistorted to its nominal pinhole.
     k, (x, y, z) = lens.pinhole, POINT
     wanted = (k.fx * x / z + k.cx + 0.5, k.fy * y / z + k.cy + 0.5)

@@ -123,8 +123,8 @@ class TestPhantom:
         assert gap < 0.3
         assert share > 0.5
 
-    def test_pictures_are_undistorted(self, folder, scene):
-        # The middle of the picture is hardly bent: there it is the stored one.
+    def test_images_are_undistorted(self, folder, scene):
+        # The middle of the image is hardly bent: there it is the stored one.
         frame = scene.train[3]
         stored = cv2.imread(str(folder / "images" / f"{frame.name}.png"))[..., ::-1].astype(float)
         middle = np.s_[HEIGHT // 2 - 5 : HEIGHT // 2 + 5, WIDTH // 2 - 5 : WIDTH // 2 + 5]
@@ -224,7 +224,7 @@ def _frame(index, change, *parts):
     return _json(lambda content: change(content["frames"][index]), *parts)
 
 
-def _picture(name, array):
+def _image(name, array):
     return lambda folder: cv2.imwrite(str(folder / name), array)
 
 
@@ -289,9 +289,9 @@ REFUSED = {
     "no shift": (_json(lambda content: content.pop("scene_T")), r"_train.json: scene_T is no shift"),
     "another camera model": (_set("camera_model", "OPENCV"), r"camera_model 'OPENCV'.*FISHEYE_OPENCV"),
     "no size": (_json(lambda content: content.pop("w")), r"_train.json: w = None"),
-    "half pixels": (_set("h", 71.5), r"a picture of 90 x 71.5"),
+    "half pixels": (_set("h", 71.5), r"an image of 90 x 71.5"),
     "tangential distortion": (_set("p1", 0.01), r"_train.json: p1 = 0.01"),
-    "a picture that is gone": (
+    "an image that is gone": (
         lambda folder: (folder / "images" / "0005_color.png").unlink(),
         r"_train.json names .*images/0005_color.png, which is not there",
     ),
@@ -307,34 +307,34 @@ REFUSED = {
     ),
     "no mask": (lambda folder: (folder / "rgb_mask.png").unlink(), r"no file .*rgb_mask.png.*mask: false"),
     "a mask of another size": (
-        _picture("rgb_mask.png", np.zeros((36, 45), np.uint8)),
+        _image("rgb_mask.png", np.zeros((36, 45), np.uint8)),
         r"rgb_mask.png is 45 x 36.*90 x 72",
     ),
     "a mask of three channels": (
-        _picture("rgb_mask.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8)),
-        r"rgb_mask.png is a picture of 3 channels",
+        _image("rgb_mask.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8)),
+        r"rgb_mask.png is an image of 3 channels",
     ),
     "intrinsics of another resolution": (
         _json(lambda content: content.update(w=180, h=144), "train", "val", "test", "true_test"),
         r"rgb_mask.png is 90 x 72.*180 x 144",
     ),
-    "a picture of another size": (
-        _picture("images/0005_color.png", np.zeros((36, 45, 3), np.uint8)),
+    "an image of another size": (
+        _image("images/0005_color.png", np.zeros((36, 45, 3), np.uint8)),
         r"images/0005_color.png is 45 x 36, but .*transforms_train.json says 90 x 72",
     ),
-    "a picture cut short": (
+    "an image cut short": (
         lambda folder: (folder / "images/0005_color.png").write_bytes(
             (folder / "images/0005_color.png").read_bytes()[:-50]
         ),
         r"images/0005_color.png \(\d+ bytes\) cannot be decoded",
     ),
     "a distance map of 8 bits": (
-        _picture("distmaps/0005_color.png", np.ones((HEIGHT, WIDTH), np.uint8)),
-        r"distmaps/0005_color.png is a picture of 1 channel of uint8",
+        _image("distmaps/0005_color.png", np.ones((HEIGHT, WIDTH), np.uint8)),
+        r"distmaps/0005_color.png is an image of 1 channel of uint8",
     ),
     "a distance map of three channels": (
-        _picture("distmaps/0005_color.png", np.ones((HEIGHT, WIDTH, 3), np.uint16)),
-        r"distmaps/0005_color.png is a picture of 3 channels of uint16",
+        _image("distmaps/0005_color.png", np.ones((HEIGHT, WIDTH, 3), np.uint16)),
+        r"distmaps/0005_color.png is an image of 3 channels of uint16",
     ),
 }
 

@@ -101,7 +101,7 @@ def test_other_folders_do_not_lack_a_trajectory_of_this_form(tmp_path):
     assert find_format(write_wall(tmp_path / "wall")) == "c3vd"
 
 
-def test_masks_belong_to_pictures(tmp_path):
+def test_masks_belong_to_images(tmp_path):
     frames = [replace(frame, mask=torch.ones(frame.image.shape[:2], dtype=torch.bool)) for frame in wall()]
     write_rgbd_scene(tmp_path / "scene", frames, poses_of(frames))
     (tmp_path / "scene" / "mask" / "0002.png").unlink()

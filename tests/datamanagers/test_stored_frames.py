@@ -33,7 +33,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture
 def reads(monkeypatch):
-    """Names of the colour pictures and of the depth files read, in order."""
+    """Names of the colour images and of the depth files read, in order."""
     read: dict[str, list[str]] = {"image": [], "depth": []}
     rgb = stored_frames.read_rgb
 
@@ -84,7 +84,7 @@ class TestLaziness:
         assert sorted(reads["image"]) == [f"{index:04d}_color.png" for index in range(9)]
         assert sorted(reads["depth"]) == [f"{index:04d}_depth.png" for index in range(9)]
 
-    def test_not_keeping_reads_depth_twice_and_pictures_once_for_the_points(self, folder, reads):
+    def test_not_keeping_reads_depth_twice_and_images_once_for_the_points(self, folder, reads):
         scene = load(folder, keep_pixels=False)
         training = [frame.name for frame in scene.train]
         assert sorted(reads["image"]) == [f"{name}.png" for name in training]
@@ -208,6 +208,6 @@ class TestThreads:
         C3VDDataManager(C3VDSettings(width=64, height=48, keep_pixels=keep_pixels)).load(
             folder, lambda *said: told.append(said)
         )
-        assert ("read pictures", 9, 9) in told or not keep_pixels
+        assert ("read images", 9, 9) in told or not keep_pixels
         assert ("fuse depth", 7, 7) in told
         assert all(0 < done <= total for _, done, total in told)

@@ -96,7 +96,7 @@ def test_layout_is_coliags_own(phantom):
     assert record["settings"]["spread"] == 0.75 and record["settings"]["width"] == 48
 
 
-def test_the_picture_is_exposed_and_red(phantom):
+def test_the_image_is_exposed_and_red(phantom):
     for path in (phantom / "images").iterdir():
         blue, green, red = (read(path) / 255.0).mean(axis=(0, 1))
         assert 0.35 < (red + green + blue) / 3 < 0.55

@@ -205,9 +205,9 @@ def test_white_balance_drifts_slowly_by_what_is_asked():
 def test_noise_at_mid_grey_is_what_is_asked():
     radiance = np.full((60_000, 3), 0.5**2.2, np.float32)
     for noise in (1.5, 3.0):
-        picture = develop(radiance, np.ones(3), PhantomSettings(noise=noise), stream(1, Purpose.SENSOR))
+        image = develop(radiance, np.ones(3), PhantomSettings(noise=noise), stream(1, Purpose.SENSOR))
         # Rounding adds a variance of 1/12.
-        assert picture.std() == pytest.approx(np.hypot(noise, np.sqrt(1 / 12)), rel=0.02)
+        assert image.std() == pytest.approx(np.hypot(noise, np.sqrt(1 / 12)), rel=0.02)
     assert np.ptp(develop(radiance, np.ones(3), PhantomSettings(noise=0.0), stream(1, Purpose.SENSOR))) == 0
 
 

@@ -52,7 +52,7 @@ def test_pycolmap_reads_what_is_written(model):
     np.testing.assert_array_equal(camera.params, [61.0, 55.0, 33.5, 21.5])
 
 
-def test_pictures_come_in_the_order_of_their_numbers(model):
+def test_images_come_in_the_order_of_their_numbers(model):
     path, trajectory = model
     read = colmap.read(path)
     assert read.names == tuple(NAMES[index] for index in ORDER)
@@ -153,11 +153,11 @@ def test_binary_numbers_that_cannot_be(tmp_path):
     content = bytearray((tmp_path / "model" / "images.bin").read_bytes())
     content[12:20] = struct.pack("<d", 3.0)
     (tmp_path / "model" / "images.bin").write_bytes(content)
-    with pytest.raises(InputError, match=r"images\.bin, picture 1 \(0000\.png\): a quaternion of length"):
+    with pytest.raises(InputError, match=r"images\.bin, image 1 \(0000\.png\): a quaternion of length"):
         colmap.read(tmp_path / "model")
     content[12:20] = struct.pack("<d", np.nan)
     (tmp_path / "model" / "images.bin").write_bytes(content)
-    with pytest.raises(InputError, match=r"picture 1 \(0000\.png\): its pose is nan"):
+    with pytest.raises(InputError, match=r"image 1 \(0000\.png\): its pose is nan"):
         colmap.read(tmp_path / "model")
 
 

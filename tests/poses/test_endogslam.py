@@ -185,7 +185,7 @@ def test_written_files_hold_the_formats_keys_and_the_first_camera_is_the_world(t
 
 @given(images=st.integers(8, 1200))
 @settings(max_examples=30)
-def test_pictures_of_the_poses(images):
+def test_images_of_the_poses(images):
     np.testing.assert_array_equal(endogslam.image_indices(images, images), np.arange(images))
     training = [index for index in range(images) if index % 8 != 7]
     np.testing.assert_array_equal(endogslam.image_indices(images - images // 8, images), training)

@@ -205,7 +205,7 @@ def test_different_cameras_are_no_common_intrinsics(tmp_path):
     content = json.loads(path.read_text())
     content["frames"][1]["fl_x"] = 99.0
     path.write_text(json.dumps(content))
-    assert nerfstudio.read(path).remarks == ("no intrinsics: the pictures have 2 different cameras",)
+    assert nerfstudio.read(path).remarks == ("no intrinsics: the images have 2 different cameras",)
 
 
 @pytest.mark.parametrize(
@@ -238,7 +238,7 @@ def test_broken_transforms_are_refused(tmp_path, text, message):
         ({"applied_scale": 0}, "applied_scale is 0"),
         ({"applied_scale": True}, "applied_scale is True"),
         ({**PINHOLE, "fl_x": "long"}, "fl_x is 'long'"),
-        ({**PINHOLE, "w": 0}, "t.json: intrinsics .* picture 0 x 48"),
+        ({**PINHOLE, "w": 0}, "t.json: intrinsics .* image 0 x 48"),
     ],
 )
 def test_broken_values_of_transforms_are_refused(tmp_path, content, message):

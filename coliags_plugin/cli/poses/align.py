@@ -83,9 +83,9 @@ class Align:
             print(self.json)
         if self.plot is not None:
             from coliags_plugin.outputs.image_files import write_png
-            from coliags_plugin.outputs.trajectory_plot import trajectory_picture
+            from coliags_plugin.outputs.trajectory_plot import plot_trajectory
 
-            write_png(self.plot, trajectory_picture(result, unit))
+            write_png(self.plot, plot_trajectory(result, unit))
             print(self.plot)
 
 

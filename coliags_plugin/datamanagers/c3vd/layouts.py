@@ -32,7 +32,7 @@ def recognise(folder: Path) -> str | None:
 
 
 def find_layout(folder: Path) -> SequenceFiles:
-    """Look at a folder; ``kind`` is ``raw`` (distorted pictures) or ``undistorted`` (pinhole pictures and a camera).
+    """Look at a folder; ``kind`` is ``raw`` (distorted images) or ``undistorted`` (pinhole images and a camera).
 
     Raises:
         InputError: It is missing, holds neither layout or parts of both, or its frames do not pair up.
@@ -73,5 +73,5 @@ def _complete(
 ) -> SequenceFiles:
     for path in filter(None, (poses, camera)):
         if not path.is_file():
-            raise InputError(f"{folder} has pictures but no {path.name}", f"{KINDS}", f"Add {path.name}")
+            raise InputError(f"{folder} has images but no {path.name}", f"{KINDS}", f"Add {path.name}")
     return SequenceFiles(kind, folder, *paired(folder, images, depths), poses, camera)

@@ -26,8 +26,8 @@ class SequenceFiles:
     Attributes:
         kind: Of layout, for provenance.
         folder: Where the sequence is.
-        images: Colour pictures, frame 0 first.
-        depths: Depth pictures of the same frames; None where there is not one.
+        images: Colour images, frame 0 first.
+        depths: Depth images of the same frames; None where there is not one.
         poses: The pose file.
         camera: The file that describes the camera, where there is one.
     """
@@ -61,10 +61,10 @@ class SequenceDataManager(RecordedDataManager):
 
     @abstractmethod
     def rectification(self, files: SequenceFiles) -> tuple[Rectification, dict[str, Any]]:
-        """How its pictures become working pictures, and what provenance says about that.
+        """How its images become working images, and what provenance says about that.
 
         Raises:
-            InputError: The camera's file cannot be read, or the pictures are not of the camera.
+            InputError: The camera's file cannot be read, or the images are not of the camera.
         """
 
     def open(self, path: Path) -> Recording:
@@ -91,7 +91,7 @@ class SequenceDataManager(RecordedDataManager):
         """How raw frames, of which one is ``image``, are undistorted, and masked outside the octagon if wanted.
 
         Raises:
-            InputError: The picture is a crop, so that the lens's calibration does not apply to it.
+            InputError: The image is a crop, so that the lens's calibration does not apply to it.
         """
         lens = whole_frame(lens, image)
         shows = octagon_mask(lens.width, lens.height) if mask else None

@@ -26,8 +26,8 @@ class PreparedFiles:
 
     Attributes:
         folder: Where the sequence is.
-        images: Colour pictures, frame 0 first.
-        depths: Depth pictures of the same frames; None where there is not one.
+        images: Colour images, frame 0 first.
+        depths: Depth images of the same frames; None where there is not one.
         poses: ``pose.txt``; None where there is none.
         params: EndoGSLAM's result; None where there is none.
         cloud: The optimised Gaussians of PR-Endo's release; None where there are none.
@@ -47,13 +47,13 @@ class PreparedFiles:
 
 def recognise(folder: Path) -> str | None:
     """What in the folder says that it is such a sequence, or the folder of PR-Endo's release; None otherwise."""
-    pictures = any(re.fullmatch(r"\d+_color", path.stem) for path in folder.glob("color/*.png"))
+    images = any(re.fullmatch(r"\d+_color", path.stem) for path in folder.glob("color/*.png"))
     poses = folder / "pose.txt"
-    if pictures and _params(folder, None) is not None:
+    if images and _params(folder, None) is not None:
         return "color/NNNN_color.png and a params.npz"
-    if pictures and poses.is_file() and has_matrices(poses):
+    if images and poses.is_file() and has_matrices(poses):
         return "pose.txt (16 numbers a line) beside color/NNNN_color.png"
-    if not pictures and (beside := _release(folder)):
+    if not images and (beside := _release(folder)):
         return f"{beside[0].parent.name}{OPTIMIZED}/ beside {beside[0].parent.name}/"
     return None
 

@@ -1,4 +1,4 @@
-"""Which pose belongs to which picture of a sequence that EndoGSLAM was run on (docs/layouts/c3vd-endogslam.md 4)."""
+"""Which pose belongs to which image of a sequence that EndoGSLAM was run on (docs/layouts/c3vd-endogslam.md 4)."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Placement:
     """The poses of a sequence in one world.
 
     Attributes:
-        camera_to_world: One for every picture. Rigid, OpenCV axes, mm. [N, 4, 4]
+        camera_to_world: One for every image. Rigid, OpenCV axes, mm. [N, 4, 4]
         from_slam: From the world that EndoGSLAM mapped in; None without params.npz. [4, 4]
         from_file: From the world of pose.txt; None without it. [4, 4]
         facts: For provenance.
@@ -54,29 +54,29 @@ class _Slam:
     Attributes:
         params: Its result.
         path: The file of it.
-        pictures: The picture of each of its F poses. [F]
+        indices: The image index of each of its F poses. [F]
         from_true: From the first camera's world of the true poses to the one mapped in. [4, 4]
         facts: For provenance.
     """
 
     params: EndoGslamParams
     path: Path
-    pictures: Int[np.ndarray, "F"]
+    indices: Int[np.ndarray, "F"]
     from_true: Float[np.ndarray, "4 4"]
     facts: Mapping[str, Any]
 
 
 def place_sequence(files: PreparedFiles, params: EndoGslamParams | None, source: PoseSource) -> Placement:
-    """The poses of a sequence's pictures.
+    """The poses of a sequence's images.
 
     Args:
         files: Of the sequence.
         params: What is in ``files.params``; None where there is none.
-        source: ``slam``: EndoGSLAM's poses, in its world; pictures it was not given get their true poses, brought
+        source: ``slam``: EndoGSLAM's poses, in its world; images it was not given get their true poses, brought
             there. ``ground-truth``: the true poses, in the world of pose.txt; without it in that of the first camera.
 
     Raises:
-        InputError: Poses and pictures do not belong together, or those asked for are not there.
+        InputError: Poses and images do not belong together, or those asked for are not there.
     """
     count = len(files.images)
     file = None if files.poses is None else read_poses(files.poses)
@@ -93,12 +93,12 @@ def place_sequence(files: PreparedFiles, params: EndoGslamParams | None, source:
     if file is not None:
         from_slam = None if slam is None else file.camera_to_world[0] @ _inverse(slam.from_true)
         return Placement(file.camera_to_world, from_slam, np.eye(4), {**facts, "world": "pose.txt"})
-    if slam is not None and len(slam.pictures) == count:
+    if slam is not None and len(slam.indices) == count:
         from_slam = _inverse(slam.from_true)
         return Placement(slam.params.true_camera_to_world, from_slam, None, {**facts, "world": "first camera"})
     raise InputError(
-        f"{files.folder} has no pose.txt" + ("" if slam is None else f", and {slam.path} no poses of test pictures"),
-        "a true pose for every picture",
+        f"{files.folder} has no pose.txt" + ("" if slam is None else f", and {slam.path} no poses of test images"),
+        "a true pose for every image",
         "Put the sequence's pose.txt of C3VD's release there",
     )
 
@@ -113,32 +113,32 @@ def _mapped(files: PreparedFiles, slam: _Slam | None, file: Poses | None, facts:
         )
     from_file = None if file is None else slam.from_true @ _inverse(file.camera_to_world[0])
     camera_to_world = slam.params.camera_to_world
-    if len(slam.pictures) < len(files.images):
+    if len(slam.indices) < len(files.images):
         if file is None or from_file is None:
             raise InputError(
-                f"{slam.path} has poses of {len(slam.pictures)} of {len(files.images)} pictures, the training frames, "
+                f"{slam.path} has poses of {len(slam.indices)} of {len(files.images)} images, the training frames, "
                 f"and {files.folder} no pose.txt for the others",
-                "a pose for every picture",
+                "a pose for every image",
                 "Put the sequence's pose.txt of C3VD's release there",
             )
         camera_to_world = from_file @ file.camera_to_world
-        camera_to_world[slam.pictures] = slam.params.camera_to_world
+        camera_to_world[slam.indices] = slam.params.camera_to_world
     return Placement(camera_to_world, np.eye(4), from_file, {**facts, "world": "first camera, as mapped"})
 
 
 def _lay_beside(path: Path, params: EndoGslamParams, files: PreparedFiles, file: Poses | None) -> _Slam:
     count, poses = len(files.images), len(params.camera_to_world)
-    pictures = image_indices(poses, count)
-    if pictures is None:
+    indices = image_indices(poses, count)
+    if indices is None:
         raise InputError(
-            f"{path} has {poses} poses for {count} pictures in {files.folder}",
-            f"{count} (one for every picture) or {count - count // 8} (all but 7, 15, 23, ...)",
-            "Give the params.npz of this sequence, run on all of its pictures",
+            f"{path} has {poses} poses for {count} images in {files.folder}",
+            f"{count} (one for every image) or {count - count // 8} (all but 7, 15, 23, ...)",
+            "Give the params.npz of this sequence, run on all of its images",
         )
     compared = None
     if file is not None:
-        true = _inverse(file.camera_to_world[0]) @ file.camera_to_world[pictures]
-        compared = _compared(path, params.true_camera_to_world, true, pictures, files.poses)
+        true = _inverse(file.camera_to_world[0]) @ file.camera_to_world[indices]
+        compared = _compared(path, params.true_camera_to_world, true, indices, files.poses)
     from_true = _fitted(params.true_camera_to_world, params.camera_to_world)
     placed = from_true @ params.true_camera_to_world
     errors = np.linalg.norm(placed[:, :3, 3] - params.camera_to_world[:, :3, 3], axis=1)
@@ -162,14 +162,14 @@ def _lay_beside(path: Path, params: EndoGslamParams, files: PreparedFiles, file:
         "ate_max_mm": float(errors.max()),
         "mean_rotation_error_deg": float(turns.mean()),
     }
-    return _Slam(params, path, pictures, from_true, facts)
+    return _Slam(params, path, indices, from_true, facts)
 
 
 def _compared(
     path: Path,
     stored: Float[np.ndarray, "F 4 4"],
     true: Float[np.ndarray, "F 4 4"],
-    pictures: Int[np.ndarray, "F"],
+    indices: Int[np.ndarray, "F"],
     pose_file: Path | None,
 ) -> dict[str, float]:
     """How far the true poses of a params.npz are from those of pose.txt."""
@@ -178,10 +178,10 @@ def _compared(
     worst = int(np.argmax(np.maximum(distances, angles)))
     if max(distances[worst], angles[worst]) > SAME_SEQUENCE:
         raise InputError(
-            f"{path}: the true pose of picture {pictures[worst]} is {distances[worst]:.3g} mm and "
+            f"{path}: the true pose of image {indices[worst]} is {distances[worst]:.3g} mm and "
             f"{angles[worst]:.3g} degrees from that of {pose_file}",
             f"both within {SAME_SEQUENCE:g}, both relative to the first camera",
-            "It is of another sequence, or of other pictures of it: give this sequence's params.npz",
+            "It is of another sequence, or of other images of it: give this sequence's params.npz",
         )
     return {"largest_distance_mm": float(distances.max()), "largest_angle_deg": float(angles.max())}
 

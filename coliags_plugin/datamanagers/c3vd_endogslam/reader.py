@@ -34,12 +34,12 @@ from coliags_plugin.lenses.models import Pinhole
 from coliags_plugin.poses.c3vd import read_poses
 from coliags_plugin.poses.endogslam import EndoGslamParams, read_params
 
-#: K of the prepared pictures, half of the calibration behind them (docs/layouts/c3vd.md 2), as EndoGSLAM has it.
+#: K of the prepared images, half of the calibration behind them (docs/layouts/c3vd.md 2), as EndoGSLAM has it.
 PREPARED_PINHOLE = Pinhole(401.1595, 400.9425, 334.1430, 273.8665)
 PREPARED_SIZE = (675, 540)
 #: EndoGSLAM's 8-bit depth: 2.55 steps a mm, cut off below; the last step is where C3VD's range ends.
 PREPARED_DEPTH = DepthSteps(100.0 / 255.0, 8, 255)
-#: How far a principal point may be from the middle, as a share of the picture; prepared pictures have 0.7 %.
+#: How far a principal point may be from the middle, as a share of the image; prepared images have 0.7 %.
 MIDDLE_TOLERANCE = 0.1
 #: Value of the first spherical harmonic: the colour of a 3DGS PLY is this times f_dc, plus a half.
 SH0 = 0.28209479177387814
@@ -72,7 +72,7 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
 
     settings: C3VDEndoGSLAMSettings
     name = "c3vd-endogslam"
-    #: EndoGSLAM and PR-Endo publish at the prepared pictures' own size.
+    #: EndoGSLAM and PR-Endo publish at the prepared images' own size.
     fits = None
     seen_split = "endogslam"
 
@@ -125,15 +125,15 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
             raise InputError(
                 f"{files.images[0]} is {width} x {height}, but {described_by} is for "
                 f"{calibrated_width} x {calibrated_height}",
-                "pictures of that size, or scaled from it",
-                "Give the params.npz that was made from these pictures",
+                "images of that size, or scaled from it",
+                "Give the params.npz that was made from these images",
             )
         pinhole = pinhole.scaled(width / calibrated_width, height / calibrated_height)
         off_middle = max(abs((pinhole.cx + 0.5) / width - 0.5), abs((pinhole.cy + 0.5) / height - 0.5))
         if off_middle > MIDDLE_TOLERANCE:
             raise InputError(
                 f"{described_by}: the principal point ({pinhole.cx:g}, {pinhole.cy:g}) is {100 * off_middle:.0f} % of "
-                f"the picture ({width} x {height}) from its middle",
+                f"the image ({width} x {height}) from its middle",
                 "intrinsics of the size that org_width and org_height say",
                 "They are of another resolution: mend org_width and org_height, or the intrinsics",
             )
@@ -143,7 +143,7 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
         files = find_sequence(folder, None)
         if files.poses is None or placement.from_file is None:
             raise InputError(
-                f"{folder} has pictures, but {'the scene' if files.poses else 'it'} has no pose.txt",
+                f"{folder} has images, but {'the scene' if files.poses else 'it'} has no pose.txt",
                 "pose.txt of the scene and of its rotation views, in one world",
                 f"Add it, or move {folder.name} away",
             )

@@ -19,7 +19,7 @@ _SIZE = 0.3
 
 
 def write_frame(folder: Path, index: int, image: UInt8[np.ndarray, "H W 3"], z_depth: Float[np.ndarray, "H W"]) -> None:
-    """Write a picture and its depth, in 8 bits, cut off below as EndoGSLAM's script does it.
+    """Write an image and its depth, in 8 bits, cut off below as EndoGSLAM's script does it.
 
     Args:
         folder: Of the sequence.

@@ -39,7 +39,7 @@ def find_sequence(folder: Path) -> SequenceFiles:
         )
     poses = folder / "pose.txt"
     if not poses.is_file():
-        raise InputError(f"{folder} has pictures but no pose.txt", LAYOUT, "Add pose.txt")
+        raise InputError(f"{folder} has images but no pose.txt", LAYOUT, "Add pose.txt")
     depths = numbered(folder / "depth", "depth", TIFF_SUFFIXES) if (folder / "depth").is_dir() else {}
     here = folder.resolve()
     camera = next((place / INTRINSICS for place in (here, *here.parents[:2]) if (place / INTRINSICS).is_file()), None)

@@ -86,10 +86,10 @@ def _by_name(path: Path, pairs: list[tuple[str, float]]) -> dict[str, float]:
 def _doubt(values: dict[str, float], width: float, height: float) -> str:
     """What makes numbers those of no omnidirectional colonoscope, or nothing."""
     if not all(map(math.isfinite, (*values.values(), width, height))) or min(width, height) < 1.0:
-        return f"a picture of {width:g} x {height:g}, or numbers that are not finite"
+        return f"an image of {width:g} x {height:g}, or numbers that are not finite"
     off_middle = max(abs(values["cx"] / width - 0.5), abs(values["cy"] / height - 0.5))
     doubts = {
-        f"a picture of {width:g} x {height:g} pixels": width != round(width) or height != round(height),
+        f"an image of {width:g} x {height:g} pixels": width != round(width) or height != round(height),
         f"a centre ({values['cx']:g}, {values['cy']:g}) far from the middle of {width:g} x {height:g}": off_middle
         > 0.1,
         f"a focal length a0 = {values['a0']:g} for {width:g} pixels": not 0.2 < values["a0"] / width < 2.0,

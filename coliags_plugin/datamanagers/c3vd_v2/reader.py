@@ -33,7 +33,7 @@ class C3VDv2Settings(SceneSettings):
 class C3VDv2DataManager(SequenceDataManager):
     """Reads a C3VDv2 sequence; see docs/layouts/c3vd-v2.md.
 
-    Registered videos have depth; deformation and screening videos have pictures and poses only.
+    Registered videos have depth; deformation and screening videos have images and poses only.
     """
 
     Settings = C3VDv2Settings

@@ -22,16 +22,16 @@ if TYPE_CHECKING:
 _PLACES = ("sparse", "colmap/sparse", ".")
 _SUFFIXES = (".bin", ".txt")
 _PARTS = ("cameras", "images", "points3D")
-#: A whole turn at once: no part of it is a pinhole picture.
-_NO_PICTURE = frozenset({"EQUIRECTANGULAR"})
+#: A whole turn at once: no part of it is a pinhole image.
+_NO_IMAGE = frozenset({"EQUIRECTANGULAR"})
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
-    """A registered picture.
+class RegisteredImage:
+    """A registered image.
 
     Attributes:
-        name: As COLMAP knows it: a path within the folder of pictures.
+        name: As COLMAP knows it: a path within the folder of images.
         camera: Which of the model's cameras took it.
         observed: Where points were seen, pixels, centres at integers + 0.5. [K, 2]
         points: Which points: rows of :attr:`Model.positions`. [K]
@@ -50,17 +50,17 @@ class Model:
     Attributes:
         folder: Where it lies.
         files: Its files.
-        pictures: In the order of their names, 2 before 10.
+        images: In the order of their names, 2 before 10.
         camera_to_world: Of each of them, OpenCV axes. [N, 4, 4]
         cameras: By COLMAP's number.
         positions: The sparse points. [P, 3]
         colors: Their colours, RGB. [P, 3]
-        track_lengths: In how many pictures each was seen. [P]
+        track_lengths: In how many images each was seen. [P]
     """
 
     folder: Path
     files: tuple[Path, ...]
-    pictures: Sequence[Picture]
+    images: Sequence[RegisteredImage]
     camera_to_world: Float[np.ndarray, "N 4 4"]
     cameras: Mapping[int, ColmapLens]
     positions: Float[np.ndarray, "P 3"]
@@ -69,7 +69,7 @@ class Model:
 
     @property
     def cameras_file(self) -> Path:
-        """What says how large the pictures are."""
+        """What says how large the images are."""
         return self.files[0]
 
 
@@ -89,7 +89,7 @@ def read_model(folder: Path) -> Model:
 
     Raises:
         InputError: The folder holds none; a file is damaged; poses are not to be believed (see
-            :func:`coliags_plugin.poses.colmap.read`); or a camera cannot have taken a pinhole-like picture.
+            :func:`coliags_plugin.poses.colmap.read`); or a camera cannot have taken a pinhole-like image.
     """
     suffix = _suffix(folder)
     if suffix is None:
@@ -112,32 +112,32 @@ def read_model(folder: Path) -> Model:
         told = str(error).splitlines()[0].strip() if str(error).strip() else type(error).__name__
         raise InputError(
             f"{folder} cannot be read: {told}",
-            f"{', '.join(file.name for file in files)}, whole and of one model",
+            f"{', '.join(file.name for file in files)}, complete and of one model",
             "Copy all of them again",
         ) from error
 
     points = sorted(model.points3D.items())
     row = {number: index for index, (number, _) in enumerate(points)}
     by_name = {image.name: image for image in model.images.values()}
-    pictures = []
+    images = []
     for name in trajectory.names or ():
         image = by_name[name]
         seen = image.get_observation_points2D()
-        # COLMAP's own reader does not look whether points are there that pictures name.
+        # COLMAP's own reader does not look whether points are there that images name.
         if gone := [point.point3D_id for point in seen if point.point3D_id not in row]:
             raise InputError(
                 f"{files[2]} has {len(row)} points, but none is {gone[0]}, which {name} shows",
-                "the points of the pictures' own model, all of them",
+                "the points of the images' own model, all of them",
                 f"{files[2].name} is cut short or of another model: copy it again",
             )
         observed = np.array([(point.x(), point.y()) for point in seen], np.float64).reshape(-1, 2)
         rows = np.array([row[point.point3D_id] for point in seen], np.int64)
-        pictures.append(Picture(name, image.camera_id, observed, rows))
-    used = sorted({picture.camera for picture in pictures})
+        images.append(RegisteredImage(name, image.camera_id, observed, rows))
+    used = sorted({image.camera for image in images})
     return Model(
         folder,
         files,
-        pictures,
+        images,
         trajectory.camera_to_world,
         {number: _lens(model.cameras[number], files[0]) for number in used},
         np.array([point.xyz for _, point in points], np.float64).reshape(-1, 3),
@@ -147,7 +147,7 @@ def read_model(folder: Path) -> Model:
 
 
 def beside(folder: Path, name: str, suffixes: Sequence[str]) -> Path | None:
-    """The file that goes with a picture in another folder: ``name.jpg.png`` (COLMAP's own way) or ``name.png``."""
+    """The file that goes with an image in another folder: ``name.jpg.png`` (COLMAP's own way) or ``name.png``."""
     for suffix in suffixes:
         for path in (folder / f"{name}{suffix}", (folder / name).with_suffix(suffix)):
             if path.is_file():
@@ -164,11 +164,11 @@ def _suffix(folder: Path) -> str | None:
 
 def _lens(camera: pycolmap.Camera, file: Path) -> ColmapLens:
     name, params = camera.model_name, tuple(float(value) for value in camera.params)
-    if name in _NO_PICTURE:
+    if name in _NO_IMAGE:
         raise InputError(
             f"{file}: camera {camera.camera_id} is {name}",
-            "a camera whose pictures can be undistorted to a pinhole's",
-            "Cut the panoramas into pinhole pictures first",
+            "a camera whose images can be undistorted to a pinhole's",
+            "Cut the panoramas into pinhole images first",
         )
     sizes = camera.width, camera.height, camera.focal_length_x, camera.focal_length_y
     if not np.all(np.isfinite(params)) or min(sizes) <= 0:

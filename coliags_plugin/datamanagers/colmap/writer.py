@@ -1,4 +1,4 @@
-"""Writing COLMAP's layout: pictures, masks and a sparse model (docs/layouts/colmap.md)."""
+"""Writing COLMAP's layout: images, masks and a sparse model (docs/layouts/colmap.md)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class SeenPoints(NamedTuple):
-    """What one picture sees of a model's points.
+    """What one image sees of a model's points.
 
     Attributes:
         pixels: Column and row, pixel centres at integers + 0.5. [K, 2]
@@ -28,14 +28,14 @@ class SeenPoints(NamedTuple):
     points: Int[np.ndarray, "K"]
 
 
-def write_picture(
+def write_image_and_mask(
     folder: Path, name: str, image: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"] | None = None
 ) -> None:
-    """Write a picture and, where there is one, its mask.
+    """Write an image and, where there is one, its mask.
 
     Args:
         folder: Of the scene.
-        name: The picture's file name, ending in ``.png``.
+        name: The image's file name, ending in ``.png``.
         image: RGB. [H, W, 3]
         mask: True where a pixel counts. [H, W]
     """
@@ -51,11 +51,11 @@ def add_points(
     colors: UInt8[np.ndarray, "N 3"],
     errors: Float[np.ndarray, "N"] | None = None,
 ) -> None:
-    """Add points to a model of posed pictures; point k becomes COLMAP's k + 1.
+    """Add points to a model of posed images; point k becomes COLMAP's k + 1.
 
     Args:
-        model: Whose image i + 1 is picture i.
-        seen: By each picture.
+        model: Whose image i + 1 is image i.
+        seen: By each image.
         positions: World, scene units. [N, 3]
         colors: RGB. [N, 3]
         errors: Mean reprojection errors, pixels; None: to be computed. [N]

@@ -14,8 +14,8 @@ import numpy as np
 
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.datamanagers.nerfstudio.cameras import PinholeCamera, PixelCenters, camera_of, number
+from coliags_plugin.datamanagers.reading.image_names import first_few
 from coliags_plugin.datamanagers.reading.images import size_of
-from coliags_plugin.datamanagers.reading.picture_names import first_few
 from coliags_plugin.lenses.models import Lens
 
 FILE = "transforms.json"
@@ -57,7 +57,7 @@ class Transforms:
         Raises:
             InputError: Files are missing, some frames alone have depth, or a camera is of another kind or incomplete.
         """
-        images = self._pictures(names)
+        images = self._images(names)
         depths = [self._file(name, "depth_file_path") for name in names]
         if None in depths and any(depths):
             lone = names[depths.index(None)]
@@ -66,7 +66,7 @@ class Transforms:
                 "depth for every frame, or for none",
                 "Add the missing ones",
             )
-        # Where the file does not say how large pictures are, all are held to the size of the first.
+        # Where the file does not say how large images are, all are held to the size of the first.
         first_size = cache(lambda: size_of(images[0]))
         return [
             Entry(
@@ -141,7 +141,7 @@ class Transforms:
             raise InputError(f"{self.path}: {key} names {unknown[0]}", "a file_path of a frame", hint)
         return sorted({index_of[posixpath.normpath(name)] for name in listed})
 
-    def _pictures(self, names: Sequence[str]) -> list[Path]:
+    def _images(self, names: Sequence[str]) -> list[Path]:
         folder = self.path.parent
         found: list[Path | None] = []
         for name in names:
@@ -150,7 +150,7 @@ class Transforms:
         missing = [name for name, path in zip(names, found, strict=True) if path is None]
         if missing:
             raise InputError(
-                f"{self.path}: {len(missing)} of {len(names)} frames have no picture in {folder}: {first_few(missing)}",
+                f"{self.path}: {len(missing)} of {len(names)} frames have no image in {folder}: {first_few(missing)}",
                 f"files of these names, as they are or with {', '.join(_IMAGE_SUFFIXES[:3])}",
                 "Restore them, or remove their frames",
             )

@@ -1,4 +1,4 @@
-"""Pictures with a ``transforms.json``, as nerfstudio, instant-ngp and Blender's NeRF scenes have it."""
+"""Images with a ``transforms.json``, as nerfstudio, instant-ngp and Blender's NeRF scenes have it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from coliags_plugin.datamanagers.lens_rectification import LensRectification, un
 from coliags_plugin.datamanagers.nerfstudio.cameras import PinholeCamera, PixelCenters
 from coliags_plugin.datamanagers.nerfstudio.files import FILE, Entry, Transforms
 from coliags_plugin.datamanagers.reading.depth_arrays import depth_format
-from coliags_plugin.datamanagers.reading.picture_names import others_beside, short_names, warn_of_others
+from coliags_plugin.datamanagers.reading.image_names import others_beside, short_names, warn_of_others
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
 from coliags_plugin.datamanagers.rectification import Rectification
@@ -25,7 +25,7 @@ from coliags_plugin.datamanagers.seen import seen_marks
 from coliags_plugin.lenses.models import Lens
 from coliags_plugin.poses import nerfstudio as nerfstudio_poses
 
-#: RotateColon's own folders and second file: its pictures are named by number, and its depth is scaled.
+#: RotateColon's own folders and second file: its images are named by number, and its depth is scaled.
 _ROTATECOLON = ("train_views", "transforms_test.json")
 
 

@@ -1,1 +1,1 @@
-"""Files of any data set: pictures, depth, points, and what they are called."""
+"""Files of any data set: images, depth, points, and what they are called."""

@@ -43,5 +43,5 @@ class DepthArray(DepthFormat):
 
 
 def depth_format(path: Path, size: float) -> DepthFormat:
-    """The format of a depth file by its suffix: ``.npy``, else 16-bit pictures; ``size`` in scene units a number."""
+    """The format of a depth file by its suffix: ``.npy``, else 16-bit images; ``size`` in scene units a number."""
     return DepthArray(size) if path.suffix.lower() == ".npy" else DepthSteps(size, 16)

@@ -50,8 +50,8 @@ class DepthSteps(DepthFormat):
     far: int | None = None
 
     def read(self, path: Path) -> Shaped[np.ndarray, "H W"]:
-        """See :class:`DepthFormat`; a picture of one channel."""
-        return read_gray(path, self.bits, f"a one-channel {self.bits}-bit depth picture")
+        """See :class:`DepthFormat`; an image of one channel."""
+        return read_gray(path, self.bits, f"a one-channel {self.bits}-bit depth image")
 
     def z_depth(self, stored: Shaped[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
         """See :class:`DepthFormat`."""

@@ -35,30 +35,30 @@ def numbered(folder: Path, what: str, suffixes: frozenset[str]) -> dict[int, Pat
 def paired(
     folder: Path, images: Mapping[int, Path], depths: Mapping[int, Path]
 ) -> tuple[tuple[Path, ...], tuple[Path, ...] | None]:
-    """Pictures, and depth files where there are any, frame 0 first.
+    """Images, and depth files where there are any, frame 0 first.
 
     Args:
         folder: Of the sequence, for errors.
-        images: Pictures by number; at least one.
-        depths: Depth files by number; none, or one for every picture.
+        images: Images by number; at least one.
+        depths: Depth files by number; none, or one for every image.
 
     Raises:
-        InputError: Numbers do not run from 0 without gaps, or pictures and depth files do not pair up.
+        InputError: Numbers do not run from 0 without gaps, or images and depth files do not pair up.
     """
     count = len(images)
     gap = next((index for index in range(count) if index not in images), None)
     if gap is not None:
         first, last = min(images), max(images)
         raise InputError(
-            f"{images[first].parent} has {count} pictures, numbers {first} to {last}, but none is {gap}",
-            "numbers from 0 without gaps, for line n of the pose file belongs to picture n",
-            "Restore the missing pictures, or renumber them and drop their poses",
+            f"{images[first].parent} has {count} images, numbers {first} to {last}, but none is {gap}",
+            "numbers from 0 without gaps, for line n of the pose file belongs to image n",
+            "Restore the missing images, or renumber them and drop their poses",
         )
     if depths and sorted(depths) != sorted(images):
         lone = min(set(depths) ^ set(images))
         raise InputError(
-            f"{folder} has {count} pictures and {len(depths)} depth files; frame {lone} has only one of the two",
-            "a depth file for every picture, or none at all",
+            f"{folder} has {count} images and {len(depths)} depth files; frame {lone} has only one of the two",
+            "a depth file for every image, or none at all",
             "Restore the missing files: archives cut short are common",
         )
     frames = range(count)

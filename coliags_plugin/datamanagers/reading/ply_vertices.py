@@ -107,4 +107,4 @@ def _ascii(path: Path, body: bytes, vertex: _Element, layout: np.dtype) -> dict[
 
 
 def _cut_short(path: Path, expected: int, found: int) -> InputError:
-    return InputError(f"{path} says it has {expected} vertices, but holds {found}", "a whole file", "Fetch it again")
+    return InputError(f"{path} says it has {expected} vertices, but holds {found}", "a complete file", "Fetch it again")

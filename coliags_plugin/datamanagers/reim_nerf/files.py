@@ -35,7 +35,7 @@ class Described:
     """One frame as the JSON files have it.
 
     Attributes:
-        image: The picture.
+        image: The image.
         distances: Its distance map, where there is one.
         camera_to_world: OpenCV axes, mm. [4, 4]
     """
@@ -51,7 +51,7 @@ class Sequence:
 
     Attributes:
         files: The JSON files, by part.
-        lens: Of the pictures, which are not undistorted.
+        lens: Of the images, which are not undistorted.
         scene_scale: Normalised units per mm.
         scene_shift: What is added to positions in mm before they are scaled. [3]
         distmap_scale: Normalised distance of the number 65535.
@@ -206,7 +206,7 @@ def _lens(file: Path, content: Mapping[str, Any]) -> FisheyeLens:
     width, height = values.pop("w"), values.pop("h")
     if min(width, height, values["fx"], values["fy"]) <= 0 or width != int(width) or height != int(height):
         raise InputError(
-            f"{file}: a picture of {width:g} x {height:g}, focal lengths {values['fx']:g}, {values['fy']:g}",
+            f"{file}: an image of {width:g} x {height:g}, focal lengths {values['fx']:g}, {values['fy']:g}",
             "whole sizes and focal lengths above 0",
         )
     for key in ("p1", "p2"):
@@ -231,7 +231,7 @@ def _frames(
     for index, frame in enumerate(content["frames"]):
         name = frame.get("file_path") if isinstance(frame, dict) else None
         if not isinstance(name, str) or not name:
-            raise InputError(f"{file}, frame {index}: no file_path", "the name of the frame's picture")
+            raise InputError(f"{file}, frame {index}: no file_path", "the name of the frame's image")
         matrix = _array(frame.get("transform_matrix"))
         if matrix.shape != (4, 4):
             raise InputError(

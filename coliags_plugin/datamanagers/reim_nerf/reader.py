@@ -1,4 +1,4 @@
-"""REIM-NeRF's preprocessed C3VD: fisheye pictures, normalised poses, and distance maps (Psychogyios et al., 2023)."""
+"""REIM-NeRF's preprocessed C3VD: fisheye images, normalised poses, and distance maps (Psychogyios et al., 2023)."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from jaxtyping import Bool
 from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.datamanagers.reading.image_names import others_beside, warn_of_others
 from coliags_plugin.datamanagers.reading.images import read_mask
-from coliags_plugin.datamanagers.reading.picture_names import others_beside, warn_of_others
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
 from coliags_plugin.datamanagers.rectification import Rectification
@@ -114,7 +114,5 @@ def _shows(mask: Path, width: int, height: int) -> Bool[np.ndarray, "H W"]:
         raise InputError(f"no file {mask}", "the mask of what lies outside the lens's circle", "Or set mask: false")
     ignored = read_mask(mask)
     if ignored.shape != (height, width):
-        raise InputError(
-            f"{mask} is {ignored.shape[1]} x {ignored.shape[0]}", f"the pictures' size, {width} x {height}"
-        )
+        raise InputError(f"{mask} is {ignored.shape[1]} x {ignored.shape[0]}", f"the images' size, {width} x {height}")
     return np.asarray(~ignored)

@@ -1,1 +1,1 @@
-"""Pictures, depth and a trajectory in TUM's form."""
+"""Images, depth and a trajectory in TUM's form."""

@@ -1,4 +1,4 @@
-"""Which picture, pose and depth file belong together, by the times in their names or by their order."""
+"""Which image, pose and depth file belong together, by the times in their names or by their order."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def times(paths: Sequence[Path]) -> Float[np.ndarray, "N"]:
 
 
 def numbers(name: str) -> tuple[int, ...]:
-    """All whole numbers in a name: pictures and depth files of one frame have the same, however they are padded."""
+    """All whole numbers in a name: images and depth files of one frame have the same, however they are padded."""
     return tuple(int(digits) for digits in re.findall(r"\d+", name))
 
 
@@ -59,7 +59,7 @@ def nearest_in_time(
     """For every wanted time the known one that belongs to it.
 
     Closest pairs are made first, and nothing belongs to two, as TUM's own tools do it: where poses are fewer than
-    pictures, a pose goes to the picture it was taken with and not to that one's neighbours too.
+    images, a pose goes to the image it was taken with and not to that one's neighbours too.
 
     Args:
         wanted: Times, in any order. [N]

@@ -1,4 +1,4 @@
-"""Finding what belongs to a scene in TUM's RGB-D form: pictures, depth, trajectory and intrinsics."""
+"""Finding what belongs to a scene in TUM's RGB-D form: images, depth, trajectory and intrinsics."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from coliags_plugin.poses import tum
 from coliags_plugin.poses.colmap import read_text_cameras
 from coliags_plugin.poses.text import read_text, shortened
 
-PICTURE_FOLDERS = ("rgb", "color", "images")
+IMAGE_FOLDERS = ("rgb", "color", "images")
 DEPTH_FOLDERS = ("depth", "depths")
 MASK_FOLDERS = ("mask", "masks")
 TRAJECTORIES = ("groundtruth.txt", "poses.txt", "traj.txt", "trajectory.txt", "*_poses.txt")
 CAMERA_FILES = ("camera.json", "intrinsics.txt", "cameras.txt")
 EXPECTED = (
-    f"{', '.join(f'{name}/' for name in PICTURE_FOLDERS)} with pictures, a TUM trajectory ({', '.join(TRAJECTORIES)}) "
+    f"{', '.join(f'{name}/' for name in IMAGE_FOLDERS)} with images, a TUM trajectory ({', '.join(TRAJECTORIES)}) "
     f"and one of {', '.join(CAMERA_FILES)}"
 )
-#: Where the principal point of a picture may lie, as a share of its size, when nothing says which size it is for.
+#: Where the principal point of an image may lie, as a share of its size, when nothing says which size it is for.
 _MIDDLE = (0.3, 0.7)
 
 
@@ -41,7 +41,7 @@ class CameraFile:
     Attributes:
         path: The file.
         pinhole: Intrinsics, pixels, centres at integers.
-        width, height: Size of the pictures they are for, pixels.
+        width, height: Size of the images they are for, pixels.
         depth_scale: Depth steps per scene unit; None where the file does not say.
     """
 
@@ -54,28 +54,28 @@ class CameraFile:
 
 def recognise(folder: Path) -> str | None:
     """What in the folder says that it is such a scene; None where nothing does."""
-    pictures = next((name for name in PICTURE_FOLDERS if (folder / name).is_dir()), None)
+    images = next((name for name in IMAGE_FOLDERS if (folder / name).is_dir()), None)
     trajectory = next((path for path in _trajectories(folder) if tum.recognise(path)), None)
-    if pictures is None or trajectory is None:
+    if images is None or trajectory is None:
         return None
-    return f"the TUM trajectory {trajectory.name} beside {pictures}/"
+    return f"the TUM trajectory {trajectory.name} beside {images}/"
 
 
-def find_pictures(folder: Path) -> list[Path]:
-    """The colour pictures, in no order.
+def find_images(folder: Path) -> list[Path]:
+    """The colour images, in no order.
 
     Raises:
-        InputError: There is no folder of pictures, or more than one, or it holds none.
+        InputError: There is no folder of images, or more than one, or it holds none.
     """
     if not folder.is_dir():
         raise InputError(f"no folder {folder}", EXPECTED, "Check the path")
-    found = _only(folder, PICTURE_FOLDERS)
+    found = _only(folder, IMAGE_FOLDERS)
     if found is None:
         raise InputError(f"{folder} holds {inventory(folder)}", EXPECTED, "Name the scene's own folder")
-    pictures = [path for path in found.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
-    if not pictures:
-        raise InputError(f"{found} holds {inventory(found)}", "PNG or JPEG pictures")
-    return pictures
+    images = [path for path in found.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
+    if not images:
+        raise InputError(f"{found} holds {inventory(found)}", "PNG or JPEG images")
+    return images
 
 
 def find_depths(folder: Path) -> list[Path]:
@@ -88,31 +88,31 @@ def find_depths(folder: Path) -> list[Path]:
     return [] if found is None else [path for path in found.iterdir() if path.suffix.lower() in DEPTH_SUFFIXES]
 
 
-def find_masks(folder: Path, pictures: Sequence[Path]) -> dict[str, Path]:
-    """Masks by the stem of their picture; none where there is no folder of them.
+def find_masks(folder: Path, images: Sequence[Path]) -> dict[str, Path]:
+    """Masks by the stem of their image; none where there is no folder of them.
 
     Raises:
-        InputError: There is more than one such folder, or a picture has no mask.
+        InputError: There is more than one such folder, or an image has no mask.
     """
     found = _only(folder, MASK_FOLDERS)
     if found is None:
         return {}
     masks = {path.stem: path for path in found.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES}
-    lone = next((picture for picture in pictures if picture.stem not in masks), None)
+    lone = next((image for image in images if image.stem not in masks), None)
     if lone is not None:
         raise InputError(
             f"{found} has no mask for {lone.name}",
-            "a mask of the same name for every picture, or no such folder",
+            "a mask of the same name for every image, or no such folder",
             "Restore the missing ones, or move the folder away",
         )
-    return {picture.stem: masks[picture.stem] for picture in pictures}
+    return {image.stem: masks[image.stem] for image in images}
 
 
 def lacks_trajectory(folder: Path) -> bool:
-    """Whether a folder holds pictures and depth in this form, and nothing that may be their poses."""
+    """Whether a folder holds images and depth in this form, and nothing that may be their poses."""
     return (
         folder.is_dir()
-        and any((folder / name).is_dir() for name in PICTURE_FOLDERS)
+        and any((folder / name).is_dir() for name in IMAGE_FOLDERS)
         and any((folder / name).is_dir() for name in DEPTH_FOLDERS)
         and any((folder / name).is_file() for name in CAMERA_FILES)
         and not any(tum.recognise(path) for path in _trajectories(folder))
@@ -136,7 +136,7 @@ def find_trajectory(folder: Path, named: str | None) -> Path:
     found = _trajectories(folder)
     if not found:
         raise InputError(
-            f"{folder} has pictures but no {' or '.join(TRAJECTORIES)}",
+            f"{folder} has images but no {' or '.join(TRAJECTORIES)}",
             EXPECTED,
             "Add it, or let coliags poses track find one from depth",
         )
@@ -149,20 +149,20 @@ def find_trajectory(folder: Path, named: str | None) -> Path:
     return found[0]
 
 
-def find_camera(folder: Path, picture: Path) -> CameraFile:
+def find_camera(folder: Path, image: Path) -> CameraFile:
     """The camera: of ``camera.json``, else of ``intrinsics.txt``, else of COLMAP's ``cameras.txt``.
 
     Args:
         folder: Of the scene.
-        picture: One of its pictures, for the size where the file does not say it.
+        image: One of its images, for the size where the file does not say it.
 
     Raises:
         InputError: There is no such file, or it is not as it should be.
     """
     for name, read in zip(CAMERA_FILES, (_read_json, _read_intrinsics_txt, _read_cameras_txt), strict=True):
         if (folder / name).is_file():
-            return read(folder / name, picture)
-    raise InputError(f"{folder} has pictures but no {', '.join(CAMERA_FILES)}", EXPECTED, "Add the camera")
+            return read(folder / name, image)
+    raise InputError(f"{folder} has images but no {', '.join(CAMERA_FILES)}", EXPECTED, "Add the camera")
 
 
 def find_mesh(folder: Path) -> Path | None:
@@ -209,7 +209,7 @@ def _trajectories(folder: Path) -> list[Path]:
     return sorted(found)
 
 
-def _read_json(path: Path, picture: Path) -> CameraFile:
+def _read_json(path: Path, image: Path) -> CameraFile:
     pinhole, width, height = read_intrinsics(path)
     scale = json.loads(path.read_text(encoding="utf-8-sig")).get("depth_scale")
     if scale is None:
@@ -219,7 +219,7 @@ def _read_json(path: Path, picture: Path) -> CameraFile:
     return CameraFile(path, pinhole, width, height, float(scale))
 
 
-def _read_intrinsics_txt(path: Path, picture: Path) -> CameraFile:
+def _read_intrinsics_txt(path: Path, image: Path) -> CameraFile:
     words = [word for line in read_text(path, "numbers").splitlines() for word in line.replace(",", " ").split()]
     try:
         values = [float(word) for word in words]
@@ -232,25 +232,24 @@ def _read_intrinsics_txt(path: Path, picture: Path) -> CameraFile:
         values = [fx, fy, cx, cy]
     if len(values) != 4 or not np.all(np.isfinite(values)) or min(values[:2]) <= 0.0:
         raise InputError(f"{path}: '{shortened(' '.join(words))}'", "fx fy cx cy, or the nine numbers of K; pixels")
-    width, height = size_of(picture)
+    width, height = size_of(image)
     fx, fy, cx, cy = values
     if not all(_MIDDLE[0] < share < _MIDDLE[1] for share in (cx / width, cy / height)):
         raise InputError(
-            f"{path}: the principal point ({cx:g}, {cy:g}) is far from the middle of {picture.name}, "
-            f"{width} x {height}",
-            "intrinsics of the pictures as they are stored",
+            f"{path}: the principal point ({cx:g}, {cy:g}) is far from the middle of {image.name}, {width} x {height}",
+            "intrinsics of the images as they are stored",
             "Scale them, or say their size in a camera.json with fx, fy, cx, cy, w, h if that is where it is",
         )
     return CameraFile(path, Pinhole(fx, fy, cx, cy), width, height)
 
 
-def _read_cameras_txt(path: Path, picture: Path) -> CameraFile:
+def _read_cameras_txt(path: Path, image: Path) -> CameraFile:
     cameras = list(read_text_cameras(path).values())
     if len(cameras) != 1:
         raise InputError(f"{path} has {len(cameras)} cameras", "one, PINHOLE or SIMPLE_PINHOLE")
     camera = cameras[0]
     if isinstance(camera, str):
-        raise InputError(f"{path}: {camera}", "PINHOLE or SIMPLE_PINHOLE", "Undistort the pictures first")
+        raise InputError(f"{path}: {camera}", "PINHOLE or SIMPLE_PINHOLE", "Undistort the images first")
     # COLMAP counts pixel centres at integers + 0.5.
     pinhole = Pinhole(camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5)
     return CameraFile(path, pinhole, camera.width, camera.height)

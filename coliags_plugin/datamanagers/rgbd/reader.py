@@ -1,4 +1,4 @@
-"""Pictures, depth and a trajectory in TUM's RGB-D form: what SLAM systems and Gaussian Pancakes read and write."""
+"""Images, depth and a trajectory in TUM's RGB-D form: what SLAM systems and Gaussian Pancakes read and write."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from coliags_plugin.datamanagers.rgbd.files import (
     CameraFile,
     find_camera,
     find_depths,
+    find_images,
     find_masks,
     find_mesh,
-    find_pictures,
     find_trajectory,
     lacks_trajectory,
     read_obj_points,
@@ -56,8 +56,8 @@ class RGBDSettings(SceneSettings):
     )
     association: Literal["auto", "time", "order"] = Field(
         "auto",
-        description="What puts pictures, poses and depth together: 'time': pictures are named by their time; 'order': "
-        "line n of the trajectory belongs to picture n; 'auto': time, where names have a decimal point.",
+        description="What puts images, poses and depth together: 'time': images are named by their time; 'order': "
+        "line n of the trajectory belongs to image n; 'auto': time, where names have a decimal point.",
     )
     max_time_difference: float = Field(
         0.02, ge=0.0, description="For association by time: the largest difference, seconds. 0.02 is TUM's own."
@@ -71,14 +71,14 @@ class RGBDSettings(SceneSettings):
 class _Frames:
     """What belongs together, in video order."""
 
-    pictures: Sequence[Path]
+    images: Sequence[Path]
     depths: Sequence[Path | None]
     poses: Sequence[int]
     facts: dict[str, Any]
 
 
 class RGBDDataManager(RecordedDataManager):
-    """Reads pictures, depth and a TUM trajectory (docs/layouts/rgbd.md)."""
+    """Reads images, depth and a TUM trajectory (docs/layouts/rgbd.md)."""
 
     Settings = RGBDSettings
 
@@ -102,34 +102,32 @@ class RGBDDataManager(RecordedDataManager):
     def open(self, path: Path) -> Recording:
         """See :class:`RecordedDataManager`."""
         settings = self.settings
-        pictures = find_pictures(path)
+        images = find_images(path)
         depths = find_depths(path) if settings.depth == "metric" else []
-        file, trajectory = self._trajectory(path, pictures)
-        by_time = self._by_time(pictures)
+        file, trajectory = self._trajectory(path, images)
+        by_time = self._by_time(images)
         pair = self._paired_by_time if by_time else self._paired_by_order
-        frames = pair(pictures, depths, trajectory, file or path)
-        camera = find_camera(path, frames.pictures[0])
+        frames = pair(images, depths, trajectory, file or path)
+        camera = find_camera(path, frames.images[0])
         scale = self._depth_scale(camera, path) if depths else None
         form = None if scale is None else DepthSteps(1.0 / scale)
         size = self.working_size(camera.width, camera.height)
         rectification = Rectification.of_pinhole(camera.pinhole, camera.width, camera.height, camera.path, size)
-        complete = len(frames.pictures) == len(pictures) == len(trajectory)
-        seen = seen_marks(path / "truth", len(pictures), complete)
-        masks = find_masks(path, frames.pictures)
+        complete = len(frames.images) == len(images) == len(trajectory)
+        seen = seen_marks(path / "truth", len(images), complete)
+        masks = find_masks(path, frames.images)
         shots = [
             Shot(
-                picture.stem,
-                picture,
+                image.stem,
+                image,
                 rectification,
                 trajectory.camera_to_world[pose],
                 depth,
                 form,
-                mask=masks.get(picture.stem),
+                mask=masks.get(image.stem),
                 seen=seen.get(index),
             )
-            for index, (picture, depth, pose) in enumerate(
-                zip(frames.pictures, frames.depths, frames.poses, strict=True)
-            )
+            for index, (image, depth, pose) in enumerate(zip(frames.images, frames.depths, frames.poses, strict=True))
         ]
         facts: dict[str, Any] = {
             "layout": "TUM RGB-D",
@@ -152,58 +150,58 @@ class RGBDDataManager(RecordedDataManager):
             kind=f"TUM RGB-D, associated by {frames.facts['by']}",
             shots=shots,
             facts=facts,
-            fingerprint=fingerprint(path, (*frames.pictures, *frames.depths, *masks.values()), (file, camera.path)),
+            fingerprint=fingerprint(path, (*frames.images, *frames.depths, *masks.values()), (file, camera.path)),
             own_points=(lambda: _points(points)) if points is not None else None,
             points_source=points,
         )
 
-    def _trajectory(self, path: Path, pictures: Sequence[Path]) -> tuple[Path | None, Trajectory]:
+    def _trajectory(self, path: Path, images: Sequence[Path]) -> tuple[Path | None, Trajectory]:
         """The poses, and the file they come from."""
         file = find_trajectory(path, self.settings.trajectory)
         return file, tum.read(file)
 
-    def _by_time(self, pictures: Sequence[Path]) -> bool:
+    def _by_time(self, images: Sequence[Path]) -> bool:
         if self.settings.association != "auto":
             return self.settings.association == "time"
-        timed = [is_time(path.stem) for path in pictures]
+        timed = [is_time(path.stem) for path in images]
         if any(timed) and not all(timed):
             raise InputError(
-                f"{pictures[timed.index(False)]} is not named by a time, but {pictures[timed.index(True)].name} is",
+                f"{images[timed.index(False)]} is not named by a time, but {images[timed.index(True)].name} is",
                 "names of one kind",
                 "Rename, or choose with the option association",
             )
         return all(timed)
 
     def _paired_by_time(
-        self, pictures: Sequence[Path], depths: Sequence[Path], trajectory: Trajectory, file: Path
+        self, images: Sequence[Path], depths: Sequence[Path], trajectory: Trajectory, file: Path
     ) -> _Frames:
         tolerance = self.settings.max_time_difference
-        taken = times(pictures)
+        taken = times(images)
         order = np.argsort(taken, kind="stable")
-        pictures, taken = [pictures[index] for index in order], taken[order]
+        images, taken = [images[index] for index in order], taken[order]
         same = np.flatnonzero(np.diff(taken) == 0.0)
         if len(same):
             first = int(same[0])
-            raise InputError(f"{pictures[first]} and {pictures[first + 1].name} have the same time", "one of them")
+            raise InputError(f"{images[first]} and {images[first + 1].name} have the same time", "one of them")
         known = np.zeros(0) if trajectory.timestamps is None else trajectory.timestamps
         pose = nearest_in_time(taken, known, tolerance)
         if not (pose >= 0).any():
             raise InputError(
-                f"no pose of {file} is within {tolerance:g} of a picture: pictures from {taken[0]:.6f} to "
+                f"no pose of {file} is within {tolerance:g} of an image: images from {taken[0]:.6f} to "
                 f"{taken[-1]:.6f}, poses from {known.min():.6f} to {known.max():.6f}",
                 "times of one clock in names and trajectory, in seconds",
-                "Shift the trajectory's times, or set association: order if line n belongs to picture n",
+                "Shift the trajectory's times, or set association: order if line n belongs to image n",
             )
         posed = pose >= 0
-        depth = np.full(len(pictures), -1)
+        depth = np.full(len(images), -1)
         complete = posed.copy()
         if depths:
             depth[posed] = nearest_in_time(taken[posed], times(depths), tolerance)
             complete &= depth >= 0
         if not complete.any():
             raise InputError(
-                f"no depth file within {tolerance:g} of a picture that has a pose",
-                "depth files named by times of the pictures' clock",
+                f"no depth file within {tolerance:g} of an image that has a pose",
+                "depth files named by times of the images' clock",
                 "Rename them, or set depth: none",
             )
         kept = np.flatnonzero(complete)
@@ -213,39 +211,39 @@ class RGBDDataManager(RecordedDataManager):
         }
         if sum(dropped.values()):
             log.warning(
-                "%s: of %d pictures %d have no pose and %d no depth within %g s; they are left out",
+                "%s: of %d images %d have no pose and %d no depth within %g s; they are left out",
                 file.parent,
-                len(pictures),
+                len(images),
                 *dropped.values(),
                 tolerance,
             )
         difference = np.abs(taken[kept] - known[pose[kept]]).max()
         facts = {"by": "time", **dropped, "largest_difference_s": float(difference)}
         return _Frames(
-            [pictures[index] for index in kept],
+            [images[index] for index in kept],
             [depths[depth[index]] if depths else None for index in kept],
             [int(pose[index]) for index in kept],
             facts,
         )
 
     def _paired_by_order(
-        self, pictures: Sequence[Path], depths: Sequence[Path], trajectory: Trajectory, file: Path
+        self, images: Sequence[Path], depths: Sequence[Path], trajectory: Trajectory, file: Path
     ) -> _Frames:
-        numbered = by_number(pictures)
+        numbered = by_number(images)
         if len(trajectory) != len(numbered):
             raise InputError(
-                f"{file} has {len(trajectory)} poses for {len(numbered)} pictures",
-                "a pose for every picture, in order",
-                "Restore the missing ones; or set association: time, if pictures are named by the times in that file",
+                f"{file} has {len(trajectory)} poses for {len(numbered)} images",
+                "a pose for every image, in order",
+                "Restore the missing ones; or set association: time, if images are named by the times in that file",
             )
         self._check_times_say_the_same(numbered, trajectory, file)
         deep = by_number(depths)
         if deep and deep.keys() != numbered.keys():
             lone = min(deep.keys() ^ numbered.keys())
             raise InputError(
-                f"{file.parent} has {len(numbered)} pictures and {len(deep)} depth files; frame "
+                f"{file.parent} has {len(numbered)} images and {len(deep)} depth files; frame "
                 f"{' '.join(map(str, lone))} has only one of the two",
-                "a depth file for every picture, or none at all",
+                "a depth file for every image, or none at all",
                 "Restore the missing files, or set depth: none",
             )
         return _Frames(
@@ -255,7 +253,7 @@ class RGBDDataManager(RecordedDataManager):
     def _check_times_say_the_same(
         self, numbered: dict[tuple[int, ...], Path], trajectory: Trajectory, file: Path
     ) -> None:
-        """Refuse frame numbers as times of which most, but not all, are the pictures' numbers: poses went astray."""
+        """Refuse frame numbers as times of which most, but not all, are the images' numbers: poses went astray."""
         if trajectory.timestamps is None or self.settings.association == "order":
             return
         named = np.array([key[0] if len(key) == 1 else -1 for key in numbered], np.float64)
@@ -263,9 +261,9 @@ class RGBDDataManager(RecordedDataManager):
         if 0.5 < agrees.mean() < 1.0 or (set(named) == set(trajectory.timestamps) and not agrees.all()):
             index = int(np.argmin(agrees))
             raise InputError(
-                f"{file}: pose {index} is of time {trajectory.timestamps[index]:g}, but picture {index} is "
+                f"{file}: pose {index} is of time {trajectory.timestamps[index]:g}, but image {index} is "
                 f"{list(numbered.values())[index].name}",
-                "line n for picture n, or the times as names",
+                "line n for image n, or the times as names",
                 "Set association: time if the names are the times, or order if the times mean nothing",
             )
 
@@ -297,7 +295,7 @@ class UnposedRGBDDataManager(RGBDDataManager):
     Registered under no name, so that nothing trains on such poses.
     """
 
-    def _trajectory(self, path: Path, pictures: Sequence[Path]) -> tuple[Path | None, Trajectory]:
-        nowhere = np.tile(np.eye(4), (len(pictures), 1, 1))
+    def _trajectory(self, path: Path, images: Sequence[Path]) -> tuple[Path | None, Trajectory]:
+        nowhere = np.tile(np.eye(4), (len(images), 1, 1))
         # A pose for every image, at its own time where it has one: images are paired with depth alone.
-        return None, Trajectory(nowhere, timestamps=times(pictures) if self._by_time(pictures) else None)
+        return None, Trajectory(nowhere, timestamps=times(images) if self._by_time(images) else None)

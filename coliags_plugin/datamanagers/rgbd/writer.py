@@ -26,30 +26,30 @@ TRAJECTORY, CAMERA = "trajectory.txt", "camera.json"
 
 def write_frame(
     folder: Path,
-    picture: str,
+    name: str,
     image: UInt8[np.ndarray, "H W 3"],
     z_depth: Float[np.ndarray, "H W"],
     scale: float,
     mask: Bool[np.ndarray, "H W"] | None = None,
 ) -> None:
-    """Write a picture, its depth and, where there is one, its mask, all under one file name.
+    """Write an image, its depth and, where there is one, its mask, all under one file name.
 
     Args:
         folder: Of the scene.
-        picture: The file name, a time in seconds or a number.
+        name: The file name, a time in seconds or a number.
         image: RGB. [H, W, 3]
         z_depth: As for :func:`depth_steps`. [H, W]
         scale: Steps per unit of length.
         mask: True where a pixel counts. [H, W]
     """
-    write_image(folder / "rgb" / picture, image)
-    write_image(folder / "depth" / picture, depth_steps(z_depth, scale))
+    write_image(folder / "rgb" / name, image)
+    write_image(folder / "depth" / name, depth_steps(z_depth, scale))
     if mask is not None:
-        write_mask(folder / "mask" / picture, mask)
+        write_mask(folder / "mask" / name, mask)
 
 
 def write_lists(folder: Path, stamps: Sequence[str]) -> None:
-    """Write ``rgb.txt`` and ``depth.txt``, which TUM's tools read: pictures named by their times in seconds."""
+    """Write ``rgb.txt`` and ``depth.txt``, which TUM's tools read: images named by their times in seconds."""
     for kind in ("rgb", "depth"):
         lines = ["# timestamp filename", *(f"{stamp} {kind}/{stamp}.png" for stamp in stamps)]
         atomic_write(folder / f"{kind}.txt", "\n".join(lines) + "\n")
@@ -88,24 +88,22 @@ def write_rgbd_scene(
     camera = frames[0].camera
     pinhole = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
     scale = depth_scale(max(_farthest(frame) for frame in frames))
-    pictures = [f"{frame.name}.png" for frame in frames]
+    names = [f"{frame.name}.png" for frame in frames]
     timed = all(is_time(frame.name) for frame in frames) and bool(
-        (np.diff(times([Path(picture) for picture in pictures])) > 0.0).all()
+        (np.diff(times([Path(name) for name in names])) > 0.0).all()
     )
     if not timed:
-        pictures = [f"{index:04d}.png" for index in range(len(frames))]
+        names = [f"{index:04d}.png" for index in range(len(frames))]
     with atomic_folder(folder, overwrite) as scratch:
         for index, frame in enumerate(frames):
             other = frame.camera
             if (other.fx, other.fy, other.cx, other.cy, other.width, other.height) != pinhole:
                 raise InputError(f"frame {frame.name} has a camera of its own", "one pinhole for all frames")
             mask = None if frame.mask is None else frame.mask.numpy()
-            write_frame(scratch, pictures[index], frame.image.numpy(), _depth(frame), scale, mask)
+            write_frame(scratch, names[index], frame.image.numpy(), _depth(frame), scale, mask)
             if progress is not None:
                 progress("write frames", index + 1, len(frames))
-        tum.write(
-            scratch / TRAJECTORY, Trajectory(camera_to_world, timestamps=times([Path(picture) for picture in pictures]))
-        )
+        tum.write(scratch / TRAJECTORY, Trajectory(camera_to_world, timestamps=times([Path(name) for name in names])))
         # Pixel centres at integers, as all of this format's cameras.
         fx, fy, cx, cy, width, height = pinhole
         integers = Pinhole(fx, fy, cx - 0.5, cy - 0.5)

@@ -45,7 +45,7 @@ def fit_scale(shots: Sequence[Shot], points: Float[np.ndarray, "N 3"]) -> ScaleF
     with the point nearest to where its depth puts it, and the scale is right that brings pixels closest to points.
 
     Args:
-        shots: Frames, of which some may have depth; pinhole pictures.
+        shots: Frames, of which some may have depth; pinhole images.
         points: World of the poses. [N, 3]
 
     Returns:

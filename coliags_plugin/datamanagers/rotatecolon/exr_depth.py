@@ -68,6 +68,6 @@ def read_exr_channel(path: Path, channel: str) -> Float32[np.ndarray, "H W"]:
 def _damaged(path: Path) -> InputError:
     return InputError(
         f"{path} ({path.stat().st_size} bytes) cannot be decoded",
-        "a whole OpenEXR file",
+        "a complete OpenEXR file",
         "It is damaged or cut short: fetch it again",
     )

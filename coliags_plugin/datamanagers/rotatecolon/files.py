@@ -27,15 +27,15 @@ POINTS = "init_point_cloud.ply"
 
 @dataclass(frozen=True)
 class ViewFiles:
-    """Pictures of one JSON file.
+    """Images of one JSON file.
 
     Attributes:
         transforms: The file.
         images: In order of their numbers.
-        depths: Of the same pictures; None where there is not one.
+        depths: Of the same images; None where there is not one.
         camera_to_world: Rigid, OpenCV axes, the data's units. [N, 4, 4]
         angle: Horizontal field of view, radians.
-        unposed: Number of pictures in the folder that the file says nothing about.
+        unposed: Number of images in the folder that the file says nothing about.
     """
 
     transforms: Path
@@ -70,41 +70,41 @@ def find_test(folder: Path, test_folder: str) -> ViewFiles | None:
     """The test views, which have no depth; None where the data have none.
 
     Raises:
-        InputError: There are poses but no pictures; or as :func:`find_views`.
+        InputError: There are poses but no images; or as :func:`find_views`.
     """
     if not (folder / TEST).is_file():
         return None
     if not (folder / test_folder).is_dir():
         raise InputError(
             f"{folder} has {TEST} but no folder {test_folder}",
-            "the pictures of the test views",
+            "the images of the test views",
             "Set test_folder to the folder they are in",
         )
     return find_views(folder / TEST, folder / test_folder, None)
 
 
-def find_views(transforms: Path, pictures: Path, depth: Path | None) -> ViewFiles:
-    """Poses, and the pictures and depth files they belong to.
+def find_views(transforms: Path, images: Path, depth: Path | None) -> ViewFiles:
+    """Poses, and the images and depth files they belong to.
 
     Raises:
         InputError: The JSON cannot be read, or a pose is not rigid; a frame is no number, stands twice or has no
-            picture; or some but not all frames have a depth file.
+            image; or some but not all frames have a depth file.
     """
     trajectory = read_transforms(transforms)
-    found = numbered(pictures, "", frozenset({".png"}))
+    found = numbered(images, "", frozenset({".png"}))
     stated = _numbers(transforms, trajectory.names_or_numbers())
     order = sorted(range(len(stated)), key=stated.__getitem__)
     numbers = [stated[index] for index in order]
     for number in numbers:
         if number not in found:
             raise InputError(
-                f"{transforms}: frame {number} has no picture {pictures / f'{number:04d}.png'}",
-                "a picture for every frame",
+                f"{transforms}: frame {number} has no image {images / f'{number:04d}.png'}",
+                "an image for every frame",
                 "Restore it, or remove the frame",
             )
     unposed = len(found) - len(numbers)
     if unposed:
-        log.warning("%s: %d pictures of %s have no pose and are left out", transforms, unposed, pictures.name)
+        log.warning("%s: %d images of %s have no pose and are left out", transforms, unposed, images.name)
     return ViewFiles(
         transforms,
         tuple(found[number] for number in numbers),
@@ -125,7 +125,7 @@ def _numbers(transforms: Path, names: Sequence[str]) -> list[int]:
             raise InputError(f"{transforms}: file_path '{name}'", "the frame's number, for instance '12'")
         number = int(stem)
         if number in seen:
-            raise InputError(f"{transforms}: frame {number} stands twice", "one pose for each picture")
+            raise InputError(f"{transforms}: frame {number} stands twice", "one pose for each image")
         seen.add(number)
         numbers.append(number)
     return numbers
@@ -142,7 +142,7 @@ def _depths(numbers: Sequence[int], folder: Path | None) -> tuple[Path, ...] | N
         raise InputError(
             f"{folder} has {len(numbers) - len(lacking)} depth files for {len(numbers)} frames; frame {lacking[0]} has "
             "none",
-            "a depth file for every picture, or none at all",
+            "a depth file for every image, or none at all",
             "Restore the missing files: archives cut short are common",
         )
     return tuple(found[number] for number in numbers)

@@ -42,7 +42,7 @@ class RotateColonSettings(SceneSettings):
         "nothing says why (docs/layouts/rotatecolon.md 4).",
     )
     depth_channel: str = Field("ViewLayer.Depth.Z", description="The EXR channel that holds depth.")
-    test_folder: str = Field("test_views_1", description="The folder of the pictures of transforms_test.json.")
+    test_folder: str = Field("test_views_1", description="The folder of the images of transforms_test.json.")
     split: Split = Field("all-train", description="As for all data; the test views come apart from the video.")
     initial_points: InitialPoints = Field("data", description="As for all data; init_point_cloud.ply.")
 
@@ -59,7 +59,7 @@ class RotateColonDataManager(RecordedDataManager):
 
     settings: RotateColonSettings
     name = "rotatecolon"
-    #: What is published was made at the pictures' own size.
+    #: What is published was made at the images' own size.
     fits = None
     seen_split = "all-train"
 
@@ -106,7 +106,7 @@ class RotateColonDataManager(RecordedDataManager):
         settings = self.settings
         width, height = size_of(files.images[0])
         focal = 0.5 * width / math.tan(0.5 * files.angle)
-        # In the middle of the picture; the corner of its first pixel lies at -0.5.
+        # In the middle of the image; the corner of its first pixel lies at -0.5.
         pinhole = Pinhole(focal, focal, 0.5 * width - 0.5, 0.5 * height - 0.5)
         rectification = Rectification.of_pinhole(
             pinhole, width, height, files.images[0], self.working_size(width, height)

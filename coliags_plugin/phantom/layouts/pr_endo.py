@@ -49,5 +49,5 @@ class PREndoLayout(Layout):
         write_gaussians(results / "point_cloud" / f"iteration_{_ITERATION}" / "point_cloud.ply", means, points.colors)
 
     def seen_mask(self, folder: Path, part: Part, index: int) -> Path:
-        """Beside the pictures, where whoever is given the scene's own folder looks."""
+        """Beside the images, where whoever is given the scene's own folder looks."""
         return super().seen_mask(folder / _DATA / _SCENE, part, index)

@@ -22,7 +22,7 @@ _AHEAD = 30.0
 
 
 class ReimNerfLayout(Layout):
-    """Fisheye pictures in a circle, distance maps, rgb_mask.png, and a JSON file for each part."""
+    """Fisheye images in a circle, distance maps, rgb_mask.png, and a JSON file for each part."""
 
     default_size = (1350, 1080)
 

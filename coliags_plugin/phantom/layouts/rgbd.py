@@ -22,7 +22,7 @@ _START, _RATE = 1_305_031_102.0, 30.0
 
 
 class RGBDLayout(Layout):
-    """Pictures and depth named by their time, groundtruth.txt, camera.json, and the lists that TUM's tools read."""
+    """Images and depth named by their time, groundtruth.txt, camera.json, and the lists that TUM's tools read."""
 
     def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
         """See :class:`Layout`; normals are not part of this layout."""

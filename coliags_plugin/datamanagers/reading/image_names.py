@@ -1,4 +1,4 @@
-"""What pictures that lie anywhere are called."""
+"""What images that lie anywhere are called."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ log = logging.getLogger(__name__)
 
 
 def short_names(paths: Sequence[str]) -> list[str]:
-    """Unique names, fit for files, of pictures given by their relative paths.
+    """Unique names, fit for files, of images given by their relative paths.
 
     Folders common to all are left out and further ones joined by a dash; suffixes go where names stay unique.
 
@@ -29,14 +29,14 @@ def short_names(paths: Sequence[str]) -> list[str]:
         if len(set(names)) == len(names):
             return names
     double = next(name for index, name in enumerate(names) if name in names[:index])
-    raise InputError(f"two pictures would be called '{double}'", "names that differ in more than / and -", "Rename one")
+    raise InputError(f"two images would be called '{double}'", "names that differ in more than / and -", "Rename one")
 
 
 def others_beside(used: Sequence[Path], but: Iterable[Path | None] = ()) -> list[Path]:
-    """Pictures in the folders of the used ones that are not used: those that nobody gave a pose.
+    """Images in the folders of the used ones that are not used: those that nobody gave a pose.
 
     Args:
-        used: Pictures with a pose.
+        used: Images with a pose.
         but: Files that are something else: depth, masks.
     """
     known = {*used, *but}
@@ -50,10 +50,10 @@ def others_beside(used: Sequence[Path], but: Iterable[Path | None] = ()) -> list
 
 
 def warn_of_others(file: Path, others: Sequence[Path]) -> None:
-    """Say which pictures are left out because ``file`` has no pose for them; nothing where there are none."""
+    """Say which images are left out because ``file`` has no pose for them; nothing where there are none."""
     if others:
         named = first_few([path.name for path in others])
-        log.warning("%s: %d pictures have no pose and are left out: %s", file, len(others), named)
+        log.warning("%s: %d images have no pose and are left out: %s", file, len(others), named)
 
 
 def first_few(names: Sequence[str]) -> str:
