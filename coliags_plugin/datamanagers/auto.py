@@ -1,4 +1,4 @@
-"""``datamanager: auto``: whichever format the scene's folder has."""
+"""``datamanager: auto``: selects the format from the scene's folder."""
 
 from __future__ import annotations
 
@@ -9,6 +9,6 @@ from coliags_plugin.datamanagers.scene_settings import SceneSettings
 
 
 class AutoDataManager:
-    """Stands for the one data manager that recognises the folder; the engine finds it (docs/data.md 1)."""
+    """Placeholder that the engine replaces by the data manager that recognises the folder (docs/data.md 1)."""
 
     Settings: ClassVar[type[Settings]] = SceneSettings

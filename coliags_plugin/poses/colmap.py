@@ -51,7 +51,7 @@ def read(path: Path) -> Trajectory:
 
     Raises:
         InputError: The files are missing, damaged or empty; or a quaternion is zero or further than 1e-3 from unit
-            length, naming its line or image; or an image stands twice.
+            length, naming its line or image; or an image is repeated.
     """
     suffix = _suffix(path)
     if suffix is None:
@@ -85,7 +85,7 @@ def write(path: Path, trajectory: Trajectory) -> None:
     """Write a binary model of one PINHOLE camera and no points.
 
     Raises:
-        InputError: The trajectory has no intrinsics, a name stands twice, the folder holds something other than a
+        InputError: The trajectory has no intrinsics, a name is repeated, the folder holds something other than a
             COLMAP model, or it cannot be written.
     """
     _write(path, trajectory, text=False)

@@ -29,7 +29,7 @@ def read(path: Path) -> Trajectory:
 
     Raises:
         InputError: The file is no such JSON, or holds no frames; a frame has no file_path or no finite, rigid 4x4 or
-            3x4 matrix, naming it; an image stands twice; or the applied change is no turn, shift and positive scale.
+            3x4 matrix, naming it; an image is repeated; or the applied change is no turn, shift and positive scale.
     """
     content = _json(path)
     frames = content.get("frames")
@@ -66,7 +66,7 @@ def write(path: Path, trajectory: Trajectory) -> None:
     """Write a ``transforms.json``; with intrinsics where they are known.
 
     Raises:
-        InputError: A name stands twice, or the folder cannot be written.
+        InputError: A name is repeated, or the folder cannot be written.
     """
     names = trajectory.names_or_numbers()
     refuse_repeated(names, str(path))
@@ -90,7 +90,7 @@ def _json(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(read_text(path, "a transforms.json"))
     except (json.JSONDecodeError, RecursionError) as error:
-        raise InputError(f"{path} is no JSON: {error}", "a transforms.json") from error
+        raise InputError(f"{path} is not JSON: {error}", "a transforms.json") from error
     if not isinstance(content, dict):
         raise InputError(f"{path} holds a JSON {type(content).__name__}", "a JSON object with 'frames'")
     return content

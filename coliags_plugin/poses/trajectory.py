@@ -134,7 +134,7 @@ def natural_order(names: Sequence[str]) -> list[int]:
 
 
 def refuse_repeated(names: Sequence[str], place: str) -> None:
-    """Refuse a name that stands twice.
+    """Refuse a name that is repeated.
 
     Raises:
         InputError: Naming it, and the two places it has in ``names``.
@@ -143,7 +143,7 @@ def refuse_repeated(names: Sequence[str], place: str) -> None:
     for index, name in enumerate(names):
         if first.setdefault(name, index) != index:
             raise InputError(
-                f"{place}: '{name}' stands twice (poses {first[name]} and {index})", "one pose for each image"
+                f"{place}: '{name}' is repeated (poses {first[name]} and {index})", "one pose for each image"
             )
 
 

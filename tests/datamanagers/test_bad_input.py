@@ -190,7 +190,7 @@ REFUSED: dict[str, Rows] = {
             remove("depth/*.png", 3),
             (r"transforms\.json, frame images/frame_00004\.png: no file \S*depth/frame_00004\.png",),
         ),
-        "reim-nerf": (remove("distmaps/*.png", 3), (r"names \S*distmaps/0003_color\.png, which is not there",)),
+        "reim-nerf": (remove("distmaps/*.png", 3), (r"names \S*distmaps/0003_color\.png, which does not exist",)),
     },
     "no depth and no points": per_kind(
         ("c3vd", "c3vd-raw", "c3vd-v2", "rgbd"),
@@ -207,7 +207,7 @@ REFUSED: dict[str, Rows] = {
         KINDS,
         lambda name, kind: (
             remove(kind.images),
-            ("(holds nothing|holds 0000_depth|have no image|are not in|has no image|is not there)", "Expected"),
+            ("(holds nothing|holds 0000_depth|have no image|are not in|has no image|does not exist)", "Expected"),
         ),
     ),
     "an image that is gone": {
@@ -231,7 +231,7 @@ REFUSED: dict[str, Rows] = {
             (r"transforms\.json: 1 of 11 frames have no image in .*images/frame_00004\.png",),
         ),
         "rgbd-by-order": (remove("rgb/*.png", 3), (r"groundtruth\.txt has 11 poses for 10 images",)),
-        "reim-nerf": (remove("images/*.png", 3), (r"names \S*images/0003_color\.png, which is not there",)),
+        "reim-nerf": (remove("images/*.png", 3), (r"names \S*images/0003_color\.png, which does not exist",)),
     },
     "fewer poses than images": {
         **per_kind(
@@ -278,7 +278,7 @@ REFUSED: dict[str, Rows] = {
         ),
         **per_kind(
             FRAMES_OF_JSON,
-            lambda name, kind: (cut(kind.poses, 0, 0.0), (rf"{kind.poses} is no JSON", "Expected")),
+            lambda name, kind: (cut(kind.poses, 0, 0.0), (rf"{kind.poses} is not JSON", "Expected")),
         ),
     },
     "a pose file cut short": {
@@ -288,7 +288,7 @@ REFUSED: dict[str, Rows] = {
         ),
         **per_kind(
             FRAMES_OF_JSON,
-            lambda name, kind: (cut(kind.poses), (rf"{kind.poses} is no JSON: .* line \d+", "Expected")),
+            lambda name, kind: (cut(kind.poses), (rf"{kind.poses} is not JSON: .* line \d+", "Expected")),
         ),
         "colmap-text": (cut("sparse/0/images.txt"), (r"sparse/0 cannot be read", r"images\.txt", "complete")),
         "colmap": (cut("sparse/0/images.bin"), (r"images\.bin \(\d+ bytes\) is damaged or cut short",)),

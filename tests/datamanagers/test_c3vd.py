@@ -223,7 +223,7 @@ class TestSplit:
         assert [frame.index for frame in scene.train] == [2, 4, 6]
 
     def test_no_training_frame_left(self, undistorted):
-        with pytest.raises(InputError, match=r"split 'every-8th' of 1 frames .* leaves none to train on"):
+        with pytest.raises(InputError, match=r"split 'every-8th' of 1 frames .* leaves no training frames"):
             small(undistorted, max_frames=1)
 
     @pytest.mark.parametrize("options", [{"block": (0.6, 0.4)}, {"block": (0.5, 1.5)}, {"split": "7:1"}, {"width": 0}])

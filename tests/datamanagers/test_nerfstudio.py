@@ -275,7 +275,7 @@ def test_the_files_own_split(folder):
 
 
 def test_no_split_of_its_own(wall):
-    with pytest.raises(InputError, match="does not say which of its frames are for testing"):
+    with pytest.raises(InputError, match="does not specify its test frames"):
         load(wall, split="own")
 
 
@@ -407,7 +407,7 @@ def test_no_file(tmp_path):
     with pytest.raises(InputError, match=r"no file .*transforms\.json"):
         opened(tmp_path)
     (tmp_path / "transforms.json").write_text("{")
-    with pytest.raises(InputError, match="is no JSON"):
+    with pytest.raises(InputError, match="is not JSON"):
         opened(tmp_path)
 
 

@@ -261,7 +261,7 @@ REFUSED = {
         lambda folder: (folder / "transforms_true_test.json").unlink(),
         r"has no transforms_true_test.json.*choose another split",
     ),
-    "no JSON": (lambda folder: (folder / "transforms_val.json").write_text("{"), r"transforms_val.json is no JSON"),
+    "no JSON": (lambda folder: (folder / "transforms_val.json").write_text("{"), r"transforms_val.json is not JSON"),
     "no frames": (_set("frames", [], "train"), r"transforms_train.json has no frames"),
     "no file_path": (_frame(1, lambda frame: frame.pop("file_path"), "train"), r"_train.json, frame 1: no file_path"),
     "no matrix": (
@@ -275,29 +275,29 @@ REFUSED = {
     "not rigid": (_frame(1, _matrix(_stretch), "train"), r"frame 1 \(images/0005_color.png\): not a rigid transform"),
     "two poses of a frame": (
         _frame(0, _matrix(_move), "test"),
-        r"_test.json: images/0000_color.png has another pose or distance map",
+        r"_test.json: pose or distance map of images/0000_color.png differs",
     ),
     "a frame twice": (
         _json(lambda content: content["frames"].append(content["frames"][0]), "train"),
-        r"_train.json: 'images/0000_color.png' stands twice",
+        r"_train.json: 'images/0000_color.png' is repeated",
     ),
-    "two scales": (_set("scene_scale", 0.5, "val"), r"_val.json: scene_scale is not that of transforms_train.json"),
+    "two scales": (_set("scene_scale", 0.5, "val"), r"_val.json: scene_scale differs from transforms_train.json"),
     "no scale": (_json(lambda content: content.pop("scene_scale")), r"_train.json: scene_scale = None"),
     "a scale of nothing": (_set("scene_scale", 0.0), r"_train.json: scene_scale = 0"),
     "a distance of nothing": (_set("distmap_scale", -1.0), r"_train.json: distmap_scale = -1"),
-    "a turned world": (_set("scene_T", _turned()), r"_train.json: scene_T is no shift"),
-    "no shift": (_json(lambda content: content.pop("scene_T")), r"_train.json: scene_T is no shift"),
+    "a turned world": (_set("scene_T", _turned()), r"_train.json: scene_T is not a translation"),
+    "no shift": (_json(lambda content: content.pop("scene_T")), r"_train.json: scene_T is not a translation"),
     "another camera model": (_set("camera_model", "OPENCV"), r"camera_model 'OPENCV'.*FISHEYE_OPENCV"),
     "no size": (_json(lambda content: content.pop("w")), r"_train.json: w = None"),
     "half pixels": (_set("h", 71.5), r"an image of 90 x 71.5"),
     "tangential distortion": (_set("p1", 0.01), r"_train.json: p1 = 0.01"),
     "an image that is gone": (
         lambda folder: (folder / "images" / "0005_color.png").unlink(),
-        r"_train.json names .*images/0005_color.png, which is not there",
+        r"_train.json names .*images/0005_color.png, which does not exist",
     ),
     "a distance map that is gone": (
         lambda folder: (folder / "distmaps" / "0005_color.png").unlink(),
-        r"_train.json names .*distmaps/0005_color.png, which is not there",
+        r"_train.json names .*distmaps/0005_color.png, which does not exist",
     ),
     "distances for some frames only": (
         _json(

@@ -242,13 +242,13 @@ class TestTimes:
 
     def test_a_name_that_is_no_time(self, my_numbered):
         (my_numbered / "rgb" / "3.png").rename(my_numbered / "rgb" / "three.png")
-        with pytest.raises(InputError, match=r"three.png: its name is no time"):
+        with pytest.raises(InputError, match=r"three.png: its name is not a timestamp"):
             load(my_numbered, association="time")
 
     def test_the_same_time_twice(self, mine):
         first = mine / "rgb" / f"{stamps(9)[0]}.png"
         shutil.copy(first, first.with_suffix(".jpg"))
-        with pytest.raises(InputError, match=r"1305031102.000000.* have the same time"):
+        with pytest.raises(InputError, match=r"1305031102.000000.* have the same timestamp"):
             load(mine)
 
 

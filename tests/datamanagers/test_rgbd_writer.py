@@ -117,6 +117,6 @@ def test_what_is_refused(tmp_path):
     with pytest.raises(InputError, match="frame 0001 has no depth"):
         write_rgbd_scene(tmp_path / "scene", [frames[0], replace(frames[1], depth=None)], poses[:2])
     other = replace(frames[1], camera=replace(frames[1].camera, fx=3.0))
-    with pytest.raises(InputError, match="frame 0001 has a camera of its own"):
+    with pytest.raises(InputError, match="frame 0001 has another camera"):
         write_rgbd_scene(tmp_path / "scene", [frames[0], other], poses[:2])
     assert list(tmp_path.iterdir()) == []

@@ -261,7 +261,7 @@ def matrix(content, index, value):
 
 REFUSED = {
     "no images": (lambda f: shutil.rmtree(f / "train_views"), "rotate holds"),
-    "no JSON": (lambda f: (f / "transforms.json").write_text("{"), "transforms.json is no JSON"),
+    "no JSON": (lambda f: (f / "transforms.json").write_text("{"), "transforms.json is not JSON"),
     "no frames": (lambda f: (f / "transforms.json").write_text("{}"), "transforms.json has no frames"),
     "no field of view": (
         lambda f: change(f / "transforms.json", lambda content: content.pop("camera_angle_x")),
@@ -283,7 +283,7 @@ REFUSED = {
     ),
     "a frame twice": (
         lambda f: change(f / "transforms.json", lambda content: content["frames"][2].update(file_path="0001")),
-        "transforms.json: frame 1 stands twice",
+        "transforms.json: frame 1 is repeated",
     ),
     "a left-handed pose": (
         lambda f: change(f / "transforms.json", lambda c: matrix(c, 3, np.diag([1.0, 1.0, -1.0, 1.0]).tolist())),

@@ -75,7 +75,7 @@ def test_masks_are_left_out_where_other_frames_are_trained_on(folders, layout, o
     assert all(frame.seen is None for frame in (*scene.train, *apart(scene)))
     assert warnings(caplog) == [
         f"{folder}: seen masks are for split '{SPLITS[layout]}' of all frames; this run trains on other frames, so "
-        "figures on seen pixels are left out"
+        "metrics on seen pixels are unavailable"
     ]
 
 

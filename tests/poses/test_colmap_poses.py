@@ -124,7 +124,7 @@ def test_models_that_are_none(tmp_path):
     with pytest.raises(InputError, match="holds no poses"):
         colmap.read(tmp_path)
     (tmp_path / "images.txt").write_text("1 1 0 0 0 5 6 7 1 a.png\n\n2 1 0 0 0 5 6 7 1 a.png\n\n")
-    with pytest.raises(InputError, match=r"'a.png' stands twice"):
+    with pytest.raises(InputError, match=r"'a.png' is repeated"):
         colmap.read(tmp_path)
 
 

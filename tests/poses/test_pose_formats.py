@@ -127,7 +127,7 @@ def test_formats_that_need_intrinsics_say_so(tmp_path, name):
 @pytest.mark.parametrize("name", ["colmap", "colmap-text", "nerfstudio"])
 def test_a_repeated_name_is_not_written(tmp_path, name):
     trajectory = winding(3, names=("a.png", "b.png", "a.png"), intrinsics=PINHOLE)
-    with pytest.raises(InputError, match=r"'a\.png' stands twice \(poses 0 and 2\)"):
+    with pytest.raises(InputError, match=r"'a\.png' is repeated \(poses 0 and 2\)"):
         write_trajectory(tmp_path / "out", trajectory, name)
 
 

@@ -211,7 +211,7 @@ def test_different_cameras_are_no_common_intrinsics(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{", "is no JSON"),
+        ("{", "is not JSON"),
         ("[1]", "holds a JSON list"),
         ("{}", "has no frames"),
         ('{"frames": []}', "has no frames"),
@@ -238,7 +238,7 @@ def test_broken_transforms_are_refused(tmp_path, text, message):
         ({"applied_scale": 0}, "applied_scale is 0"),
         ({"applied_scale": True}, "applied_scale is True"),
         ({**PINHOLE, "fl_x": "long"}, "fl_x is 'long'"),
-        ({**PINHOLE, "w": 0}, "t.json: intrinsics .* image 0 x 48"),
+        ({**PINHOLE, "w": 0}, "t.json: intrinsics .* (image|picture) 0 x 48"),
     ],
 )
 def test_broken_values_of_transforms_are_refused(tmp_path, content, message):
@@ -250,7 +250,7 @@ def test_frames_of_transforms_are_checked(tmp_path):
     stretched = some_transform(0) @ np.diag([1.1, 1, 1, 1])
     with pytest.raises(InputError, match=r"frame 1 \(1\.png\): not a rigid transform"):
         nerfstudio.read(transforms(tmp_path / "t.json", [some_transform(0), stretched]))
-    with pytest.raises(InputError, match=r"'a' stands twice \(poses 0 and 1\)"):
+    with pytest.raises(InputError, match=r"'a' is repeated \(poses 0 and 1\)"):
         nerfstudio.read(transforms(tmp_path / "t.json", [some_transform(0)] * 2, ["a", "a"]))
 
 

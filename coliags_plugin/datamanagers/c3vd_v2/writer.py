@@ -1,4 +1,4 @@
-"""Writing C3VDv2's layout (docs/layouts/c3vd-v2.md 1); its poses are C3VD's."""
+"""Writes C3VDv2's layout (docs/layouts/c3vd-v2.md 1); its poses are in C3VD's format."""
 
 from __future__ import annotations
 
@@ -29,6 +29,6 @@ def write_frame(
 
 
 def write_lens(folder: Path, lens: OmnidirectionalLens) -> None:
-    """Write ``camera_intrinsics.txt``: the calibration, every number with its name."""
+    """Write the calibration as named numbers to ``camera_intrinsics.txt``."""
     values = {"a1": 0.0, **vars(lens)}
     atomic_write(folder / INTRINSICS, "".join(f"{name} = {values[name]!r}\n" for name in ORDER))

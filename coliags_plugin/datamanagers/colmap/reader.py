@@ -1,4 +1,4 @@
-"""Images with a COLMAP sparse model: poses, cameras, points, and depth at those points."""
+"""Data manager for COLMAP sparse models: poses, cameras, points and sparse depth."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud, SparseDepth
-from coliags_plugin.datamanagers.colmap.files import Model, RegisteredImage, beside, find_models, read_model
+from coliags_plugin.datamanagers.colmap.files import Model, RegisteredImage, find_models, read_model, sidecar_file
 from coliags_plugin.datamanagers.colmap.lens import PINHOLES, ColmapLens
 from coliags_plugin.datamanagers.lens_rectification import LensRectification, undistorter
 from coliags_plugin.datamanagers.reading.depth_arrays import depth_format
-from coliags_plugin.datamanagers.reading.image_names import first_few, others_beside, short_names, warn_of_others
+from coliags_plugin.datamanagers.reading.image_names import first_few, short_names, unposed_images, warn_of_unposed
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
 from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
-from coliags_plugin.datamanagers.seen import seen_marks
+from coliags_plugin.datamanagers.seen import find_seen_masks
 
 log = logging.getLogger(__name__)
 
@@ -33,39 +33,38 @@ class ColmapSettings(SceneSettings):
 
     initial_points: InitialPoints = Field(
         "data",
-        description="Initial points: 'data': the model's sparse points; 'depth': fused from depths/ where there is "
-        "one; 'file': points_file.",
+        description="Initial points: 'data': the model's sparse points; 'depth': fused from depths/ if present; "
+        "'file': points_file.",
     )
     model: str | None = Field(
         None,
         description="Folder of the sparse model, relative to the scene. None: sparse/0, sparse, colmap/sparse/0, "
-        "colmap/sparse or the scene's folder itself, whichever comes first.",
+        "colmap/sparse or the scene's folder itself, the first that exists.",
     )
     images_folder: str = Field("images", description="Folder that the model's image names are relative to.")
     scale: float = Field(
         1.0,
         gt=0.0,
-        description="Millimetres in the model's unit of length, which COLMAP leaves open. Poses, points and what "
-        "depends on them are multiplied by it.",
+        description="Millimetres per unit of the model, whose scale is arbitrary. Poses, points and sparse depth are "
+        "multiplied by it.",
     )
     max_reprojection_error: float = Field(
         2.0,
         gt=0.0,
-        description="An image is given the depth of a point only where the point falls within so many pixels of the "
-        "stored image of where it was seen.",
+        description="Largest reprojection error of an observation that gives sparse depth, pixels of the stored image.",
     )
     min_track_length: int = Field(
         3,
         ge=2,
-        description="Points seen in fewer images than this give no depth; they are initial points all the same.",
+        description="Least track length of points that give sparse depth; all points are initial points.",
     )
     depth_unit: float = Field(
-        1.0, gt=0.0, description="Millimetres that the number 1 in a file of depths/ stands for (after scale)."
+        1.0, gt=0.0, description="Millimetres per stored unit of the files in depths/ (after scale)."
     )
 
 
 class ColmapDataManager(RecordedDataManager):
-    """Reads images posed by COLMAP, or by anything that writes its sparse models (docs/layouts/colmap.md)."""
+    """Reads images with a COLMAP sparse model (docs/layouts/colmap.md)."""
 
     Settings = ColmapSettings
 
@@ -75,7 +74,7 @@ class ColmapDataManager(RecordedDataManager):
     @classmethod
     def recognise(cls, path: Path) -> str | None:
         """See :class:`DataManager`."""
-        # nerfstudio keeps the model it was made from; its own poses are in transforms.json.
+        # A nerfstudio scene may contain its COLMAP model, but its poses are in transforms.json.
         found = [] if (path / "transforms.json").is_file() else find_models(path)
         return f"a sparse model in {found[0].relative_to(path).as_posix()}" if found else None
 
@@ -86,13 +85,13 @@ class ColmapDataManager(RecordedDataManager):
             raise InputError(f"no folder {path}", "a folder with images/ and sparse/0", "Check the path")
         model = read_model(self._model_folder(path))
         paths = _image_paths(path / settings.images_folder, model)
-        masks = [beside(path / "masks", image.name, (".png",)) for image in model.images]
+        masks = [sidecar_file(path / "masks", image.name, (".png",)) for image in model.images]
         depths = _depths(path / "depths", model)
         rectifications = self._rectifications(model)
         names = short_names([image.name for image in model.images])
-        others = others_beside(paths, (*masks, *depths))
-        warn_of_others(model.files[1], others)
-        seen = seen_marks(path / "truth", len(paths), complete=not others)
+        others = unposed_images(paths, (*masks, *depths))
+        warn_of_unposed(model.files[1], others)
+        seen = find_seen_masks(path / "truth", len(paths), complete=not others)
         shots, used = [], 0
         for index, image in enumerate(model.images):
             camera_to_world = model.camera_to_world[index].copy()
@@ -166,7 +165,7 @@ class ColmapDataManager(RecordedDataManager):
     def _sparse_depth(
         self, model: Model, image: RegisteredImage, camera_to_world: np.ndarray, rectification: Rectification
     ) -> SparseDepth | None:
-        """Depth where the points project to, which many images agree on, not where this one image saw them."""
+        """z-depth of the image's points at their projections (not at the observed keypoints)."""
         settings, lens = self.settings, model.cameras[image.camera]
         points = model.positions[image.points] * settings.scale
         local = (points - camera_to_world[:3, 3]) @ camera_to_world[:3, :3]
@@ -181,7 +180,7 @@ class ColmapDataManager(RecordedDataManager):
                 & (pixels[:, 1] < rectification.height)
             )
         kept &= model.track_lengths[image.points] >= settings.min_track_length
-        # A point that was seen twice in one image still has one depth there.
+        # One depth per point, even if the image observes it twice.
         kept[kept] = _first_of_each(image.points[kept])
         if not kept.any():
             return None
@@ -221,7 +220,7 @@ def _depths(folder: Path, model: Model) -> list[Path | None]:
     """Depth files of all images, or of none."""
     if not folder.is_dir():
         return [None] * len(model.images)
-    depths = [beside(folder, image.name, _DEPTH_SUFFIXES) for image in model.images]
+    depths = [sidecar_file(folder, image.name, _DEPTH_SUFFIXES) for image in model.images]
     missing = [image.name for image, depth in zip(model.images, depths, strict=True) if depth is None]
     if missing:
         raise InputError(

@@ -1,4 +1,4 @@
-"""Writing nerfstudio's layout, through OpenCV's lens (docs/layouts/nerfstudio.md)."""
+"""Writes nerfstudio's layout with OpenCV's lens model (docs/layouts/nerfstudio.md)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def write_frame(
         index: Of the frame, counted from 0.
         image: RGB, as the lens shows it. [H, W, 3]
         z_depth: Scene units; 0 where unknown. [H, W]
-        depth_unit: Scene units in a step of the 16 bits.
+        depth_unit: Scene units per 16-bit step.
     """
     write_image(folder / "images" / _name(index), image)
     steps = np.rint(z_depth / depth_unit).clip(0.0, 65535.0)

@@ -1,4 +1,4 @@
-"""Finding what belongs to a scene in TUM's RGB-D form: images, depth, trajectory and intrinsics."""
+"""Finding the files of a scene in TUM's RGB-D layout: images, depth, trajectory and intrinsics."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class CameraFile:
 
 
 def recognise(folder: Path) -> str | None:
-    """What in the folder says that it is such a scene; None where nothing does."""
+    """The files that identify this layout; None if the folder has another one."""
     images = next((name for name in IMAGE_FOLDERS if (folder / name).is_dir()), None)
     trajectory = next((path for path in _trajectories(folder) if tum.recognise(path)), None)
     if images is None or trajectory is None:
@@ -62,10 +62,10 @@ def recognise(folder: Path) -> str | None:
 
 
 def find_images(folder: Path) -> list[Path]:
-    """The colour images, in no order.
+    """The colour images, unordered.
 
     Raises:
-        InputError: There is no folder of images, or more than one, or it holds none.
+        InputError: There is no folder of images, or more than one, or it is empty.
     """
     if not folder.is_dir():
         raise InputError(f"no folder {folder}", EXPECTED, "Check the path")
@@ -79,7 +79,7 @@ def find_images(folder: Path) -> list[Path]:
 
 
 def find_depths(folder: Path) -> list[Path]:
-    """The depth files, in no order; none where there is no folder of them.
+    """The depth files, unordered; empty without a folder of them.
 
     Raises:
         InputError: There is more than one such folder.
@@ -89,7 +89,7 @@ def find_depths(folder: Path) -> list[Path]:
 
 
 def find_masks(folder: Path, images: Sequence[Path]) -> dict[str, Path]:
-    """Masks by the stem of their image; none where there is no folder of them.
+    """Mask files by the stem of their image; empty without a folder of them.
 
     Raises:
         InputError: There is more than one such folder, or an image has no mask.
@@ -109,7 +109,7 @@ def find_masks(folder: Path, images: Sequence[Path]) -> dict[str, Path]:
 
 
 def lacks_trajectory(folder: Path) -> bool:
-    """Whether a folder holds images and depth in this form, and nothing that may be their poses."""
+    """Whether a folder holds images, depth and intrinsics in this layout, but no trajectory."""
     return (
         folder.is_dir()
         and any((folder / name).is_dir() for name in IMAGE_FOLDERS)
@@ -123,27 +123,27 @@ def find_trajectory(folder: Path, named: str | None) -> Path:
     """The trajectory file.
 
     Args:
-        folder: Of the scene.
-        named: Its name, where the user gives one; relative to the folder, or absolute.
+        folder: Folder of the scene.
+        named: File name given by the user, relative to the folder or absolute; None: search for it.
 
     Raises:
-        InputError: There is none, or more than one and none is named.
+        InputError: There is none, or there are several and none is given.
     """
     if named is not None:
         if not (folder / named).is_file():
-            raise InputError(f"no file {folder / named}", "a TUM trajectory", "Mend the option trajectory")
+            raise InputError(f"no file {folder / named}", "a TUM trajectory", "Correct the option trajectory")
         return folder / named
     found = _trajectories(folder)
     if not found:
         raise InputError(
             f"{folder} has images but no {' or '.join(TRAJECTORIES)}",
             EXPECTED,
-            "Add it, or let coliags poses track find one from depth",
+            "Add it, or estimate one from depth by coliags poses track",
         )
     if len(found) > 1:
         raise InputError(
             f"{folder} has the trajectories {', '.join(path.name for path in found)}",
-            "one",
+            "one trajectory",
             f"Choose with the option trajectory, for instance --set datamanager.trajectory={found[0].name}",
         )
     return found[0]
@@ -166,16 +166,16 @@ def find_camera(folder: Path, image: Path) -> CameraFile:
 
 
 def find_mesh(folder: Path) -> Path | None:
-    """The only OBJ file of the folder; None where there is none, or several."""
+    """The OBJ file of the folder; None if there is none or several."""
     found = sorted(folder.glob("*.obj"))
     return found[0] if len(found) == 1 else None
 
 
 def read_obj_points(path: Path) -> PointCloud:
-    """The vertices of an OBJ file, and their colours where every vertex has one behind its position, from 0 to 1.
+    """Read the vertices of an OBJ file, and their colours (0 to 1 behind the position) if all have one.
 
     Raises:
-        InputError: The file cannot be read, or a vertex line holds no three or six numbers.
+        InputError: The file cannot be read, or a vertex line does not hold three or six numbers.
     """
     rows: list[list[float]] = []
     for number, line in enumerate(read_text(path, "an OBJ file").splitlines(), start=1):
@@ -199,7 +199,9 @@ def _only(folder: Path, names: tuple[str, ...]) -> Path | None:
     found = [folder / name for name in names if (folder / name).is_dir()]
     if len(found) > 1:
         raise InputError(
-            f"{folder} holds {' and '.join(f'{path.name}/' for path in found)}", "one of them", "Move the other away"
+            f"{folder} holds {' and '.join(f'{path.name}/' for path in found)}",
+            "only one of them",
+            "Move the other away",
         )
     return found[0] if found else None
 

@@ -31,7 +31,7 @@ def list_images(folder: Path) -> list[Path]:
     if len(found) < 2:
         raise InputError(
             f"{folder} holds {len(found)} images",
-            f"two at least ({', '.join(IMAGE_SUFFIXES)})",
+            f"at least two ({', '.join(IMAGE_SUFFIXES)})",
             f"Give the folder of the frames; from a video, {_FFMPEG}",
         )
     return [found[index] for index in natural_order([path.name for path in found])]

@@ -160,7 +160,7 @@ def reconstruct(
     settings = settings or SfmSettings()
     images = tuple(images)
     if len(images) < 2:
-        raise InputError(f"{len(images)} images", "two at least", "Give more of the video")
+        raise InputError(f"{len(images)} images", "at least two", "Give more of the video")
     with quiet_colmap(settings.seed):
         features, sizes = _features(images, settings, masks, progress)
         cameras = _cameras(settings.camera, images, sizes)

@@ -160,7 +160,7 @@ def triangulate(
     settings = settings or TriangulationSettings()
     if len(frames) < 2:
         raise InputError(
-            f"{len(frames)} frames", "two at least, from different camera positions", "Give more of the video"
+            f"{len(frames)} frames", "at least two, from different camera positions", "Give more of the video"
         )
     centers = np.stack([frame.camera.center.cpu().double().numpy() for frame in frames])
     if not np.ptp(centers, axis=0).max() > 0.0:
