@@ -14,7 +14,7 @@ from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, Wall
 from coliags_plugin.poses.colmap import colmap_poses, posed_model
 from coliags_plugin.poses.rigid import inverse
 
-#: A feature detector finds a point in one of so many of the images that show it.
+#: A point is observed in one of this many images that show it, like a detected feature.
 _FOUND_IN_ONE_OF = 3
 
 
