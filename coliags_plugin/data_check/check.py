@@ -15,8 +15,8 @@ from coliags_plugin.data_check.facts import (
     PathFacts,
     depth_facts,
     image_facts,
-    looked_at,
     path_facts,
+    sampled_frames,
     video_of,
 )
 from coliags_plugin.data_check.findings import Finding
@@ -77,7 +77,7 @@ def check_scene(scene: Scene, progress: Progress | None = None) -> SceneCheck:
         progress: Called during the comparison of frames.
     """
     video = video_of(scene)
-    looked = looked_at(video)
+    looked = sampled_frames(video)
     pairs = video_pairs(video)
     with_depth = [Pair(a, b) for a, b in pairs if a.depth is not None and b.depth is not None]
     readings, scale, matched = {}, None, {}

@@ -52,7 +52,7 @@ class ImageFacts:
     repeated: tuple[str, ...]
 
 
-def looked_at(frames: Sequence[Frame]) -> list[Frame]:
+def sampled_frames(frames: Sequence[Frame]) -> list[Frame]:
     """Evenly spaced sample of the frames, at most 64."""
     places = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), _LOOKED_AT)).astype(int))
     return [frames[place] for place in places]

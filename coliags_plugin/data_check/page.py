@@ -53,10 +53,10 @@ def _readings(check: SceneCheck) -> str:
         return ""
     apart = abs(check.pairs[0][1].index - check.pairs[0][0].index) if check.pairs else 0
     note = (
-        f"Each of {len(check.pairs)} frames is carried into the frame {apart} later by depth, poses and calibration; "
-        "medians over all pixels. Where the poses as given are not the best row, they are suspect."
+        f"Each of {len(check.pairs)} frames is reprojected {apart} frames ahead by depth, poses and calibration; "
+        "medians over all pixels. If the given poses are not the best row, they are suspect."
         if check.agreement
-        else f"Features of {len(check.pairs)} pairs of frames, {apart} apart, matched: there is no depth to carry over."
+        else f"Matched features of {len(check.pairs)} pairs of frames, {apart} apart, as there is no depth."
     )
     return f'<section><h2>Agreement</h2><p class="hint">{escape(note)}</p>{table(head, rows)}</section>'
 
@@ -69,9 +69,9 @@ def _images(check: SceneCheck) -> str:
         if source.depth is not None and target.depth is not None:
             painted, shown = warp_image(source, target)
             canvas = torch.where(shown[..., None], painted, torch.full_like(painted, 0.5))
-            cells.append(_cell((canvas * 255).round().byte().numpy(), f"{target.name} painted from {source.name}"))
+            cells.append(_cell((canvas * 255).round().byte().numpy(), f"{target.name} warped from {source.name}"))
             mixed = torch.where(_checkered(shown)[..., None], canvas, target.rgb.double())
-            cells.append(_cell((mixed * 255).round().byte().numpy(), "both, in squares: edges must go on"))
+            cells.append(_cell((mixed * 255).round().byte().numpy(), "checkerboard of both: edges must be continuous"))
             error = colorize_rgb_error(painted.float(), target.rgb, shown)
             cells.append(_cell(error, "difference, black 0 to yellow 20 % of full scale"))
         if target.depth is not None:
@@ -83,7 +83,7 @@ def _images(check: SceneCheck) -> str:
                 cells.append(_cell(colorize_depth(depth, (low, max(high, low * 1.001))), title))
         parts.append(f"<h3>{escape(source.name)} and {escape(target.name)}</h3>")
         parts.append(f'<div class="view" style="--cells: 3">{"".join(cells)}</div>')
-    return f"<section><h2>Frames in one another</h2>{''.join(parts)}</section>" if parts else ""
+    return f"<section><h2>Reprojected frames</h2>{''.join(parts)}</section>" if parts else ""
 
 
 def _checkered(shown: torch.Tensor) -> torch.Tensor:

@@ -66,7 +66,7 @@ def reading_rows(check: SceneCheck) -> tuple[list[str], list[list[str]]]:
             "depth error, %",
             "depth error, mm",
             "colour error, grey levels",
-            "lands in the image, %",
+            "projects into the image, %",
         ]
         rows = [
             [

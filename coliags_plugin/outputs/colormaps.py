@@ -214,7 +214,7 @@ def side_by_side(
     for label, array in zip(labels, arrays, strict=True):
         column = sheet[:, x : x + array.shape[1]]
         column[band:] = array
-        # Drawn into a strip of its own, so that a label cannot overlap the next one.
+        # Drawn into a separate strip, so that a label cannot overlap the next one.
         strip = np.ascontiguousarray(column[:band])
         _text(strip, _shortened(label, array.shape[1] - 4, scale), (2, 16), scale)
         column[:band] = strip

@@ -97,7 +97,7 @@ def write_depth_tiff(path: Path, depth_mm: Float32[np.ndarray, "H W"] | Tensor) 
     """
     depth = as_array(depth_mm)
     if depth.ndim != 2 or depth.size == 0 or not np.issubdtype(depth.dtype, np.floating):
-        raise InputError(f"{path} was to hold {_kind(depth)}", "a depth map: floating point, [H, W]")
+        raise InputError(f"cannot write {_kind(depth)} to {path}", "a depth map: floating point, [H, W]")
     # cv2's default, LZW with a floating-point predictor, is not read by many libraries (tifffile needs a plug-in).
     options = [cv2.IMWRITE_TIFF_COMPRESSION, _TIFF_DEFLATE, cv2.IMWRITE_TIFF_PREDICTOR, _TIFF_NO_PREDICTOR]
     atomic_write(path, encode_image(depth.astype(np.float32), ".tiff", options))

@@ -93,9 +93,9 @@ def _views(image: np.ndarray, paths: tuple[np.ndarray, np.ndarray], unit: str) -
         panel = _Panel(left, 70, width, height, edges)
         _axes(image, panel, f"z [{unit}]", name.format(unit))
         for path, (_, color, thickness, radius) in zip(paths, _STYLES, strict=True):
-            placed = panel.place(path[:, [2, axis]])
-            _line(image, placed, color, thickness)
-            cv2.circle(image, _fixed(placed[:1])[0], radius << _BITS, color, thickness, cv2.LINE_AA, _BITS)
+            pixels = panel.place(path[:, [2, axis]])
+            _line(image, pixels, color, thickness)
+            cv2.circle(image, _fixed(pixels[:1])[0], radius << _BITS, color, thickness, cv2.LINE_AA, _BITS)
 
 
 def _errors(image: np.ndarray, box: tuple[int, int, int, int], errors: np.ndarray, y_label: str, x_label: str) -> None:

@@ -1,7 +1,7 @@
-"""COLMAP's sparse models, binary and text; here only their poses.
+"""Reads and writes the poses of COLMAP's binary and text sparse models.
 
-Poses are read without pycolmap: it wants files that poses do not need, names no line, and a binary file cut short makes
-it abort the whole process (4.2.1), which nothing here could turn into a message. Models are written with it.
+Poses are read without pycolmap, which requires further files, names no line in errors, and aborts the process on a
+truncated binary file (4.2.1). Models are written with it.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder
 from coliags_plugin.poses.format import Format
 from coliags_plugin.poses.rigid import inverse, rigid, rotations_from_wxyz, wxyz_from_rotations
-from coliags_plugin.poses.text import placed, read_text, shortened
+from coliags_plugin.poses.text import prefixed_errors, read_text, shortened
 from coliags_plugin.poses.trajectory import Intrinsics, Trajectory, natural_order, refuse_repeated
 
 if TYPE_CHECKING:
     import pycolmap
 
-#: Models without distortion by COLMAP's number, with the number of their parameters.
+#: Models without distortion by COLMAP's ID, with the number of their parameters.
 _PINHOLES = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4)}
 _PARTS = ("cameras", "images", "points3D", "rigs", "frames")
-#: What a folder may hold that a model takes the place of.
+#: Files in a folder that writing a model may replace.
 _MODEL_FILES = {f"{part}{suffix}" for part in _PARTS for suffix in (".bin", ".txt")} | {"project.ini"}
 _BINARY_IMAGE = struct.Struct("<I7dI")
 _POINT_BYTES = 24
@@ -51,7 +51,7 @@ def read(path: Path) -> Trajectory:
 
     Raises:
         InputError: The files are missing, damaged or empty; or a quaternion is zero or further than 1e-3 from unit
-            length, naming its line or image; or an image is repeated.
+            length (the message names the line or image); or an image is repeated.
     """
     suffix = _suffix(path)
     if suffix is None:
@@ -95,7 +95,7 @@ def write_text(path: Path, trajectory: Trajectory) -> None:
     """Write a text model of one PINHOLE camera and no points; as :func:`write`.
 
     Raises:
-        InputError: As :func:`write`; or a name has blanks, which COLMAP's own reader would cut off.
+        InputError: As :func:`write`; or a name has blanks, which COLMAP's reader would truncate.
     """
     for name in trajectory.names_or_numbers():
         if name.split() != [name]:
@@ -131,15 +131,15 @@ def posed_model(
     world_to_camera: Sequence[pycolmap.Rigid3d],
     names: Sequence[str],
     cameras: Sequence[Intrinsics],
-    taken_by: Sequence[int],
+    camera_indices: Sequence[int],
 ) -> pycolmap.Reconstruction:
     """A model of posed images without points: image i becomes COLMAP's image i + 1, camera k its camera k + 1.
 
     Args:
-        world_to_camera: Of each image, OpenCV axes.
-        names: Of the images.
+        world_to_camera: World-to-camera transforms of the images, OpenCV axes.
+        names: Image names.
         cameras: Undistorted pinholes.
-        taken_by: Which of them took each image.
+        camera_indices: Camera index of each image.
     """
     import pycolmap
 
@@ -149,7 +149,7 @@ def posed_model(
         model.add_camera_with_trivial_rig(
             pycolmap.Camera(camera_id=number, model="PINHOLE", width=k.width, height=k.height, params=params)
         )
-    for index, (pose, name, camera) in enumerate(zip(world_to_camera, names, taken_by, strict=True)):
+    for index, (pose, name, camera) in enumerate(zip(world_to_camera, names, camera_indices, strict=True)):
         image = pycolmap.Image(name=name, camera_id=camera + 1, image_id=index + 1)
         model.add_image_with_trivial_frame(image, pose)
     return model
@@ -165,7 +165,7 @@ def _write(path: Path, trajectory: Trajectory, text: bool) -> None:
     refuse_repeated(trajectory.names_or_numbers(), str(path))
     others = sorted(found.name for found in path.iterdir() if found.name not in _MODEL_FILES) if path.is_dir() else []
     if others:
-        raise InputError(f"{path} holds {others[0]}, which is no part of a COLMAP model", "a folder to itself")
+        raise InputError(f"{path} holds {others[0]}, which is not part of a COLMAP model", "an empty or new folder")
     names = trajectory.names_or_numbers()
     model = posed_model(colmap_poses(trajectory.camera_to_world), names, [trajectory.intrinsics], [0] * len(names))
     with atomic_folder(path, overwrite=True) as scratch:
@@ -188,17 +188,17 @@ def _text_images(path: Path) -> Iterator[_Image]:
             raise InputError(
                 f"{place}: '{shortened(line)}'",
                 "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, all numbers finite",
-                "Each image has two lines; the second lists its points and may be empty, but must be there",
+                "Each image has two lines; the second lists its points and may be empty, but must exist",
             ) from error
         yield image
         next(lines, None)  # the image's points
 
 
 def read_text_cameras(path: Path) -> dict[int, Intrinsics | str]:
-    """The cameras of a ``cameras.txt`` by their number: the pinhole each is, or what it is instead, in words.
+    """Read the cameras of a ``cameras.txt`` by ID: the pinhole, or a description of another camera model.
 
     Raises:
-        InputError: The file cannot be read, or a line is no camera; naming the line.
+        InputError: The file cannot be read, or a line is not a camera; the message names the line.
     """
     cameras: dict[int, Intrinsics | str] = {}
     for number, line in enumerate(read_text(path).splitlines(), start=1):
@@ -206,7 +206,7 @@ def read_text_cameras(path: Path) -> dict[int, Intrinsics | str]:
         if not words or words[0].startswith("#"):
             continue
         try:
-            with placed(f"{path}, line {number}"):
+            with prefixed_errors(f"{path}, line {number}"):
                 cameras[int(words[0])] = _camera(words[1], int(words[2]), int(words[3]), [float(w) for w in words[4:]])
         except (ValueError, IndexError) as error:
             raise InputError(
@@ -247,12 +247,12 @@ def _binary_cameras(path: Path) -> dict[int, Intrinsics | str]:
         for _ in range(count):
             number, model, width, height = struct.unpack_from("<IiQQ", data, at)
             if model not in _PINHOLES:
-                # How long its parameters are is not known here, and no pinhole can be common to all images any more.
+                # The number of its parameters is unknown, and the images cannot share one pinhole any more.
                 cameras[number] = f"camera {number} is COLMAP's model {model}"
                 return cameras
             name, parameters = _PINHOLES[model]
             values = struct.unpack_from(f"<{parameters}d", data, at + 24)
-            with placed(f"{path}, camera {number}"):
+            with prefixed_errors(f"{path}, camera {number}"):
                 cameras[number] = _camera(name, width, height, list(values))
             at += 24 + 8 * parameters
     except struct.error as error:
@@ -274,7 +274,7 @@ def _damaged(path: Path, data: bytes) -> InputError:
 
 
 def _camera(model: str, width: int, height: int, parameters: list[float]) -> Intrinsics | str:
-    """The pinhole, or what it is instead."""
+    """The pinhole, or a description of another camera model."""
     if model == "PINHOLE":
         fx, fy, cx, cy = parameters
     elif model == "SIMPLE_PINHOLE":
@@ -286,7 +286,7 @@ def _camera(model: str, width: int, height: int, parameters: list[float]) -> Int
 
 
 def _common(cameras: dict[int, Intrinsics | str], used: set[int]) -> tuple[Intrinsics | None, str]:
-    """The pinhole that took every image; or None, and why there is none."""
+    """The pinhole shared by all images; or None, and the reason."""
     found = [cameras[number] for number in sorted(used) if number in cameras]
     others = [camera for camera in cameras.values() if isinstance(camera, str)]
     if len(found) < len(used) or any(isinstance(camera, str) for camera in found):

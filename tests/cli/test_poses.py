@@ -90,7 +90,7 @@ def test_images_give_names(truth, tmp_path, capsys):
         (("--to", "tum", "--from", "colmap"), "holds no COLMAP model"),
         (("--to", "tum", "--from", "tum"), "line 1:"),
         (("--to", "endogslam"), "no intrinsics"),
-        (("--to", "endogslam-truth"), "is only read"),
+        (("--to", "endogslam-truth"), "is read-only"),
         (("--to", "colmap", "--size", "64x48"), "--size without --intrinsics"),
         (("--to", "colmap", "--intrinsics", "1,2,3,4"), "--intrinsics without --size"),
         (("--to", "colmap", "--intrinsics", "1,2,3", "--size", "64x48"), "--intrinsics 1,2,3. Expected four numbers"),

@@ -376,7 +376,7 @@ REFUSED: dict[str, Rows] = {
             PARAMS,
             lambda name, kind: (
                 change_npz(PARAMS[name], lambda arrays: arrays["cam_unnorm_rots"][..., 3].fill(0.0)),
-                (r"params\.npz, cam_unnorm_rots, frame 3: the quaternion \(0, 0, 0, 0\) is no rotation",),
+                (r"params\.npz, cam_unnorm_rots, frame 3: the quaternion \(0, 0, 0, 0\) is not a rotation",),
             ),
         ),
     },

@@ -373,7 +373,7 @@ def test_text_files_that_end_in_rubbish(tmp_path, name):
     [
         (lambda words: ["nan", *words[1:]], r"images\.txt, line 5"),
         (lambda words: [str(2.0 * float(word)) for word in words[:4]] + words[4:], r"a quaternion of length 2"),
-        (lambda words: ["0", "0", "0", "0", *words[4:]], r"is no rotation"),
+        (lambda words: ["0", "0", "0", "0", *words[4:]], r"is not a rotation"),
         (lambda words: [*words[:4], "inf", *words[5:]], r"images\.txt, line 5"),
     ],
     ids=["nan", "not of unit length", "zero", "infinite"],

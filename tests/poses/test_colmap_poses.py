@@ -75,7 +75,7 @@ def test_points_in_images_txt_may_be_missing_or_blank_but_keep_their_line(tmp_pa
     [
         ("1 1 0 0 0 5 6 1 b.png", "line 2: '1 1 0 0 0 5 6 1 b.png'. Expected IMAGE_ID QW"),
         ("1 2 0 0 0 5 6 7 1 b.png", "line 2: a quaternion of length 2"),
-        ("1 0 0 0 0 5 6 7 1 b.png", "line 2: the quaternion .* is no rotation"),
+        ("1 0 0 0 0 5 6 7 1 b.png", "line 2: the quaternion .* is not a rotation"),
         ("1 1 0 0 0 nan 6 7 1 b.png", "line 2: .*nan"),
     ],
 )

@@ -117,7 +117,7 @@ def test_one_message_names_every_fault(tmp_path):
         "rgb_colors has the shape [7, 4], not [N, 3]",
         "log_scales holds numbers that are not finite",
         "org_width holds <U4, not numbers",
-        "keyframe_time_indices is no array of numbers",
+        "keyframe_time_indices is not an array of numbers",
     ):
         assert fault in str(caught.value)
 
@@ -125,7 +125,7 @@ def test_one_message_names_every_fault(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"cam_unnorm_rots": np.zeros((1, 4, FRAMES))}, "cam_unnorm_rots, frame 0: the quaternion .* is no rotation"),
+        ({"cam_unnorm_rots": np.zeros((1, 4, FRAMES))}, "cam_unnorm_rots, frame 0: the quaternion .* is not a rotation"),
         ({"gt_w2c_all_frames": 2.0 * winding(FRAMES).camera_to_world}, "gt_w2c_all_frames, frame 0: not a rigid"),
         ({"cam_unnorm_rots": np.ones((1, 4, 0)), "cam_trans": np.ones((1, 3, 0)),
           "gt_w2c_all_frames": np.ones((0, 4, 4))}, "no frames"),

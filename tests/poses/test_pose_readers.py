@@ -53,7 +53,7 @@ def test_quaternions_by_the_formula(numbers):
 
 @pytest.mark.parametrize("quat", [[0, 0, 0, 0], [1e-12, 0, 0, 0], [np.nan, 0, 0, 1], [np.inf, 0, 0, 0]])
 def test_what_is_no_rotation_is_refused(quat):
-    with pytest.raises(InputError, match=r"frame 1: the quaternion .* is no rotation"):
+    with pytest.raises(InputError, match=r"frame 1: the quaternion .* is not a rotation"):
         rotations_from_wxyz(np.array([[1, 0, 0, 0], quat], float), lambda index: f"frame {index}", unit=False)
 
 
@@ -80,7 +80,7 @@ def test_tum_is_camera_to_world_with_w_last(tmp_path):
 @pytest.mark.parametrize(
     ("row", "message"),
     [
-        ([1, 1, 2, 3, 0, 0, 0, 0], "line 4: the quaternion .* is no rotation"),
+        ([1, 1, 2, 3, 0, 0, 0, 0], "line 4: the quaternion .* is not a rotation"),
         ([1, 1, 2, 3, 0, 0, 0, 1.01], "line 4: a quaternion of length 1.01. Expected length 1 within 0.001"),
         ([1, 1, 2, 3, 0, 0, 1], "line 4: '1.0 1.0 2.0 3.0 0.0 0.0 1.0'. Expected 8 finite numbers"),
         ([1, np.nan, 2, 3, 0, 0, 0, 1], "line 4: .*nan"),
@@ -234,7 +234,7 @@ def test_broken_transforms_are_refused(tmp_path, text, message):
     ("content", "message"),
     [
         ({"applied_transform": [[1, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 0]]}, "applied_transform: not a rigid transform"),
-        ({"applied_transform": "x"}, "applied_transform is no matrix"),
+        ({"applied_transform": "x"}, "applied_transform is not a matrix"),
         ({"applied_scale": 0}, "applied_scale is 0"),
         ({"applied_scale": True}, "applied_scale is True"),
         ({**PINHOLE, "fl_x": "long"}, "fl_x is 'long'"),

@@ -68,8 +68,8 @@ class Align:
         kind, reference = read_and_log(self.reference, self.reference_format)
         unit = self.unit or kind.unit
         matches = associate(estimate, reference, self.match, self.tolerance)
-        if matches.passed_over:
-            log.warning("matched by %s, though names or times do not (%s)", matches.by, "; ".join(matches.passed_over))
+        if matches.skipped:
+            log.warning("matched by %s, though names or times do not (%s)", matches.by, "; ".join(matches.skipped))
         result = align(estimate, reference, matches, self.scale, self.delta)
         print(
             f"{len(matches)} frames matched by {matches.by}, of {len(estimate)} estimated and {len(reference)} "

@@ -46,7 +46,7 @@ def parse_intrinsics(intrinsics: str | None, size: str | None) -> Intrinsics | N
     Raises:
         InputError: Only one is given, or one has another form.
     """
-    from coliags_plugin.poses.text import placed
+    from coliags_plugin.poses.text import prefixed_errors
     from coliags_plugin.poses.trajectory import Intrinsics
 
     if intrinsics is None and size is None:
@@ -58,7 +58,7 @@ def parse_intrinsics(intrinsics: str | None, size: str | None) -> Intrinsics | N
         fx, fy, cx, cy = (float(part) for part in intrinsics.split(","))
     except ValueError as error:
         raise InputError(f"--intrinsics {intrinsics}", "four numbers fx,fy,cx,cy in pixels") from error
-    with placed("--intrinsics, --size"):
+    with prefixed_errors("--intrinsics, --size"):
         return Intrinsics(fx, fy, cx, cy, *parse_size(size))
 
 
