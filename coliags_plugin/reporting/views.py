@@ -107,7 +107,7 @@ def read_views(runs: Sequence[EvaluatedRun], count: int) -> Views:
 
     Args:
         runs: Runs evaluated on the same frames.
-        count: Frames per set; a smaller set is shown whole.
+        count: Frames per set; all of a smaller set.
 
     Raises:
         InputError: ``count`` is not positive; or an image is missing, damaged, or not of the ground truth's size.
@@ -142,7 +142,7 @@ def read_views(runs: Sequence[EvaluatedRun], count: int) -> Views:
 
 
 def evenly(length: int, count: int) -> list[int]:
-    """``count`` indices spread evenly over ``length``, first and last included; the middle one for one."""
+    """``count`` evenly spaced indices below ``length``, first and last included; the middle one if ``count`` is 1."""
     if count >= length:
         return list(range(length))
     if count == 1:
@@ -222,7 +222,7 @@ def _reduced_rgb(rgb: np.ndarray, reduction: int) -> np.ndarray:
 
 
 def _reduced_map(values: np.ndarray, reduction: int) -> np.ndarray:
-    """Subsampled map: averaging across an edge would give depths of no surface."""
+    """Subsampled map: averaging across an edge would mix depths of different surfaces."""
     height, width = values.shape[0] // reduction, values.shape[1] // reduction
     middle = reduction // 2
     return values[middle::reduction, middle::reduction][:height, :width]

@@ -66,8 +66,8 @@ def test_convert_says_what_it_read_and_what_it_lost(truth, tmp_path, caplog):
     assert "c3vd (camera-to-world matrices, column-major); 20 poses, path" in said
     assert "mean step" in said
     assert "mean looking direction (" in said
-    assert "the input names no images: called 0000.png" in said
-    assert "tum keeps no names: left behind" in said
+    assert "the input has no image names: using 0000.png" in said
+    assert "tum does not store names: dropped" in said
     assert "no timestamps: frame numbers stand in" in said
 
 

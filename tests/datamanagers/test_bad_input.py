@@ -458,7 +458,7 @@ REFUSED: dict[str, Rows] = {
         "colmap": (cut("sparse/0/points3D.bin"), (r"points3D\.bin \(\d+ bytes\) is damaged or cut short",)),
         "colmap-text": (
             _cut_after_lines("sparse/0/points3D.txt", 100),
-            (r"points3D\.txt has 97 points, but none is \d+",),
+            (r"points3D\.txt has 97 points, but not \d+",),
         ),
         "rotatecolon": (cut("init_point_cloud.ply"), (r"init_point_cloud\.ply says it has \d+ vertices, but holds",)),
         "reim-nerf": (cut("rgb_mask.png"), (r"rgb_mask\.png \(\d+ bytes\) cannot be decoded",)),
@@ -492,7 +492,7 @@ REFUSED: dict[str, Rows] = {
         TUM,
         lambda name, kind: (
             change_json("camera.json", lambda content: content.pop("depth_scale")),
-            ("nothing says how many of their steps", "5000 steps a metre", "depth_scale=5000"),
+            ("their number of steps per unit", "5000 steps per metre", "depth_scale=5000"),
         ),
     ),
 }

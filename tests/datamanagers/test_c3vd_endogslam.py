@@ -262,7 +262,7 @@ class TestPoses:
         # Stopped early: the remaining poses are as they were initialised.
         write_params(mine / "params.npz", training(10), lambda pose: np.where(_late(pose), np.eye(4), pose))
         load(mine)
-        assert "lost its way, or was stopped early" in caplog.text and "params.npz" in caplog.text
+        assert "tracking failed or stopped early" in caplog.text and "params.npz" in caplog.text
 
     def test_params_file_may_be_named(self, mine, tmp_path):
         elsewhere = write_params(tmp_path / "experiments" / "x.npz", training(10), drift)

@@ -432,7 +432,7 @@ def test_a_model_without_points_says_what_is_missing(tmp_path):
     model = pycolmap.Reconstruction(str(tmp_path / "sparse/0"))
     model.delete_all_points2D_and_points3D()
     model.write_binary(str(tmp_path / "sparse/0"))
-    with pytest.raises(InputError, match="initial points"):
+    with pytest.raises(InputError, match="points for the initial Gaussians"):
         load(tmp_path)
     assert all(shot.sparse_depth is None for shot in opened(tmp_path).shots)
 

@@ -314,7 +314,7 @@ def test_the_fingerprint_sees_the_file(folder):
         ({"ply_file_path": "gone.ply"}, r"no file .*gone\.ply"),
         ({"depth_unit_scale_factor": 0}, "depth_unit_scale_factor is 0"),
         ({"train_filenames": ["images/frame_0001.png"]}, r"train_filenames names .*Did you mean"),
-        ({"train_filenames": "all"}, "train_filenames is no list"),
+        ({"train_filenames": "all"}, "train_filenames is not a list"),
         (
             {"train_filenames": ["images/frame_00001.png"], "test_filenames": ["images/frame_00001.png"]},
             "is in train_filenames and test_filenames",

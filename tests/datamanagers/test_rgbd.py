@@ -293,7 +293,7 @@ class TestOrder:
         (my_numbered / "groundtruth.txt").write_text("\n".join(lines[:6] + lines[7:]) + "\n")
         for part in ("rgb", "depth"):
             (my_numbered / part / "7.png").unlink()
-        with pytest.raises(InputError, match=r"pose 5 is of time 6, but image 5 is 5.png"):
+        with pytest.raises(InputError, match=r"pose 5 has timestamp 6, but image 5 is 5.png"):
             load(my_numbered)
         assert len(everything(load(my_numbered, association="order"))) == 11
         scene = load(my_numbered, association="time")
@@ -324,7 +324,7 @@ class TestDepthScale:
         return folder
 
     def test_is_never_guessed(self, mine):
-        with pytest.raises(InputError, match=r"nothing says how many of their steps.*5000"):
+        with pytest.raises(InputError, match=r"their number of steps per unit.*5000"):
             load(self.without_scale(mine))
 
     def test_from_the_option(self, mine):

@@ -86,7 +86,7 @@ def test_a_folder_without_poses(tmp_path):
     assert [frame.name for frame in scene.train] == ["0000", "0001", "0002", "0003"]
     assert all(torch.equal(frame.camera.camera_to_world.double(), torch.eye(4).double()) for frame in scene.train)
     assert scene.provenance["pose_convention"] is None
-    with pytest.raises(InputError, match=r"Add it, or let coliags poses track find one"):
+    with pytest.raises(InputError, match=r"Add it, or estimate one from depth by coliags poses track"):
         RGBDDataManager(SETTINGS).load(folder)
     for name in ("rgb", "depth"):
         for path in (folder / name).iterdir():

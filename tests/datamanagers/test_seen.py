@@ -120,4 +120,4 @@ def test_images_without_a_pose_put_masks_out_of_step(folders, tmp_path, layout, 
     shutil.copy(first, first.with_name("0099.png"))
     with caplog.at_level(logging.WARNING):
         assert all(frame.seen is None for frame in apart(load(folder)))
-    assert len(warnings(caplog)) == 1 and "are for all images; some are left out" in caplog.text
+    assert len(warnings(caplog)) == 1 and "are for all images, but some are left out" in caplog.text

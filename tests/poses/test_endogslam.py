@@ -125,7 +125,7 @@ def test_one_message_names_every_fault(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"cam_unnorm_rots": np.zeros((1, 4, FRAMES))}, "cam_unnorm_rots, frame 0: the quaternion .* is not a rotation"),
+        ({"cam_unnorm_rots": np.zeros((1, 4, FRAMES))}, "cam_unnorm_rots, frame 0: the quaternion .* not a rotation"),
         ({"gt_w2c_all_frames": 2.0 * winding(FRAMES).camera_to_world}, "gt_w2c_all_frames, frame 0: not a rigid"),
         ({"cam_unnorm_rots": np.ones((1, 4, 0)), "cam_trans": np.ones((1, 3, 0)),
           "gt_w2c_all_frames": np.ones((0, 4, 4))}, "no frames"),

@@ -458,7 +458,7 @@ def test_what_is_missing_is_refused(tmp_path):
         ("metrics.jsonl", "3\n", "line 1 holds a int"),
         ("eval/paper/per_frame.csv", "set,frame,psnr\n", "lists no frames"),
         ("eval/paper/per_frame.csv", "set,frame,psnr\ntest,0001,many\n", "cannot be read"),
-        ("eval/paper/per_frame.csv", "frame,psnr\n0001,3\n", "line 2 names no set"),
+        ("eval/paper/per_frame.csv", "frame,psnr\n0001,3\n", "line 2 has no set"),
         ("eval/paper/truth/test/0004.png", "x", r"truth/test/0004\.png cannot be decoded"),
         ("eval/paper/depth/test/0004.tiff", "x", r"depth/test/0004\.tiff cannot be decoded"),
     ],

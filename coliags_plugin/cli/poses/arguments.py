@@ -71,7 +71,7 @@ def settings_of(kind: type[S], assignments: Sequence[str], prefix: str = "") -> 
         prefix: Prefix of the keys in messages.
 
     Raises:
-        InputError: An assignment is none, or a key or value is not valid; naming it.
+        InputError: An assignment is malformed, or a key or value is invalid; the message names it.
     """
     from pydantic import ValidationError
 
@@ -79,7 +79,7 @@ def settings_of(kind: type[S], assignments: Sequence[str], prefix: str = "") -> 
 
     tree = override_all(Node({}, "options"), assignments)
     try:
-        # Laid over the defaults, as those of a nested part may differ from the part's own.
+        # Merged with the defaults, as a nested part's defaults may differ from its class's.
         return kind.model_validate(_upon(kind().model_dump(), tree.plain()))
     except ValidationError as error:
         first = error.errors()[0]
@@ -88,7 +88,7 @@ def settings_of(kind: type[S], assignments: Sequence[str], prefix: str = "") -> 
 
 
 def settings_among(kind: type[S], assignments: Sequence[str], prefix: str) -> tuple[S, list[str]]:
-    """Settings from those ``--set`` assignments whose keys begin with a prefix, and the others, which are the data's.
+    """Settings from the ``--set`` assignments with a key prefix, and the others, which are the data manager's.
 
     Raises:
         InputError: See :func:`settings_of`.

@@ -46,7 +46,7 @@ class Convert:
         pinhole = parse_intrinsics(self.intrinsics, self.size)
         _, trajectory = read_and_log(self.input, self.from_format)
         if self.output.exists() and self.output.samefile(self.input):
-            raise InputError(f"{self.output} is the input itself", "another place for the output")
+            raise InputError(f"{self.output} is the input itself", "another output path")
         if pinhole is not None:
             trajectory = replace(trajectory, intrinsics=pinhole)
         if self.images is not None:
@@ -58,11 +58,11 @@ class Convert:
         ]
         write_trajectory(self.output, trajectory, self.to, self.overwrite)
         if lost:
-            log.info("%s keeps no %s: left behind", self.to, ", ".join(lost))
+            log.info("%s does not store %s: dropped", self.to, ", ".join(lost))
         if "names" in target.keeps and trajectory.names is None:
-            log.info("the input names no images: called 0000.png, 0001.png, ...; --images takes their real names")
+            log.info("the input has no image names: using 0000.png, 0001.png, ...; --images takes the real names")
         if "timestamps" in target.keeps and trajectory.timestamps is None:
-            log.info("the input has no timestamps: frame numbers stand in for them")
+            log.info("the input has no timestamps: frame numbers are written instead")
         print(self.output)
 
 

@@ -55,7 +55,7 @@ class Sfm:
         write_sfm_scene(self.out, found, masks, self.overwrite)
         print(
             f"{found.summary()}\n"
-            f"the unit of length is arbitrary: in the median the points are {found.median_depth:.4g} units away; where "
-            "their distance in mm is known, divide it by that and pass --set datamanager.scale=QUOTIENT\n"
+            f"the unit of length is arbitrary: the median depth of the points is {found.median_depth:.4g} units; if it "
+            "is known in mm, divide that by this number and pass --set datamanager.scale=QUOTIENT\n"
             f"{self.out}\n{train_command(self.out, SPARSE_DEPTH)}"
         )
