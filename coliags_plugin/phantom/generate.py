@@ -119,15 +119,15 @@ def prepare(settings: PhantomSettings, progress: Progress | None = None) -> Phan
     Raises:
         InputError: The seed's colon leaves no clearance for the path, or open3d is missing.
     """
-    tell = progress or _silent
+    report = progress or _silent
     layout: Layout = phantom_layouts.get(settings.layout)()
     settings = resolve(settings, layout)
-    tell("colon", 0, 4)
+    report("colon", 0, 4)
     anatomy = grow_anatomy(settings)
     surface = build_surface(anatomy, settings)
-    tell("colon", 1, 4)
+    report("colon", 1, 4)
     mucosa = paint_mucosa(anatomy, surface, settings)
-    tell("colon", 2, 4)
+    report("colon", 2, 4)
     tracer = Tracer(surface)
     lamp = Lamp.of(settings)
     world = World(surface, mucosa, tracer, lamp, value_or_default(settings.vignetting, settings.preset.vignetting))
@@ -146,7 +146,7 @@ def prepare(settings: PhantomSettings, progress: Progress | None = None) -> Phan
             settings.interreflection,
             generator,
         )
-    tell("colon", 3, 4)
+    report("colon", 3, 4)
     lens, mask = layout.lens(*image_size(settings, layout))
     sensor = Sensor.behind(lens, mask, settings.supersampling)
     thin = sensor.subsampled(_METERED)
@@ -154,7 +154,7 @@ def prepare(settings: PhantomSettings, progress: Progress | None = None) -> Phan
     for index, pose in enumerate(poses):
         ideal.append(exposure_for(meter(world, thin, pose, indirect[index]), settings.target_grey, settings.gamma))
     gains = exposures(ideal, settings)[:, None] * white_balances(settings)
-    tell("colon", 4, 4)
+    report("colon", 4, 4)
     return Phantom(settings, layout, world, sensor, poses, views, indirect, gains)
 
 
@@ -177,11 +177,11 @@ def generate(
         InputError: The folder exists or cannot be written, the seed's colon leaves no clearance for the path, or open3d
             is missing.
     """
-    tell = progress or _silent
+    report = progress or _silent
     try:
         with atomic_folder(output, overwrite) as folder:
-            phantom = prepare(settings, tell)
-            _write(phantom, folder, tell)
+            phantom = prepare(settings, report)
+            _write(phantom, folder, report)
             (folder / "phantom.json").write_text(
                 _json({"version": __version__, "settings": phantom.settings.model_dump()})
             )
@@ -191,7 +191,7 @@ def generate(
     _LOG.info("phantom of seed %d written to %s", settings.seed, output)
 
 
-def _write(phantom: Phantom, folder: Path, tell: Progress) -> None:
+def _write(phantom: Phantom, folder: Path, report: Progress) -> None:
     layout, lens, frames = phantom.layout, phantom.sensor.lens, len(phantom.poses)
     rotated = [view.camera_to_world for view in phantom.rotation_views]
     total = frames + len(rotated)
@@ -199,7 +199,7 @@ def _write(phantom: Phantom, folder: Path, tell: Progress) -> None:
     observed = np.zeros(len(phantom.world.surface.triangles), bool)
     trained_on = np.zeros_like(observed)
     drawn = []
-    tell("frames", 0, total)
+    report("frames", 0, total)
     for number, (exposure, color) in enumerate(_rendered_frames(phantom, total)):
         image = phantom.sensor.image
         part: Part = "video" if number < frames else "rotation"
@@ -216,7 +216,7 @@ def _write(phantom: Phantom, folder: Path, tell: Progress) -> None:
         else:
             seen = image(_seen_mask(phantom, exposure, pose))
             write_image(layout.seen_mask(folder, part, index), seen)
-        tell("frames", number + 1, total)
+        report("frames", number + 1, total)
     layout.write_sequence(folder, "video", phantom.poses, lens)
     if rotated:
         layout.write_sequence(folder, "rotation", rotated, lens)
@@ -224,9 +224,9 @@ def _write(phantom: Phantom, folder: Path, tell: Progress) -> None:
         layout.write_points(folder, _wall_points(phantom, drawn), phantom.poses, lens)
     if layout.has_coverage_mesh:
         meshes.write_coverage_obj(folder / "coverage_mesh.obj", phantom.world.surface, observed)
-    tell("truth", 0, 1)
+    report("truth", 0, 1)
     _write_truth(phantom, folder / "truth", trained_on, observed)
-    tell("truth", 1, 1)
+    report("truth", 1, 1)
 
 
 def _rendered_frames(phantom: Phantom, total: int) -> Iterator[tuple[Exposure, UInt8[np.ndarray, "P 3"]]]:

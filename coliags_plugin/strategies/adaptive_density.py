@@ -75,8 +75,11 @@ class AdaptiveDensity(Strategy):
                 f"between steps {self.schedule.at(self.settings.densify_from)} and {self.until}"
             )
         resets = range(reset, self.until, reset)
-        ending = f"resets opacities every {reset} steps until step {resets[-1]}" if resets else "never resets opacities"
-        return f"this run clones, splits and prunes every {every} steps from step {events[0]} to {events[-1]}, and {ending}"
+        resetting = (
+            f"resets opacities every {reset} steps until step {resets[-1]}" if resets else "never resets opacities"
+        )
+        densifying = f"clones, splits and prunes every {every} steps from step {events[0]} to {events[-1]}"
+        return f"this run {densifying}, and {resetting}"
 
     @torch.no_grad()
     def after_backward(self, step: TrainingStep, rows: ParameterRows) -> dict[str, int]:

@@ -406,7 +406,7 @@ PARAMS = {
     "no archive": (lambda f: (f / "params.npz").write_text("PK nonsense"), "cannot read .*params.npz"),
 }
 
-PICTURES = {
+IMAGES = {
     "no poses at all": (lambda f: (f / "pose.txt").unlink(), "no pose.txt"),
     "a gap": (lambda f: (f / "color/0001_color.png").unlink(), "color has 9 images, numbers 0 to 9, but none is 1"),
     "depth for some": (lambda f: (f / "depth/0002_depth.tiff").unlink(), "frame 2 has only one of the two"),
@@ -443,10 +443,10 @@ class TestRefused:
         with pytest.raises(InputError, match=message):
             load(mine)
 
-    @pytest.mark.parametrize("fault", PICTURES)
+    @pytest.mark.parametrize("fault", IMAGES)
     def test_images(self, mine, tmp_path, fault):
         params = write_params(tmp_path / "p.npz", training(10))
-        spoil, message = PICTURES[fault]
+        spoil, message = IMAGES[fault]
         spoil(mine)
         with pytest.raises(InputError, match=message):
             load(mine, params_file=str(params))

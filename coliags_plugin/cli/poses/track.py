@@ -27,7 +27,7 @@ class Track:
     out: Path
     """Folder to create, in the layout of `rgbd`."""
     format: DataFormat = None
-    """How the scene is laid out (`coliags list datamanagers`); default: what its files show."""
+    """Dataset format (`coliags list datamanagers`); default: recognised from the files."""
     set: Assignments = ()
     """An option of the data manager, as width=675, or of tracking, as tracking.method=hybrid."""
     overwrite: bool = False

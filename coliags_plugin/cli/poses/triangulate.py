@@ -27,7 +27,7 @@ class Triangulate:
     out: Path
     """Folder to create, in COLMAP's layout."""
     format: DataFormat = None
-    """How the scene is laid out (`coliags list datamanagers`); default: what its files show."""
+    """Dataset format (`coliags list datamanagers`); default: recognised from the files."""
     set: Assignments = ()
     """An option of the data manager, as width=675, or of triangulation, as triangulation.min_angle=1."""
     overwrite: bool = False

@@ -30,8 +30,8 @@ def write_frame(
     """Write a frame of an undistorted scene (docs/layouts/c3vd.md 3).
 
     Args:
-        folder: Of the scene.
-        index: Of the frame, counted from 0.
+        folder: Folder of the scene.
+        index: Index of the frame, from 0.
         image: RGB. [H, W, 3]
         z_depth: mm, as for :func:`depth_steps`; None where there is none. [H, W]
     """
@@ -50,8 +50,8 @@ def write_raw_frame(
     """Write a frame of the raw release (docs/layouts/c3vd.md 1).
 
     Args:
-        folder: Of the sequence.
-        index: Of the frame, counted from 0.
+        folder: Folder of the sequence.
+        index: Index of the frame, from 0.
         image: RGB, as the lens shows it. [H, W, 3]
         z_depth: mm, as for :func:`depth_steps`. [H, W]
         normals: As for :func:`normal_steps`. [H, W, 3]

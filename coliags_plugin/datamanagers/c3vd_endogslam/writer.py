@@ -22,8 +22,8 @@ def write_frame(folder: Path, index: int, image: UInt8[np.ndarray, "H W 3"], z_d
     """Write an image and its depth in 8 bits, rounded down like EndoGSLAM's script.
 
     Args:
-        folder: Of the sequence.
-        index: Of the frame, counted from 0.
+        folder: Folder of the sequence.
+        index: Index of the frame, from 0.
         image: RGB. [H, W, 3]
         z_depth: mm; 0 where unknown. [H, W]
     """

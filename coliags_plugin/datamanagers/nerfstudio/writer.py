@@ -19,8 +19,8 @@ def write_frame(
     """Write a frame.
 
     Args:
-        folder: Of the scene.
-        index: Of the frame, counted from 0.
+        folder: Folder of the scene.
+        index: Index of the frame, from 0.
         image: RGB, as the lens shows it. [H, W, 3]
         z_depth: Scene units; 0 where unknown. [H, W]
         depth_unit: Scene units per 16-bit step.
@@ -36,7 +36,7 @@ def write_transforms(
     """Write ``transforms.json``.
 
     Args:
-        folder: Of the scene.
+        folder: Folder of the scene.
         camera_to_world: OpenCV axes, scene units. [N, 4, 4]
         lens: Of all frames, at their size, with radial terms up to k2.
         depth_unit: As for :func:`write_frame`.

@@ -41,7 +41,7 @@ class ReimNerfWriter:
         """Write a frame; z-depth is clipped at C3VD's 100 mm.
 
         Args:
-            index: Of the frame, counted from 0.
+            index: Index of the frame, from 0.
             image: RGB, as the lens shows it. [H, W, 3]
             z_depth: mm; 0 where unknown. [H, W]
         """

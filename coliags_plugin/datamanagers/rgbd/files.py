@@ -36,13 +36,13 @@ _MIDDLE = (0.3, 0.7)
 
 @dataclass(frozen=True)
 class CameraFile:
-    """What a file says about the camera.
+    """Contents of a camera file.
 
     Attributes:
         path: The file.
         pinhole: Intrinsics, pixels, centres at integers.
         width, height: Size of the images they are for, pixels.
-        depth_scale: Depth steps per scene unit; None where the file does not say.
+        depth_scale: Depth steps per scene unit; None if not given.
     """
 
     path: Path
@@ -153,11 +153,11 @@ def find_camera(folder: Path, image: Path) -> CameraFile:
     """The camera: of ``camera.json``, else of ``intrinsics.txt``, else of COLMAP's ``cameras.txt``.
 
     Args:
-        folder: Of the scene.
-        image: One of its images, for the size where the file does not say it.
+        folder: Folder of the scene.
+        image: One of its images, for the size if the file has none.
 
     Raises:
-        InputError: There is no such file, or it is not as it should be.
+        InputError: There is no such file, or it is invalid.
     """
     for name, read in zip(CAMERA_FILES, (_read_json, _read_intrinsics_txt, _read_cameras_txt), strict=True):
         if (folder / name).is_file():

@@ -22,8 +22,8 @@ def write_view(folder: Path, index: int, image: UInt8[np.ndarray, "H W 3"], z_de
     """Write a training view.
 
     Args:
-        folder: Of the scene.
-        index: Of the view, counted from 0.
+        folder: Folder of the scene.
+        index: Index of the view, from 0.
         image: RGB. [H, W, 3]
         z_depth: mm; 0 where there is no wall. [H, W]
     """
@@ -41,7 +41,7 @@ def write_transforms(folder: Path, camera_to_world: Float[np.ndarray, "N 4 4"], 
     """Write the JSON of the training or of the test views.
 
     Args:
-        folder: Of the scene.
+        folder: Folder of the scene.
         camera_to_world: OpenCV axes, mm. [N, 4, 4]
         angle: Horizontal field of view, radians.
         test: Whether they are the test views.
