@@ -52,7 +52,7 @@ class SceneSettings(Settings):
     points_file: str = Field(
         POINTS_FILE, description="PLY or NPZ for initial_points 'file', relative to the scene folder or absolute."
     )
-    points_count: int = Field(200_000, ge=1, description="Most initial points, sampled without replacement.")
+    points_count: int = Field(200_000, ge=1, description="Largest number of initial points, sampled at random.")
     seed: int = Field(0, ge=0, description="Seed of the sampling of initial points.")
     keep_pixels: bool = Field(
         True,

@@ -148,7 +148,7 @@ def grow_anatomy(settings: PhantomSettings) -> Anatomy:
 
 
 def _draw_polyp(generator: np.random.Generator, stations: list[float]) -> Polyp:
-    """A polyp between two folds, on the stretch the camera looks at."""
+    """Sample a polyp between two folds, on the part of the wall that the camera looks at."""
     between = [0.5 * (a + b) for a, b in pairwise(stations)]
     places = [arc for arc in between if 30.0 < arc < 125.0]
     arc = float(generator.choice(places)) + generator.uniform(-4.0, 4.0)

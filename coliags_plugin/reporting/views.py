@@ -49,7 +49,7 @@ class EncodedImage:
 
 @dataclass(frozen=True)
 class RunView:
-    """Rendering, error map and metrics of one run; ``error`` is None where the run has no depth of the frame."""
+    """Rendering, error map and metrics of one run; ``error`` is None if the run has no depth of the frame."""
 
     render: EncodedImage
     error: EncodedImage | None
@@ -58,7 +58,7 @@ class RunView:
 
 @dataclass(frozen=True)
 class View:
-    """One held-out frame: ground truth and every run's rendering; ``depth`` is None where the data have none."""
+    """One held-out frame: ground truth and every run's rendering; ``depth`` is None if the data have none."""
 
     set_name: str
     frame: str

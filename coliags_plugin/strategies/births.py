@@ -39,7 +39,7 @@ def one_per_free_cell(
         positions: Candidates, scene units. [C, 3]
         gradients: Gradient statistic of each candidate. [C]
         cell: Edge of a cell, scene units.
-        limit: Most new anchors.
+        limit: Largest number of new anchors.
     """
     taken = torch.unique(torch.round(anchors / cell), dim=0)
     cells, member_of = torch.unique(torch.round(positions / cell), dim=0, return_inverse=True)

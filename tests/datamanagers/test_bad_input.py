@@ -439,7 +439,9 @@ REFUSED: dict[str, Rows] = {
             lambda folder: (folder / "camera_intrinsics.txt").write_text(
                 (folder / "camera_intrinsics.txt").read_text().replace("cx = 677", "cx = 338")
             ),
-            (r"camera_intrinsics\.txt cannot be told for sure: a centre \(338\.739, 543\.058\) far from the middle",),
+            (
+                r"camera_intrinsics\.txt is ambiguous or implausible: a centre \(338\.739, 543\.058\) far from the middle",
+            ),
         ),
         "rotatecolon": (
             change_json("transforms.json", lambda content: content.update(camera_angle_x=80.0)),
@@ -450,7 +452,7 @@ REFUSED: dict[str, Rows] = {
         **per_kind(
             ("c3vd", *TUM), lambda name, kind: (cut("camera.json"), (r"cannot read \S*camera\.json: .* line", "JSON"))
         ),
-        "c3vd-v2": (cut("camera_intrinsics.txt"), (r"camera_intrinsics\.txt cannot be told for sure: no a3, a4",)),
+        "c3vd-v2": (cut("camera_intrinsics.txt"), (r"camera_intrinsics\.txt is ambiguous or implausible: no a3, a4",)),
         "colmap": (cut("sparse/0/cameras.bin"), (r"cameras\.bin \(\d+ bytes\) is damaged or cut short",)),
         "colmap-text": (cut("sparse/0/cameras.txt", 0, 0.9), (r"cameras\.txt, line 4: '1 PINHOLE 64 51",)),
     },

@@ -163,14 +163,16 @@ class TestIntrinsicsFile:
     )
     def test_whatever_else_is_refused_and_the_way_out_named(self, tmp_path, text, seen):
         (tmp_path / "camera_intrinsics.txt").write_text(text)
-        with pytest.raises(InputError, match="cannot be told for sure") as refused:
+        with pytest.raises(InputError, match="is ambiguous or implausible") as refused:
             read_camera_intrinsics(tmp_path / "camera_intrinsics.txt")
         assert seen in str(refused.value)
         assert "camera_intrinsics.txt" in str(refused.value) and "lens: v2" in str(refused.value)
 
     def test_the_scene_is_refused_with_it(self, mine):
         (mine / "camera_intrinsics.txt").write_text("767.7 677.7 543.1")
-        with pytest.raises(InputError, match=r"camera_intrinsics.txt cannot be told.*set lens: v2.*or lens: v1"):
+        with pytest.raises(
+            InputError, match=r"camera_intrinsics.txt is ambiguous or implausible.*set lens: v2.*or lens: v1"
+        ):
             load(mine)
 
 

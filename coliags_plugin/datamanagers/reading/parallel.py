@@ -12,7 +12,7 @@ from coliags_plugin.core.progress import Progress
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
-#: Most threads: more would wait for the disk.
+#: Largest number of threads: more would wait for the disk.
 _READERS = 8
 
 

@@ -1,4 +1,4 @@
-"""The layout of C3VD's own release (docs/layouts/c3vd.md)."""
+"""The layout of C3VD's raw release (docs/layouts/c3vd.md)."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ class FeatureSettings(Settings):
         default=0.001, gt=0.0, description="SIFT peak (contrast) threshold. COLMAP's default is 0.0067."
     )
     max_features: int = Field(
-        default=4000, ge=1, description="Most features of an image; those of the largest scale are kept."
+        default=4000, ge=1, description="Largest number of features per image; those of the largest scale are kept."
     )
     upright: bool = Field(
         default=True,
