@@ -137,7 +137,7 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
                 f"{described_by}: the principal point ({pinhole.cx:g}, {pinhole.cy:g}) is {100 * off_middle:.0f} % of "
                 f"the image ({width} x {height}) from its middle",
                 "intrinsics of the size that org_width and org_height say",
-                "They are of another resolution: mend org_width and org_height, or the intrinsics",
+                "They are of another resolution: correct org_width and org_height, or the intrinsics",
             )
         return Rectification.of_pinhole(pinhole, width, height, files.images[0], self.working_size(width, height))
 
