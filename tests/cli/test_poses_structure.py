@@ -98,7 +98,7 @@ def test_options_of_reading_and_of_triangulation(tube, tmp_path, capsys, caplog)
         ),
         (("--set", "splitt=block"), "unknown key 'splitt'"),
         (("--set", "triangulation.min_angle"), "key.path=value"),
-        (("--set", "max_frames=1", "--set", "split=all-train"), "1 frames. Expected two at least"),
+        (("--set", "max_frames=1", "--set", "split=all-train"), "1 frames. Expected at least two"),
         (("--out", "tube/out"), "a folder apart from the input"),
         (("--out", "."), "a folder apart from the input"),
         (("--format", "rgbd"), "coliags: "),

@@ -121,7 +121,7 @@ def test_unknown_pixels_make_no_step_but_hide_none(make, depths):
 
 def test_inner_mse_is_unavailable_where_every_pixel_is_near_a_step(make, depths):
     board = 20 + 10 * ((torch.arange(8)[:, None] + torch.arange(8)) % 2).float()
-    with pytest.raises(UnavailableError, match="away from depth steps"):
+    with pytest.raises(UnavailableError, match="near depth steps"):
         make("depth_mse_inner")(depths(board, board))
 
 

@@ -172,7 +172,7 @@ def test_a_camera_that_stays_in_place(away):
     assert "the camera does not move" in result.transform.undetermined
     np.testing.assert_array_equal(result.transform.rotation, np.eye(3))
     for pair in ((still, winding(6)), (winding(6), still), (still, still)):
-        with pytest.raises(InputError, match="a scale cannot be found"):
+        with pytest.raises(InputError, match="a scale cannot be estimated"):
             aligned(*pair, with_scale=True)
 
 
