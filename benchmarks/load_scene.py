@@ -19,7 +19,7 @@ import tyro
 from machine import describe_machine, markdown_table, write_results
 
 MIB = 1024.0
-#: Different pictures; the sequence repeats them.
+#: Different images; the sequence repeats them.
 ORIGINALS = 9
 
 
@@ -30,7 +30,7 @@ class Options:
     frames: int = 1142
     """Frames of the sequence; C3VD's cecum_t2_b has 1142."""
     size: str = "338x270"
-    """Size of the pictures on disk WxH, pixels."""
+    """Size of the images on disk WxH, pixels."""
     open_files: int = 256
     """How many files a process may have open."""
     json: Path | None = None
@@ -38,7 +38,7 @@ class Options:
     child: Path | None = None
     """Measure one case, this scene, in this process and print it; what the benchmark starts itself."""
     keep_pixels: bool = True
-    """For that case: whether pictures stay in memory."""
+    """For that case: whether images stay in memory."""
 
 
 def write_sequence(folder: Path, frames: int, width: int, height: int) -> Path:

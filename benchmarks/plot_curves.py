@@ -1,4 +1,4 @@
-"""Training curves of several runs as one SVG picture.
+"""Training curves of several runs as one SVG figure.
 
 python benchmarks/plot_curves.py --out docs/curves/c3vd.svg --curves "coliags=RUN/curve.jsonl" "none=OTHER/curve.jsonl"
 """
@@ -79,7 +79,7 @@ def legend(names: list[str], top: int) -> list[str]:
     return parts
 
 
-def picture(curves: list[tuple[str, list[dict[str, Any]]]], keys: list[str]) -> str:
+def figure(curves: list[tuple[str, list[dict[str, Any]]]], keys: list[str]) -> str:
     """All panels, two to a row, under a legend."""
     head = 12 + LEGEND * -(-len(curves) // 2)
     charts = [panel(curves, key, label, log_y) for key, label, log_y in PANELS if key in keys]
@@ -102,7 +102,7 @@ def picture(curves: list[tuple[str, list[dict[str, Any]]]], keys: list[str]) -> 
 def main(options: Options) -> None:
     """Read, draw, write."""
     curves = [read_curve(argument) for argument in options.curves]
-    atomic_write(options.out, picture(curves, options.panels.split(",")))
+    atomic_write(options.out, figure(curves, options.panels.split(",")))
 
 
 if __name__ == "__main__":

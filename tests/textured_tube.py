@@ -1,4 +1,4 @@
-"""A blind tube with a solid texture, filmed from inside: pictures with features, and closed-form depth."""
+"""A blind tube with a solid texture, filmed from inside: images with features, and closed-form depth."""
 
 from __future__ import annotations
 

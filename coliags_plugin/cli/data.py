@@ -21,7 +21,7 @@ class Data:
     scene: tyro.conf.Positional[Path]
     """The scene's folder."""
     format: DataFormat = None
-    """How the scene is laid out (`coliags list datamanagers`); default: what its files show."""
+    """Dataset format (`coliags list datamanagers`); default: recognised from the files."""
     html: OptionalPath = None
     """Also write an HTML page with images and the trajectory."""
     json: OptionalPath = None

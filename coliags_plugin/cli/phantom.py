@@ -22,7 +22,7 @@ class Phantom:
     layout: Annotated[str, tyro.conf.arg(metavar="NAME")] = "c3vd"
     """Files and folders to write (`coliags list phantom_layouts`)."""
     trajectory: Literal["pullback", "rotation"] = "pullback"
-    """Withdrawal along the lumen, or mostly turning on the spot."""
+    """Withdrawal along the lumen, or mostly rotation in place."""
     frames: int = 120
     """Frames of the sequence; every 8th is a test frame."""
     size: OptionalText = None
@@ -36,7 +36,7 @@ class Phantom:
     polyps: int = 4
     """Sessile polyps, 3 to 10 mm wide."""
     rotation_views: int = 12
-    """Extra test views turned 15 to 30 degrees off the path; none in layouts that cannot store them."""
+    """Extra test views rotated by 15 to 30 degrees; none in layouts that cannot store them."""
     set: Assignments = ()
     """Any other phantom setting, for instance roughness=0.4 (docs/phantom.md 6 lists them)."""
     overwrite: bool = False

@@ -20,7 +20,7 @@ class Train:
     data: Path
     """The scene's folder."""
     format: DataFormat = None
-    """How the scene is laid out (`coliags list datamanagers`); default: what its files show."""
+    """Dataset format (`coliags list datamanagers`); default: recognised from the files."""
     output: OptionalPath = None
     """Run folder; default runs/SCENE/METHOD/STAMP."""
     steps: OptionalInt = None

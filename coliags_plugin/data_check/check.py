@@ -11,12 +11,12 @@ from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.data_check import findings as suspect
 from coliags_plugin.data_check.facts import (
     DepthFacts,
+    ImageFacts,
     PathFacts,
-    PictureFacts,
     depth_facts,
-    looked_at,
+    image_facts,
     path_facts,
-    picture_facts,
+    sampled_frames,
     video_of,
 )
 from coliags_plugin.data_check.findings import Finding
@@ -32,7 +32,7 @@ class SceneCheck:
     Attributes:
         scene: The scene checked.
         pairs: Source and target frames of the reprojection or matching.
-        depth, path, pictures: Statistics; None where there is nothing to measure.
+        depth, path, images: Statistics; None where there is nothing to measure.
         agreement: Reprojection errors of frames with depth, by pose hypothesis.
         scale: The factor on depth with the smallest reprojection error, and the relative depth error with it.
         matches: Epipolar errors of matched features, by pose hypothesis; empty where there is depth.
@@ -43,7 +43,7 @@ class SceneCheck:
     pairs: list[tuple[Frame, Frame]]
     depth: DepthFacts | None
     path: PathFacts | None
-    pictures: PictureFacts
+    images: ImageFacts
     agreement: dict[str, Agreement]
     scale: tuple[float, float] | None
     matches: dict[str, EpipolarAgreement]
@@ -59,7 +59,7 @@ class SceneCheck:
             "initial_points": len(self.scene.points),
             "depth": None if self.depth is None else asdict(self.depth),
             "path": None if self.path is None else asdict(self.path),
-            "pictures": asdict(self.pictures),
+            "pictures": asdict(self.images),
             "pairs": [[source.name, target.name] for source, target in self.pairs],
             "agreement": {name: asdict(found) for name, found in self.agreement.items()},
             "best_depth_scale": None if self.scale is None else {"factor": self.scale[0], "depth_error": self.scale[1]},
@@ -77,7 +77,7 @@ def check_scene(scene: Scene, progress: Progress | None = None) -> SceneCheck:
         progress: Called during the comparison of frames.
     """
     video = video_of(scene)
-    looked = looked_at(video)
+    looked = sampled_frames(video)
     pairs = video_pairs(video)
     with_depth = [Pair(a, b) for a, b in pairs if a.depth is not None and b.depth is not None]
     readings, scale, matched = {}, None, {}
@@ -95,16 +95,16 @@ def check_scene(scene: Scene, progress: Progress | None = None) -> SceneCheck:
         matched = {name: reading for name, reading in found.items() if reading is not None}
     if progress is not None:
         progress("compare frames", len(CHANGES), len(CHANGES))
-    depth, path, pictures = depth_facts(looked), path_facts(video), picture_facts(looked)
+    depth, path, images = depth_facts(looked), path_facts(video), image_facts(looked)
     found_suspect = [
         *suspect.agreement_findings(readings, scale, path),
         *suspect.match_findings(matched),
         *suspect.depth_findings(depth),
         *suspect.path_findings(path),
         *suspect.calibration_findings(video),
-        *suspect.picture_findings(pictures),
+        *suspect.image_findings(images),
     ]
-    return SceneCheck(scene, pairs, depth, path, pictures, readings, scale, matched, found_suspect)
+    return SceneCheck(scene, pairs, depth, path, images, readings, scale, matched, found_suspect)
 
 
 def _without_nan(value: Any) -> Any:

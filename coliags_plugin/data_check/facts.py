@@ -40,7 +40,7 @@ class PathFacts:
 
 
 @dataclass(frozen=True)
-class PictureFacts:
+class ImageFacts:
     """Intensities of the sampled frames, grey levels; shares of the unmasked pixels."""
 
     mean: float
@@ -52,7 +52,7 @@ class PictureFacts:
     repeated: tuple[str, ...]
 
 
-def looked_at(frames: Sequence[Frame]) -> list[Frame]:
+def sampled_frames(frames: Sequence[Frame]) -> list[Frame]:
     """Evenly spaced sample of the frames, at most 64."""
     places = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), _LOOKED_AT)).astype(int))
     return [frames[place] for place in places]
@@ -105,7 +105,7 @@ def path_facts(video: Sequence[Frame]) -> PathFacts | None:
     )
 
 
-def picture_facts(frames: Sequence[Frame]) -> PictureFacts:
+def image_facts(frames: Sequence[Frame]) -> ImageFacts:
     """Image statistics of frames in video order."""
     means, over, masked, repeated = [], [], [], []
     before: torch.Tensor | None = None
@@ -118,7 +118,7 @@ def picture_facts(frames: Sequence[Frame]) -> PictureFacts:
         if before is not None and before.shape == image.shape and torch.equal(before, image):
             repeated.append(frame.name)
         before = image
-    return PictureFacts(
+    return ImageFacts(
         mean=float(np.mean(means)),
         darkest_frame=float(min(means)),
         darkest_at=frames[int(np.argmin(means))].name,

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.data_check.facts import DepthFacts, PathFacts, PictureFacts
+from coliags_plugin.data_check.facts import DepthFacts, ImageFacts, PathFacts
 from coliags_plugin.data_check.hypotheses import ADVICE, GIVEN, NO_MOTION
 from coliags_plugin.data_check.matches import EpipolarAgreement
 from coliags_plugin.data_check.reprojection import Agreement
@@ -63,13 +63,13 @@ def depth_findings(depth: DepthFacts | None) -> Iterator[Finding]:
         yield Finding(
             "depth is the same everywhere",
             f"{depth.nearest:.4g} to {depth.farthest:.4g}",
-            "Check the depth files: images of one value are what a failed export leaves",
+            "Check the depth files: a failed export can leave images of one value",
         )
     if depth.median < 1.0:
         yield Finding(
             "depth looks like metres",
-            f"median {depth.median:.4g}; this package takes lengths for millimetres, and renderers leave out what is "
-            f"nearer than {NEAR:g}",
+            f"median {depth.median:.4g}; this package expects millimetres, and renderers clip at a near plane of "
+            f"{NEAR:g}",
             "Give lengths in mm: poses and depth times 1000, or the format's unit option",
         )
     elif depth.median > 1000.0:
@@ -88,7 +88,10 @@ def agreement_findings(
     if given is None or path is None or path.length == 0.0:
         return
     error = math.inf if given.depth_error is None or given.share < SHARE_LANDS else given.depth_error
-    told = f"surfaces differ by {_percent(given.depth_error)} of the depth, {given.share:.0%} of the pixels land"
+    errors = (
+        f"surfaces differ by {_percent(given.depth_error)} of the depth, {given.share:.0%} of the pixels project into "
+        "the other image"
+    )
     better = {
         name: reading
         for name, reading in readings.items()
@@ -100,21 +103,21 @@ def agreement_findings(
     if scale is not None and by_scale * CLEARLY_BETTER < min(error, least * CLEARLY_BETTER):
         yield Finding(
             "depth and poses are in different units",
-            f"as they are, {told}; with depth times {scale[0]:.3g}, {_percent(by_scale)}",
+            f"as given, {errors}; with depth times {scale[0]:.3g}, {_percent(by_scale)}",
             f"Check the units: depth seems to be {1.0 / scale[0]:.3g} times what the poses expect",
         )
     elif best is not None and least * CLEARLY_BETTER < error:
         yield Finding(
             f"poses agree with depth when read as: {best}",
-            f"as they are, {told}; read so, {_percent(least)}",
+            f"as given, {errors}; read this way, {_percent(least)}",
             ADVICE[best],
         )
     elif error > DEPTH_AGREES:
         still = readings[NO_MOTION].depth_error
         yield Finding(
             "frames do not agree on the surface",
-            f"{told}; with no motion at all, {_percent(still)}",
-            "Check that images, depth and poses belong together frame by frame, and the calibration",
+            f"{errors}; without motion, {_percent(still)}",
+            "Check that images, depth and poses match frame by frame, and the calibration",
         )
 
 
@@ -123,7 +126,7 @@ def match_findings(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Findin
     given = readings.get(GIVEN)
     if given is None:
         return
-    told = (
+    errors = (
         f"{given.count} matches lie {given.error:.2g} px from their epipolar lines (median), {given.in_front:.0%} in "
         "front of both cameras"
     )
@@ -143,19 +146,19 @@ def match_findings(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Findin
         reading = readings[best]
         yield Finding(
             f"poses agree with the images when read as: {best}",
-            f"as they are, {told}; read so, {reading.error:.2g} px, {reading.in_front:.0%} in front",
+            f"as given, {errors}; read this way, {reading.error:.2g} px, {reading.in_front:.0%} in front",
             ADVICE[best],
         )
     elif given.error > EPIPOLAR_AGREES or not in_front:
         yield Finding(
             "images do not agree with the poses",
-            told,
-            "Check that images and poses belong together frame by frame, and the calibration",
+            errors,
+            "Check that images and poses match frame by frame, and the calibration",
         )
 
 
 def path_findings(path: PathFacts | None) -> Iterator[Finding]:
-    """Jumps and standstill of the camera."""
+    """Jumps of the camera, or a static camera."""
     if path is None:
         return
     if path.length == 0.0:
@@ -194,34 +197,35 @@ def calibration_findings(frames: Sequence[Frame]) -> Iterator[Finding]:
         angle = 2.0 * math.degrees(math.atan(0.5 * camera.width / camera.fx))
         if not 25.0 < angle < 160.0:
             yield Finding(
-                "the view is no endoscope's",
+                "the field of view is implausible for an endoscope",
                 f"{frame.name}: {angle:.3g} degrees across",
                 "Check the focal length and the image size it is for",
             )
 
 
-def picture_findings(pictures: PictureFacts) -> Iterator[Finding]:
+def image_findings(images: ImageFacts) -> Iterator[Finding]:
     """Black, overexposed, mostly masked or repeated images."""
-    if pictures.darkest_frame < 4.0:
+    if images.darkest_frame < 4.0:
         yield Finding(
-            "an image is black", f"{pictures.darkest_at}: mean {pictures.darkest_frame:.2g} of 255", "Leave it out"
+            "an image is black", f"{images.darkest_at}: mean {images.darkest_frame:.2g} of 255", "Leave it out"
         )
-    if pictures.overexposed_share > 0.25:
-        yield Finding("images are overexposed", f"{pictures.overexposed_share:.0%} of the pixels are white", "")
-    if pictures.masked_share > 0.75:
+    if images.overexposed_share > 0.25:
+        yield Finding("images are overexposed", f"{images.overexposed_share:.0%} of the pixels are white", "")
+    if images.masked_share > 0.75:
         yield Finding(
-            "masks leave little",
-            f"{pictures.masked_share:.0%} of the pixels are ignored",
+            "most pixels are masked",
+            f"{images.masked_share:.0%} of the pixels are ignored",
             "Check the meaning of the mask: black is ignored here",
         )
-    if pictures.repeated:
-        count = len(pictures.repeated)
+    if images.repeated:
+        count = len(images.repeated)
         yield Finding(
             "images repeat",
-            f"{pictures.repeated[0]}"
+            f"{images.repeated[0]}"
             + (f" and {count - 1} more equal" if count > 1 else " equals")
             + " the image before",
-            "Leave repeated images and their poses out: the video was captured at a higher rate than the scope's",
+            "Leave repeated images and their poses out: the video was captured at a higher frame rate than the "
+            "endoscope's",
         )
 
 

@@ -48,7 +48,7 @@ CHANGES: dict[str, Change] = {
 #: Advice where a hypothesis fits.
 ADVICE = {
     "world-to-camera": "The poses look like world-to-camera transforms; write camera-to-world, their inverses",
-    "rotation transposed": "The rotations look transposed: rows were taken for columns where the file was written",
-    "translation of opposite sign": "The translations look negated: check the sign in whatever wrote the file",
+    "rotation transposed": "The rotations look transposed: the program that wrote the file confused rows and columns",
+    "translation of opposite sign": "The translations look negated: check the sign in the program that wrote the file",
     "camera axes y up, z backward": "The camera axes look like OpenGL's; negate the second and third column",
 }

@@ -12,12 +12,12 @@ import torch
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.data_check.check import SceneCheck
 from coliags_plugin.data_check.facts import video_of
-from coliags_plugin.data_check.reprojection import carried_picture
+from coliags_plugin.data_check.reprojection import warp_image
 from coliags_plugin.data_check.text import fact_rows, reading_rows
 from coliags_plugin.outputs.charts import Series, line_chart
-from coliags_plugin.outputs.colormaps import depth_picture, rgb_error_picture
+from coliags_plugin.outputs.colormaps import colorize_depth, colorize_rgb_error
 from coliags_plugin.outputs.image_files import encode_png
-from coliags_plugin.outputs.page import fact_list, picture, record, table, write_page
+from coliags_plugin.outputs.page import fact_list, figure, record, table, write_page
 
 #: Number of pairs shown.
 _SHOWN = 3
@@ -33,7 +33,7 @@ def write_check_page(check: SceneCheck, output: Path) -> None:
     name = check.scene.name
     verdict = f"{len(check.findings)} suspect" if check.findings else "nothing suspect"
     header = f"<h1>{escape(name)}: {verdict}</h1>" + fact_list(dict(fact_rows(check)))
-    sections = [_findings(check), _readings(check), _pictures(check), _path(video_of(check.scene)), _provenance(check)]
+    sections = [_findings(check), _readings(check), _images(check), _path(video_of(check.scene)), _provenance(check)]
     write_page(output, f"{name}: data check", header, sections)
 
 
@@ -53,26 +53,26 @@ def _readings(check: SceneCheck) -> str:
         return ""
     apart = abs(check.pairs[0][1].index - check.pairs[0][0].index) if check.pairs else 0
     note = (
-        f"Each of {len(check.pairs)} frames is carried into the frame {apart} later by depth, poses and calibration; "
-        "medians over all pixels. Where the poses as given are not the best row, they are suspect."
+        f"Each of {len(check.pairs)} frames is reprojected {apart} frames ahead by depth, poses and calibration; "
+        "medians over all pixels. If the given poses are not the best row, they are suspect."
         if check.agreement
-        else f"Features of {len(check.pairs)} pairs of frames, {apart} apart, matched: there is no depth to carry over."
+        else f"Matched features of {len(check.pairs)} pairs of frames, {apart} apart, as there is no depth."
     )
     return f'<section><h2>Agreement</h2><p class="hint">{escape(note)}</p>{table(head, rows)}</section>'
 
 
-def _pictures(check: SceneCheck) -> str:
+def _images(check: SceneCheck) -> str:
     chosen = check.pairs[:: max(1, len(check.pairs) // _SHOWN)][:_SHOWN]
     parts = []
     for source, target in chosen:
         cells = [_cell(source.image.numpy(), source.name), _cell(target.image.numpy(), target.name)]
         if source.depth is not None and target.depth is not None:
-            painted, shown = carried_picture(source, target)
+            painted, shown = warp_image(source, target)
             canvas = torch.where(shown[..., None], painted, torch.full_like(painted, 0.5))
-            cells.append(_cell((canvas * 255).round().byte().numpy(), f"{target.name} painted from {source.name}"))
+            cells.append(_cell((canvas * 255).round().byte().numpy(), f"{target.name} warped from {source.name}"))
             mixed = torch.where(_checkered(shown)[..., None], canvas, target.rgb.double())
-            cells.append(_cell((mixed * 255).round().byte().numpy(), "both, in squares: edges must go on"))
-            error = rgb_error_picture(painted.float(), target.rgb, shown)
+            cells.append(_cell((mixed * 255).round().byte().numpy(), "checkerboard of both: edges must be continuous"))
+            error = colorize_rgb_error(painted.float(), target.rgb, shown)
             cells.append(_cell(error, "difference, black 0 to yellow 20 % of full scale"))
         if target.depth is not None:
             depth = target.depth.numpy()
@@ -80,10 +80,10 @@ def _pictures(check: SceneCheck) -> str:
             if len(known):
                 low, high = (float(value) for value in np.quantile(known, (0.01, 0.99)))
                 title = f"z-depth, {low:.3g} to {high:.3g} scene units"
-                cells.append(_cell(depth_picture(depth, (low, max(high, low * 1.001))), title))
+                cells.append(_cell(colorize_depth(depth, (low, max(high, low * 1.001))), title))
         parts.append(f"<h3>{escape(source.name)} and {escape(target.name)}</h3>")
         parts.append(f'<div class="view" style="--cells: 3">{"".join(cells)}</div>')
-    return f"<section><h2>Frames in one another</h2>{''.join(parts)}</section>" if parts else ""
+    return f"<section><h2>Reprojected frames</h2>{''.join(parts)}</section>" if parts else ""
 
 
 def _checkered(shown: torch.Tensor) -> torch.Tensor:
@@ -118,4 +118,4 @@ def _provenance(check: SceneCheck) -> str:
 
 
 def _cell(rgb: np.ndarray, caption: str) -> str:
-    return picture(encode_png(rgb), caption)
+    return figure(encode_png(rgb), caption)

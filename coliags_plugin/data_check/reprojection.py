@@ -27,7 +27,7 @@ _LAND = 0.2
 
 
 @dataclass(frozen=True)
-class Landing:
+class ReprojectedPixels:
     """Pixels of a source frame reprojected into a target frame.
 
     Attributes:
@@ -62,7 +62,7 @@ class Pair:
         self._colors = source.image.reshape(-1, 3)[chosen].double()
         self._colors_there = target.image.reshape(-1, 3).double()
 
-    def carried(self, change: Change, scale: float = 1.0, every: int = 1) -> Landing:
+    def reproject(self, change: Change, scale: float = 1.0, every: int = 1) -> ReprojectedPixels:
         """Reproject the source's pixels.
 
         Args:
@@ -73,7 +73,7 @@ class Pair:
         points = self._points[::every] * scale
         if not len(points):
             nothing = torch.zeros(0, dtype=torch.float64)
-            return Landing(0.0, nothing, nothing, nothing)
+            return ReprojectedPixels(0.0, nothing, nothing, nothing)
         pose = change(self._source.camera_to_world.double())
         camera = _changed(self._target, change)
         pixels, z = camera.project(points @ pose[:3, :3].T + pose[:3, 3])
@@ -83,7 +83,7 @@ class Pair:
         there = self._depth_there[place] * scale
         difference = (z[lands] - there).abs()
         known = torch.isfinite(difference)
-        return Landing(
+        return ReprojectedPixels(
             float(lands.double().mean()),
             (difference / there)[known],
             difference[known],
@@ -125,13 +125,13 @@ def video_pairs(frames: Sequence[Frame], farther: int = 1, count: int = PAIRS) -
 
 
 def agreement(pairs: Sequence[Pair], change: str = GIVEN, scale: float = 1.0, every: int = 1) -> Agreement:
-    """Reproject the first frame of every pair into the second; arguments as in :meth:`Pair.carried`."""
-    landings = [pair.carried(CHANGES[change], scale, every) for pair in pairs]
+    """Reproject the first frame of every pair into the second; arguments as in :meth:`Pair.reproject`."""
+    reprojected = [pair.reproject(CHANGES[change], scale, every) for pair in pairs]
     return Agreement(
-        _median([landing.depth_errors for landing in landings]),
-        _median([landing.depth_errors_mm for landing in landings]),
-        _median([landing.color_errors for landing in landings]),
-        float(np.mean([landing.share for landing in landings])) if landings else 0.0,
+        _median([landing.depth_errors for landing in reprojected]),
+        _median([landing.depth_errors_mm for landing in reprojected]),
+        _median([landing.color_errors for landing in reprojected]),
+        float(np.mean([landing.share for landing in reprojected])) if reprojected else 0.0,
     )
 
 
@@ -152,14 +152,14 @@ def best_scale(pairs: Sequence[Pair]) -> tuple[float, float] | None:
     return float(fine[int(np.argmin(fine_errors))]), float(min(fine_errors))
 
 
-def carried_picture(source: Frame, target: Frame) -> tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"]]:
+def warp_image(source: Frame, target: Frame) -> tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"]]:
     """The source image warped into the target view by the target's depth, and the mask of warped pixels."""
     depth = _known_depth(target)
     pixels, z = _changed(source.camera).project(_changed(target.camera).unproject(depth).reshape(-1, 3))
     camera = source.camera
     grid = (pixels / pixels.new_tensor([camera.width, camera.height]) * 2 - 1).reshape(1, *depth.shape, 2)
-    picture = source.image.permute(2, 0, 1)[None].double()
-    painted = torch.nn.functional.grid_sample(picture, grid.nan_to_num(2.0), align_corners=False)[0].permute(1, 2, 0)
+    image = source.image.permute(2, 0, 1)[None].double()
+    painted = torch.nn.functional.grid_sample(image, grid.nan_to_num(2.0), align_corners=False)[0].permute(1, 2, 0)
     z_there = torch.nn.functional.grid_sample(
         _known_depth(source)[None, None].nan_to_num(0.0), grid.nan_to_num(2.0), mode="nearest", align_corners=False
     )[0, 0]

@@ -49,11 +49,11 @@ def fact_rows(check: SceneCheck) -> Iterator[tuple[str, str]]:
             f"{path.length:.4g} long, steps {path.mean_step:.3g} (largest {path.largest_step:.3g} to "
             f"{path.largest_step_at}), turns {path.turn:.3g} degrees in all",
         )
-    pictures = check.pictures
+    images = check.images
     yield (
         "brightness",
-        f"mean {pictures.mean:.0f} of 255, frames {pictures.darkest_frame:.0f} to {pictures.brightest_frame:.0f}, "
-        f"{pictures.overexposed_share:.1%} white, {pictures.masked_share:.1%} masked",
+        f"mean {images.mean:.0f} of 255, frames {images.darkest_frame:.0f} to {images.brightest_frame:.0f}, "
+        f"{images.overexposed_share:.1%} white, {images.masked_share:.1%} masked",
     )
     yield "initial points", f"{len(scene.points)} from {data.get('points', {}).get('source', 'unknown')}"
 
@@ -66,7 +66,7 @@ def reading_rows(check: SceneCheck) -> tuple[list[str], list[list[str]]]:
             "depth error, %",
             "depth error, mm",
             "colour error, grey levels",
-            "lands in the image, %",
+            "projects into the image, %",
         ]
         rows = [
             [

@@ -1,4 +1,4 @@
-"""``datamanager: auto``: whichever format the scene's folder has."""
+"""``datamanager: auto``: selects the format from the scene's folder."""
 
 from __future__ import annotations
 

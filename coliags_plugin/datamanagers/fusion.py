@@ -1,4 +1,4 @@
-"""Initial points: back-projected training depth, or a file."""
+"""Initial points from back-projected depth or from a file."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from torch import Tensor
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame, PointCloud
+from coliags_plugin.datamanagers.reading.parallel import parallel_map
 from coliags_plugin.datamanagers.reading.ply_vertices import read_vertices
-from coliags_plugin.datamanagers.reading.side_by_side import side_by_side
 
 log = logging.getLogger(__name__)
 
@@ -24,16 +24,16 @@ _COLORS = ("red", "green", "blue")
 def fuse_depth(
     frames: Sequence[Frame], count: int, generator: np.random.Generator, progress: Progress | None = None
 ) -> PointCloud:
-    """Points on the surface that the frames' depth shows.
+    """Surface points back-projected from a uniform sample of the frames' valid depth pixels.
 
-    Every valid pixel of every frame is equally likely, and none is drawn twice; all are taken where there are no more
-    than ``count``. Rays go through the true principal point (the authors' code: the image centre, docs/methods.md 6).
+    Pixels are sampled without replacement over all frames; all are used if there are at most ``count``. Rays use the
+    true principal point (the authors' code: the image centre, docs/methods.md 6).
 
     Args:
-        frames: With z-depth, mm, NaN where unknown.
-        count: Points to draw.
-        generator: Draws them.
-        progress: Told how much is done.
+        frames: Frames with z-depth, mm, NaN where unknown.
+        count: Number of points.
+        generator: Random generator of the sampling.
+        progress: Progress callback.
 
     Returns:
         World positions, float32, and the pixels' colours, in frame order.
@@ -41,8 +41,8 @@ def fuse_depth(
     Raises:
         InputError: No frame has a valid depth.
     """
-    # Each frame is looked at twice, never all at once: the pixels of a long video may not fit into memory side by side.
-    available = np.array(side_by_side(_count_usable, frames, "look for depth", progress))
+    # Two passes over the frames, since the pixels of a long video may not fit into memory.
+    available = np.array(parallel_map(_count_usable, frames, "count depth pixels", progress))
     if available.sum() == 0:
         raise InputError(
             f"none of the {len(frames)} training frames has a valid depth",
@@ -50,13 +50,13 @@ def fuse_depth(
             "Check the depth files, or set initial_points: file",
         )
     taken = available if available.sum() <= count else generator.multivariate_hypergeometric(available, count)
-    # Sorting keeps the reading order; which pixels are taken is already random.
+    # Sorted to keep the pixel order; the choice is already random.
     chosen = [
         np.sort(generator.choice(there, number, replace=False)) if number < there else np.arange(there)
         for there, number in zip(available, taken, strict=True)
     ]
     wanted = [pair for pair in zip(frames, chosen, strict=True) if len(pair[1])]
-    found = side_by_side(_fused, wanted, "fuse depth", progress)
+    found = parallel_map(_fused, wanted, "fuse depth", progress)
     positions, colors = zip(*found, strict=True)
     return PointCloud(torch.from_numpy(np.concatenate(positions)), torch.from_numpy(np.concatenate(colors)))
 
@@ -66,7 +66,7 @@ def _count_usable(frame: Frame) -> int:
 
 
 def _usable(depth: Tensor | None, mask: Tensor | None) -> np.ndarray:
-    """Flat indices of the pixels that count and whose depth is known. [N]"""
+    """Flat indices of unmasked pixels with known depth. [N]"""
     if depth is None:
         return np.zeros(0, np.int64)
     known = np.isfinite(depth.numpy())
@@ -74,7 +74,7 @@ def _usable(depth: Tensor | None, mask: Tensor | None) -> np.ndarray:
 
 
 def _fused(wanted: tuple[Frame, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """World positions, in double precision until they are there, and colours of chosen usable pixels. [N, 3], [N, 3]"""
+    """World positions, computed in float64, and colours of chosen usable pixels. [N, 3], [N, 3]"""
     frame, chosen = wanted[0].to("cpu"), wanted[1]
     if frame.depth is None:
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
@@ -90,21 +90,19 @@ def _fused(wanted: tuple[Frame, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def read_points(path: Path, count: int, generator: np.random.Generator) -> PointCloud:
-    """Points from a PLY file, or from an NPZ file with ``positions`` [N, 3] and perhaps ``colors`` uint8 [N, 3].
-
-    See :func:`thinned` for which.
+    """Read at most ``count`` points from a PLY file or an NPZ file (``positions`` [N, 3], optional uint8 ``colors``).
 
     Raises:
         InputError: The file is missing or holds no points.
     """
-    return thinned(load_points(path), count, generator, path)
+    return subsampled(load_points(path), count, generator, path)
 
 
 def load_points(path: Path) -> PointCloud:
-    """All points of a PLY or NPZ file.
+    """Read all points of a PLY or NPZ file.
 
     Raises:
-        InputError: The file is missing or is neither.
+        InputError: The file is missing or has another format.
     """
     if not path.is_file():
         raise InputError(f"no file {path}", "a PLY or NPZ file of points in the world of the poses", "Check the path")
@@ -119,11 +117,11 @@ def load_points(path: Path) -> PointCloud:
     )
 
 
-def thinned(points: PointCloud, count: int, generator: np.random.Generator, source: Path | None) -> PointCloud:
-    """At most ``count`` of the points, drawn without replacement; those that are not finite are left out.
+def subsampled(points: PointCloud, count: int, generator: np.random.Generator, source: Path | None) -> PointCloud:
+    """Sample at most ``count`` finite points without replacement.
 
     Raises:
-        InputError: None is finite.
+        InputError: No point is finite.
     """
     finite = np.flatnonzero(torch.isfinite(points.positions).all(dim=1).numpy())
     if len(finite) < len(points):
@@ -159,7 +157,7 @@ def _read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
         return positions, None
     colors = np.stack([vertices[name] for name in _COLORS], axis=1)
     if colors.dtype != np.uint8:
-        # Floating-point colours are shares; whole ones count to 255 in every kind.
-        share = 255.0 if np.issubdtype(colors.dtype, np.floating) else 1.0
-        colors = np.rint(np.clip(np.nan_to_num(colors) * share, 0.0, 255.0)).astype(np.uint8)
+        # Floating-point colours range from 0 to 1, integers from 0 to 255.
+        scale = 255.0 if np.issubdtype(colors.dtype, np.floating) else 1.0
+        colors = np.rint(np.clip(np.nan_to_num(colors) * scale, 0.0, 255.0)).astype(np.uint8)
     return positions, colors

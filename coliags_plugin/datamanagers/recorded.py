@@ -1,4 +1,4 @@
-"""From a recording on disk to a scene: split, read, and given initial points, alike for every data set."""
+"""Base class of data managers: splits a recording, reads its frames and creates initial points."""
 
 from __future__ import annotations
 
@@ -17,68 +17,68 @@ from coliags_plugin.contracts import DataManager
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
-from coliags_plugin.datamanagers.fusion import fuse_depth, read_points, thinned
+from coliags_plugin.datamanagers.fusion import fuse_depth, read_points, subsampled
 from coliags_plugin.datamanagers.recording import Recording, Shot
 from coliags_plugin.datamanagers.rectification import PAPER_SIZE, fitted
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
-from coliags_plugin.datamanagers.seen import with_valid_marks
+from coliags_plugin.datamanagers.seen import with_valid_seen_masks
 from coliags_plugin.datamanagers.splits import Split, divide
-from coliags_plugin.datamanagers.stored_frames import StoredFrame, read_side_by_side
+from coliags_plugin.datamanagers.stored_frames import StoredFrame, read_in_parallel
 
 log = logging.getLogger(__name__)
 
 
 class NoPointsError(InputError):
-    """There is nothing to make initial points from."""
+    """Neither depth nor a point file is available for initial points."""
 
 
 class RecordedDataManager(DataManager):
-    """A data manager that finds a :class:`Recording`; the rest is the same for all of them."""
+    """Loads a scene from the :class:`Recording` that a subclass finds on disk."""
 
     Settings: ClassVar[type[SceneSettings]] = SceneSettings
 
     settings: SceneSettings
-    #: The name it is registered under.
+    #: Name in the registry.
     name: ClassVar[str]
-    #: Width and height, pixels, that pictures are made to fit by default: what is published for the data, or else the
-    #: paper's (docs/data.md 2). None: they stay as large as they are stored.
+    #: Default bounds of the working width and height, pixels: the published size of the dataset, or else the paper's
+    #: (docs/data.md 2). None: the stored size.
     fits: ClassVar[tuple[int, int] | None] = PAPER_SIZE
-    #: The split of all frames whose training frames the data's seen masks tell of (docs/layouts/c3vd.md 5).
+    #: The split whose training frames the dataset's seen masks refer to (docs/layouts/c3vd.md 5).
     seen_split: ClassVar[Split] = "every-8th"
 
     @abstractmethod
     def open(self, path: Path) -> Recording:
-        """Find out what the folder holds, without reading pixels.
+        """Find the files of a scene and read its poses and cameras, but no pixels.
 
         Raises:
-            InputError: The folder is missing, or its files are not as they should be.
+            InputError: The folder is missing, or files are missing or invalid.
         """
 
     def working_size(self, width: int, height: int) -> tuple[int, int]:
-        """Working width and height of pictures stored at a size, pixels: as set, or the largest in :attr:`fits`."""
+        """Working size for a stored size, pixels: the configured size, or the largest within :attr:`fits`."""
         return self.settings.size or fitted(width, height, self.fits)
 
     def load(self, path: Path, progress: Progress | None = None) -> Scene:
         """Read the scene.
 
         Args:
-            path: Its folder.
-            progress: Told ``(what, done, total)`` while pictures are read.
+            path: The scene's folder.
+            progress: Progress callback ``(what, done, total)``.
 
         Returns:
-            Frames of the working size; the world and the units of the data.
+            Frames of the working size, in the dataset's world frame and units.
 
         Raises:
-            InputError: The folder is missing, or anything in it is not as it should be.
+            InputError: The folder is missing, or its contents are invalid.
         """
         path, settings = Path(path), self.settings
         recording = self.open(path)
         for doubt in dict.fromkeys(shot.rectification.doubt() for shot in recording.shots):
             if doubt is not None:
                 log.warning("%s", doubt)
-        self._tell_of_smaller_pictures(recording, path)
+        self._log_downscaling(recording, path)
         train_indices, test_indices = self._split(recording, path)
-        recording = with_valid_marks(recording, self.seen_split, train_indices, test_indices, path)
+        recording = with_valid_seen_masks(recording, self.seen_split, train_indices, test_indices, path)
         train = self._frames(recording.shots, train_indices)
         test_sets = {"test": self._frames(recording.shots, test_indices)} if test_indices else {}
         for name, shots in recording.test_sets.items():
@@ -86,7 +86,7 @@ class RecordedDataManager(DataManager):
         video = sorted([*train, *(test_sets["test"] if test_indices else [])], key=lambda frame: frame.index)
         if settings.keep_pixels:
             others = (frame for name in recording.test_sets for frame in test_sets[name])
-            read_side_by_side([*video, *others], progress)
+            read_in_parallel([*video, *others], progress)
         points, described = self._initial_points(recording, path, train, progress)
         split: dict[str, Any] = {
             "name": settings.split,
@@ -114,14 +114,14 @@ class RecordedDataManager(DataManager):
         log.info("%s: %d frames, %s", path, len(recording.shots), recording.kind)
         return Scene(path.resolve().name, train, test_sets, points, provenance)
 
-    def _tell_of_smaller_pictures(self, recording: Recording, path: Path) -> None:
-        """Log that pictures are made smaller than they are stored, where nobody asked for it."""
+    def _log_downscaling(self, recording: Recording, path: Path) -> None:
+        """Log that images are downscaled by default."""
         if self.settings.size is not None:
             return
         for rectification in (shot.rectification for shot in recording.shots):
             if (rectification.width, rectification.height) != (rectification.source_width, rectification.source_height):
                 log.info(
-                    "%s: pictures stored at %d x %d are used at %d x %d; datamanager.width and datamanager.height set "
+                    "%s: images stored at %d x %d are used at %d x %d; datamanager.width and datamanager.height set "
                     "another size",
                     path,
                     rectification.source_width,
@@ -135,15 +135,15 @@ class RecordedDataManager(DataManager):
         return [StoredFrame(shots[index], index, self.settings.keep_pixels) for index in indices]
 
     def _split(self, recording: Recording, path: Path) -> tuple[list[int], list[int]]:
-        """Indices of training and of test frames."""
+        """Indices of training frames and of test frames."""
         settings = self.settings
         indices = list(range(0, len(recording.shots), settings.frame_step))[: settings.max_frames]
         if settings.split == "own" and recording.own_split is None:
-            raise InputError(f"{path} does not say which of its frames are for testing", "a split of another name", "")
+            raise InputError(f"{path} does not specify its test frames", "a split other than 'own'", "")
         train, test = divide(settings.split, indices, recording.own_split, settings.block)
         if not train:
             raise InputError(
-                f"split '{settings.split}' of {len(indices)} frames of {path} leaves none to train on",
+                f"split '{settings.split}' of {len(indices)} frames of {path} leaves no training frames",
                 "at least one training frame",
                 "Use more frames, or another split ('all-train' holds none out)",
             )
@@ -169,11 +169,11 @@ class RecordedDataManager(DataManager):
             missing = POINTS_FILE if recording.points_source is None else recording.points_source.name
             raise NoPointsError(
                 f"{path} has neither depth files nor {missing}",
-                "depth to make initial points from, or the points themselves",
-                f"Make a scene with points: coliags poses triangulate {shlex.quote(str(path))} --out FOLDER; or put "
+                "depth or points for the initial Gaussians",
+                f"Create a scene with points: coliags poses triangulate {shlex.quote(str(path))} --out FOLDER; or put "
                 f"{missing} (world of the poses) there; or set initial_points: file and points_file",
             )
-        points = thinned(own(), settings.points_count, generator, recording.points_source)
+        points = subsampled(own(), settings.points_count, generator, recording.points_source)
         return points, self._described_points(recording.points_source, points)
 
     def _described_points(self, source: Path | str, points: PointCloud) -> dict[str, Any]:

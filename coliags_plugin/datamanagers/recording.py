@@ -1,4 +1,4 @@
-"""What a data set says before any pixel is read: which pictures, from where, with what beside them."""
+"""Description of a posed video on disk: image files, poses, cameras, depth files and masks."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from coliags_plugin.datamanagers.rectification import Rectification
 
 @dataclass(frozen=True)
 class Shot:
-    """One picture as it lies on disk.
+    """Files, pose and camera of one frame on disk.
 
     Attributes:
         name: Unique within the recording.
-        image: The picture.
-        view: How it becomes a working picture; shared by pictures of the same camera.
+        image: The image file.
+        rectification: Mapping from the stored to the working image; shared by images of the same camera.
         camera_to_world: Rigid, OpenCV axes, scene units. [4, 4]
-        depth: Its depth file.
-        depth_format: How to read that.
-        mask: A picture, not black where a pixel counts, as large as ``image``.
-        seen: A picture, not black where training frames see the same surface, as large as ``image``.
-        sparse_depth: Depth at single points of the working picture.
+        depth: Depth file.
+        depth_format: Format of the depth file.
+        mask: Mask file of the image's size; black pixels are ignored.
+        seen: Mask file of the image's size; not black where training frames see the same surface.
+        sparse_depth: Depth at single points of the working image.
     """
 
     name: str
@@ -46,17 +46,17 @@ class Shot:
 
 @dataclass(frozen=True)
 class Recording:
-    """A posed video as it lies on disk.
+    """A posed video on disk.
 
     Attributes:
-        kind: Of data set and layout, for the log.
-        shots: In video order.
-        facts: For provenance: layout, lens, sizes, pose convention and whatever else was found out.
-        fingerprint: Of the files; see :func:`fingerprint`.
-        test_sets: Test sets that come with the data, apart from the video, by name.
-        own_split: Indices in ``shots`` that the data themselves train and test on, ``{"train": ..., "test": ...}``.
-        own_points: Reads the data's own initial points; None where there are none.
-        points_source: The file or folder these come from.
+        kind: Dataset and layout, for the log.
+        shots: Frames in video order.
+        facts: Provenance: layout, lens, sizes, pose convention and so on.
+        fingerprint: Hash of the files; see :func:`fingerprint`.
+        test_sets: The dataset's separate test sets, by name.
+        own_split: The dataset's split as indices into ``shots``, ``{"train": ..., "test": ...}``.
+        own_points: Reads the dataset's initial points; None where there are none.
+        points_source: The file or folder of these points.
     """
 
     kind: str
@@ -70,7 +70,7 @@ class Recording:
 
 
 def fingerprint(folder: Path, large: Iterable[Path | None], small: Iterable[Path | None]) -> str:
-    """SHA-256 over the names and sizes of large files and the contents of small ones."""
+    """SHA-256 of the names and sizes of large files and the contents of small ones."""
     digest = hashlib.sha256()
     for path in filter(None, large):
         name = path.relative_to(folder) if path.is_relative_to(folder) else path.name
@@ -80,11 +80,11 @@ def fingerprint(folder: Path, large: Iterable[Path | None], small: Iterable[Path
     return digest.hexdigest()
 
 
-def check_pose_count(file: Path, poses: int, pictures: int) -> None:
-    """Raise InputError where a pose file does not have a pose for every picture."""
-    if poses != pictures:
+def check_pose_count(file: Path, poses: int, images: int) -> None:
+    """Raise InputError if the numbers of poses and images differ."""
+    if poses != images:
         raise InputError(
-            f"{file} has {poses} poses for {pictures} pictures",
-            "a pose for every picture, in order",
+            f"{file} has {poses} poses for {images} images",
+            "a pose for every image, in order",
             "Restore the missing ones, or remove the surplus at the end",
         )

@@ -1,4 +1,4 @@
-"""The options that all data managers share."""
+"""Options shared by all data managers."""
 
 from __future__ import annotations
 
@@ -29,37 +29,35 @@ class SceneSettings(Settings):
         1.0,
         gt=0.0,
         le=4.0,
-        description="Factor on the nominal focal length when distorted frames are undistorted; below 1 more of a wide "
-        "view is kept.",
+        description="Factor on the nominal focal length of undistorted images; below 1 more of a wide field of view is "
+        "kept.",
     )
     split: Split = Field(
         "every-8th",
         description="Test frames: 'every-8th': 0, 8, 16, ... as in the paper; 'endogslam': 7, 15, 23, ...; "
-        "'block': one stretch of the video; 'all-train': none; 'own': as the data say. Counted after frame_step and "
-        "max_frames.",
+        "'block': one contiguous block of the video; 'all-train': none; 'own': the dataset's own split. Counted after "
+        "frame_step and max_frames.",
     )
     block: tuple[Share, Share] = Field(
-        (0.4, 0.6), description="Split 'block': where the stretch begins and ends, as shares of the video."
+        (0.4, 0.6), description="Split 'block': start and end of the block, as fractions of the video."
     )
-    frame_step: int = Field(1, ge=1, description="Use every so-many-th frame of the video.")
-    max_frames: int | None = Field(
-        None, ge=1, description="Use at most so many frames, the first ones after frame_step."
-    )
+    frame_step: int = Field(1, ge=1, description="Use every n-th frame of the video.")
+    max_frames: int | None = Field(None, ge=1, description="Use at most the first n frames, after frame_step.")
     initial_points: InitialPoints = Field(
         "depth",
-        description="Initial points: 'depth': fused from the training frames' depth, or the data's own where there is "
-        "no depth; 'data': the data's own, or from depth where there are none; 'file': points_file; 'none': "
-        "none, for looking at a scene.",
+        description="Initial points: 'depth': fused from the training frames' depth, or the dataset's own if there is "
+        "no depth; 'data': the dataset's own, or from depth if there are none; 'file': points_file; 'none': "
+        "no points, to inspect a scene.",
     )
     points_file: str = Field(
         POINTS_FILE, description="PLY or NPZ for initial_points 'file', relative to the scene folder or absolute."
     )
-    points_count: int = Field(200_000, ge=1, description="At most so many initial points, drawn without replacement.")
-    seed: int = Field(0, ge=0, description="Of the draw of initial points.")
+    points_count: int = Field(200_000, ge=1, description="Largest number of initial points, sampled at random.")
+    seed: int = Field(0, ge=0, description="Seed of the sampling of initial points.")
     keep_pixels: bool = Field(
         True,
-        description="Whether pictures stay in memory, as small as they were stored; otherwise they are read anew each "
-        "time, which is slow and for videos larger than the memory.",
+        description="Whether to cache images in memory in the stored data type; otherwise they are read from disk at "
+        "every access, which is slow, for videos larger than memory.",
     )
 
     @model_validator(mode="after")
@@ -71,7 +69,7 @@ class SceneSettings(Settings):
     @model_validator(mode="after")
     def _block_is_a_stretch(self) -> Self:
         if self.block[0] >= self.block[1]:
-            raise ValueError(f"block = {self.block}: it must begin before it ends")
+            raise ValueError(f"block = {self.block}: its start must be below its end")
         return self
 
     @property

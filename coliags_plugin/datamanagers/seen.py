@@ -1,4 +1,4 @@
-"""Views that only test, and the masks that say what training frames see of test frames (docs/layouts/c3vd.md 5)."""
+"""Masks of the test pixels whose surface is seen by training frames (docs/layouts/c3vd.md 5)."""
 
 from __future__ import annotations
 
@@ -7,73 +7,74 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from coliags_plugin.datamanagers.reading.frame_files import marks
+from coliags_plugin.datamanagers.reading.frame_files import numbered_masks
 from coliags_plugin.datamanagers.recording import Recording, Shot
 from coliags_plugin.datamanagers.splits import Split, divide
 
 log = logging.getLogger(__name__)
 
-#: The folder of rotation views beside a sequence, and the test set they become.
+#: Folder and test set of the rotation views of a sequence.
 ROTATION = "rotation"
 
 
-def seen_marks(path: Path, count: int, complete: bool = True) -> dict[int, Path]:
-    """``seen/NNNN_seen.png`` in a folder, by frame; for which training frames, :func:`with_valid_marks` asks.
+def find_seen_masks(path: Path, count: int, complete: bool = True) -> dict[int, Path]:
+    """Find seen masks ``seen/NNNN_seen.png``, by frame index; :func:`with_valid_seen_masks` checks the split.
 
     Args:
-        path: What holds the folder ``seen``.
+        path: Parent of the folder ``seen``.
         count: Number of frames.
-        complete: Whether the frames are all pictures of the data. Masks are numbered by picture, so that a picture
-            left out puts them out of step.
+        complete: Whether the frames are all images of the dataset. Masks are numbered by image, so that they do not
+            match frames where images are left out.
 
     Raises:
-        InputError: One belongs to no frame.
+        InputError: A mask has no frame.
     """
     folder = path / "seen"
     if complete:
-        return marks(folder, "seen", count)
+        return numbered_masks(folder, "seen", count)
     if folder.is_dir():
         log.warning(
-            "%s: seen masks are for all pictures; some are left out, so figures on seen pixels are left out", folder
+            "%s: seen masks are for all images, but some are left out, so metrics on seen pixels are unavailable",
+            folder,
         )
     return {}
 
 
-def with_valid_marks(
+def with_valid_seen_masks(
     recording: Recording, split: Split, train: Collection[int], test: Collection[int], path: Path
 ) -> Recording:
-    """The recording with those seen masks that are right for a run: all of its test frames' or none.
+    """Keep the seen masks of test frames if the run trains on the frames they were made for, else drop all.
 
     Args:
-        recording: With every mask that was found.
-        split: The masks say what its training frames see, of all frames.
-        train: Indices of the frames that the run trains on.
-        test: Indices of the frames of the video that it tests on.
+        recording: Recording with all masks.
+        split: Split whose training frames the masks refer to, applied to all frames.
+        train: Indices of the run's training frames.
+        test: Indices of the run's test frames in the video.
         path: The scene, for the log.
     """
     meant, _ = divide(split, range(len(recording.shots)), recording.own_split)
     trained = set(train)
     if set(meant) == trained:
-        shots = [_unmarked(shot) if index in trained else shot for index, shot in enumerate(recording.shots)]
+        shots = [_without_seen(shot) if index in trained else shot for index, shot in enumerate(recording.shots)]
         return replace(recording, shots=shots)
     tested = bool(test or recording.test_sets)
     if tested and any(shot.seen for shots in (recording.shots, *recording.test_sets.values()) for shot in shots):
         log.warning(
-            "%s: seen masks are for split '%s' of all frames; this run trains on other frames, so figures on seen "
-            "pixels are left out",
+            "%s: seen masks are for split '%s' of all frames; this run trains on other frames, so metrics on seen "
+            "pixels are unavailable",
             path,
             split,
         )
     return replace(
         recording,
-        shots=_all_unmarked(recording.shots),
-        test_sets={name: _all_unmarked(shots) for name, shots in recording.test_sets.items()},
+        shots=_all_without_seen(recording.shots),
+        test_sets={name: _all_without_seen(shots) for name, shots in recording.test_sets.items()},
     )
 
 
-def _all_unmarked(shots: Sequence[Shot]) -> list[Shot]:
-    return [_unmarked(shot) for shot in shots]
+def _all_without_seen(shots: Sequence[Shot]) -> list[Shot]:
+    return [_without_seen(shot) for shot in shots]
 
 
-def _unmarked(shot: Shot) -> Shot:
+def _without_seen(shot: Shot) -> Shot:
     return shot if shot.seen is None else replace(shot, seen=None)

@@ -1,4 +1,4 @@
-"""Which frames are held out."""
+"""Train/test splits."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ EVERY = 8
 
 
 def held_out(split: Split, count: int, block: tuple[float, float] = (0.4, 0.6)) -> Bool[np.ndarray, "N"]:
-    """Which of ``count`` frames, in video order, are test frames.
+    """Mask of the test frames among ``count`` frames in video order.
 
     Args:
         split: ``every-8th``: 0, 8, 16, ... (the paper, Gaussian Pancakes); ``endogslam``: 7, 15, 23, ... (EndoGSLAM,
-            PR-Endo; docs/data.md 3); ``block``: one stretch of the video, which no training frame interrupts, so
-            that test views are not merely in-betweens; ``all-train``: none. ``own`` is not a rule but what data say.
+            PR-Endo; docs/data.md 3); ``block``: one contiguous block without training frames, so that test views are
+            not between neighbouring training views; ``all-train``: none. ``own`` is handled by :func:`divide`.
         count: Number of frames.
-        block: Where the stretch begins and ends, as shares of the video.
+        block: Start and end of the block, as fractions of the video.
 
     Returns:
         True for test frames. [N]
@@ -42,17 +42,17 @@ def divide(
     own: Mapping[str, Sequence[int]] | None = None,
     block: tuple[float, float] = (0.4, 0.6),
 ) -> tuple[list[int], list[int]]:
-    """Indices to train on and indices to test on, among those of a video that are used.
+    """Training and test indices among the used frames of a video.
 
     Args:
         split: As for :func:`held_out`.
-        indices: Of the frames used, in video order.
-        own: What the data say, ``{"train": ..., "test": ...}``; there must be some for split ``own``.
+        indices: Indices of the used frames, in video order.
+        own: The dataset's split, ``{"train": ..., "test": ...}``; required for split ``own``.
         block: As for :func:`held_out`.
     """
     if split == "own":
         if own is None:
-            raise ValueError("split 'own' of data that have none")
+            raise ValueError("split 'own' needs the dataset's own split")
         used = set(indices)
         train, test = ([index for index in own[part] if index in used] for part in ("train", "test"))
         return train, test

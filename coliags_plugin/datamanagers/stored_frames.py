@@ -1,4 +1,4 @@
-"""Frames whose pixels are read when they are first asked for."""
+"""Frames that read their pixels lazily from disk."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from torch import Tensor
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.reading.images import read_mask, read_rgb
-from coliags_plugin.datamanagers.reading.side_by_side import side_by_side
+from coliags_plugin.datamanagers.reading.parallel import parallel_map
 from coliags_plugin.datamanagers.recording import Shot
 
 
 @dataclass(frozen=True)
 class _Pixels:
-    """A working picture and what lies beside it, as small as it was stored."""
+    """Image, depth and masks of the working size, in the stored data types."""
 
     image: UInt8[np.ndarray, "H W 3"]
     depth: Shaped[np.ndarray, "H W"] | None
@@ -28,16 +28,15 @@ class _Pixels:
 
 
 class StoredFrame(Frame):
-    """A frame on disk. What is read stays in memory in the type it was stored in: 5 bytes a pixel with 16-bit depth.
+    """A lazily read frame, cached in the stored data types: 5 bytes per pixel with 16-bit depth.
 
-    May be used from several threads. The attributes of pixels raise InputError where a file is damaged, of the wrong
-    kind or of the wrong size.
+    Thread-safe. Pixel attributes raise InputError if a file is damaged or has the wrong format or size.
 
     Args:
-        shot: The picture.
-        index: Of the frame in the video, counted from 0.
-        keep: Whether pixels stay in memory once read. Otherwise every attribute reads its own file each time, so that
-            whoever wants several takes them from one :meth:`to`.
+        shot: Files, pose and camera of the frame.
+        index: Index of the frame in the video, from 0.
+        keep: Whether to cache pixels. Otherwise every attribute access reads its file; use :meth:`to` to get several
+            attributes at once.
     """
 
     def __init__(self, shot: Shot, index: int, keep: bool = True) -> None:
@@ -85,7 +84,7 @@ class StoredFrame(Frame):
         return _tensor(self._read().seen if self._keep else _seen(self._shot))
 
     def to(self, device: torch.device | str) -> Frame:
-        """The frame on a device, read once and decoded."""
+        """Decoded frame on a device; files are read once."""
         pixels = self._read()
         tensors = {
             "depth": self._z_depth(pixels.depth),
@@ -106,7 +105,7 @@ class StoredFrame(Frame):
         return f"StoredFrame({self.name!r}, {str(self._shot.image)!r})"
 
     def _read(self) -> _Pixels:
-        # Two threads may both read, and the second to finish replaces what the first has kept: it is the same.
+        # If two threads read at the same time, the second overwrites the cache with equal data.
         if self._pixels is not None:
             return self._pixels
         pixels = _read_pixels(self._shot)
@@ -130,13 +129,13 @@ class StoredFrame(Frame):
     _pixels: _Pixels | None
 
 
-def read_side_by_side(frames: Sequence[Frame], progress: Progress | None = None) -> None:
-    """Have frames read their pixels now.
+def read_in_parallel(frames: Sequence[Frame], progress: Progress | None = None) -> None:
+    """Read the pixels of frames into their caches, in parallel.
 
     Raises:
-        InputError: For the first bad frame.
+        InputError: The first invalid frame's error.
     """
-    side_by_side(lambda frame: frame.image.numel(), frames, "read pictures", progress)
+    parallel_map(lambda frame: frame.image.numel(), frames, "read images", progress)
 
 
 def _read_pixels(shot: Shot) -> _Pixels:

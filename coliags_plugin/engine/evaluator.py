@@ -19,7 +19,7 @@ from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.provenance import software
 from coliags_plugin.engine.scoring import Scorer, Scores, within_seen
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.outputs.colormaps import DEPTH_ERROR_LIMIT_MM, depth_error_picture
+from coliags_plugin.outputs.colormaps import DEPTH_ERROR_LIMIT_MM, colorize_depth_error
 from coliags_plugin.outputs.image_files import eight_bit, write_depth_tiff, write_png
 
 #: The main test set, whose means are at the top of metrics.json.
@@ -101,7 +101,7 @@ def _write_pictures(folder: Path, set_name: str, frame: Frame, comparison: Compa
     known = torch.where(comparison.depth_valid, comparison.true_depth, torch.nan)
     write_depth_tiff(folder / "depth" / f"{name}.tiff", comparison.depth)
     write_depth_tiff(folder / "true_depth" / f"{name}.tiff", known)
-    picture = depth_error_picture(comparison.depth, known, comparison.depth_valid, DEPTH_ERROR_LIMIT_MM)
+    picture = colorize_depth_error(comparison.depth, known, comparison.depth_valid, DEPTH_ERROR_LIMIT_MM)
     write_png(folder / "errors" / f"{name}.png", picture)
 
 

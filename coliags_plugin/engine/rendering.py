@@ -17,9 +17,9 @@ from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.outputs.colormaps import (
     DEPTH_ERROR_LIMIT_MM,
     color_bar,
-    depth_error_picture,
-    depth_picture,
-    rgb_error_picture,
+    colorize_depth,
+    colorize_depth_error,
+    colorize_rgb_error,
 )
 from coliags_plugin.outputs.image_files import eight_bit, write_png
 from coliags_plugin.outputs.video import write_video
@@ -86,11 +86,11 @@ def _write_frame(folder: Path, frame: Frame, output: RenderOutput, limits: tuple
     name = f"{frame.name}.png"
     depth = output["depth_accumulated"]
     write_png(folder / "rgb" / name, eight_bit(output.rgb))
-    write_png(folder / "depth" / name, depth_picture(depth, limits))
+    write_png(folder / "depth" / name, colorize_depth(depth, limits))
     valid = frame.valid.cpu()
-    write_png(folder / "rgb_error" / name, rgb_error_picture(output.rgb.cpu(), frame.image, valid, RGB_ERROR_LIMIT))
+    write_png(folder / "rgb_error" / name, colorize_rgb_error(output.rgb.cpu(), frame.image, valid, RGB_ERROR_LIMIT))
     if frame.depth is not None:
-        picture = depth_error_picture(depth.cpu(), frame.depth, valid, DEPTH_ERROR_LIMIT_MM)
+        picture = colorize_depth_error(depth.cpu(), frame.depth, valid, DEPTH_ERROR_LIMIT_MM)
         write_png(folder / "depth_error" / name, picture)
 
 
@@ -100,5 +100,5 @@ def _film(
     for count, frame in enumerate(path, start=1):
         output = _render(trained, frame)
         rgb = eight_bit(output.rgb).cpu().numpy()
-        yield np.concatenate([rgb, depth_picture(output["depth_accumulated"], limits)], axis=1)
+        yield np.concatenate([rgb, colorize_depth(output["depth_accumulated"], limits)], axis=1)
         progress.update(done + count)

@@ -13,7 +13,7 @@ from coliags_plugin.contracts import Loss, LossSettings, TrainingStep
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.masked import masked_mean, zero_outside
 
-#: :data:`coliags_plugin.core.render_output.DEPTH_KINDS`, spelt out for the type checker; a test compares the two.
+#: :data:`coliags_plugin.core.render_output.DEPTH_KINDS` as a literal type; a test compares the two.
 DepthKind = Literal["depth_accumulated", "depth_expected", "depth_median", "inverse_depth_accumulated"]
 
 
@@ -32,7 +32,7 @@ class DepthL1Loss(Loss):
     """Mean |D - D_true| in mm over the valid pixels of known true depth (the paper's L_depth; docs/methods.md 4.1).
 
     The paper writes a sum over pixels and the authors' code takes the mean; this is the mean. The authors' code also
-    pulls pixels of unknown depth towards 0; here they count for nothing.
+    pulls pixels of unknown depth towards 0; here they are ignored.
 
     For ``inverse_depth_accumulated`` (E = sum w/z, what the authors' code trains on) D = 1/E where E > 0. Where
     nothing was drawn (E = 0) D is ``empty_depth``, which enters the value but has no gradient.

@@ -23,7 +23,7 @@ class SparseDepthSettings(LossSettings):
     huber: float | None = Field(
         default=None,
         gt=0.0,
-        description="Huber threshold, scene units: smaller differences count by their square over twice this; null: "
+        description="Huber threshold, scene units: smaller differences are squared and divided by twice this; null: "
         "absolute differences.",
     )
 
@@ -31,9 +31,9 @@ class SparseDepthSettings(LossSettings):
 class SparseDepthLoss(Loss):
     """Mean |D(p) - z| in scene units over the points p of a frame whose z-depth is known (docs/methods.md 4.5).
 
-    The idea is DS-NeRF's (Deng et al., "Depth-supervised NeRF: Fewer Views and Faster Training for Free", CVPR 2022):
-    structure from motion already gives the depth of its points. D is interpolated bilinearly at a point, with border
-    pixels replicated. A point counts where all pixels that enter are valid and have alpha > 0.
+    After DS-NeRF (Deng et al., "Depth-supervised NeRF: Fewer Views and Faster Training for Free", CVPR 2022). D is
+    interpolated bilinearly at a point, with border pixels replicated. A point is used if all interpolated pixels are
+    valid and have alpha > 0.
     """
 
     Settings: ClassVar[type[LossSettings]] = SparseDepthSettings
@@ -46,7 +46,7 @@ class SparseDepthLoss(Loss):
         return frozenset({self.settings.depth})
 
     def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
-        """The unweighted term, scene units; 0, still part of the graph, where no point counts."""
+        """The unweighted term, scene units; 0, still part of the graph, if no point is used."""
         rendered, points = step.output[self.settings.depth], step.target.sparse_depth
         if points is None or not len(points.depth):
             return rendered.reshape(-1)[:0].sum()
@@ -65,9 +65,9 @@ class SparseDepthLoss(Loss):
 def _interpolated(
     values: Float[Tensor, "H W"], usable: Bool[Tensor, "H W"], points: SparseDepth
 ) -> tuple[Float[Tensor, "K"], Bool[Tensor, "K"]]:
-    """Bilinear samples of a map at points, and whether all pixels that enter a sample are usable.
+    """Bilinear samples of a map at points, and whether all interpolated pixels are usable.
 
-    Unusable pixels may be NaN; they affect no value and no gradient. Points outside the map count as not usable.
+    Unusable pixels may be NaN; they affect no value and no gradient. Points outside the map are not usable.
     """
     height, width = values.shape
     size = points.pixels.new_tensor([width, height])

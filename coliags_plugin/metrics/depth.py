@@ -93,7 +93,7 @@ class DepthMSEInner(DepthMSE):
         steps = depth_steps(truth, counts, self.settings.relative_step)
         inner = counts & ~dilated(steps, self.settings.margin)
         if not inner.any():
-            raise UnavailableError("no pixel of this frame lies away from depth steps")
+            raise UnavailableError("all pixels of this frame are near depth steps")
         return inner
 
 

@@ -64,7 +64,7 @@ class LPIPS(Metric):
         require_image(comparison)
         height, width = comparison.valid.shape
         if min(height, width) < _SMALLEST:
-            raise UnavailableError(f"LPIPS needs at least {_SMALLEST} pixels a side, the picture is {width}x{height}")
+            raise UnavailableError(f"LPIPS needs at least {_SMALLEST} pixels a side, the image is {width}x{height}")
         network = _network(
             self.settings.net, *find_weights(self.settings.net, self.settings.weights), comparison.rgb.device
         )

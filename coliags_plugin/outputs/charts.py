@@ -32,7 +32,7 @@ class Series:
         name: Label.
         style: Colour index, the same for one method in every chart of a page.
         x: Increasing.
-        y: As many; values that are not finite (or not positive on a logarithmic axis) interrupt the line.
+        y: Same length; values that are not finite (or not positive on a logarithmic axis) interrupt the line.
         low: Lower edge of a band around the line, or empty.
         high: Upper edge of the band.
     """
@@ -153,7 +153,7 @@ class _Axes:
             x_low, x_high = x_low - 0.5, x_high + 0.5
         y_low, y_high = min(ys), max(ys)
         if log_y:
-            # Half a decade at least, so that there are ticks to read.
+            # At least half a decade, so that there are tick labels.
             margin = max(1.1, math.sqrt(10.0**0.5 / min(y_high / y_low, 10.0**0.5)))
             return cls(x_low, x_high, y_low / margin, y_high * margin, log_y, x_names)
         margin = 0.06 * (y_high - y_low) or max(abs(y_high), 1.0) * 0.05

@@ -45,7 +45,7 @@ def color_table(color_map: ColorMap) -> UInt8[np.ndarray, "256 3"]:
     return table
 
 
-def depth_picture(
+def colorize_depth(
     depth_mm: Float[np.ndarray, "H W"] | Tensor, limits: tuple[float, float]
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Colour-mapped depth: near is dark, far is bright, unknown is grey.
@@ -60,12 +60,12 @@ def depth_picture(
     depth = _map(depth_mm, "depth_mm")
     low, high = _interval(limits)
     known = np.isfinite(depth)
-    picture = _colored((np.where(known, depth, low) - low) / (high - low), "depth")
-    picture[~known] = UNKNOWN_GREY
-    return picture
+    image = _colored((np.where(known, depth, low) - low) / (high - low), "depth")
+    image[~known] = UNKNOWN_GREY
+    return image
 
 
-def depth_error_picture(
+def colorize_depth_error(
     rendered_mm: Float[np.ndarray, "H W"] | Tensor,
     true_mm: Float[np.ndarray, "H W"] | Tensor,
     valid: Bool[np.ndarray, "H W"] | Tensor | None,
@@ -93,7 +93,7 @@ def depth_error(
     true_mm: Float[np.ndarray, "H W"] | Tensor,
     valid: Bool[np.ndarray, "H W"] | Tensor | None = None,
 ) -> tuple[Float[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
-    """Absolute depth error, as drawn by :func:`depth_error_picture`.
+    """Absolute depth error, as drawn by :func:`colorize_depth_error`.
 
     Returns:
         |rendered - true| in mm, infinite where the truth is known and the rendering is not finite, 0 where the truth is
@@ -115,7 +115,7 @@ def depth_error(
     return error, known
 
 
-def rgb_error_picture(
+def colorize_rgb_error(
     rendered: np.ndarray | Tensor,
     true: np.ndarray | Tensor,
     valid: Bool[np.ndarray, "H W"] | Tensor | None = None,
@@ -170,41 +170,41 @@ def color_bar(
     size, thickness, scale = 18, 1, 0.45
     (unit_width, _), _ = cv2.getTextSize(unit, _FONT, scale, thickness)
     left, right, top = 24, width - unit_width - 32, 8
-    picture = np.full((top + size + 26, width, 3), 255, np.uint8)
-    picture[top : top + size, left:right] = _colored(np.linspace(0.0, 1.0, right - left)[None], color_map)
+    image = np.full((top + size + 26, width, 3), 255, np.uint8)
+    image[top : top + size, left:right] = _colored(np.linspace(0.0, 1.0, right - left)[None], color_map)
     for tick in linear_ticks(low, high):
         x = left + round((tick - low) / (high - low) * (right - left - 1))
-        cv2.line(picture, (x, top + size), (x, top + size + 4), _INK, 1)
+        cv2.line(image, (x, top + size), (x, top + size + 4), _INK, 1)
         label = tick_label(tick)
         (text_width, _), _ = cv2.getTextSize(label, _FONT, scale, thickness)
-        _text(picture, label, (x - text_width // 2, top + size + 20), scale)
-    _text(picture, unit, (right + 20, top + size - 4), scale)
-    return picture
+        _text(image, label, (x - text_width // 2, top + size + 20), scale)
+    _text(image, unit, (right + 20, top + size - 4), scale)
+    return image
 
 
 def side_by_side(
-    pictures: Sequence[UInt8[np.ndarray, "H W 3"] | Tensor], labels: Sequence[str], gap: int = 8
+    images: Sequence[UInt8[np.ndarray, "H W 3"] | Tensor], labels: Sequence[str], gap: int = 8
 ) -> UInt8[np.ndarray, "Hs Ws 3"]:
     """Images of equal height in a row on white, each under its label.
 
     Args:
-        pictures: uint8 RGB. [H, W, 3] each
+        images: uint8 RGB. [H, W, 3] each
         labels: One per image; ASCII; shortened where wider than its image.
         gap: White pixels between the images.
 
     Raises:
         InputError: No image, another number of labels, or heights that differ.
     """
-    arrays = [as_array(picture) for picture in pictures]
+    arrays = [as_array(image) for image in images]
     if not arrays or len(arrays) != len(labels):
-        raise InputError(f"{len(arrays)} pictures with {len(labels)} labels", "one label for each picture")
+        raise InputError(f"{len(arrays)} images with {len(labels)} labels", "one label for each image")
     for label, array in zip(labels, arrays, strict=True):
         if array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] != 3:
-            raise InputError(f"picture '{label}' is {array.dtype} {list(array.shape)}", "uint8 RGB [H, W, 3]")
+            raise InputError(f"image '{label}' is {array.dtype} {list(array.shape)}", "uint8 RGB [H, W, 3]")
         if array.shape[0] != arrays[0].shape[0]:
             raise InputError(
-                f"picture '{label}' is {array.shape[0]} px high, '{labels[0]}' {arrays[0].shape[0]} px",
-                "pictures of one height",
+                f"image '{label}' is {array.shape[0]} px high, '{labels[0]}' {arrays[0].shape[0]} px",
+                "images of one height",
             )
     band, scale = 24, 0.5
     height = band + arrays[0].shape[0]
@@ -214,7 +214,7 @@ def side_by_side(
     for label, array in zip(labels, arrays, strict=True):
         column = sheet[:, x : x + array.shape[1]]
         column[band:] = array
-        # Drawn into a strip of its own, so that a label cannot overlap the next one.
+        # Drawn into a separate strip, so that a label cannot overlap the next one.
         strip = np.ascontiguousarray(column[:band])
         _text(strip, _shortened(label, array.shape[1] - 4, scale), (2, 16), scale)
         column[:band] = strip
@@ -233,15 +233,15 @@ def hatch(height: int, width: int) -> UInt8[np.ndarray, "H W 3"]:
 def _error_colors(error: np.ndarray, known: np.ndarray, limit: float) -> np.ndarray:
     if not (math.isfinite(limit) and limit > 0.0):
         raise InputError(f"an error scale that ends at {limit}", "a positive number")
-    picture = _colored(error / limit, "error")
-    picture[~known] = hatch(*known.shape)[~known]
-    return picture
+    image = _colored(error / limit, "error")
+    image[~known] = hatch(*known.shape)[~known]
+    return image
 
 
 def _colored(fraction: np.ndarray, color_map: ColorMap) -> np.ndarray:
     index = np.rint(np.clip(fraction, 0.0, 1.0) * 255.0).astype(np.uint8)
-    picture: np.ndarray = color_table(color_map)[index]
-    return picture
+    image: np.ndarray = color_table(color_map)[index]
+    return image
 
 
 def _map(values: np.ndarray | Tensor, name: str) -> np.ndarray:
@@ -270,8 +270,8 @@ def _same_shape(array: np.ndarray, like: np.ndarray, name: str) -> None:
         raise InputError(f"{name} has the shape {list(array.shape)}", f"{list(like.shape)}, as the truth")
 
 
-def _text(picture: np.ndarray, text: str, origin: tuple[int, int], scale: float) -> None:
-    cv2.putText(picture, text, origin, _FONT, scale, _INK, 1, cv2.LINE_AA)
+def _text(image: np.ndarray, text: str, origin: tuple[int, int], scale: float) -> None:
+    cv2.putText(image, text, origin, _FONT, scale, _INK, 1, cv2.LINE_AA)
 
 
 def _shortened(label: str, width: int, scale: float) -> str:

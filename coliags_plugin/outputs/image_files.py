@@ -81,7 +81,7 @@ def read_rgb(path: Path) -> UInt8[np.ndarray, "H W 3"]:
     """
     pixels = _decode(path)
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
-        raise InputError(f"{path} holds {_kind(pixels)}", "an 8-bit RGB picture")
+        raise InputError(f"{path} holds {_kind(pixels)}", "an 8-bit RGB image")
     return np.ascontiguousarray(pixels[:, :, ::-1])
 
 
@@ -97,7 +97,7 @@ def write_depth_tiff(path: Path, depth_mm: Float32[np.ndarray, "H W"] | Tensor) 
     """
     depth = as_array(depth_mm)
     if depth.ndim != 2 or depth.size == 0 or not np.issubdtype(depth.dtype, np.floating):
-        raise InputError(f"{path} was to hold {_kind(depth)}", "a depth map: floating point, [H, W]")
+        raise InputError(f"cannot write {_kind(depth)} to {path}", "a depth map: floating point, [H, W]")
     # cv2's default, LZW with a floating-point predictor, is not read by many libraries (tifffile needs a plug-in).
     options = [cv2.IMWRITE_TIFF_COMPRESSION, _TIFF_DEFLATE, cv2.IMWRITE_TIFF_PREDICTOR, _TIFF_NO_PREDICTOR]
     atomic_write(path, encode_image(depth.astype(np.float32), ".tiff", options))
@@ -118,7 +118,7 @@ def read_depth_tiff(path: Path) -> Float32[np.ndarray, "H W"]:
 def _checked(rgb: np.ndarray | Tensor) -> np.ndarray:
     pixels = as_array(rgb)
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.size == 0:
-        raise InputError(f"a picture is {_kind(pixels)}", "8-bit RGB, uint8 [H, W, 3]")
+        raise InputError(f"an image is {_kind(pixels)}", "8-bit RGB, uint8 [H, W, 3]")
     return pixels
 
 
@@ -130,11 +130,11 @@ def _decode(path: Path) -> Any:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or error}", "a picture") from error
+        raise InputError(f"{path} cannot be read: {error.strerror or error}", "an image") from error
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
     except cv2.error as error:
-        raise InputError(f"{path} cannot be decoded: {error}", "a picture") from error
+        raise InputError(f"{path} cannot be decoded: {error}", "an image") from error
     if pixels is None:
-        raise InputError(f"{path} cannot be decoded ({len(data)} bytes)", "a whole PNG, JPEG or TIFF picture")
+        raise InputError(f"{path} cannot be decoded ({len(data)} bytes)", "a complete PNG, JPEG or TIFF image")
     return pixels

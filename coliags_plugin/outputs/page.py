@@ -65,7 +65,7 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     return f'<div class="scroll"><table><thead><tr>{columns}</tr></thead><tbody>{"".join(lines)}</tbody></table></div>'
 
 
-def picture(png: bytes, caption: str) -> str:
+def figure(png: bytes, caption: str) -> str:
     """HTML figure of an image and its caption, a cell of a ``view`` row."""
     source = base64.b64encode(png).decode()
     name = escape(caption, quote=True)

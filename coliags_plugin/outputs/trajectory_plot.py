@@ -42,7 +42,7 @@ class _Panel:
         return np.stack([x, y], axis=1)
 
 
-def trajectory_picture(alignment: Alignment, unit: str) -> UInt8[np.ndarray, "900 1200 3"]:
+def plot_trajectory(alignment: Alignment, unit: str) -> UInt8[np.ndarray, "900 1200 3"]:
     """Plot an aligned estimate over its reference.
 
     The views look along the axes of the reference's world, both at one scale: from above x over z, from the side y over
@@ -52,26 +52,26 @@ def trajectory_picture(alignment: Alignment, unit: str) -> UInt8[np.ndarray, "90
         alignment: The aligned trajectories and their errors.
         unit: Name of the unit of length; ASCII.
     """
-    picture = np.full((_HEIGHT, _WIDTH, 3), 255, np.uint8)
+    image = np.full((_HEIGHT, _WIDTH, 3), 255, np.uint8)
     paths = (alignment.reference[:, :3, 3], alignment.estimate[:, :3, 3])
     kind = "Sim(3)" if alignment.with_scale else "SE(3)"
     spread = alignment.ate
     title = f"{len(alignment.matches)} frames, {kind}   ATE rmse {spread.rmse:.4g} {unit}, max {spread.max:.4g} {unit}"
-    _text(picture, title, (70, 30), 0.55)
-    _legend(picture)
-    _views(picture, paths, unit)
+    _text(image, title, (70, 30), 0.55)
+    _legend(image)
+    _views(image, paths, unit)
     charts = [(alignment.position_errors, f"position error [{unit}]")]
     if alignment.rotation_errors_deg is not None:
         charts.append((alignment.rotation_errors_deg, "rotation error [deg]"))
     else:
-        _text(picture, f"rotation error: none, {alignment.transform.undetermined}", (70, 800), _TEXT)
+        _text(image, f"rotation error: none, {alignment.transform.undetermined}", (70, 800), _TEXT)
     for index, (errors, label) in enumerate(charts):
         last = index == len(charts) - 1
-        _errors(picture, (70, 590 + 160 * index, 1110, 100), errors, label, "matched frame" if last else "")
-    return picture
+        _errors(image, (70, 590 + 160 * index, 1110, 100), errors, label, "matched frame" if last else "")
+    return image
 
 
-def _views(picture: np.ndarray, paths: tuple[np.ndarray, np.ndarray], unit: str) -> None:
+def _views(image: np.ndarray, paths: tuple[np.ndarray, np.ndarray], unit: str) -> None:
     """Draw both paths from above and from the side, at one scale."""
     points = np.concatenate(paths)
     low, high = points.min(axis=0), points.max(axis=0)
@@ -91,59 +91,57 @@ def _views(picture: np.ndarray, paths: tuple[np.ndarray, np.ndarray], unit: str)
             center[axis] + sense * half_height,
         )
         panel = _Panel(left, 70, width, height, edges)
-        _axes(picture, panel, f"z [{unit}]", name.format(unit))
+        _axes(image, panel, f"z [{unit}]", name.format(unit))
         for path, (_, color, thickness, radius) in zip(paths, _STYLES, strict=True):
-            placed = panel.place(path[:, [2, axis]])
-            _line(picture, placed, color, thickness)
-            cv2.circle(picture, _fixed(placed[:1])[0], radius << _BITS, color, thickness, cv2.LINE_AA, _BITS)
+            pixels = panel.place(path[:, [2, axis]])
+            _line(image, pixels, color, thickness)
+            cv2.circle(image, _fixed(pixels[:1])[0], radius << _BITS, color, thickness, cv2.LINE_AA, _BITS)
 
 
-def _errors(
-    picture: np.ndarray, box: tuple[int, int, int, int], errors: np.ndarray, y_label: str, x_label: str
-) -> None:
+def _errors(image: np.ndarray, box: tuple[int, int, int, int], errors: np.ndarray, y_label: str, x_label: str) -> None:
     top = 1.1 * float(errors.max()) or 1.0
     # From slightly below 0, so that a line at zero error is visible.
     panel = _Panel(*box, (0.0, len(errors) - 1.0, -0.06 * top, top))
-    _axes(picture, panel, x_label, y_label)
-    _line(picture, panel.place(np.column_stack([np.arange(len(errors)), errors])), ESTIMATE_RGB, 1)
+    _axes(image, panel, x_label, y_label)
+    _line(image, panel.place(np.column_stack([np.arange(len(errors)), errors])), ESTIMATE_RGB, 1)
 
 
-def _axes(picture: np.ndarray, panel: _Panel, x_label: str, y_label: str) -> None:
+def _axes(image: np.ndarray, panel: _Panel, x_label: str, y_label: str) -> None:
     """Draw frame, grid, ticks and labels; the label of the y axis is above it."""
     left, right, bottom, top = panel.values
     end_x, end_y = panel.left + panel.width, panel.top + panel.height
     for tick in linear_ticks(left, right):
         x = round(float(panel.place(np.array([[tick, bottom]]))[0, 0]))
-        cv2.line(picture, (x, panel.top), (x, end_y), _GRID, 1)
-        _text(picture, tick_label(tick), (x, end_y + 18), 0.4, align=0.5)
+        cv2.line(image, (x, panel.top), (x, end_y), _GRID, 1)
+        _text(image, tick_label(tick), (x, end_y + 18), 0.4, align=0.5)
     for tick in linear_ticks(min(bottom, top), max(bottom, top), 4):
         y = round(float(panel.place(np.array([[left, tick]]))[0, 1]))
-        cv2.line(picture, (panel.left, y), (end_x, y), _GRID, 1)
-        _text(picture, tick_label(tick), (panel.left - 8, y + 4), 0.4, align=1.0)
-    cv2.rectangle(picture, (panel.left, panel.top), (end_x, end_y), _INK, 1)
-    _text(picture, y_label, (panel.left, panel.top - 10), _TEXT)
-    _text(picture, x_label, (end_x, end_y + 36), _TEXT, align=1.0)
+        cv2.line(image, (panel.left, y), (end_x, y), _GRID, 1)
+        _text(image, tick_label(tick), (panel.left - 8, y + 4), 0.4, align=1.0)
+    cv2.rectangle(image, (panel.left, panel.top), (end_x, end_y), _INK, 1)
+    _text(image, y_label, (panel.left, panel.top - 10), _TEXT)
+    _text(image, x_label, (end_x, end_y + 36), _TEXT, align=1.0)
 
 
-def _legend(picture: np.ndarray) -> None:
+def _legend(image: np.ndarray) -> None:
     x = 770
     for name, color, thickness, _ in _STYLES:
-        cv2.line(picture, (x, 26), (x + 30, 26), color, thickness, cv2.LINE_AA)
-        _text(picture, name, (x + 38, 30), _TEXT)
+        cv2.line(image, (x, 26), (x + 30, 26), color, thickness, cv2.LINE_AA)
+        _text(image, name, (x + 38, 30), _TEXT)
         x += 130
-    cv2.circle(picture, (1090, 26), 6, _INK, 1, cv2.LINE_AA)
-    _text(picture, "first frame", (1102, 30), _TEXT)
+    cv2.circle(image, (1090, 26), 6, _INK, 1, cv2.LINE_AA)
+    _text(image, "first frame", (1102, 30), _TEXT)
 
 
-def _line(picture: np.ndarray, points: np.ndarray, color: tuple[int, int, int], thickness: int) -> None:
-    cv2.polylines(picture, [_fixed(points)], False, color, thickness, cv2.LINE_AA, _BITS)
+def _line(image: np.ndarray, points: np.ndarray, color: tuple[int, int, int], thickness: int) -> None:
+    cv2.polylines(image, [_fixed(points)], False, color, thickness, cv2.LINE_AA, _BITS)
 
 
 def _fixed(points: np.ndarray) -> np.ndarray:
     return np.rint(points * (1 << _BITS)).astype(np.int32)
 
 
-def _text(picture: np.ndarray, text: str, origin: tuple[int, int], scale: float, align: float = 0.0) -> None:
+def _text(image: np.ndarray, text: str, origin: tuple[int, int], scale: float, align: float = 0.0) -> None:
     """Draw text whose start (``align`` 0), middle (0.5) or end (1) is at the origin."""
     (width, _), _ = cv2.getTextSize(text, _FONT, scale, 1)
-    cv2.putText(picture, text, (round(origin[0] - align * width), origin[1]), _FONT, scale, _INK, 1, cv2.LINE_AA)
+    cv2.putText(image, text, (round(origin[0] - align * width), origin[1]), _FONT, scale, _INK, 1, cv2.LINE_AA)

@@ -71,18 +71,18 @@ def _encode(frames: Iterable[np.ndarray | Tensor], scratch: Path, fps: float) ->
     count = 0
     try:
         for frame in frames:
-            picture = as_array(frame)
-            if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or picture.size == 0:
-                raise InputError(f"frame {count} is {picture.dtype} {list(picture.shape)}", "uint8 RGB [H, W, 3]")
+            image = as_array(frame)
+            if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
+                raise InputError(f"frame {count} is {image.dtype} {list(image.shape)}", "uint8 RGB [H, W, 3]")
             if writer is None:
-                shape = picture.shape
+                shape = image.shape
                 writer = _writer(scratch, fps, shape[1] + shape[1] % 2, shape[0] + shape[0] % 2)
-            elif picture.shape != shape:
+            elif image.shape != shape:
                 raise InputError(
-                    f"frame {count} is {picture.shape[1]} x {picture.shape[0]} px",
+                    f"frame {count} is {image.shape[1]} x {image.shape[0]} px",
                     f"{shape[1]} x {shape[0]} px as frame 0",
                 )
-            even = np.pad(picture, ((0, shape[0] % 2), (0, shape[1] % 2), (0, 0)), mode="edge")
+            even = np.pad(image, ((0, shape[0] % 2), (0, shape[1] % 2), (0, 0)), mode="edge")
             writer.write(np.ascontiguousarray(even[:, :, ::-1]))
             count += 1
     finally:

@@ -1,4 +1,4 @@
-"""A procedural, physically lit colon, filmed by a moving colonoscope and written in the layouts of real data sets.
+"""Synthetic colonoscopy videos of a procedural, physically lit colon, written in the layouts of real datasets.
 
 :func:`coliags_plugin.phantom.generate.generate` makes one. Importing this package loads nothing heavy.
 """

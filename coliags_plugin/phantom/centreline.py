@@ -1,4 +1,4 @@
-"""The curve the colon follows."""
+"""Centre line of the colon."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class CentreLine:
 
 
 def grow_centre_line(generator: np.random.Generator) -> CentreLine:
-    """A gentle curve that runs into a strong bend, which closes the lumen to the eye.
+    """Generate a gentle curve with a strong bend at its end, which closes the lumen in the image.
 
     Starts at the origin, roughly along +z.
     """

@@ -1,4 +1,4 @@
-"""The colon's wall: anatomy as a radius over arc length and clock angle, and the triangle mesh made of it.
+"""Geometry of the colon's wall: a radius over arc length and clock angle, and the triangle mesh sampled from it.
 
 The wall lies at ``centre(s) + radius(s, phi) (cos phi n + sin phi b)``. Sizes follow docs/phantom.md 1: radius
 20 mm, three taeniae that make the lumen three-lobed, and between them haustral folds - thin crescents 5 to 8 mm high
@@ -30,12 +30,12 @@ class Fold:
     """A haustral fold: a thin crescent across part of the circumference.
 
     Attributes:
-        arc: Where along the colon, mm.
+        arc: Arc length of its position, mm.
         clock: Middle of the crescent, radians.
         half_width: Half the angle it spans, radians.
-        height: How far it stands into the lumen at its middle, mm.
+        height: Height above the wall at its middle, mm.
         thickness: Full width at half height, mm.
-        slant: How far its ends lie ahead of its middle, mm.
+        slant: Distance of its ends ahead of its middle, mm.
         sway: Amplitude and phase of its waviness, mm and radians.
     """
 
@@ -60,7 +60,7 @@ class Fold:
 
 @dataclass(frozen=True)
 class Polyp:
-    """A sessile polyp: a cap of ``width`` mm that stands ``height`` mm into the lumen."""
+    """A sessile polyp: a cap ``width`` mm wide and ``height`` mm high."""
 
     arc: float
     clock: float
@@ -76,7 +76,7 @@ class Polyp:
 
 @dataclass(frozen=True)
 class Anatomy:
-    """Everything that decides the wall's large-scale shape."""
+    """Parameters of the wall's large-scale shape."""
 
     centre_line: CentreLine
     folds: tuple[Fold, ...]
@@ -89,8 +89,8 @@ class Anatomy:
         self, arc: Float[np.ndarray, "S 1"], clock: Float[np.ndarray, "1 C"]
     ) -> Float[np.ndarray, "3 S C"]:
         """Clock angle to each of the three taeniae, radians. [3, S, C]"""
-        turned = clock - self.taenia_clock - self.taenia_twist * arc
-        return _wrapped(turned[None] - _TAENIAE[:, None, None])
+        rotated = clock - self.taenia_clock - self.taenia_twist * arc
+        return _wrapped(rotated[None] - _TAENIAE[:, None, None])
 
     def radius(self, arc: Float[np.ndarray, "S"], clock: Float[np.ndarray, "C"]) -> Float[np.ndarray, "S C"]:
         """Distance of the wall from the centre line, mm. [S, C]"""
@@ -115,7 +115,7 @@ class Anatomy:
 
 
 def grow_anatomy(settings: PhantomSettings) -> Anatomy:
-    """Draw a colon."""
+    """Sample a random colon."""
     generator = stream(settings.seed, Purpose.ANATOMY)
     centre_line = grow_centre_line(generator)
     taenia_clock = generator.uniform(0.0, 2.0 * np.pi)
@@ -148,7 +148,7 @@ def grow_anatomy(settings: PhantomSettings) -> Anatomy:
 
 
 def _draw_polyp(generator: np.random.Generator, stations: list[float]) -> Polyp:
-    """A polyp between two folds, on the stretch the camera looks at."""
+    """Sample a polyp between two folds, on the part of the wall that the camera looks at."""
     between = [0.5 * (a + b) for a, b in pairwise(stations)]
     places = [arc for arc in between if 30.0 < arc < 125.0]
     arc = float(generator.choice(places)) + generator.uniform(-4.0, 4.0)
@@ -160,15 +160,15 @@ def _draw_polyp(generator: np.random.Generator, stations: list[float]) -> Polyp:
 class ColonSurface:
     """The wall as a mesh on a grid: rows along the colon, columns around it (periodic).
 
-    Rows are evenly spaced in the length one walks along the wall, over folds and all, not in arc length of the centre
-    line; so texture and mesh are not stretched on the flanks of folds.
+    Rows are evenly spaced along the wall's surface, not along the centre line, so that texture and mesh are not
+    stretched on the flanks of folds.
 
     Attributes:
         vertices: World, mm, row-major. [R*C, 3]
         normals: Unit, into the lumen. [R*C, 3]
         tangents: Unit, along the colon. [R*C, 3]
-        triangles: Vertex numbers; counter-clockwise seen from the lumen. [F, 3]
-        areas: Wall area belonging to each vertex, mm^2. [R*C]
+        triangles: Vertex indices; counter-clockwise seen from the lumen. [F, 3]
+        areas: Wall area of each vertex, mm^2. [R*C]
         arc: Arc length of each row, mm. [R]
         columns: C.
         row_length: Mean distance of rows along the wall, mm.
@@ -193,13 +193,13 @@ class ColonSurface:
         """Clock angle of each column, radians. [C]"""
         return np.arange(self.columns) * (2.0 * np.pi / self.columns)
 
-    def grid_place(
+    def grid_coordinates(
         self, triangle: Int[np.ndarray, "N"], barycentric: Float[np.ndarray, "N 2"]
     ) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
-        """Row and column, with fractions, of points inside triangles.
+        """Fractional row and column of points inside triangles.
 
         Args:
-            triangle: Triangle numbers. [N]
+            triangle: Triangle indices. [N]
             barycentric: Weights of the second and third corner. [N, 2]
         """
         cell, odd = np.divmod(triangle, 2)
@@ -213,7 +213,7 @@ class ColonSurface:
 
 
 def build_surface(anatomy: Anatomy, settings: PhantomSettings) -> ColonSurface:
-    """Mesh the wall, with its fine unevenness, at ``settings.mesh_spacing``."""
+    """Mesh the wall, with fine displacement noise, at ``settings.mesh_spacing``."""
     arc, wall_length = _even_rows(anatomy, settings.mesh_spacing)
     columns = max(round(2.0 * np.pi * 0.95 * RADIUS / settings.mesh_spacing), 24)
     clock = np.arange(columns) * (2.0 * np.pi / columns)
@@ -225,7 +225,7 @@ def build_surface(anatomy: Anatomy, settings: PhantomSettings) -> ColonSurface:
     smooth = (centres[:, None, :] + radius[:, :, None] * around).astype(np.float32)
     for scale, height in _RELIEF:
         bumps = noise.layer(smooth, scale)
-        # A mesh too coarse for a layer would only alias it.
+        # A layer finer than the mesh would be aliased.
         if scale > settings.mesh_spacing:
             radius -= height * np.clip(radius / RADIUS, 0.0, 1.0) * bumps
     grid = centres[:, None, :] + radius[:, :, None] * around
@@ -233,7 +233,7 @@ def build_surface(anatomy: Anatomy, settings: PhantomSettings) -> ColonSurface:
     across = 0.5 * (np.roll(grid, -1, axis=1) - np.roll(grid, 1, axis=1))
     normals = np.cross(along, across)
     areas = np.linalg.norm(normals, axis=-1)
-    # At the tip of the dome a whole row is one point, whose normal looks back along the colon.
+    # At the tip of the dome all vertices of a row coincide; their normal points back along the colon.
     tip = areas < 1e-9
     normals[tip] = np.broadcast_to(-frames[:, None, :, 2], grid.shape)[tip]
     along[tip] = np.broadcast_to(frames[:, None, :, 0], grid.shape)[tip]
@@ -275,5 +275,5 @@ def _unit(vectors: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
 
 
 def _wrapped(angle: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """The same angle in [-pi, pi)."""
+    """Angle wrapped to [-pi, pi)."""
     return np.asarray((angle + np.pi) % (2.0 * np.pi) - np.pi)

@@ -1,4 +1,4 @@
-"""Making a phantom: colon, light, path, pictures, truth."""
+"""Generates phantoms: colon, lighting, camera path, images and ground truth."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, Wall
 from coliags_plugin.phantom.light import Lamp
 from coliags_plugin.phantom.mucosa import Mucosa, paint_mucosa
 from coliags_plugin.phantom.response import KNEE, develop, exposure_for, exposures, white_balances
-from coliags_plugin.phantom.settings import PhantomSettings, either
+from coliags_plugin.phantom.settings import PhantomSettings, value_or_default
 from coliags_plugin.phantom.streams import Purpose, stream
 from coliags_plugin.phantom.tracing import Tracer
-from coliags_plugin.phantom.trajectory import RotationView, travel, turn_away
-from coliags_plugin.phantom.visibility import likeliest_first, seen_from
+from coliags_plugin.phantom.trajectory import RotationView, camera_path, turn_away
+from coliags_plugin.phantom.visibility import nearest_poses_first, seen_from
 
 _LOG = logging.getLogger(__name__)
 
-#: Pixels an exposure meter looks at.
+#: Pixels of the exposure meter.
 _METERED = 2500
-#: Pictures taken side by side; open3d shares the cores anyway, this fills the gaps between its calls.
+#: Images rendered concurrently; open3d is multi-threaded itself, this fills the gaps between its calls.
 _AT_ONCE = 2
 #: Initial points of the layouts that have some: about as many as structure from motion finds in such a video.
 _POINTS = 20_000
@@ -44,16 +44,16 @@ _POINTS = 20_000
 
 @dataclass(frozen=True)
 class Phantom:
-    """A colon, ready to be filmed: what :func:`generate` writes is this, seen from every pose.
+    """A prepared phantom: scene, camera poses and exposure, from which :func:`generate` renders the frames.
 
     Attributes:
-        settings: Resolved.
-        layout: What it is to be written in.
+        settings: Resolved settings.
+        layout: Output layout.
         world: Wall, material, lamp.
-        sensor: Of every picture.
-        poses: Of the sequence. Each [4, 4]
-        rotation_views: Test views away from it.
-        indirect: Light from the wall, for the sequence and then the rotation views.
+        sensor: Sensor of every image.
+        poses: Poses of the sequence. Each [4, 4]
+        rotation_views: Test views with rotated cameras.
+        indirect: Indirect light for the sequence and then the rotation views.
         gains: Red, green, blue gain of every frame of the sequence. [T, 3]
     """
 
@@ -76,11 +76,11 @@ class Phantom:
         """Albedo at the mesh's vertices, linear RGB. [V, 3]"""
         return vertex_albedo(self.world.surface, self.world.mucosa)
 
-    def photograph(self, number: int) -> tuple[Exposure, UInt8[np.ndarray, "P 3"]]:
-        """Take picture ``number``: the sequence's frames come first, then the rotation views.
+    def render_frame(self, number: int) -> tuple[Exposure, UInt8[np.ndarray, "P 3"]]:
+        """Render image ``number``: the sequence's frames come first, then the rotation views.
 
-        A rotation view is taken with the exposure of the frame it turns away from, as if the camera turned faster than
-        the exposure follows.
+        A rotation view has the exposure of the frame at its position, as if the camera turned faster than the exposure
+        adapts.
         """
         frames = len(self.poses)
         if number < frames:
@@ -95,43 +95,43 @@ class Phantom:
     def seen(
         self, points: Float[np.ndarray, "N 3"], camera_to_world: Float[np.ndarray, "4 4"]
     ) -> Bool[np.ndarray, "N"]:
-        """Which points of the wall, seen from this pose, a training frame sees too. [N]"""
-        order = likeliest_first(camera_to_world, self.training_poses)
+        """Which points of the wall seen from this pose are also seen by a training frame. [N]"""
+        order = nearest_poses_first(camera_to_world, self.training_poses)
         return seen_from(points, order, self.sensor.lens, self.sensor.mask, self.world.tracer)
 
 
 def image_size(settings: PhantomSettings, layout: Layout) -> tuple[int, int]:
-    """Width and height of the pictures, pixels: the layout's own where none are chosen."""
+    """Image width and height, pixels; the layout's default if not set."""
     width, height = layout.default_size
-    return either(settings.width, width), either(settings.height, height)
+    return value_or_default(settings.width, width), value_or_default(settings.height, height)
 
 
 def resolve(settings: PhantomSettings, layout: Layout) -> PhantomSettings:
-    """The same settings with every None replaced, and without rotation views where the layout has no place for them."""
+    """Settings with every None replaced, and without rotation views if the layout does not support them."""
     width, height = image_size(settings, layout)
     views = settings.rotation_views if layout.has_rotation else 0
     return settings.model_copy(update={"width": width, "height": height, "rotation_views": views}).resolved()
 
 
 def prepare(settings: PhantomSettings, progress: Progress | None = None) -> Phantom:
-    """Grow the colon, choose the path, and solve for indirect light and exposure.
+    """Generate the colon and the camera path, and solve for indirect light and exposure.
 
     Raises:
-        InputError: The seed's colon has no room for the path, or open3d is missing.
+        InputError: The seed's colon leaves no clearance for the path, or open3d is missing.
     """
-    tell = progress or _silent
+    report = progress or _silent
     layout: Layout = phantom_layouts.get(settings.layout)()
     settings = resolve(settings, layout)
-    tell("colon", 0, 4)
+    report("colon", 0, 4)
     anatomy = grow_anatomy(settings)
     surface = build_surface(anatomy, settings)
-    tell("colon", 1, 4)
+    report("colon", 1, 4)
     mucosa = paint_mucosa(anatomy, surface, settings)
-    tell("colon", 2, 4)
+    report("colon", 2, 4)
     tracer = Tracer(surface)
     lamp = Lamp.of(settings)
-    world = World(surface, mucosa, tracer, lamp, either(settings.vignetting, settings.preset.vignetting))
-    poses = list(travel(anatomy.centre_line, settings, tracer.clearance))
+    world = World(surface, mucosa, tracer, lamp, value_or_default(settings.vignetting, settings.preset.vignetting))
+    poses = list(camera_path(anatomy.centre_line, settings, tracer.clearance))
     views = turn_away(np.stack(poses), settings, layout.is_test) if layout.has_rotation else []
     everywhere = [*poses, *(view.camera_to_world for view in views)]
     indirect: list[IndirectLight | None] = [None] * len(everywhere)
@@ -146,43 +146,42 @@ def prepare(settings: PhantomSettings, progress: Progress | None = None) -> Phan
             settings.interreflection,
             generator,
         )
-    tell("colon", 3, 4)
+    report("colon", 3, 4)
     lens, mask = layout.lens(*image_size(settings, layout))
     sensor = Sensor.behind(lens, mask, settings.supersampling)
-    thin = sensor.thinned(_METERED)
+    thin = sensor.subsampled(_METERED)
     ideal = []
     for index, pose in enumerate(poses):
         ideal.append(exposure_for(meter(world, thin, pose, indirect[index]), settings.target_grey, settings.gamma))
     gains = exposures(ideal, settings)[:, None] * white_balances(settings)
-    tell("colon", 4, 4)
+    report("colon", 4, 4)
     return Phantom(settings, layout, world, sensor, poses, views, indirect, gains)
 
 
 def generate(
     settings: PhantomSettings, output: Path, overwrite: bool = False, progress: Progress | None = None
 ) -> None:
-    """Make a phantom and write it.
+    """Generate a phantom and write it.
 
-    The folder holds the sequence in ``settings.layout``; the rotation-only test views and masks of what training frames
-    saw of them, where the layout has a place for them; ``truth/``, with the mesh, the albedo, the light, every frame's
-    gain, the poses in float64, and the masks of the sequence's own test frames; and ``phantom.json``. The same settings
-    give the same bytes.
+    The folder holds the sequence in ``settings.layout``; rotation-only test views and their seen masks, if the layout
+    supports them; ``truth/``, with the mesh, the albedo, the light, every frame's gain, the poses in float64, and the
+    seen masks of the sequence's test frames; and ``phantom.json``. The same settings give the same bytes.
 
     Args:
-        settings: What to make.
-        output: The folder to make. It appears whole or not at all.
+        settings: Settings.
+        output: The folder to create, atomically.
         overwrite: Replace the folder if it exists.
-        progress: Called with a stage's name, how much of it is done and how much there is.
+        progress: Progress callback ``(stage, done, total)``.
 
     Raises:
-        InputError: The folder exists or cannot be written, the seed's colon has no room for the path, or open3d is
-            missing.
+        InputError: The folder exists or cannot be written, the seed's colon leaves no clearance for the path, or open3d
+            is missing.
     """
-    tell = progress or _silent
+    report = progress or _silent
     try:
         with atomic_folder(output, overwrite) as folder:
-            phantom = prepare(settings, tell)
-            _write(phantom, folder, tell)
+            phantom = prepare(settings, report)
+            _write(phantom, folder, report)
             (folder / "phantom.json").write_text(
                 _json({"version": __version__, "settings": phantom.settings.model_dump()})
             )
@@ -192,20 +191,20 @@ def generate(
     _LOG.info("phantom of seed %d written to %s", settings.seed, output)
 
 
-def _write(phantom: Phantom, folder: Path, tell: Progress) -> None:
+def _write(phantom: Phantom, folder: Path, report: Progress) -> None:
     layout, lens, frames = phantom.layout, phantom.sensor.lens, len(phantom.poses)
-    turned = [view.camera_to_world for view in phantom.rotation_views]
-    total = frames + len(turned)
+    rotated = [view.camera_to_world for view in phantom.rotation_views]
+    total = frames + len(rotated)
     # Coverage as C3VD counts it: triangles that are the first hit of any pixel ray of any frame.
     observed = np.zeros(len(phantom.world.surface.triangles), bool)
     trained_on = np.zeros_like(observed)
     drawn = []
-    tell("frames", 0, total)
-    for number, (exposure, color) in enumerate(_photographs(phantom, total)):
+    report("frames", 0, total)
+    for number, (exposure, color) in enumerate(_rendered_frames(phantom, total)):
         image = phantom.sensor.image
         part: Part = "video" if number < frames else "rotation"
         index = number if part == "video" else number - frames
-        pose = phantom.poses[index] if part == "video" else turned[index]
+        pose = phantom.poses[index] if part == "video" else rotated[index]
         taken = PhantomFrame(part, index, image(color), image(exposure.z_depth), image(exposure.normals))
         layout.write_frame(folder, taken)
         if part == "video":
@@ -217,34 +216,34 @@ def _write(phantom: Phantom, folder: Path, tell: Progress) -> None:
         else:
             seen = image(_seen_mask(phantom, exposure, pose))
             write_image(layout.seen_mask(folder, part, index), seen)
-        tell("frames", number + 1, total)
+        report("frames", number + 1, total)
     layout.write_sequence(folder, "video", phantom.poses, lens)
-    if turned:
-        layout.write_sequence(folder, "rotation", turned, lens)
+    if rotated:
+        layout.write_sequence(folder, "rotation", rotated, lens)
     if layout.has_points:
         layout.write_points(folder, _wall_points(phantom, drawn), phantom.poses, lens)
     if layout.has_coverage_mesh:
         meshes.write_coverage_obj(folder / "coverage_mesh.obj", phantom.world.surface, observed)
-    tell("truth", 0, 1)
+    report("truth", 0, 1)
     _write_truth(phantom, folder / "truth", trained_on, observed)
-    tell("truth", 1, 1)
+    report("truth", 1, 1)
 
 
-def _photographs(phantom: Phantom, total: int) -> Iterator[tuple[Exposure, UInt8[np.ndarray, "P 3"]]]:
-    """All pictures in order, a few ahead of whoever writes them."""
+def _rendered_frames(phantom: Phantom, total: int) -> Iterator[tuple[Exposure, UInt8[np.ndarray, "P 3"]]]:
+    """All images in order, rendered a few ahead of the writer."""
     with ThreadPoolExecutor(_AT_ONCE) as pool:
-        waiting = [pool.submit(phantom.photograph, number) for number in range(min(_AT_ONCE, total))]
+        waiting = [pool.submit(phantom.render_frame, number) for number in range(min(_AT_ONCE, total))]
         for number in range(total):
             ready = waiting.pop(0).result()
             if number + _AT_ONCE < total:
-                waiting.append(pool.submit(phantom.photograph, number + _AT_ONCE))
+                waiting.append(pool.submit(phantom.render_frame, number + _AT_ONCE))
             yield ready
 
 
 def _seen_mask(
     phantom: Phantom, exposure: Exposure, camera_to_world: Float[np.ndarray, "4 4"]
 ) -> UInt8[np.ndarray, "P"]:
-    """255 where a pixel's wall is also seen by a training frame; 0 elsewhere, and where there is no wall. [P]"""
+    """Seen mask: 255 where a training frame sees the pixel's surface point, else 0. [P]"""
     found = np.flatnonzero(exposure.z_depth > 0.0)
     points = _wall(phantom, exposure, camera_to_world, found)
     mask = np.zeros(len(exposure.z_depth), np.uint8)
@@ -258,7 +257,7 @@ def _wall(
     camera_to_world: Float[np.ndarray, "4 4"],
     pixels: Int[np.ndarray, "N"],
 ) -> Float[np.ndarray, "N 3"]:
-    """Where on the wall, world frame, lit pixels look. [N, 3]"""
+    """Wall points of the lit pixels, world frame. [N, 3]"""
     local = phantom.sensor.centers[pixels] * exposure.z_depth[pixels, None]
     return np.asarray(local.astype(np.float64) @ camera_to_world[:3, :3].T + camera_to_world[:3, 3])
 

@@ -1,4 +1,4 @@
-"""Taking pictures: rays through a lens, onto the mesh, and back as radiance, z-depth and normals."""
+"""Ray-traced rendering of the mesh through a lens: radiance, z-depth and normals."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from coliags_plugin.phantom.colon import ColonSurface
 from coliags_plugin.phantom.interreflection import IndirectLight
 from coliags_plugin.phantom.light import Lamp
 from coliags_plugin.phantom.mucosa import Mucosa
-from coliags_plugin.phantom.tracing import Hits, Tracer, turned
+from coliags_plugin.phantom.tracing import Hits, Tracer, rotated
 
-#: Samples shaded at a time: bounds memory, and keeps the working set in the cache.
+#: Samples shaded per batch, which bounds memory and fits the cache.
 _CHUNK = 1 << 15
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """The pixels that see something, and the directions they sample.
+    """The lit pixels and their ray directions.
 
     Attributes:
-        lens: What pictures are taken through.
-        mask: Pixels that the lens lights. [H, W]
-        centers: Direction through each such pixel's centre. [P, 3]
+        lens: Lens.
+        mask: Lit pixels. [H, W]
+        centers: Ray direction through each lit pixel's centre. [P, 3]
         samples: Directions of its K colour samples. [P, K, 3]
     """
 
@@ -36,7 +36,7 @@ class Sensor:
 
     @classmethod
     def behind(cls, lens: Lens, mask: Bool[np.ndarray, "H W"], supersampling: int) -> Sensor:
-        """A sensor with ``supersampling`` x ``supersampling`` colour samples a pixel."""
+        """A sensor with ``supersampling`` x ``supersampling`` colour samples per pixel."""
         row, column = np.nonzero(mask)
         pixels = np.stack([column, row], axis=1) + 0.5
         reached = ~np.isnan(lens.unproject(pixels)[:, 0])
@@ -47,12 +47,12 @@ class Sensor:
         sub = np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(-1, 2)
         centers = lens.unproject(pixels)
         samples = np.stack([lens.unproject(pixels + offset) for offset in sub], axis=1)
-        # A sub-sample past the lens's reach looks where its pixel's centre does.
+        # A sub-sample outside the lens's field of view uses the direction of its pixel's centre.
         samples = np.where(np.isnan(samples), centers[:, None, :], samples)
         return cls(lens, mask, centers.astype(np.float32), samples.astype(np.float32))
 
-    def thinned(self, most: int) -> Sensor:
-        """An exposure meter: about ``most`` of the pixels, evenly spread, one sample each."""
+    def subsampled(self, most: int) -> Sensor:
+        """A sparse sensor for exposure metering: about ``most`` evenly spread pixels, one sample each."""
         stride = max(int(np.sqrt(len(self.centers) / most)), 1)
         grid = np.zeros_like(self.mask)
         grid[stride // 2 :: stride, stride // 2 :: stride] = True
@@ -61,7 +61,7 @@ class Sensor:
         return Sensor(self.lens, mask, chosen, chosen[:, None, :])
 
     def image(self, values: np.ndarray) -> np.ndarray:
-        """Values of the lit pixels as an image that is 0 elsewhere. [P, ...] -> [H, W, ...]"""
+        """Scatter values of the lit pixels to an image that is 0 elsewhere. [P, ...] -> [H, W, ...]"""
         image = np.zeros((*self.mask.shape, *values.shape[1:]), values.dtype)
         image[self.mask] = values
         return image
@@ -69,7 +69,7 @@ class Sensor:
 
 @dataclass(frozen=True)
 class World:
-    """Everything a picture depends on but the camera's place."""
+    """Scene description: wall, material, lamp and lens, without the camera pose."""
 
     surface: ColonSurface
     mucosa: Mucosa
@@ -80,13 +80,13 @@ class World:
 
 @dataclass(frozen=True)
 class Exposure:
-    """What reaches the sensor's P lit pixels.
+    """Rendered values of the sensor's P lit pixels.
 
     Attributes:
         radiance: Linear, before exposure. [P, 3]
-        z_depth: mm at the pixel's centre; 0 where the ray meets nothing. [P]
-        normals: Unit, camera axes, towards the camera; 0 where the ray meets nothing. [P, 3]
-        triangles: Numbers of all triangles met.
+        z_depth: mm at the pixel's centre; 0 where the ray hits nothing. [P]
+        normals: Unit, camera axes, towards the camera; 0 where the ray hits nothing. [P, 3]
+        triangles: Indices of all triangles hit.
     """
 
     radiance: Float[np.ndarray, "P 3"]
@@ -98,7 +98,7 @@ class Exposure:
 def expose(
     world: World, sensor: Sensor, camera_to_world: Float[np.ndarray, "4 4"], indirect: IndirectLight | None
 ) -> Exposure:
-    """Take one picture. Colour is the mean of a pixel's samples; z-depth and normal are those of its centre alone."""
+    """Render one image. Colour is the mean of a pixel's samples; z-depth and normal are those of its centre."""
     pixels, per_pixel = sensor.samples.shape[:2]
     radiance = np.empty((pixels, 3), np.float32)
     met = np.zeros(len(world.surface.triangles), bool)
@@ -117,14 +117,14 @@ def expose(
     z_depth = np.where(hits.found, hits.z_depth, np.float32(0.0))
     normals = np.zeros((pixels, 3), np.float32)
     facing = _unit(world.tracer.interpolate(world.surface.normals, hits.kept()))
-    normals[hits.found] = turned(facing, camera_to_world[:3, :3].T)
+    normals[hits.found] = rotated(facing, camera_to_world[:3, :3].T)
     return Exposure(radiance, z_depth, normals, np.flatnonzero(met))
 
 
 def meter(
     world: World, sensor: Sensor, camera_to_world: Float[np.ndarray, "4 4"], indirect: IndirectLight | None
 ) -> Float[np.ndarray, "P 3"]:
-    """Radiance of the pixels' centres only; what an exposure meter looks at. [P, 3]"""
+    """Radiance of the pixels' centres only, for exposure metering. [P, 3]"""
     hits = world.tracer.cast(camera_to_world, sensor.centers)
     light = np.zeros((len(sensor.centers), 3), np.float32)
     spacing = float(np.sqrt(_pixel_solid_angle(sensor)))
@@ -140,27 +140,27 @@ def shade(
     spacing: float,
     indirect: IndirectLight | None,
 ) -> Float[np.ndarray, "N 3"]:
-    """Radiance that hits send back along their rays.
+    """Radiance reflected from ray hits towards the camera.
 
     ``cos^k theta (albedo (E n.l + E_indirect) + gloss E)`` with ``E = beam (20 / d)^2``.
 
     Args:
         world: Wall, lamp and lens.
         camera_to_world: Pose. [4, 4]
-        directions: Of the rays, camera axes, z = 1. [N, 3]
-        hits: Where they met the wall; all found. [N]
+        directions: Ray directions, camera axes, z = 1. [N, 3]
+        hits: Their hits; all valid. [N]
         spacing: Distance between neighbouring samples at z-depth 1.
-        indirect: Light that the wall throws onto the wall, or none.
+        indirect: Indirect light, or None.
     """
     length = np.sqrt(np.einsum("nc,nc->n", directions, directions))
     cos_theta = 1.0 / length
-    to_eye = turned(directions, camera_to_world[:3, :3]) * -cos_theta[:, None]
+    to_eye = rotated(directions, camera_to_world[:3, :3]) * -cos_theta[:, None]
     points = camera_to_world[:3, 3].astype(np.float32) - to_eye * (hits.z_depth * length)[:, None]
 
     normals = _unit(world.tracer.interpolate(world.surface.normals, hits))
     slant = np.maximum(np.einsum("nc,nc->n", normals, to_eye), 0.15)
-    row, column = world.surface.grid_place(hits.triangle, hits.barycentric)
-    # A sample's footprint is an ellipse, longer where the wall slants away; the texture is blurred evenly.
+    row, column = world.surface.grid_coordinates(hits.triangle, hits.barycentric)
+    # A sample's footprint is an ellipse, elongated on slanted walls; the texture is blurred isotropically.
     material = world.mucosa.sample(row, column, hits.z_depth * spacing / np.sqrt(slant))
 
     along = world.surface.tangents[world.surface.triangles[hits.triangle, 0]]
@@ -168,7 +168,7 @@ def shade(
     across = np.cross(normals, along)
     tipped = along * material.slopes[:, :1] + across * material.slopes[:, 1:]
     film = _unit(normals - tipped)
-    # Light diffuses about half a millimetre inside tissue, which evens out half of the finest relief's shading.
+    # Light diffuses about half a millimetre inside tissue, which smooths half of the finest relief's shading.
     tissue = _unit(normals - 0.5 * tipped)
 
     strength, to_lamp = world.lamp.irradiance(points, camera_to_world)
@@ -180,14 +180,14 @@ def shade(
     if indirect is not None:
         received = received + indirect.at(row, column)
     gloss = strength * material.wetness * world.lamp.gloss(film, to_lamp, to_eye, material.slope_variance)
-    # The film cannot shine where the wall itself turns its back.
+    # The mucus film does not reflect where the wall faces away from the light.
     gloss *= np.einsum("nc,nc->n", normals, to_lamp) > 0.0
     light = material.albedo * received + gloss[:, None]
     return np.asarray(light * (cos_theta**world.vignetting)[:, None], dtype=np.float32)
 
 
 def _pixel_solid_angle(sensor: Sensor) -> float:
-    """Mean area that a pixel covers at z-depth 1, seen near the middle of the image."""
+    """Mean area of a pixel at z-depth 1, near the middle of the image."""
     # The pixel whose top left corner is the middle, and its neighbours.
     middle = np.array([0.5 * sensor.lens.width, 0.5 * sensor.lens.height]) + 0.5
     corner = sensor.lens.unproject(middle + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))

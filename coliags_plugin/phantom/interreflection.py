@@ -1,10 +1,9 @@
-"""Light that the wall throws onto the wall.
+"""Diffuse interreflections of the wall, by radiosity.
 
-A colon is nearly a closed cavity, and its mucosa returns most of the red light: what one wall sends back lights the
-others, several times over. That is why the far lumen of a real picture is a deep red-brown and not black, and why red
-falls off more slowly with distance than green and blue (linear exponents 1.4 against 2.2 and 2.4, measured on C3VD;
-docs/phantom.md 2.3). It is solved here by radiosity: the wall is cut into patches of about 5 mm, all of
-them Lambertian, with traced mutual visibility.
+A colon is nearly a closed cavity, and its mucosa reflects most of the red light, so that multiple bounces matter. This
+is why the far lumen of a real image is a deep red-brown and not black, and why red falls off more slowly with distance
+than green and blue (linear exponents 1.4 against 2.2 and 2.4, measured on C3VD; docs/phantom.md 2.3). The wall is
+divided into Lambertian patches of about 5 mm with ray-traced mutual visibility.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from coliags_plugin.phantom.light import Lamp
 from coliags_plugin.phantom.tracing import Tracer
 
 _PATCH = 5.0
-#: Sample points a patch.
+#: Sample points per patch.
 _SAMPLES = 4
 #: Bounces; at an albedo of .8 the rest is under 1 %.
 _BOUNCES = 24
@@ -40,7 +39,7 @@ class IndirectLight:
     columns_per_column: float
 
     def at(self, row: Float[np.ndarray, "N"], column: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N 3"]:
-        """Bilinear between patch centres; columns are periodic. [N, 3]"""
+        """Bilinear interpolation between patch centres; columns are periodic. [N, 3]"""
         rows, columns = self.irradiance.shape[:2]
         y = np.clip(row * self.rows_per_row - 0.5, 0.0, rows - 1.001)
         x = column * self.columns_per_column - 0.5
@@ -56,7 +55,7 @@ class IndirectLight:
 
 @dataclass(frozen=True)
 class Patches:
-    """The wall in pieces.
+    """Patches of the wall.
 
     Attributes:
         points: Sample points, world, mm. [P, K, 3]
@@ -73,10 +72,10 @@ class Patches:
     shape: tuple[int, int]
 
 
-def cut_patches(
+def make_patches(
     surface: ColonSurface, vertex_albedo: Float[np.ndarray, "V 3"], generator: np.random.Generator
 ) -> Patches:
-    """Cut the wall into a grid of patches, each represented by a few of its vertices."""
+    """Divide the wall into a grid of patches, each represented by a few of its vertices."""
     rows = min(max(round(surface.row_length * (surface.rows - 1) / _PATCH), 4), surface.rows)
     columns = min(max(round(2.0 * np.pi * RADIUS / _PATCH), 6), surface.columns)
     row_of = (np.arange(surface.rows) * rows) // surface.rows
@@ -107,9 +106,9 @@ def cut_patches(
 
 
 def form_factors(patches: Patches, tracer: Tracer) -> Float[np.ndarray, "P P"]:
-    """Share of what patch i receives from the whole half-space above it that comes from patch j. [P, P]
+    """Form factors from patch j to patch i. [P, P]
 
-    A point sees a small disc of area A under ``cos cos A / (pi r^2 + A)``; the mean is taken over pairs of samples.
+    The form factor of a small disc of area A is ``cos cos A / (pi r^2 + A)``, averaged over pairs of samples.
     """
     count = len(patches.areas)
     total = np.zeros((count, count))
@@ -128,19 +127,19 @@ def form_factors(patches: Patches, tracer: Tracer) -> Float[np.ndarray, "P P"]:
         total[i, j] += leaving[i, j] * arriving[i, j] * area / (np.pi * square[i, j] + area)
     total /= _SAMPLES
     np.fill_diagonal(total, 0.0)
-    # No patch can receive more than a full half-space.
+    # The form factors of a patch sum to at most 1.
     return np.asarray(total / np.maximum(total.sum(axis=1, keepdims=True), 1.0))
 
 
 def solve(
     patches: Patches, factors: Float[np.ndarray, "P P"], direct: Float[np.ndarray, "P T"]
 ) -> Float[np.ndarray, "T P 3"]:
-    """Indirect irradiance under T lamps at once.
+    """Solve for the indirect irradiance of T lamps at once.
 
     Args:
         patches: The wall.
         factors: From :func:`form_factors`. [P, P]
-        direct: Irradiance straight from each (white) lamp. [P, T]
+        direct: Direct irradiance from each (white) lamp. [P, T]
     """
     answer = np.empty((direct.shape[1], direct.shape[0], 3), np.float32)
     for channel in range(3):
@@ -166,20 +165,20 @@ def indirect_lights(
     Args:
         surface: The wall.
         vertex_albedo: Its albedo, linear RGB. [V, 3]
-        tracer: For visibility.
-        lamp: Carried by the cameras.
+        tracer: Ray tracer for visibility.
+        lamp: Lamp, fixed to the cameras.
         cameras_to_world: Poses, each [4, 4].
         share: Factor on the result.
-        generator: Chooses the patches' sample points.
+        generator: Random generator of the patches' sample points.
     """
-    patches = cut_patches(surface, vertex_albedo, generator)
+    patches = make_patches(surface, vertex_albedo, generator)
     factors = form_factors(patches, tracer)
     flat_points, flat_normals = patches.points.reshape(-1, 3), patches.normals.reshape(-1, 3)
     direct = np.empty((len(patches.areas), len(cameras_to_world)))
     for index, camera_to_world in enumerate(cameras_to_world):
         strength, to_lamp = lamp.irradiance(flat_points, camera_to_world)
         received = strength * np.maximum(np.einsum("nc,nc->n", flat_normals, to_lamp), 0.0)
-        # Seen from the lens even when the lamp stands behind it: see light.py on rings of light guides.
+        # Visibility is from the lens even if the lamp is behind it: see light.py on rings of light guides.
         offset = np.asarray(lamp.offset) if lamp.casts_shadows else np.zeros(3)
         source = camera_to_world[:3, 3] + camera_to_world[:3, :3] @ offset
         lit = np.flatnonzero(received > 0.0)
@@ -204,6 +203,6 @@ def _mutually_visible(
     clear = np.empty(len(i), bool)
     for start in range(0, len(i), 1 << 19):
         part = slice(start, start + (1 << 19))
-        # Off the wall by a hair, so that the receiver does not hide behind itself.
+        # Offset from the wall to avoid self-occlusion.
         clear[part] = tracer.visible(emitter[j[part]], receiver[i[part]] + 0.05 * up[i[part]])
     return clear

@@ -1,11 +1,11 @@
-"""The lamp and the wall's reflection, in linear light (docs/phantom.md 2, 2.2).
+"""Light source and reflectance of the wall, in linear light (docs/phantom.md 2, 2.2).
 
-Radiance is counted in units of what a white Lambertian wall sends back that the lamp's axis strikes squarely at
-20 mm, so exposures are of the order of 1.
+The unit of radiance is that of a white Lambertian wall at 20 mm, perpendicular to the lamp's axis, so that exposures
+are of the order of 1.
 
-No cast shadows are drawn for a lamp on the optical axis. Exactly at the lens it casts none that the lens could see.
-Behind the lens it stands for a ring of light guides around it (such a ring, too, gains less than 1/d^2 on close walls,
-docs/phantom.md 2.1), and what the lens sees, the ring as a whole lights. A lamp beside the lens does cast shadows.
+A lamp on the optical axis casts no shadows. At the lens, its shadows are invisible to the lens. Behind the lens it
+models a ring of light guides around it (such a ring, too, gains less than 1/d^2 on close walls, docs/phantom.md 2.1),
+which lights all that the lens sees. A lamp beside the lens casts shadows.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from coliags_plugin.phantom.settings import PhantomSettings, SpreadLaw, either
+from coliags_plugin.phantom.settings import PhantomSettings, SpreadLaw, value_or_default
 from coliags_plugin.phantom.streams import smoothstep
 
 #: Distance at which radiance is 1, mm.
 UNIT_DISTANCE = 20.0
-#: cos psi below which the beam fades to nothing at 90 degrees: light guides shine forward only. No pixel looks there.
+#: cos psi below which the beam fades to 0 at 90 degrees: light guides only emit forward. No pixel looks there.
 _EDGE = float(np.cos(np.radians(72.0)))
 
 
 @dataclass(frozen=True)
 class Lamp:
-    """A spotlight that the camera carries, and the mucosa's gloss.
+    """A spotlight fixed to the camera, and the mucosa's specular reflection.
 
     Attributes:
         offset: Position in camera axes, mm.
@@ -46,14 +46,14 @@ class Lamp:
 
     @classmethod
     def of(cls, settings: PhantomSettings) -> Lamp:
-        """The lamp that settings describe; it is tilted downwards in the image."""
+        """Lamp from settings; it is tilted downwards in the image."""
         preset = settings.preset
-        tilt = np.radians(either(settings.tilt, preset.tilt))
+        tilt = np.radians(value_or_default(settings.tilt, preset.tilt))
         return cls(
-            offset=either(settings.light_offset, preset.light_offset),
+            offset=value_or_default(settings.light_offset, preset.light_offset),
             axis=(0.0, float(np.sin(tilt)), float(np.cos(tilt))),
-            spread_law=either(settings.spread_law, preset.spread_law),
-            spread=either(settings.spread, preset.spread),
+            spread_law=value_or_default(settings.spread_law, preset.spread_law),
+            spread=value_or_default(settings.spread, preset.spread),
             specular=settings.specular,
             roughness=settings.roughness,
             f0=settings.f0,
@@ -61,7 +61,7 @@ class Lamp:
 
     @property
     def casts_shadows(self) -> bool:
-        """Whether the lamp stands beside the optical axis."""
+        """Whether the lamp is off the optical axis."""
         return bool(np.hypot(self.offset[0], self.offset[1]) > 0.0)
 
     def beam(self, cosine: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
@@ -79,11 +79,11 @@ class Lamp:
     def irradiance(
         self, points: Float[np.ndarray, "N 3"], camera_to_world: Float[np.ndarray, "4 4"]
     ) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N 3"]]:
-        """What a wall square to the light would receive, and where the light comes from.
+        """Irradiance of surfaces perpendicular to the light, and the directions to the lamp.
 
         Args:
             points: World, mm. [N, 3]
-            camera_to_world: Pose of the camera that carries the lamp. [4, 4]
+            camera_to_world: Camera pose. [4, 4]
 
         Returns:
             ``beam(cos psi) (20 / d)^2`` and unit directions from the points to the lamp, world. [N], [N, 3]
@@ -111,8 +111,8 @@ class Lamp:
             normals: Unit, with the micro-relief. [N, 3]
             to_lamp: Unit. [N, 3]
             to_eye: Unit. [N, 3]
-            slope_variance: Relief too small for the sample, summed over two directions; it widens the lobe as
-                roughness does (a GGX lobe of width alpha stands for slopes of variance alpha^2). [N]
+            slope_variance: Slope variance of relief smaller than the sample, summed over two directions; it widens the
+                lobe like roughness (a GGX lobe of width alpha has slope variance alpha^2). [N]
         """
         half = to_lamp + to_eye
         half /= np.maximum(np.sqrt(np.einsum("nc,nc->n", half, half)), 1e-6)[:, None]
@@ -128,5 +128,5 @@ class Lamp:
         return np.asarray(self.specular * fresnel * lobe * 0.5 * light / np.maximum(masking, 1e-6))
 
     def describe(self) -> dict[str, Any]:
-        """Plain values for the truth folder."""
+        """Parameters as plain values, for the truth folder."""
         return {**asdict(self), "unit_distance_mm": UNIT_DISTANCE}

@@ -1,4 +1,4 @@
-"""What the wall is coloured with: a texture of albedo, wetness and micro-relief over the colon's grid."""
+"""Procedural texture of the wall: albedo, wetness and micro-relief."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from coliags_plugin.phantom.colon import RADIUS, Anatomy, ColonSurface
 from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.phantom.streams import Purpose, SolidNoise, smoothstep, stream
 
-#: Size and relative strength of the mottling of brightness, mm.
+#: Size, mm, and relative strength of the mottling of brightness.
 _MOTTLING = ((6.0, 0.06), (1.6, 0.045), (0.4, 0.045), (0.18, 0.045))
-#: Size, mm, and strength of changes in blood content, which take green and blue but spare red.
+#: Size, mm, and strength of variations in blood content, which absorb green and blue but hardly red.
 _REDDENING = ((9.0, 0.09), (2.5, 0.10), (0.9, 0.06))
 #: Absorption of a vessel's blood at full strength, per RGB channel (optical depth).
 _BLOOD = (0.30, 0.95, 0.85)
@@ -22,7 +22,7 @@ _BLOOD = (0.30, 0.95, 0.85)
 _MICRO_RELIEF = ((0.8, 0.04), (0.24, 0.085))
 #: Share of reddening that each RGB channel shows.
 _REDDENED = (0.12, 1.0, 0.95)
-#: Share of the mottling: what is darker is darker because it holds more blood, so it is redder too.
+#: Share of the mottling due to blood content, so that darker regions are also redder.
 _MOTTLED = (0.7, 1.2, 1.15)
 _VESSELS = 120
 _LEVELS = 6
@@ -34,9 +34,9 @@ class MucosaSample:
 
     Attributes:
         albedo: Linear RGB. [N, 3]
-        wetness: Share of the mucus film, 0 to 1. [N]
+        wetness: Coverage by the mucus film, 0 to 1. [N]
         slopes: Micro-relief along the colon and around it, rise per run. [N, 2]
-        slope_variance: Relief lost inside the footprint, summed over both directions. [N]
+        slope_variance: Slope variance filtered out within the footprint, summed over both directions. [N]
     """
 
     albedo: Float[np.ndarray, "N 3"]
@@ -47,7 +47,7 @@ class MucosaSample:
 
 @dataclass(frozen=True)
 class Mucosa:
-    """The texture and its coarser copies; each level halves the last. Columns are periodic.
+    """Mipmapped texture; columns are periodic.
 
     Attributes:
         color: Albedo RGB and wetness, float32, per level. [Hl, Wl + 2, 4]
@@ -70,11 +70,11 @@ class Mucosa:
     def sample(
         self, row: Float[np.ndarray, "N"], column: Float[np.ndarray, "N"], footprint: Float[np.ndarray, "N"]
     ) -> MucosaSample:
-        """The material at places of the mesh's grid, blurred to what one camera sample covers.
+        """Sample the material at grid coordinates, filtered to the footprint of a camera sample.
 
         Args:
-            row: Place on the mesh's grid. [N]
-            column: Place on the mesh's grid. [N]
+            row: Fractional row of the mesh's grid. [N]
+            column: Fractional column of the mesh's grid. [N]
             footprint: Size of the sample on the wall, mm. [N]
         """
         level = np.clip(np.log2(np.maximum(footprint / self.texel, 1.0)), 0.0, _LEVELS - 1.001).astype(np.float32)
@@ -87,7 +87,7 @@ class Mucosa:
             if not len(chosen):
                 continue
             scale = 0.5**current
-            # Texel centres lie half a texel from the grid's lines, and one column stands before the first.
+            # Texel centres are offset by half a texel from the grid lines, and there is one padding column.
             x = (column[chosen] * self.columns_per_column * scale) % (self.color[current].shape[1] - 2) + 0.5
             y = row[chosen] * self.rows_per_row * scale - 0.5
             values = [_look_up(level[current], x, y) for level in (self.color, self.relief)]
@@ -97,7 +97,7 @@ class Mucosa:
 
 
 def paint_mucosa(anatomy: Anatomy, surface: ColonSurface, settings: PhantomSettings) -> Mucosa:
-    """Paint the wall: red-pink base, mottling, blood, branching vessels, mucus and micro-relief."""
+    """Generate the texture: red-pink base, mottling, blood, branching vessels, mucus and micro-relief."""
     generator = stream(settings.seed, Purpose.MUCOSA)
     length = surface.row_length * (surface.rows - 1)
     around = 2.0 * np.pi * RADIUS
@@ -107,7 +107,7 @@ def paint_mucosa(anatomy: Anatomy, surface: ColonSurface, settings: PhantomSetti
     width = multiple * (round(around / settings.texture_spacing / multiple) + 1)
     solid = SolidNoise(generator)
     positions = _texel_positions(surface, (height, width))
-    # Broad layers are worked out on every fourth texel.
+    # Low-frequency layers are computed on every fourth texel.
     sparse = _texel_positions(surface, (height // 4, width // 4))
 
     def noise(scale: float) -> Float[np.ndarray, "H W"]:
@@ -142,7 +142,7 @@ def paint_mucosa(anatomy: Anatomy, surface: ColonSurface, settings: PhantomSetti
     relief = np.zeros((height, width, 3), np.float32)
     for scale, slope in _MICRO_RELIEF:
         bumps = noise(scale)
-        # A Gaussian process of kernel sigma has slopes of 1 / (sqrt(2) sigma); this keeps them alike everywhere.
+        # A Gaussian process of kernel sigma has slopes of 1 / (sqrt(2) sigma); this keeps them uniform.
         rise = slope * np.sqrt(2.0) * scale / 2.5
         relief[..., 0] += rise * np.gradient(bumps, axis=0) / np.maximum(along, 1e-3)
         relief[..., 1] += rise * np.gradient(bumps, axis=1) / np.maximum(across, 1e-3)
@@ -157,7 +157,7 @@ def paint_mucosa(anatomy: Anatomy, surface: ColonSurface, settings: PhantomSetti
 
 
 def _texel_positions(surface: ColonSurface, shape: tuple[int, int]) -> Float[np.ndarray, "H W 3"]:
-    """Where texel centres lie in the world, mm. [H, W, 3]"""
+    """Texel centres in the world frame, mm. [H, W, 3]"""
     grid = surface.vertices.reshape(surface.rows, surface.columns, 3)
     grid = np.concatenate([grid, grid[:, :1]], axis=1)
     row = (np.arange(shape[0], dtype=np.float32) + 0.5) * ((surface.rows - 1) / shape[0])
@@ -169,9 +169,9 @@ def _texel_positions(surface: ColonSurface, shape: tuple[int, int]) -> Float[np.
 def _draw_vessels(
     shape: tuple[int, int], sizes: tuple[float, float], generator: np.random.Generator
 ) -> Float[np.ndarray, "H W"]:
-    """How much vessel lies under each texel, 0 to about 1. [H, W]
+    """Vessel density at each texel, 0 to about 1. [H, W]
 
-    Random walks that taper and branch. Half lie deep, where the tissue above blurs and weakens them.
+    Vessels are random walks that taper and branch. Half are deep, blurred and attenuated by the tissue above.
     """
     pad = round(12.0 / sizes[1])
     layers = []
@@ -203,9 +203,9 @@ def _draw_branch(
     generator: np.random.Generator,
     surfacing: float = 0.0,
 ) -> None:
-    """Draw one vessel (row, column in mm) and, recursively, what branches off it; all taper to 0.15 mm.
+    """Draw one vessel (row, column in mm) and, recursively, its branches; all taper to 0.15 mm.
 
-    Over its first ``surfacing`` mm a vessel rises out of the depth of the wall.
+    Over its first ``surfacing`` mm a vessel rises from deep in the wall.
     """
     place, step, walked = start.copy(), 0.6, 0.0
     wander = 0.0
@@ -219,7 +219,7 @@ def _draw_branch(
         ends = [
             (round((point[1] / sizes[1] + pad) * 16), round(point[0] / sizes[0] * 16)) for point in (place, following)
         ]
-        # What is thinner than a texel shows as a fainter one.
+        # Vessels thinner than a texel are drawn fainter.
         thickness = max(round(width / sizes[0]), 1)
         risen = min(walked / surfacing, 1.0) if surfacing else 1.0
         shown = round(strength * risen * min(width / sizes[0], 1.0) * min(1.0, width / 0.3))
@@ -236,7 +236,7 @@ def _draw_branch(
 
 
 def _pyramid(texture: Float[np.ndarray, "H W K"]) -> tuple[Float[np.ndarray, "H W K"], ...]:
-    """The texture, then each level the 2 x 2 means of the last, with one column repeated at either edge."""
+    """Mipmap levels by 2 x 2 means, with one periodic padding column at either edge."""
     levels = [texture]
     for _ in range(_LEVELS - 1):
         height, width, _ = levels[-1].shape
@@ -248,7 +248,7 @@ def _look_up(
     texture: Float[np.ndarray, "H W K"], x: Float[np.ndarray, "N"], y: Float[np.ndarray, "N"]
 ) -> Float[np.ndarray, "N K"]:
     """Bilinear values, centres at integers, rows clamped. [N, K]"""
-    # OpenCV wants maps no larger than 32767 a side.
+    # cv2.remap takes maps of at most 32767 per side.
     width = min(len(x), 4096)
     padded = -len(x) % width
     maps = [np.pad(axis.astype(np.float32), (0, padded)).reshape(-1, width) for axis in (x, y)]

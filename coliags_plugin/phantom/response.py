@@ -1,4 +1,4 @@
-"""From radiance to the picture: exposure, white balance, tone curve and noise."""
+"""Camera response from radiance to 8-bit images: exposure, white balance, tone curve and noise."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import numpy as np
 import scipy.ndimage
 from jaxtyping import Float, UInt8
 
-from coliags_plugin.phantom.settings import PhantomSettings, either
+from coliags_plugin.phantom.settings import PhantomSettings, value_or_default
 from coliags_plugin.phantom.streams import Purpose, stream
 
-#: Linear level above which the shoulder bends, and softly nears 1.
+#: Linear level above which the soft shoulder approaches 1.
 KNEE = 0.7
 #: Correlation length of the white balance's drift, frames.
 _DRIFT_LENGTH = 20.0
@@ -26,7 +26,7 @@ def encode(linear: Float[np.ndarray, "..."], gamma: float) -> Float[np.ndarray, 
 
 
 def exposure_for(radiance: Float[np.ndarray, "N 3"], target: float, gamma: float) -> float:
-    """The gain, within a factor 1e6 of 1, that gives the encoded samples mean ``target``; 1 for a black picture."""
+    """The gain, within a factor 1e6 of 1, that gives the encoded samples mean ``target``; 1 for a black image."""
     if not np.any(radiance > 0.0):
         return 1.0
     low, high = np.log(1e-6), np.log(1e6)
@@ -40,10 +40,10 @@ def exposure_for(radiance: Float[np.ndarray, "N 3"], target: float, gamma: float
 
 
 def exposures(ideal: Sequence[float], settings: PhantomSettings) -> Float[np.ndarray, "T"]:
-    """Gain of every frame.
+    """Exposure gain of every frame.
 
-    The automatic exposure follows the logarithm of the ideal gain with a first-order lag and stays within
-    ``gain_span``, centred on the sequence's median; the fixed one is that median.
+    Automatic exposure follows the logarithm of the ideal gain with a first-order lag, limited to ``gain_span`` around
+    the sequence's median; fixed exposure is the median.
 
     Args:
         ideal: For each frame, the gain that would bring it to the target grey. [T]
@@ -51,7 +51,7 @@ def exposures(ideal: Sequence[float], settings: PhantomSettings) -> Float[np.nda
     """
     wanted = np.log(np.asarray(ideal, np.float64))
     reference = float(np.median(wanted))
-    if either(settings.gain, settings.preset.gain) == "fixed":
+    if value_or_default(settings.gain, settings.preset.gain) == "fixed":
         return np.full(len(wanted), np.exp(reference))
     half_span = 0.5 * np.log(settings.gain_span)
     wanted = np.clip(wanted, reference - half_span, reference + half_span)
@@ -69,8 +69,8 @@ def white_balances(settings: PhantomSettings) -> Float[np.ndarray, "T 3"]:
     generator = stream(settings.seed, Purpose.WHITE_BALANCE)
     drift = generator.standard_normal((settings.frames + 8 * int(_DRIFT_LENGTH), 2))
     drift = scipy.ndimage.gaussian_filter1d(drift, _DRIFT_LENGTH, axis=0)[4 * int(_DRIFT_LENGTH) :][: settings.frames]
-    # Scaled by the filter's known gain, not by the sample: a short sequence sees only a piece of the drift.
-    drift *= np.sqrt(2.0 * np.sqrt(np.pi) * _DRIFT_LENGTH) * either(
+    # Scaled by the filter's known gain, not by the sample's deviation, since a short sequence covers only part of it.
+    drift *= np.sqrt(2.0 * np.sqrt(np.pi) * _DRIFT_LENGTH) * value_or_default(
         settings.white_balance_drift, settings.preset.white_balance_drift
     )
     return np.exp(np.stack([drift[:, 0], np.zeros(settings.frames), drift[:, 1]], axis=1))
@@ -82,7 +82,7 @@ def develop(
     settings: PhantomSettings,
     generator: np.random.Generator,
 ) -> UInt8[np.ndarray, "N 3"]:
-    """The 8-bit picture.
+    """Apply gain, tone curve and noise, and quantise to 8 bits.
 
     Noise is added to the encoded value; half its variance at mid grey is read noise, the other half is shot noise,
     whose variance grows with the value.
@@ -91,7 +91,7 @@ def develop(
         radiance: Linear, from :mod:`imaging`. [N, 3]
         gain: Exposure times white balance. [3]
         settings: Gamma and noise.
-        generator: Of this frame alone.
+        generator: Random generator of this frame.
     """
     value = encode(radiance * gain.astype(np.float32), settings.gamma)
     deviation = settings.noise / 255.0 * np.sqrt(0.5 + value)

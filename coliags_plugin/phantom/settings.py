@@ -1,4 +1,4 @@
-"""What can be chosen about a phantom, and the two presets of light and motion."""
+"""Settings of phantoms and the two presets of light and motion."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ GainMode = Literal["auto", "fixed"]
 
 @dataclass(frozen=True)
 class Preset:
-    """Values that stand in for settings left at None, and the motion that goes with them.
+    """Defaults of settings left at None, and motion parameters.
 
     Attributes:
         light_offset: Lamp position in camera axes, mm.
@@ -32,7 +32,7 @@ class Preset:
         gain: See :class:`PhantomSettings`.
         white_balance_drift: See :class:`PhantomSettings`.
         turn: Largest yaw, pitch and roll of the wobble, degrees.
-        scan: Largest turn away from the lumen of the ``rotation`` trajectory, degrees.
+        scan: Largest rotation away from the lumen of the ``rotation`` trajectory, degrees.
         wobble: Smallest and largest lateral excursion from the centre line, mm.
         approaches: How often the camera comes close to the wall.
         closest: Camera-to-wall distance of an approach, mm.
@@ -88,22 +88,22 @@ PRESETS: dict[str, Preset] = {
 }
 
 
-def either(value: _T | None, otherwise: _T) -> _T:
-    """The value, unless it is None."""
+def value_or_default(value: _T | None, otherwise: _T) -> _T:
+    """The value, or the default if it is None."""
     return otherwise if value is None else value
 
 
 class PhantomSettings(Settings):
-    """A phantom: the colon, the scope that films it, and the folder layout.
+    """Settings of a phantom: colon, endoscope, light, motion and folder layout.
 
-    Ranges bracket what is published about colons and endoscopes (docs/phantom.md 1, 2, 3). A setting left at None
-    takes the value of the preset ``light`` names.
+    Ranges cover published values of colons and endoscopes (docs/phantom.md 1, 2, 3). A setting left at None takes the
+    value of the preset named by ``light``.
     """
 
-    seed: int = Field(0, ge=0, description="The whole phantom follows from it.")
+    seed: int = Field(0, ge=0, description="Seed of all random numbers of the phantom.")
     layout: str = Field("c3vd", description="Files and folders to write; docs/phantom.md 5 lists the layouts.")
     trajectory: Literal["pullback", "rotation"] = Field(
-        "pullback", description="pullback: withdrawal along the lumen. rotation: the camera mostly turns on the spot."
+        "pullback", description="pullback: withdrawal along the lumen. rotation: the camera mostly rotates in place."
     )
     frames: int = Field(120, ge=9, le=2000, description="Frames of the sequence; every 8th is a test frame.")
     width: int | None = Field(None, ge=16, le=4096, description="Image width, pixels. None: the layout's own.")
@@ -112,14 +112,14 @@ class PhantomSettings(Settings):
         12,
         ge=0,
         le=500,
-        description="Test views at positions of the path, turned 15 to 30 degrees away from it; none in a layout that "
-        "has no place for them.",
+        description="Number of test views at positions of the path, rotated by 15 to 30 degrees; none in layouts that "
+        "do not support them.",
     )
     supersampling: int = Field(2, ge=1, le=4, description="Colour samples per pixel side; depth is never averaged.")
 
     light: Literal["c3vd", "strong"] = Field("c3vd", description="Preset of light and motion; see PRESETS.")
     gain: GainMode | None = Field(
-        None, description="auto: exposure follows the picture with a lag. fixed: one exposure for the whole sequence."
+        None, description="auto: exposure follows the image with a lag. fixed: one exposure for the whole sequence."
     )
     light_offset: tuple[float, float, float] | None = Field(
         None,
@@ -140,9 +140,9 @@ class PhantomSettings(Settings):
         1.0,
         ge=0.0,
         le=1.0,
-        description="Share of the light that the wall throws onto the wall; 1 is the solved radiosity, 0 none.",
+        description="Scale of indirect light; 1 is the solved radiosity, 0 none.",
     )
-    specular: float = Field(1.0, ge=0.0, le=1.0, description="Share of the mucus film's Fresnel reflection.")
+    specular: float = Field(1.0, ge=0.0, le=1.0, description="Scale of the mucus film's Fresnel reflection.")
     roughness: float = Field(
         0.3, ge=0.15, le=0.7, description="GGX roughness of the mucus film, whose alpha is its square."
     )
@@ -156,7 +156,7 @@ class PhantomSettings(Settings):
         0.45,
         ge=0.1,
         le=0.8,
-        description="Mean of the encoded picture that the exposure aims at; C3VD has .19 to .59 (docs/phantom.md 3).",
+        description="Mean of the encoded image that the exposure aims at; C3VD has .19 to .59 (docs/phantom.md 3).",
     )
     gain_lag: float = Field(
         2.0, ge=0.0, le=100.0, description="Time constant of the automatic exposure, frames; 0 follows at once."
@@ -181,7 +181,7 @@ class PhantomSettings(Settings):
     @classmethod
     def _layout_is_known(cls, name: str) -> str:
         if name not in phantom_layouts:
-            raise ValueError(f"there is no such layout; known are {', '.join(phantom_layouts)}")
+            raise ValueError(f"unknown layout; known are {', '.join(phantom_layouts)}")
         return name
 
     @field_validator("light_offset")
@@ -201,17 +201,19 @@ class PhantomSettings(Settings):
 
     @property
     def preset(self) -> Preset:
-        """The preset behind the settings left at None."""
+        """The preset for settings left at None."""
         return PRESETS[self.light]
 
     def resolved(self) -> PhantomSettings:
-        """The same settings with every None that the preset stands in for replaced; sizes are the layout's to say."""
+        """Settings with None replaced by the preset's values; sizes are left to the layout."""
         names = ("light_offset", "spread_law", "spread", "vignetting", "tilt", "gain", "white_balance_drift")
-        return self.model_copy(update={name: either(getattr(self, name), getattr(self.preset, name)) for name in names})
+        return self.model_copy(
+            update={name: value_or_default(getattr(self, name), getattr(self.preset, name)) for name in names}
+        )
 
 
 def phantom_settings(options: Mapping[str, Any]) -> PhantomSettings:
-    """Validated settings from plain options.
+    """Validate plain options.
 
     Raises:
         InputError: An option is unknown, of the wrong type or out of range; the first such one is named.

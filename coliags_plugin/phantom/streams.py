@@ -1,4 +1,4 @@
-"""Random numbers: one independent stream per purpose, all children of one seed."""
+"""Independent random number streams per purpose from one seed, and smooth noise."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 
 class Purpose(IntEnum):
-    """What a stream is for. The numbers are part of what a seed means: never renumber them."""
+    """Purpose of a stream. Renumbering would change the phantom of a seed."""
 
     ANATOMY = 0
     RELIEF = 1
@@ -25,18 +25,18 @@ class Purpose(IntEnum):
 
 
 def stream(seed: int, purpose: Purpose, *key: int) -> np.random.Generator:
-    """The generator of one purpose (and of one frame, say, through ``key``), whatever was drawn before elsewhere."""
+    """The independent generator of a purpose and, through ``key``, for instance of a frame."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(int(purpose), *key)))
 
 
 class SolidNoise:
-    """Smooth noise that fills space: a function of where a point lies, so it knows no seam, stretching or mesh.
+    """Smooth 3D noise as a function of position, free of seams and texture stretching.
 
-    It repeats only after 64 times its scale, in a direction that has nothing to do with the colon's.
+    Its period is 64 times its scale, along random directions.
     """
 
     _SIZE = 128
-    #: Voxels a standard deviation of the smoothing kernel spans, for linear interpolation to be smooth enough.
+    #: Standard deviation of the smoothing kernel in voxels, large enough for linear interpolation.
     _SIGMA = 2.0
 
     def __init__(self, generator: np.random.Generator) -> None:
@@ -51,7 +51,7 @@ class SolidNoise:
         self._generator = generator
 
     def layer(self, points: Float[np.ndarray, "... 3"], scale: float) -> Float[np.ndarray, "..."]:
-        """Noise of zero mean and unit standard deviation at points; every call draws an independent layer.
+        """Noise of zero mean and unit standard deviation at points; every call samples an independent layer.
 
         Args:
             points: mm. [..., 3]
@@ -60,13 +60,13 @@ class SolidNoise:
         turn, _ = np.linalg.qr(self._generator.standard_normal((3, 3)))
         shift = self._generator.uniform(0.0, self._SIZE, 3)
         turn = (turn * (2.5 * self._SIGMA / scale)).astype(np.float32)
-        # One row per coordinate is what map_coordinates wants; as a matrix product this takes eight times as long.
+        # map_coordinates takes one row per coordinate; as a matrix product this takes eight times as long.
         place = np.einsum("nc,cd->dn", points.reshape(-1, 3), turn) + shift.astype(np.float32)[:, None]
         noise = scipy.ndimage.map_coordinates(self._volume, place, order=1, mode="grid-wrap", output=np.float32)
         return np.asarray(noise.reshape(points.shape[:-1]))
 
 
 def smoothstep(x: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """0 below 0, 1 above 1, and a cubic with flat ends between."""
+    """Cubic Hermite step: 0 below 0, 1 above 1."""
     x = np.clip(x, 0.0, 1.0)
     return np.asarray(x * x * (3.0 - 2.0 * x))

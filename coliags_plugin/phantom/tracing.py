@@ -14,12 +14,12 @@ from coliags_plugin.phantom.colon import ColonSurface
 
 @dataclass(frozen=True)
 class Hits:
-    """Where N rays first meet the wall.
+    """First hits of N rays on the wall.
 
     Attributes:
-        found: Whether they do. [N]
-        z_depth: mm along the optical axis; infinite where they do not. [N]
-        triangle: Triangle number. [N]
+        found: Whether the ray hits the wall. [N]
+        z_depth: mm along the optical axis; infinite without a hit. [N]
+        triangle: Triangle index. [N]
         barycentric: Weights of the triangle's second and third corner. [N, 2]
     """
 
@@ -29,18 +29,18 @@ class Hits:
     barycentric: Float[np.ndarray, "N 2"]
 
     def kept(self) -> Hits:
-        """Only the rays that meet the wall."""
+        """Subset of the rays that hit the wall."""
         keep = self.found
         return Hits(keep[keep], self.z_depth[keep], self.triangle[keep], self.barycentric[keep])
 
 
-def turned(vectors: Float[np.ndarray, "N 3"], rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "N 3"]:
-    """``rotation @ vector`` for many vectors, in their precision; a matrix product takes several times as long."""
+def rotated(vectors: Float[np.ndarray, "N 3"], rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "N 3"]:
+    """``rotation @ vector`` for many vectors, in their precision; several times faster than a matrix product."""
     return np.einsum("nc,dc->nd", vectors, rotation.astype(vectors.dtype))
 
 
 class Tracer:
-    """The mesh, prepared for rays.
+    """Ray-casting scene of the mesh.
 
     Raises:
         InputError: open3d cannot be imported.
@@ -51,11 +51,11 @@ class Tracer:
             import open3d
         except (ImportError, OSError) as error:
             raise InputError(
-                f"open3d does not import here ({error})",
+                f"open3d cannot be imported ({error})",
                 "open3d, which traces a phantom's rays",
                 "Install it with `pip install open3d`; on Debian and Ubuntu it also needs the package libusb-1.0-0",
             ) from error
-        # Its stubs know only some of its constructors.
+        # open3d's type stubs lack some constructors.
         self._open3d: Any = open3d
         self._surface = surface
         self._scene = open3d.t.geometry.RaycastingScene()
@@ -73,7 +73,7 @@ class Tracer:
         """
         rays = np.empty((len(directions), 6), np.float32)
         rays[:, :3] = camera_to_world[:3, 3]
-        rays[:, 3:] = turned(directions, camera_to_world[:3, :3])
+        rays[:, 3:] = rotated(directions, camera_to_world[:3, :3])
         answer = self._scene.cast_rays(self._open3d.core.Tensor(rays))
         z_depth = answer["t_hit"].numpy()
         found = np.isfinite(z_depth)
@@ -81,7 +81,7 @@ class Tracer:
         return Hits(found, z_depth, triangle, answer["primitive_uvs"].numpy())
 
     def interpolate(self, values: Float[np.ndarray, "V K"], hits: Hits) -> Float[np.ndarray, "N K"]:
-        """Values of the mesh's vertices at hits. [N, K]"""
+        """Interpolate vertex values at hits. [N, K]"""
         corners = self._surface.triangles[hits.triangle]
         second, third = hits.barycentric[:, :1], hits.barycentric[:, 1:]
         return np.asarray(
@@ -93,9 +93,9 @@ class Tracer:
     def visible(
         self, points: Float[np.ndarray, "N 3"], viewpoints: Float[np.ndarray, "3"] | Float[np.ndarray, "N 3"]
     ) -> Bool[np.ndarray, "N"]:
-        """Whether nothing stands between points on the wall and viewpoints off it. [N]
+        """Whether points on the wall are visible from viewpoints off it. [N]
 
-        The last thousandth of the way is left out: the point lies on the wall itself.
+        The last thousandth of the ray is ignored, as the point is on the wall itself.
         """
         rays = np.empty((len(points), 6), np.float32)
         rays[:, :3] = viewpoints

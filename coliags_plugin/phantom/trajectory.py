@@ -1,4 +1,4 @@
-"""Where the camera goes: withdrawal along the lumen, turning on the spot, and test views turned away from the path."""
+"""Camera paths of phantoms: withdrawal along the lumen, rotation in place, and rotated test views."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from coliags_plugin.phantom.streams import Purpose, stream
 
 #: No closer to the wall than this, mm; C3VD's nearest surface of any sequence is 5.9 mm away.
 NEAREST = 6.0
-#: Every how many frames one is held out for testing.
+#: Interval of held-out test frames.
 TEST_EVERY = 8
 #: Arc length of the pullback's shallow end, mm. Far enough in that a view turned sideways still ends on the wall.
 _SHALLOW_END = 26.0
@@ -32,11 +32,11 @@ Clearance = Callable[[Float[np.ndarray, "N 3"]], Float[np.ndarray, "N"]]
 
 @dataclass(frozen=True)
 class RotationView:
-    """A test view at the place of a frame, turned away from it.
+    """A rotated test view at the position of a frame.
 
     Attributes:
-        frame: The frame whose place and exposure it shares.
-        turn: By how much its look direction differs from that frame's, degrees.
+        frame: Index of the frame whose position and exposure it shares.
+        turn: Angle between its viewing direction and the frame's, degrees.
         camera_to_world: OpenCV axes, mm. [4, 4]
     """
 
@@ -45,16 +45,16 @@ class RotationView:
     camera_to_world: Float[np.ndarray, "4 4"]
 
 
-def travel(centre_line: CentreLine, settings: PhantomSettings, clearance: Clearance) -> Float[np.ndarray, "T 4 4"]:
+def camera_path(centre_line: CentreLine, settings: PhantomSettings, clearance: Clearance) -> Float[np.ndarray, "T 4 4"]:
     """Camera-to-world pose of every frame, OpenCV axes, mm.
 
     Args:
-        centre_line: Of the colon.
+        centre_line: Centre line of the colon.
         settings: Frames, trajectory, preset.
         clearance: Distance of points to the wall, mm.
 
     Raises:
-        InputError: The colon drawn leaves no way that keeps 6 mm from the wall.
+        InputError: The colon leaves no path that keeps 6 mm from the wall.
     """
     generator = stream(settings.seed, Purpose.TRAJECTORY)
     preset = settings.preset
@@ -71,9 +71,9 @@ def travel(centre_line: CentreLine, settings: PhantomSettings, clearance: Cleara
     clock = generator.uniform(0.0, 2.0 * np.pi) + 2.2 * waver[:, 0] + 4.0 * time
     amount = 0.5 * (low + high) + 0.5 * (high - low) * waver[:, 1]
     sideways = amount[:, None] * np.stack([np.cos(clock), np.sin(clock)], axis=1)
-    sideways = _kept_off(sideways, points, frames, clearance, NEAREST + 0.5)
+    sideways = _limit_excursion(sideways, points, frames, clearance, NEAREST + 0.5)
     for approach in range(0 if on_the_spot else preset.approaches):
-        sideways = _approached(sideways, points, frames, clearance, preset.closest, approach, time, generator)
+        sideways = _add_approach(sideways, points, frames, clearance, preset.closest, approach, time, generator)
     centers = points + np.einsum("nck,nk->nc", frames[:, :, :2], sideways)
     nearest = float(clearance(centers).min())
     if nearest < NEAREST:
@@ -88,7 +88,7 @@ def travel(centre_line: CentreLine, settings: PhantomSettings, clearance: Cleara
     if not on_the_spot:
         yaw, pitch, roll = (np.radians(limit) * waver[:, 2 + axis] for axis, limit in enumerate(preset.turn))
     else:
-        # Round and round, outwards: the look direction goes over a whole disc.
+        # An outward spiral, so that the viewing direction covers a disc.
         clock = 2.0 * np.pi * 2.5 * time + generator.uniform(0.0, 2.0 * np.pi)
         away = np.radians(preset.scan) * np.sqrt(time)
         yaw, pitch = away * np.cos(clock), away * np.sin(clock)
@@ -99,16 +99,16 @@ def travel(centre_line: CentreLine, settings: PhantomSettings, clearance: Cleara
 
 
 def every_8th(index: int) -> bool:
-    """Whether a frame is held out for testing where nothing else is said: 0, 8, 16, ..."""
+    """Whether a frame is held out by the default split: 0, 8, 16, ..."""
     return index % TEST_EVERY == 0
 
 
 def turn_away(
     poses: Float[np.ndarray, "T 4 4"], settings: PhantomSettings, is_test: Callable[[int], bool] = every_8th
 ) -> list[RotationView]:
-    """Test views at places of training frames, their look direction 15 to 30 degrees off.
+    """Test views at positions of training frames, rotated by 15 to 30 degrees.
 
-    On a pullback they turn all round the clock; where the camera scans, they go on outwards from where it looked.
+    On a pullback they are rotated in all directions; on a rotation trajectory further outwards.
     """
     generator = stream(settings.seed, Purpose.ROTATION_VIEWS)
     training = [index for index in range(len(poses)) if not is_test(index)]
@@ -117,7 +117,7 @@ def turn_away(
     for number in range(settings.rotation_views):
         place = (number + 0.5) / settings.rotation_views * len(training)
         frame = training[min(int(place), len(training) - 1)]
-        # The golden angle spreads directions evenly over the clock however many views there are.
+        # The golden angle distributes any number of directions evenly.
         clock += np.pi * (3.0 - np.sqrt(5.0))
         turn = generator.uniform(*_ROTATION_TURN)
         direction = clock
@@ -126,21 +126,21 @@ def turn_away(
             direction = float(np.arctan2(-middle[1], -middle[0]))
         axis = np.array([-np.sin(direction), np.cos(direction), 0.0])
         pose = poses[frame].copy()
-        pose[:3, :3] = pose[:3, :3] @ about(axis, np.radians(turn))
+        pose[:3, :3] = pose[:3, :3] @ rotation_about(axis, np.radians(turn))
         views.append(RotationView(frame, float(turn), pose))
     return views
 
 
 def rotation(yaw: float, pitch: float, roll: float) -> Float[np.ndarray, "3 3"]:
-    """Turn right by yaw, then up by pitch, then clockwise by roll; radians, camera axes."""
+    """Rotation right by yaw, then up by pitch, then clockwise by roll; radians, camera axes."""
     return np.asarray(
-        about(np.array([0.0, 1.0, 0.0]), yaw)
-        @ about(np.array([1.0, 0.0, 0.0]), pitch)
-        @ about(np.array([0.0, 0.0, 1.0]), roll)
+        rotation_about(np.array([0.0, 1.0, 0.0]), yaw)
+        @ rotation_about(np.array([1.0, 0.0, 0.0]), pitch)
+        @ rotation_about(np.array([0.0, 0.0, 1.0]), roll)
     )
 
 
-def about(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarray, "3 3"]:
+def rotation_about(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarray, "3 3"]:
     """Rotation about a unit axis, radians, right-handed (Rodrigues)."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -162,7 +162,7 @@ def _looking(
 
 
 def _sway(time: Float[np.ndarray, "T"], generator: np.random.Generator) -> Float[np.ndarray, "T"]:
-    """A smooth wander whose largest excursion is 1; the same curve however finely it is sampled."""
+    """A smooth random curve with amplitude 1, independent of its sampling."""
     cycles = np.array([0.6, 1.3, 2.4])
     phase = generator.uniform(0.0, 2.0 * np.pi, 3)
     weight = np.array([1.0, 0.7, 0.35]) * generator.uniform(0.7, 1.3, 3)
@@ -173,14 +173,14 @@ def _sway(time: Float[np.ndarray, "T"], generator: np.random.Generator) -> Float
     return np.asarray(curve(time) / np.abs(curve(np.linspace(0.0, 1.0, 512))).max())
 
 
-def _kept_off(
+def _limit_excursion(
     sideways: Float[np.ndarray, "T 2"],
     points: Float[np.ndarray, "T 3"],
     frames: Float[np.ndarray, "T 3 3"],
     clearance: Clearance,
     least: float,
 ) -> Float[np.ndarray, "T 2"]:
-    """The excursion, shrunk as a whole until it keeps its distance."""
+    """Lateral offsets, scaled down until they keep the least distance from the wall."""
     for _ in range(30):
         if clearance(points + np.einsum("nck,nk->nc", frames[:, :, :2], sideways)).min() >= least:
             break
@@ -188,7 +188,7 @@ def _kept_off(
     return sideways
 
 
-def _approached(
+def _add_approach(
     sideways: Float[np.ndarray, "T 2"],
     points: Float[np.ndarray, "T 3"],
     frames: Float[np.ndarray, "T 3 3"],
@@ -198,7 +198,7 @@ def _approached(
     time: Float[np.ndarray, "T"],
     generator: np.random.Generator,
 ) -> Float[np.ndarray, "T 2"]:
-    """The excursion with one swing towards the wall that comes as close as ``closest``, mm."""
+    """Lateral offsets with one approach to the wall down to ``closest`` mm."""
     middle = (0.40, 0.78)[number % 2] + generator.uniform(-0.04, 0.04)
     swing = np.exp(-0.5 * ((time - middle) / _APPROACH_WIDTH) ** 2)
     clock = generator.uniform(0.0, 2.0 * np.pi)
@@ -206,7 +206,7 @@ def _approached(
     near = swing > 0.1
 
     def swung(amount: float) -> Float[np.ndarray, "T 2"]:
-        # The wobble gives way to the swing, so that the two do not add up.
+        # The wobble is faded out during the approach.
         return np.asarray(sideways * (1.0 - swing[:, None]) + amount * swing[:, None] * direction)
 
     def distance(amount: float) -> float:

@@ -1,4 +1,4 @@
-"""What other frames saw: masks for test views, and flags for the mesh."""
+"""Visibility of wall points in other frames, for seen masks and mesh coverage."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ def seen_from(
 ) -> Bool[np.ndarray, "N"]:
     """Whether at least one camera sees each point of the wall.
 
-    A camera sees a point that falls on a lit pixel with nothing standing between.
+    A camera sees a point that projects to a lit pixel and is not occluded.
 
     Args:
-        points: On the wall, world, mm. [N, 3]
-        cameras_to_world: Poses; the likeliest to see the points first, as a point once seen is done with.
-        lens: Of all of them.
+        points: Points on the wall, world, mm. [N, 3]
+        cameras_to_world: Poses, ideally the likeliest to see the points first, as seen points are not tested again.
+        lens: Lens of all cameras.
         mask: Lit pixels. [H, W]
-        tracer: The wall.
+        tracer: Ray tracer of the wall.
     """
     seen = np.zeros(len(points), bool)
     open_points = np.arange(len(points))
@@ -48,11 +48,11 @@ def seen_from(
     return seen
 
 
-def likeliest_first(
+def nearest_poses_first(
     camera_to_world: Float[np.ndarray, "4 4"], others: Sequence[Float[np.ndarray, "4 4"]]
 ) -> list[Float[np.ndarray, "4 4"]]:
-    """Other poses, those first that stand near and look the same way (1 mm counts like 1 degree)."""
+    """Other poses, sorted by distance and viewing angle (1 mm counts like 1 degree)."""
     stack = np.stack(others)
     apart = np.linalg.norm(stack[:, :3, 3] - camera_to_world[:3, 3], axis=1)
-    turned = np.degrees(np.arccos(np.clip(stack[:, :3, 2] @ camera_to_world[:3, 2], -1.0, 1.0)))
-    return [others[index] for index in np.argsort(apart + turned, kind="stable")]
+    rotated = np.degrees(np.arccos(np.clip(stack[:, :3, 2] @ camera_to_world[:3, 2], -1.0, 1.0)))
+    return [others[index] for index in np.argsort(apart + rotated, kind="stable")]

@@ -1,4 +1,1 @@
-"""Camera trajectories: the files they come in, and how far two of them are apart.
-
-Plain modules: nothing here knows a room.
-"""
+"""Camera trajectories: pose file formats, alignment and trajectory errors."""

@@ -1,4 +1,4 @@
-"""How far an estimated trajectory is from a reference: association, alignment, ATE and RPE.
+"""Evaluation of an estimated trajectory against a reference: association, alignment, ATE and RPE.
 
 - Alignment in closed form: S. Umeyama, "Least-squares estimation of transformation parameters between two point
   patterns", IEEE TPAMI 13(4), 1991.
@@ -23,29 +23,29 @@ from coliags_plugin.poses.trajectory import Trajectory
 
 Match = Literal["auto", "name", "time", "index", "endogslam-train"]
 
-#: Fewer matched frames than this determine nothing.
+#: Least number of matched frames for an alignment.
 FEWEST_MATCHES = 3
-#: A rotation about the line of motion is believed only where the paths leave that line by more than this share of
-#: their length along it (both as standard deviations).
+#: Least ratio of the paths' extents (standard deviations) across and along their main direction for which the rotation
+#: about that direction is determined.
 OFF_LINE_SHARE = 1e-3
-#: Extents below this share of the coordinates are rounding.
+#: Extents below this share of the coordinates are rounding errors.
 _ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Which frames of two trajectories belong together.
+    """Matched frames of two trajectories.
 
     Attributes:
         first, second: Indices into the two, in the order of the first. [M]
         by: ``name``, ``time``, ``index`` or ``endogslam-train``.
-        passed_over: What was tried before and why it did not serve.
+        skipped: Criteria tried before, and why they failed.
     """
 
     first: Int[np.ndarray, "M"]
     second: Int[np.ndarray, "M"]
     by: str
-    passed_over: tuple[str, ...] = ()
+    skipped: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         """Number of pairs."""
@@ -58,10 +58,10 @@ class Similarity:
 
     Attributes:
         scale: 1 for a rigid transform.
-        rotation: Right-handed. [3, 3]
-        translation: In units of the target. [3]
-        undetermined: Why the rotation is not determined by the points, or an empty string. It then is the smallest
-            rotation among those that fit equally well.
+        rotation: Rotation matrix, det 1. [3, 3]
+        translation: Units of the target. [3]
+        undetermined: Why the points do not determine the rotation, or an empty string. The rotation is then the
+            smallest among those that fit equally well.
     """
 
     scale: float
@@ -70,17 +70,17 @@ class Similarity:
     undetermined: str = ""
 
     def points(self, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
-        """Points, moved. [N, 3]"""
+        """Transformed points. [N, 3]"""
         return self.scale * points @ self.rotation.T + self.translation
 
     def poses(self, camera_to_world: Float[np.ndarray, "N 4 4"]) -> Float[np.ndarray, "N 4 4"]:
-        """Camera-to-world poses, moved; they stay rigid, the scale acts on the centres. [N, 4, 4]"""
+        """Transformed camera-to-world poses; they stay rigid, the scale acts on the centres. [N, 4, 4]"""
         return rigid(self.rotation @ camera_to_world[:, :3, :3], self.points(camera_to_world[:, :3, 3]))
 
 
 @dataclass(frozen=True)
-class Spread:
-    """What is told of many errors."""
+class ErrorStatistics:
+    """Summary statistics of errors."""
 
     rmse: float
     mean: float
@@ -88,8 +88,8 @@ class Spread:
     max: float
 
     @classmethod
-    def of(cls, errors: Float[np.ndarray, "N"]) -> Spread:
-        """The figures of N errors, N > 0."""
+    def of(cls, errors: Float[np.ndarray, "N"]) -> ErrorStatistics:
+        """Statistics of N errors, N > 0."""
         return cls(
             float(np.sqrt(np.mean(errors**2))), float(errors.mean()), float(np.median(errors)), float(errors.max())
         )
@@ -97,19 +97,19 @@ class Spread:
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """An estimate laid over a reference; matched frames only.
+    """Matched frames of an estimate aligned with a reference, and their errors.
 
     Attributes:
-        matches: Which frames belong together; ``first`` is the estimate's.
+        matches: Matched frames; ``first`` is the estimate's.
         transform: From the estimate's world to the reference's.
-        with_scale: Whether the scale was free.
+        with_scale: Whether the scale was estimated.
         estimate: The estimate after alignment, camera-to-world. [M, 4, 4]
         reference: The reference, camera-to-world. [M, 4, 4]
         delta: Frames between the two poses of a relative error.
         position_errors: Distance of the centres, in units of the reference. [M]
-        rotation_errors_deg: Angle between the cameras; None where alignment leaves the rotation undetermined. [M]
-        relative_translation_errors: Of the motion over ``delta`` matched frames, units of the reference. [M - delta]
-        relative_rotation_errors_deg: Of the same. [M - delta]
+        rotation_errors_deg: Angle between the cameras; None if the alignment's rotation is undetermined. [M]
+        relative_translation_errors: RPE over ``delta`` matched frames, units of the reference. [M - delta]
+        relative_rotation_errors_deg: RPE over ``delta`` matched frames, degrees. [M - delta]
     """
 
     matches: Matches
@@ -124,30 +124,30 @@ class Alignment:
     relative_rotation_errors_deg: Float[np.ndarray, "P"]
 
     @property
-    def ate(self) -> Spread:
+    def ate(self) -> ErrorStatistics:
         """Absolute trajectory error, units of the reference."""
-        return Spread.of(self.position_errors)
+        return ErrorStatistics.of(self.position_errors)
 
     @property
-    def rotation_deg(self) -> Spread | None:
-        """Rotation error after alignment, degrees; None where it is undetermined."""
-        return None if self.rotation_errors_deg is None else Spread.of(self.rotation_errors_deg)
+    def rotation_deg(self) -> ErrorStatistics | None:
+        """Rotation error after alignment, degrees; None if undetermined."""
+        return None if self.rotation_errors_deg is None else ErrorStatistics.of(self.rotation_errors_deg)
 
     @property
-    def rpe_translation(self) -> Spread:
-        """Relative pose error, its translation, units of the reference."""
-        return Spread.of(self.relative_translation_errors)
+    def rpe_translation(self) -> ErrorStatistics:
+        """Translation part of the relative pose error, units of the reference."""
+        return ErrorStatistics.of(self.relative_translation_errors)
 
     @property
-    def rpe_rotation_deg(self) -> Spread:
-        """Relative pose error, its rotation, degrees."""
-        return Spread.of(self.relative_rotation_errors_deg)
+    def rpe_rotation_deg(self) -> ErrorStatistics:
+        """Rotation part of the relative pose error, degrees."""
+        return ErrorStatistics.of(self.relative_rotation_errors_deg)
 
     def to_json(self, unit: str) -> dict[str, Any]:
-        """All figures, for programs; null and a reason where there is none.
+        """All results as JSON values; null and a reason for undetermined ones.
 
         Args:
-            unit: What to call the reference's unit of length.
+            unit: Name of the reference's unit of length.
         """
         rotation = self.rotation_deg
         return {
@@ -174,16 +174,15 @@ class Alignment:
 
 
 def associate(first: Trajectory, second: Trajectory, match: Match = "auto", tolerance: float = 0.02) -> Matches:
-    """Find the frames that belong together.
+    """Match the frames of two trajectories.
 
     Args:
-        first: One trajectory, the estimate where there is one.
+        first: One trajectory, usually the estimate.
         second: The other.
-        match: ``name``: the same picture name, or the same last part of it without its suffix. ``time``: timestamps
-            no further apart than ``tolerance``, nearest pairs first, each frame once. ``index``: the k-th with the
-            k-th, which needs equal counts. ``endogslam-train``: the k-th of the first with the k-th of those of the
-            second that EndoGSLAM trains on, all but 7, 15, 23, ... ``auto``: the first of name, time and index that
-            matches at least three frames.
+        match: ``name``: equal image names, or equal file stems. ``time``: timestamps within ``tolerance``, nearest
+            pairs first, each frame once. ``index``: by index, for equal counts. ``endogslam-train``: the k-th pose of
+            the first with the k-th training frame of the second by EndoGSLAM's split, all but 7, 15, 23, ...
+            ``auto``: the first of name, time and index that matches at least three frames.
         tolerance: s.
 
     Raises:
@@ -205,7 +204,7 @@ def associate(first: Trajectory, second: Trajectory, match: Match = "auto", tole
     fits_training = match == "auto" and training is not None and len(first) != len(second)
     raise InputError(
         f"frames cannot be matched ({'; '.join(tried)})",
-        f"at least {FEWEST_MATCHES} frames that belong together",
+        f"at least {FEWEST_MATCHES} matching frames",
         "The counts are those of EndoGSLAM's training frames: pass --match endogslam-train"
         if fits_training
         else "Give trajectories of the same frames, or formats that keep names or timestamps",
@@ -213,19 +212,19 @@ def associate(first: Trajectory, second: Trajectory, match: Match = "auto", tole
 
 
 def umeyama(source: Float[np.ndarray, "N 3"], target: Float[np.ndarray, "N 3"], with_scale: bool = False) -> Similarity:
-    """The rigid or similarity transform that carries points closest to others, in the sense of least squares.
+    """Least-squares rigid or similarity transform between corresponding points (Umeyama's method).
 
-    The rotation is unique only where d2 + s d3 > 0, with d1 >= d2 >= d3 the singular values of the covariance and s
-    the sign of its determinant (Umeyama 1991, section III). Where that fails, as for points on a line, the smallest
-    rotation that fits is taken, and :attr:`Similarity.undetermined` says why.
+    The rotation is unique only if d2 + s d3 > 0, with d1 >= d2 >= d3 the singular values of the covariance and s the
+    sign of its determinant (Umeyama 1991, section III). Otherwise, as for points on a line, the smallest rotation that
+    fits is returned, and :attr:`Similarity.undetermined` gives the reason.
 
     Args:
-        source: Points to move. [N, 3]
-        target: Where they belong. [N, 3]
-        with_scale: Also find a scale.
+        source: Points to transform. [N, 3]
+        target: Corresponding target points. [N, 3]
+        with_scale: Also estimate a scale.
 
     Raises:
-        InputError: A scale is wanted, and the points of one side coincide or those of the two have nothing in common.
+        InputError: A scale is requested, and the points of one side coincide or the two are uncorrelated.
     """
     source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
     centered, wanted = source - source_mean, target - target_mean
@@ -238,9 +237,9 @@ def umeyama(source: Float[np.ndarray, "N 3"], target: Float[np.ndarray, "N 3"], 
     if still or values[0] <= _ROUNDING * np.sqrt((centered**2).sum() * (wanted**2).sum()) / len(source):
         rotation = np.eye(3)
         undetermined = (
-            "the camera stays in one place, so that positions determine no rotation"
+            "the camera does not move, so that positions determine no rotation"
             if still
-            else "the two paths have nothing in common that would determine a rotation"
+            else "the two paths are uncorrelated, so that positions determine no rotation"
         )
     elif values[1] + sign * values[2] <= OFF_LINE_SHARE**2 * values[0]:
         rotation = _shortest_rotation(right[0], left[:, 0], right[1])
@@ -253,7 +252,7 @@ def umeyama(source: Float[np.ndarray, "N 3"], target: Float[np.ndarray, "N 3"], 
     if with_scale:
         if still or not values[0] > 0.0:
             raise InputError(
-                "a scale cannot be found: the camera of one trajectory stays in one place",
+                "a scale cannot be estimated: the camera of one trajectory does not move",
                 "two cameras that move",
                 "Align without --scale",
             )
@@ -264,13 +263,13 @@ def umeyama(source: Float[np.ndarray, "N 3"], target: Float[np.ndarray, "N 3"], 
 def align(
     estimate: Trajectory, reference: Trajectory, matches: Matches, with_scale: bool = False, delta: int = 1
 ) -> Alignment:
-    """Align the matched frames of an estimate with a reference, and take the errors.
+    """Align the matched frames of an estimate with a reference, and compute the errors.
 
     Args:
-        estimate: What to judge.
-        reference: What to judge it by.
+        estimate: The estimated trajectory.
+        reference: The reference trajectory.
         matches: From :func:`associate`, estimate first.
-        with_scale: Sim(3) instead of SE(3), for an estimate whose scale means nothing.
+        with_scale: Sim(3) instead of SE(3), for an estimate of arbitrary scale.
         delta: Matched frames between the two poses of a relative error.
 
     Raises:
@@ -285,7 +284,7 @@ def align(
     estimated, true = estimate.camera_to_world[matches.first], reference.camera_to_world[matches.second]
     transform = umeyama(estimated[:, :3, 3], true[:, :3, 3], with_scale)
     aligned = transform.poses(estimated)
-    # The motion of the camera in its own axes, on either side; world frames cancel, the scale does not.
+    # Relative motions in the camera frame: world frames cancel, the scale does not.
     difference = inverse(_motion(true, delta)) @ _motion(aligned, delta)
     rotation_errors = rotation_angles_deg(true[:, :3, :3].transpose(0, 2, 1) @ aligned[:, :3, :3])
     return Alignment(
@@ -303,10 +302,10 @@ def align(
 
 
 def _shortest_rotation(start: np.ndarray, end: np.ndarray, beside: np.ndarray) -> np.ndarray:
-    """The smallest rotation from one unit vector to another; ``beside`` is at right angles to the first.
+    """The smallest rotation from one unit vector to another; ``beside`` is perpendicular to the first.
 
-    Two half turns, about the first vector and about the middle of both. (scipy's ``align_vectors`` of one vector is off
-    by degrees where the two are nearly opposite, 1.17.)
+    The product of two half turns, about the first vector and about the bisector of both. (scipy 1.17's
+    ``align_vectors`` of one vector is off by degrees if the two are nearly opposite.)
     """
     if start @ end < -0.9999:
         about = _half_turn(beside)
@@ -339,7 +338,7 @@ def _by_name(first: Trajectory, second: Trajectory, tolerance: float) -> _Pairs:
         common = set(names) & set(others)
         repeated = [name for counts in (Counter(names), Counter(others)) for name in common if counts[name] > 1]
         if repeated:
-            return _NO_PAIRS, f"'{min(repeated)}' stands for several frames"
+            return _NO_PAIRS, f"'{min(repeated)}' names several frames"
         if common:
             places = {name: index for index, name in enumerate(others)}
             return np.array([(index, places[name]) for index, name in enumerate(names) if name in common]), ""
@@ -351,7 +350,7 @@ def _by_time(first: Trajectory, second: Trajectory, tolerance: float) -> _Pairs:
         return _NO_PAIRS, "not both have timestamps"
     if any(len(np.unique(times)) < len(times) for times in (first.timestamps, second.timestamps)):
         return _NO_PAIRS, "timestamps are repeated"
-    # All pairs within the tolerance, through one sorted side; then the nearest first, each frame once.
+    # All pairs within the tolerance, by binary search; then the nearest first, each frame once.
     order = np.argsort(second.timestamps, kind="stable")
     times = second.timestamps[order]
     low = np.searchsorted(times, first.timestamps - tolerance, side="left")

@@ -1,4 +1,4 @@
-"""C3VD's pose files: camera-to-world matrices whose reading order changed between releases."""
+"""C3VD's pose files: camera-to-world matrices, row-major or column-major depending on the release."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Poses:
     Attributes:
         camera_to_world: Rigid, OpenCV axes, mm. [N, 4, 4]
         convention: ``column-major`` (the current release) or ``row-major`` (the one under review).
-        evidence: The figures behind that choice, and what the trajectory then looks like.
+        evidence: Measurements behind that choice, and a summary of the trajectory.
     """
 
     camera_to_world: Float[np.ndarray, "N 4 4"]
@@ -33,15 +33,14 @@ class Poses:
 
 
 def read_poses(path: Path) -> Poses:
-    """Read ``pose.txt`` or ``camera_pose.txt``: sixteen numbers a line, separated by commas or blanks.
+    """Read ``pose.txt`` or ``camera_pose.txt``: sixteen numbers per line, separated by commas or blanks.
 
-    The web page calls the files row-major; the numbers are columns (docs/layouts/c3vd.md 4). So the order is found, not
-    believed: read row by row, a rigid transform has its translation in the last column and (0, 0, 0, 1) in the last
-    row.
+    The web page calls the files row-major, but they are column-major (docs/layouts/c3vd.md 4). So the order is
+    detected: read row-major, a rigid transform has its translation in the last column and (0, 0, 0, 1) in the last row.
 
     Raises:
-        InputError: A line does not hold sixteen finite numbers, or is a rigid transform in neither reading, or is
-            left-handed; or the order cannot be told.
+        InputError: A line does not hold sixteen finite numbers, or is not a rigid transform in either order, or is
+            left-handed; or the order cannot be determined.
     """
     lines = read_numbers(
         path,
@@ -53,12 +52,12 @@ def read_poses(path: Path) -> Poses:
     last_column = np.abs(matrices[:, :3, 3]).max(initial=0.0)
     last_row = np.abs(matrices[:, 3, :3]).max(initial=0.0)
     by_columns = matrices.transpose(0, 2, 1)
-    # Most lines decide, so that one spoilt line is called spoilt and does not turn the whole file.
+    # By majority of the lines, so that one damaged line is reported and does not change the order.
     is_row = np.abs(matrices[:, 3, :3]).max(axis=1) < 1e-6
     is_column = np.abs(matrices[:, :3, 3]).max(axis=1) < 1e-6
     if np.all(is_row & is_column) and not np.allclose(matrices, by_columns, atol=1e-6):
         raise InputError(
-            f"{path}: no pose has a translation, so rows cannot be told from columns",
+            f"{path}: no pose has a translation, so that row-major and column-major order cannot be distinguished",
             "at least one camera away from the world's origin",
             "Check that the file holds camera-to-world transforms in mm",
         )
@@ -87,7 +86,7 @@ def read_poses(path: Path) -> Poses:
 
 
 def read(path: Path) -> Trajectory:
-    """Read a C3VD pose file, in whichever order its numbers stand.
+    """Read a C3VD pose file, row-major or column-major.
 
     Raises:
         InputError: As :func:`read_poses`.
@@ -97,7 +96,7 @@ def read(path: Path) -> Trajectory:
 
 
 def write(path: Path, trajectory: Trajectory) -> None:
-    """Write sixteen numbers a line, column by column as the current release has them; nothing is rounded.
+    """Write column-major matrices of the current release, sixteen unrounded numbers per line.
 
     Raises:
         InputError: The folder cannot be written.
@@ -106,7 +105,7 @@ def write(path: Path, trajectory: Trajectory) -> None:
 
 
 def matrix_lines(camera_to_world: Float[np.ndarray, "N 4 4"], digits: int | None = None) -> str:
-    """A pose file's text: sixteen numbers a line, column by column; ``digits`` significant ones, None for all."""
+    """Text of a pose file: sixteen numbers per line, column-major; ``digits`` significant digits, None for all."""
     columns = np.asarray(camera_to_world, np.float64).transpose(0, 2, 1).reshape(-1, 16).tolist()
     lines = [
         ",".join(repr(number) if digits is None else f"{number:.{digits}g}" for number in line) for line in columns

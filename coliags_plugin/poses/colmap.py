@@ -1,7 +1,7 @@
-"""COLMAP's sparse models, binary and text; here only their poses.
+"""Reads and writes the poses of COLMAP's binary and text sparse models.
 
-Poses are read without pycolmap: it wants files that poses do not need, names no line, and a binary file cut short makes
-it abort the whole process (4.2.1), which nothing here could turn into a message. Models are written with it.
+Poses are read without pycolmap, which requires further files, names no line in errors, and aborts the process on a
+truncated binary file (4.2.1). Models are written with it.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from coliags_plugin.core.files import atomic_folder
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.poses.format import Format
 from coliags_plugin.poses.rigid import inverse, rigid, rotations_from_wxyz, wxyz_from_rotations
-from coliags_plugin.poses.text import placed, read_text, shortened
+from coliags_plugin.poses.text import prefixed_errors, read_text, shortened
 from coliags_plugin.poses.trajectory import Trajectory, natural_order, refuse_repeated
 
 if TYPE_CHECKING:
     import pycolmap
 
-#: Models without distortion by COLMAP's number, with the number of their parameters.
+#: Models without distortion by COLMAP's ID, with the number of their parameters.
 _PINHOLES = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4)}
 _PARTS = ("cameras", "images", "points3D", "rigs", "frames")
-#: What a folder may hold that a model takes the place of.
+#: Files in a folder that writing a model may replace.
 _MODEL_FILES = {f"{part}{suffix}" for part in _PARTS for suffix in (".bin", ".txt")} | {"project.ini"}
 _BINARY_IMAGE = struct.Struct("<I7dI")
 _POINT_BYTES = 24
@@ -45,14 +45,14 @@ class _Image:
 
 
 def read(path: Path) -> Trajectory:
-    """Read the poses of a sparse model, ordered by picture name, 2 before 10.
+    """Read the poses of a sparse model, ordered by image name, 2 before 10.
 
     Args:
         path: A folder with ``images`` and ``cameras``, both ``.bin`` or both ``.txt``; binary is preferred.
 
     Raises:
         InputError: The files are missing, damaged or empty; or a quaternion is zero or further than 1e-3 from unit
-            length, naming its line or picture; or a picture stands twice.
+            length (the message names the line or image); or an image is repeated.
     """
     suffix = _suffix(path)
     if suffix is None:
@@ -66,7 +66,7 @@ def read(path: Path) -> Trajectory:
     )
     images = list(read_images(path / f"images{suffix}"))
     if not images:
-        raise InputError(f"{path / f'images{suffix}'} holds no poses", "at least one registered picture")
+        raise InputError(f"{path / f'images{suffix}'} holds no poses", "at least one registered image")
     refuse_repeated([image.name for image in images], str(path / f"images{suffix}"))
     images = [images[index] for index in natural_order([image.name for image in images])]
     quats_wxyz = np.array([image.quat_wxyz for image in images])
@@ -86,7 +86,7 @@ def write(path: Path, trajectory: Trajectory) -> None:
     """Write a binary model of one PINHOLE camera and no points.
 
     Raises:
-        InputError: The trajectory has no intrinsics, a name stands twice, the folder holds something other than a
+        InputError: The trajectory has no intrinsics, a name is repeated, the folder holds something other than a
             COLMAP model, or it cannot be written.
     """
     _write(path, trajectory, text=False)
@@ -96,11 +96,11 @@ def write_text(path: Path, trajectory: Trajectory) -> None:
     """Write a text model of one PINHOLE camera and no points; as :func:`write`.
 
     Raises:
-        InputError: As :func:`write`; or a name has blanks, which COLMAP's own reader would cut off.
+        InputError: As :func:`write`; or a name has blanks, which COLMAP's reader would truncate.
     """
     for name in trajectory.names_or_numbers():
         if name.split() != [name]:
-            raise InputError(f"the picture name '{name}'", "no blanks in a text model", "Write a binary one: colmap")
+            raise InputError(f"the image name '{name}'", "no blanks in a text model", "Write a binary one: colmap")
     _write(path, trajectory, text=True)
 
 
@@ -132,15 +132,15 @@ def posed_model(
     world_to_camera: Sequence[pycolmap.Rigid3d],
     names: Sequence[str],
     cameras: Sequence[Intrinsics],
-    taken_by: Sequence[int],
+    camera_indices: Sequence[int],
 ) -> pycolmap.Reconstruction:
-    """A model of posed pictures without points: picture i becomes COLMAP's image i + 1, camera k its camera k + 1.
+    """A model of posed images without points: image i becomes COLMAP's image i + 1, camera k its camera k + 1.
 
     Args:
-        world_to_camera: Of each picture, OpenCV axes.
-        names: Of the pictures.
+        world_to_camera: World-to-camera transforms of the images, OpenCV axes.
+        names: Image names.
         cameras: Undistorted pinholes.
-        taken_by: Which of them took each picture.
+        camera_indices: Camera index of each image.
     """
     import pycolmap
 
@@ -150,7 +150,7 @@ def posed_model(
         model.add_camera_with_trivial_rig(
             pycolmap.Camera(camera_id=number, model="PINHOLE", width=k.width, height=k.height, params=params)
         )
-    for index, (pose, name, camera) in enumerate(zip(world_to_camera, names, taken_by, strict=True)):
+    for index, (pose, name, camera) in enumerate(zip(world_to_camera, names, camera_indices, strict=True)):
         image = pycolmap.Image(name=name, camera_id=camera + 1, image_id=index + 1)
         model.add_image_with_trivial_frame(image, pose)
     return model
@@ -160,13 +160,13 @@ def _write(path: Path, trajectory: Trajectory, text: bool) -> None:
     if trajectory.intrinsics is None:
         raise InputError(
             f"no intrinsics for {path}",
-            "a COLMAP model to hold the camera's intrinsics and picture size",
+            "a COLMAP model to hold the camera's intrinsics and image size",
             "Pass --intrinsics fx,fy,cx,cy --size WIDTHxHEIGHT",
         )
     refuse_repeated(trajectory.names_or_numbers(), str(path))
     others = sorted(found.name for found in path.iterdir() if found.name not in _MODEL_FILES) if path.is_dir() else []
     if others:
-        raise InputError(f"{path} holds {others[0]}, which is no part of a COLMAP model", "a folder to itself")
+        raise InputError(f"{path} holds {others[0]}, which is not part of a COLMAP model", "an empty or new folder")
     names = trajectory.names_or_numbers()
     model = posed_model(colmap_poses(trajectory.camera_to_world), names, [trajectory.intrinsics], [0] * len(names))
     with atomic_folder(path, overwrite=True) as scratch:
@@ -189,17 +189,17 @@ def _text_images(path: Path) -> Iterator[_Image]:
             raise InputError(
                 f"{place}: '{shortened(line)}'",
                 "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, all numbers finite",
-                "Each picture has two lines; the second lists its points and may be empty, but must be there",
+                "Each image has two lines; the second lists its points and may be empty, but must exist",
             ) from error
         yield image
-        next(lines, None)  # the picture's points
+        next(lines, None)  # the image's points
 
 
 def read_text_cameras(path: Path) -> dict[int, Intrinsics | str]:
-    """The cameras of a ``cameras.txt`` by their number: the pinhole each is, or what it is instead, in words.
+    """Read the cameras of a ``cameras.txt`` by ID: the pinhole, or a description of another camera model.
 
     Raises:
-        InputError: The file cannot be read, or a line is no camera; naming the line.
+        InputError: The file cannot be read, or a line is not a camera; the message names the line.
     """
     cameras: dict[int, Intrinsics | str] = {}
     for number, line in enumerate(read_text(path).splitlines(), start=1):
@@ -207,7 +207,7 @@ def read_text_cameras(path: Path) -> dict[int, Intrinsics | str]:
         if not words or words[0].startswith("#"):
             continue
         try:
-            with placed(f"{path}, line {number}"):
+            with prefixed_errors(f"{path}, line {number}"):
                 cameras[int(words[0])] = _camera(words[1], int(words[2]), int(words[3]), [float(w) for w in words[4:]])
         except (ValueError, IndexError) as error:
             raise InputError(
@@ -229,7 +229,7 @@ def _binary_images(path: Path) -> Iterator[_Image]:
             at = end + 9 + _POINT_BYTES * points
             if at > len(data):
                 raise ValueError("out of bounds")
-            place = f"{path}, picture {number} ({name})"
+            place = f"{path}, image {number} ({name})"
             if not np.all(np.isfinite(values)):
                 raise InputError(f"{place}: its pose is {', '.join(f'{v:g}' for v in values)}", "seven finite numbers")
             yield _Image(place, tuple(values[:4]), tuple(values[4:]), camera, name)
@@ -248,12 +248,12 @@ def _binary_cameras(path: Path) -> dict[int, Intrinsics | str]:
         for _ in range(count):
             number, model, width, height = struct.unpack_from("<IiQQ", data, at)
             if model not in _PINHOLES:
-                # How long its parameters are is not known here, and no pinhole can be common to all pictures any more.
+                # The number of its parameters is unknown, and the images cannot share one pinhole any more.
                 cameras[number] = f"camera {number} is COLMAP's model {model}"
                 return cameras
             name, parameters = _PINHOLES[model]
             values = struct.unpack_from(f"<{parameters}d", data, at + 24)
-            with placed(f"{path}, camera {number}"):
+            with prefixed_errors(f"{path}, camera {number}"):
                 cameras[number] = _camera(name, width, height, list(values))
             at += 24 + 8 * parameters
     except struct.error as error:
@@ -275,7 +275,7 @@ def _damaged(path: Path, data: bytes) -> InputError:
 
 
 def _camera(model: str, width: int, height: int, parameters: list[float]) -> Intrinsics | str:
-    """The pinhole, or what it is instead."""
+    """The pinhole, or a description of another camera model."""
     if model == "PINHOLE":
         fx, fy, cx, cy = parameters
     elif model == "SIMPLE_PINHOLE":
@@ -287,15 +287,15 @@ def _camera(model: str, width: int, height: int, parameters: list[float]) -> Int
 
 
 def _common(cameras: dict[int, Intrinsics | str], used: set[int]) -> tuple[Intrinsics | None, str]:
-    """The pinhole that took every picture; or None, and why there is none."""
+    """The pinhole shared by all images; or None, and the reason."""
     found = [cameras[number] for number in sorted(used) if number in cameras]
     others = [camera for camera in cameras.values() if isinstance(camera, str)]
     if len(found) < len(used) or any(isinstance(camera, str) for camera in found):
-        reason = others[0] if others else "the model lacks a camera that a picture names"
+        reason = others[0] if others else "the model lacks a camera that an image names"
         return None, f"no intrinsics: {reason}, not an undistorted pinhole"
     pinholes = {camera for camera in found if isinstance(camera, Intrinsics)}
     if len(pinholes) > 1:
-        return None, f"no intrinsics: the pictures have {len(pinholes)} different cameras"
+        return None, f"no intrinsics: the images have {len(pinholes)} different cameras"
     return pinholes.pop(), ""
 
 

@@ -1,4 +1,4 @@
-"""EndoGSLAM's ``params.npz``: estimated poses, true poses and a cloud of isotropic Gaussians in one file.
+"""Reads and writes EndoGSLAM's ``params.npz``: estimated poses, true poses and isotropic Gaussians.
 
 Its world is the first camera of the sequence, its lengths are mm, its poses world-to-camera.
 """
@@ -20,10 +20,10 @@ from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.poses.format import Format
 from coliags_plugin.poses.rigid import check_rigid, inverse, rigid, rotations_from_wxyz, wxyz_from_rotations
-from coliags_plugin.poses.text import head, placed
+from coliags_plugin.poses.text import head, prefixed_errors
 from coliags_plugin.poses.trajectory import Trajectory
 
-#: Key -> shapes it may have; a letter is one number throughout the file, F that of the poses.
+#: Key -> allowed shapes; a letter is the same size throughout the file, F the number of poses.
 SHAPES: dict[str, tuple[tuple[int | str, ...], ...]] = {
     "cam_unnorm_rots": ((1, 4, "F"),),
     "cam_trans": ((1, 3, "F"),),
@@ -38,15 +38,15 @@ SHAPES: dict[str, tuple[tuple[int | str, ...], ...]] = {
 }
 _POSES = ("cam_unnorm_rots", "cam_trans")
 _PINHOLE = ("intrinsics", "org_width", "org_height")
-#: What nothing here is made from: tools that rewrite the file leave it out.
+#: Unused keys, which may be missing because tools that rewrite the file drop them.
 _SPARE = ("log_scales", "keyframe_time_indices")
-#: EndoGSLAM holds out frames 7, 15, 23, ... unless told otherwise.
+#: EndoGSLAM holds out frames 7, 15, 23, ... by default.
 _HELD_OUT_EVERY = 8
 
 
 @dataclass(frozen=True, eq=False)
 class EndoGslamParams:
-    """What a ``params.npz`` holds, in this package's conventions.
+    """Contents of a ``params.npz``, in this package's conventions.
 
     Attributes:
         camera_to_world: Estimated poses, rigid, OpenCV axes; world: the first camera; mm. [F, 4, 4]
@@ -54,9 +54,9 @@ class EndoGslamParams:
         intrinsics: Of all images.
         means: Centres of the Gaussians, world, mm; N may be 0. float64. [N, 3]
         rgb_colors: Colours, nominally in [0, 1]; may lie a little outside. float64. [N, 3]
-        log_scales: Logarithms of the standard deviations in mm; one column where Gaussians are isotropic. None where
-            the file has none. [N, 1] or [N, 3]
-        keyframes: Which of the F frames were keyframes; None where the file does not say. [K]
+        log_scales: Logarithms of the standard deviations in mm; one column if Gaussians are isotropic. None if missing
+            in the file. [N, 1] or [N, 3]
+        keyframes: Indices of keyframes; None if missing in the file. [K]
     """
 
     camera_to_world: Float[np.ndarray, "F 4 4"]
@@ -69,11 +69,11 @@ class EndoGslamParams:
 
 
 def read_params(path: Path) -> EndoGslamParams:
-    """Read a whole ``params.npz``.
+    """Read all contents of a ``params.npz``.
 
     Raises:
-        InputError: It is no NPZ, or keys are missing, misshaped, not numbers or not finite (all of them are named);
-            a pose is no rigid transform; or the intrinsics are no pinhole's. ``log_scales`` and
+        InputError: It is not an NPZ file, or keys are missing or have invalid shapes or values (all of them are named);
+            a pose is not rigid; or the intrinsics are not a pinhole's. ``log_scales`` and
             ``keyframe_time_indices`` may be missing.
     """
     arrays = _arrays(path, tuple(key for key in SHAPES if key not in _SPARE), optional=_SPARE)
@@ -90,7 +90,7 @@ def read_params(path: Path) -> EndoGslamParams:
 
 
 def read(path: Path) -> Trajectory:
-    """Read the estimated poses, and nothing else but the intrinsics.
+    """Read the estimated poses and the intrinsics.
 
     Raises:
         InputError: As :func:`read_params`, about the keys needed here.
@@ -104,7 +104,7 @@ def read(path: Path) -> Trajectory:
 
 
 def read_truth(path: Path) -> Trajectory:
-    """Read the data set's poses that EndoGSLAM kept beside its own.
+    """Read the dataset's true poses stored by EndoGSLAM.
 
     Raises:
         InputError: As :func:`read_params`, about the keys needed here.
@@ -114,10 +114,10 @@ def read_truth(path: Path) -> Trajectory:
 
 
 def write(path: Path, trajectory: Trajectory) -> None:
-    """Write a ``params.npz`` that holds poses and intrinsics, and no Gaussians.
+    """Write a ``params.npz`` with poses and intrinsics, but no Gaussians.
 
-    The world becomes the first camera, as the format has it. Both the estimate and the true poses are the trajectory:
-    readers differ in which of the two they take. Poses are float32, as EndoGSLAM's.
+    The world becomes the first camera, as the format requires. The trajectory is written as both estimated and true
+    poses, since readers differ in which of them they use. Poses are float32, as EndoGSLAM's.
 
     Raises:
         InputError: The trajectory has no intrinsics, or the folder cannot be written.
@@ -125,7 +125,7 @@ def write(path: Path, trajectory: Trajectory) -> None:
     if trajectory.intrinsics is None:
         raise InputError(
             f"no intrinsics for {path}",
-            "a params.npz to hold the camera's intrinsics and picture size",
+            "a params.npz to hold the camera's intrinsics and image size",
             "Pass --intrinsics fx,fy,cx,cy --size WIDTHxHEIGHT",
         )
     intrinsics = trajectory.intrinsics
@@ -155,21 +155,21 @@ def write(path: Path, trajectory: Trajectory) -> None:
 
 
 def recognise(path: Path) -> bool:
-    """Whether a file is a ZIP archive, which is what NPZ is."""
+    """Whether a file is a ZIP archive, as NPZ files are."""
     return head(path).startswith(b"PK\x03\x04")
 
 
 def image_indices(poses: int, images: int) -> Int[np.ndarray, "F"] | None:
-    """Which pictures of a sequence EndoGSLAM's poses belong to.
+    """Image indices of EndoGSLAM's poses in a sequence.
 
-    Its default config is given only training frames, so that a file may hold 7/8 of the sequence's poses.
+    EndoGSLAM's default config tracks only training frames, so that a file may hold 7/8 of the sequence's poses.
 
     Args:
         poses: Number of poses in the file.
-        images: Number of pictures of the sequence.
+        images: Number of images of the sequence.
 
     Returns:
-        The picture of each pose: all of them, or all but 7, 15, 23, ...; None where the numbers fit neither. [F]
+        Image index of each pose: all images, or all but 7, 15, 23, ...; None if the counts match neither. [F]
     """
     every = np.arange(images)
     if poses == images:
@@ -194,7 +194,7 @@ def _intrinsics(path: Path, arrays: dict[str, np.ndarray]) -> Intrinsics:
     fx, fy, cx, cy = (float(matrix[row, column]) for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
     width, height = (int(arrays[key].item()) for key in ("org_width", "org_height"))
     # EndoGSLAM unprojects pixel u as (u - cx) / fx: its pixel centres are integers.
-    with placed(str(path)):
+    with prefixed_errors(str(path)):
         return Intrinsics(fx, fy, cx + 0.5, cy + 0.5, width, height)
 
 
@@ -211,7 +211,7 @@ def _truth(path: Path, arrays: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def _arrays(path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> dict[str, np.ndarray]:
-    """The named arrays, float64, their shapes and values checked; optional ones where they are there."""
+    """Load the named arrays as float64 and check their shapes and values; optional ones if present."""
     arrays: dict[str, np.ndarray] = {}
     faults: list[str] = []
     try:
@@ -226,7 +226,7 @@ def _arrays(path: Path, required: Sequence[str], optional: Sequence[str] = ()) -
                 try:
                     arrays[key] = archive[key]
                 except ValueError:
-                    faults.append(f"{key} is no array of numbers")
+                    faults.append(f"{key} is not an array of numbers")
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f"cannot read {path}: {error}", "a params.npz written by EndoGSLAM") from error
     sizes: dict[str, int] = {}
@@ -248,7 +248,7 @@ def _arrays(path: Path, required: Sequence[str], optional: Sequence[str] = ()) -
 
 
 def _fault(key: str, array: np.ndarray, sizes: dict[str, int]) -> str:
-    """What is wrong with an array, or nothing; remembers the sizes that letters stand for."""
+    """Describe the fault of an array, or return an empty string; records the sizes of letters."""
     if not (np.issubdtype(array.dtype, np.number) and not np.iscomplexobj(array)):
         return f"{key} holds {array.dtype}, not numbers"
     for shape in SHAPES[key]:

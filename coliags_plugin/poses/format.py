@@ -1,4 +1,4 @@
-"""What a kind of pose file has to say of itself; :data:`coliags_plugin.config.registry.pose_formats` names them."""
+"""Description of a pose file format; the registry is :data:`coliags_plugin.config.registry.pose_formats`."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from coliags_plugin.poses.trajectory import Trajectory
 
 @dataclass(frozen=True)
 class Format:
-    """One kind of pose file.
+    """A pose file format.
 
     Attributes:
-        name: What it is called on the command line.
-        read: Reads a file, or a folder, of the kind.
-        write: Writes one in place of what is there, or None where the kind is only read.
-        recognise: Whether a path is of this kind, by content; None where another format answers for it.
-        unit: Its unit of length, or ``"units"`` where the format fixes none.
-        keeps: What it keeps beside the poses: ``names``, ``timestamps``, ``intrinsics``.
-        folder: Whether it is a folder of files.
+        name: Name on the command line.
+        read: Reads a file or folder.
+        write: Writes a file or folder, replacing an existing one; None if the format is read-only.
+        recognise: Whether a path has this format, by content; None if another format recognises it.
+        unit: Its unit of length, or ``"units"`` if the format defines none.
+        keeps: Further stored data: ``names``, ``timestamps``, ``intrinsics``.
+        folder: Whether the format is a folder of files.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Which format a pose file is in, and writing one."""
+"""Detects pose file formats and writes trajectories."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from coliags_plugin.poses.trajectory import Trajectory
 
 
 def format_named(name: str) -> Format:
-    """The format of a name.
+    """The format with a given name.
 
     Raises:
-        InputError: There is none.
+        InputError: The name is unknown.
     """
     known: Format = pose_formats.get(name)
     return known
@@ -25,12 +25,12 @@ def format_of(path: Path, name: str | None = None) -> Format:
     """The format of a file or folder.
 
     Args:
-        path: A file or folder that is there.
-        name: The format, where it is known; otherwise content tells.
+        path: An existing file or folder.
+        name: The format's name; None: detect it from the content.
 
     Raises:
-        InputError: There is no such path or format; a file is given for a format that is a folder, or the other way
-            round; or the content is none of the formats.
+        InputError: The path or format does not exist; a file is given for a folder format, or the other way round; or
+            the content has none of the formats.
     """
     if not path.exists():
         raise InputError(f"no file or folder {path}", "poses")
@@ -48,34 +48,34 @@ def format_of(path: Path, name: str | None = None) -> Format:
         raise InputError(f"{path} holds {shown}", "the folder of a COLMAP model, or a pose file inside a folder")
     count = count_first_numbers(path)
     raise InputError(
-        f"{path} is no pose file known here: its first line holds "
+        f"{path} has no known pose format: its first line holds "
         + (f"{count} numbers" if count is not None else "no row of numbers"),
-        "16 numbers a line (c3vd), 8 (tum), a params.npz (endogslam) or a transforms.json (nerfstudio)",
+        "16 numbers per line (c3vd), 8 (tum), a params.npz (endogslam) or a transforms.json (nerfstudio)",
     )
 
 
 def write_trajectory(path: Path, trajectory: Trajectory, name: str, overwrite: bool = False) -> None:
-    """Write a trajectory, whole or not at all.
+    """Write a trajectory atomically.
 
     Args:
-        path: Where to; its folder is made.
-        trajectory: What to write.
-        name: The format.
-        overwrite: Replace what is there; of folders, nothing but a COLMAP model.
+        path: The file or folder; its parent folder is created.
+        trajectory: The trajectory.
+        name: Name of the format.
+        overwrite: Replace an existing file, or a COLMAP model in a folder.
 
     Raises:
-        InputError: There is no such format or it is only read; the path exists and ``overwrite`` is off; or as the
-            format's writer.
+        InputError: The format is unknown or read-only; the path exists and ``overwrite`` is off; or as the format's
+            writer.
     """
     known = format_named(name)
     if known.write is None:
         writable = [other for other in pose_formats if format_named(other).write is not None]
-        raise InputError(f"'{name}' is only read", f"one of {', '.join(writable)}")
+        raise InputError(f"format '{name}' is read-only", f"one of {', '.join(writable)}")
     if path.exists() and path.is_dir() != known.folder:
         raise InputError(
             f"{path} is a {'folder' if path.is_dir() else 'file'}",
             f"a new {'folder' if known.folder else 'file'}, as {name} poses are one",
         )
     if path.exists() and not overwrite and not (path.is_dir() and not any(path.iterdir())):
-        raise InputError(f"{path} already exists", "a new place", "Choose another, or pass --overwrite")
+        raise InputError(f"{path} already exists", "a new path", "Choose another, or pass --overwrite")
     known.write(path, trajectory)

@@ -1,4 +1,7 @@
-"""``transforms.json`` as nerfstudio, instant-ngp and Blender's NeRF scenes have it: OpenGL axes, camera-to-world."""
+"""Reads and writes poses in ``transforms.json`` of nerfstudio, instant-ngp and Blender's NeRF scenes.
+
+Poses are camera-to-world with OpenGL axes.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ from coliags_plugin.core.files import write_json
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.poses.format import Format
 from coliags_plugin.poses.rigid import FLIP_Y_AND_Z, check_rigid
-from coliags_plugin.poses.text import head, placed, read_text
+from coliags_plugin.poses.text import head, prefixed_errors, read_text
 from coliags_plugin.poses.trajectory import Trajectory, natural_order, refuse_repeated
 
 _PINHOLE = ("fl_x", "fl_y", "cx", "cy", "w", "h")
@@ -25,12 +28,13 @@ _UNDISTORTED = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "PERSPECTIVE")
 def read(path: Path) -> Trajectory:
     """Read ``frames[].transform_matrix``, ordered by ``file_path``, 2 before 10.
 
-    nerfstudio's own conversion turns the world and says so in ``applied_transform`` (and ``applied_scale``); that is
-    undone, so that the world is the one poses were made in.
+    nerfstudio's conversion transforms the world and stores that in ``applied_transform`` (and ``applied_scale``); it is
+    undone, so that poses are in their original world.
 
     Raises:
-        InputError: The file is no such JSON, or holds no frames; a frame has no file_path or no finite, rigid 4x4 or
-            3x4 matrix, naming it; a picture stands twice; or the applied change is no turn, shift and positive scale.
+        InputError: The file is not such a JSON, or holds no frames; a frame has no file_path or no finite, rigid 4x4 or
+            3x4 matrix (the message names it); an image is repeated; or the applied transform is not rigid with a
+            positive scale.
     """
     content = _json(path)
     frames = content.get("frames")
@@ -40,7 +44,7 @@ def read(path: Path) -> Trajectory:
     for index, frame in enumerate(frames):
         name = frame.get("file_path") if isinstance(frame, dict) else None
         if not isinstance(name, str) or not name:
-            raise InputError(f"{path}, frame {index}: no file_path", "the name of the frame's picture")
+            raise InputError(f"{path}, frame {index}: no file_path", "the name of the frame's image")
         names.append(name)
         matrices.append(_matrix(frame.get("transform_matrix"), f"{path}, frame {index} ({name}): transform_matrix"))
     refuse_repeated(names, str(path))
@@ -48,7 +52,7 @@ def read(path: Path) -> Trajectory:
     camera_to_world = np.array(matrices)
     check_rigid(camera_to_world, lambda index: f"{path}, frame {index} ({names[index]})")
     if "applied_transform" in content or "applied_scale" in content:
-        camera_to_world = _undone(path, content, camera_to_world)
+        camera_to_world = _undo_applied_transform(path, content, camera_to_world)
         remarks.append("nerfstudio's change of the world (applied_transform) is undone")
     order = natural_order(names)
     if order != list(range(len(order))):
@@ -64,10 +68,10 @@ def read(path: Path) -> Trajectory:
 
 
 def write(path: Path, trajectory: Trajectory) -> None:
-    """Write a ``transforms.json``; with intrinsics where they are known.
+    """Write a ``transforms.json``, with intrinsics if known.
 
     Raises:
-        InputError: A name stands twice, or the folder cannot be written.
+        InputError: A name is repeated, or the folder cannot be written.
     """
     names = trajectory.names_or_numbers()
     refuse_repeated(names, str(path))
@@ -83,7 +87,7 @@ def write(path: Path, trajectory: Trajectory) -> None:
 
 
 def recognise(path: Path) -> bool:
-    """Whether a file begins as a JSON object does."""
+    """Whether a file begins like a JSON object."""
     return head(path).removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{")
 
 
@@ -91,14 +95,14 @@ def _json(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(read_text(path, "a transforms.json"))
     except (json.JSONDecodeError, RecursionError) as error:
-        raise InputError(f"{path} is no JSON: {error}", "a transforms.json") from error
+        raise InputError(f"{path} is not JSON: {error}", "a transforms.json") from error
     if not isinstance(content, dict):
         raise InputError(f"{path} holds a JSON {type(content).__name__}", "a JSON object with 'frames'")
     return content
 
 
 def _matrix(value: Any, place: str) -> np.ndarray:
-    """A finite [4, 4] from nested lists of four or three rows."""
+    """Finite matrix from nested lists of four or three rows. [4, 4]"""
     try:
         matrix = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -107,15 +111,15 @@ def _matrix(value: Any, place: str) -> np.ndarray:
         matrix = np.vstack([matrix, (0.0, 0.0, 0.0, 1.0)])
     expected = "4 (or 3) rows of 4 finite numbers"
     if matrix.shape != (4, 4):
-        raise InputError(f"{place} is {'missing' if value is None else 'no matrix'}", expected)
+        raise InputError(f"{place} is {'missing' if value is None else 'not a matrix'}", expected)
     if not np.all(np.isfinite(matrix)):
         row, column = np.argwhere(~np.isfinite(matrix))[0]
         raise InputError(f"{place} is {matrix[row, column]} in row {row}, column {column}", expected)
     return matrix
 
 
-def _undone(path: Path, content: dict[str, Any], camera_to_world: np.ndarray) -> np.ndarray:
-    """Poses before nerfstudio turned (and scaled) the world."""
+def _undo_applied_transform(path: Path, content: dict[str, Any], camera_to_world: np.ndarray) -> np.ndarray:
+    """Poses before nerfstudio's applied_transform and applied_scale."""
     applied = _matrix(content.get("applied_transform", np.eye(4)), f"{path}: applied_transform")
     check_rigid(applied[None], lambda _: f"{path}: applied_transform")
     scale = content.get("applied_scale", 1.0)
@@ -127,10 +131,10 @@ def _undone(path: Path, content: dict[str, Any], camera_to_world: np.ndarray) ->
 
 
 def _intrinsics(path: Path, content: dict[str, Any], frames: list[dict[str, Any]]) -> tuple[Intrinsics | None, str]:
-    """The pinhole that took every picture; or None, and why there is none."""
+    """The pinhole shared by all images; or None, and the reason."""
     found: set[Intrinsics] = set()
     for frame in frames:
-        # A frame's own value goes before the file's.
+        # A frame's value overrides the file's.
         values = {
             key: frame.get(key, content.get(key)) for key in (*_PINHOLE, *_DISTORTION, "camera_model", "camera_angle_x")
         }
@@ -146,10 +150,10 @@ def _intrinsics(path: Path, content: dict[str, Any], frames: list[dict[str, Any]
         if missing:
             return None, f"no intrinsics: the file has no {', '.join(missing)}"
         fx, fy, cx, cy, width, height = (_number(path, values, key) for key in _PINHOLE)
-        with placed(str(path)):
+        with prefixed_errors(str(path)):
             found.add(Intrinsics(fx, fy, cx, cy, round(width), round(height)))
     if len(found) > 1:
-        return None, f"no intrinsics: the pictures have {len(found)} different cameras"
+        return None, f"no intrinsics: the images have {len(found)} different cameras"
     return found.pop(), ""
 
 

@@ -1,4 +1,4 @@
-"""Rigid transforms and quaternions: checks, and the way from one to the other."""
+"""Checks and conversions of rigid transforms and quaternions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
 
-#: How far R^T R may be from the identity, and a quaternion from unit length. The files carry six digits: 1e-6 off.
+#: Largest deviation of R^T R from the identity, and of a quaternion from unit length. Six digits in files give 1e-6.
 RIGID_TOLERANCE = 1e-3
 #: Below this length a quaternion has no direction.
 ZERO_QUATERNION = 1e-8
@@ -30,11 +30,11 @@ def check_rigid(
     Args:
         matrices: Transforms. [N, 4, 4]
         place: What to call the matrix of an index in the message: file and line, or frame.
-        expected: What the message about a matrix that is not rigid says would be right.
-        do: What it says to do.
+        expected: Expectation in the error message for a matrix that is not rigid.
+        do: Advice in that message.
 
     Raises:
-        InputError: Naming the place.
+        InputError: A matrix is invalid; the message names its place.
     """
     finite = np.isfinite(matrices).all(axis=(1, 2))
     safe = np.where(finite[:, None, None], matrices, np.eye(4))
@@ -58,14 +58,14 @@ def check_rigid(
     raise InputError(
         f"{place(index)}: a left-handed transform (det R = -1)",
         "camera axes x right, y down, z forward in a right-handed world",
-        "Undo the flip of one axis in whatever wrote the file",
+        "Undo the flip of one axis in the program that wrote the file",
     )
 
 
 def rotations_from_wxyz(
     quats_wxyz: Float[np.ndarray, "N 4"], place: Callable[[int], str], *, unit: bool
 ) -> Float[np.ndarray, "N 3 3"]:
-    """Rotation matrices of quaternions.
+    """Rotation matrices from quaternions.
 
     Args:
         quats_wxyz: Quaternions, w first; normalised here. [N, 4]
@@ -74,12 +74,12 @@ def rotations_from_wxyz(
             quaternions, another length means another column order or a damaged file.
 
     Raises:
-        InputError: One is not finite, or zero, or not of unit length where it has to be.
+        InputError: A quaternion is not finite, or zero, or not of unit length if required.
     """
     lengths = np.linalg.norm(quats_wxyz, axis=1)
     for index in np.flatnonzero(~(lengths > ZERO_QUATERNION) | ~np.isfinite(lengths)):
         raise InputError(
-            f"{place(int(index))}: the quaternion ({_listed(quats_wxyz[index])}) is no rotation",
+            f"{place(int(index))}: the quaternion ({_listed(quats_wxyz[index])}) is not a rotation",
             "four finite numbers, not all 0",
         )
     for index in np.flatnonzero(np.abs(lengths - 1.0) > RIGID_TOLERANCE) if unit else ():
@@ -98,7 +98,7 @@ def wxyz_from_rotations(rotations: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarr
 
 
 def rigid(rotations: Float[np.ndarray, "N 3 3"], translations: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 4 4"]:
-    """Transforms from their rotations and translations. [N, 4, 4]"""
+    """Rigid transforms from rotations and translations. [N, 4, 4]"""
     matrices = np.tile(np.eye(4), (len(rotations), 1, 1))
     matrices[:, :3, :3] = rotations
     matrices[:, :3, 3] = translations
@@ -106,13 +106,13 @@ def rigid(rotations: Float[np.ndarray, "N 3 3"], translations: Float[np.ndarray,
 
 
 def inverse(matrices: Float[np.ndarray, "N 4 4"]) -> Float[np.ndarray, "N 4 4"]:
-    """Inverses, using that the transforms are rigid. [N, 4, 4]"""
+    """Inverses of rigid transforms. [N, 4, 4]"""
     transposed = matrices[:, :3, :3].transpose(0, 2, 1)
     return rigid(transposed, -np.einsum("nij,nj->ni", transposed, matrices[:, :3, 3]))
 
 
 def rotation_angles_deg(rotations: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarray, "N"]:
-    """Angle that each rotation turns by, degrees, 0 to 180; exact for small angles too. [N]"""
+    """Rotation angles, degrees, 0 to 180; exact for small angles too. [N]"""
     return np.rad2deg(Rotation.from_matrix(rotations).magnitude())
 
 

@@ -1,4 +1,4 @@
-"""Pose files that are text: tolerant of byte order marks, line ends and blank lines, and of nothing else."""
+"""Reads text pose files; tolerates byte order marks, any line ends and blank lines."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import numpy as np
 
 from coliags_plugin.core.errors import InputError
 
-#: How much of a file is looked at to recognise it.
+#: Bytes of a file read to recognise it.
 _HEAD_BYTES = 65_536
 
 
 def read_text(path: Path, expected: str = "a text file of poses") -> str:
-    """The text of a file, UTF-8 with or without a byte order mark.
+    """Read a UTF-8 text file with or without a byte order mark.
 
     Raises:
-        InputError: It cannot be read, or is no text.
+        InputError: The file cannot be read, or is not text.
     """
     try:
         return path.read_text(encoding="utf-8-sig")
@@ -30,17 +30,17 @@ def read_text(path: Path, expected: str = "a text file of poses") -> str:
 def read_numbers(
     path: Path, count: int, expected: str, do: str, *, comments: bool = False
 ) -> list[tuple[int, list[float]]]:
-    """Rows of finite numbers, separated by commas or blanks, each with the number of its line.
+    """Read rows of finite numbers, separated by commas or blanks, each with its line number.
 
     Args:
         path: A text file.
-        count: Numbers in a row.
-        expected: What the message about a line that holds something else says would be right.
-        do: What it says to do.
-        comments: Pass over lines that begin with ``#``.
+        count: Numbers per row.
+        expected: Expectation in the error message for an invalid line.
+        do: Advice in that message.
+        comments: Skip lines that begin with ``#``.
 
     Raises:
-        InputError: The file cannot be read or holds no rows, or a line is none; naming the line.
+        InputError: The file cannot be read or holds no rows, or a line is invalid; the message names the line.
     """
     rows: list[tuple[int, list[float]]] = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
@@ -60,7 +60,7 @@ def read_numbers(
 
 
 def count_first_numbers(path: Path) -> int | None:
-    """How many numbers the first line of a text file holds, comments apart; None where that is no row of numbers."""
+    """Count of numbers in the first line of a text file that is not a comment; None if it holds anything else."""
     for line in head(path).decode("utf-8-sig", errors="replace").splitlines():
         words = _words(line)
         if not words or words[0].startswith("#"):
@@ -73,7 +73,7 @@ def count_first_numbers(path: Path) -> int | None:
 
 
 def head(path: Path) -> bytes:
-    """The beginning of a file; nothing where it is none."""
+    """The first bytes of a file; empty if it cannot be read."""
     try:
         with path.open("rb") as file:
             return file.read(_HEAD_BYTES)
@@ -82,8 +82,8 @@ def head(path: Path) -> bytes:
 
 
 @contextmanager
-def placed(place: str) -> Iterator[None]:
-    """Put a place before what an :class:`InputError` from within the block has seen."""
+def prefixed_errors(place: str) -> Iterator[None]:
+    """Prefix the message of an :class:`InputError` raised within the block by a place."""
     try:
         yield
     except InputError as error:
@@ -91,7 +91,7 @@ def placed(place: str) -> Iterator[None]:
 
 
 def shortened(line: str) -> str:
-    """A line as a message shows it."""
+    """A line shortened for messages."""
     text = line.strip()
     return text if len(text) <= 60 else f"{text[:57]}..."
 

@@ -1,4 +1,4 @@
-"""A camera trajectory, whatever file it came from."""
+"""Camera trajectories, independent of the file format."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from coliags_plugin.poses.rigid import check_rigid
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """The poses of a camera, in the order of the video.
+    """Camera poses in video order.
 
     Attributes:
         camera_to_world: Rigid, OpenCV axes (x right, y down, z forward); lengths and world as in the file, unless a
             remark says otherwise. float64. [N, 4, 4]
-        names: The picture of each pose, as the file calls it, or None.
-        timestamps: When each picture was taken, s, or None. float64. [N]
-        intrinsics: The pinhole that took all pictures, or None where it is unknown or there are several.
-        stored_as: How the file stored the poses, for whoever reads along.
-        remarks: What was changed, or left behind, when the file was read.
+        names: Image name of each pose in the file, or None.
+        timestamps: Capture time of each image, s, or None. float64. [N]
+        intrinsics: The pinhole that took all images, or None where it is unknown or there are several.
+        stored_as: Convention of the file, for messages.
+        remarks: Changes and omissions when the file was read.
     """
 
     camera_to_world: Float[np.ndarray, "N 4 4"]
@@ -36,11 +36,11 @@ class Trajectory:
     remarks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuse poses that are none, and names or times that do not belong to them.
+        """Check poses, names and timestamps.
 
         Raises:
-            InputError: There is no pose; one is not rigid, right-handed and finite; or names or timestamps are not one
-                for each pose, or not finite.
+            InputError: There is no pose; one is not rigid, right-handed and finite; or there is not one name or finite
+                timestamp per pose.
         """
         matrices = np.asarray(self.camera_to_world, dtype=np.float64)
         if matrices.ndim != 3 or matrices.shape[1:] != (4, 4) or not len(matrices):
@@ -78,10 +78,10 @@ class Trajectory:
         return np.asarray(np.linalg.norm(np.diff(self.centers, axis=0), axis=1))
 
     def summary(self, unit: str = "units") -> str:
-        """Count, length and looking direction in one line: a wrong convention shows in them first.
+        """One-line summary: number of poses, path length and viewing direction, which reveal a wrong convention.
 
         Args:
-            unit: What to call the unit of length.
+            unit: Name of the unit of length.
         """
         steps = self.steps
         mean_step = float(steps.mean()) if len(steps) else 0.0
@@ -92,30 +92,30 @@ class Trajectory:
         )
 
     def names_or_numbers(self) -> tuple[str, ...]:
-        """The names, or ``0000.png``, ``0001.png``, ... where there are none."""
+        """The names, or ``0000.png``, ``0001.png``, ... without names."""
         return self.names if self.names is not None else tuple(f"{index:04d}.png" for index in range(len(self)))
 
 
 def natural_order(names: Sequence[str]) -> list[int]:
-    """Indices that sort names as people count: 2 before 10. Equal names keep their order."""
+    """Indices that sort names in natural order, 2 before 10; stable."""
     return sorted(range(len(names)), key=lambda index: _natural(names[index]))
 
 
 def refuse_repeated(names: Sequence[str], place: str) -> None:
-    """Refuse a name that stands twice.
+    """Refuse a name that is repeated.
 
     Raises:
-        InputError: Naming it, and the two places it has in ``names``.
+        InputError: A name is repeated; the message gives it and its two indices.
     """
     first: dict[str, int] = {}
     for index, name in enumerate(names):
         if first.setdefault(name, index) != index:
             raise InputError(
-                f"{place}: '{name}' stands twice (poses {first[name]} and {index})", "one pose for each picture"
+                f"{place}: '{name}' is repeated (poses {first[name]} and {index})", "one pose for each image"
             )
 
 
 def _natural(name: str) -> tuple[list[tuple[int, int, str]], str]:
-    # Numbers before words; the name itself last, so that 01 and 1 have an order.
+    # Numbers before words; the name itself last, to order 01 and 1.
     parts = [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.findall(r"\d+|\D+", name)]
     return parts, name

@@ -1,4 +1,4 @@
-"""TUM's trajectory format, which most SLAM systems write and which Gaussian Pancakes reads."""
+"""Reads and writes TUM trajectory files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from coliags_plugin.poses.trajectory import Trajectory
 
 
 def read(path: Path) -> Trajectory:
-    """Read ``timestamp tx ty tz qx qy qz qw`` a line: camera-to-world, seconds, quaternion with w last.
+    """Read lines of ``timestamp tx ty tz qx qy qz qw``: camera-to-world, seconds, quaternion with w last.
 
     Raises:
         InputError: A line does not hold eight finite numbers, or its quaternion is zero or further than 1e-3 from unit
@@ -24,7 +24,7 @@ def read(path: Path) -> Trajectory:
         path,
         8,
         "8 finite numbers: timestamp tx ty tz qx qy qz qw",
-        "Write one camera-to-world pose a line, comments behind #",
+        "Write one camera-to-world pose per line, comments after #",
         comments=True,
     )
     rows = np.array([numbers for _, numbers in lines])
@@ -38,7 +38,7 @@ def read(path: Path) -> Trajectory:
 
 
 def write(path: Path, trajectory: Trajectory) -> None:
-    """Write a TUM file; without timestamps, frame numbers stand in for them.
+    """Write a TUM file; without timestamps, frame indices are written instead.
 
     Raises:
         InputError: The folder cannot be written.

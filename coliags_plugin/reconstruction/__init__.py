@@ -1,1 +1,1 @@
-"""Poses and points from pictures: structure from motion, triangulation, RGB-D odometry."""
+"""Camera poses and 3D points from images: structure from motion, triangulation and RGB-D odometry."""

@@ -20,7 +20,7 @@ from coliags_plugin.outputs.image_files import encode_png
 from coliags_plugin.outputs.page import leaves, plain, record, refuse_folder, write_page
 from coliags_plugin.reporting.comparison_table import Column, columns, metric_title, unit_text
 from coliags_plugin.reporting.run_data import SEEN_SUFFIX, EvaluatedRun, read_runs
-from coliags_plugin.reporting.views import SCALE_PERCENTILE, Picture, RunView, View, Views, read_views
+from coliags_plugin.reporting.views import SCALE_PERCENTILE, EncodedImage, RunView, View, Views, read_views
 
 _SET_TITLES = {"test": "test: held out along the path", "rotation": "rotation: beyond the path"}
 #: Metrics shown under an image, where available.
@@ -241,7 +241,7 @@ def _scales(views: Views) -> str:
     parts = [color_bar_svg((0.0, views.error_limit), "mm", "error", "|depth error|", "error-scale")]
     if views.depth_limits is not None:
         parts.append(color_bar_svg(views.depth_limits, "mm", "depth", "true depth", "depth-scale"))
-    sample = Picture("image/png", encode_png(hatch(14, 34)), 34, 14)
+    sample = EncodedImage("image/png", encode_png(hatch(14, 34)), 34, 14)
     parts.append(
         f'<div class="unknown">{_img(sample, "grey hatch")}<span>no true depth (plain grey in true depth)</span></div>'
     )
@@ -288,12 +288,12 @@ def _view_metrics(run: EvaluatedRun, part: RunView) -> str:
     return "".join(texts) or "no metrics for this frame"
 
 
-def _img(picture: Picture, alt: str) -> str:
-    source = f"data:{picture.mime};base64,{b64encode(picture.data).decode('ascii')}"
-    return f'<img src="{source}" width="{picture.width}" height="{picture.height}" alt="{escape(alt, quote=True)}">'
+def _img(image: EncodedImage, alt: str) -> str:
+    source = f"data:{image.mime};base64,{b64encode(image.data).decode('ascii')}"
+    return f'<img src="{source}" width="{image.width}" height="{image.height}" alt="{escape(alt, quote=True)}">'
 
 
-def _missing(like: Picture, text: str) -> str:
+def _missing(like: EncodedImage, text: str) -> str:
     return f'<div class="missing" style="aspect-ratio: {like.width} / {like.height}">{escape(text)}</div>'
 
 

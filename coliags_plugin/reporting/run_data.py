@@ -169,7 +169,9 @@ def _read_json(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise InputError(f"{path} is not JSON: {error}", "a whole JSON file", "Make it again, or restore it") from error
+        raise InputError(
+            f"{path} is not JSON: {error}", "a complete JSON file", "Make it again, or restore it"
+        ) from error
 
 
 def _read_history(path: Path) -> dict[str, np.ndarray]:
@@ -184,9 +186,9 @@ def _read_history(path: Path) -> dict[str, np.ndarray]:
         try:
             values = json.loads(line)
         except ValueError as error:
-            raise InputError(f"{path}, line {number} is not JSON: {error}", "one JSON object a line") from error
+            raise InputError(f"{path}, line {number} is not JSON: {error}", "one JSON object per line") from error
         if not isinstance(values, dict):
-            raise InputError(f"{path}, line {number} holds a {type(values).__name__}", "one JSON object a line")
+            raise InputError(f"{path}, line {number} holds a {type(values).__name__}", "one JSON object per line")
         lines.append(values)
     columns = ("step", "loss", "psnr", "seconds", "gaussians", "anchors")
     table = {name: np.array([_or_nan(values.get(name)) for values in lines], dtype=np.float64) for name in columns}
@@ -200,7 +202,7 @@ def _read_per_frame(path: Path, folder: Path, protocol: str) -> dict[str, list[F
             for number, row in enumerate(csv.DictReader(file), start=2):
                 if not row.get("set") or not row.get("frame"):
                     raise InputError(
-                        f"{path}, line {number} names no set or no frame",
+                        f"{path}, line {number} has no set or no frame",
                         "columns set, frame, ...",
                         _again(folder, protocol),
                     )

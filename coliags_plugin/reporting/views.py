@@ -14,11 +14,11 @@ import numpy as np
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.outputs.axis_ticks import linear_ticks, round_up
 from coliags_plugin.outputs.colormaps import (
+    colorize_depth,
+    colorize_depth_error,
+    colorize_rgb_error,
     depth_error,
-    depth_error_picture,
-    depth_picture,
     rgb_error,
-    rgb_error_picture,
 )
 from coliags_plugin.outputs.image_files import encode_jpeg, encode_png, read_depth_tiff, read_rgb
 from coliags_plugin.reporting.run_data import EvaluatedRun, FrameMetrics
@@ -31,7 +31,7 @@ _SMALLEST_SCALE = 1e-6
 
 
 @dataclass(frozen=True)
-class Picture:
+class EncodedImage:
     """An encoded image.
 
     Attributes:
@@ -49,23 +49,23 @@ class Picture:
 
 @dataclass(frozen=True)
 class RunView:
-    """Rendering, error map and metrics of one run; ``error`` is None where the run has no depth of the frame."""
+    """Rendering, error map and metrics of one run; ``error`` is None if the run has no depth of the frame."""
 
-    render: Picture
-    error: Picture | None
+    render: EncodedImage
+    error: EncodedImage | None
     metrics: FrameMetrics
 
 
 @dataclass(frozen=True)
 class View:
-    """One held-out frame: ground truth and every run's rendering; ``depth`` is None where the data have none."""
+    """One held-out frame: ground truth and every run's rendering; ``depth`` is None if the data have none."""
 
     set_name: str
     frame: str
     position: int
     frames_in_set: int
-    truth: Picture
-    depth: Picture | None
+    truth: EncodedImage
+    depth: EncodedImage | None
     runs: Sequence[RunView]
 
 
@@ -107,7 +107,7 @@ def read_views(runs: Sequence[EvaluatedRun], count: int) -> Views:
 
     Args:
         runs: Runs evaluated on the same frames.
-        count: Frames per set; a smaller set is shown whole.
+        count: Frames per set; all of a smaller set.
 
     Raises:
         InputError: ``count`` is not positive; or an image is missing, damaged, or not of the ground truth's size.
@@ -142,7 +142,7 @@ def read_views(runs: Sequence[EvaluatedRun], count: int) -> Views:
 
 
 def evenly(length: int, count: int) -> list[int]:
-    """``count`` indices spread evenly over ``length``, first and last included; the middle one for one."""
+    """``count`` evenly spaced indices below ``length``, first and last included; the middle one if ``count`` is 1."""
     if count >= length:
         return list(range(length))
     if count == 1:
@@ -194,13 +194,13 @@ def _read(
     if not path.is_file():
         raise InputError(
             f"{path} is missing, though per_frame.csv lists its frame",
-            "a whole evaluation",
+            "a complete evaluation",
             f"Run `coliags eval {run.folder} --protocol {run.evaluation.name} --overwrite` again",
         )
     pixels = reader(path)
     if shape is not None and pixels.shape[:2] != shape:
         raise InputError(
-            f"{path} is {pixels.shape[1]} x {pixels.shape[0]} px", f"{shape[1]} x {shape[0]} px, as the true picture"
+            f"{path} is {pixels.shape[1]} x {pixels.shape[0]} px", f"{shape[1]} x {shape[0]} px, as the true image"
         )
     return pixels
 
@@ -222,7 +222,7 @@ def _reduced_rgb(rgb: np.ndarray, reduction: int) -> np.ndarray:
 
 
 def _reduced_map(values: np.ndarray, reduction: int) -> np.ndarray:
-    """Subsampled map: averaging across an edge would give depths of no surface."""
+    """Subsampled map: averaging across an edge would mix depths of different surfaces."""
     height, width = values.shape[0] // reduction, values.shape[1] // reduction
     middle = reduction // 2
     return values[middle::reduction, middle::reduction][:height, :width]
@@ -266,22 +266,22 @@ def _draw(
     for run, render, depth in zip(runs, frame.renders, frame.depths, strict=True):
         error = None
         if kind == "rgb":
-            error = _png(rgb_error_picture(render, frame.truth, limit=limit / 255.0))
+            error = _png(colorize_rgb_error(render, frame.truth, limit=limit / 255.0))
         elif depth is not None and frame.true_depth is not None:
-            error = _png(depth_error_picture(depth, frame.true_depth, None, limit))
+            error = _png(colorize_depth_error(depth, frame.true_depth, None, limit))
         drawn.append(RunView(_jpeg(render), error, run.per_frame[frame.set_name][frame.position]))
     in_set = runs[0].per_frame[frame.set_name]
     true_depth = None
     if frame.true_depth is not None and depth_limits is not None:
-        true_depth = _png(depth_picture(frame.true_depth, depth_limits))
+        true_depth = _png(colorize_depth(frame.true_depth, depth_limits))
     return View(
         frame.set_name, in_set[frame.position].name, frame.position, len(in_set), _jpeg(frame.truth), true_depth, drawn
     )
 
 
-def _png(rgb: np.ndarray) -> Picture:
-    return Picture("image/png", encode_png(rgb), rgb.shape[1], rgb.shape[0])
+def _png(rgb: np.ndarray) -> EncodedImage:
+    return EncodedImage("image/png", encode_png(rgb), rgb.shape[1], rgb.shape[0])
 
 
-def _jpeg(rgb: np.ndarray) -> Picture:
-    return Picture("image/jpeg", encode_jpeg(rgb), rgb.shape[1], rgb.shape[0])
+def _jpeg(rgb: np.ndarray) -> EncodedImage:
+    return EncodedImage("image/jpeg", encode_jpeg(rgb), rgb.shape[1], rgb.shape[0])

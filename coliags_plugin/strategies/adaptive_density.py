@@ -36,11 +36,11 @@ class AdaptiveDensitySettings(Settings):
 
 
 class ExplicitRows(Protocol):
-    """What adaptive density control needs of a field whose elements are Gaussians.
+    """Protocol of fields of explicit Gaussians for adaptive density control.
 
     Attributes:
-        means, scales, quats, opacities: As :class:`coliags_plugin.fields.explicit_gaussians.ExplicitGaussians` has
-            them: log scales, opacity logits. [N, 3], [N, 3], [N, 4], [N]
+        means, scales, quats, opacities: As in :class:`coliags_plugin.fields.explicit_gaussians.ExplicitGaussians`:
+            log scales, opacity logits. [N, 3], [N, 3], [N, 4], [N]
         row_parameters: Names of the parameter groups with one row per Gaussian.
     """
 
@@ -67,7 +67,7 @@ class AdaptiveDensity(Strategy):
         self.largest_radius = torch.zeros(0)  # [N]
 
     def plan(self) -> str:
-        """When this run densifies and resets opacities, or why it does not."""
+        """Steps at which this run densifies and resets opacities, for the log."""
         every, reset, events = self.settings.every, self.settings.reset_every, self.events
         if len(events) == 0:
             return (
@@ -75,14 +75,15 @@ class AdaptiveDensity(Strategy):
                 f"between steps {self.schedule.at(self.settings.densify_from)} and {self.until}"
             )
         resets = range(reset, self.until, reset)
-        told = f"resets opacities every {reset} steps until step {resets[-1]}" if resets else "never resets opacities"
-        return (
-            f"this run clones, splits and prunes every {every} steps from step {events[0]} to {events[-1]}, and {told}"
+        resetting = (
+            f"resets opacities every {reset} steps until step {resets[-1]}" if resets else "never resets opacities"
         )
+        densifying = f"clones, splits and prunes every {every} steps from step {events[0]} to {events[-1]}"
+        return f"this run {densifying}, and {resetting}"
 
     @torch.no_grad()
     def after_backward(self, step: TrainingStep, rows: ParameterRows) -> dict[str, int]:
-        """Count; every so often densify, prune, and reset opacities."""
+        """Accumulate statistics; at event steps densify, prune, and reset opacities."""
         if step.step >= self.until:
             return {}
         field: ExplicitRows = step.model.field
@@ -113,7 +114,7 @@ class AdaptiveDensity(Strategy):
         self.largest_radius[slots] = torch.maximum(self.largest_radius[slots], splats.radii)
 
     def _densify(self, field: ExplicitRows, rows: ParameterRows) -> int:
-        """Clone and split; returns how many more there are."""
+        """Clone and split Gaussians; returns the increase in their number."""
         before = len(field.means)
         wanted = self.gradient_sum / self.drawn.clamp_min(1.0) >= self.settings.gradient_threshold
         large = field.scales.amax(dim=1).exp() > self.settings.dense_share * self.extent
@@ -133,13 +134,13 @@ class AdaptiveDensity(Strategy):
         return len(field.means) - before
 
     def _shifts(self, scales: Tensor, quats: Tensor) -> Tensor:
-        """Random points of Gaussians about their means. [S, 3]"""
+        """Random offsets sampled from Gaussians, relative to their means. [S, 3]"""
         points = torch.randn(len(scales), 3, generator=self.generator).to(scales)
         turned = rotation_matrices(nn.functional.normalize(quats, dim=1)) @ (points * scales.exp())[..., None]
         return turned.squeeze(-1)
 
     def _prune(self, field: ExplicitRows, rows: ParameterRows, step: int) -> int:
-        """Remove the faint and, after the first reset, the oversized; returns how many."""
+        """Remove transparent and, after the first reset, oversized Gaussians; returns their number."""
         options = self.settings
         gone = field.opacities.sigmoid() < options.min_opacity
         if step > options.reset_every:
@@ -148,7 +149,7 @@ class AdaptiveDensity(Strategy):
             if options.max_scale_share is not None:
                 gone |= field.scales.amax(dim=1).exp() > options.max_scale_share * self.extent
         if gone.all():
-            return 0  # an empty field could never recover
+            return 0  # an empty field could not recover
         self._keep(field, rows, ~gone)
         return int(gone.sum())
 

@@ -1,4 +1,4 @@
-"""Growing and pruning anchors: Scaffold-GS's statistics, cells of the anchors' spacing, births that disturb little."""
+"""Growing and pruning of anchors by Scaffold-GS's statistics, with grid cells of the anchors' spacing."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from coliags_plugin.strategies.image_gradients import gradient_lengths
 
 
 class AnchorGrowthSettings(Settings):
-    """Options of anchor growth (docs/methods.md 4.3 says which are Scaffold-GS's). Steps scale with the run."""
+    """Options of anchor growth (docs/methods.md 4.3 lists Scaffold-GS's values). Steps scale with the run."""
 
     statistics_from: int = Field(default=500, ge=0)  # steps; first and last are themselves left out
     growth_from: int = Field(default=1500, ge=0)  # step after which events grow and prune
@@ -26,7 +26,7 @@ class AnchorGrowthSettings(Settings):
     gradient_threshold: float = Field(default=0.0002, gt=0)  # of the centres' gradient, normalised image units
     success_share: float = Field(
         default=0.8, gt=0, le=1
-    )  # of ``every``: how often seen, to be judged (docs/methods.md 4.3)
+    )  # share of ``every`` steps with an anchor in view for pruning, half of it for growing (docs/methods.md 4.3)
     min_opacity: float = Field(default=0.005, ge=0)  # mean of an anchor's that stays
     levels: int = Field(default=3, ge=1)  # cells of the anchors' spacing, and each further level a quarter of that
     finest_cell: float = Field(default=0.25, ge=0)  # in voxels; finer levels are left out
@@ -35,13 +35,13 @@ class AnchorGrowthSettings(Settings):
 
 
 class Anchors(Protocol):
-    """What anchor growth needs of a field whose elements are anchors.
+    """Protocol of fields of anchors for anchor growth.
 
     Attributes:
         anchors: Positions, scene units. [M, 3]
-        offsets, features, scalings: One row for each anchor, as :class:`coliags_plugin.fields.anchors.AnchorField` has
-            them. [M, K, 3], [M, F], [M, 6]
-        spacing: Of the anchors at the start, scene units. []
+        offsets, features, scalings: One row per anchor, as in :class:`coliags_plugin.fields.anchors.AnchorField`.
+            [M, K, 3], [M, F], [M, 6]
+        spacing: Initial spacing of the anchors, scene units. []
         voxel_size: Scene units. []
         anchor_parameters: Names of the parameter groups with one row per anchor.
     """
@@ -55,15 +55,15 @@ class Anchors(Protocol):
     anchor_parameters: ClassVar[tuple[str, ...]]
 
     def child_positions(self) -> Tensor:
-        """Where every child stands, scene units. [M, K, 3]"""
+        """Positions of the children, scene units. [M, K, 3]"""
 
 
 class AnchorGrowth(Strategy):
     """Adds anchors where children's image gradients stay large and removes anchors that stay transparent.
 
-    Scaffold-GS's statistics and thresholds; cells, births and the limit on each event are this package's own, because
-    the published ones rest on cells finer than the spacing of the initial points (docs/methods.md 4.3). Counts only
-    anchors that the view can see, as Scaffold-GS does.
+    Statistics and thresholds are Scaffold-GS's; the grid cells, the initialisation of new anchors and the limit per
+    event are this package's, because the published ones rely on cells finer than the spacing of the initial points
+    (docs/methods.md 4.3). Only anchors visible in the view are counted, as in Scaffold-GS.
     """
 
     Settings: ClassVar[type[Settings]] = AnchorGrowthSettings
@@ -81,7 +81,7 @@ class AnchorGrowth(Strategy):
         self.drawn = torch.zeros(0)  # [M * K]
 
     def plan(self) -> str:
-        """When this run grows and prunes, or why it does not."""
+        """Steps at which this run grows and prunes, for the log."""
         every, events = self.settings.every, self.events
         if len(events) == 0:
             return (
@@ -92,7 +92,7 @@ class AnchorGrowth(Strategy):
 
     @torch.no_grad()
     def after_backward(self, step: TrainingStep, rows: ParameterRows) -> dict[str, int]:
-        """Count; every so often grow and prune."""
+        """Accumulate statistics; at event steps grow and prune."""
         if not self.statistics_from < step.step < self.until:
             return {}
         field: Anchors = step.model.field
@@ -107,7 +107,7 @@ class AnchorGrowth(Strategy):
         return {"grown": grown, "pruned": pruned}
 
     def _resize(self, anchors: int, children: int, device: torch.device) -> None:
-        """Make room for anchors that have no counters yet."""
+        """Extend the counters to new anchors."""
         for name, per_anchor in (("opacity_sum", 1), ("seen", 1), ("gradient_sum", children), ("drawn", children)):
             old = getattr(self, name).to(device)
             if len(old) == anchors * per_anchor:
@@ -144,7 +144,7 @@ class AnchorGrowth(Strategy):
         return len(field.anchors) - first_count
 
     def _add(self, field: Anchors, rows: ParameterRows, births: Births, anchor_of: Tensor, cell: float) -> None:
-        """Append anchors that look like their parents at a cell's size, and that Adam moves no faster than these."""
+        """Append anchors with their parents' features and Adam second moments, at most the size of a cell."""
         if len(births) == 0:
             return
         parents = anchor_of[births.candidates]
@@ -167,7 +167,7 @@ class AnchorGrowth(Strategy):
         self.seen[judged] = 0.0
         keep = ~faint
         if not keep.any() or keep.all():
-            return 0  # an empty field could never recover
+            return 0  # an empty field could not recover
         keep_children = keep.repeat_interleave(children)
         self.opacity_sum, self.seen = self.opacity_sum[keep], self.seen[keep]
         self.gradient_sum, self.drawn = self.gradient_sum[keep_children], self.drawn[keep_children]

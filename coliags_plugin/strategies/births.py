@@ -1,4 +1,4 @@
-"""Choosing positions of new anchors: at most one in every grid cell that holds no anchor."""
+"""Selection of positions of new anchors: at most one per grid cell without an anchor."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ def one_per_free_cell(
     """The strongest candidate of every cell without an anchor, the strongest cells first.
 
     Args:
-        anchors: Those that there are, scene units. [M, 3]
+        anchors: Existing anchors, scene units. [M, 3]
         positions: Candidates, scene units. [C, 3]
-        gradients: How much each candidate is needed. [C]
+        gradients: Gradient statistic of each candidate. [C]
         cell: Edge of a cell, scene units.
-        limit: At most so many births.
+        limit: Largest number of new anchors.
     """
     taken = torch.unique(torch.round(anchors / cell), dim=0)
     cells, member_of = torch.unique(torch.round(positions / cell), dim=0, return_inverse=True)
@@ -47,7 +47,7 @@ def one_per_free_cell(
     occupied = torch.zeros(len(taken) + len(cells), dtype=torch.bool, device=cells.device)
     occupied[place[: len(taken)]] = True
     free = ~occupied[place[len(taken) :]]
-    # Strongest first; of each cell the first stays.
+    # Sorted by gradient; the first of each cell is kept.
     order = torch.argsort(gradients, descending=True, stable=True)
     order = order[free[member_of[order]]]
     first = torch.full((len(cells),), len(order), device=cells.device)

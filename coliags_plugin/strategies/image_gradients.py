@@ -12,7 +12,7 @@ from coliags_plugin.core.render_output import RenderOutput
 def gradient_lengths(output: RenderOutput) -> Float[Tensor, "N"] | None:
     """Length of the gradient of each projected centre in units of half the image; 0 where a Gaussian was not drawn.
 
-    These are the units of the lineage's thresholds (docs/methods.md 4.3). None before ``backward``, or where no
+    These are the units of 3DGS's and Scaffold-GS's thresholds (docs/methods.md 4.3). None before ``backward``, or if no
     gradient reached the centres. [N]
     """
     splats = output.drawn
@@ -20,6 +20,6 @@ def gradient_lengths(output: RenderOutput) -> Float[Tensor, "N"] | None:
     if gradient is None:
         return None
     height, width = output.alpha.shape
-    # A mask rather than a selection: a selection's size would have to come back from a GPU first.
+    # A mask instead of indexing, which would synchronise with the GPU.
     lengths = torch.hypot(0.5 * width * gradient[:, 0], 0.5 * height * gradient[:, 1])
     return torch.where(splats.radii > 0, lengths, 0.0)

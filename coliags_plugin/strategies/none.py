@@ -1,4 +1,4 @@
-"""The strategy that leaves the field as it is."""
+"""Strategy that does not change the field."""
 
 from __future__ import annotations
 

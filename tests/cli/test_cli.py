@@ -86,12 +86,12 @@ def test_protocols_disagree_and_say_so(trained):
     assert paper["depth_mse"] != authors["depth_mse"]
 
 
-def test_render_writes_pictures_scales_and_a_video(trained, tmp_path):
+def test_render_writes_images_scales_and_a_video(trained, tmp_path):
     assert run("render", trained, "--output", tmp_path / "out") == 0
     for kind in ("rgb", "depth", "rgb_error", "depth_error"):
-        pictures = sorted((tmp_path / "out" / kind).iterdir())
-        assert [path.name for path in pictures] == ["0000_color.png", "0008_color.png", "0016_color.png"]
-        assert read_rgb(pictures[0]).shape == (24, 32, 3)
+        images = sorted((tmp_path / "out" / kind).iterdir())
+        assert [path.name for path in images] == ["0000_color.png", "0008_color.png", "0016_color.png"]
+        assert read_rgb(images[0]).shape == (24, 32, 3)
     assert (tmp_path / "out" / "trajectory.mp4").stat().st_size > 0
     assert (tmp_path / "out" / "depth_scale.png").is_file()
 

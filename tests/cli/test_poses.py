@@ -66,12 +66,12 @@ def test_convert_says_what_it_read_and_what_it_lost(truth, tmp_path, caplog):
     assert "c3vd (camera-to-world matrices, column-major); 20 poses, path" in said
     assert "mean step" in said
     assert "mean looking direction (" in said
-    assert "the input names no pictures: called 0000.png" in said
-    assert "tum keeps no names: left behind" in said
+    assert "the input has no image names: using 0000.png" in said
+    assert "tum does not store names: dropped" in said
     assert "no timestamps: frame numbers stand in" in said
 
 
-def test_pictures_give_names(truth, tmp_path, capsys):
+def test_images_give_names(truth, tmp_path, capsys):
     (tmp_path / "images").mkdir()
     for index in range(20):
         write_png(tmp_path / "images" / f"{index}_color.png", np.zeros((2, 2, 3), np.uint8))
@@ -79,8 +79,8 @@ def test_pictures_give_names(truth, tmp_path, capsys):
     assert run(*argv, "--images", tmp_path / "images") == 0
     assert format_named("colmap").read(tmp_path / "model").names == tuple(f"{index}_color.png" for index in range(20))
     (tmp_path / "images" / "7_color.png").unlink()
-    assert "holds 19 pictures for 20 poses" in refused(capsys, *argv, "--images", tmp_path / "images", "--overwrite")
-    assert "a folder of pictures" in refused(capsys, *argv, "--images", truth)
+    assert "holds 19 images for 20 poses" in refused(capsys, *argv, "--images", tmp_path / "images", "--overwrite")
+    assert "a folder of images" in refused(capsys, *argv, "--images", truth)
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_pictures_give_names(truth, tmp_path, capsys):
         (("--to", "tum", "--from", "colmap"), "holds no COLMAP model"),
         (("--to", "tum", "--from", "tum"), "line 1:"),
         (("--to", "endogslam"), "no intrinsics"),
-        (("--to", "endogslam-truth"), "is only read"),
+        (("--to", "endogslam-truth"), "is read-only"),
         (("--to", "colmap", "--size", "64x48"), "--size without --intrinsics"),
         (("--to", "colmap", "--intrinsics", "1,2,3,4"), "--intrinsics without --size"),
         (("--to", "colmap", "--intrinsics", "1,2,3", "--size", "64x48"), "--intrinsics 1,2,3. Expected four numbers"),

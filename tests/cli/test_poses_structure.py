@@ -98,7 +98,7 @@ def test_options_of_reading_and_of_triangulation(tube, tmp_path, capsys, caplog)
         ),
         (("--set", "splitt=block"), "unknown key 'splitt'"),
         (("--set", "triangulation.min_angle"), "key.path=value"),
-        (("--set", "max_frames=1", "--set", "split=all-train"), "1 frames. Expected two at least"),
+        (("--set", "max_frames=1", "--set", "split=all-train"), "1 frames. Expected at least two"),
         (("--out", "tube/out"), "a folder apart from the input"),
         (("--out", "."), "a folder apart from the input"),
         (("--format", "rgbd"), "coliags: "),
@@ -135,7 +135,7 @@ def test_sfm_makes_a_scene_that_trains_and_aligns(tube, tmp_path, capsys, caplog
     out = tmp_path / "out"
     assert run("poses", "sfm", tube / "images", "--out", out, *CAMERA, "--every", 2, "--max-frames", 5) == 0
     summary, unit, place, command = capsys.readouterr().out.splitlines()
-    assert summary.startswith("5 of 5 pictures posed")
+    assert summary.startswith("5 of 5 images posed")
     assert "the unit of length is arbitrary" in unit
     assert place == str(out)
     assert sorted(path.name for path in (out / "images").iterdir()) == [f"{n:04d}_color.png" for n in range(0, 9, 2)]
@@ -159,7 +159,7 @@ def test_sfm_makes_a_scene_that_trains_and_aligns(tube, tmp_path, capsys, caplog
         (("--set", "overlapp=3"), "unknown key 'overlapp'"),
         (("--every", "0"), "--every 0"),
         (("--max-frames", "1"), "--max-frames 1"),
-        (("--every", "20"), "1 pictures"),
+        (("--every", "20"), "1 images"),
         (("--mask", "tube/nothing"), "has no mask for 0000_color.png"),
         (("--out", "tube/images"), "a folder apart from the input"),
     ],

@@ -130,7 +130,7 @@ def test_what_is_refused(posed, unposed, tmp_path, capsys):
     for path in (unposed / "rgb").iterdir():
         cv2.imwrite(str(path), np.zeros((128, 160, 3), np.uint8))
     message = refused(capsys, "poses", "track", unposed, "--out", out, *FAST)
-    assert "no two neighbours among 6 frames could be laid together" in message
+    assert "no two consecutive frames of 6 could be registered" in message
     shutil.rmtree(unposed / "depth")
     assert "none of the formats" in refused(capsys, "poses", "track", unposed, "--out", out)
     assert not out.exists()

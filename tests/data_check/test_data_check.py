@@ -39,7 +39,7 @@ def scene(folder):
 
 
 def changed(scene: Scene, pose=None, depth=None, camera=None, image=None) -> Scene:
-    """The scene with every frame's pose, depth, camera or picture put through a function of it and its place."""
+    """The scene with every frame's pose, depth, camera or image put through a function of it and its place."""
 
     def of(frame: Frame) -> Frame:
         whole = frame.to("cpu")
@@ -157,7 +157,7 @@ def test_carrying_a_plane_is_exact(tmp_path):
     assert agreement(pairs).depth_error < 1e-4
     assert agreement(pairs, "no motion").depth_error == pytest.approx(np.median([2 / 18, 2 / 16]), rel=0.07)
     assert best_scale(pairs)[0] == pytest.approx(1.0, abs=0.02)
-    # The picture of a camera 2 ahead holds the middle 18 / 20 of the first one's, each way.
+    # The image of a camera 2 ahead holds the middle 18 / 20 of the first one's, each way.
     assert agreement(pairs[:1]).share == pytest.approx(0.9**2, abs=0.03)
 
 

@@ -11,7 +11,7 @@ import pycolmap
 from tests.datamanagers.wall_scenes import colors, look, poses
 
 WIDTH, HEIGHT = 64, 48
-#: Off-centre; pixel centres at integers + 0.5. One set of parameters for every model that takes pictures.
+#: Off-centre; pixel centres at integers + 0.5. One set of parameters for every model that takes images.
 _F, _FF, _C = [61.0], [61.0, 55.0], [33.5, 21.5]
 CAMERAS = {
     "SIMPLE_PINHOLE": [*_F, *_C],
@@ -32,7 +32,7 @@ CAMERAS = {
     "FISHEYE": [*_FF, *_C],
     "EUCM": [*_FF, *_C, 0.5, 1.1],
 }
-#: Points on the wall, all of them seen in every picture that they fall into.
+#: Points on the wall, all of them seen in every image that they fall into.
 POINTS = 120
 
 
@@ -49,7 +49,7 @@ def taken(cam: pycolmap.Camera, pose: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def wall_model(cameras: list[pycolmap.Camera], names: list[str], unit: float = 1.0) -> pycolmap.Reconstruction:
-    """Picture i is taken from pose i by camera i, round and round; lengths in units of ``unit`` mm."""
+    """Image i is taken from pose i by camera i, round and round; lengths in units of ``unit`` mm."""
     model = pycolmap.Reconstruction()
     for cam in cameras:
         model.add_camera_with_trivial_rig(cam)
@@ -86,7 +86,7 @@ def write_colmap(
     text: bool = False,
     unit: float = 1.0,
 ) -> Path:
-    """The wall, its model in ``place`` and its pictures in ``images``."""
+    """The wall, its model in ``place`` and its images in ``images``."""
     cameras = cameras or [camera()]
     names = names or [f"{index}.png" for index in range(9)]
     model = wall_model(cameras, names, unit)

@@ -37,15 +37,15 @@ def widest_pinhole(lens: Lens, width: int, height: int) -> Intrinsics:
 
 
 def sparse_points(shared_data: Path) -> PointCloud:
-    """The ground-truth points of frames 0 and 1, coloured from their pictures (grey beyond the crop)."""
+    """The ground-truth points of frames 0 and 1, coloured from their images (grey beyond the crop)."""
     positions, colors = [], []
     for index in (0, 1):
         data = np.load(shared_data / "c3vd_sparse_depth" / f"cecum_t1_a_{index:04d}.npz")
-        picture = read_rgb(shared_data / "c3vd_cecum_t1_a" / f"{index:04d}_color_crop800.jpg")
+        image = read_rgb(shared_data / "c3vd_cecum_t1_a" / f"{index:04d}_color_crop800.jpg")
         column, row = np.rint(data["uv_raw1350x1080"] - (275, 140)).astype(int).T
         inside = (column >= 0) & (column < 800) & (row >= 0) & (row < 800)
         color = np.full((len(column), 3), 128, np.uint8)
-        color[inside] = picture[row[inside], column[inside]]
+        color[inside] = image[row[inside], column[inside]]
         positions.append(data["points_world_mm"])
         colors.append(color)
     return PointCloud(torch.from_numpy(np.concatenate(positions)), torch.from_numpy(np.concatenate(colors)))

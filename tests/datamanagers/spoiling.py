@@ -29,7 +29,7 @@ class Kind:
     Attributes:
         layout: Of the phantom.
         format: The data manager that reads it.
-        pictures: Glob of the pictures, from the scene's folder.
+        images: Glob of the images, from the scene's folder.
         depths: Glob of the depth files; empty where there are none.
         poses: The pose file; empty where spoiling it is of no use.
         scene: Where in the phantom the scene's folder is.
@@ -39,7 +39,7 @@ class Kind:
 
     layout: str
     format: str
-    pictures: str
+    images: str
     depths: str
     poses: str
     scene: str = "."
@@ -114,7 +114,7 @@ def files(folder: Path, pattern: str) -> list[Path]:
     return sorted(folder.glob(pattern), key=lambda path: [int(digits) for digits in re.findall(r"\d+", path.name)])
 
 
-# Pictures
+# Images
 
 
 def repaint(pattern: str, place: int, change: Callable[[np.ndarray], np.ndarray]) -> Spoil:
@@ -136,7 +136,7 @@ def half_size(pixels: np.ndarray) -> np.ndarray:
 
 
 def three_channels(pixels: np.ndarray) -> np.ndarray:
-    """A grey picture saved as a colour one."""
+    """A grey image saved as a colour one."""
     return np.dstack([pixels] * 3)
 
 
@@ -198,12 +198,12 @@ def _lines(path: Path) -> list[str]:
 
 
 def drop_last_line(name: str, count: int = 1) -> Spoil:
-    """Fewer poses than pictures."""
+    """Fewer poses than images."""
     return lambda folder: (folder / name).write_text("\n".join(_lines(folder / name)[:-count]) + "\n")
 
 
 def repeat_last_line(name: str) -> Spoil:
-    """More poses than pictures."""
+    """More poses than images."""
     return lambda folder: (folder / name).write_text("\n".join([*_lines(folder / name), _lines(folder / name)[-1]]))
 
 
@@ -300,7 +300,7 @@ def change_npz(name: str, change: Callable[[dict[str, np.ndarray]], Any]) -> Spo
 
 
 def change_binary_pose(place: int, change: Callable[[np.ndarray], np.ndarray]) -> Spoil:
-    """Change the seven numbers of a picture's pose in ``images.bin``: quaternion, w first, and translation."""
+    """Change the seven numbers of an image's pose in ``images.bin``: quaternion, w first, and translation."""
 
     def spoil(folder: Path) -> None:
         path = folder / "sparse/0/images.bin"
@@ -318,7 +318,7 @@ def change_binary_pose(place: int, change: Callable[[np.ndarray], np.ndarray]) -
 
 
 def unregistered(folder: Path) -> None:
-    """A model of which no picture was registered."""
+    """A model of which no image was registered."""
     place = folder / "sparse/0"
     empty = pycolmap.Reconstruction()
     for camera in pycolmap.Reconstruction(str(place)).cameras.values():

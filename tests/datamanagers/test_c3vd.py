@@ -223,7 +223,7 @@ class TestSplit:
         assert [frame.index for frame in scene.train] == [2, 4, 6]
 
     def test_no_training_frame_left(self, undistorted):
-        with pytest.raises(InputError, match=r"split 'every-8th' of 1 frames .* leaves none to train on"):
+        with pytest.raises(InputError, match=r"split 'every-8th' of 1 frames .* leaves no training frames"):
             small(undistorted, max_frames=1)
 
     @pytest.mark.parametrize("options", [{"block": (0.6, 0.4)}, {"block": (0.5, 1.5)}, {"split": "7:1"}, {"width": 0}])
@@ -272,7 +272,7 @@ class TestExtras:
 
     def test_a_spoilt_rotation_set_is_an_error_of_its_own(self, with_rotation):
         (with_rotation / "rotation" / "camera.json").unlink()
-        with pytest.raises(InputError, match=r"rotation has pictures but no camera.json"):
+        with pytest.raises(InputError, match=r"rotation has images but no camera.json"):
             small(with_rotation)
 
 
@@ -366,7 +366,7 @@ def truncate(name):
     return spoil
 
 
-def picture(name, pixels):
+def image(name, pixels):
     return lambda folder: cv2.imwrite(str(folder / name), pixels)
 
 
@@ -401,35 +401,35 @@ UNDISTORTED_FAULTS = {
         lambda folder: [shutil.rmtree(p) if p.is_dir() else p.unlink() for p in folder.iterdir()],
         "wall holds nothing.*raw release",
     ),
-    "no pictures": (remove("images/*"), "images holds nothing.*_color.png"),
-    "pictures of other names": (
+    "no images": (remove("images/*"), "images holds nothing.*_color.png"),
+    "images of other names": (
         lambda folder: [p.rename(p.with_name(f"frame{p.name[:4]}.png")) for p in list((folder / "images").iterdir())],
         "images holds frame0000.png",
     ),
-    "no poses": (remove("camera_pose.txt"), "pictures but no camera_pose.txt"),
-    "no camera.json": (remove("camera.json"), "pictures but no camera.json"),
-    "both layouts": (picture("0000_color.png", BLACK), "holds both 0000_color.png and images/"),
-    "gap": (remove("*/0003_*"), "8 pictures, numbers 0 to 8, but none is 3"),
+    "no poses": (remove("camera_pose.txt"), "images but no camera_pose.txt"),
+    "no camera.json": (remove("camera.json"), "images but no camera.json"),
+    "both layouts": (image("0000_color.png", BLACK), "holds both 0000_color.png and images/"),
+    "gap": (remove("*/0003_*"), "8 images, numbers 0 to 8, but none is 3"),
     "numbers from one": (shift_up, "numbers 1 to 9, but none is 0"),
-    "fewer depths": (remove("depths/0008*"), "9 pictures and 8 depth files; frame 8 has only one"),
-    "fewer pictures": (remove("images/0008*"), "8 pictures and 9 depth files; frame 8"),
-    "fewer poses": (drop_last_pose, "camera_pose.txt has 8 poses for 9 pictures"),
-    "same number twice": (picture("images/3_color.png", BLACK), "have the same number"),
-    "cut picture": (truncate("images/0005_color.png"), "0005_color.png .* cannot be decoded"),
+    "fewer depths": (remove("depths/0008*"), "9 images and 8 depth files; frame 8 has only one"),
+    "fewer images": (remove("images/0008*"), "8 images and 9 depth files; frame 8"),
+    "fewer poses": (drop_last_pose, "camera_pose.txt has 8 poses for 9 images"),
+    "same number twice": (image("images/3_color.png", BLACK), "have the same number"),
+    "cut image": (truncate("images/0005_color.png"), "0005_color.png .* cannot be decoded"),
     "cut depth": (truncate("depths/0005_depth.png"), "0005_depth.png .* cannot be decoded"),
     "nan pose": (nan_pose, "camera_pose.txt, line 5"),
     "8-bit depth": (
-        picture("depths/0002_depth.png", BLACK[..., 0]),
-        "0002_depth.png is a picture of 1 channel of uint8",
+        image("depths/0002_depth.png", BLACK[..., 0]),
+        "0002_depth.png is an image of 1 channel of uint8",
     ),
     "colour depth": (
-        picture("depths/0002_depth.png", BLACK.astype(np.uint16)),
-        "0002_depth.png is a picture of 3 channels",
+        image("depths/0002_depth.png", BLACK.astype(np.uint16)),
+        "0002_depth.png is an image of 3 channels",
     ),
-    "grey picture": (picture("images/0002_color.png", BLACK[..., 0]), "0002_color.png is a picture of 1 channel"),
+    "grey image": (image("images/0002_color.png", BLACK[..., 0]), "0002_color.png is an image of 1 channel"),
     "other size than camera.json": (camera_json(w=65), "0000_color.png is 64 x 48, but .*camera.json says 65 x 48"),
-    "a frame of another size": (picture("images/0004_color.png", BLACK[:-1]), "0004_color.png is 64 x 47, but"),
-    "a depth of another size": (picture("depths/0004_depth.png", BLACK[:, 1:, 0].astype(np.uint16)), "is 63 x 48, but"),
+    "a frame of another size": (image("images/0004_color.png", BLACK[:-1]), "0004_color.png is 64 x 47, but"),
+    "a depth of another size": (image("depths/0004_depth.png", BLACK[:, 1:, 0].astype(np.uint16)), "is 63 x 48, but"),
     "missing keys": (camera_json(fx=..., cy=...), "camera.json has no fx, cy"),
     "words for numbers": (camera_json(fx="wide"), "camera.json: .*'wide'"),
     "no focal length": (camera_json(fy=0), "camera.json: .*above 0"),
@@ -450,12 +450,12 @@ def test_a_spoilt_undistorted_scene_is_one_clear_error(mine, fault):
 
 
 RAW_FAULTS = {
-    "no poses": (remove("pose.txt"), "pictures but no pose.txt"),
+    "no poses": (remove("pose.txt"), "images but no pose.txt"),
     "cut depth": (truncate("0005_depth.tiff"), "0005_depth.tiff .* cannot be decoded"),
     "gap": (remove("0003_*"), "none is 3"),
-    "fewer depths": (remove("0003_depth.tiff"), "9 pictures and 8 depth files; frame 3"),
-    "fewer poses": (drop_last_pose, "8 poses for 9 pictures"),
-    "a frame of another size": (picture("0004_color.png", BLACK), "0004_color.png is 64 x 48, but .*0000_color.png"),
+    "fewer depths": (remove("0003_depth.tiff"), "9 images and 8 depth files; frame 3"),
+    "fewer poses": (drop_last_pose, "8 poses for 9 images"),
+    "a frame of another size": (image("0004_color.png", BLACK), "0004_color.png is 64 x 48, but .*0000_color.png"),
     "a crop": (lambda folder: [cv2.imwrite(str(path), np.zeros((200, 200, 3), np.uint8)) for path in
                                folder.glob("*_color.png")], "is 200 x 200.*undistorted layout"),
 }  # fmt: skip

@@ -56,13 +56,13 @@ def training(count: int) -> np.ndarray:
 
 def write_params(
     path: Path,
-    pictures: np.ndarray,
+    images: np.ndarray,
     wander: Callable[[np.ndarray], np.ndarray] = lambda pose: pose,
     points: np.ndarray | None = None,
     **changes,
 ) -> Path:
-    """EndoGSLAM's result for some pictures of the wall, with poses that wander and true ones; points in its world."""
-    true = poses(max(pictures) + 1)[pictures]
+    """EndoGSLAM's result for some images of the wall, with poses that wander and true ones; points in its world."""
+    true = poses(max(images) + 1)[images]
     path.parent.mkdir(parents=True, exist_ok=True)
     endogslam.write(path, Trajectory(true, intrinsics=PINHOLE))
     with np.load(path) as file:
@@ -258,7 +258,7 @@ class TestPoses:
         # Stopped early: the remaining poses are as they were initialised.
         write_params(mine / "params.npz", training(10), lambda pose: np.where(_late(pose), np.eye(4), pose))
         load(mine)
-        assert "lost its way, or was stopped early" in caplog.text and "params.npz" in caplog.text
+        assert "tracking failed or stopped early" in caplog.text and "params.npz" in caplog.text
 
     def test_params_file_may_be_named(self, mine, tmp_path):
         elsewhere = write_params(tmp_path / "experiments" / "x.npz", training(10), drift)
@@ -272,7 +272,7 @@ def _late(pose: np.ndarray) -> np.ndarray:
     return (np.arange(len(pose)) >= 5)[:, None, None]
 
 
-class TestPictures:
+class TestImages:
     @pytest.mark.parametrize("bits", [8, 16])
     def test_depth_of_both_kinds(self, tmp_path, bits):
         folder = write_prepared(tmp_path / "wall", 3, bits)
@@ -371,15 +371,15 @@ def other_scene(folder: Path) -> None:
 PARAMS = {
     "poses of other counts": (
         lambda f: write_params(f / "params.npz", np.arange(7)),
-        r"params.npz has 7 poses for 10 pictures in .*Expected 10 .* or 9 \(all but 7, 15",
+        r"params.npz has 7 poses for 10 images in .*Expected 10 .* or 9 \(all but 7, 15",
     ),
     "true poses of another scene": (
         lambda f: (write_params(f / "params.npz", np.arange(10)), other_scene(f)),
-        r"params.npz: the true pose of picture 9 is .* mm and .* degrees from that of .*pose.txt",
+        r"params.npz: the true pose of image 9 is .* mm and .* degrees from that of .*pose.txt",
     ),
     "training poses, but one frame on": (
         lambda f: write_params(f / "params.npz", np.array([0, *range(2, 10)])),
-        r"the true pose of picture \d is",
+        r"the true pose of image \d is",
     ),
     "a quaternion of no length": (
         lambda f: write_params(f / "params.npz", np.arange(10), cam_unnorm_rots=np.zeros((1, 4, 10))),
@@ -402,29 +402,29 @@ PARAMS = {
     "no archive": (lambda f: (f / "params.npz").write_text("PK nonsense"), "cannot read .*params.npz"),
 }
 
-PICTURES = {
+IMAGES = {
     "no poses at all": (lambda f: (f / "pose.txt").unlink(), "no pose.txt"),
-    "a gap": (lambda f: (f / "color/0001_color.png").unlink(), "color has 9 pictures, numbers 0 to 9, but none is 1"),
+    "a gap": (lambda f: (f / "color/0001_color.png").unlink(), "color has 9 images, numbers 0 to 9, but none is 1"),
     "depth for some": (lambda f: (f / "depth/0002_depth.tiff").unlink(), "frame 2 has only one of the two"),
-    "no pictures": (lambda f: shutil.rmtree(f / "color"), "wall holds depth/, pose.txt"),
-    "poses cut short": (lambda f: spoil_pose(f, 9, ""), "pose.txt has 9 poses for 10 pictures"),
+    "no images": (lambda f: shutil.rmtree(f / "color"), "wall holds depth/, pose.txt"),
+    "poses cut short": (lambda f: spoil_pose(f, 9, ""), "pose.txt has 9 poses for 10 images"),
     "left-handed": (
         lambda f: spoil_pose(f, 1, "1,0,0,0, 0,1,0,0, 0,0,-1,0, 1,2,3,1"),
         "pose.txt, line 2: a left-handed transform",
     ),
     "depth of both kinds": (
         lambda f: cv2.imwrite(str(f / "depth/0003_depth.tiff"), np.zeros((HEIGHT, WIDTH), np.uint16)),
-        "0003_depth.tiff is a picture of 1 channel of uint16",
+        "0003_depth.tiff is an image of 1 channel of uint16",
     ),
     "depth in colour": (
         lambda f: cv2.imwrite(str(f / "depth/0003_depth.tiff"), np.zeros((HEIGHT, WIDTH, 3), np.uint8)),
-        "0003_depth.tiff is a picture of 3 channels of uint8",
+        "0003_depth.tiff is an image of 3 channels of uint8",
     ),
-    "a picture of another size": (
+    "an image of another size": (
         lambda f: cv2.imwrite(str(f / "color/0004_color.png"), np.zeros((HEIGHT, 60, 3), np.uint8)),
         "0004_color.png is 60 x 48, but .*0000_color.png says 64 x 48",
     ),
-    "a picture cut short": (
+    "an image cut short": (
         lambda f: (f / "color/0002_color.png").write_bytes((f / "color/0002_color.png").read_bytes()[:300]),
         r"0002_color.png \(300 bytes\) cannot be decoded",
     ),
@@ -439,10 +439,10 @@ class TestRefused:
         with pytest.raises(InputError, match=message):
             load(mine)
 
-    @pytest.mark.parametrize("fault", PICTURES)
-    def test_pictures(self, mine, tmp_path, fault):
+    @pytest.mark.parametrize("fault", IMAGES)
+    def test_images(self, mine, tmp_path, fault):
         params = write_params(tmp_path / "p.npz", training(10))
-        spoil, message = PICTURES[fault]
+        spoil, message = IMAGES[fault]
         spoil(mine)
         with pytest.raises(InputError, match=message):
             load(mine, params_file=str(params))
@@ -458,7 +458,7 @@ class TestRefused:
             with pytest.raises(InputError, match=r"Put the sequence's pose.txt of C3VD's release there"):
                 load(mine, poses=source)
 
-    def test_pictures_that_are_not_the_tables(self, mine):
+    def test_images_that_are_not_the_tables(self, mine):
         with pytest.raises(
             InputError, match=r"0000_color.png is 64 x 48, but EndoGSLAM's calibration is for 675 x 540"
         ):
@@ -467,10 +467,10 @@ class TestRefused:
     def test_rotation_views_without_their_world(self, mine):
         write_params(mine / "params.npz", np.arange(10))
         shutil.copytree(mine / "color", mine / "rotation" / "color")
-        with pytest.raises(InputError, match=r"rotation has pictures, but it has no pose.txt"):
+        with pytest.raises(InputError, match=r"rotation has images, but it has no pose.txt"):
             load(mine)
         (mine / "pose.txt").rename(mine / "rotation/pose.txt")
-        with pytest.raises(InputError, match=r"rotation has pictures, but the scene has no pose.txt"):
+        with pytest.raises(InputError, match=r"rotation has images, but the scene has no pose.txt"):
             load(mine)
 
     def test_no_such_folder(self, tmp_path):

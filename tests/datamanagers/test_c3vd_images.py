@@ -1,4 +1,4 @@
-"""Reading and resizing pictures."""
+"""Reading and resizing images."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_colour_order_and_alpha(tmp_path):
         (read_mask, np.zeros((4, 4, 3), np.uint8), "3 channels of uint8"),
     ],
 )
-def test_the_wrong_kind_of_picture(tmp_path, reader, pixels, message):
+def test_the_wrong_kind_of_image(tmp_path, reader, pixels, message):
     cv2.imwrite(str(tmp_path / "x.png"), pixels)
     with pytest.raises(InputError, match=message):
         reader(tmp_path / "x.png")
@@ -70,7 +70,7 @@ def test_half_a_file_is_refused_by_name(tmp_path, suffix, share):
         read_mask(path)
 
 
-def test_a_missing_picture(tmp_path):
+def test_a_missing_image(tmp_path):
     with pytest.raises(InputError, match="cannot read"):
         read_rgb(tmp_path / "x.png")
 

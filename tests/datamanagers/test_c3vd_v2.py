@@ -162,24 +162,26 @@ class TestIntrinsicsFile:
             (as_text(c=0.0, d=1.0), "c, d, e = 0, 1, 0"),
             (as_text(width=1350.5), "1350.5 x 1080 pixels"),
             (as_text(a3=float("inf")), "no a3"),
-            (" ".join(line.split(" = ")[1] for line in as_text().splitlines()[::-1]), "a picture of"),
+            (" ".join(line.split(" = ")[1] for line in as_text().splitlines()[::-1]), "an image of"),
         ],
     )
     def test_whatever_else_is_refused_and_the_way_out_named(self, tmp_path, text, seen):
         (tmp_path / "camera_intrinsics.txt").write_text(text)
-        with pytest.raises(InputError, match="cannot be told for sure") as refused:
+        with pytest.raises(InputError, match="is ambiguous or implausible") as refused:
             read_camera_intrinsics(tmp_path / "camera_intrinsics.txt")
         assert seen in str(refused.value)
         assert "camera_intrinsics.txt" in str(refused.value) and "lens: v2" in str(refused.value)
 
     def test_the_scene_is_refused_with_it(self, mine):
         (mine / "camera_intrinsics.txt").write_text("767.7 677.7 543.1")
-        with pytest.raises(InputError, match=r"camera_intrinsics.txt cannot be told.*set lens: v2.*or lens: v1"):
+        with pytest.raises(
+            InputError, match=r"camera_intrinsics.txt is ambiguous or implausible.*set lens: v2.*or lens: v1"
+        ):
             load(mine)
 
 
 class TestVideosWithoutDepth:
-    def test_pictures_and_poses_are_enough_where_points_are_given(self, mine):
+    def test_images_and_poses_are_enough_where_points_are_given(self, mine):
         shutil.rmtree(mine / "depth")
         write_ply(mine / "points3D.ply", point_properties(torch.rand(50, 3).numpy()))
         scene = load(mine)
@@ -221,28 +223,28 @@ def spoil_pose(folder: Path, line: int, text: str) -> None:
 
 
 REFUSED = {
-    "a gap": (lambda f: (f / "rgb/0001.png").unlink(), r"rgb has 3 pictures, numbers 0 to 3, but none is 1"),
+    "a gap": (lambda f: (f / "rgb/0001.png").unlink(), r"rgb has 3 images, numbers 0 to 3, but none is 1"),
     "one number twice": (lambda f: shutil.copy(f / "rgb/0001.png", f / "rgb/1.png"), "same number"),
     "depth for some": (lambda f: (f / "depth/0002_depth.tiff").unlink(), "frame 2 has only one of the two"),
-    "no poses": (lambda f: (f / "pose.txt").unlink(), "has pictures but no pose.txt"),
-    "no pictures": (lambda f: shutil.rmtree(f / "rgb"), "wall holds depth/, pose.txt"),
-    "poses cut short": (lambda f: spoil_pose(f, 3, ""), "pose.txt has 3 poses for 4 pictures"),
+    "no poses": (lambda f: (f / "pose.txt").unlink(), "has images but no pose.txt"),
+    "no images": (lambda f: shutil.rmtree(f / "rgb"), "wall holds depth/, pose.txt"),
+    "poses cut short": (lambda f: spoil_pose(f, 3, ""), "pose.txt has 3 poses for 4 images"),
     "a word in a pose": (lambda f: spoil_pose(f, 2, "none"), "pose.txt, line 3: 'none'"),
     "left-handed": (
         lambda f: spoil_pose(f, 1, "1,0,0,0, 0,1,0,0, 0,0,-1,0, 1,2,3,1"),
         "pose.txt, line 2: a left-handed transform",
     ),
-    "a picture cut short": (
+    "an image cut short": (
         lambda f: (f / "rgb/0002.png").write_bytes((f / "rgb/0002.png").read_bytes()[:300]),
         r"0002.png \(300 bytes\) cannot be decoded",
     ),
     "depth in colour": (
         lambda f: cv2.imwrite(str(f / "depth/0001_depth.tiff"), np.zeros((216, 270, 3), np.uint16)),
-        "0001_depth.tiff is a picture of 3 channels of uint16",
+        "0001_depth.tiff is an image of 3 channels of uint16",
     ),
     "depth in 8 bits": (
         lambda f: cv2.imwrite(str(f / "depth/0001_depth.tiff"), np.zeros((216, 270), np.uint8)),
-        "0001_depth.tiff is a picture of 1 channel of uint8",
+        "0001_depth.tiff is an image of 1 channel of uint8",
     ),
     "another size": (
         lambda f: cv2.imwrite(str(f / "rgb/0003.png"), np.zeros((100, 125, 3), np.uint8)),

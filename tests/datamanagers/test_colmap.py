@@ -32,7 +32,7 @@ def opened(folder: Path, **options):
 
 @pytest.fixture(scope="module")
 def scene_folder(tmp_path_factory) -> Path:
-    """Nine pictures of the wall, never changed."""
+    """Nine images of the wall, never changed."""
     return write_colmap(tmp_path_factory.mktemp("colmap") / "wall")
 
 
@@ -58,7 +58,7 @@ def test_the_list_of_cameras_is_colmaps():
 
 
 @pytest.mark.parametrize("model", CAMERAS)
-def test_pictures_of_every_camera_become_pinhole_pictures(model, tmp_path):
+def test_images_of_every_camera_become_pinhole_images(model, tmp_path):
     scene = load(write_colmap(tmp_path, [camera(model)], [f"{index}.png" for index in range(4)]))
     fx, fy = CAMERAS[model][0], CAMERAS[model][0 if camera(model).focal_length_x == camera(model).focal_length_y else 1]
     for frame in in_video_order(scene):
@@ -74,7 +74,7 @@ def test_pictures_of_every_camera_become_pinhole_pictures(model, tmp_path):
         assert off_wall(sparse_points(frame)).max() < 1e-4
 
 
-def test_pinhole_pictures_are_left_alone(scene_folder):
+def test_pinhole_images_are_left_alone(scene_folder):
     frame = load(scene_folder).train[0]
     np.testing.assert_array_equal(frame.image.numpy(), taken(camera(), poses(9)[1])[1])
     assert frame.mask is None and frame.depth is None
@@ -82,11 +82,11 @@ def test_pinhole_pictures_are_left_alone(scene_folder):
 
 def test_text_is_binary(scene_folder, tmp_path):
     one, other = read_model(scene_folder / "sparse/0"), read_model(write_colmap(tmp_path, text=True) / "sparse/0")
-    assert [picture.name for picture in one.pictures] == [picture.name for picture in other.pictures]
+    assert [image.name for image in one.images] == [image.name for image in other.images]
     assert one.cameras == other.cameras
     for name in ("camera_to_world", "positions", "colors", "track_lengths"):
         np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-12, atol=1e-12)
-    for first, second in zip(one.pictures, other.pictures, strict=True):
+    for first, second in zip(one.images, other.images, strict=True):
         np.testing.assert_allclose(first.observed, second.observed, rtol=1e-12)
         np.testing.assert_array_equal(first.points, second.points)
 
@@ -139,13 +139,13 @@ def test_a_rig_of_two_cameras(tmp_path):
     model.write_binary(str(tmp_path / "sparse"))
     read_back = read_model(tmp_path / "sparse")
     by_name = {image.name: image for image in model.images.values()}
-    assert len(read_back.pictures) == 6 and len(read_back.cameras) == 2
-    for picture, pose in zip(read_back.pictures, read_back.camera_to_world, strict=True):
-        expected = by_name[picture.name].cam_from_world().matrix()
+    assert len(read_back.images) == 6 and len(read_back.cameras) == 2
+    for image, pose in zip(read_back.images, read_back.camera_to_world, strict=True):
+        expected = by_name[image.name].cam_from_world().matrix()
         np.testing.assert_allclose(np.linalg.inv(pose)[:3], expected, atol=1e-9)
 
 
-def test_pictures_come_in_the_order_of_their_numbers(tmp_path):
+def test_images_come_in_the_order_of_their_numbers(tmp_path):
     names = ["cam1/10.png", "cam1/9.png", "cam0/100.png", "cam0/20.jpg"]
     shots = opened(write_colmap(tmp_path, names=names)).shots
     assert [shot.name for shot in shots] == ["cam0-20", "cam0-100", "cam1-9", "cam1-10"]
@@ -196,7 +196,7 @@ def test_depth_files(folder, suffix):
     assert len(scene.points) > 1000
     assert len(load(folder, depth_unit=0.002).points) == POINTS
     (folder / "depths" / f"4{suffix}").unlink()
-    with pytest.raises(InputError, match=r"depths has no file for 1 of 9 pictures, the first of them 4\.png"):
+    with pytest.raises(InputError, match=r"depths has no file for 1 of 9 images, the first of them 4\.png"):
         load(folder)
 
 
@@ -220,7 +220,7 @@ def test_depth_only_of_points_that_are_seen_often_and_fall_where_they_were_seen(
         return [len(shot.sparse_depth.depth) for shot in opened(tmp_path, **options).shots]
 
     def seen(least: int, less: int = 0) -> list[int]:
-        """Points of each picture with tracks of so many pictures, one less in the second."""
+        """Points of each image with tracks of so many images, one less in the second."""
         lengths = {number: found.track.length() for number, found in model.points3D.items()}
         per_image = [
             sum(lengths[p.point3D_id] >= least for p in image.get_observation_points2D())
@@ -236,7 +236,7 @@ def test_depth_only_of_points_that_are_seen_often_and_fall_where_they_were_seen(
     assert len(load(tmp_path).points) == POINTS
 
 
-def test_a_point_seen_twice_in_a_picture_has_one_depth(tmp_path):
+def test_a_point_seen_twice_in_an_image_has_one_depth(tmp_path):
     names = ["0.png", "1.png", "2.png"]
     write_colmap(tmp_path, names=names)
     before = opened(tmp_path).shots[0].sparse_depth
@@ -293,7 +293,7 @@ def test_binary_before_text(folder, tmp_path):
     assert len(opened(folder).shots) == 9
 
 
-def test_another_folder_of_pictures(folder):
+def test_another_folder_of_images(folder):
     (folder / "images").rename(folder / "frames")
     assert len(load(folder, images_folder="frames").train) == 7
     with pytest.raises(InputError, match=r"no folder .*images.*images_folder"):
@@ -317,20 +317,20 @@ def test_the_fingerprint_sees_the_model(folder):
 # What is refused
 
 
-def test_missing_pictures_are_named(folder):
+def test_missing_images_are_named(folder):
     for index in (2, 5):
         (folder / "images" / f"{index}.png").unlink()
-    with pytest.raises(InputError, match=r"2 of the 9 pictures of .* are not in .*images: 2\.png, 5\.png"):
+    with pytest.raises(InputError, match=r"2 of the 9 images of .* are not in .*images: 2\.png, 5\.png"):
         load(folder)
 
 
-def test_a_picture_of_another_size(folder):
+def test_an_image_of_another_size(folder):
     cv2.imwrite(str(folder / "images/4.png"), np.zeros((24, 32, 3), np.uint8))
     with pytest.raises(InputError, match=r"4\.png is 32 x 24, but .*cameras\.bin says 64 x 48"):
         load(folder)
 
 
-def test_a_picture_cut_short(folder):
+def test_an_image_cut_short(folder):
     data = (folder / "images/4.png").read_bytes()
     (folder / "images/4.png").write_bytes(data[:200])
     with pytest.raises(InputError, match=r"4\.png \(200 bytes\) cannot be decoded"):
@@ -373,7 +373,7 @@ def test_text_files_that_end_in_rubbish(tmp_path, name):
     [
         (lambda words: ["nan", *words[1:]], r"images\.txt, line 5"),
         (lambda words: [str(2.0 * float(word)) for word in words[:4]] + words[4:], r"a quaternion of length 2"),
-        (lambda words: ["0", "0", "0", "0", *words[4:]], r"is no rotation"),
+        (lambda words: ["0", "0", "0", "0", *words[4:]], r"is not a rotation"),
         (lambda words: [*words[:4], "inf", *words[5:]], r"images\.txt, line 5"),
     ],
     ids=["nan", "not of unit length", "zero", "infinite"],
@@ -389,7 +389,7 @@ def test_poses_that_are_none(tmp_path, spoil, message):
         opened(tmp_path)
 
 
-def test_a_model_without_registered_pictures(tmp_path):
+def test_a_model_without_registered_images(tmp_path):
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(camera())
     (tmp_path / "sparse").mkdir()
@@ -432,7 +432,7 @@ def test_a_model_without_points_says_what_is_missing(tmp_path):
     model = pycolmap.Reconstruction(str(tmp_path / "sparse/0"))
     model.delete_all_points2D_and_points3D()
     model.write_binary(str(tmp_path / "sparse/0"))
-    with pytest.raises(InputError, match="initial points"):
+    with pytest.raises(InputError, match="points for the initial Gaussians"):
         load(tmp_path)
     assert all(shot.sparse_depth is None for shot in opened(tmp_path).shots)
 
@@ -481,11 +481,11 @@ def test_reprojection_error_is_the_one_colmap_finds(shared_data, place):
     folder = shared_data / "colmap_23img" / place
     model = read_model(folder)
     errors, numbers = [], []
-    for picture, pose in zip(model.pictures, model.camera_to_world, strict=True):
-        local = (model.positions[picture.points] - pose[:3, 3]) @ pose[:3, :3]
-        seen = model.cameras[picture.camera].project(local)
-        errors.append(np.linalg.norm(seen - picture.observed, axis=1))
-        numbers.append(picture.points)
+    for image, pose in zip(model.images, model.camera_to_world, strict=True):
+        local = (model.positions[image.points] - pose[:3, 3]) @ pose[:3, :3]
+        seen = model.cameras[image.camera].project(local)
+        errors.append(np.linalg.norm(seen - image.observed, axis=1))
+        numbers.append(image.points)
     by_point = np.concatenate(numbers)
     mean = (np.bincount(by_point, np.concatenate(errors)) / np.bincount(by_point)).mean()
     reference = pycolmap.Reconstruction(str(folder))
@@ -497,21 +497,21 @@ def test_reprojection_error_is_the_one_colmap_finds(shared_data, place):
 
 
 @pytest.mark.parametrize(("place", "model"), [("sparse", "PINHOLE"), ("distorted_sparse", "SIMPLE_RADIAL")])
-def test_points_fall_where_they_were_seen_in_the_loaders_undistorted_pictures(shared_data, place, model):
-    """As far from there as COLMAP says, in pixels of the stored picture: scene cameras and views agree."""
+def test_points_fall_where_they_were_seen_in_the_loaders_undistorted_images(shared_data, place, model):
+    """As far from there as COLMAP says, in pixels of the stored image: scene cameras and views agree."""
     folder = shared_data / "colmap_23img"
     data = read_model(folder / place)
     shots = ColmapDataManager(ColmapSettings(model=place)).open(folder).shots
     assert {lens.model for lens in data.cameras.values()} == {model}
     errors, numbers = [], []
-    for shot, picture in zip(shots, data.pictures, strict=True):
+    for shot, image in zip(shots, data.images, strict=True):
         camera = shot.rectification.camera(shot.camera_to_world).to(dtype=torch.float64)
-        found, depth = camera.project(torch.from_numpy(data.positions[picture.points]))
+        found, depth = camera.project(torch.from_numpy(data.positions[image.points]))
         assert (depth > 0).all()
-        seen = shot.rectification.pixels(picture.observed)
-        stored = data.cameras[picture.camera].pinhole.fx / shot.rectification.pinhole.fx
+        seen = shot.rectification.pixels(image.observed)
+        stored = data.cameras[image.camera].pinhole.fx / shot.rectification.pinhole.fx
         errors.append(stored * np.linalg.norm(found.numpy() - seen, axis=1))
-        numbers.append(picture.points)
+        numbers.append(image.points)
     by_point = np.concatenate(numbers)
     mean = (np.bincount(by_point, np.concatenate(errors)) / np.bincount(by_point)).mean()
     reference = pycolmap.Reconstruction(str(folder / place))
@@ -522,7 +522,7 @@ def test_points_fall_where_they_were_seen_in_the_loaders_undistorted_pictures(sh
 def test_undistorting_is_what_colmap_did(shared_data):
     """Features of the SIMPLE_RADIAL model through our lens are the PINHOLE model's, which COLMAP undistorted."""
     before, after = (read_model(shared_data / "colmap_23img" / place) for place in ("distorted_sparse", "sparse"))
-    for one, other in zip(before.pictures, after.pictures, strict=True):
+    for one, other in zip(before.images, after.images, strict=True):
         pinhole = after.cameras[other.camera].pinhole
         directions = before.cameras[one.camera].unproject(one.observed)[:, :2]
         pixels = directions * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy)

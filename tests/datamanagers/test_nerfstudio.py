@@ -104,7 +104,7 @@ def folder(wall, tmp_path) -> Path:
         ("OPENCV_FISHEYE", {}, FisheyeLens(**SIZE, k1=0, k2=0, k3=0, k4=0)),
     ],
 )
-def test_pictures_of_every_camera_become_pinhole_pictures(tmp_path, model, bends, lens):
+def test_images_of_every_camera_become_pinhole_images(tmp_path, model, bends, lens):
     scene = load(write(tmp_path, lens, camera_model=model, **bends))
     for frame in in_video_order(scene):
         cam = frame.camera
@@ -266,7 +266,7 @@ def test_the_files_own_split(folder):
 
 
 def test_no_split_of_its_own(wall):
-    with pytest.raises(InputError, match="does not say which of its frames are for testing"):
+    with pytest.raises(InputError, match="does not specify its test frames"):
         load(wall, split="own")
 
 
@@ -305,7 +305,7 @@ def test_the_fingerprint_sees_the_file(folder):
         ({"ply_file_path": "gone.ply"}, r"no file .*gone\.ply"),
         ({"depth_unit_scale_factor": 0}, "depth_unit_scale_factor is 0"),
         ({"train_filenames": ["images/frame_0001.png"]}, r"train_filenames names .*Did you mean"),
-        ({"train_filenames": "all"}, "train_filenames is no list"),
+        ({"train_filenames": "all"}, "train_filenames is not a list"),
         (
             {"train_filenames": ["images/frame_00001.png"], "test_filenames": ["images/frame_00001.png"]},
             "is in train_filenames and test_filenames",
@@ -335,10 +335,10 @@ def test_poses_that_are_none(folder, spoil):
         opened(changed(folder, frames=content["frames"]))
 
 
-def test_missing_pictures_are_named(folder):
+def test_missing_images_are_named(folder):
     for index in (2, 5):
         (folder / f"images/frame_{index:05d}.png").unlink()
-    with pytest.raises(InputError, match=r"2 of 9 frames have no picture in .*: images/frame_00002\.png, images/fr"):
+    with pytest.raises(InputError, match=r"2 of 9 frames have no image in .*: images/frame_00002\.png, images/fr"):
         opened(folder)
 
 
@@ -362,7 +362,7 @@ def test_depth_or_masks_that_are_not_there(tmp_path):
         (lambda path: path.write_bytes(b"\x89PNG"), "cannot be decoded"),
     ],
 )
-def test_depth_pictures_of_another_kind(tmp_path, write_bad, message):
+def test_depth_images_of_another_kind(tmp_path, write_bad, message):
     write(tmp_path, frame_keys=depth_files(tmp_path, 1.0, ".png"))
     write_bad(tmp_path / "depth/3.png")
     with pytest.raises(InputError, match=rf"depth/3\.png.*{message}"):
@@ -386,7 +386,7 @@ def test_depth_arrays_of_another_kind(tmp_path, write_bad, message):
         load(tmp_path)
 
 
-def test_pictures_of_two_sizes(folder):
+def test_images_of_two_sizes(folder):
     cv2.imwrite(str(folder / "images/frame_00004.png"), np.zeros((24, 32, 3), np.uint8))
     with pytest.raises(InputError, match=r"frame_00004\.png is 32 x 24, but .*transforms\.json says 64 x 48"):
         load(folder)
@@ -398,7 +398,7 @@ def test_no_file(tmp_path):
     with pytest.raises(InputError, match=r"no file .*transforms\.json"):
         opened(tmp_path)
     (tmp_path / "transforms.json").write_text("{")
-    with pytest.raises(InputError, match="is no JSON"):
+    with pytest.raises(InputError, match="is not JSON"):
         opened(tmp_path)
 
 
@@ -413,7 +413,7 @@ def test_neither_depth_nor_points(folder):
 
 @pytest.fixture(scope="module")
 def phantoms(tmp_path_factory) -> tuple[Path, Path]:
-    """One colon through nerfstudio's lens and through the pinhole that its pictures are undistorted to."""
+    """One colon through nerfstudio's lens and through the pinhole that its images are undistorted to."""
     base = tmp_path_factory.mktemp("phantoms")
     return tuple(write_phantom(base / name, name, noise=0.0) for name in ("nerfstudio", "c3vd"))
 
@@ -430,7 +430,7 @@ def test_the_phantom_comes_back(phantoms):
         # The nearest source pixel is up to half a pixel away, which matters where the wall slants.
         gap = (one.depth - other.depth).abs() / other.depth
         assert gap.nanmedian() < 0.01
-        # A slightly different picture asks for a slightly different exposure.
+        # A slightly different image asks for a slightly different exposure.
         exposure = other.rgb.mean() / one.rgb.mean()
         assert (exposure * one.rgb - other.rgb).abs().mean() < 4 / 255
     assert distance_from_wall(phantoms[0], bent.points.positions).mean() < 0.5
@@ -454,8 +454,8 @@ def test_the_real_sequence_opens_with_the_poses_and_the_lens_of_its_other_file(s
     assert rectification.lens == real_lens(shared_data)
     assert (rectification.width, rectification.height) == (270, 270)
     undistortion = Undistortion(real_lens(shared_data), rectification.pinhole)
-    picture = read_rgb(recording.shots[100].image)
-    np.testing.assert_array_equal(rectification.image(picture), undistortion.image(picture))
+    image = read_rgb(recording.shots[100].image)
+    np.testing.assert_array_equal(rectification.image(image), undistortion.image(image))
     assert rectification.valid is None
 
 

@@ -47,7 +47,7 @@ def test_ground_truth_points_project_where_the_lens_and_the_undistortion_put_the
     np.testing.assert_allclose(depth, data["depth_mm"], atol=2e-4)
     inside = ((pixels > 3) & (pixels < 197)).all(dim=1).numpy()
     assert inside.sum() > 2000
-    # Colours of the undistorted picture there, against those of the distorted one where the points were seen.
+    # Colours of the undistorted image there, against those of the distorted one where the points were seen.
     crop = read_rgb(shared_data / "c3vd_cecum_t1_a" / "0000_color_crop800.jpg")
     source = (data["uv_raw1350x1080"][inside] - (275, 140)).astype(np.float32)
     smooth = cv2.blur(crop, (3, 3))

@@ -123,8 +123,8 @@ class TestPhantom:
         assert gap < 0.3
         assert share > 0.5
 
-    def test_pictures_are_undistorted(self, folder, scene):
-        # The middle of the picture is hardly bent: there it is the stored one.
+    def test_images_are_undistorted(self, folder, scene):
+        # The middle of the image is hardly bent: there it is the stored one.
         frame = scene.train[3]
         stored = cv2.imread(str(folder / "images" / f"{frame.name}.png"))[..., ::-1].astype(float)
         middle = np.s_[HEIGHT // 2 - 5 : HEIGHT // 2 + 5, WIDTH // 2 - 5 : WIDTH // 2 + 5]
@@ -224,7 +224,7 @@ def _frame(index, change, *parts):
     return _json(lambda content: change(content["frames"][index]), *parts)
 
 
-def _picture(name, array):
+def _image(name, array):
     return lambda folder: cv2.imwrite(str(folder / name), array)
 
 
@@ -261,7 +261,7 @@ REFUSED = {
         lambda folder: (folder / "transforms_true_test.json").unlink(),
         r"has no transforms_true_test.json.*choose another split",
     ),
-    "no JSON": (lambda folder: (folder / "transforms_val.json").write_text("{"), r"transforms_val.json is no JSON"),
+    "no JSON": (lambda folder: (folder / "transforms_val.json").write_text("{"), r"transforms_val.json is not JSON"),
     "no frames": (_set("frames", [], "train"), r"transforms_train.json has no frames"),
     "no file_path": (_frame(1, lambda frame: frame.pop("file_path"), "train"), r"_train.json, frame 1: no file_path"),
     "no matrix": (
@@ -275,29 +275,29 @@ REFUSED = {
     "not rigid": (_frame(1, _matrix(_stretch), "train"), r"frame 1 \(images/0005_color.png\): not a rigid transform"),
     "two poses of a frame": (
         _frame(0, _matrix(_move), "test"),
-        r"_test.json: images/0000_color.png has another pose or distance map",
+        r"_test.json: pose or distance map of images/0000_color.png differs",
     ),
     "a frame twice": (
         _json(lambda content: content["frames"].append(content["frames"][0]), "train"),
-        r"_train.json: 'images/0000_color.png' stands twice",
+        r"_train.json: 'images/0000_color.png' is repeated",
     ),
-    "two scales": (_set("scene_scale", 0.5, "val"), r"_val.json: scene_scale is not that of transforms_train.json"),
+    "two scales": (_set("scene_scale", 0.5, "val"), r"_val.json: scene_scale differs from transforms_train.json"),
     "no scale": (_json(lambda content: content.pop("scene_scale")), r"_train.json: scene_scale = None"),
     "a scale of nothing": (_set("scene_scale", 0.0), r"_train.json: scene_scale = 0"),
     "a distance of nothing": (_set("distmap_scale", -1.0), r"_train.json: distmap_scale = -1"),
-    "a turned world": (_set("scene_T", _turned()), r"_train.json: scene_T is no shift"),
-    "no shift": (_json(lambda content: content.pop("scene_T")), r"_train.json: scene_T is no shift"),
+    "a turned world": (_set("scene_T", _turned()), r"_train.json: scene_T is not a translation"),
+    "no shift": (_json(lambda content: content.pop("scene_T")), r"_train.json: scene_T is not a translation"),
     "another camera model": (_set("camera_model", "OPENCV"), r"camera_model 'OPENCV'.*FISHEYE_OPENCV"),
     "no size": (_json(lambda content: content.pop("w")), r"_train.json: w = None"),
-    "half pixels": (_set("h", 71.5), r"a picture of 90 x 71.5"),
+    "half pixels": (_set("h", 71.5), r"an image of 90 x 71.5"),
     "tangential distortion": (_set("p1", 0.01), r"_train.json: p1 = 0.01"),
-    "a picture that is gone": (
+    "an image that is gone": (
         lambda folder: (folder / "images" / "0005_color.png").unlink(),
-        r"_train.json names .*images/0005_color.png, which is not there",
+        r"_train.json names .*images/0005_color.png, which does not exist",
     ),
     "a distance map that is gone": (
         lambda folder: (folder / "distmaps" / "0005_color.png").unlink(),
-        r"_train.json names .*distmaps/0005_color.png, which is not there",
+        r"_train.json names .*distmaps/0005_color.png, which does not exist",
     ),
     "distances for some frames only": (
         _json(
@@ -307,34 +307,34 @@ REFUSED = {
     ),
     "no mask": (lambda folder: (folder / "rgb_mask.png").unlink(), r"no file .*rgb_mask.png.*mask: false"),
     "a mask of another size": (
-        _picture("rgb_mask.png", np.zeros((36, 45), np.uint8)),
+        _image("rgb_mask.png", np.zeros((36, 45), np.uint8)),
         r"rgb_mask.png is 45 x 36.*90 x 72",
     ),
     "a mask of three channels": (
-        _picture("rgb_mask.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8)),
-        r"rgb_mask.png is a picture of 3 channels",
+        _image("rgb_mask.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8)),
+        r"rgb_mask.png is an image of 3 channels",
     ),
     "intrinsics of another resolution": (
         _json(lambda content: content.update(w=180, h=144), "train", "val", "test", "true_test"),
         r"rgb_mask.png is 90 x 72.*180 x 144",
     ),
-    "a picture of another size": (
-        _picture("images/0005_color.png", np.zeros((36, 45, 3), np.uint8)),
+    "an image of another size": (
+        _image("images/0005_color.png", np.zeros((36, 45, 3), np.uint8)),
         r"images/0005_color.png is 45 x 36, but .*transforms_train.json says 90 x 72",
     ),
-    "a picture cut short": (
+    "an image cut short": (
         lambda folder: (folder / "images/0005_color.png").write_bytes(
             (folder / "images/0005_color.png").read_bytes()[:-50]
         ),
         r"images/0005_color.png \(\d+ bytes\) cannot be decoded",
     ),
     "a distance map of 8 bits": (
-        _picture("distmaps/0005_color.png", np.ones((HEIGHT, WIDTH), np.uint8)),
-        r"distmaps/0005_color.png is a picture of 1 channel of uint8",
+        _image("distmaps/0005_color.png", np.ones((HEIGHT, WIDTH), np.uint8)),
+        r"distmaps/0005_color.png is an image of 1 channel of uint8",
     ),
     "a distance map of three channels": (
-        _picture("distmaps/0005_color.png", np.ones((HEIGHT, WIDTH, 3), np.uint16)),
-        r"distmaps/0005_color.png is a picture of 3 channels of uint16",
+        _image("distmaps/0005_color.png", np.ones((HEIGHT, WIDTH, 3), np.uint16)),
+        r"distmaps/0005_color.png is an image of 3 channels of uint16",
     ),
 }
 

@@ -52,7 +52,7 @@ def write_wall(
     places: tuple[str, str] = ("rgb", "depth"),
     trajectory: str = "groundtruth.txt",
 ) -> Path:
-    """The tilted wall: picture i is taken from pose i and called ``stems[i]``."""
+    """The tilted wall: image i is taken from pose i and called ``stems[i]``."""
     count = len(stems)
     directions = rays(PINHOLE)
     for place in places:
@@ -158,7 +158,7 @@ class TestPhantom:
         assert framed.sum() > 500
         assert ((found - z[framed]).abs() / z[framed]).nanmedian() < 0.01
 
-    def test_pictures_are_those_on_disk(self, folder, frames):
+    def test_images_are_those_on_disk(self, folder, frames):
         stored = cv2.imread(str(folder / "rgb" / f"{frames[5].name}.png"))[..., ::-1]
         np.testing.assert_array_equal(frames[5].image, stored)
 
@@ -203,7 +203,7 @@ class TestTimes:
         tum.write(mine / "groundtruth.txt", Trajectory(matrices, timestamps=np.concatenate([fine, times])))
         assert max(worst(frame)[0] for frame in everything(load(mine))) < 0.001
 
-    def test_pictures_without_a_pose_or_depth_are_left_out_and_counted(self, mine, caplog):
+    def test_images_without_a_pose_or_depth_are_left_out_and_counted(self, mine, caplog):
         lines = (mine / "groundtruth.txt").read_text().splitlines()
         (mine / "groundtruth.txt").write_text("\n".join([*lines[:3], *lines[4:9]]) + "\n")
         (mine / "depth" / f"{stamps(9)[4]}.png").unlink()
@@ -212,7 +212,7 @@ class TestTimes:
         assert names(everything(scene)) == left
         assert scene.provenance["association"]["without_pose"] == 2
         assert scene.provenance["association"]["without_depth"] == 1
-        assert "of 9 pictures 2 have no pose and 1 no depth" in caplog.text
+        assert "of 9 images 2 have no pose and 1 no depth" in caplog.text
         assert max(worst(frame)[0] for frame in everything(scene)) < 0.001
 
     def test_times_are_sorted_as_numbers(self, tmp_path):
@@ -233,7 +233,7 @@ class TestTimes:
     def test_depth_of_another_clock(self, mine):
         for path in (mine / "depth").iterdir():
             path.rename(path.with_name(f"{float(path.stem) + 100:.6f}.png"))
-        with pytest.raises(InputError, match=r"no depth file within 0.02 of a picture that has a pose"):
+        with pytest.raises(InputError, match=r"no depth file within 0.02 of an image that has a pose"):
             load(mine)
 
     def test_names_of_two_kinds(self, mine):
@@ -243,13 +243,13 @@ class TestTimes:
 
     def test_a_name_that_is_no_time(self, my_numbered):
         (my_numbered / "rgb" / "3.png").rename(my_numbered / "rgb" / "three.png")
-        with pytest.raises(InputError, match=r"three.png: its name is no time"):
+        with pytest.raises(InputError, match=r"three.png: its name is not a timestamp"):
             load(my_numbered, association="time")
 
     def test_the_same_time_twice(self, mine):
         first = mine / "rgb" / f"{stamps(9)[0]}.png"
         shutil.copy(first, first.with_suffix(".jpg"))
-        with pytest.raises(InputError, match=r"1305031102.000000.* have the same time"):
+        with pytest.raises(InputError, match=r"1305031102.000000.* have the same timestamp"):
             load(mine)
 
 
@@ -282,19 +282,19 @@ class TestOrder:
     def test_whole_numbers_can_be_times(self, my_numbered):
         lines = (my_numbered / "groundtruth.txt").read_text().splitlines()
         (my_numbered / "groundtruth.txt").write_text("\n".join(lines[:6] + lines[7:]) + "\n")
-        with pytest.raises(InputError, match=r"groundtruth.txt has 11 poses for 12 pictures.*association: time"):
+        with pytest.raises(InputError, match=r"groundtruth.txt has 11 poses for 12 images.*association: time"):
             load(my_numbered)
         scene = load(my_numbered, association="time")
         assert names(everything(scene)) == [str(index) for index in range(12) if index != 5]
         assert max(worst(frame)[0] for frame in everything(scene)) < 0.001
 
-    def test_a_pose_and_another_picture_lost(self, my_numbered):
-        """As many poses as pictures, but not of the same frames: the numbers in the trajectory tell."""
+    def test_a_pose_and_another_image_lost(self, my_numbered):
+        """As many poses as images, but not of the same frames: the numbers in the trajectory tell."""
         lines = (my_numbered / "groundtruth.txt").read_text().splitlines()
         (my_numbered / "groundtruth.txt").write_text("\n".join(lines[:6] + lines[7:]) + "\n")
         for part in ("rgb", "depth"):
             (my_numbered / part / "7.png").unlink()
-        with pytest.raises(InputError, match=r"pose 5 is of time 6, but picture 5 is 5.png"):
+        with pytest.raises(InputError, match=r"pose 5 has timestamp 6, but image 5 is 5.png"):
             load(my_numbered)
         assert len(everything(load(my_numbered, association="order"))) == 11
         scene = load(my_numbered, association="time")
@@ -303,7 +303,7 @@ class TestOrder:
 
     def test_depth_for_some_frames_only(self, my_numbered):
         (my_numbered / "depth" / "4.png").unlink()
-        with pytest.raises(InputError, match=r"12 pictures and 11 depth files; frame 4 has only one of the two"):
+        with pytest.raises(InputError, match=r"12 images and 11 depth files; frame 4 has only one of the two"):
             load(my_numbered)
 
     def test_one_number_twice(self, my_numbered):
@@ -325,7 +325,7 @@ class TestDepthScale:
         return folder
 
     def test_is_never_guessed(self, mine):
-        with pytest.raises(InputError, match=r"nothing says how many of their steps.*5000"):
+        with pytest.raises(InputError, match=r"their number of steps per unit.*5000"):
             load(self.without_scale(mine))
 
     def test_from_the_option(self, mine):
@@ -456,7 +456,7 @@ class TestIntrinsics:
 
     def test_none(self, mine):
         (mine / "camera.json").unlink()
-        with pytest.raises(InputError, match=r"has pictures but no camera.json, intrinsics.txt, cameras.txt"):
+        with pytest.raises(InputError, match=r"has images but no camera.json, intrinsics.txt, cameras.txt"):
             load(mine)
 
     def test_of_another_resolution(self, mine):
@@ -479,7 +479,7 @@ def _line(number, text):
     return spoil
 
 
-def _picture(name, array):
+def _image(name, array):
     return lambda folder: cv2.imwrite(str(folder / name), array)
 
 
@@ -489,14 +489,14 @@ def _cut(name):
 
 FOURTH = f"{stamps(9)[3]}.png"
 REFUSED = {
-    "no pictures": (_delete("rgb"), r"wall holds camera.json, depth/, groundtruth.txt"),
+    "no images": (_delete("rgb"), r"wall holds camera.json, depth/, groundtruth.txt"),
     "an empty folder": (
         lambda folder: [path.unlink() for path in (folder / "rgb").iterdir()],
         r"rgb holds nothing.*PNG or JPEG",
     ),
-    "two folders of pictures": (lambda folder: (folder / "images").mkdir(), r"holds rgb/ and images/"),
+    "two folders of images": (lambda folder: (folder / "images").mkdir(), r"holds rgb/ and images/"),
     "two folders of depth": (lambda folder: (folder / "depths").mkdir(), r"holds depth/ and depths/"),
-    "no trajectory": (_delete("groundtruth.txt"), r"has pictures but no groundtruth.txt or poses.txt"),
+    "no trajectory": (_delete("groundtruth.txt"), r"has images but no groundtruth.txt or poses.txt"),
     "two trajectories": (
         lambda folder: shutil.copy(folder / "groundtruth.txt", folder / "slam_poses.txt"),
         r"has the trajectories groundtruth.txt, slam_poses.txt.*--set datamanager.trajectory=groundtruth.txt",
@@ -510,26 +510,26 @@ REFUSED = {
         _line(3, lambda words: " ".join([*words[:4], *(str(2 * float(word)) for word in words[4:])])),
         r"groundtruth.txt, line 4: a quaternion of length 2",
     ),
-    "a picture of another size": (
-        _picture(f"rgb/{FOURTH}", np.zeros((24, 32, 3), np.uint8)),
+    "an image of another size": (
+        _image(f"rgb/{FOURTH}", np.zeros((24, 32, 3), np.uint8)),
         rf"{FOURTH} is 32 x 24, but .*camera.json says 64 x 48",
     ),
     "depth of another size": (
-        _picture(f"depth/{FOURTH}", np.ones((24, 32), np.uint16)),
+        _image(f"depth/{FOURTH}", np.ones((24, 32), np.uint16)),
         rf"depth/{FOURTH} is 32 x 24, but .*camera.json says 64 x 48",
     ),
-    "a picture cut short": (_cut(f"rgb/{FOURTH}"), rf"rgb/{FOURTH} \(\d+ bytes\) cannot be decoded"),
+    "an image cut short": (_cut(f"rgb/{FOURTH}"), rf"rgb/{FOURTH} \(\d+ bytes\) cannot be decoded"),
     "depth of 8 bits": (
-        _picture(f"depth/{FOURTH}", np.ones((48, 64), np.uint8)),
-        rf"depth/{FOURTH} is a picture of 1 channel of uint8",
+        _image(f"depth/{FOURTH}", np.ones((48, 64), np.uint8)),
+        rf"depth/{FOURTH} is an image of 1 channel of uint8",
     ),
     "depth of three channels": (
-        _picture(f"depth/{FOURTH}", np.ones((48, 64, 3), np.uint16)),
-        rf"depth/{FOURTH} is a picture of 3 channels of uint16",
+        _image(f"depth/{FOURTH}", np.ones((48, 64, 3), np.uint16)),
+        rf"depth/{FOURTH} is an image of 3 channels of uint16",
     ),
-    "a grey picture": (
-        _picture(f"rgb/{FOURTH}", np.ones((48, 64), np.uint8)),
-        rf"rgb/{FOURTH} is a picture of 1 channel of uint8",
+    "a grey image": (
+        _image(f"rgb/{FOURTH}", np.ones((48, 64), np.uint8)),
+        rf"rgb/{FOURTH} is an image of 1 channel of uint8",
     ),
 }
 

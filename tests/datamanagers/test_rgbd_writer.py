@@ -86,7 +86,7 @@ def test_a_folder_without_poses(tmp_path):
     assert [frame.name for frame in scene.train] == ["0000", "0001", "0002", "0003"]
     assert all(torch.equal(frame.camera.camera_to_world.double(), torch.eye(4).double()) for frame in scene.train)
     assert scene.provenance["pose_convention"] is None
-    with pytest.raises(InputError, match=r"Add it, or let coliags poses track find one"):
+    with pytest.raises(InputError, match=r"Add it, or estimate one from depth by coliags poses track"):
         RGBDDataManager(SETTINGS).load(folder)
     for name in ("rgb", "depth"):
         for path in (folder / name).iterdir():
@@ -101,7 +101,7 @@ def test_other_folders_do_not_lack_a_trajectory_of_this_form(tmp_path):
     assert find_format(write_wall(tmp_path / "wall")) == "c3vd"
 
 
-def test_masks_belong_to_pictures(tmp_path):
+def test_masks_belong_to_images(tmp_path):
     frames = [replace(frame, mask=torch.ones(frame.image.shape[:2], dtype=torch.bool)) for frame in wall()]
     write_rgbd_scene(tmp_path / "scene", frames, poses_of(frames))
     (tmp_path / "scene" / "mask" / "0002.png").unlink()
@@ -117,6 +117,6 @@ def test_what_is_refused(tmp_path):
     with pytest.raises(InputError, match="frame 0001 has no depth"):
         write_rgbd_scene(tmp_path / "scene", [frames[0], replace(frames[1], depth=None)], poses[:2])
     other = replace(frames[1], camera=replace(frames[1].camera, fx=3.0))
-    with pytest.raises(InputError, match="frame 0001 has a camera of its own"):
+    with pytest.raises(InputError, match="frame 0001 has another camera"):
         write_rgbd_scene(tmp_path / "scene", [frames[0], other], poses[:2])
     assert list(tmp_path.iterdir()) == []

@@ -63,7 +63,7 @@ class TestPhantom:
         )
         camera = scene.train[0].camera
         assert camera.fx == camera.fy == pytest.approx(32.0 * 200.8769 / 169.0)
-        # The middle of the picture, where pixel centres lie at integers + 0.5.
+        # The middle of the image, where pixel centres lie at integers + 0.5.
         assert (camera.cx, camera.cy) == (32.0, 24.0)
 
     def test_depth_lies_on_the_wall(self, phantom):
@@ -73,7 +73,7 @@ class TestPhantom:
         gap, share = depth_gap(*frames[3:5])
         assert gap < 0.5 and share > 0.4
 
-    def test_test_views_have_pictures_and_marks_but_no_depth(self, phantom):
+    def test_test_views_have_images_and_marks_but_no_depth(self, phantom):
         scene = read(phantom, "rotatecolon")
         assert [frame.name for frame in scene.test_sets["test"]] == ["test-0000", "test-0001"]
         for frame in scene.test_sets["test"]:
@@ -162,10 +162,10 @@ class TestEvaluation:
 
 class TestFiles:
     def test_alpha_is_dropped(self, mine):
-        picture = cv2.imread(str(mine / "train_views/0003.png"))
-        alpha = np.full(picture.shape[:2], 7, np.uint8)
-        cv2.imwrite(str(mine / "train_views/0003.png"), np.dstack([picture, alpha]))
-        np.testing.assert_array_equal(load(mine).train[3].image, picture[..., ::-1])
+        image = cv2.imread(str(mine / "train_views/0003.png"))
+        alpha = np.full(image.shape[:2], 7, np.uint8)
+        cv2.imwrite(str(mine / "train_views/0003.png"), np.dstack([image, alpha]))
+        np.testing.assert_array_equal(load(mine).train[3].image, image[..., ::-1])
 
     def test_numbers_decide_the_order_and_may_be_written_as_paths(self, mine):
         def renumber(content):
@@ -181,12 +181,12 @@ class TestFiles:
         assert [frame.name for frame in scene.train] == [str(index) for index in range(2, 11)]
         np.testing.assert_allclose([frame.camera.camera_to_world for frame in scene.train], true_poses(mine), atol=1e-5)
 
-    def test_pictures_without_pose_are_left_out_and_counted(self, mine, caplog):
+    def test_images_without_pose_are_left_out_and_counted(self, mine, caplog):
         change(mine / "transforms.json", lambda content: content["frames"].pop(4))
         scene = load(mine)
         assert [frame.name for frame in scene.train] == [f"{index:04d}" for index in range(9) if index != 4]
         assert scene.provenance["pictures_without_pose"] == 1
-        assert "1 pictures of train_views have no pose" in caplog.text
+        assert "1 images of train_views have no pose" in caplog.text
 
     def test_without_test_views_there_is_no_test_set(self, mine):
         (mine / "transforms_test.json").unlink()
@@ -260,8 +260,8 @@ def matrix(content, index, value):
 
 
 REFUSED = {
-    "no pictures": (lambda f: shutil.rmtree(f / "train_views"), "rotate holds"),
-    "no JSON": (lambda f: (f / "transforms.json").write_text("{"), "transforms.json is no JSON"),
+    "no images": (lambda f: shutil.rmtree(f / "train_views"), "rotate holds"),
+    "no JSON": (lambda f: (f / "transforms.json").write_text("{"), "transforms.json is not JSON"),
     "no frames": (lambda f: (f / "transforms.json").write_text("{}"), "transforms.json has no frames"),
     "no field of view": (
         lambda f: change(f / "transforms.json", lambda content: content.pop("camera_angle_x")),
@@ -271,8 +271,8 @@ REFUSED = {
         lambda f: change(f / "transforms_test.json", lambda content: content.update(camera_angle_x=80.0)),
         "transforms_test.json: camera_angle_x is 80.0",
     ),
-    "a picture is missing": (lambda f: (f / "train_views/0004.png").unlink(), r"frame 4 has no picture .*0004.png"),
-    "a test picture is missing": (lambda f: (f / "test_views_1/0001.png").unlink(), r"frame 1 has no .*test_views_1"),
+    "an image is missing": (lambda f: (f / "train_views/0004.png").unlink(), r"frame 4 has no image .*0004.png"),
+    "a test image is missing": (lambda f: (f / "test_views_1/0001.png").unlink(), r"frame 1 has no .*test_views_1"),
     "depth for some": (
         lambda f: (f / "depth_train/0005.exr").unlink(),
         "depth_train has 8 depth files for 9 frames; frame 5 has none",
@@ -283,7 +283,7 @@ REFUSED = {
     ),
     "a frame twice": (
         lambda f: change(f / "transforms.json", lambda content: content["frames"][2].update(file_path="0001")),
-        "transforms.json: frame 1 stands twice",
+        "transforms.json: frame 1 is repeated",
     ),
     "a left-handed pose": (
         lambda f: change(f / "transforms.json", lambda c: matrix(c, 3, np.diag([1.0, 1.0, -1.0, 1.0]).tolist())),
@@ -293,7 +293,7 @@ REFUSED = {
         lambda f: change(f / "transforms.json", lambda c: matrix(c, 3, np.diag([2.0, 2.0, 2.0, 1.0]).tolist())),
         r"transforms.json, frame 3 \(3\): not a rigid transform",
     ),
-    "a picture of another size": (
+    "an image of another size": (
         lambda f: cv2.imwrite(str(f / "train_views/0004.png"), np.zeros((48, 60, 3), np.uint8)),
         "0004.png is 60 x 48, but .*0000.png says 64 x 48",
     ),
@@ -301,7 +301,7 @@ REFUSED = {
         lambda f: write_exr(f / "depth_train/0004.exr", **{Z: np.ones((24, 32), np.float32)}),
         "0004.exr is 32 x 24, but .*0000.png says 64 x 48",
     ),
-    "a picture cut short": (
+    "an image cut short": (
         lambda f: (f / "test_views_1/0001.png").write_bytes(b"\x89PNG"),
         r"0001.png \(4 bytes\) cannot be decoded",
     ),

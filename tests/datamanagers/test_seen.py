@@ -75,7 +75,7 @@ def test_masks_are_left_out_where_other_frames_are_trained_on(folders, layout, o
     assert all(frame.seen is None for frame in (*scene.train, *apart(scene)))
     assert warnings(caplog) == [
         f"{folder}: seen masks are for split '{SPLITS[layout]}' of all frames; this run trains on other frames, so "
-        "figures on seen pixels are left out"
+        "metrics on seen pixels are unavailable"
     ]
 
 
@@ -112,12 +112,12 @@ def test_nothing_is_left_out_where_nothing_is_tested(folders, caplog):
 
 
 @pytest.mark.parametrize(
-    ("layout", "pictures"), [("colmap", "images"), ("nerfstudio", "images"), ("rotatecolon", "train_views")]
+    ("layout", "images"), [("colmap", "images"), ("nerfstudio", "images"), ("rotatecolon", "train_views")]
 )
-def test_pictures_without_a_pose_put_masks_out_of_step(folders, tmp_path, layout, pictures, caplog):
+def test_images_without_a_pose_put_masks_out_of_step(folders, tmp_path, layout, images, caplog):
     folder = Path(shutil.copytree(folders(layout), tmp_path / "colon"))
-    first = min((folder / pictures).iterdir())
+    first = min((folder / images).iterdir())
     shutil.copy(first, first.with_name("0099.png"))
     with caplog.at_level(logging.WARNING):
         assert all(frame.seen is None for frame in apart(load(folder)))
-    assert len(warnings(caplog)) == 1 and "are for all pictures; some are left out" in caplog.text
+    assert len(warnings(caplog)) == 1 and "are for all images, but some are left out" in caplog.text

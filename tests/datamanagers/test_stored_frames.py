@@ -16,7 +16,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.datamanagers import stored_frames
 from coliags_plugin.datamanagers.c3vd.reader import C3VDDataManager, C3VDSettings
-from coliags_plugin.datamanagers.reading.side_by_side import side_by_side
+from coliags_plugin.datamanagers.reading.parallel import parallel_map
 from coliags_plugin.datamanagers.stored_frames import StoredFrame
 from tests.datamanagers.wall_scenes import write_undistorted
 
@@ -33,7 +33,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture
 def reads(monkeypatch):
-    """Names of the colour pictures and of the depth files read, in order."""
+    """Names of the colour images and of the depth files read, in order."""
     read: dict[str, list[str]] = {"image": [], "depth": []}
     rgb = stored_frames.read_rgb
 
@@ -84,7 +84,7 @@ class TestLaziness:
         assert sorted(reads["image"]) == [f"{index:04d}_color.png" for index in range(9)]
         assert sorted(reads["depth"]) == [f"{index:04d}_depth.png" for index in range(9)]
 
-    def test_not_keeping_reads_depth_twice_and_pictures_once_for_the_points(self, folder, reads):
+    def test_not_keeping_reads_depth_twice_and_images_once_for_the_points(self, folder, reads):
         scene = load(folder, keep_pixels=False)
         training = [frame.name for frame in scene.train]
         assert sorted(reads["image"]) == [f"{name}.png" for name in training]
@@ -185,10 +185,10 @@ class TestThreads:
 
     def test_results_come_in_order_and_progress_is_told(self):
         told = []
-        squares = side_by_side(lambda number: number**2, list(range(50)), "square", lambda *said: told.append(said))
+        squares = parallel_map(lambda number: number**2, list(range(50)), "square", lambda *said: told.append(said))
         assert squares == [number**2 for number in range(50)]
         assert told == [("square", done, 50) for done in range(1, 51)]
-        assert side_by_side(lambda number: number, [], "nothing") == []
+        assert parallel_map(lambda number: number, [], "nothing") == []
 
     def test_the_first_failure_is_raised_and_the_rest_left_undone(self):
         begun = []
@@ -199,7 +199,7 @@ class TestThreads:
                 raise InputError("one", "two")
 
         with pytest.raises(InputError, match="one"):
-            side_by_side(work, list(range(5000)), "work")
+            parallel_map(work, list(range(5000)), "work")
         assert len(begun) < 5000
 
     @pytest.mark.parametrize("keep_pixels", [True, False])
@@ -208,6 +208,6 @@ class TestThreads:
         C3VDDataManager(C3VDSettings(width=64, height=48, keep_pixels=keep_pixels)).load(
             folder, lambda *said: told.append(said)
         )
-        assert ("read pictures", 9, 9) in told or not keep_pixels
+        assert ("read images", 9, 9) in told or not keep_pixels
         assert ("fuse depth", 7, 7) in told
         assert all(0 < done <= total for _, done, total in told)

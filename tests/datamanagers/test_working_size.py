@@ -1,4 +1,4 @@
-"""What size pictures have by default: what is published for their data, or else what fits the paper's."""
+"""What size images have by default: what is published for their data, or else what fits the paper's."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_the_pages_say_so():
     assert not splits
 
 
-class TestSmallerPictures:
+class TestSmallerImages:
     @pytest.fixture(scope="class")
     def large(self, tmp_path_factory):
         return write_undistorted(tmp_path_factory.mktemp("large") / "wall", count=3, width=400, height=300)
@@ -73,7 +73,7 @@ class TestSmallerPictures:
 
     def test_both_sizes_and_the_setting_are_told_once(self, large, caplog):
         assert self.told(large, caplog) == [
-            f"{large}: pictures stored at 400 x 300 are used at 338 x 254; datamanager.width and datamanager.height "
+            f"{large}: images stored at 400 x 300 are used at 338 x 254; datamanager.width and datamanager.height "
             "set another size"
         ]
 

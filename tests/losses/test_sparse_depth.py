@@ -76,7 +76,7 @@ def test_a_point_on_a_pixel_centre_is_that_pixel(case, rendered):
 
 
 @pytest.mark.parametrize("place", [(0.0, 0.0), (WIDTH, HEIGHT), (0.2, 6.9), (8.99, 0.0)])
-def test_edges_of_the_picture_take_the_outermost_pixels(case, rendered, place):
+def test_edges_of_the_image_take_the_outermost_pixels(case, rendered, place):
     at = rendered[min(int(place[1]), HEIGHT - 1), min(int(place[0]), WIDTH - 1)]
     assert case(rendered, [place], [0.0]).item() == pytest.approx(at.item())
 
@@ -133,7 +133,7 @@ def test_inverse_depth_is_inverted_and_emptiness_left_out(case):
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 6), (5, 1)])
-def test_pictures_of_one_row_or_column(case, size):
+def test_images_of_one_row_or_column(case, size):
     rendered = torch.arange(1.0, 1.0 + size[0] * size[1]).reshape(size)
     assert case(rendered, [[0.5, 0.5]], [0.0]).item() == 1.0
     assert case(rendered, [[size[1] - 0.5, size[0] - 0.5]], [0.0]).item() == rendered[-1, -1].item()

@@ -17,7 +17,7 @@ def _make(name, **options):
     return metric(metric.Settings(**options))
 
 
-def _pictures(rgb, true_rgb, valid=None):
+def _images(rgb, true_rgb, valid=None):
     valid = torch.ones(rgb.shape[:2], dtype=torch.bool) if valid is None else valid
     return Comparison(rgb, true_rgb, valid)
 
@@ -45,9 +45,9 @@ def make():
 
 
 @pytest.fixture
-def pictures():
-    """A Comparison of two pictures."""
-    return _pictures
+def images():
+    """A Comparison of two images."""
+    return _images
 
 
 @pytest.fixture

@@ -58,9 +58,9 @@ def test_only_valid_pixels_enter(name, make, depths, truth, errors):
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_unavailable_depth_metrics_give_the_reason(name, make, depths, pictures, truth):
+def test_unavailable_depth_metrics_give_the_reason(name, make, depths, images, truth):
     with pytest.raises(UnavailableError, match="this frame has no ground-truth depth"):
-        make(name)(pictures(torch.zeros(4, 4, 3), torch.zeros(4, 4, 3)))
+        make(name)(images(torch.zeros(4, 4, 3), torch.zeros(4, 4, 3)))
     with pytest.raises(UnavailableError, match="no pixel of this frame has a valid ground-truth depth"):
         make(name)(depths(truth, torch.full_like(truth, torch.nan)))
     broken = truth.clone()
@@ -121,7 +121,7 @@ def test_unknown_pixels_make_no_step_but_hide_none(make, depths):
 
 def test_inner_mse_is_unavailable_where_every_pixel_is_near_a_step(make, depths):
     board = 20 + 10 * ((torch.arange(8)[:, None] + torch.arange(8)) % 2).float()
-    with pytest.raises(UnavailableError, match="away from depth steps"):
+    with pytest.raises(UnavailableError, match="near depth steps"):
         make("depth_mse_inner")(depths(board, board))
 
 

@@ -62,10 +62,10 @@ def nowhere(monkeypatch, tmp_path):
 
 
 @pytest.fixture
-def pair(pictures):
+def pair(images):
     generator = torch.Generator().manual_seed(3)
     truth = torch.rand(48, 40, 3, generator=generator)
-    return pictures((truth + 0.1 * torch.randn(48, 40, 3, generator=generator)).clamp(0, 1), truth)
+    return images((truth + 0.1 * torch.randn(48, 40, 3, generator=generator)).clamp(0, 1), truth)
 
 
 def read(path):
@@ -88,44 +88,44 @@ def squeeze(shared_data, make, nowhere):
     return options
 
 
-def test_the_example_pictures_score_as_the_lpips_package_scores_them(squeeze, pictures, examples):
-    """0.7110476 and 0.1479016: lpips 0.1.4 (net="squeeze") on the same weights and pictures, run once."""
+def test_the_example_images_score_as_the_lpips_package_scores_them(squeeze, images, examples):
+    """0.7110476 and 0.1479016: lpips 0.1.4 (net="squeeze") on the same weights and images, run once."""
     metric = squeeze(input_range="minus-one-one")
-    assert metric(pictures(examples["p0"], examples["ref"])) == pytest.approx(0.7110476, abs=2e-6)
-    assert metric(pictures(examples["p1"], examples["ref"])) == pytest.approx(0.1479016, abs=2e-6)
+    assert metric(images(examples["p0"], examples["ref"])) == pytest.approx(0.7110476, abs=2e-6)
+    assert metric(images(examples["p1"], examples["ref"])) == pytest.approx(0.1479016, abs=2e-6)
 
 
-def test_unmapped_images_give_other_values_in_the_same_order(squeeze, pictures, examples):
-    blurred, warped = (squeeze()(pictures(examples[name], examples["ref"])) for name in ("p0", "p1"))
+def test_unmapped_images_give_other_values_in_the_same_order(squeeze, images, examples):
+    blurred, warped = (squeeze()(images(examples[name], examples["ref"])) for name in ("p0", "p1"))
     assert 0 < warped < blurred
-    mapped = squeeze(input_range="minus-one-one")(pictures(examples["p0"], examples["ref"]))
+    mapped = squeeze(input_range="minus-one-one")(images(examples["p0"], examples["ref"]))
     assert abs(blurred - mapped) > 0.001
 
 
-def test_equal_pictures_are_at_zero_and_distance_has_no_direction(squeeze, pictures, examples):
-    assert squeeze()(pictures(examples["ref"], examples["ref"])) == 0.0
-    there = squeeze()(pictures(examples["p0"], examples["ref"]))
-    assert squeeze()(pictures(examples["ref"], examples["p0"])) == there
+def test_equal_images_are_at_zero_and_distance_has_no_direction(squeeze, images, examples):
+    assert squeeze()(images(examples["ref"], examples["ref"])) == 0.0
+    there = squeeze()(images(examples["p0"], examples["ref"]))
+    assert squeeze()(images(examples["ref"], examples["p0"])) == there
 
 
-def test_ignored_pixels_do_not_change_lpips(squeeze, pictures, examples):
+def test_ignored_pixels_do_not_change_lpips(squeeze, images, examples):
     mask = torch.ones(64, 64, dtype=torch.bool)
     mask[:, 40:] = False
     hidden, truth = examples["p1"].clone(), examples["ref"].clone()
     hidden[~mask], truth[~mask] = torch.nan, 7.0
-    masked = squeeze()(pictures(examples["p1"], examples["ref"], mask))
-    assert squeeze()(pictures(hidden, truth, mask)) == masked
-    assert masked != squeeze()(pictures(examples["p1"], examples["ref"]))
+    masked = squeeze()(images(examples["p1"], examples["ref"], mask))
+    assert squeeze()(images(hidden, truth, mask)) == masked
+    assert masked != squeeze()(images(examples["p1"], examples["ref"]))
 
 
-def test_the_mask_chooses_where_the_distance_is_averaged(squeeze, pictures, examples):
+def test_the_mask_chooses_where_the_distance_is_averaged(squeeze, images, examples):
     """Only the left half differs, so leaving out the right half raises the mean."""
     rendered = examples["ref"].clone()
     rendered[:, :32] = examples["p0"][:, :32]
     left = torch.zeros(64, 64, dtype=torch.bool)
     left[:, :32] = True
-    everywhere = squeeze()(pictures(rendered, examples["ref"]))
-    assert squeeze()(pictures(rendered, examples["ref"], left)) > 1.2 * everywhere
+    everywhere = squeeze()(images(rendered, examples["ref"]))
+    assert squeeze()(images(rendered, examples["ref"], left)) > 1.2 * everywhere
 
 
 def test_the_published_heads_fit_all_three_nets(shared_data):
@@ -278,9 +278,9 @@ def test_a_missing_weights_folder_is_an_input_error(make, tmp_path):
         make("lpips", weights=str(tmp_path / "nothing"))
 
 
-def test_lpips_of_too_small_images_is_unavailable(make, pictures, nowhere):
+def test_lpips_of_too_small_images_is_unavailable(make, images, nowhere):
     with pytest.raises(UnavailableError, match="40x31"):
-        make("lpips")(pictures(torch.zeros(31, 40, 3), torch.ones(31, 40, 3)))
+        make("lpips")(images(torch.zeros(31, 40, 3), torch.ones(31, 40, 3)))
 
 
 def test_the_network_is_read_once(nowhere, make, pair):

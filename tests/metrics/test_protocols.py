@@ -68,7 +68,7 @@ def test_nothing_compared_carries_a_graph(name, scene):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_frame_without_depth_has_pictures_only(name, scene):
+def test_a_frame_without_depth_has_images_only(name, scene):
     output, frame = scene
     comparison = protocol(name).compare(output, dataclasses.replace(frame, depth=None))
     assert comparison.depth is None
@@ -132,7 +132,7 @@ def test_authors_code_scores_clipped_depth_against_the_sensors_limit(scene):
     assert comparison.true_depth[0, 0] == pytest.approx(20.0, abs=0.0016)
 
 
-def test_authors_code_rounds_pictures_to_eight_bits(scene):
+def test_authors_code_rounds_images_to_eight_bits(scene):
     output, frame = scene
     comparison = protocol("authors-code").compare(output, frame)
     levels = comparison.rgb.numpy() * 255

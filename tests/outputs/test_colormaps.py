@@ -9,11 +9,11 @@ from coliags_plugin.outputs.colormaps import (
     UNKNOWN_GREY,
     color_bar,
     color_table,
+    colorize_depth,
+    colorize_depth_error,
+    colorize_rgb_error,
     depth_error,
-    depth_error_picture,
-    depth_picture,
     hatch,
-    rgb_error_picture,
     side_by_side,
 )
 
@@ -39,41 +39,41 @@ def test_maps_grow_brighter_throughout():
         assert lab[-1] - lab[0] > 70
 
 
-def test_depth_picture():
+def test_depth_image():
     table = color_table("depth")
     depth = torch.tensor([[10.0, 60.0, 35.0], [-5.0, 99.0, torch.nan]])
-    picture = depth_picture(depth, (10.0, 60.0))
-    assert picture.dtype == np.uint8
-    np.testing.assert_array_equal(picture[0, 0], table[0])
-    np.testing.assert_array_equal(picture[0, 1], table[255])
-    np.testing.assert_array_equal(picture[0, 2], table[128])
-    np.testing.assert_array_equal(picture[1, 0], table[0])
-    np.testing.assert_array_equal(picture[1, 1], table[255])
-    assert (picture[1, 2] == UNKNOWN_GREY).all()
+    image = colorize_depth(depth, (10.0, 60.0))
+    assert image.dtype == np.uint8
+    np.testing.assert_array_equal(image[0, 0], table[0])
+    np.testing.assert_array_equal(image[0, 1], table[255])
+    np.testing.assert_array_equal(image[0, 2], table[128])
+    np.testing.assert_array_equal(image[1, 0], table[0])
+    np.testing.assert_array_equal(image[1, 1], table[255])
+    assert (image[1, 2] == UNKNOWN_GREY).all()
 
 
 def test_infinite_depth_is_unknown():
-    assert (depth_picture(np.array([[np.inf, -np.inf]]), (0.0, 1.0)) == UNKNOWN_GREY).all()
+    assert (colorize_depth(np.array([[np.inf, -np.inf]]), (0.0, 1.0)) == UNKNOWN_GREY).all()
 
 
 @pytest.mark.parametrize("limits", [(1.0, 1.0), (2.0, 1.0), (0.0, np.nan), (0.0, np.inf)])
-def test_depth_picture_refuses_limits(limits):
+def test_depth_image_refuses_limits(limits):
     with pytest.raises(InputError, match="limits"):
-        depth_picture(np.zeros((2, 2)), limits)
+        colorize_depth(np.zeros((2, 2)), limits)
 
 
-def test_depth_error_picture():
+def test_depth_error_image():
     table = color_table("error")
     true = np.full((2, 4), 30.0, np.float32)
     rendered = true + np.array([[0.0, 1.0, -2.0, 7.0], [np.nan, 0.0, 0.0, 0.0]], np.float32)
     true[1, 1] = np.nan
     valid = np.ones((2, 4), bool)
     valid[1, 2] = False
-    picture = depth_error_picture(torch.from_numpy(rendered), true, valid, limit_mm=2.0)
-    np.testing.assert_array_equal(picture[0], table[[0, 128, 255, 255]])
-    np.testing.assert_array_equal(picture[1, 0], table[255])  # nothing rendered where there is a truth
-    np.testing.assert_array_equal(picture[1, 1:3], hatch(2, 4)[1, 1:3])
-    np.testing.assert_array_equal(picture[1, 3], table[0])
+    image = colorize_depth_error(torch.from_numpy(rendered), true, valid, limit_mm=2.0)
+    np.testing.assert_array_equal(image[0], table[[0, 128, 255, 255]])
+    np.testing.assert_array_equal(image[1, 0], table[255])  # nothing rendered where there is a truth
+    np.testing.assert_array_equal(image[1, 1:3], hatch(2, 4)[1, 1:3])
+    np.testing.assert_array_equal(image[1, 3], table[0])
 
 
 def test_depth_error_is_zero_where_unknown_and_infinite_where_nothing_was_rendered():
@@ -82,29 +82,29 @@ def test_depth_error_is_zero_where_unknown_and_infinite_where_nothing_was_render
     np.testing.assert_array_equal(known, [[False, True, True]])
 
 
-def test_depth_error_picture_refuses():
+def test_depth_error_image_refuses():
     map_ = np.zeros((2, 3))
     for limit in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(InputError, match="error scale"):
-            depth_error_picture(map_, map_, None, limit)
+            colorize_depth_error(map_, map_, None, limit)
     with pytest.raises(InputError, match="rendered_mm"):
-        depth_error_picture(np.zeros((3, 2)), map_, None, 1.0)
+        colorize_depth_error(np.zeros((3, 2)), map_, None, 1.0)
     with pytest.raises(InputError, match="valid"):
-        depth_error_picture(map_, map_, np.ones((3, 2), bool), 1.0)
+        colorize_depth_error(map_, map_, np.ones((3, 2), bool), 1.0)
     with pytest.raises(InputError, match=r"\[H, W\]"):
-        depth_error_picture(map_[None], map_, None, 1.0)
+        colorize_depth_error(map_[None], map_, None, 1.0)
 
 
-def test_rgb_error_picture():
+def test_rgb_error_image():
     table = color_table("error")
     true = np.zeros((1, 3, 3), np.uint8)
     rendered = true.copy()
     rendered[0, 1] = (51, 0, 0)  # a mean of 17 levels: one third of 0.2
     rendered[0, 2] = 255
     expected = table[[0, 85, 255]]
-    np.testing.assert_array_equal(rgb_error_picture(rendered, true)[0], expected)
-    np.testing.assert_array_equal(rgb_error_picture(torch.from_numpy(rendered / 255.0), true)[0], expected)
-    masked = rgb_error_picture(rendered, true, np.array([[True, True, False]]))
+    np.testing.assert_array_equal(colorize_rgb_error(rendered, true)[0], expected)
+    np.testing.assert_array_equal(colorize_rgb_error(torch.from_numpy(rendered / 255.0), true)[0], expected)
+    masked = colorize_rgb_error(rendered, true, np.array([[True, True, False]]))
     np.testing.assert_array_equal(masked[0, 2], hatch(1, 3)[0, 2])
 
 
@@ -134,16 +134,16 @@ def test_side_by_side():
     assert (sheet[:-10, 46:] < 128).any()
 
 
-def test_a_long_label_stays_over_its_picture():
-    picture = np.zeros((4, 60, 3), np.uint8)
-    sheet = side_by_side([picture, picture], ["a label much longer than its picture", ""])
+def test_a_long_label_stays_over_its_image():
+    image = np.zeros((4, 60, 3), np.uint8)
+    sheet = side_by_side([image, image], ["a label much longer than its image", ""])
     assert (sheet[:-4, 60:] == 255).all()
 
 
 def test_side_by_side_refuses():
-    picture = np.zeros((4, 4, 3), np.uint8)
-    for pictures, labels in (([], []), ([picture], ["a", "b"]), ([picture, picture[:2]], ["a", "b"])):
+    image = np.zeros((4, 4, 3), np.uint8)
+    for images, labels in (([], []), ([image], ["a", "b"]), ([image, image[:2]], ["a", "b"])):
         with pytest.raises(InputError):
-            side_by_side(pictures, labels)
+            side_by_side(images, labels)
     with pytest.raises(InputError, match="uint8"):
-        side_by_side([picture.astype(float)], ["a"])
+        side_by_side([image.astype(float)], ["a"])

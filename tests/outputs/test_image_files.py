@@ -59,7 +59,7 @@ def test_tiff_rounds_float64(tmp_path):
     "wrong",
     [np.zeros((4, 4), np.uint8), np.zeros((4, 4, 4), np.uint8), np.zeros((4, 4, 3)), np.zeros((0, 4, 3), np.uint8)],
 )
-def test_what_is_no_picture_is_refused(wrong):
+def test_what_is_no_image_is_refused(wrong):
     with pytest.raises(InputError, match="uint8"):
         encode_png(wrong)
 

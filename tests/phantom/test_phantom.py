@@ -88,15 +88,15 @@ def test_layout_is_coliags_own(phantom):
     color, depth = read(phantom / "images/0000_color.png"), read(phantom / "depths/0016_depth.png")
     assert color.shape == (38, 48, 3) and color.dtype == np.uint8
     assert depth.shape == (38, 48) and depth.dtype == np.uint16 and depth.min() > 0
-    turned = phantom / "rotation"
-    assert len(list((turned / "images").iterdir())) == len(list((turned / "seen").iterdir())) == 3
-    assert (turned / "camera.json").read_text() == (phantom / "camera.json").read_text()
+    rotated = phantom / "rotation"
+    assert len(list((rotated / "images").iterdir())) == len(list((rotated / "seen").iterdir())) == 3
+    assert (rotated / "camera.json").read_text() == (phantom / "camera.json").read_text()
     assert sorted(path.name for path in (phantom / "truth/seen").iterdir()) == [f"{i:04d}_seen.png" for i in (0, 8, 16)]
     record = json.loads((phantom / "phantom.json").read_text())
     assert record["settings"]["spread"] == 0.75 and record["settings"]["width"] == 48
 
 
-def test_the_picture_is_exposed_and_red(phantom):
+def test_the_image_is_exposed_and_red(phantom):
     for path in (phantom / "images").iterdir():
         blue, green, red = (read(path) / 255.0).mean(axis=(0, 1))
         assert 0.35 < (red + green + blue) / 3 < 0.55
@@ -145,11 +145,11 @@ def test_seen_masks_agree_with_a_depth_test(phantom):
     views = cameras(phantom)
     training = [index for index in range(17) if index % 8]
     agreement = []
-    for number, turned in enumerate(cameras(phantom / "rotation")):
+    for number, rotated in enumerate(cameras(phantom / "rotation")):
         depth = z_depth(phantom / f"rotation/depths/{number:04d}_depth.png")
         mask = read(phantom / f"rotation/seen/{number:04d}_seen.png")
         assert mask.dtype == np.uint8 and set(np.unique(mask)) <= {0, 255}
-        points = turned.unproject(depth).reshape(-1, 3)
+        points = rotated.unproject(depth).reshape(-1, 3)
         seen = torch.zeros(len(points), dtype=torch.bool)
         for index in training:
             other = z_depth(phantom / f"depths/{index:04d}_depth.png")
@@ -183,8 +183,8 @@ def test_gain_and_light_are_told(phantom):
     assert [int(row["frame"]) for row in rows] == list(range(17))
     light = json.loads((phantom / "truth/light.json").read_text())
     assert light["lamp"]["offset"] == [0.0, 0.0, -3.6] and light["gain"] == "auto"
-    turned = list(csv.DictReader((phantom / "truth/rotation_gain.csv").open()))
-    for view, row in zip(light["rotation_views"], turned, strict=True):
+    rotated = list(csv.DictReader((phantom / "truth/rotation_gain.csv").open()))
+    for view, row in zip(light["rotation_views"], rotated, strict=True):
         # Turned faster than the exposure follows: the gain of the frame it turned away from.
         assert row["gain_g"] == rows[view["frame"]]["gain_g"]
 

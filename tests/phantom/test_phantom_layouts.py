@@ -63,7 +63,7 @@ def test_lens_is_of_the_size_asked_for(name):
 
 
 def test_an_unknown_layout_is_refused_by_name():
-    with pytest.raises(InputError, match=r"phantom setting layout: .*no such layout; known are c3vd, c3vd-raw"):
+    with pytest.raises(InputError, match=r"phantom setting layout: .*unknown layout; known are c3vd, c3vd-raw"):
         phantom_settings({"layout": "c3dv"})
 
 

@@ -11,15 +11,15 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.lenses.pinhole import PinholeLens
 from coliags_plugin.phantom.colon import ColonSurface, build_surface, grow_anatomy
 from coliags_plugin.phantom.imaging import Sensor, World, expose
-from coliags_plugin.phantom.interreflection import cut_patches, form_factors, solve
+from coliags_plugin.phantom.interreflection import form_factors, make_patches, solve
 from coliags_plugin.phantom.light import UNIT_DISTANCE, Lamp
 from coliags_plugin.phantom.mucosa import Mucosa, paint_mucosa
 from coliags_plugin.phantom.response import develop, encode, exposure_for, exposures, white_balances
 from coliags_plugin.phantom.settings import PRESETS, PhantomSettings, phantom_settings
 from coliags_plugin.phantom.streams import Purpose, SolidNoise, stream
 from coliags_plugin.phantom.tracing import Tracer
-from coliags_plugin.phantom.trajectory import NEAREST, about, rotation, travel, turn_away
-from coliags_plugin.phantom.visibility import likeliest_first, seen_from
+from coliags_plugin.phantom.trajectory import NEAREST, camera_path, rotation, rotation_about, turn_away
+from coliags_plugin.phantom.visibility import nearest_poses_first, seen_from
 
 ALBEDO = (0.7, 0.3, 0.2)
 COARSE = {"mesh_spacing": 1.2, "texture_spacing": 0.4}
@@ -152,7 +152,7 @@ def test_interreflection_in_a_sphere_is_the_integrating_spheres():
     unit = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi], axis=-1)
     sphere = grid_surface(20.0 * unit, -unit, np.cross(unit, [0.0, 0.0, 1.0]))
     albedo = np.broadcast_to(np.array(ALBEDO, np.float32), (len(sphere.vertices), 3))
-    patches = cut_patches(sphere, albedo, stream(0, Purpose.INTERREFLECTION))
+    patches = make_patches(sphere, albedo, stream(0, Purpose.INTERREFLECTION))
     factors = form_factors(patches, Tracer(sphere))
     assert factors.sum(axis=1).max() <= 1.0 + 1e-9
     np.testing.assert_allclose(factors.sum(axis=1).mean(), 1.0, atol=0.05)
@@ -205,9 +205,9 @@ def test_white_balance_drifts_slowly_by_what_is_asked():
 def test_noise_at_mid_grey_is_what_is_asked():
     radiance = np.full((60_000, 3), 0.5**2.2, np.float32)
     for noise in (1.5, 3.0):
-        picture = develop(radiance, np.ones(3), PhantomSettings(noise=noise), stream(1, Purpose.SENSOR))
+        image = develop(radiance, np.ones(3), PhantomSettings(noise=noise), stream(1, Purpose.SENSOR))
         # Rounding adds a variance of 1/12.
-        assert picture.std() == pytest.approx(np.hypot(noise, np.sqrt(1 / 12)), rel=0.02)
+        assert image.std() == pytest.approx(np.hypot(noise, np.sqrt(1 / 12)), rel=0.02)
     assert np.ptp(develop(radiance, np.ones(3), PhantomSettings(noise=0.0), stream(1, Purpose.SENSOR))) == 0
 
 
@@ -260,13 +260,13 @@ def test_grid_place_agrees_with_barycentric_interpolation(colon):
     pose = np.eye(4)
     pose[:3, 3] = (0.0, 0.0, 20.0)
     hits = tracer.cast(pose, directions).kept()
-    row, column = surface.grid_place(hits.triangle, hits.barycentric)
+    row, column = surface.grid_coordinates(hits.triangle, hits.barycentric)
     number = np.repeat(np.arange(surface.rows), surface.columns)[:, None].astype(np.float32)
     np.testing.assert_allclose(row, tracer.interpolate(number, hits)[:, 0], atol=1e-3)
     angle = np.tile(surface.clock, surface.rows)
     around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    turned = tracer.interpolate(around, hits)
-    apart = np.arctan2(turned[:, 1], turned[:, 0]) - column * (2 * np.pi / surface.columns)
+    rotated = tracer.interpolate(around, hits)
+    apart = np.arctan2(rotated[:, 1], rotated[:, 0]) - column * (2 * np.pi / surface.columns)
     np.testing.assert_allclose((apart + np.pi) % (2 * np.pi) - np.pi, 0.0, atol=1e-3)
 
 
@@ -303,7 +303,7 @@ def test_mucosa_has_the_albedo_asked_for_and_no_seam(colon):
 def test_the_camera_keeps_off_the_wall_and_poses_are_rigid(colon, light, trajectory):
     anatomy, _, tracer = colon
     chosen = PhantomSettings(light=light, trajectory=trajectory, frames=60, **COARSE)
-    poses = travel(anatomy.centre_line, chosen, tracer.clearance)
+    poses = camera_path(anatomy.centre_line, chosen, tracer.clearance)
     rotations = poses[:, :3, :3]
     np.testing.assert_allclose(
         rotations.transpose(0, 2, 1) @ rotations, np.broadcast_to(np.eye(3), (60, 3, 3)), atol=1e-9
@@ -325,7 +325,7 @@ def test_the_camera_keeps_off_the_wall_and_poses_are_rigid(colon, light, traject
 def test_rotation_views_share_a_training_frames_place_and_turn_15_to_30_degrees(colon):
     anatomy, _, tracer = colon
     chosen = PhantomSettings(frames=41, rotation_views=12, **COARSE)
-    poses = travel(anatomy.centre_line, chosen, tracer.clearance)
+    poses = camera_path(anatomy.centre_line, chosen, tracer.clearance)
     views = turn_away(poses, chosen)
     assert len(views) == 12
     clocks = []
@@ -342,7 +342,7 @@ def test_rotation_views_share_a_training_frames_place_and_turn_15_to_30_degrees(
 def test_where_the_camera_scans_rotation_views_go_on_outwards(colon):
     anatomy, _, tracer = colon
     chosen = PhantomSettings(frames=41, trajectory="rotation", **COARSE)
-    poses = travel(anatomy.centre_line, chosen, tracer.clearance)
+    poses = camera_path(anatomy.centre_line, chosen, tracer.clearance)
     middle = poses[:, :3, 2].mean(axis=0)
     middle /= np.linalg.norm(middle)
     for view in turn_away(poses, chosen):
@@ -354,7 +354,7 @@ def test_rotation_conventions():
     # Yaw turns the look to the right (+x), pitch upwards (-y).
     assert rotation(0.1, 0.0, 0.0)[0, 2] > 0.0
     assert rotation(0.0, 0.1, 0.0)[1, 2] < 0.0
-    np.testing.assert_allclose(about(np.array([0.0, 0.0, 1.0]), np.pi / 2) @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(rotation_about(np.array([0.0, 0.0, 1.0]), np.pi / 2) @ [1, 0, 0], [0, 1, 0], atol=1e-12)
 
 
 # --- visibility ------------------------------------------------------------------------------------------------------
@@ -373,7 +373,7 @@ def test_a_point_is_seen_only_inside_the_frame_in_front_and_unhidden():
     aside[0, 3] = 30.0
     assert seen_from(points, [np.eye(4), aside], lens, mask, tracer).tolist() == [True, True, False, False, False]
     assert not seen_from(points, [], lens, mask, tracer).any()
-    assert likeliest_first(aside, [np.eye(4), aside])[0] is aside
+    assert nearest_poses_first(aside, [np.eye(4), aside])[0] is aside
 
 
 # --- settings --------------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.poses import c3vd, nerfstudio
-from coliags_plugin.poses.alignment import Matches, Spread, align, associate, umeyama
+from coliags_plugin.poses.alignment import ErrorStatistics, Matches, align, associate, umeyama
 from coliags_plugin.poses.rigid import rigid
 from coliags_plugin.poses.trajectory import Trajectory
 from tests.poses.winding import some_transform, trajectories, winding
@@ -169,10 +169,10 @@ def test_a_camera_that_stays_in_place(away):
     poses[:, :3, 3] = away
     still = Trajectory(poses)
     result = aligned(still, winding(6))
-    assert "stays in one place" in result.transform.undetermined
+    assert "the camera does not move" in result.transform.undetermined
     np.testing.assert_array_equal(result.transform.rotation, np.eye(3))
     for pair in ((still, winding(6)), (winding(6), still), (still, still)):
-        with pytest.raises(InputError, match="a scale cannot be found"):
+        with pytest.raises(InputError, match="a scale cannot be estimated"):
             aligned(*pair, with_scale=True)
 
 
@@ -253,7 +253,7 @@ def test_a_constant_turn_of_every_camera_is_a_rotation_error_alone():
 
 
 def test_spread():
-    assert Spread.of(np.array([1.0, 2.0, 6.0])) == Spread(np.sqrt(41 / 3), 3.0, 2.0, 6.0)
+    assert ErrorStatistics.of(np.array([1.0, 2.0, 6.0])) == ErrorStatistics(np.sqrt(41 / 3), 3.0, 2.0, 6.0)
 
 
 @pytest.mark.parametrize("delta", [0, -1, 12, 100])
@@ -296,7 +296,7 @@ def test_a_last_part_that_several_frames_share_serves_nobody():
     first = named(["left/a.png", "right/a.png", "left/b.png"])
     matches = associate(first, named(["a.jpg", "b.jpg", "c.jpg"]))
     assert matches.by == "index"
-    assert matches.passed_over == ("by name: 'a' stands for several frames",)
+    assert matches.skipped == ("by name: 'a' names several frames",)
     assert associate(first, first).by == "name"
 
 
@@ -329,12 +329,12 @@ def test_by_time_is_greedy_over_all_pairs(seed):
 def test_by_index_where_counts_agree():
     matches = associate(winding(5), winding(5, timestamps=np.arange(5.0)))
     assert (matches.by, pairs(matches)) == ("index", [(k, k) for k in range(5)])
-    assert matches.passed_over == ()
+    assert matches.skipped == ()
 
 
 def test_repeated_times_are_passed_over():
     trajectory = winding(5, timestamps=np.zeros(5))
-    assert associate(trajectory, trajectory).passed_over == ("by time: timestamps are repeated",)
+    assert associate(trajectory, trajectory).skipped == ("by time: timestamps are repeated",)
 
 
 def test_endogslams_training_frames():

@@ -48,7 +48,7 @@ def test_a_first_pose_at_the_origin_is_no_obstacle(tmp_path):
 def test_without_translation_only_symmetric_rotations_can_be_read(tmp_path):
     still = poses(3)
     still[:, :3, 3] = 0.0
-    with pytest.raises(InputError, match="rows cannot be told from columns"):
+    with pytest.raises(InputError, match="row-major and column-major order cannot be distinguished"):
         read_poses(write(tmp_path / "pose.txt", still))
     np.testing.assert_array_equal(read_poses(write(tmp_path / "one.txt", [np.eye(4)])).camera_to_world, [np.eye(4)])
 

@@ -52,7 +52,7 @@ def test_pycolmap_reads_what_is_written(model):
     np.testing.assert_array_equal(camera.params, [61.0, 55.0, 33.5, 21.5])
 
 
-def test_pictures_come_in_the_order_of_their_numbers(model):
+def test_images_come_in_the_order_of_their_numbers(model):
     path, trajectory = model
     read = colmap.read(path)
     assert read.names == tuple(NAMES[index] for index in ORDER)
@@ -75,7 +75,7 @@ def test_points_in_images_txt_may_be_missing_or_blank_but_keep_their_line(tmp_pa
     [
         ("1 1 0 0 0 5 6 1 b.png", "line 2: '1 1 0 0 0 5 6 1 b.png'. Expected IMAGE_ID QW"),
         ("1 2 0 0 0 5 6 7 1 b.png", "line 2: a quaternion of length 2"),
-        ("1 0 0 0 0 5 6 7 1 b.png", "line 2: the quaternion .* is no rotation"),
+        ("1 0 0 0 0 5 6 7 1 b.png", "line 2: the quaternion .* is not a rotation"),
         ("1 1 0 0 0 nan 6 7 1 b.png", "line 2: .*nan"),
     ],
 )
@@ -124,7 +124,7 @@ def test_models_that_are_none(tmp_path):
     with pytest.raises(InputError, match="holds no poses"):
         colmap.read(tmp_path)
     (tmp_path / "images.txt").write_text("1 1 0 0 0 5 6 7 1 a.png\n\n2 1 0 0 0 5 6 7 1 a.png\n\n")
-    with pytest.raises(InputError, match=r"'a.png' stands twice"):
+    with pytest.raises(InputError, match=r"'a.png' is repeated"):
         colmap.read(tmp_path)
 
 
@@ -153,11 +153,11 @@ def test_binary_numbers_that_cannot_be(tmp_path):
     content = bytearray((tmp_path / "model" / "images.bin").read_bytes())
     content[12:20] = struct.pack("<d", 3.0)
     (tmp_path / "model" / "images.bin").write_bytes(content)
-    with pytest.raises(InputError, match=r"images\.bin, picture 1 \(0000\.png\): a quaternion of length"):
+    with pytest.raises(InputError, match=r"images\.bin, image 1 \(0000\.png\): a quaternion of length"):
         colmap.read(tmp_path / "model")
     content[12:20] = struct.pack("<d", np.nan)
     (tmp_path / "model" / "images.bin").write_bytes(content)
-    with pytest.raises(InputError, match=r"picture 1 \(0000\.png\): its pose is nan"):
+    with pytest.raises(InputError, match=r"image 1 \(0000\.png\): its pose is nan"):
         colmap.read(tmp_path / "model")
 
 

@@ -118,7 +118,7 @@ def test_one_message_names_every_fault(tmp_path):
         "rgb_colors has the shape [7, 4], not [N, 3]",
         "log_scales holds numbers that are not finite",
         "org_width holds <U4, not numbers",
-        "keyframe_time_indices is no array of numbers",
+        "keyframe_time_indices is not an array of numbers",
     ):
         assert fault in str(caught.value)
 
@@ -126,7 +126,7 @@ def test_one_message_names_every_fault(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"cam_unnorm_rots": np.zeros((1, 4, FRAMES))}, "cam_unnorm_rots, frame 0: the quaternion .* is no rotation"),
+        ({"cam_unnorm_rots": np.zeros((1, 4, FRAMES))}, "cam_unnorm_rots, frame 0: the quaternion .* not a rotation"),
         ({"gt_w2c_all_frames": 2.0 * winding(FRAMES).camera_to_world}, "gt_w2c_all_frames, frame 0: not a rigid"),
         ({"cam_unnorm_rots": np.ones((1, 4, 0)), "cam_trans": np.ones((1, 3, 0)),
           "gt_w2c_all_frames": np.ones((0, 4, 4))}, "no frames"),
@@ -186,7 +186,7 @@ def test_written_files_hold_the_formats_keys_and_the_first_camera_is_the_world(t
 
 @given(images=st.integers(8, 1200))
 @settings(max_examples=30)
-def test_pictures_of_the_poses(images):
+def test_images_of_the_poses(images):
     np.testing.assert_array_equal(endogslam.image_indices(images, images), np.arange(images))
     training = [index for index in range(images) if index % 8 != 7]
     np.testing.assert_array_equal(endogslam.image_indices(images - images // 8, images), training)

@@ -108,7 +108,7 @@ def test_nothing_is_replaced_unasked(tmp_path, name):
 def test_a_folder_of_other_things_is_never_replaced(tmp_path):
     (tmp_path / "project").mkdir()
     (tmp_path / "project" / "thesis.tex").write_text("everything")
-    with pytest.raises(InputError, match=r"thesis\.tex, which is no part of a COLMAP model"):
+    with pytest.raises(InputError, match=r"thesis\.tex, which is not part of a COLMAP model"):
         write_trajectory(tmp_path / "project", winding(intrinsics=PINHOLE), "colmap", overwrite=True)
     with pytest.raises(InputError, match="project is a folder"):
         write_trajectory(tmp_path / "project", winding(), "tum", overwrite=True)
@@ -128,7 +128,7 @@ def test_formats_that_need_intrinsics_say_so(tmp_path, name):
 @pytest.mark.parametrize("name", ["colmap", "colmap-text", "nerfstudio"])
 def test_a_repeated_name_is_not_written(tmp_path, name):
     trajectory = winding(3, names=("a.png", "b.png", "a.png"), intrinsics=PINHOLE)
-    with pytest.raises(InputError, match=r"'a\.png' stands twice \(poses 0 and 2\)"):
+    with pytest.raises(InputError, match=r"'a\.png' is repeated \(poses 0 and 2\)"):
         write_trajectory(tmp_path / "out", trajectory, name)
 
 
@@ -154,7 +154,7 @@ def test_names_of_formats(tmp_path):
         format_of(tmp_path / "a", "colmab")
     with pytest.raises(InputError, match="is a folder"):
         format_of(tmp_path, "tum")
-    with pytest.raises(InputError, match="'endogslam-truth' is only read"):
+    with pytest.raises(InputError, match="format 'endogslam-truth' is read-only"):
         write_trajectory(tmp_path / "out", winding(), "endogslam-truth")
 
 

@@ -53,7 +53,7 @@ def test_quaternions_by_the_formula(numbers):
 
 @pytest.mark.parametrize("quat", [[0, 0, 0, 0], [1e-12, 0, 0, 0], [np.nan, 0, 0, 1], [np.inf, 0, 0, 0]])
 def test_what_is_no_rotation_is_refused(quat):
-    with pytest.raises(InputError, match=r"frame 1: the quaternion .* is no rotation"):
+    with pytest.raises(InputError, match=r"frame 1: the quaternion .* is not a rotation"):
         rotations_from_wxyz(np.array([[1, 0, 0, 0], quat], float), lambda index: f"frame {index}", unit=False)
 
 
@@ -80,7 +80,7 @@ def test_tum_is_camera_to_world_with_w_last(tmp_path):
 @pytest.mark.parametrize(
     ("row", "message"),
     [
-        ([1, 1, 2, 3, 0, 0, 0, 0], "line 4: the quaternion .* is no rotation"),
+        ([1, 1, 2, 3, 0, 0, 0, 0], "line 4: the quaternion .* is not a rotation"),
         ([1, 1, 2, 3, 0, 0, 0, 1.01], "line 4: a quaternion of length 1.01. Expected length 1 within 0.001"),
         ([1, 1, 2, 3, 0, 0, 1], "line 4: '1.0 1.0 2.0 3.0 0.0 0.0 1.0'. Expected 8 finite numbers"),
         ([1, np.nan, 2, 3, 0, 0, 0, 1], "line 4: .*nan"),
@@ -205,13 +205,13 @@ def test_different_cameras_are_no_common_intrinsics(tmp_path):
     content = json.loads(path.read_text())
     content["frames"][1]["fl_x"] = 99.0
     path.write_text(json.dumps(content))
-    assert nerfstudio.read(path).remarks == ("no intrinsics: the pictures have 2 different cameras",)
+    assert nerfstudio.read(path).remarks == ("no intrinsics: the images have 2 different cameras",)
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{", "is no JSON"),
+        ("{", "is not JSON"),
         ("[1]", "holds a JSON list"),
         ("{}", "has no frames"),
         ('{"frames": []}', "has no frames"),
@@ -234,7 +234,7 @@ def test_broken_transforms_are_refused(tmp_path, text, message):
     ("content", "message"),
     [
         ({"applied_transform": [[1, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 0]]}, "applied_transform: not a rigid transform"),
-        ({"applied_transform": "x"}, "applied_transform is no matrix"),
+        ({"applied_transform": "x"}, "applied_transform is not a matrix"),
         ({"applied_scale": 0}, "applied_scale is 0"),
         ({"applied_scale": True}, "applied_scale is True"),
         ({**PINHOLE, "fl_x": "long"}, "fl_x is 'long'"),
@@ -250,7 +250,7 @@ def test_frames_of_transforms_are_checked(tmp_path):
     stretched = some_transform(0) @ np.diag([1.1, 1, 1, 1])
     with pytest.raises(InputError, match=r"frame 1 \(1\.png\): not a rigid transform"):
         nerfstudio.read(transforms(tmp_path / "t.json", [some_transform(0), stretched]))
-    with pytest.raises(InputError, match=r"'a' stands twice \(poses 0 and 1\)"):
+    with pytest.raises(InputError, match=r"'a' is repeated \(poses 0 and 1\)"):
         nerfstudio.read(transforms(tmp_path / "t.json", [some_transform(0)] * 2, ["a", "a"]))
 
 

@@ -1,11 +1,11 @@
-"""The picture of two trajectories."""
+"""The image of two trajectories."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from coliags_plugin.outputs.trajectory_plot import ESTIMATE_RGB, REFERENCE_RGB, trajectory_picture
+from coliags_plugin.outputs.trajectory_plot import ESTIMATE_RGB, REFERENCE_RGB, plot_trajectory
 from coliags_plugin.poses.alignment import align, associate
 from coliags_plugin.poses.trajectory import Trajectory
 from tests.poses.winding import winding
@@ -14,8 +14,8 @@ from tests.poses.winding import winding
 VIEWS = slice(71, 500), (slice(71, 580), slice(671, 1180))
 
 
-def picture_of(estimate, reference, unit="mm"):
-    return trajectory_picture(align(estimate, reference, associate(estimate, reference)), unit)
+def plot_of(estimate, reference, unit="mm"):
+    return plot_trajectory(align(estimate, reference, associate(estimate, reference)), unit)
 
 
 def places(view, color):
@@ -32,11 +32,11 @@ def test_paths_lie_where_their_axes_say():
     poses[:, 2, 3] = np.linspace(0.0, 20.0, 9)
     poses[4, 0, 3] += 1.0
     reference = Trajectory(poses)
-    picture = picture_of(reference, reference)
-    assert picture.shape == (900, 1200, 3)
-    assert picture.dtype == np.uint8
+    image = plot_of(reference, reference)
+    assert image.shape == (900, 1200, 3)
+    assert image.dtype == np.uint8
     for columns, rises in zip(VIEWS[1], (True, False), strict=True):
-        found = places(picture[VIEWS[0], columns], ESTIMATE_RGB)
+        found = places(image[VIEWS[0], columns], ESTIMATE_RGB)
         first, last = found[found[:, 1].argmin()], found[found[:, 1].argmax()]
         assert (last[0] < first[0]) == rises
 
@@ -45,17 +45,17 @@ def test_the_larger_circle_is_the_references_and_both_are_drawn():
     reference = winding(15)
     shifted = reference.camera_to_world.copy()
     shifted[3:, :3, 3] += (3.0, -2.0, 1.0)
-    picture = picture_of(Trajectory(shifted), reference)
+    image = plot_of(Trajectory(shifted), reference)
     for columns in VIEWS[1]:
-        view = picture[VIEWS[0], columns]
+        view = image[VIEWS[0], columns]
         assert len(places(view, REFERENCE_RGB)) > len(places(view, ESTIMATE_RGB)) > 50
 
 
 @pytest.mark.parametrize("motion", [0.0, 30.0])
-def test_where_no_rotation_is_determined_a_picture_is_still_drawn(motion):
+def test_where_no_rotation_is_determined_an_image_is_still_drawn(motion):
     poses = np.tile(np.eye(4), (5, 1, 1))
     poses[:, 2, 3] = np.linspace(0.0, motion, 5)
-    picture = picture_of(Trajectory(poses), Trajectory(poses))
-    assert (picture != 255).any()
-    assert not len(places(picture[745:855], ESTIMATE_RGB))  # no chart of rotation errors
-    assert len(places(picture[585:700], ESTIMATE_RGB))
+    image = plot_of(Trajectory(poses), Trajectory(poses))
+    assert (image != 255).any()
+    assert not len(places(image[745:855], ESTIMATE_RGB))  # no chart of rotation errors
+    assert len(places(image[585:700], ESTIMATE_RGB))

@@ -34,7 +34,7 @@ def filmed_wall(poses: np.ndarray, lamp: Lamp | None = None) -> list[RgbdFrame]:
 
     Args:
         poses: Camera-to-world. [N, 4, 4]
-        lamp: Factor on the picture's brightness from the frame's number and the distance of each pixel.
+        lamp: Factor on the image's brightness from the frame's number and the distance of each pixel.
     """
     x = (np.arange(PINHOLE.width) + 0.5 - PINHOLE.cx) / PINHOLE.fx
     y = (np.arange(PINHOLE.height) + 0.5 - PINHOLE.cy) / PINHOLE.fy

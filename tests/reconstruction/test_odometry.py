@@ -1,4 +1,4 @@
-"""Poses from pictures and depth: exact motions, moving lamps, lost frames, the pose graph, and what is refused."""
+"""Poses from images and depth: exact motions, moving lamps, lost frames, the pose graph, and what is refused."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from coliags_plugin.engine.data_formats import open_video
 from coliags_plugin.poses.alignment import align, associate
 from coliags_plugin.poses.rigid import inverse, rotation_angles_deg
 from coliags_plugin.poses.trajectory import Trajectory
-from coliags_plugin.reconstruction.odometry.chain import Bridge, chain, filled, power
+from coliags_plugin.reconstruction.odometry.chain import Bridge, chain, fill_gaps, power
 from coliags_plugin.reconstruction.odometry.features import motion_by_features
 from coliags_plugin.reconstruction.odometry.frames import PreparedFrame, PreparedVideo, Video, prepare, typical_depth
-from coliags_plugin.reconstruction.odometry.libraries import exact_open3d
-from coliags_plugin.reconstruction.odometry.pose_graph import further_pairs, optimise, revisited_pairs
+from coliags_plugin.reconstruction.odometry.libraries import deterministic_open3d
+from coliags_plugin.reconstruction.odometry.pose_graph import optimise, revisit_pairs, skip_pairs
 from coliags_plugin.reconstruction.odometry.registration import Edge, agreement
 from coliags_plugin.reconstruction.odometry.settings import TrackingSettings
 from coliags_plugin.reconstruction.odometry.tracking import track
@@ -99,7 +99,7 @@ def test_highlights_are_left_out():
     poses = swaying(4)
     video = filmed_wall(poses)
     for frame in video:
-        frame.image[40:60, 60:90] = 255  # it stays where it is in the picture, as the lamp's mirror image does
+        frame.image[40:60, 60:90] = 255  # it stays where it is in the image, as the lamp's mirror image does
     assert pixels_off(track(video, PINHOLE, FAST).camera_to_world, poses, video) < 0.3
     prepared = prepare(video[0], 40.0)
     assert (prepared.depth[39:61, 59:91] == 0.0).all()
@@ -180,7 +180,7 @@ def test_a_phantom_of_long_steps(phantom_video, phantom_tracked):
 
 
 def test_given_poses_do_not_matter():
-    """Poses come with the frames, but only pictures and depth go in: scrambled ones change not one bit."""
+    """Poses come with the frames, but only images and depth go in: scrambled ones change not one bit."""
     frames = tube_frames(4, step=0.5)
     scrambled = [
         replace(frame, camera=replace(frame.camera, camera_to_world=torch.from_numpy(some_transform(seed))))
@@ -237,8 +237,8 @@ def registering(poses, bad=(), blind=()):
 def test_a_chain_passes_lost_frames_over():
     poses = relative(winding(9).camera_to_world)
     found = chain(9, registering(poses, bad=(3, 4)), max_gap=4)
-    assert found.placed == (0, 1, 2, 5, 6, 7, 8)
-    np.testing.assert_allclose(found.camera_to_world, poses[list(found.placed)], atol=1e-9)
+    assert found.posed == (0, 1, 2, 5, 6, 7, 8)
+    np.testing.assert_allclose(found.camera_to_world, poses[list(found.posed)], atol=1e-9)
     assert [(one.source, one.target) for one in found.edges][2] == (5, 2)
     assert found.bridges == ()
 
@@ -248,7 +248,7 @@ def test_a_chain_begins_anew_where_the_camera_has_jumped():
     poses = relative(winding(8).camera_to_world)
     blind = [(early, late) for early in range(4) for late in range(4, 8)]
     found = chain(8, registering(poses, blind=blind), max_gap=4)
-    assert found.placed == tuple(range(8))
+    assert found.posed == tuple(range(8))
     assert [(bridge.source, bridge.target) for bridge in found.bridges] == [(4, 3)]
     np.testing.assert_allclose(relative(found.camera_to_world[4:]), relative(poses[4:]), atol=1e-9)
     velocity = inverse(poses[2:3])[0] @ poses[3]
@@ -259,7 +259,7 @@ def test_a_chain_begins_anew_where_the_camera_has_jumped():
 def test_a_chain_goes_on_after_more_lost_frames_than_a_gap_may_have():
     poses = relative(winding(12).camera_to_world)
     found = chain(12, registering(poses, bad=(2, 3, 4, 5, 6)), max_gap=2)
-    assert {0, 1, 7, 8, 9, 10, 11} <= set(found.placed)
+    assert {0, 1, 7, 8, 9, 10, 11} <= set(found.posed)
     assert found.bridges
     assert [(one.source, one.target) for one in found.edges][1:] == [(8, 7), (9, 8), (10, 9), (11, 10)]
 
@@ -277,11 +277,11 @@ def test_a_part_of_a_motion_done_so_often_is_the_motion(seed, parts):
 
 def test_what_is_filled_in():
     poses = swaying(2, step=4.0)
-    result = filled((0, 4), poses, 6)
+    result = fill_gaps((0, 4), poses, 6)
     np.testing.assert_array_equal(result[[0, 4]], poses)
     steps = inverse(result[:-1]) @ result[1:]
     np.testing.assert_allclose(steps, np.stack([steps[0]] * 5), atol=1e-9)
-    np.testing.assert_array_equal(filled((0,), np.eye(4)[None], 3), np.stack([np.eye(4)] * 3))
+    np.testing.assert_array_equal(fill_gaps((0,), np.eye(4)[None], 3), np.stack([np.eye(4)] * 3))
 
 
 # The pose graph
@@ -300,7 +300,7 @@ def test_a_wrong_edge_is_dropped_and_the_others_mend_the_path():
     wrong = edge(9, 2, some_transform(3, extent=1.0))
     information = 1e4 * np.eye(6)
     informed = lambda edges: [(one, information) for one in edges]  # noqa: E731
-    with exact_open3d() as open3d:
+    with deterministic_open3d() as open3d:
         found, dropped = optimise(
             open3d, range(12), np.stack(drifted), informed(steps), informed([*right, wrong]), (), 0.25
         )
@@ -318,7 +318,7 @@ def test_a_bridge_gives_way_to_an_edge():
     steps = [edge(frame, frame - 1, motion(frame, frame - 1)) for frame in (1, 2, 4, 5)]
     path = poses.copy()
     path[3:] = path[2] @ wrong @ inverse(poses[3:4])[0] @ poses[3:]
-    with exact_open3d() as open3d:
+    with deterministic_open3d() as open3d:
         found, dropped = optimise(
             open3d,
             range(6),
@@ -332,16 +332,16 @@ def test_a_bridge_gives_way_to_an_edge():
     np.testing.assert_allclose(found, poses, atol=2e-3)
 
 
-def test_which_frames_are_laid_together_too():
-    assert further_pairs((0, 1, 2, 4), (2, 3)) == [(2, 0), (4, 2), (4, 1)]
+def test_pairs_of_further_edges():
+    assert skip_pairs((0, 1, 2, 4), (2, 3)) == [(2, 0), (4, 2), (4, 1)]
     poses = np.tile(np.eye(4), (50, 1, 1))
     poses[:, 0, 3] = np.concatenate([np.arange(25), np.arange(25)[::-1]])  # there and back again
-    pairs = revisited_pairs(range(50), poses, 20, 0.9, 20.0, 1)
+    pairs = revisit_pairs(range(50), poses, 20, 0.9, 20.0, 1)
     assert pairs[0] == (35, 14)
     assert pairs[-1] == (49, 0)
     assert all(source + target == 49 for source, target in pairs)
     poses[30:, :3, :3] = Rotation.from_euler("y", 30, degrees=True).as_matrix()
-    assert revisited_pairs(range(50), poses, 20, 0.9, 20.0, 1) == []
+    assert revisit_pairs(range(50), poses, 20, 0.9, 20.0, 1) == []
 
 
 def test_a_path_back_to_where_it_began_is_closed():
@@ -379,7 +379,7 @@ def test_agreement_knows_right_from_wrong():
     assert agreement(other, one, behind, PINHOLE) == (0.0, 0.0, 0.0)
 
 
-def test_a_flat_picture_agrees_with_nothing():
+def test_a_flat_image_agrees_with_nothing():
     one, other = (prepare(frame, 40.0) for frame in blackened(filmed_wall(swaying(2)), 1))
     fitness, _, correlation = agreement(other, one, np.eye(4), PINHOLE)
     assert fitness > 0.5
@@ -420,9 +420,9 @@ def test_what_is_refused():
     with pytest.raises(InputError, match="none has a pixel of known depth"):
         track(unknown, PINHOLE, FAST)
     small = replace(video[1], image=video[1].image[:64], depth=video[1].depth[:64])
-    with pytest.raises(InputError, match=r"frame 1 \(0001\): a picture of 160 x 64\. Expected 160 x 128"):
+    with pytest.raises(InputError, match=r"frame 1 \(0001\): image of 160 x 64\. Expected 160 x 128"):
         track([video[0], small, video[2]], PINHOLE, FAST)
-    with pytest.raises(InputError, match="no two neighbours among 3 frames could be laid together"):
+    with pytest.raises(InputError, match="no two consecutive frames of 3 could be registered"):
         track(blackened(video, 0, 1, 2), PINHOLE, FAST)
 
 

@@ -1,4 +1,4 @@
-"""Poses and points from pictures alone."""
+"""Poses and points from images alone."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from coliags_plugin.poses import colmap
 from coliags_plugin.poses.alignment import align, associate
 from coliags_plugin.poses.trajectory import Trajectory
 from coliags_plugin.reconstruction.structure.features import FeatureSettings
-from coliags_plugin.reconstruction.structure.pictures import file_names, pictures_of
+from coliags_plugin.reconstruction.structure.image_files import file_names, list_images
 from coliags_plugin.reconstruction.structure.sfm import (
     CameraSettings,
     SfmSettings,
@@ -39,7 +39,7 @@ def tube(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def found(tube):
-    return reconstruct(pictures_of(tube), KNOWN)
+    return reconstruct(list_images(tube), KNOWN)
 
 
 def share_of_path(trajectory, poses):
@@ -58,8 +58,8 @@ def test_a_known_camera_finds_its_path(found):
     assert degrees < 3.0  # the path is nearly straight, and only positions are aligned
     (camera,) = found.model.cameras.values()
     assert tuple(camera.params) == INTRINSICS
-    assert f"{COUNT} of {COUNT} pictures posed" in found.summary()
-    assert found.trajectory.names == tuple(path.name for path in found.pictures)
+    assert f"{COUNT} of {COUNT} images posed" in found.summary()
+    assert found.trajectory.names == tuple(path.name for path in found.images)
 
 
 def test_median_depth_is_that_of_the_points(found):
@@ -71,8 +71,8 @@ def test_median_depth_is_that_of_the_points(found):
     assert found.median_depth == pytest.approx(np.median(depths))
 
 
-def test_the_same_pictures_give_the_same_poses(found, tube):
-    again = reconstruct(pictures_of(tube), KNOWN)
+def test_the_same_images_give_the_same_poses(found, tube):
+    again = reconstruct(list_images(tube), KNOWN)
     np.testing.assert_array_equal(again.camera_to_world, found.camera_to_world)
 
 
@@ -80,20 +80,20 @@ def test_the_written_scene_is_read_as_it_is(found, tmp_path):
     mask = np.ones((128, 160), bool)
     mask[:20] = False
     write_sfm_scene(tmp_path / "scene", found, mask)
-    for path in found.pictures:
+    for path in found.images:
         assert (tmp_path / "scene" / "images" / path.name).read_bytes() == path.read_bytes()
     np.testing.assert_allclose(colmap.read(tmp_path / "scene" / "sparse" / "0").camera_to_world, found.camera_to_world)
     scene = open_scene(tmp_path / "scene", options=["split=all-train"])
     assert len(scene.points) == found.model.num_points3D()
     assert all(len(frame.sparse_depth.depth) > 20 and not frame.mask[:20].any() for frame in scene.train)
-    # Points have the pictures' colours.
+    # Points have the images' colours.
     assert scene.points.colors.float().std() > 20
 
 
 def test_a_phantom_is_found_without_its_camera(phantom, caplog):
-    pictures = pictures_of(phantom / "images")
-    found = reconstruct(pictures, SfmSettings(camera=CameraSettings(model="SIMPLE_PINHOLE")))
-    assert len(found.registered) == len(pictures)
+    images = list_images(phantom / "images")
+    found = reconstruct(images, SfmSettings(camera=CameraSettings(model="SIMPLE_PINHOLE")))
+    assert len(found.registered) == len(images)
     assert share_of_path(found.trajectory, np.load(phantom / "truth" / "camera_to_world.npy"))[0] < 0.005
     (camera,) = found.model.cameras.values()
     assert camera.focal_length == pytest.approx(json.loads((phantom / "camera.json").read_text())["fx"], rel=0.05)
@@ -101,17 +101,17 @@ def test_a_phantom_is_found_without_its_camera(phantom, caplog):
 
 
 def test_a_focal_length_that_runs_away_is_doubted(tube, caplog):
-    reconstruct(pictures_of(tube), SfmSettings(camera=CameraSettings(model="SIMPLE_PINHOLE", focal_factor=2.5)))
+    reconstruct(list_images(tube), SfmSettings(camera=CameraSettings(model="SIMPLE_PINHOLE", focal_factor=2.5)))
     assert "the focal length went from 400 to" in caplog.text
 
 
-def test_pictures_of_something_else_are_left_out_and_named(tube, tmp_path, caplog):
-    for path in pictures_of(tube):
+def test_images_of_something_else_are_left_out_and_named(tube, tmp_path, caplog):
+    for path in list_images(tube):
         write_png(tmp_path / path.name, read_rgb(path))
     write_png(tmp_path / "9_other.png", np.random.default_rng(0).integers(0, 255, (128, 160, 3)).astype(np.uint8))
-    found = reconstruct(pictures_of(tmp_path), KNOWN)
+    found = reconstruct(list_images(tmp_path), KNOWN)
     assert [path.name for path in found.left_out] == ["9_other.png"]
-    assert f"1 of {COUNT + 1} pictures have no pose: 9_other.png" in caplog.text
+    assert f"1 of {COUNT + 1} images have no pose: 9_other.png" in caplog.text
     write_sfm_scene(tmp_path / "scene", found)
     assert not (tmp_path / "scene" / "images" / "9_other.png").exists()
     assert len(open_scene(tmp_path / "scene", options=["split=all-train"]).train) == COUNT
@@ -120,7 +120,7 @@ def test_pictures_of_something_else_are_left_out_and_named(tube, tmp_path, caplo
 def test_masked_parts_have_no_features(tube):
     mask = np.ones((128, 160), bool)
     mask[64:] = False
-    half = reconstruct(pictures_of(tube), KNOWN, mask)
+    half = reconstruct(list_images(tube), KNOWN, mask)
     seen = [point.y() for image in half.model.images.values() for point in image.get_observation_points2D()]
     assert max(seen) < 62
 
@@ -128,7 +128,7 @@ def test_masked_parts_have_no_features(tube):
 def test_nothing_is_said_by_the_library(tube, capfd):
     logging.getLogger("coliags_plugin").setLevel(logging.ERROR)
     try:
-        reconstruct(pictures_of(tube), SfmSettings())
+        reconstruct(list_images(tube), SfmSettings())
     finally:
         logging.getLogger("coliags_plugin").setLevel(logging.NOTSET)
     assert capfd.readouterr() == ("", "")
@@ -140,7 +140,7 @@ def test_interrupts_are_heard(tube):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        reconstruct(pictures_of(tube), KNOWN, progress=interrupted)
+        reconstruct(list_images(tube), KNOWN, progress=interrupted)
     assert pycolmap.logging.minloglevel < 3
 
 
@@ -149,13 +149,13 @@ def test_interrupts_are_heard(tube):
 
 def refusal(match, tube, settings=KNOWN, masks=None):
     with pytest.raises(InputError, match=match):
-        reconstruct(pictures_of(tube), settings, masks)
+        reconstruct(list_images(tube), settings, masks)
 
 
-def test_pictures_without_motion_are_refused(tube, tmp_path):
+def test_images_without_motion_are_refused(tube, tmp_path):
     for index in range(4):
-        write_png(tmp_path / f"{index}.png", read_rgb(pictures_of(tube)[0]))
-    refusal(r"no model from 4 pictures with \d+ features.*the camera has to move", tmp_path)
+        write_png(tmp_path / f"{index}.png", read_rgb(list_images(tube)[0]))
+    refusal(r"no model from 4 images with \d+ features.*the camera has to move", tmp_path)
 
 
 def test_cameras_that_are_none_are_refused(tube, tmp_path):
@@ -166,48 +166,48 @@ def test_cameras_that_are_none_are_refused(tube, tmp_path):
     )
     one = SfmSettings(camera=CameraSettings(model="PINHOLE", params=(1.0,)))
     refusal("1 parameters for PINHOLE. Expected 4: fx, fy, cx, cy", tube, one)
-    write_png(tmp_path / "0.png", read_rgb(pictures_of(tube)[0]))
+    write_png(tmp_path / "0.png", read_rgb(list_images(tube)[0]))
     write_png(tmp_path / "1.png", np.zeros((20, 30, 3), np.uint8))
-    refusal("1.png is 30 x 20, 0.png 160 x 128. Expected pictures of one size", tmp_path, KNOWN)
-    refusal("the mask of .*0.png is 30 x 20, the picture 160 x 128", tmp_path, KNOWN, np.ones((20, 30), bool))
+    refusal("1.png is 30 x 20, 0.png 160 x 128. Expected images of one size", tmp_path, KNOWN)
+    refusal("the mask of .*0.png is 30 x 20, the image 160 x 128", tmp_path, KNOWN, np.ones((20, 30), bool))
 
 
-def test_folders_without_pictures_are_refused(tmp_path):
+def test_folders_without_images_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"no folder .*nowhere"):
-        pictures_of(tmp_path / "nowhere")
+        list_images(tmp_path / "nowhere")
     (tmp_path / "video.mp4").write_bytes(b"film")
-    with pytest.raises(InputError, match=r"video.mp4 is a file. Expected a folder of pictures.*ffmpeg -i"):
-        pictures_of(tmp_path / "video.mp4")
-    with pytest.raises(InputError, match=r"holds 0 pictures"):
-        pictures_of(tmp_path)
+    with pytest.raises(InputError, match=r"video.mp4 is a file. Expected a folder of images.*ffmpeg -i"):
+        list_images(tmp_path / "video.mp4")
+    with pytest.raises(InputError, match=r"holds 0 images"):
+        list_images(tmp_path)
     (tmp_path / "0.png").write_bytes(b"")
-    (tmp_path / "1.png").write_bytes(b"no picture")
+    (tmp_path / "1.png").write_bytes(b"no image")
     with pytest.raises(InputError, match=r"0.png \(0 bytes\) cannot be decoded"):
-        reconstruct(pictures_of(tmp_path))
-    with pytest.raises(InputError, match="1 pictures"):
+        reconstruct(list_images(tmp_path))
+    with pytest.raises(InputError, match="1 images"):
         reconstruct([tmp_path / "0.png"])
 
 
-# Pictures, masks and settings
+# Images, masks and settings
 
 
-def test_pictures_are_ordered_as_people_count(tmp_path):
+def test_images_are_ordered_as_people_count(tmp_path):
     for name in ("10.PNG", "9.jpg", "a.txt", "8.jpeg"):
         (tmp_path / name).touch()
-    assert [path.name for path in pictures_of(tmp_path)] == ["8.jpeg", "9.jpg", "10.PNG"]
+    assert [path.name for path in list_images(tmp_path)] == ["8.jpeg", "9.jpg", "10.PNG"]
     assert file_names(["2", "10"], ".png") == ["2.png", "10.png"]
     assert file_names(["b", "a/c"], "") == ["00000_b", "00001_a-c"]
 
 
 def test_masks_of_a_file_and_of_a_folder(tmp_path):
-    pictures = [Path("a.jpg"), Path("b.jpg")]
+    images = [Path("a.jpg"), Path("b.jpg")]
     black, white = np.zeros((4, 6, 3), np.uint8), np.full((4, 6, 3), 255, np.uint8)
     write_png(tmp_path / "masks" / "a.jpg.png", black)
     write_png(tmp_path / "masks" / "b.png", white)
-    masks = masks_for(tmp_path / "masks", pictures)
-    assert not masks[pictures[0]].any()
-    assert masks[pictures[1]].all()
-    assert masks_for(tmp_path / "masks" / "b.png", pictures).all()
+    masks = masks_for(tmp_path / "masks", images)
+    assert not masks[images[0]].any()
+    assert masks[images[1]].all()
+    assert masks_for(tmp_path / "masks" / "b.png", images).all()
     with pytest.raises(InputError, match=r"has no mask for c.jpg. Expected c.jpg.png or c.png"):
         masks_for(tmp_path / "masks", [Path("c.jpg")])
 

@@ -142,8 +142,8 @@ class Page(HTMLParser):
     def all(self, tag):
         return [attrs for name, attrs in self.tags if name == tag]
 
-    def pictures(self, alt):
-        """Decoded pictures whose alternative text matches."""
+    def images(self, alt):
+        """Decoded images whose alternative text matches."""
         found = [attrs["src"] for attrs in self.all("img") if re.search(alt, attrs["alt"])]
         raw = [base64.b64decode(source.split(",", 1)[1], validate=True) for source in found]
         return [cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1] for data in raw]
@@ -297,7 +297,7 @@ def test_error_maps_share_one_scale(tmp_path, two_runs):
     # The errors are 0.5 mm in one run and 1 mm in the other, so the scale ends at 1 mm.
     page = report(tmp_path, two_runs)
     table = color_table("error")
-    (first, *_), (second, *_) = (page.pictures(f"depth error of {name}") for name in ("coliags", "scaffold-gs"))
+    (first, *_), (second, *_) = (page.images(f"depth error of {name}") for name in ("coliags", "scaffold-gs"))
     assert first.shape == (HEIGHT, WIDTH, 3)
     assert np.abs(first[5].astype(int) - table[128]).max() <= 2
     assert (second[5] == table[255]).all()
@@ -318,7 +318,7 @@ def test_without_depth_colors_are_compared(tmp_path):
     page = report(tmp_path, [make_run(tmp_path, "coliags", with_depth=False)])
     assert "no true depth" in page.words
     assert "|colour error| [levels of 255]" in page.words
-    assert len(page.pictures("colour error of coliags")) == 6
+    assert len(page.images("colour error of coliags")) == 6
     assert "true depth [mm]" not in page.words
 
 
@@ -328,12 +328,12 @@ def test_one_run_lacking_depth_says_so(tmp_path, two_runs):
     assert page.words.count("no depth to compare") == 1
 
 
-def test_large_pictures_are_reduced(tmp_path):
+def test_large_images_are_reduced(tmp_path):
     run = make_run(tmp_path, "coliags", frames={"test": ["0001"]}, with_depth=False)
     for kind in ("truth", "renders"):
         write_png(run / "eval" / "paper" / kind / "test" / "0001.png", np.zeros((101, 1281, 3), np.uint8))
     page = report(tmp_path, [run])
-    assert page.pictures("true image")[0].shape == (33, 427, 3)
+    assert page.images("true image")[0].shape == (33, 427, 3)
     assert f"1281 {TIMES} 101 px" in page.words
     assert "1/3 of their size" in page.words
 
@@ -458,7 +458,7 @@ def test_what_is_missing_is_refused(tmp_path):
         ("metrics.jsonl", "3\n", "line 1 holds a int"),
         ("eval/paper/per_frame.csv", "set,frame,psnr\n", "lists no frames"),
         ("eval/paper/per_frame.csv", "set,frame,psnr\ntest,0001,many\n", "cannot be read"),
-        ("eval/paper/per_frame.csv", "frame,psnr\n0001,3\n", "line 2 names no set"),
+        ("eval/paper/per_frame.csv", "frame,psnr\n0001,3\n", "line 2 has no set"),
         ("eval/paper/truth/test/0004.png", "x", r"truth/test/0004\.png cannot be decoded"),
         ("eval/paper/depth/test/0004.tiff", "x", r"depth/test/0004\.tiff cannot be decoded"),
     ],
@@ -469,7 +469,7 @@ def test_what_is_damaged_is_refused(tmp_path, file, content, match):
     refuses(tmp_path, [run], match)
 
 
-def test_pictures_of_another_size_are_refused(tmp_path):
+def test_images_of_another_size_are_refused(tmp_path):
     run = make_run(tmp_path, "coliags")
     write_png(run / "eval" / "paper" / "renders" / "test" / "0004.png", np.zeros((5, 6, 3), np.uint8))
     refuses(tmp_path, [run], "6 x 5 px. Expected 16 x 12 px")

@@ -63,13 +63,13 @@ class Align:
             if path is not None and path.exists() and not self.overwrite:
                 raise InputError(f"{path} already exists", "a new file", "Choose another, or pass --overwrite")
             if path is not None and (path.is_dir() or path in (self.estimate, self.reference)):
-                raise InputError(f"{path} is a folder or one of the inputs", "a file of its own")
+                raise InputError(f"{path} is a folder or one of the inputs", "another file")
         _, estimate = read_and_log(self.estimate, self.estimate_format)
         kind, reference = read_and_log(self.reference, self.reference_format)
         unit = self.unit or kind.unit
         matches = associate(estimate, reference, self.match, self.tolerance)
-        if matches.passed_over:
-            log.warning("matched by %s, though names or times do not (%s)", matches.by, "; ".join(matches.passed_over))
+        if matches.skipped:
+            log.warning("matched by %s, as names or times do not match (%s)", matches.by, "; ".join(matches.skipped))
         result = align(estimate, reference, matches, self.scale, self.delta)
         print(
             f"{len(matches)} frames matched by {matches.by}, of {len(estimate)} estimated and {len(reference)} "
@@ -83,9 +83,9 @@ class Align:
             print(self.json)
         if self.plot is not None:
             from coliags_plugin.outputs.image_files import write_png
-            from coliags_plugin.outputs.trajectory_plot import trajectory_picture
+            from coliags_plugin.outputs.trajectory_plot import plot_trajectory
 
-            write_png(self.plot, trajectory_picture(result, unit))
+            write_png(self.plot, plot_trajectory(result, unit))
             print(self.plot)
 
 

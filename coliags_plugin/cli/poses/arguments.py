@@ -48,7 +48,7 @@ def parse_intrinsics(intrinsics: str | None, size: str | None) -> Intrinsics | N
         InputError: Only one is given, or one has another form.
     """
     from coliags_plugin.core.intrinsics import Intrinsics
-    from coliags_plugin.poses.text import placed
+    from coliags_plugin.poses.text import prefixed_errors
 
     if intrinsics is None and size is None:
         return None
@@ -59,7 +59,7 @@ def parse_intrinsics(intrinsics: str | None, size: str | None) -> Intrinsics | N
         fx, fy, cx, cy = (float(part) for part in intrinsics.split(","))
     except ValueError as error:
         raise InputError(f"--intrinsics {intrinsics}", "four numbers fx,fy,cx,cy in pixels") from error
-    with placed("--intrinsics, --size"):
+    with prefixed_errors("--intrinsics, --size"):
         return Intrinsics(fx, fy, cx, cy, *parse_size(size))
 
 
@@ -72,7 +72,7 @@ def settings_of(kind: type[S], assignments: Sequence[str], prefix: str = "") -> 
         prefix: Prefix of the keys in messages.
 
     Raises:
-        InputError: An assignment is none, or a key or value is not valid; naming it.
+        InputError: An assignment is malformed, or a key or value is invalid; the message names it.
     """
     from pydantic import ValidationError
 
@@ -80,7 +80,7 @@ def settings_of(kind: type[S], assignments: Sequence[str], prefix: str = "") -> 
 
     tree = override_all(Node({}, "options"), assignments)
     try:
-        # Laid over the defaults, as those of a nested part may differ from the part's own.
+        # Merged with the defaults, as a nested part's defaults may differ from its class's.
         return kind.model_validate(_upon(kind().model_dump(), tree.plain()))
     except ValidationError as error:
         first = error.errors()[0]
@@ -89,7 +89,7 @@ def settings_of(kind: type[S], assignments: Sequence[str], prefix: str = "") -> 
 
 
 def settings_among(kind: type[S], assignments: Sequence[str], prefix: str) -> tuple[S, list[str]]:
-    """Settings from those ``--set`` assignments whose keys begin with a prefix, and the others, which are the data's.
+    """Settings from the ``--set`` assignments with a key prefix, and the others, which are the data manager's.
 
     Raises:
         InputError: See :func:`settings_of`.

@@ -46,11 +46,11 @@ class Convert:
         pinhole = parse_intrinsics(self.intrinsics, self.size)
         _, trajectory = read_and_log(self.input, self.from_format)
         if self.output.exists() and self.output.samefile(self.input):
-            raise InputError(f"{self.output} is the input itself", "another place for the output")
+            raise InputError(f"{self.output} is the input itself", "another output path")
         if pinhole is not None:
             trajectory = replace(trajectory, intrinsics=pinhole)
         if self.images is not None:
-            trajectory = replace(trajectory, names=_picture_names(self.images, len(trajectory)))
+            trajectory = replace(trajectory, names=_image_names(self.images, len(trajectory)))
         lost = [
             what
             for what in ("names", "timestamps", "intrinsics")
@@ -58,26 +58,26 @@ class Convert:
         ]
         write_trajectory(self.output, trajectory, self.to, self.overwrite)
         if lost:
-            log.info("%s keeps no %s: left behind", self.to, ", ".join(lost))
+            log.info("%s does not store %s: dropped", self.to, ", ".join(lost))
         if "names" in target.keeps and trajectory.names is None:
-            log.info("the input names no pictures: called 0000.png, 0001.png, ...; --images takes their real names")
+            log.info("the input has no image names: using 0000.png, 0001.png, ...; --images takes the real names")
         if "timestamps" in target.keeps and trajectory.timestamps is None:
-            log.info("the input has no timestamps: frame numbers stand in for them")
+            log.info("the input has no timestamps: frame numbers are written instead")
         print(self.output)
 
 
-def _picture_names(folder: Path, count: int) -> tuple[str, ...]:
+def _image_names(folder: Path, count: int) -> tuple[str, ...]:
     """Names of a folder's images in natural order, one per pose."""
     from coliags_plugin.core.errors import InputError
     from coliags_plugin.poses.trajectory import natural_order
 
     if not folder.is_dir():
-        raise InputError(f"--images {folder}", "a folder of pictures")
+        raise InputError(f"--images {folder}", "a folder of images")
     names = [path.name for path in folder.iterdir() if path.suffix.lower() in (".png", ".jpg", ".jpeg")]
     if len(names) != count:
         raise InputError(
-            f"{folder} holds {len(names)} pictures for {count} poses",
-            "one picture (.png, .jpg, .jpeg) for each pose",
+            f"{folder} holds {len(names)} images for {count} poses",
+            "one image (.png, .jpg, .jpeg) for each pose",
             "Give the folder of exactly these frames",
         )
     return tuple(names[index] for index in natural_order(names))

@@ -39,7 +39,7 @@ class Sfm:
         from coliags_plugin.cli.poses.arguments import SPARSE_DEPTH, refuse_output, settings_of, train_command
         from coliags_plugin.core.errors import InputError
         from coliags_plugin.engine.progress import progress_callback
-        from coliags_plugin.reconstruction.structure.pictures import pictures_of
+        from coliags_plugin.reconstruction.structure.image_files import list_images
         from coliags_plugin.reconstruction.structure.sfm import SfmSettings, masks_for, reconstruct, write_sfm_scene
 
         refuse_output(self.out, self.frames, self.overwrite)
@@ -48,14 +48,14 @@ class Sfm:
         given = [] if self.camera is None else [f"camera.model={self.camera}"]
         given += [] if self.params is None else [f"camera.params=[{self.params}]"]
         settings = settings_of(SfmSettings, [*given, *self.set])
-        pictures = pictures_of(self.frames)[:: self.every][: self.max_frames]
-        masks = None if self.mask is None else masks_for(self.mask, pictures)
+        images = list_images(self.frames)[:: self.every][: self.max_frames]
+        masks = None if self.mask is None else masks_for(self.mask, images)
         with progress_callback() as progress:
-            found = reconstruct(pictures, settings, masks, progress)
+            found = reconstruct(images, settings, masks, progress)
         write_sfm_scene(self.out, found, masks, self.overwrite)
         print(
             f"{found.summary()}\n"
-            f"the unit of length is arbitrary: in the median the points are {found.median_depth:.4g} units away; where "
-            "their distance in mm is known, divide it by that and pass --set datamanager.scale=QUOTIENT\n"
+            f"the unit of length is arbitrary: the median depth of the points is {found.median_depth:.4g} units; if it "
+            "is known in mm, divide that by this number and pass --set datamanager.scale=QUOTIENT\n"
             f"{self.out}\n{train_command(self.out, SPARSE_DEPTH)}"
         )

@@ -27,7 +27,7 @@ class Track:
     out: Path
     """Folder to create, in the layout of `rgbd`."""
     format: DataFormat = None
-    """How the scene is laid out (`coliags list datamanagers`); default: what its files show."""
+    """Dataset format (`coliags list datamanagers`); default: recognised from the files."""
     set: Assignments = ()
     """An option of the data manager, as width=675, or of tracking, as tracking.method=hybrid."""
     overwrite: bool = False
@@ -71,7 +71,7 @@ def _warn_of_losses(found: Tracking) -> None:
         log.warning("frames %s are lost: their poses are guesses at constant velocity", shown)
     for before, after in found.jumps:
         log.warning(
-            "between frames %d and %d nothing was found: how the path behind lies to the path before is a guess",
+            "no motion was found between frames %d and %d: the relative pose of the two segments is a guess",
             before,
             after,
         )
@@ -87,8 +87,8 @@ def _described(found: Tracking) -> list[str]:
     ]
     if found.further or found.dropped or found.refused:
         lines.append(
-            f"pose graph: {len(found.further)} further edges, {len(found.dropped)} dropped as contradicted, "
-            f"{found.refused} pairs that could not be laid together"
+            f"pose graph: {len(found.further)} further edges, {len(found.dropped)} dropped as outliers, "
+            f"{found.refused} pairs that could not be registered"
         )
     return lines
 
@@ -101,7 +101,7 @@ def _errors(found: Tracking, scene: Scene) -> str:
     from coliags_plugin.poses.trajectory import Trajectory
 
     if len(scene.train) < FEWEST_MATCHES:
-        return f"against the scene's own poses: no figures for fewer than {FEWEST_MATCHES} frames"
+        return f"against the scene's own poses: no errors for fewer than {FEWEST_MATCHES} frames"
     given = Trajectory(np.stack([frame.camera.camera_to_world.double().numpy() for frame in scene.train]))
     estimate = Trajectory(found.camera_to_world)
     result = align(estimate, given, associate(estimate, given, "index"))

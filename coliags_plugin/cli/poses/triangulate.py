@@ -27,7 +27,7 @@ class Triangulate:
     out: Path
     """Folder to create, in COLMAP's layout."""
     format: DataFormat = None
-    """How the scene is laid out (`coliags list datamanagers`); default: what its files show."""
+    """Dataset format (`coliags list datamanagers`); default: recognised from the files."""
     set: Assignments = ()
     """An option of the data manager, as width=675, or of triangulation, as triangulation.min_angle=1."""
     overwrite: bool = False
@@ -70,14 +70,14 @@ def _held_out(scene: Scene) -> tuple[list[Frame], list[str]]:
     others = {name: len(frames) for name, frames in scene.test_sets.items() if name != "test"}
     if others:
         log.warning(
-            "left out: %s, which COLMAP's layout has no place for",
+            "left out: %s, which COLMAP's layout does not support",
             ", ".join(f"test set {name} ({count} frames)" for name, count in others.items()),
         )
     chosen = scene.provenance.get("split", {})
     block = tuple(chosen.get("block", (0.4, 0.6)))
     video = sorted([*scene.train, *test], key=lambda frame: frame.index)
-    places = {frame.index for frame in test}
-    is_test = [frame.index in places for frame in video]
+    test_indices = {frame.index for frame in test}
+    is_test = [frame.index in test_indices for frame in video]
     options: dict[Split, list[str]] = {
         "every-8th": [],
         "endogslam": ["datamanager.split=endogslam"],
@@ -87,5 +87,5 @@ def _held_out(scene: Scene) -> tuple[list[Frame], list[str]]:
     for split, assignments in options.items():
         if held_out(split, len(video), (block[0], block[1])).tolist() == is_test:
             return test, assignments
-    log.warning("left out: the %d test frames, as COLMAP's layout cannot say which they are", len(test))
+    log.warning("left out: the %d test frames, as COLMAP's layout cannot mark test frames", len(test))
     return [], options["all-train"]

@@ -1,4 +1,4 @@
-"""Which of C3VD's two layouts a folder has, told by its files and never by its name (docs/layouts/c3vd.md 1, 3)."""
+"""Recognises C3VD's two layouts from a folder's files (docs/layouts/c3vd.md 1, 3)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ KINDS = (
 
 
 def recognise(folder: Path) -> str | None:
-    """What in the folder says that it is one of the two layouts; None where nothing does."""
+    """The files that identify one of the two layouts; None if the folder has neither."""
     if (folder / "camera_pose.txt").is_file() and (folder / "images").is_dir():
         return "camera_pose.txt beside images/"
     if (folder / "pose.txt").is_file() and next(folder.glob("*_color.png"), None) is not None:
@@ -32,10 +32,10 @@ def recognise(folder: Path) -> str | None:
 
 
 def find_layout(folder: Path) -> SequenceFiles:
-    """Look at a folder; ``kind`` is ``raw`` (distorted pictures) or ``undistorted`` (pinhole pictures and a camera).
+    """Find the files of a sequence; ``kind`` is ``raw`` (distorted images) or ``undistorted`` (pinhole images).
 
     Raises:
-        InputError: It is missing, holds neither layout or parts of both, or its frames do not pair up.
+        InputError: The folder is missing, has neither layout or parts of both, or its files do not pair up.
     """
     if not folder.is_dir():
         raise InputError(f"no folder {folder}", f"a C3VD sequence: {KINDS}", "Check the path")
@@ -73,5 +73,5 @@ def _complete(
 ) -> SequenceFiles:
     for path in filter(None, (poses, camera)):
         if not path.is_file():
-            raise InputError(f"{folder} has pictures but no {path.name}", f"{KINDS}", f"Add {path.name}")
+            raise InputError(f"{folder} has images but no {path.name}", f"{KINDS}", f"Add {path.name}")
     return SequenceFiles(kind, folder, *paired(folder, images, depths), poses, camera)

@@ -1,4 +1,4 @@
-"""C3VD: posed colonoscopy of silicone phantoms, with dense depth (Bobrow et al., 2023)."""
+"""Data manager for C3VD: posed colonoscopy of silicone phantoms with dense depth (Bobrow et al., 2023)."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ class C3VDSettings(SceneSettings):
 
     lens: Literal["omnidirectional", "legacy-pinhole", "fisheye"] = Field(
         "omnidirectional",
-        description="How raw frames are undistorted (pinhole frames need none): 'omnidirectional' rendered the ground "
-        "truth; 'legacy-pinhole' is behind most published numbers and off by degrees (docs/layouts/c3vd.md 2); "
-        "'fisheye' is REIM-NeRF's.",
+        description="Lens model to undistort raw frames: 'omnidirectional': that of the rendered ground truth; "
+        "'legacy-pinhole': used for most published numbers, and wrong by degrees (docs/layouts/c3vd.md 2); 'fisheye': "
+        "REIM-NeRF's.",
     )
-    mask: bool = Field(True, description="Ignore what lies outside the octagon of raw frames.")
+    mask: bool = Field(True, description="Ignore pixels outside the octagon of raw frames.")
 
 
 class C3VDDataManager(SequenceDataManager):
-    """Reads a C3VD sequence: the raw release or the undistorted layout, told apart by the files.
+    """Reads a C3VD sequence in the raw or the undistorted layout.
 
     See docs/layouts/c3vd.md 1 and 3, and :class:`SequenceDataManager` for test views beside the sequence.
     """

@@ -1,4 +1,4 @@
-"""What C3VD's releases have in common: numbered frames, one pose file, 16-bit depth, and test views beside them."""
+"""Base data manager of C3VD's releases: numbered frames, one pose file, 16-bit depth and separate test views."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, check_pose_count, fingerprint
 from coliags_plugin.datamanagers.rectification import Rectification, whole_frame
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE
-from coliags_plugin.datamanagers.seen import ROTATION, seen_marks
+from coliags_plugin.datamanagers.seen import ROTATION, find_seen_masks
 from coliags_plugin.lenses.models import Lens, octagon_mask
 from coliags_plugin.poses.c3vd import read_poses
 
@@ -24,12 +24,12 @@ class SequenceFiles:
     """The files of one sequence.
 
     Attributes:
-        kind: Of layout, for provenance.
-        folder: Where the sequence is.
-        images: Colour pictures, frame 0 first.
-        depths: Depth pictures of the same frames; None where there is not one.
+        kind: Layout, for provenance.
+        folder: Folder of the sequence.
+        images: Colour images, frame 0 first.
+        depths: Depth images of the same frames; None if there are none.
         poses: The pose file.
-        camera: The file that describes the camera, where there is one.
+        camera: The camera file, if any.
     """
 
     kind: str
@@ -45,15 +45,15 @@ class SequenceFiles:
 
 
 class SequenceDataManager(RecordedDataManager):
-    """A data manager of one of the releases, which says where the files are and how they were looked at.
+    """Base class; subclasses find the files and define the rectification.
 
     A sub-folder ``rotation`` in the same layout becomes the test set of that name. ``seen/NNNN_seen.png`` in it, and
-    ``truth/seen/NNNN_seen.png`` beside the sequence, mark what training frames see: those of :attr:`seen_split`.
+    ``truth/seen/NNNN_seen.png`` beside the sequence, are the seen masks for :attr:`seen_split`.
     """
 
     @abstractmethod
     def find(self, folder: Path) -> SequenceFiles:
-        """The files of the sequence in a folder.
+        """Find the files of the sequence in a folder.
 
         Raises:
             InputError: They are missing or do not pair up.
@@ -61,20 +61,20 @@ class SequenceDataManager(RecordedDataManager):
 
     @abstractmethod
     def rectification(self, files: SequenceFiles) -> tuple[Rectification, dict[str, Any]]:
-        """How its pictures become working pictures, and what provenance says about that.
+        """The rectification of a sequence's images, and its provenance.
 
         Raises:
-            InputError: The camera's file cannot be read, or the pictures are not of the camera.
+            InputError: The camera file cannot be read, or does not match the images.
         """
 
     def open(self, path: Path) -> Recording:
         """See :class:`RecordedDataManager`."""
         files = self.find(path)
-        shots, facts = self._shots(files, seen_marks(path / "truth", len(files.images)))
+        shots, facts = self._shots(files, find_seen_masks(path / "truth", len(files.images)))
         test_sets = {}
         if (path / ROTATION).is_dir():
             rotation = self.find(path / ROTATION)
-            seen = seen_marks(path / ROTATION, len(rotation.images))
+            seen = find_seen_masks(path / ROTATION, len(rotation.images))
             test_sets[ROTATION], facts[ROTATION] = self._shots(rotation, seen, f"{ROTATION}-")
         points = path / POINTS_FILE
         return Recording(
@@ -88,10 +88,10 @@ class SequenceDataManager(RecordedDataManager):
         )
 
     def octagon_rectification(self, lens: Lens, image: Path, mask: bool) -> Rectification:
-        """How raw frames, of which one is ``image``, are undistorted, and masked outside the octagon if wanted.
+        """The rectification of raw frames like ``image``, optionally masked outside the octagon.
 
         Raises:
-            InputError: The picture is a crop, so that the lens's calibration does not apply to it.
+            InputError: The image is a crop, to which the lens calibration does not apply.
         """
         lens = whole_frame(lens, image)
         shows = octagon_mask(lens.width, lens.height) if mask else None

@@ -1,4 +1,4 @@
-"""Writing C3VD's layouts: frames, poses and camera of the raw release and of undistorted scenes."""
+"""Writes C3VD's raw and undistorted layouts: frames, poses and camera."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def write_frame(
     """Write a frame of an undistorted scene (docs/layouts/c3vd.md 3).
 
     Args:
-        folder: Of the scene.
-        index: Of the frame, counted from 0.
+        folder: Folder of the scene.
+        index: Index of the frame, from 0.
         image: RGB. [H, W, 3]
         z_depth: mm, as for :func:`depth_steps`; None where there is none. [H, W]
     """
@@ -50,8 +50,8 @@ def write_raw_frame(
     """Write a frame of the raw release (docs/layouts/c3vd.md 1).
 
     Args:
-        folder: Of the sequence.
-        index: Of the frame, counted from 0.
+        folder: Folder of the sequence.
+        index: Index of the frame, from 0.
         image: RGB, as the lens shows it. [H, W, 3]
         z_depth: mm, as for :func:`depth_steps`. [H, W]
         normals: As for :func:`normal_steps`. [H, W, 3]
@@ -62,7 +62,7 @@ def write_raw_frame(
 
 
 def write_poses(path: Path, camera_to_world: Float[np.ndarray, "N 4 4"]) -> None:
-    """Write a pose file of the release's precision, nine digits; OpenCV axes, mm. [N, 4, 4]"""
+    """Write a pose file with the release's nine digits; OpenCV axes, mm. [N, 4, 4]"""
     atomic_write(path, matrix_lines(camera_to_world, digits=9))
 
 
@@ -76,16 +76,16 @@ def write_c3vd_scene(
     points: PointCloud | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write a whole undistorted scene, its poses unrounded (docs/layouts/c3vd.md 3).
+    """Write a complete undistorted scene with unrounded poses (docs/layouts/c3vd.md 3).
 
     Args:
-        folder: The folder to make.
+        folder: The folder to create.
         images: RGB, all of one size. N of [H, W, 3]
         camera_to_world: Rigid, OpenCV axes, mm. [N, 4, 4]
         intrinsics: Of all images, at their size.
-        depths: z-depth, mm, NaN where unknown; 100 mm and more cannot be told from unknown. N of [H, W]
+        depths: z-depth, mm, NaN where unknown; 100 mm and more are stored like unknown. N of [H, W]
         points: Initial points, world frame, mm; written to ``points3D.ply``.
-        overwrite: Replace what is there.
+        overwrite: Replace an existing folder.
 
     Raises:
         InputError: The numbers of images, poses and depths differ, or the folder exists or cannot be written.
@@ -93,7 +93,7 @@ def write_c3vd_scene(
     if not len(images) == len(camera_to_world) == (len(images) if depths is None else len(depths)):
         raise InputError(
             f"{len(images)} images, {len(camera_to_world)} poses and {'no' if depths is None else len(depths)} depths",
-            "as many of each, or no depths",
+            "equal numbers, or no depths",
         )
     with atomic_folder(folder, overwrite) as scratch:
         for index, image in enumerate(images):
@@ -106,14 +106,14 @@ def write_c3vd_scene(
 
 
 def depth_steps(z_depth: Float[np.ndarray, "H W"]) -> UInt16[np.ndarray, "H W"]:
-    """z-depth, mm, as C3VD stores it: 65535 / 100 steps a mm, 0 where unknown, 65535 from 100 mm on. [H, W]"""
+    """z-depth, mm, in C3VD's encoding: 65535 / 100 steps per mm, 0 where unknown, 65535 from 100 mm on. [H, W]"""
     known = np.isfinite(z_depth) & (z_depth > 0.0)
     steps = np.rint(np.where(known, z_depth, 0.0) * _STEPS_PER_MM)
     return np.where(known, np.clip(steps, 1, C3VD_DEPTH.far), 0).astype(np.uint16)
 
 
 def normal_steps(normals: Float[np.ndarray, "H W 3"]) -> UInt16[np.ndarray, "H W 3"]:
-    """Unit normals, camera axes, as C3VD stores them: -1 to 1 becomes 0 to 65535; 0, 0, 0 stays. [H, W, 3]"""
+    """Unit normals, camera axes, in C3VD's encoding: -1 to 1 becomes 0 to 65535; 0, 0, 0 stays. [H, W, 3]"""
     encoded = np.rint((normals + 1.0) * (0.5 * 65535.0)).clip(0.0, 65535.0).astype(np.uint16)
     encoded[~normals.any(axis=-1)] = 0
     return encoded

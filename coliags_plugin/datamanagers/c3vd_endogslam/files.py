@@ -1,4 +1,4 @@
-"""Where the files of C3VD as EndoGSLAM and PR-Endo prepared it are (docs/layouts/c3vd-endogslam.md 1, 2)."""
+"""Finding the files of C3VD as prepared by EndoGSLAM and PR-Endo (docs/layouts/c3vd-endogslam.md 1, 2)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LAYOUT = (
     "or PR-Endo's: C3VD/<scene> beside C3VD_endogslam_optimized/<scene>"
 )
 PARAMS = "params.npz"
-#: PR-Endo keeps the scenes of the folder X in X, and what EndoGSLAM made of them in X_endogslam_optimized.
+#: PR-Endo's release has the scenes in a folder X and EndoGSLAM's results in X_endogslam_optimized.
 OPTIMIZED = "_endogslam_optimized"
 
 
@@ -25,12 +25,12 @@ class PreparedFiles:
     """The files of one sequence.
 
     Attributes:
-        folder: Where the sequence is.
-        images: Colour pictures, frame 0 first.
-        depths: Depth pictures of the same frames; None where there is not one.
-        poses: ``pose.txt``; None where there is none.
-        params: EndoGSLAM's result; None where there is none.
-        cloud: The optimised Gaussians of PR-Endo's release; None where there are none.
+        folder: Folder of the sequence.
+        images: Colour images, frame 0 first.
+        depths: Depth images of the same frames, or None.
+        poses: ``pose.txt``, or None.
+        params: EndoGSLAM's result, or None.
+        cloud: The optimised Gaussians of PR-Endo's release, or None.
     """
 
     folder: Path
@@ -46,23 +46,23 @@ class PreparedFiles:
 
 
 def recognise(folder: Path) -> str | None:
-    """What in the folder says that it is such a sequence, or the folder of PR-Endo's release; None otherwise."""
-    pictures = any(re.fullmatch(r"\d+_color", path.stem) for path in folder.glob("color/*.png"))
+    """The files that identify such a sequence or the folder of PR-Endo's release; None otherwise."""
+    images = any(re.fullmatch(r"\d+_color", path.stem) for path in folder.glob("color/*.png"))
     poses = folder / "pose.txt"
-    if pictures and _params(folder, None) is not None:
+    if images and _params(folder, None) is not None:
         return "color/NNNN_color.png and a params.npz"
-    if pictures and poses.is_file() and has_matrices(poses):
+    if images and poses.is_file() and has_matrices(poses):
         return "pose.txt (16 numbers a line) beside color/NNNN_color.png"
-    if not pictures and (beside := _release(folder)):
+    if not images and (beside := _release(folder)):
         return f"{beside[0].parent.name}{OPTIMIZED}/ beside {beside[0].parent.name}/"
     return None
 
 
 def scene_folder(path: Path) -> Path:
-    """The sequence's own folder: ``path``, or the one scene of PR-Endo's release in it.
+    """The sequence's folder: ``path`` itself, or the only scene of PR-Endo's release in it.
 
     Raises:
-        InputError: ``path`` is missing, or holds a release of several scenes.
+        InputError: ``path`` is missing, or holds several scenes.
     """
     if not path.is_dir():
         raise InputError(f"no folder {path}", LAYOUT, "Check the path")
@@ -73,21 +73,23 @@ def scene_folder(path: Path) -> Path:
 
 
 def find_sequence(folder: Path, params_file: str | None) -> PreparedFiles:
-    """Look at a sequence's own folder.
+    """Find the files of a sequence.
 
     Args:
-        folder: With ``color`` in it.
-        params_file: Where EndoGSLAM's result is, relative to the folder or absolute; None to look in the folder and
-            where PR-Endo's release has it.
+        folder: Folder that contains ``color``.
+        params_file: EndoGSLAM's result, relative to the folder or absolute; None: search in the folder and in PR-Endo's
+            release.
 
     Raises:
-        InputError: It holds something else, its frames do not pair up, or ``params_file`` is not there.
+        InputError: The folder has another layout, its files do not pair up, or ``params_file`` does not exist.
     """
     images = numbered(folder / "color", "color", frozenset({".png"})) if (folder / "color").is_dir() else {}
     if not images:
-        place = folder / "color" if (folder / "color").is_dir() else folder
+        searched = folder / "color" if (folder / "color").is_dir() else folder
         raise InputError(
-            f"{place} holds {inventory(place)}", LAYOUT, "Name the sequence's own folder, for instance C3VD/cecum_t1_b"
+            f"{searched} holds {inventory(searched)}",
+            LAYOUT,
+            "Name the sequence's own folder, for instance C3VD/cecum_t1_b",
         )
     depths = numbered(folder / "depth", "depth", TIFF_SUFFIXES) if (folder / "depth").is_dir() else {}
     params = _params(folder, params_file)
@@ -104,11 +106,11 @@ def find_sequence(folder: Path, params_file: str | None) -> PreparedFiles:
 def _params(folder: Path, params_file: str | None) -> Path | None:
     if params_file is not None:
         if not (folder / params_file).is_file():
-            raise InputError(f"no file {folder / params_file}", "EndoGSLAM's params.npz", "Mend params_file")
+            raise InputError(f"no file {folder / params_file}", "EndoGSLAM's params.npz", "Correct params_file")
         return folder / params_file
     here = folder.resolve()
     beside = here.parent.with_name(here.parent.name + OPTIMIZED) / here.name if here.parent.name else here
-    return next((place / PARAMS for place in (folder, beside) if (place / PARAMS).is_file()), None)
+    return next((path / PARAMS for path in (folder, beside) if (path / PARAMS).is_file()), None)
 
 
 def _newest_cloud(folder: Path) -> Path | None:
@@ -122,7 +124,7 @@ def _newest_cloud(folder: Path) -> Path | None:
 
 
 def _release(folder: Path) -> list[Path]:
-    """The scenes of PR-Endo's release in a folder, for which EndoGSLAM's result is there too."""
+    """The scenes of PR-Endo's release in a folder for which EndoGSLAM's result exists."""
     return [
         scene
         for results in folder.glob(f"*{OPTIMIZED}")

@@ -1,4 +1,4 @@
-"""Which pose belongs to which picture of a sequence that EndoGSLAM was run on (docs/layouts/c3vd-endogslam.md 4)."""
+"""Combines EndoGSLAM's and ground-truth poses of a sequence in one world (docs/layouts/c3vd-endogslam.md 4)."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ log = logging.getLogger(__name__)
 
 PoseSource = Literal["slam", "ground-truth"]
 
-#: How far the true poses of params.npz may be from pose.txt, mm and degrees. Rounding of either is a thousandth of
-#: this; another sequence, or another order of frames, is millimetres away.
+#: Largest difference of params.npz's true poses from pose.txt, mm and degrees. Rounding is a thousandth of this;
+#: another sequence, or another order of frames, differs by millimetres.
 SAME_SEQUENCE = 0.05
-#: From which share of the spread of the cameras on their error is worth a warning.
+#: Ratio of the ATE to the spread of the cameras from which tracking counts as lost.
 LOST = 0.2
 
 
 @dataclass(frozen=True)
-class Placement:
+class SequencePoses:
     """The poses of a sequence in one world.
 
     Attributes:
-        camera_to_world: One for every picture. Rigid, OpenCV axes, mm. [N, 4, 4]
-        from_slam: From the world that EndoGSLAM mapped in; None without params.npz. [4, 4]
-        from_file: From the world of pose.txt; None without it. [4, 4]
-        facts: For provenance.
+        camera_to_world: Pose of every image. Rigid, OpenCV axes, mm. [N, 4, 4]
+        from_slam: Transform from EndoGSLAM's world; None without params.npz. [4, 4]
+        from_file: Transform from the world of pose.txt; None without it. [4, 4]
+        facts: Provenance.
     """
 
     camera_to_world: Float[np.ndarray, "N 4 4"]
@@ -49,40 +49,40 @@ class Placement:
 
 @dataclass(frozen=True)
 class _Slam:
-    """EndoGSLAM's trajectory laid beside the true one.
+    """EndoGSLAM's trajectory aligned with the true one.
 
     Attributes:
-        params: Its result.
-        path: The file of it.
-        pictures: The picture of each of its F poses. [F]
-        from_true: From the first camera's world of the true poses to the one mapped in. [4, 4]
-        facts: For provenance.
+        params: EndoGSLAM's result.
+        path: Its file.
+        indices: The image index of each of its F poses. [F]
+        from_true: Transform from the true poses, relative to their first camera, to EndoGSLAM's world. [4, 4]
+        facts: Provenance.
     """
 
     params: EndoGslamParams
     path: Path
-    pictures: Int[np.ndarray, "F"]
+    indices: Int[np.ndarray, "F"]
     from_true: Float[np.ndarray, "4 4"]
     facts: Mapping[str, Any]
 
 
-def place_sequence(files: PreparedFiles, params: EndoGslamParams | None, source: PoseSource) -> Placement:
-    """The poses of a sequence's pictures.
+def load_poses(files: PreparedFiles, params: EndoGslamParams | None, source: PoseSource) -> SequencePoses:
+    """Load the poses of a sequence's images.
 
     Args:
-        files: Of the sequence.
-        params: What is in ``files.params``; None where there is none.
-        source: ``slam``: EndoGSLAM's poses, in its world; pictures it was not given get their true poses, brought
-            there. ``ground-truth``: the true poses, in the world of pose.txt; without it in that of the first camera.
+        files: Files of the sequence.
+        params: Contents of ``files.params``, or None.
+        source: ``slam``: EndoGSLAM's poses, in its world; images it did not track get their true poses, transformed
+            to it. ``ground-truth``: the true poses, in the world of pose.txt, or without it of the first camera.
 
     Raises:
-        InputError: Poses and pictures do not belong together, or those asked for are not there.
+        InputError: Poses and images do not match, or the requested poses are missing.
     """
     count = len(files.images)
     file = None if files.poses is None else read_poses(files.poses)
     if file is not None and files.poses is not None:
         check_pose_count(files.poses, len(file.camera_to_world), count)
-    slam = None if params is None or files.params is None else _lay_beside(files.params, params, files, file)
+    slam = None if params is None or files.params is None else _align_slam(files.params, params, files, file)
     facts: dict[str, Any] = {
         "poses": source,
         "pose_convention": None if file is None else {"order": file.convention, **file.evidence},
@@ -92,62 +92,62 @@ def place_sequence(files: PreparedFiles, params: EndoGslamParams | None, source:
         return _mapped(files, slam, file, facts)
     if file is not None:
         from_slam = None if slam is None else file.camera_to_world[0] @ _inverse(slam.from_true)
-        return Placement(file.camera_to_world, from_slam, np.eye(4), {**facts, "world": "pose.txt"})
-    if slam is not None and len(slam.pictures) == count:
+        return SequencePoses(file.camera_to_world, from_slam, np.eye(4), {**facts, "world": "pose.txt"})
+    if slam is not None and len(slam.indices) == count:
         from_slam = _inverse(slam.from_true)
-        return Placement(slam.params.true_camera_to_world, from_slam, None, {**facts, "world": "first camera"})
+        return SequencePoses(slam.params.true_camera_to_world, from_slam, None, {**facts, "world": "first camera"})
     raise InputError(
-        f"{files.folder} has no pose.txt" + ("" if slam is None else f", and {slam.path} no poses of test pictures"),
-        "a true pose for every picture",
+        f"{files.folder} has no pose.txt" + ("" if slam is None else f", and {slam.path} no poses of test images"),
+        "a true pose for every image",
         "Put the sequence's pose.txt of C3VD's release there",
     )
 
 
-def _mapped(files: PreparedFiles, slam: _Slam | None, file: Poses | None, facts: Mapping[str, Any]) -> Placement:
-    """Poses in the world EndoGSLAM mapped in."""
+def _mapped(files: PreparedFiles, slam: _Slam | None, file: Poses | None, facts: Mapping[str, Any]) -> SequencePoses:
+    """Poses in EndoGSLAM's world."""
     if slam is None:
         raise InputError(
             f"{files.folder} has no {PARAMS}, in it or where PR-Endo's release has it",
-            "EndoGSLAM's result, whose poses are asked for",
+            "EndoGSLAM's result, for option poses: slam",
             "Set params_file, or poses: ground-truth",
         )
     from_file = None if file is None else slam.from_true @ _inverse(file.camera_to_world[0])
     camera_to_world = slam.params.camera_to_world
-    if len(slam.pictures) < len(files.images):
+    if len(slam.indices) < len(files.images):
         if file is None or from_file is None:
             raise InputError(
-                f"{slam.path} has poses of {len(slam.pictures)} of {len(files.images)} pictures, the training frames, "
+                f"{slam.path} has poses of {len(slam.indices)} of {len(files.images)} images, the training frames, "
                 f"and {files.folder} no pose.txt for the others",
-                "a pose for every picture",
+                "a pose for every image",
                 "Put the sequence's pose.txt of C3VD's release there",
             )
         camera_to_world = from_file @ file.camera_to_world
-        camera_to_world[slam.pictures] = slam.params.camera_to_world
-    return Placement(camera_to_world, np.eye(4), from_file, {**facts, "world": "first camera, as mapped"})
+        camera_to_world[slam.indices] = slam.params.camera_to_world
+    return SequencePoses(camera_to_world, np.eye(4), from_file, {**facts, "world": "first camera, as mapped"})
 
 
-def _lay_beside(path: Path, params: EndoGslamParams, files: PreparedFiles, file: Poses | None) -> _Slam:
+def _align_slam(path: Path, params: EndoGslamParams, files: PreparedFiles, file: Poses | None) -> _Slam:
     count, poses = len(files.images), len(params.camera_to_world)
-    pictures = image_indices(poses, count)
-    if pictures is None:
+    indices = image_indices(poses, count)
+    if indices is None:
         raise InputError(
-            f"{path} has {poses} poses for {count} pictures in {files.folder}",
-            f"{count} (one for every picture) or {count - count // 8} (all but 7, 15, 23, ...)",
-            "Give the params.npz of this sequence, run on all of its pictures",
+            f"{path} has {poses} poses for {count} images in {files.folder}",
+            f"{count} (one for every image) or {count - count // 8} (all but 7, 15, 23, ...)",
+            "Give the params.npz of this sequence, run on all of its images",
         )
     compared = None
     if file is not None:
-        true = _inverse(file.camera_to_world[0]) @ file.camera_to_world[pictures]
-        compared = _compared(path, params.true_camera_to_world, true, pictures, files.poses)
-    from_true = _fitted(params.true_camera_to_world, params.camera_to_world)
-    placed = from_true @ params.true_camera_to_world
-    errors = np.linalg.norm(placed[:, :3, 3] - params.camera_to_world[:, :3, 3], axis=1)
-    turns = _angles(placed, params.camera_to_world)
-    ate, spread = float(np.sqrt(np.mean(errors**2))), float(placed[:, :3, 3].std(axis=0).max())
+        true = _inverse(file.camera_to_world[0]) @ file.camera_to_world[indices]
+        compared = _compared(path, params.true_camera_to_world, true, indices, files.poses)
+    from_true = _rigid_alignment(params.true_camera_to_world, params.camera_to_world)
+    aligned = from_true @ params.true_camera_to_world
+    errors = np.linalg.norm(aligned[:, :3, 3] - params.camera_to_world[:, :3, 3], axis=1)
+    angles = _angles(aligned, params.camera_to_world)
+    ate, spread = float(np.sqrt(np.mean(errors**2))), float(aligned[:, :3, 3].std(axis=0).max())
     if ate > LOST * spread:
         log.warning(
-            "%s: EndoGSLAM's cameras are %.3g mm (RMS) from the true ones, which spread over %.3g mm: it lost its way, "
-            "or was stopped early",
+            "%s: EndoGSLAM's cameras are %.3g mm (RMS) from the true ones, which spread over %.3g mm: tracking failed "
+            "or stopped early",
             path,
             ate,
             spread,
@@ -160,42 +160,44 @@ def _lay_beside(path: Path, params: EndoGslamParams, files: PreparedFiles, file:
         "compared_with_pose_file": compared,
         "ate_rmse_mm": ate,
         "ate_max_mm": float(errors.max()),
-        "mean_rotation_error_deg": float(turns.mean()),
+        "mean_rotation_error_deg": float(angles.mean()),
     }
-    return _Slam(params, path, pictures, from_true, facts)
+    return _Slam(params, path, indices, from_true, facts)
 
 
 def _compared(
     path: Path,
     stored: Float[np.ndarray, "F 4 4"],
     true: Float[np.ndarray, "F 4 4"],
-    pictures: Int[np.ndarray, "F"],
+    indices: Int[np.ndarray, "F"],
     pose_file: Path | None,
 ) -> dict[str, float]:
-    """How far the true poses of a params.npz are from those of pose.txt."""
+    """Largest differences between the true poses of params.npz and pose.txt."""
     distances = np.linalg.norm(stored[:, :3, 3] - true[:, :3, 3], axis=1)
     angles = _angles(stored, true)
     worst = int(np.argmax(np.maximum(distances, angles)))
     if max(distances[worst], angles[worst]) > SAME_SEQUENCE:
         raise InputError(
-            f"{path}: the true pose of picture {pictures[worst]} is {distances[worst]:.3g} mm and "
+            f"{path}: the true pose of image {indices[worst]} is {distances[worst]:.3g} mm and "
             f"{angles[worst]:.3g} degrees from that of {pose_file}",
             f"both within {SAME_SEQUENCE:g}, both relative to the first camera",
-            "It is of another sequence, or of other pictures of it: give this sequence's params.npz",
+            "It belongs to another sequence or to other images: give this sequence's params.npz",
         )
     return {"largest_distance_mm": float(distances.max()), "largest_angle_deg": float(angles.max())}
 
 
-def _fitted(source: Float[np.ndarray, "F 4 4"], target: Float[np.ndarray, "F 4 4"]) -> Float[np.ndarray, "4 4"]:
-    """The rigid motion from one trajectory to another of the same frames: the mean turn, then the mean shift.
+def _rigid_alignment(
+    source: Float[np.ndarray, "F 4 4"], target: Float[np.ndarray, "F 4 4"]
+) -> Float[np.ndarray, "4 4"]:
+    """Rigid alignment of two trajectories of the same frames: mean relative rotation, then mean translation.
 
-    The turn comes from the cameras' orientations and not from their places, because a colonoscope's path is nearly a
-    straight line, about which places leave it free.
+    The rotation is estimated from orientations, since a colonoscope's path is nearly a straight line, and positions
+    leave the rotation about it undetermined.
     """
-    turns = target[:, :3, :3] @ source[:, :3, :3].transpose(0, 2, 1)
-    rotation = Rotation.from_matrix(turns).mean().as_matrix()
-    shift = (target[:, :3, 3] - source[:, :3, 3] @ rotation.T).mean(axis=0)
-    return rigid(rotation[None], shift[None])[0]
+    rotations = target[:, :3, :3] @ source[:, :3, :3].transpose(0, 2, 1)
+    rotation = Rotation.from_matrix(rotations).mean().as_matrix()
+    translation = (target[:, :3, 3] - source[:, :3, 3] @ rotation.T).mean(axis=0)
+    return rigid(rotation[None], translation[None])[0]
 
 
 def _angles(first: Float[np.ndarray, "F 4 4"], second: Float[np.ndarray, "F 4 4"]) -> Float[np.ndarray, "F"]:

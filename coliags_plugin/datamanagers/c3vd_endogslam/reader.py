@@ -1,4 +1,4 @@
-"""C3VD as EndoGSLAM prepared it, with the poses and the map EndoGSLAM found; and PR-Endo's release of both."""
+"""Data manager for C3VD as prepared by EndoGSLAM, with EndoGSLAM's poses and map; also PR-Endo's release."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from coliags_plugin.datamanagers.c3vd_endogslam.files import (
     recognise,
     scene_folder,
 )
-from coliags_plugin.datamanagers.c3vd_endogslam.poses import Placement, PoseSource, place_sequence
+from coliags_plugin.datamanagers.c3vd_endogslam.poses import PoseSource, SequencePoses, load_poses
 from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH, DepthFormat, DepthSteps
 from coliags_plugin.datamanagers.reading.images import bits_of, size_of
 from coliags_plugin.datamanagers.reading.ply_vertices import read_vertices
@@ -29,17 +29,17 @@ from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, check_pose_count
 from coliags_plugin.datamanagers.rectification import ASPECT_TOLERANCE, Rectification
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
-from coliags_plugin.datamanagers.seen import ROTATION, seen_marks
+from coliags_plugin.datamanagers.seen import ROTATION, find_seen_masks
 from coliags_plugin.datamanagers.splits import Split
 from coliags_plugin.poses.c3vd import read_poses
 from coliags_plugin.poses.endogslam import EndoGslamParams, read_params
 
-#: K of the prepared pictures, half of the calibration behind them (docs/layouts/c3vd.md 2), as EndoGSLAM has it, which
-#: counts pixel centres at integers: hence + 0.5.
+#: K of the prepared images, half of the calibration behind them (docs/layouts/c3vd.md 2), as EndoGSLAM has it, with
+#: pixel centres at integers: hence + 0.5.
 PREPARED_PINHOLE = Intrinsics(401.1595, 400.9425, 334.1430 + 0.5, 273.8665 + 0.5, 675, 540)
-#: EndoGSLAM's 8-bit depth: 2.55 steps a mm, cut off below; the last step is where C3VD's range ends.
+#: EndoGSLAM's 8-bit depth: 2.55 steps per mm, rounded down; 255 is the end of C3VD's range.
 PREPARED_DEPTH = DepthSteps(100.0 / 255.0, 8, 255)
-#: How far a principal point may be from the middle, as a share of the picture; prepared pictures have 0.7 %.
+#: How far a principal point may be from the middle, as a share of the image; prepared images have 0.7 %.
 MIDDLE_TOLERANCE = 0.1
 #: Value of the first spherical harmonic: the colour of a 3DGS PLY is this times f_dc, plus a half.
 SH0 = 0.28209479177387814
@@ -50,29 +50,31 @@ class C3VDEndoGSLAMSettings(SceneSettings):
 
     poses: PoseSource = Field(
         "slam",
-        description="'slam': those EndoGSLAM found; 'ground-truth': those of the data set.",
+        description="'slam': EndoGSLAM's estimated poses; 'ground-truth': the dataset's.",
     )
     params_file: str | None = Field(
         None,
         description="EndoGSLAM's params.npz, relative to the scene folder or absolute. None: params.npz in the scene "
         "folder, or where PR-Endo's release has it.",
     )
-    split: Split = Field("endogslam", description="As for all data; EndoGSLAM and PR-Endo test on 7, 15, 23, ...")
-    initial_points: InitialPoints = Field("data", description="As for all data; the map that EndoGSLAM found.")
+    split: Split = Field(
+        "endogslam", description="As for all data managers; EndoGSLAM and PR-Endo test on 7, 15, 23, ..."
+    )
+    initial_points: InitialPoints = Field("data", description="As for all data managers; 'data' is EndoGSLAM's map.")
 
 
 class C3VDEndoGSLAMDataManager(RecordedDataManager):
     """Reads C3VD with EndoGSLAM's poses and map: EndoGSLAM's own folders, or PR-Endo's release.
 
     See docs/layouts/c3vd-endogslam.md. A sub-folder ``rotation``, with its own pose.txt, becomes the test set of that
-    name; ``rotation/seen`` and ``truth/seen`` mark what training frames see: those of :attr:`seen_split`.
+    name; ``rotation/seen`` and ``truth/seen`` hold the seen masks for :attr:`seen_split`.
     """
 
     Settings = C3VDEndoGSLAMSettings
 
     settings: C3VDEndoGSLAMSettings
     name = "c3vd-endogslam"
-    #: EndoGSLAM and PR-Endo publish at the prepared pictures' own size.
+    #: EndoGSLAM and PR-Endo publish at the stored size.
     fits = None
     seen_split = "endogslam"
 
@@ -86,22 +88,22 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
         folder = scene_folder(path)
         files = find_sequence(folder, self.settings.params_file)
         params = None if files.params is None else read_params(files.params)
-        placement = place_sequence(files, params, self.settings.poses)
+        poses = load_poses(files, params, self.settings.poses)
         rectification = self._rectification(files, params)
         depth_format = _depth_format(files)
         facts: dict[str, Any] = {
             "layout": "endogslam" if files.cloud is None else "pr-endo",
             "scene": folder.name,
-            **placement.facts,
+            **poses.facts,
             "intrinsics_from": "EndoGSLAM's table" if files.params is None else str(files.params),
             "depth_step_mm": None if depth_format is None else depth_format.size,
             **rectification.facts(),
         }
-        seen = seen_marks(folder / "truth", len(files.images))
-        shots = _shots(files, rectification, placement.camera_to_world, depth_format, seen)
+        seen = find_seen_masks(folder / "truth", len(files.images))
+        shots = _shots(files, rectification, poses.camera_to_world, depth_format, seen)
         test_sets = {}
         if (folder / ROTATION).is_dir():
-            test_sets[ROTATION] = self._rotation(folder / ROTATION, rectification, placement)
+            test_sets[ROTATION] = self._rotation(folder / ROTATION, rectification, poses)
         points_source = files.cloud or (files.params if params is not None and len(params.means) else None)
         return Recording(
             kind=f"{facts['layout']} layout, {self.settings.poses} poses",
@@ -109,7 +111,7 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
             facts=facts,
             fingerprint=files.fingerprint(),
             test_sets=test_sets,
-            own_points=None if points_source is None else lambda: _map_points(files.cloud, params, placement),
+            own_points=None if points_source is None else lambda: _map_points(files.cloud, params, poses),
             points_source=points_source or folder / PARAMS,
         )
 
@@ -122,32 +124,32 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
             raise InputError(
                 f"{files.images[0]} is {width} x {height}, but {described_by} is for "
                 f"{calibrated.width} x {calibrated.height}",
-                "pictures of that size, or scaled from it",
-                "Give the params.npz that was made from these pictures",
+                "images of that size, or scaled from it",
+                "Give the params.npz that was made from these images",
             )
         pinhole = calibrated.resized(width, height)
         off_middle = max(abs(pinhole.cx / width - 0.5), abs(pinhole.cy / height - 0.5))
         if off_middle > MIDDLE_TOLERANCE:
             raise InputError(
                 f"{described_by}: the principal point ({pinhole.cx:g}, {pinhole.cy:g}) is {100 * off_middle:.0f} % of "
-                f"the picture ({width} x {height}) from its middle",
+                f"the image ({width} x {height}) from its middle",
                 "intrinsics of the size that org_width and org_height say",
-                "They are of another resolution: mend org_width and org_height, or the intrinsics",
+                "They are of another resolution: correct org_width and org_height, or the intrinsics",
             )
         return Rectification.of_pinhole(pinhole, files.images[0], self.working_size(width, height))
 
-    def _rotation(self, folder: Path, rectification: Rectification, placement: Placement) -> list[Shot]:
+    def _rotation(self, folder: Path, rectification: Rectification, poses: SequencePoses) -> list[Shot]:
         files = find_sequence(folder, None)
-        if files.poses is None or placement.from_file is None:
+        if files.poses is None or poses.from_file is None:
             raise InputError(
-                f"{folder} has pictures, but {'the scene' if files.poses else 'it'} has no pose.txt",
+                f"{folder} has images, but {'the scene' if files.poses else 'it'} has no pose.txt",
                 "pose.txt of the scene and of its rotation views, in one world",
                 f"Add it, or move {folder.name} away",
             )
-        poses = read_poses(files.poses).camera_to_world
-        check_pose_count(files.poses, len(poses), len(files.images))
-        seen = seen_marks(folder, len(files.images))
-        return _shots(files, rectification, placement.from_file @ poses, _depth_format(files), seen, f"{ROTATION}-")
+        rotation = read_poses(files.poses).camera_to_world
+        check_pose_count(files.poses, len(rotation), len(files.images))
+        seen = find_seen_masks(folder, len(files.images))
+        return _shots(files, rectification, poses.from_file @ rotation, _depth_format(files), seen, f"{ROTATION}-")
 
 
 def _shots(
@@ -166,14 +168,14 @@ def _shots(
 
 
 def _depth_format(files: PreparedFiles) -> DepthSteps | None:
-    """8 bits as EndoGSLAM's script leaves them, or C3VD's own 16; the first file tells, and all must be alike."""
+    """EndoGSLAM's 8-bit or C3VD's 16-bit format, by the first file; all files must have the same."""
     if files.depths is None:
         return None
     return PREPARED_DEPTH if bits_of(files.depths[0]) == PREPARED_DEPTH.bits else C3VD_DEPTH
 
 
-def _map_points(cloud: Path | None, params: EndoGslamParams | None, placement: Placement) -> PointCloud:
-    """The map's points in the world of the poses."""
+def _map_points(cloud: Path | None, params: EndoGslamParams | None, poses: SequencePoses) -> PointCloud:
+    """Points of EndoGSLAM's map in the world of the poses."""
     if cloud is not None:
         names = tuple(f"f_dc_{channel}" for channel in range(3))
         vertices = read_vertices(cloud, ("x", "y", "z", *names))
@@ -182,8 +184,8 @@ def _map_points(cloud: Path | None, params: EndoGslamParams | None, placement: P
     elif params is not None:
         positions, shares = params.means, params.rgb_colors
     else:
-        raise TypeError("points of a map that is not there")
+        raise TypeError("there is no map to take points from")
     colors = np.rint(255.0 * np.clip(np.nan_to_num(shares), 0.0, 1.0)).astype(np.uint8)
-    if placement.from_slam is not None:
-        positions = positions @ placement.from_slam[:3, :3].T + placement.from_slam[:3, 3]
+    if poses.from_slam is not None:
+        positions = positions @ poses.from_slam[:3, :3].T + poses.from_slam[:3, 3]
     return PointCloud(torch.from_numpy(positions.astype(np.float32)), torch.from_numpy(colors))

@@ -1,4 +1,4 @@
-"""Writing C3VD as EndoGSLAM prepares it, and EndoGSLAM's and 3DGS's results (docs/layouts/c3vd-endogslam.md)."""
+"""Writes C3VD in EndoGSLAM's layout, with EndoGSLAM's and 3DGS's results (docs/layouts/c3vd-endogslam.md)."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _SIZE = 0.3
 
 
 def write_frame(folder: Path, index: int, image: UInt8[np.ndarray, "H W 3"], z_depth: Float[np.ndarray, "H W"]) -> None:
-    """Write a picture and its depth, in 8 bits, cut off below as EndoGSLAM's script does it.
+    """Write an image and its depth in 8 bits, rounded down like EndoGSLAM's script.
 
     Args:
-        folder: Of the sequence.
-        index: Of the frame, counted from 0.
+        folder: Folder of the sequence.
+        index: Index of the frame, from 0.
         image: RGB. [H, W, 3]
         z_depth: mm; 0 where unknown. [H, W]
     """
@@ -35,16 +35,16 @@ def write_frame(folder: Path, index: int, image: UInt8[np.ndarray, "H W 3"], z_d
 def write_params(
     path: Path, trajectory: Trajectory, positions: Float[np.ndarray, "N 3"], colors: UInt8[np.ndarray, "N 3"]
 ) -> Float[np.ndarray, "N 3"]:
-    """Write ``params.npz``: EndoGSLAM's result, had it found these poses and a round Gaussian at every point.
+    """Write ``params.npz`` like EndoGSLAM, with given poses and an isotropic Gaussian at every point.
 
     Args:
-        path: Where to.
-        trajectory: Poses, mm, with intrinsics; the first is EndoGSLAM's world.
-        positions: What becomes the map, world frame, mm. [N, 3]
+        path: The file.
+        trajectory: Poses, mm, with intrinsics; the first camera defines EndoGSLAM's world.
+        positions: Points of the map, world frame, mm. [N, 3]
         colors: RGB. [N, 3]
 
     Returns:
-        The map's points in its world, mm. [N, 3]
+        The map's points in EndoGSLAM's world, mm. [N, 3]
 
     Raises:
         InputError: The trajectory has no intrinsics, or the folder cannot be written.
@@ -68,10 +68,10 @@ def write_params(
 
 
 def write_gaussians(path: Path, positions: Float[np.ndarray, "N 3"], colors: UInt8[np.ndarray, "N 3"]) -> None:
-    """Write equal, round Gaussians as a PLY of 3D Gaussian splatting, of the lowest degree.
+    """Write isotropic Gaussians of equal size as a 3DGS PLY file of spherical-harmonics degree 0.
 
     Args:
-        path: Where to.
+        path: The file.
         positions: Means, in the world of ``params.npz``, mm. [N, 3]
         colors: RGB. [N, 3]
     """

@@ -1,1 +1,1 @@
-"""C3VDv2."""
+"""The C3VDv2 dataset."""

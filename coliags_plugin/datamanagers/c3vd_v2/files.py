@@ -1,4 +1,4 @@
-"""Where the files of a C3VDv2 sequence are (docs/layouts/c3vd-v2.md 1)."""
+"""Finding the files of a C3VDv2 sequence (docs/layouts/c3vd-v2.md 1)."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from coliags_plugin.datamanagers.reading.frame_files import TIFF_SUFFIXES, inven
 from coliags_plugin.poses.c3vd import recognise as has_matrices
 
 LAYOUT = "rgb/NNNN.png and pose.txt, for registered videos also depth/NNNN_depth.tiff"
-#: Said to come with the release; where in it, and in what form, is not.
+#: Announced for the release; its location and format are not documented.
 INTRINSICS = "camera_intrinsics.txt"
 
 
 def recognise(folder: Path) -> str | None:
-    """What in the folder says that it is a C3VDv2 sequence; None where nothing does."""
+    """The files that identify a C3VDv2 sequence; None if the folder is none."""
     numbers = any(re.fullmatch(r"\d+", path.stem) for path in folder.glob("rgb/*.png"))
     if numbers and (folder / "pose.txt").is_file() and has_matrices(folder / "pose.txt"):
         return "pose.txt (16 numbers a line) beside rgb/NNNN.png"
@@ -24,23 +24,25 @@ def recognise(folder: Path) -> str | None:
 
 
 def find_sequence(folder: Path) -> SequenceFiles:
-    """Look at a folder. ``camera`` is the file of intrinsics in it, or up to two folders up; None where there is none.
+    """Find the files of a sequence; ``camera`` is the intrinsics file in it or up to two folders up, or None.
 
     Raises:
-        InputError: It is missing or holds something else, or its frames do not pair up.
+        InputError: The folder is missing or has another layout, or its files do not pair up.
     """
     if not folder.is_dir():
         raise InputError(f"no folder {folder}", f"a C3VDv2 sequence: {LAYOUT}", "Check the path")
     images = numbered(folder / "rgb", "", frozenset({".png"})) if (folder / "rgb").is_dir() else {}
     if not images:
-        place = folder / "rgb" if (folder / "rgb").is_dir() else folder
+        searched = folder / "rgb" if (folder / "rgb").is_dir() else folder
         raise InputError(
-            f"{place} holds {inventory(place)}", LAYOUT, "Name the sequence's own folder, for instance c1_cecum_t1_v1"
+            f"{searched} holds {inventory(searched)}",
+            LAYOUT,
+            "Name the sequence's own folder, for instance c1_cecum_t1_v1",
         )
     poses = folder / "pose.txt"
     if not poses.is_file():
-        raise InputError(f"{folder} has pictures but no pose.txt", LAYOUT, "Add pose.txt")
+        raise InputError(f"{folder} has images but no pose.txt", LAYOUT, "Add pose.txt")
     depths = numbered(folder / "depth", "depth", TIFF_SUFFIXES) if (folder / "depth").is_dir() else {}
     here = folder.resolve()
-    camera = next((place / INTRINSICS for place in (here, *here.parents[:2]) if (place / INTRINSICS).is_file()), None)
+    camera = next((path / INTRINSICS for path in (here, *here.parents[:2]) if (path / INTRINSICS).is_file()), None)
     return SequenceFiles("c3vd-v2", folder, *paired(folder, images, depths), poses, camera)

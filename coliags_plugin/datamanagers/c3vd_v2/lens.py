@@ -1,4 +1,4 @@
-"""The lens of C3VDv2: a candidate calibration, and the file that may say the true one."""
+"""Lens calibrations of C3VDv2: an unverified candidate, and reading of ``camera_intrinsics.txt``."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CANDIDATE_LENS = OmnidirectionalLens(
     e=0.0,
 )
 
-#: The order in which C3VD's page lists the model's numbers.
+#: Order of the model's parameters on C3VD's page.
 ORDER = ("width", "height", "cx", "cy", "a0", "a1", "a2", "a3", "a4", "c", "d", "e")
 _NEEDED = frozenset({"cx", "cy", "a0", "a2", "a3", "a4"})
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
@@ -35,15 +35,14 @@ _NAMED = re.compile(rf"([A-Za-z]\w*)[\"']?\s*[:=\s]\s*({_NUMBER.pattern})")
 
 
 def read_camera_intrinsics(path: Path) -> OmnidirectionalLens:
-    """The lens that a ``camera_intrinsics.txt`` describes.
+    """Read a ``camera_intrinsics.txt``.
 
-    The file's form is not published. Two are taken for unmistakable: every number with its name (``cx = 677.7``), or
-    twelve bare numbers in the order of C3VD's page, :data:`ORDER`, or its last ten (size 1350 x 1080). Either way the
-    centre must lie near the middle and the focal length be that of a wide lens. Its pixel centres are at integers, as
-    C3VD's.
+    The file's format is not published. Two unambiguous ones are accepted: named numbers (``cx = 677.7``), or twelve
+    bare numbers in the order of C3VD's page, :data:`ORDER`, or its last ten (size 1350 x 1080). The centre must be near
+    the middle, and the focal length that of a wide-angle lens. Its pixel centres are at integers, as C3VD's.
 
     Raises:
-        InputError: It cannot be read as either, or its numbers are those of no such lens.
+        InputError: The file has neither format, or its values are implausible.
     """
     text = "\n".join(line.split("#")[0] for line in read_text(path, "a text file of intrinsics").splitlines())
     named, bare = _NAMED.findall(text), _bare(text)
@@ -65,7 +64,7 @@ def read_camera_intrinsics(path: Path) -> OmnidirectionalLens:
 
 
 def _bare(text: str) -> list[float] | None:
-    """The numbers of a text that holds nothing else."""
+    """Numbers of a text; None if it holds anything else."""
     words = [word for word in re.split(r"[,;\s\[\]()]+", text) if word]
     return [float(word) for word in words] if all(_NUMBER.fullmatch(word) for word in words) else None
 
@@ -86,12 +85,12 @@ def _by_name(path: Path, pairs: list[tuple[str, float]]) -> dict[str, float]:
 
 
 def _doubt(values: dict[str, float], width: float, height: float) -> str:
-    """What makes numbers those of no omnidirectional colonoscope, or nothing."""
+    """Reason why a calibration is implausible for an omnidirectional colonoscope, or an empty string."""
     if not all(map(math.isfinite, (*values.values(), width, height))) or min(width, height) < 1.0:
-        return f"a picture of {width:g} x {height:g}, or numbers that are not finite"
+        return f"an image of {width:g} x {height:g}, or numbers that are not finite"
     off_middle = max(abs(values["cx"] / width - 0.5), abs(values["cy"] / height - 0.5))
     doubts = {
-        f"a picture of {width:g} x {height:g} pixels": width != round(width) or height != round(height),
+        f"an image of {width:g} x {height:g} pixels": width != round(width) or height != round(height),
         f"a centre ({values['cx']:g}, {values['cy']:g}) far from the middle of {width:g} x {height:g}": off_middle
         > 0.1,
         f"a focal length a0 = {values['a0']:g} for {width:g} pixels": not 0.2 < values["a0"] / width < 2.0,
@@ -106,7 +105,7 @@ def _doubt(values: dict[str, float], width: float, height: float) -> str:
 
 def _unclear(path: Path, seen: str) -> InputError:
     return InputError(
-        f"{path} cannot be told for sure: {seen}",
+        f"{path} is ambiguous or implausible: {seen}",
         f"each number with its name ({', '.join(ORDER)}), or the {len(ORDER)} numbers alone in that order",
-        "Rewrite it so, or set lens: v2 (an unverified candidate) or lens: v1 (C3VD's own)",
+        "Rewrite it in this format, or set lens: v2 (an unverified candidate) or lens: v1 (C3VD's own)",
     )

@@ -1,4 +1,4 @@
-"""C3VDv2: C3VD's successor, with debris, deformation and more phantoms (doi 10.7281/T1/JC64MK)."""
+"""Data manager for C3VDv2, with debris, deformation and more phantoms than C3VD (doi 10.7281/T1/JC64MK)."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ class C3VDv2Settings(SceneSettings):
 
     lens: Literal["file", "v2", "v1"] = Field(
         "file",
-        description="How frames are undistorted: 'file': as camera_intrinsics.txt says, or as 'v2' where there is "
-        "none; 'v2': a candidate calibration, unverified (docs/layouts/c3vd-v2.md 2); 'v1': C3VD's omnidirectional.",
+        description="Lens calibration: 'file': from camera_intrinsics.txt, or 'v2' if it is missing; 'v2': a candidate "
+        "calibration, unverified (docs/layouts/c3vd-v2.md 2); 'v1': C3VD's omnidirectional.",
     )
-    mask: bool = Field(True, description="Ignore what lies outside the octagon of the frames.")
+    mask: bool = Field(True, description="Ignore pixels outside the octagon of the frames.")
 
 
 class C3VDv2DataManager(SequenceDataManager):
     """Reads a C3VDv2 sequence; see docs/layouts/c3vd-v2.md.
 
-    Registered videos have depth; deformation and screening videos have pictures and poses only.
+    Registered videos have depth; deformation and screening videos have images and poses only.
     """
 
     Settings = C3VDv2Settings
@@ -63,7 +63,7 @@ class C3VDv2DataManager(SequenceDataManager):
         return self.octagon_rectification(lens, files.images[0], settings.mask), facts
 
     def _lens(self, files: SequenceFiles) -> tuple[Lens, str]:
-        """The lens, and where its numbers come from."""
+        """The lens and the source of its calibration."""
         if self.settings.lens == "v1":
             return LENSES["omnidirectional"], "C3VD's omnidirectional calibration"
         if self.settings.lens == "file" and files.camera is not None:

@@ -1,4 +1,4 @@
-"""Writing C3VDv2's layout (docs/layouts/c3vd-v2.md 1); its poses are C3VD's."""
+"""Writes C3VDv2's layout (docs/layouts/c3vd-v2.md 1); its poses are in C3VD's format."""
 
 from __future__ import annotations
 
@@ -29,6 +29,6 @@ def write_frame(
 
 
 def write_lens(folder: Path, lens: OmnidirectionalLens) -> None:
-    """Write ``camera_intrinsics.txt``: the calibration, every number with its name, pixel centres at integers."""
+    """Write the calibration as named numbers to ``camera_intrinsics.txt``, pixel centres at integers."""
     values = {"a1": 0.0, **vars(lens), "cx": lens.cx - 0.5, "cy": lens.cy - 0.5}
     atomic_write(folder / INTRINSICS, "".join(f"{name} = {values[name]!r}\n" for name in ORDER))

@@ -1,1 +1,1 @@
-"""COLMAP models and their pictures."""
+"""COLMAP models and their images."""

@@ -1,7 +1,7 @@
-"""Whether the binary files of a COLMAP model are whole.
+"""Checks the length of the binary files of a COLMAP model.
 
-COLMAP's own reader believes every count in them: a file cut short makes it run away or take the whole process down
-(pycolmap 4.2.1), which could not be turned into a message. So lengths are checked before it is let in.
+COLMAP's reader trusts every count in them: a truncated file makes it hang or crash the process (pycolmap 4.2.1), which
+cannot be turned into an error message. So lengths are checked first.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ _POSE = 7 * 8
 _SENSOR = 8
 
 
-class _Walk:
-    """Goes through a file without looking at more than its counts."""
+class _Cursor:
+    """Position in a binary file, advanced past its records by reading only their counts."""
 
     def __init__(self, data: bytes) -> None:
         self.data, self.at = data, 0
@@ -36,25 +36,25 @@ class _Walk:
         self.at = self.data.index(b"\0", self.at) + 1
 
 
-def check_whole(folder: Path) -> None:
-    """Refuse a binary model with a file that is cut short or longer than it says.
+def check_complete(folder: Path) -> None:
+    """Refuse a binary model with a file that is shorter or longer than its counts require.
 
     Raises:
-        InputError: Naming the file.
+        InputError: A file is damaged; the message names it.
     """
-    for name, walk_one in _FILES.items():
+    for name, skip_record in _FILES.items():
         path = folder / f"{name}.bin"
         if not path.is_file():
             continue
         try:
-            walk = _Walk(path.read_bytes())
-            for _ in range(walk.number("<Q")):
-                walk_one(walk)
+            cursor = _Cursor(path.read_bytes())
+            for _ in range(cursor.number("<Q")):
+                skip_record(cursor)
         except OSError as error:
             raise InputError(f"cannot read {path}: {error.strerror or error}", "a file of a COLMAP model") from error
         except ValueError as error:
             raise _damaged(path) from error
-        if walk.at != len(walk.data):
+        if cursor.at != len(cursor.data):
             raise _damaged(path)
 
 
@@ -63,43 +63,43 @@ def _damaged(path: Path) -> InputError:
     return InputError(f"{path} ({size} bytes) is damaged or cut short", "a file written by COLMAP", "Copy it again")
 
 
-def _camera(walk: _Walk) -> None:
+def _camera(cursor: _Cursor) -> None:
     import pycolmap
 
-    walk.skip(4)
-    model = walk.number("<i")
-    walk.skip(2 * 8)
-    walk.skip(8 * len(pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 1, 1).params))
+    cursor.skip(4)
+    model = cursor.number("<i")
+    cursor.skip(2 * 8)
+    cursor.skip(8 * len(pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 1, 1).params))
 
 
-def _image(walk: _Walk) -> None:
-    walk.skip(4 + _POSE + 4)
-    walk.text()
-    walk.skip(24 * walk.number("<Q"))
+def _image(cursor: _Cursor) -> None:
+    cursor.skip(4 + _POSE + 4)
+    cursor.text()
+    cursor.skip(24 * cursor.number("<Q"))
 
 
-def _point(walk: _Walk) -> None:
-    walk.skip(8 + 3 * 8 + 3 + 8)
-    walk.skip(8 * walk.number("<Q"))
+def _point(cursor: _Cursor) -> None:
+    cursor.skip(8 + 3 * 8 + 3 + 8)
+    cursor.skip(8 * cursor.number("<Q"))
 
 
-def _rig(walk: _Walk) -> None:
-    walk.skip(4)
-    sensors = walk.number("<I")
+def _rig(cursor: _Cursor) -> None:
+    cursor.skip(4)
+    sensors = cursor.number("<I")
     if sensors:
-        walk.skip(_SENSOR)
+        cursor.skip(_SENSOR)
     for _ in range(sensors - 1):
-        walk.skip(_SENSOR)
-        if walk.number("<B"):
-            walk.skip(_POSE)
+        cursor.skip(_SENSOR)
+        if cursor.number("<B"):
+            cursor.skip(_POSE)
 
 
-def _frame(walk: _Walk) -> None:
-    walk.skip(4 + 4 + _POSE)
-    walk.skip((_SENSOR + 8) * walk.number("<I"))
+def _frame(cursor: _Cursor) -> None:
+    cursor.skip(4 + 4 + _POSE)
+    cursor.skip((_SENSOR + 8) * cursor.number("<I"))
 
 
-_FILES: dict[str, Callable[[_Walk], None]] = {
+_FILES: dict[str, Callable[[_Cursor], None]] = {
     "cameras": _camera,
     "images": _image,
     "points3D": _point,

@@ -11,30 +11,30 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.datamanagers.colmap.binary import check_whole
+from coliags_plugin.datamanagers.colmap.binary import check_complete
 from coliags_plugin.datamanagers.colmap.lens import ColmapLens
 from coliags_plugin.poses import colmap as colmap_poses
 
 if TYPE_CHECKING:
     import pycolmap
 
-#: Where a model may lie in a scene; the numbered ones of a folder come before the folder itself.
-_PLACES = ("sparse", "colmap/sparse", ".")
+#: Folders that may hold a model; numbered sub-folders come before the folder itself.
+_MODEL_FOLDERS = ("sparse", "colmap/sparse", ".")
 _SUFFIXES = (".bin", ".txt")
 _PARTS = ("cameras", "images", "points3D")
-#: A whole turn at once: no part of it is a pinhole picture.
-_NO_PICTURE = frozenset({"EQUIRECTANGULAR"})
+#: Panoramic camera models, which cannot be undistorted to a pinhole image.
+_PANORAMIC = frozenset({"EQUIRECTANGULAR"})
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
-    """A registered picture.
+class RegisteredImage:
+    """A registered image and its observations.
 
     Attributes:
-        name: As COLMAP knows it: a path within the folder of pictures.
-        camera: Which of the model's cameras took it.
-        observed: Where points were seen, pixels, centres at integers + 0.5. [K, 2]
-        points: Which points: rows of :attr:`Model.positions`. [K]
+        name: Path relative to the folder of images.
+        camera: COLMAP's camera ID.
+        observed: Observed keypoints, pixels, centres at integers + 0.5. [K, 2]
+        points: Their points: rows of :attr:`Model.positions`. [K]
     """
 
     name: str
@@ -45,22 +45,22 @@ class Picture:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A sparse model, in its own world and unit.
+    """A sparse model, in its own world frame and unit.
 
     Attributes:
-        folder: Where it lies.
+        folder: Folder of the model.
         files: Its files.
-        pictures: In the order of their names, 2 before 10.
-        camera_to_world: Of each of them, OpenCV axes. [N, 4, 4]
-        cameras: By COLMAP's number.
-        positions: The sparse points. [P, 3]
+        images: Registered images in natural order of their names, 2 before 10.
+        camera_to_world: Their poses, OpenCV axes. [N, 4, 4]
+        cameras: Cameras by COLMAP's ID.
+        positions: Sparse points. [P, 3]
         colors: Their colours, RGB. [P, 3]
-        track_lengths: In how many pictures each was seen. [P]
+        track_lengths: Number of observations of each point. [P]
     """
 
     folder: Path
     files: tuple[Path, ...]
-    pictures: Sequence[Picture]
+    images: Sequence[RegisteredImage]
     camera_to_world: Float[np.ndarray, "N 4 4"]
     cameras: Mapping[int, ColmapLens]
     positions: Float[np.ndarray, "P 3"]
@@ -69,15 +69,15 @@ class Model:
 
     @property
     def cameras_file(self) -> Path:
-        """What says how large the pictures are."""
+        """The file that holds the image sizes."""
         return self.files[0]
 
 
 def find_models(scene: Path) -> list[Path]:
-    """Folders with a model, in the first place of a scene that has any: ``sparse/0``, ``sparse/1``, ``sparse``, ..."""
-    for place in _PLACES:
-        parent = scene / place
-        numbered = [] if place == "." or not parent.is_dir() else [p for p in parent.iterdir() if p.name.isdecimal()]
+    """Model folders in the first parent folder that has any: ``sparse/0``, ``sparse/1``, ``sparse``, ..."""
+    for name in _MODEL_FOLDERS:
+        parent = scene / name
+        numbered = [] if name == "." or not parent.is_dir() else [p for p in parent.iterdir() if p.name.isdecimal()]
         candidates = [*sorted(numbered, key=lambda path: int(path.name)), parent]
         if found := [path for path in candidates if _suffix(path) is not None]:
             return found
@@ -85,11 +85,11 @@ def find_models(scene: Path) -> list[Path]:
 
 
 def read_model(folder: Path) -> Model:
-    """Read a model, binary or text (binary where both are there).
+    """Read a binary or text model; binary if both exist.
 
     Raises:
-        InputError: The folder holds none; a file is damaged; poses are not to be believed (see
-            :func:`coliags_plugin.poses.colmap.read`); or a camera cannot have taken a pinhole-like picture.
+        InputError: The folder holds none; a file is damaged; poses are invalid (see
+            :func:`coliags_plugin.poses.colmap.read`); or a camera cannot be undistorted to a pinhole.
     """
     suffix = _suffix(folder)
     if suffix is None:
@@ -99,7 +99,7 @@ def read_model(folder: Path) -> Model:
             "Give the model's folder with --set datamanager.model=FOLDER",
         )
     if suffix == ".bin":
-        check_whole(folder)
+        check_complete(folder)
     trajectory = colmap_poses.read(folder)
     files = tuple(folder / f"{part}{suffix}" for part in _PARTS)
 
@@ -109,35 +109,35 @@ def read_model(folder: Path) -> Model:
         model = pycolmap.Reconstruction()
         (model.read_binary if suffix == ".bin" else model.read_text)(str(folder))
     except (ValueError, IndexError, KeyError, RuntimeError, MemoryError) as error:
-        told = str(error).splitlines()[0].strip() if str(error).strip() else type(error).__name__
+        reason = str(error).splitlines()[0].strip() if str(error).strip() else type(error).__name__
         raise InputError(
-            f"{folder} cannot be read: {told}",
-            f"{', '.join(file.name for file in files)}, whole and of one model",
+            f"{folder} cannot be read: {reason}",
+            f"{', '.join(file.name for file in files)}, complete and of one model",
             "Copy all of them again",
         ) from error
 
     points = sorted(model.points3D.items())
     row = {number: index for index, (number, _) in enumerate(points)}
     by_name = {image.name: image for image in model.images.values()}
-    pictures = []
+    images = []
     for name in trajectory.names or ():
         image = by_name[name]
         seen = image.get_observation_points2D()
-        # COLMAP's own reader does not look whether points are there that pictures name.
+        # COLMAP's reader does not check that observed points exist.
         if gone := [point.point3D_id for point in seen if point.point3D_id not in row]:
             raise InputError(
-                f"{files[2]} has {len(row)} points, but none is {gone[0]}, which {name} shows",
-                "the points of the pictures' own model, all of them",
+                f"{files[2]} has {len(row)} points, but not {gone[0]}, which {name} observes",
+                "all points of the model",
                 f"{files[2].name} is cut short or of another model: copy it again",
             )
         observed = np.array([(point.x(), point.y()) for point in seen], np.float64).reshape(-1, 2)
         rows = np.array([row[point.point3D_id] for point in seen], np.int64)
-        pictures.append(Picture(name, image.camera_id, observed, rows))
-    used = sorted({picture.camera for picture in pictures})
+        images.append(RegisteredImage(name, image.camera_id, observed, rows))
+    used = sorted({image.camera for image in images})
     return Model(
         folder,
         files,
-        pictures,
+        images,
         trajectory.camera_to_world,
         {number: _lens(model.cameras[number], files[0]) for number in used},
         np.array([point.xyz for _, point in points], np.float64).reshape(-1, 3),
@@ -146,8 +146,8 @@ def read_model(folder: Path) -> Model:
     )
 
 
-def beside(folder: Path, name: str, suffixes: Sequence[str]) -> Path | None:
-    """The file that goes with a picture in another folder: ``name.jpg.png`` (COLMAP's own way) or ``name.png``."""
+def sidecar_file(folder: Path, name: str, suffixes: Sequence[str]) -> Path | None:
+    """The mask or depth file of an image: ``name.jpg.png``, as COLMAP names it, or ``name.png``; None if missing."""
     for suffix in suffixes:
         for path in (folder / f"{name}{suffix}", (folder / name).with_suffix(suffix)):
             if path.is_file():
@@ -164,11 +164,11 @@ def _suffix(folder: Path) -> str | None:
 
 def _lens(camera: pycolmap.Camera, file: Path) -> ColmapLens:
     name, params = camera.model_name, tuple(float(value) for value in camera.params)
-    if name in _NO_PICTURE:
+    if name in _PANORAMIC:
         raise InputError(
             f"{file}: camera {camera.camera_id} is {name}",
-            "a camera whose pictures can be undistorted to a pinhole's",
-            "Cut the panoramas into pinhole pictures first",
+            "a camera whose images can be undistorted to a pinhole's",
+            "Cut the panoramas into pinhole images first",
         )
     sizes = camera.width, camera.height, camera.focal_length_x, camera.focal_length_y
     if not np.all(np.isfinite(params)) or min(sizes) <= 0:

@@ -1,4 +1,4 @@
-"""COLMAP's camera models as lenses, with COLMAP's own arithmetic."""
+"""COLMAP's camera models as lenses, projected by pycolmap."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from coliags_plugin.lenses.tabulated import MappedLens
 if TYPE_CHECKING:
     import pycolmap
 
-#: Cameras that took pinhole pictures: nothing to undistort.
+#: Camera models without distortion.
 PINHOLES = frozenset({"SIMPLE_PINHOLE", "PINHOLE"})
 
 

@@ -1,4 +1,4 @@
-"""Pictures with a COLMAP sparse model: poses, cameras, points, and depth at those points."""
+"""Data manager for COLMAP sparse models: poses, cameras, points and sparse depth."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud, SparseDepth
-from coliags_plugin.datamanagers.colmap.files import Model, Picture, beside, find_models, read_model
+from coliags_plugin.datamanagers.colmap.files import Model, RegisteredImage, find_models, read_model, sidecar_file
 from coliags_plugin.datamanagers.colmap.lens import PINHOLES, ColmapLens
 from coliags_plugin.datamanagers.lens_rectification import LensRectification, undistorter
 from coliags_plugin.datamanagers.reading.depth_arrays import depth_format
-from coliags_plugin.datamanagers.reading.picture_names import first_few, others_beside, short_names, warn_of_others
+from coliags_plugin.datamanagers.reading.image_names import first_few, short_names, unposed_images, warn_of_unposed
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
 from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
-from coliags_plugin.datamanagers.seen import seen_marks
+from coliags_plugin.datamanagers.seen import find_seen_masks
 
 log = logging.getLogger(__name__)
 
@@ -33,39 +33,38 @@ class ColmapSettings(SceneSettings):
 
     initial_points: InitialPoints = Field(
         "data",
-        description="Initial points: 'data': the model's sparse points; 'depth': fused from depths/ where there is "
-        "one; 'file': points_file.",
+        description="Initial points: 'data': the model's sparse points; 'depth': fused from depths/ if present; "
+        "'file': points_file.",
     )
     model: str | None = Field(
         None,
         description="Folder of the sparse model, relative to the scene. None: sparse/0, sparse, colmap/sparse/0, "
-        "colmap/sparse or the scene's folder itself, whichever comes first.",
+        "colmap/sparse or the scene's folder itself, the first that exists.",
     )
-    images_folder: str = Field("images", description="Folder that the model's picture names are relative to.")
+    images_folder: str = Field("images", description="Folder that the model's image names are relative to.")
     scale: float = Field(
         1.0,
         gt=0.0,
-        description="Millimetres in the model's unit of length, which COLMAP leaves open. Poses, points and what "
-        "depends on them are multiplied by it.",
+        description="Millimetres per unit of the model, whose scale is arbitrary. Poses, points and sparse depth are "
+        "multiplied by it.",
     )
     max_reprojection_error: float = Field(
         2.0,
         gt=0.0,
-        description="A picture is given the depth of a point only where the point falls within so many pixels of the "
-        "stored picture of where it was seen.",
+        description="Largest reprojection error of an observation that gives sparse depth, pixels of the stored image.",
     )
     min_track_length: int = Field(
         3,
         ge=2,
-        description="Points seen in fewer pictures than this give no depth; they are initial points all the same.",
+        description="Least track length of points that give sparse depth; all points are initial points.",
     )
     depth_unit: float = Field(
-        1.0, gt=0.0, description="Millimetres that the number 1 in a file of depths/ stands for (after scale)."
+        1.0, gt=0.0, description="Millimetres per stored unit of the files in depths/ (after scale)."
     )
 
 
 class ColmapDataManager(RecordedDataManager):
-    """Reads pictures posed by COLMAP, or by anything that writes its sparse models (docs/layouts/colmap.md)."""
+    """Reads images with a COLMAP sparse model (docs/layouts/colmap.md)."""
 
     Settings = ColmapSettings
 
@@ -75,7 +74,7 @@ class ColmapDataManager(RecordedDataManager):
     @classmethod
     def recognise(cls, path: Path) -> str | None:
         """See :class:`DataManager`."""
-        # nerfstudio keeps the model it was made from; its own poses are in transforms.json.
+        # A nerfstudio scene may contain its COLMAP model, but its poses are in transforms.json.
         found = [] if (path / "transforms.json").is_file() else find_models(path)
         return f"a sparse model in {found[0].relative_to(path).as_posix()}" if found else None
 
@@ -85,25 +84,25 @@ class ColmapDataManager(RecordedDataManager):
         if not path.is_dir():
             raise InputError(f"no folder {path}", "a folder with images/ and sparse/0", "Check the path")
         model = read_model(self._model_folder(path))
-        images = _pictures_on_disk(path / settings.images_folder, model)
-        masks = [beside(path / "masks", picture.name, (".png",)) for picture in model.pictures]
+        paths = _image_paths(path / settings.images_folder, model)
+        masks = [sidecar_file(path / "masks", image.name, (".png",)) for image in model.images]
         depths = _depths(path / "depths", model)
         rectifications = self._rectifications(model)
-        names = short_names([picture.name for picture in model.pictures])
-        others = others_beside(images, (*masks, *depths))
-        warn_of_others(model.files[1], others)
-        seen = seen_marks(path / "truth", len(images), complete=not others)
+        names = short_names([image.name for image in model.images])
+        others = unposed_images(paths, (*masks, *depths))
+        warn_of_unposed(model.files[1], others)
+        seen = find_seen_masks(path / "truth", len(paths), complete=not others)
         shots, used = [], 0
-        for index, picture in enumerate(model.pictures):
+        for index, image in enumerate(model.images):
             camera_to_world = model.camera_to_world[index].copy()
             camera_to_world[:3, 3] *= settings.scale
-            rectification, depth = rectifications[picture.camera], depths[index]
-            sparse = self._sparse_depth(model, picture, camera_to_world, rectification)
+            rectification, depth = rectifications[image.camera], depths[index]
+            sparse = self._sparse_depth(model, image, camera_to_world, rectification)
             used += 0 if sparse is None else len(sparse.depth)
             shots.append(
                 Shot(
                     names[index],
-                    images[index],
+                    paths[index],
                     rectification,
                     camera_to_world,
                     depth,
@@ -123,7 +122,7 @@ class ColmapDataManager(RecordedDataManager):
             **next(iter(rectifications.values())).facts(),
             "scale": settings.scale,
             "sparse_points": len(model.positions),
-            "observations": sum(len(picture.points) for picture in model.pictures),
+            "observations": sum(len(image.points) for image in model.images),
             "sparse_depths": used,
             "masks": sum(mask is not None for mask in masks),
         }
@@ -131,7 +130,7 @@ class ColmapDataManager(RecordedDataManager):
             kind=f"COLMAP model {model.folder}, {len(model.positions)} points, cameras {', '.join(kinds)}",
             shots=shots,
             facts=facts,
-            fingerprint=fingerprint(path, [*images, *masks, *depths], model.files),
+            fingerprint=fingerprint(path, [*paths, *masks, *depths], model.files),
             own_points=(lambda: self._points(model)) if len(model.positions) else None,
             points_source=model.files[-1],
         )
@@ -164,21 +163,21 @@ class ColmapDataManager(RecordedDataManager):
         return {number: rectification(lens) for number, lens in model.cameras.items()}
 
     def _sparse_depth(
-        self, model: Model, picture: Picture, camera_to_world: np.ndarray, rectification: Rectification
+        self, model: Model, image: RegisteredImage, camera_to_world: np.ndarray, rectification: Rectification
     ) -> SparseDepth | None:
-        """Depth where the points project to, which many pictures agree on, not where this one picture saw them."""
-        settings, lens = self.settings, model.cameras[picture.camera]
-        points = model.positions[picture.points] * settings.scale
+        """z-depth of the image's points at their projections (not at the observed keypoints)."""
+        settings, lens = self.settings, model.cameras[image.camera]
+        points = model.positions[image.points] * settings.scale
         local = (points - camera_to_world[:3, 3]) @ camera_to_world[:3, :3]
         with np.errstate(divide="ignore", invalid="ignore"):
-            error = np.linalg.norm(lens.project(local) - picture.observed, axis=1)
+            error = np.linalg.norm(lens.project(local) - image.observed, axis=1)
             k = rectification.pinhole
             pixels = local[:, :2] / local[:, 2:] * (k.fx, k.fy) + (k.cx, k.cy)
             kept = (error <= settings.max_reprojection_error) & (local[:, 2] > 0.0)
             kept &= (pixels >= 0.0).all(axis=1) & (pixels[:, 0] < k.width) & (pixels[:, 1] < k.height)
-        kept &= model.track_lengths[picture.points] >= settings.min_track_length
-        # A point that was seen twice in one picture still has one depth there.
-        kept[kept] = _first_of_each(picture.points[kept])
+        kept &= model.track_lengths[image.points] >= settings.min_track_length
+        # One depth per point, even if the image observes it twice.
+        kept[kept] = _first_of_each(image.points[kept])
         if not kept.any():
             return None
         return SparseDepth(
@@ -196,33 +195,33 @@ def _first_of_each(numbers: np.ndarray) -> np.ndarray:
     return first
 
 
-def _pictures_on_disk(folder: Path, model: Model) -> list[Path]:
+def _image_paths(folder: Path, model: Model) -> list[Path]:
     if not folder.is_dir():
         raise InputError(
-            f"no folder {folder}", "the pictures that the model was made from", "Set datamanager.images_folder"
+            f"no folder {folder}", "the images that the model was made from", "Set datamanager.images_folder"
         )
-    paths = [folder / picture.name for picture in model.pictures]
+    paths = [folder / image.name for image in model.images]
     missing = [path for path in paths if not path.is_file()]
     if missing:
         named = first_few([path.name for path in missing])
         raise InputError(
-            f"{len(missing)} of the {len(paths)} pictures of {model.folder} are not in {folder}: {named}",
-            "every registered picture, under the name the model has for it",
+            f"{len(missing)} of the {len(paths)} images of {model.folder} are not in {folder}: {named}",
+            "every registered image, under the name the model has for it",
             "Restore them, or set datamanager.images_folder",
         )
     return paths
 
 
 def _depths(folder: Path, model: Model) -> list[Path | None]:
-    """Depth files of all pictures, or of none."""
+    """Depth files of all images, or of none."""
     if not folder.is_dir():
-        return [None] * len(model.pictures)
-    depths = [beside(folder, picture.name, _DEPTH_SUFFIXES) for picture in model.pictures]
-    missing = [picture.name for picture, depth in zip(model.pictures, depths, strict=True) if depth is None]
+        return [None] * len(model.images)
+    depths = [sidecar_file(folder, image.name, _DEPTH_SUFFIXES) for image in model.images]
+    missing = [image.name for image, depth in zip(model.images, depths, strict=True) if depth is None]
     if missing:
         raise InputError(
-            f"{folder} has no file for {len(missing)} of {len(depths)} pictures, the first of them {missing[0]}",
-            f"NAME{', NAME'.join(_DEPTH_SUFFIXES)} for every picture, or no such folder",
+            f"{folder} has no file for {len(missing)} of {len(depths)} images, the first of them {missing[0]}",
+            f"NAME{', NAME'.join(_DEPTH_SUFFIXES)} for every image, or no such folder",
             "Restore the missing files, or move the folder elsewhere",
         )
     return depths

@@ -1,4 +1,4 @@
-"""Writing COLMAP's layout: pictures, masks and a sparse model (docs/layouts/colmap.md)."""
+"""Writes COLMAP's layout: images, masks and a sparse model (docs/layouts/colmap.md)."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ if TYPE_CHECKING:
 
 
 class SeenPoints(NamedTuple):
-    """What one picture sees of a model's points.
+    """Observations of a model's points in one image.
 
     Attributes:
         pixels: Column and row, pixel centres at integers + 0.5. [K, 2]
-        points: Which points, counted from 0. [K]
+        points: Point indices, from 0. [K]
     """
 
     pixels: Float[np.ndarray, "K 2"]
     points: Int[np.ndarray, "K"]
 
 
-def write_picture(
+def write_image_and_mask(
     folder: Path, name: str, image: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"] | None = None
 ) -> None:
-    """Write a picture and, where there is one, its mask.
+    """Write an image and its optional mask.
 
     Args:
-        folder: Of the scene.
-        name: The picture's file name, ending in ``.png``.
+        folder: Folder of the scene.
+        name: The image's file name, ending in ``.png``.
         image: RGB. [H, W, 3]
         mask: True where a pixel counts. [H, W]
     """
@@ -51,14 +51,14 @@ def add_points(
     colors: UInt8[np.ndarray, "N 3"],
     errors: Float[np.ndarray, "N"] | None = None,
 ) -> None:
-    """Add points to a model of posed pictures; point k becomes COLMAP's k + 1.
+    """Add points to a model of posed images; point k gets COLMAP's ID k + 1.
 
     Args:
-        model: Whose image i + 1 is picture i.
-        seen: By each picture.
+        model: Model in which image i has ID i + 1.
+        seen: Observations of each image.
         positions: World, scene units. [N, 3]
         colors: RGB. [N, 3]
-        errors: Mean reprojection errors, pixels; None: to be computed. [N]
+        errors: Mean reprojection errors, pixels; None: computed. [N]
     """
     import pycolmap
 
@@ -80,6 +80,6 @@ def add_points(
 
 def write_model(folder: Path, model: pycolmap.Reconstruction) -> None:
     """Write a binary model into ``sparse/0`` of a scene's folder."""
-    place = folder / "sparse" / "0"
-    make_folder(place)
-    model.write_binary(str(place))
+    target = folder / "sparse" / "0"
+    make_folder(target)
+    model.write_binary(str(target))

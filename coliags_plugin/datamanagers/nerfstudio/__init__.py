@@ -1,1 +1,1 @@
-"""``transforms.json``."""
+"""nerfstudio's ``transforms.json`` format."""

@@ -1,4 +1,4 @@
-"""The cameras of a ``transforms.json`` (docs/layouts/nerfstudio.md 3)."""
+"""Reads the cameras of a ``transforms.json`` (docs/layouts/nerfstudio.md 3)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from coliags_plugin.lenses.pinhole import PinholeLens
 
 PixelCenters = Literal["half", "integer"]
 
-#: The models nerfstudio takes pictures with, and the distortion each may have; other terms must be 0 or absent.
+#: nerfstudio's camera models and their distortion parameters; others must be 0 or absent.
 _MODELS: Mapping[str, tuple[str, ...]] = {
     "OPENCV": ("k1", "k2", "k3", "p1", "p2"),
     "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
@@ -24,23 +24,23 @@ _BENDS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
 def camera_of(
-    values: Mapping[str, Any], place: str, pixel_centers: PixelCenters, picture_size: Callable[[], tuple[int, int]]
+    values: Mapping[str, Any], place: str, pixel_centers: PixelCenters, image_size: Callable[[], tuple[int, int]]
 ) -> Lens:
     """The camera of one frame: a :class:`PinholeLens` where its images need no undistortion.
 
     Args:
         values: Keys of the file, overlaid with those of the frame.
-        place: What to call the frame in a message.
+        place: Name of the frame in messages.
         pixel_centers: Where ``cx`` and ``cy`` count pixel centres.
-        picture_size: Width and height of the picture; asked only where the file does not say.
+        image_size: Returns width and height of the image; called only if the file has no size.
 
     Raises:
-        InputError: The model is unknown, or a value is missing, no number, or does not go with the model.
+        InputError: The model is unknown, or a value is missing, not a number, or not a parameter of the model.
     """
     model = values.get("camera_model") or ("OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")
     if model not in _MODELS:
         raise InputError(f"{place}: camera_model is {model}", f"one of {', '.join(_MODELS)}")
-    width, height = _size(values, place) if "w" in values or "h" in values else picture_size()
+    width, height = _size(values, place) if "w" in values or "h" in values else image_size()
     fx, fy = _focal_lengths(values, place, width, height)
     # Without a principal point the middle of the picture is meant, however pixels are counted.
     shift = 0.0 if pixel_centers == "half" else 0.5
@@ -54,7 +54,7 @@ def camera_of(
         raise InputError(
             f"{place}: {model} with {wrong[0]} = {bends[wrong[0]]:g}; {meaning}",
             f"{', '.join(_MODELS[model]) or 'no distortion'} alone",
-            "Undistort the pictures, or mend camera_model",
+            "Undistort the images, or correct camera_model",
         )
     if model == "OPENCV_FISHEYE":
         k1, k2, k3, k4 = (bends.get(key, 0.0) for key in _MODELS[model])
@@ -69,7 +69,7 @@ def number(values: Mapping[str, Any], key: str, place: str) -> float:
     """A finite number.
 
     Raises:
-        InputError: It is missing or something else.
+        InputError: It is missing or not a finite number.
     """
     value = values.get(key)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
@@ -85,7 +85,7 @@ def _size(values: Mapping[str, Any], place: str) -> tuple[int, int]:
 
 
 def _focal_lengths(values: Mapping[str, Any], place: str, width: int, height: int) -> tuple[float, float]:
-    """Across and down, pixels; one stands for both where one alone is known, as pixels are square then."""
+    """Horizontal and vertical focal length, pixels; equal if only one is given."""
     lengths: dict[str, float] = {}
     for axis, pixels in (("x", width), ("y", height)):
         if f"fl_{axis}" in values:

@@ -1,4 +1,4 @@
-"""What ``transforms.json`` says besides poses: files, cameras, a split (docs/layouts/nerfstudio.md)."""
+"""Reads files, cameras, points and split from ``transforms.json`` (docs/layouts/nerfstudio.md)."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import numpy as np
 
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.datamanagers.nerfstudio.cameras import PixelCenters, camera_of, number
+from coliags_plugin.datamanagers.reading.image_names import first_few
 from coliags_plugin.datamanagers.reading.images import size_of
-from coliags_plugin.datamanagers.reading.picture_names import first_few
 from coliags_plugin.lenses.models import Lens
 
 FILE = "transforms.json"
@@ -24,7 +24,7 @@ _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 
 @dataclass(frozen=True)
 class Entry:
-    """One of ``frames``: its files, which are there, and its camera."""
+    """An entry of ``frames``: its existing files and its camera."""
 
     name: str
     image: Path
@@ -34,13 +34,13 @@ class Entry:
 
 
 class Transforms:
-    """A ``transforms.json``.
+    """Contents of a ``transforms.json``.
 
     Args:
-        path: The file; its poses have been read, so it is a JSON object with frames that have names.
+        path: The file; its poses have been read before, so that its structure is valid.
 
     Raises:
-        InputError: It cannot be read any more.
+        InputError: The file cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -52,12 +52,12 @@ class Transforms:
         self.frames: dict[str, dict[str, Any]] = {frame["file_path"]: frame for frame in self.content["frames"]}
 
     def entries(self, names: Sequence[str], pixel_centers: PixelCenters) -> list[Entry]:
-        """The frames of these names.
+        """Frame entries by name.
 
         Raises:
-            InputError: Files are missing, some frames alone have depth, or a camera is of another kind or incomplete.
+            InputError: Files are missing, only some frames have depth, or a camera is unsupported or incomplete.
         """
-        images = self._pictures(names)
+        images = self._images(names)
         depths = [self._file(name, "depth_file_path") for name in names]
         if None in depths and any(depths):
             lone = names[depths.index(None)]
@@ -66,7 +66,7 @@ class Transforms:
                 "depth for every frame, or for none",
                 "Add the missing ones",
             )
-        # Where the file does not say how large pictures are, all are held to the size of the first.
+        # Without a size in the file, all images must have the size of the first.
         first_size = cache(lambda: size_of(images[0]))
         return [
             Entry(
@@ -82,10 +82,10 @@ class Transforms:
         ]
 
     def points_file(self) -> Path | None:
-        """The point cloud that belongs to the scene.
+        """The file of ``ply_file_path``; None if there is none.
 
         Raises:
-            InputError: It is named and not there.
+            InputError: The file does not exist.
         """
         name = self.content.get("ply_file_path")
         if name is None:
@@ -95,19 +95,19 @@ class Transforms:
             raise InputError(f"{self.path}: no file {path}", "the point cloud of ply_file_path", "Restore or remove it")
         return path
 
-    def undone(self, positions: np.ndarray) -> np.ndarray:
-        """Points of the file's world in the world that poses are read into (:mod:`coliags_plugin.poses.nerfstudio`)."""
+    def undo_applied_transform(self, positions: np.ndarray) -> np.ndarray:
+        """Transform points of the file's world into the poses' world (:mod:`coliags_plugin.poses.nerfstudio`)."""
         applied = np.array(self.content.get("applied_transform", np.eye(4)), np.float64)[:3]
-        back = positions / float(self.content.get("applied_scale", 1.0)) - applied[:, 3]
-        return np.asarray(back @ applied[:, :3])
+        unscaled = positions / float(self.content.get("applied_scale", 1.0)) - applied[:, 3]
+        return np.asarray(unscaled @ applied[:, :3])
 
     def split(self, names: Sequence[str]) -> dict[str, list[int]] | None:
-        """Indices of training and of test frames among ``names``; None where the file does not say.
+        """Indices of training and test frames among ``names``; None if the file has no split.
 
-        The file's test frames are those of ``test_filenames`` or, where there are none, of ``val_filenames``.
+        Test frames are those of ``test_filenames`` or, if empty, of ``val_filenames``.
 
         Raises:
-            InputError: A list names no frame of the file, or a training frame is tested on.
+            InputError: A listed name is not a frame, or a training frame is a test frame.
         """
         listed = {part: self.content.get(f"{part}_filenames") for part in ("train", "val", "test")}
         if not listed["train"]:
@@ -124,7 +124,7 @@ class Transforms:
         return chosen
 
     def depth_unit(self) -> float | None:
-        """Units of the world before applied_scale that 1 in a depth file stands for; None where the file is silent."""
+        """World units before applied_scale per stored depth unit; None if not given."""
         if "depth_unit_scale_factor" not in self.content:
             return None
         factor = number(self.content, "depth_unit_scale_factor", str(self.path))
@@ -134,14 +134,14 @@ class Transforms:
 
     def _indices(self, key: str, listed: Any, index_of: Mapping[str, int]) -> list[int]:
         if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
-            raise InputError(f"{self.path}: {key} is no list of names", "file_paths of frames")
+            raise InputError(f"{self.path}: {key} is not a list of names", "file_paths of frames")
         unknown = [name for name in listed if posixpath.normpath(name) not in index_of]
         if unknown:
             hint = did_you_mean(unknown[0], index_of)
             raise InputError(f"{self.path}: {key} names {unknown[0]}", "a file_path of a frame", hint)
         return sorted({index_of[posixpath.normpath(name)] for name in listed})
 
-    def _pictures(self, names: Sequence[str]) -> list[Path]:
+    def _images(self, names: Sequence[str]) -> list[Path]:
         folder = self.path.parent
         found: list[Path | None] = []
         for name in names:
@@ -150,8 +150,8 @@ class Transforms:
         missing = [name for name, path in zip(names, found, strict=True) if path is None]
         if missing:
             raise InputError(
-                f"{self.path}: {len(missing)} of {len(names)} frames have no picture in {folder}: {first_few(missing)}",
-                f"files of these names, as they are or with {', '.join(_IMAGE_SUFFIXES[:3])}",
+                f"{self.path}: {len(missing)} of {len(names)} frames have no image in {folder}: {first_few(missing)}",
+                f"files of these names, with or without {', '.join(_IMAGE_SUFFIXES[:3])}",
                 "Restore them, or remove their frames",
             )
         return cast(list[Path], found)

@@ -1,4 +1,4 @@
-"""Pictures with a ``transforms.json``, as nerfstudio, instant-ngp and Blender's NeRF scenes have it."""
+"""Data manager for ``transforms.json`` of nerfstudio, instant-ngp and Blender's NeRF scenes."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from coliags_plugin.datamanagers.lens_rectification import LensRectification, un
 from coliags_plugin.datamanagers.nerfstudio.cameras import PixelCenters
 from coliags_plugin.datamanagers.nerfstudio.files import FILE, Entry, Transforms
 from coliags_plugin.datamanagers.reading.depth_arrays import depth_format
-from coliags_plugin.datamanagers.reading.picture_names import others_beside, short_names, warn_of_others
+from coliags_plugin.datamanagers.reading.image_names import short_names, unposed_images, warn_of_unposed
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
 from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
-from coliags_plugin.datamanagers.seen import seen_marks
+from coliags_plugin.datamanagers.seen import find_seen_masks
 from coliags_plugin.lenses.models import Lens
 from coliags_plugin.lenses.pinhole import PinholeLens
 from coliags_plugin.poses import nerfstudio as nerfstudio_poses
 
-#: RotateColon's own folders and second file: its pictures are named by number, and its depth is scaled.
+#: Files that identify RotateColon instead, whose images are named by number and whose depth is scaled.
 _ROTATECOLON = ("train_views", "transforms_test.json")
 
 
@@ -41,8 +41,8 @@ class NerfstudioSettings(SceneSettings):
     depth_unit_scale_factor: float | None = Field(
         None,
         gt=0.0,
-        description="Units of the world before applied_scale that the number 1 in a depth file stands for. None: as "
-        "the file says under this name, or a millimetre.",
+        description="World units before applied_scale per stored depth unit. None: the file's value of this name, or a "
+        "millimetre.",
     )
     pixel_centers: PixelCenters = Field(
         "half",
@@ -80,9 +80,9 @@ class NerfstudioDataManager(RecordedDataManager):
         rectifications = self._rectifications(entries, file)
         images = [entry.image for entry in entries]
         others = [found for entry in entries for found in (entry.depth, entry.mask)]
-        unposed = others_beside(images, others)
-        warn_of_others(file, unposed)
-        seen = seen_marks(path / "truth", len(images), complete=not unposed)
+        unposed = unposed_images(images, others)
+        warn_of_unposed(file, unposed)
+        seen = find_seen_masks(path / "truth", len(images), complete=not unposed)
         shots = [
             Shot(
                 short,
@@ -125,7 +125,7 @@ class NerfstudioDataManager(RecordedDataManager):
         )
 
     def _depth_unit(self, transforms: Transforms) -> float:
-        """Millimetres that the number 1 in a depth file stands for."""
+        """Millimetres per stored depth unit."""
         for factor in (self.settings.depth_unit_scale_factor, transforms.depth_unit()):
             if factor is not None:
                 return factor * self.settings.scale
@@ -143,7 +143,7 @@ class NerfstudioDataManager(RecordedDataManager):
         return {lens: rectification(lens) for lens in dict.fromkeys(entry.camera for entry in entries)}
 
     def _own_points(self, path: Path, transforms: Transforms) -> tuple[Callable[[], PointCloud] | None, Path | None]:
-        """The points of ``ply_file_path``, in the file's world, or else of ``points3D.ply``, in the scene's."""
+        """Points of ``ply_file_path`` (in the file's world), or else of ``points3D.ply`` (in the scene's world)."""
         file = transforms.points_file()
         if file is None:
             beside = path / POINTS_FILE
@@ -151,7 +151,7 @@ class NerfstudioDataManager(RecordedDataManager):
 
         def points() -> PointCloud:
             cloud = load_points(file)
-            positions = transforms.undone(cloud.positions.double().numpy()) * self.settings.scale
+            positions = transforms.undo_applied_transform(cloud.positions.double().numpy()) * self.settings.scale
             return PointCloud(torch.from_numpy(positions).float(), cloud.colors)
 
         return points, file

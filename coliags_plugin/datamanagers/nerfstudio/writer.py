@@ -1,4 +1,4 @@
-"""Writing nerfstudio's layout, through OpenCV's lens (docs/layouts/nerfstudio.md)."""
+"""Writes nerfstudio's layout with OpenCV's lens model (docs/layouts/nerfstudio.md)."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ def write_frame(
     """Write a frame.
 
     Args:
-        folder: Of the scene.
-        index: Of the frame, counted from 0.
+        folder: Folder of the scene.
+        index: Index of the frame, from 0.
         image: RGB, as the lens shows it. [H, W, 3]
         z_depth: Scene units; 0 where unknown. [H, W]
-        depth_unit: Scene units in a step of the 16 bits.
+        depth_unit: Scene units per 16-bit step.
     """
     write_image(folder / "images" / _name(index), image)
     steps = np.rint(z_depth / depth_unit).clip(0.0, 65535.0)
@@ -36,7 +36,7 @@ def write_transforms(
     """Write ``transforms.json``.
 
     Args:
-        folder: Of the scene.
+        folder: Folder of the scene.
         camera_to_world: OpenCV axes, scene units. [N, 4, 4]
         lens: Of all frames, at their size, with radial terms up to k2.
         depth_unit: As for :func:`write_frame`.

@@ -1,1 +1,1 @@
-"""Files of any data set: pictures, depth, points, and what they are called."""
+"""Reading of images, depth files, points and camera files, shared by all data managers."""

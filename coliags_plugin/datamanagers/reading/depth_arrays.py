@@ -1,4 +1,4 @@
-"""z-depth in NumPy's own files."""
+"""z-depth in ``.npy`` files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class DepthArray(DepthFormat):
     """An ``.npy`` array [H, W] or [H, W, 1] of real numbers; 0, negative and not finite mean unknown.
 
     Attributes:
-        size: Scene units that the number 1 stands for.
+        size: Scene units per stored unit.
     """
 
     size: float
@@ -43,5 +43,5 @@ class DepthArray(DepthFormat):
 
 
 def depth_format(path: Path, size: float) -> DepthFormat:
-    """The format of a depth file by its suffix: ``.npy``, else 16-bit pictures; ``size`` in scene units a number."""
+    """Depth format by file suffix: ``.npy``, else 16-bit images; ``size`` in scene units per stored unit."""
     return DepthArray(size) if path.suffix.lower() == ".npy" else DepthSteps(size, 16)

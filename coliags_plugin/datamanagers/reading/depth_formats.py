@@ -1,4 +1,4 @@
-"""How z-depth is written down: each format keeps its own numbers until they are used."""
+"""Depth file formats: reading stored values and converting them to z-depth."""
 
 from __future__ import annotations
 
@@ -13,36 +13,33 @@ from coliags_plugin.datamanagers.reading.images import read_gray
 
 
 class DepthFormat(ABC):
-    """Depth files of one kind. 0 means unknown in all of them: it is what undistortion fills in."""
+    """Interface of depth file formats. The stored value 0 means unknown in all of them; undistortion fills it in."""
 
     @abstractmethod
     def read(self, path: Path) -> Shaped[np.ndarray, "H W"]:
-        """A file's numbers as stored.
+        """Read the stored values of a file.
 
         Raises:
-            InputError: It cannot be read whole, or is of another kind.
+            InputError: The file is damaged or has another format.
         """
 
     @abstractmethod
     def z_depth(self, stored: Shaped[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
-        """z-depth of stored numbers, scene units; NaN where unknown."""
+        """Convert stored values to z-depth, scene units; NaN where unknown."""
 
     def clipped_at(self, stored: Shaped[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"] | None:
-        """Where the format's range ends and the surface lies there or beyond, the range; NaN elsewhere.
-
-        None where nothing is clipped.
-        """
+        """Lower bound of z-depth at pixels clipped to the format's range, NaN elsewhere; None if none is clipped."""
         return None
 
 
 @dataclass(frozen=True)
 class DepthSteps(DepthFormat):
-    """Whole numbers, proportional to z-depth.
+    """Integers proportional to z-depth.
 
     Attributes:
-        size: Scene units a step.
+        size: Scene units per step.
         bits: 8 or 16.
-        far: The number that means "this far or farther"; None where there is none.
+        far: Stored value of depths clipped to the range; None where there is none.
     """
 
     size: float
@@ -50,8 +47,8 @@ class DepthSteps(DepthFormat):
     far: int | None = None
 
     def read(self, path: Path) -> Shaped[np.ndarray, "H W"]:
-        """See :class:`DepthFormat`; a picture of one channel."""
-        return read_gray(path, self.bits, f"a one-channel {self.bits}-bit depth picture")
+        """See :class:`DepthFormat`; an image of one channel."""
+        return read_gray(path, self.bits, f"a one-channel {self.bits}-bit depth image")
 
     def z_depth(self, stored: Shaped[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
         """See :class:`DepthFormat`."""
@@ -66,5 +63,5 @@ class DepthSteps(DepthFormat):
         return np.where(clipped, np.float32(self.far * self.size), np.float32(np.nan))
 
 
-#: C3VD's own: 100 mm in 16 bits; nothing is farther.
+#: C3VD's format: 16 bits for 100 mm, clipped beyond.
 C3VD_DEPTH = DepthSteps(100.0 / 65535.0, 16, 65535)

@@ -1,4 +1,4 @@
-"""Finding the numbered files of a video, whatever they are called otherwise."""
+"""Finding the numbered files of a video."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ DEPTH_SUFFIXES = TIFF_SUFFIXES | {".png"}
 
 
 def numbered(folder: Path, what: str, suffixes: frozenset[str]) -> dict[int, Path]:
-    """``<number>_<what>`` files by their number, padded or not; ``<number>`` alone where ``what`` is empty.
+    """Files ``<number>_<what>`` by number, padded or not; ``<number>`` alone if ``what`` is empty.
 
     Raises:
         InputError: Two files have the same number.
@@ -35,41 +35,41 @@ def numbered(folder: Path, what: str, suffixes: frozenset[str]) -> dict[int, Pat
 def paired(
     folder: Path, images: Mapping[int, Path], depths: Mapping[int, Path]
 ) -> tuple[tuple[Path, ...], tuple[Path, ...] | None]:
-    """Pictures, and depth files where there are any, frame 0 first.
+    """Image files and, if any, depth files in frame order.
 
     Args:
-        folder: Of the sequence, for errors.
-        images: Pictures by number; at least one.
-        depths: Depth files by number; none, or one for every picture.
+        folder: Folder of the sequence, for errors.
+        images: Images by number; at least one.
+        depths: Depth files by number; none, or one for every image.
 
     Raises:
-        InputError: Numbers do not run from 0 without gaps, or pictures and depth files do not pair up.
+        InputError: Numbers do not run from 0 without gaps, or images and depth files do not pair up.
     """
     count = len(images)
     gap = next((index for index in range(count) if index not in images), None)
     if gap is not None:
         first, last = min(images), max(images)
         raise InputError(
-            f"{images[first].parent} has {count} pictures, numbers {first} to {last}, but none is {gap}",
-            "numbers from 0 without gaps, for line n of the pose file belongs to picture n",
-            "Restore the missing pictures, or renumber them and drop their poses",
+            f"{images[first].parent} has {count} images, numbers {first} to {last}, but none is {gap}",
+            "numbers from 0 without gaps, as line n of the pose file belongs to image n",
+            "Restore the missing images, or renumber them and drop their poses",
         )
     if depths and sorted(depths) != sorted(images):
         lone = min(set(depths) ^ set(images))
         raise InputError(
-            f"{folder} has {count} pictures and {len(depths)} depth files; frame {lone} has only one of the two",
-            "a depth file for every picture, or none at all",
-            "Restore the missing files: archives cut short are common",
+            f"{folder} has {count} images and {len(depths)} depth files; frame {lone} has only one of the two",
+            "a depth file for every image, or none at all",
+            "Restore the missing files: incomplete archives are common",
         )
     frames = range(count)
     return tuple(images[index] for index in frames), tuple(depths[index] for index in frames) if depths else None
 
 
-def marks(folder: Path, what: str, count: int) -> dict[int, Path]:
-    """``<number>_<what>.png`` files by frame, none where the folder is absent.
+def numbered_masks(folder: Path, what: str, count: int) -> dict[int, Path]:
+    """Files ``<number>_<what>.png`` by frame index; empty if the folder is missing.
 
     Raises:
-        InputError: One belongs to no frame.
+        InputError: A file has no frame.
     """
     found = numbered(folder, what, frozenset({".png"})) if folder.is_dir() else {}
     for index, path in found.items():
@@ -83,7 +83,7 @@ def marks(folder: Path, what: str, count: int) -> dict[int, Path]:
 
 
 def inventory(folder: Path) -> str:
-    """What a folder holds, for errors: the first few names."""
+    """The first few names in a folder, for error messages."""
     names = sorted(path.name + "/" * path.is_dir() for path in folder.iterdir())
     if not names:
         return "nothing"

@@ -1,4 +1,4 @@
-"""Reading and resizing pictures. What cannot be read whole is not read at all."""
+"""Reading and resizing images; truncated files are errors."""
 
 from __future__ import annotations
 
@@ -12,69 +12,69 @@ from coliags_plugin.core.errors import InputError
 
 
 def read_rgb(path: Path) -> UInt8[np.ndarray, "H W 3"]:
-    """An 8-bit colour picture; an alpha channel is dropped.
+    """Read an 8-bit colour image, without its alpha channel.
 
     Raises:
-        InputError: It cannot be read whole, or is something else.
+        InputError: The file is damaged or has another format.
     """
     image = _read(path)
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] not in (3, 4):
-        raise InputError(f"{path} is {_kind(image)}", "an 8-bit RGB picture", "Convert it")
+        raise InputError(f"{path} is {_kind(image)}", "an 8-bit RGB image", "Convert it")
     return np.ascontiguousarray(image[..., 2::-1])
 
 
 def read_gray(path: Path, bits: int, expected: str) -> Shaped[np.ndarray, "H W"]:
-    """A picture of one channel of 8 or 16 bits, as stored.
+    """Read a one-channel image of 8 or 16 bits, as stored.
 
     Args:
-        path: The picture.
-        bits: Of a pixel.
-        expected: What it should be, for the error.
+        path: The image.
+        bits: Bits per pixel.
+        expected: The expected kind of file, for the error.
 
     Raises:
-        InputError: It cannot be read whole, or is something else.
+        InputError: The file is damaged or has another format.
     """
-    picture = _read(path)
-    if picture.dtype != np.dtype(f"uint{bits}") or picture.ndim != 2:
-        lost = picture.dtype == np.uint8 and bits == 16
+    image = _read(path)
+    if image.dtype != np.dtype(f"uint{bits}") or image.ndim != 2:
+        lost = image.dtype == np.uint8 and bits == 16
         raise InputError(
-            f"{path} is {_kind(picture)}",
+            f"{path} is {_kind(image)}",
             expected,
-            "Take the original file: depth that went through 8 bits has lost 0.4 mm" if lost else "Convert it",
+            "Use the original file: depth converted to 8 bits has lost 0.4 mm" if lost else "Convert it",
         )
-    return picture
+    return image
 
 
 def bits_of(path: Path) -> int:
-    """Bits of a pixel's channel, as stored.
+    """Bits per channel of an image file.
 
     Raises:
-        InputError: The picture cannot be read whole.
+        InputError: The image cannot be read completely.
     """
     return 8 * _read(path).itemsize
 
 
 def size_of(path: Path) -> tuple[int, int]:
-    """Width and height of a picture, pixels.
+    """Width and height of an image file, pixels.
 
     Raises:
-        InputError: It cannot be read whole.
+        InputError: The image cannot be read completely.
     """
     height, width = _read(path).shape[:2]
     return width, height
 
 
 def read_mask(path: Path) -> Shaped[np.ndarray, "H W"]:
-    """An 8-bit one-channel picture as a mask: True where it is not black. [H, W]
+    """Read an 8-bit one-channel image as a mask: True where it is not black. [H, W]
 
     Raises:
-        InputError: It cannot be read whole, or is something else.
+        InputError: The file is damaged or has another format.
     """
     return read_gray(path, 8, "a one-channel 8-bit mask") > 0
 
 
 def resize_rgb(image: UInt8[np.ndarray, "H W 3"], width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
-    """A colour picture at another size: averaged over areas when it shrinks, bilinear when it grows."""
+    """Resize a colour image: area averaging to downscale, bilinear to upscale."""
     if image.shape[:2] == (height, width):
         return image
     import cv2
@@ -85,7 +85,7 @@ def resize_rgb(image: UInt8[np.ndarray, "H W 3"], width: int, height: int) -> UI
 
 
 def resize_nearest(values: Shaped[np.ndarray, "H W"], width: int, height: int) -> Shaped[np.ndarray, "h w"]:
-    """Values at another size, each from the pixel under its centre, so that none are mixed."""
+    """Resize by nearest-neighbour sampling at pixel centres."""
     rows, columns = values.shape
     if (rows, columns) == (height, width):
         return values
@@ -100,14 +100,14 @@ def _read(path: Path) -> np.ndarray:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}", "a readable picture") from error
-    # Decoders differ in what they make of half a PNG; its last chunk says whether it is whole.
-    whole = bool(data) and (not data.startswith(b"\x89PNG") or b"IEND" in data[-64:])
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if whole else None
+        raise InputError(f"cannot read {path}: {error.strerror or error}", "a readable image") from error
+    # Decoders accept truncated PNGs to different degrees, so the last chunk is checked.
+    complete = bool(data) and (not data.startswith(b"\x89PNG") or b"IEND" in data[-64:])
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if complete else None
     if image is None:
         raise InputError(
             f"{path} ({len(data)} bytes) cannot be decoded",
-            "a whole picture",
+            "a complete image",
             "It is damaged or cut short: fetch it again",
         )
     return cast(np.ndarray, image)
@@ -115,4 +115,4 @@ def _read(path: Path) -> np.ndarray:
 
 def _kind(image: np.ndarray) -> str:
     channels = 1 if image.ndim == 2 else image.shape[2]
-    return f"a picture of {channels} channel{'s' * (channels > 1)} of {image.dtype}"
+    return f"an image of {channels} channel{'s' * (channels > 1)} of {image.dtype}"

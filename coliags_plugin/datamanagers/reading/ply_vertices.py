@@ -1,4 +1,4 @@
-"""Reading the vertices of a PLY file, whole or not at all."""
+"""Reading the vertices of a PLY file; truncated files are errors."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
 
 @dataclass
 class _Element:
-    """One ``element`` of a header, with its properties in order: name and kind, None for a list."""
+    """A PLY ``element`` with its properties in order: name and data type, None for a list."""
 
     name: str
     count: int
@@ -32,17 +32,17 @@ class _Element:
 
 
 def read_vertices(path: Path, needed: tuple[str, ...] = ("x", "y", "z")) -> dict[str, np.ndarray]:
-    """The properties of a PLY file's vertices, ASCII or binary, by name.
+    """Read the vertex properties of an ASCII or binary PLY file, by name.
 
     Args:
         path: The file.
-        needed: Properties that must be there.
+        needed: Required properties.
 
     Returns:
-        One array a property, of the type it is stored in. Each [N]
+        One array per property, of the stored data type. Each [N]
 
     Raises:
-        InputError: The file cannot be read whole, is no PLY, or its vertices lack a property.
+        InputError: The file is damaged or not a PLY file, or its vertices lack a property.
     """
     try:
         data = path.read_bytes()
@@ -52,7 +52,7 @@ def read_vertices(path: Path, needed: tuple[str, ...] = ("x", "y", "z")) -> dict
     if not data.startswith(b"ply") or not body:
         raise InputError(f"{path} ({len(data)} bytes) has no PLY header", "a PLY file", "Fetch it again")
     form, elements = _parsed(path, header.decode("ascii", errors="replace"))
-    # The vertices come first in every file met so far; before a list their place could not be computed.
+    # Only files with the vertices first are supported: behind a list, their offset would be unknown.
     if not elements or elements[0].name != "vertex" or any(kind is None for _, kind in elements[0].properties):
         raise InputError(f"{path} does not begin with vertices of plain numbers", "a PLY file of points")
     vertex = elements[0]
@@ -63,7 +63,7 @@ def read_vertices(path: Path, needed: tuple[str, ...] = ("x", "y", "z")) -> dict
             f"vertices with {', '.join(needed)}",
         )
     layout = np.dtype([(name, _ORDERS[form] + str(kind)) for name, kind in vertex.properties])
-    # What follows the header's last line.
+    # Skip the rest of the header's last line.
     body = body[body.find(b"\n") + 1 :]
     if form == "ascii":
         return _ascii(path, body, vertex, layout)
@@ -102,9 +102,9 @@ def _ascii(path: Path, body: bytes, vertex: _Element, layout: np.dtype) -> dict[
         rows = np.array([line.split() for line in lines], np.float64).reshape(vertex.count, len(vertex.properties))
     except ValueError as error:
         expected = f"rows of {len(vertex.properties)} numbers"
-        raise InputError(f"{path}: a vertex is no row of numbers", expected) from error
+        raise InputError(f"{path}: a vertex row that is not numbers", expected) from error
     return {name: rows[:, index].astype(layout[name]) for index, name in enumerate(layout.names or ())}
 
 
 def _cut_short(path: Path, expected: int, found: int) -> InputError:
-    return InputError(f"{path} says it has {expected} vertices, but holds {found}", "a whole file", "Fetch it again")
+    return InputError(f"{path} says it has {expected} vertices, but holds {found}", "a complete file", "Fetch it again")

@@ -1,4 +1,4 @@
-"""REIM-NeRF's preprocessed C3VD: the transforms_*.json files, and depth as normalised distance along the ray."""
+"""Reads REIM-NeRF's preprocessed C3VD: transforms_*.json files and depth as normalised distance along the ray."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from coliags_plugin.poses.rigid import FLIP_Y_AND_Z, check_rigid
 from coliags_plugin.poses.text import read_text
 from coliags_plugin.poses.trajectory import natural_order, refuse_repeated
 
-#: The parts a sequence is divided into; ``test`` is all of it, ``true_test`` what neither training nor validation saw.
+#: Parts of a sequence; ``test`` is all frames, ``true_test`` those in neither training nor validation.
 PARTS = ("train", "val", "test", "true_test")
 EXPECTED = "images/, distmaps/, rgb_mask.png and transforms_train.json as REIM-NeRF's preprocessing writes them"
-#: z-depth that C3VD's depth ends at, mm. The preprocessing keeps pixels clipped there, as if the wall stood there.
+#: z-depth at which C3VD's depth is clipped, mm. The preprocessing treats clipped pixels as valid.
 C3VD_RANGE = 100.0
 _LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "w", "h")
 _SHARED = (*_LENS, "p1", "p2", "scene_scale", "distmap_scale", "camera_model")
 
 
 @dataclass(frozen=True)
-class Described:
-    """One frame as the JSON files have it.
+class FrameEntry:
+    """A frame of the JSON files.
 
     Attributes:
-        image: The picture.
-        distances: Its distance map, where there is one.
+        image: The image file.
+        distances: Its distance map, if any.
         camera_to_world: OpenCV axes, mm. [4, 4]
     """
 
@@ -47,16 +47,16 @@ class Described:
 
 @dataclass(frozen=True)
 class Sequence:
-    """What the JSON files of a folder say together.
+    """Combined contents of a folder's JSON files.
 
     Attributes:
         files: The JSON files, by part.
-        lens: Of the pictures, which are not undistorted.
+        lens: Lens of the images, which are distorted.
         scene_scale: Normalised units per mm.
-        scene_shift: What is added to positions in mm before they are scaled. [3]
-        distmap_scale: Normalised distance of the number 65535.
-        frames: In video order.
-        parts: Indices in ``frames``, by part.
+        scene_shift: Offset added to positions in mm before scaling. [3]
+        distmap_scale: Normalised distance of the stored value 65535.
+        frames: Frames in video order.
+        parts: Indices into ``frames``, by part.
     """
 
     files: Mapping[str, Path]
@@ -64,17 +64,17 @@ class Sequence:
     scene_scale: float
     scene_shift: Float[np.ndarray, "3"]
     distmap_scale: float
-    frames: tuple[Described, ...]
+    frames: tuple[FrameEntry, ...]
     parts: Mapping[str, tuple[int, ...]]
 
 
 @dataclass(frozen=True, eq=False)
 class RayDistance(DepthFormat):
-    """16-bit distance along the ray; 0 is unknown. What ends at C3VD's 100 mm is there or beyond.
+    """16-bit distance along the ray; 0 is unknown, and C3VD's 100 mm z-depth is a lower bound.
 
     Attributes:
-        size: mm a step, along the ray.
-        cosine: z-depth per distance, of each working pixel's source pixel. [h, w]
+        size: mm per step, along the ray.
+        cosine: Ratio of z-depth to ray distance at each working pixel's source pixel. [h, w]
     """
 
     size: float
@@ -87,30 +87,32 @@ class RayDistance(DepthFormat):
     def z_depth(self, stored: Shaped[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
         """See :class:`DepthFormat`."""
         depth = self._z(stored)
-        depth[(stored == 0) | self._ends(stored, depth)] = np.nan
+        depth[(stored == 0) | self._is_clipped(stored, depth)] = np.nan
         return depth
 
     def clipped_at(self, stored: Shaped[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"] | None:
         """See :class:`DepthFormat`."""
         depth = self._z(stored)
-        ends = self._ends(stored, depth)
-        if not ends.any():
+        clipped = self._is_clipped(stored, depth)
+        if not clipped.any():
             return None
-        return np.where(ends, np.minimum(depth, np.float32(C3VD_RANGE)), np.float32(np.nan))
+        return np.where(clipped, np.minimum(depth, np.float32(C3VD_RANGE)), np.float32(np.nan))
 
     def _z(self, stored: Shaped[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
         return np.asarray(stored.astype(np.float32) * np.float32(self.size) * self.cosine)
 
-    def _ends(self, stored: Shaped[np.ndarray, "h w"], depth: Float32[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-        """Where the distance map or the depth it was made from ends; one step is lost to rounding. [h, w]"""
+    def _is_clipped(
+        self, stored: Shaped[np.ndarray, "h w"], depth: Float32[np.ndarray, "h w"]
+    ) -> Bool[np.ndarray, "h w"]:
+        """Pixels clipped in the distance map or in the original depth, with one step for rounding. [h, w]"""
         return np.asarray((stored == 65535) | (depth >= C3VD_RANGE - self.size))
 
 
 def ray_cosines(lens: Lens) -> Float32[np.ndarray, "H W"]:
-    """z-depth per distance at every stored pixel; 0 where the lens does not reach.
+    """Ratio of z-depth to ray distance at every stored pixel; 0 outside the lens's field of view.
 
     The preprocessing takes its rays at integers + 0.5 with a calibration that counts from integers, half a pixel off
-    the centres. This is undone here as it was done; the half pixel is worth 3e-4 of the depth at most.
+    the centres, and so does this inverse; the half pixel changes depth by at most 3e-4 of its value.
     """
     column, row = np.meshgrid(np.arange(lens.width) + 1.0, np.arange(lens.height) + 1.0)
     rays = lens.unproject(np.stack([column.ravel(), row.ravel()], axis=1))
@@ -119,7 +121,7 @@ def ray_cosines(lens: Lens) -> Float32[np.ndarray, "H W"]:
 
 
 def recognise(folder: Path) -> str | None:
-    """What in the folder says that it is such a sequence; None where nothing does."""
+    """The files that identify this layout; None if the folder has another one."""
     if not (folder / "transforms_train.json").is_file():
         return None
     beside = next((name for name in ("distmaps", "rgb_mask.png") if (folder / name).exists()), None)
@@ -127,10 +129,10 @@ def recognise(folder: Path) -> str | None:
 
 
 def read_sequence(folder: Path) -> Sequence:
-    """Read the JSON files of a folder.
+    """Read and combine the JSON files of a folder.
 
     Raises:
-        InputError: The folder or ``transforms_train.json`` is missing; a file is not as it should be, naming the frame;
+        InputError: The folder or ``transforms_train.json`` is missing; a file is invalid (the message names the frame);
             or two files contradict each other.
     """
     if not folder.is_dir():
@@ -145,7 +147,7 @@ def read_sequence(folder: Path) -> Sequence:
         _check_same(files["train"], first, files[part], content)
     lens = _lens(files["train"], first)
     scale, shift = _normalisation(files["train"], first)
-    found: dict[str, Described] = {}
+    found: dict[str, FrameEntry] = {}
     named: dict[str, list[str]] = {}
     for part, content in contents.items():
         named[part] = []
@@ -155,9 +157,9 @@ def read_sequence(folder: Path) -> Sequence:
                 known.camera_to_world, frame.camera_to_world, atol=1e-4
             ):
                 raise InputError(
-                    f"{files[part]}: {name} has another pose or distance map than in another of the files",
-                    "the same of each frame in all of them",
-                    "Write them again, all from one run",
+                    f"{files[part]}: pose or distance map of {name} differs from another file's",
+                    "the same values for a frame in all files",
+                    "Write all files in one run",
                 )
             named[part].append(name)
     names = list(found)
@@ -181,9 +183,9 @@ def _read(file: Path) -> dict[str, Any]:
     try:
         content = json.loads(read_text(file, "a JSON object"))
     except (json.JSONDecodeError, RecursionError) as error:
-        raise InputError(f"{file} is no JSON: {error}", "a JSON object with frames") from error
+        raise InputError(f"{file} is not JSON: {error}", "a JSON object with frames") from error
     frames = content.get("frames") if isinstance(content, dict) else None
-    # A short video has no validation frames; one without training frames is none.
+    # A short video may have no validation frames, but there must be training frames.
     if not isinstance(frames, list) or (not frames and file.name == "transforms_train.json"):
         raise InputError(f"{file} has no frames", "'frames': [{'file_path': ..., 'transform_matrix': ...}, ...]")
     return content
@@ -193,9 +195,9 @@ def _check_same(file: Path, first: Mapping[str, Any], other: Path, content: Mapp
     for key in (*_SHARED, "scene_T"):
         if first.get(key) != content.get(key):
             raise InputError(
-                f"{other}: {key} is not that of {file.name}",
+                f"{other}: {key} differs from {file.name}",
                 "one camera and one scale for all files",
-                "Write them again",
+                "Write all files in one run",
             )
 
 
@@ -206,7 +208,7 @@ def _lens(file: Path, content: Mapping[str, Any]) -> FisheyeLens:
     width, height = values.pop("w"), values.pop("h")
     if min(width, height, values["fx"], values["fy"]) <= 0 or width != int(width) or height != int(height):
         raise InputError(
-            f"{file}: a picture of {width:g} x {height:g}, focal lengths {values['fx']:g}, {values['fy']:g}",
+            f"{file}: an image of {width:g} x {height:g}, focal lengths {values['fx']:g}, {values['fy']:g}",
             "whole sizes and focal lengths above 0",
         )
     for key in ("p1", "p2"):
@@ -221,28 +223,28 @@ def _normalisation(file: Path, content: Mapping[str, Any]) -> tuple[float, Float
     scale = _positive(file, content, "scene_scale", None)
     shift = _array(content.get("scene_T"))
     if shift.shape != (4, 4) or not np.allclose(shift[:3, :3], np.eye(3)) or not np.allclose(shift[3], (0, 0, 0, 1)):
-        raise InputError(f"{file}: scene_T is no shift", "a 4x4 matrix that moves the world and does not turn it")
+        raise InputError(f"{file}: scene_T is not a translation", "a 4x4 matrix without rotation")
     return scale, shift[:3, 3]
 
 
 def _frames(
     folder: Path, file: Path, content: Mapping[str, Any], scale: float, shift: Float[np.ndarray, "3"]
-) -> list[tuple[str, Described]]:
+) -> list[tuple[str, FrameEntry]]:
     result, names, matrices = [], [], []
     for index, frame in enumerate(content["frames"]):
         name = frame.get("file_path") if isinstance(frame, dict) else None
         if not isinstance(name, str) or not name:
-            raise InputError(f"{file}, frame {index}: no file_path", "the name of the frame's picture")
+            raise InputError(f"{file}, frame {index}: no file_path", "the name of the frame's image")
         matrix = _array(frame.get("transform_matrix"))
         if matrix.shape != (4, 4):
             raise InputError(
-                f"{file}, frame {index} ({name}): transform_matrix is missing or no matrix",
+                f"{file}, frame {index} ({name}): transform_matrix is missing or not a matrix",
                 "4 rows of 4 finite numbers",
             )
         names.append(name)
         matrices.append(matrix)
     refuse_repeated(names, str(file))
-    # Of no frames too: a short video has none to validate on.
+    # Also with no frames: a short video may have no validation frames.
     check_rigid(np.reshape(matrices, (-1, 4, 4)), lambda index: f"{file}, frame {index} ({names[index]})")
     for name, matrix, frame in zip(names, matrices, content["frames"], strict=True):
         camera_to_world = matrix @ FLIP_Y_AND_Z
@@ -251,13 +253,13 @@ def _frames(
         paths = [folder / name, *([folder / distances] if isinstance(distances, str) else [])]
         for path in paths:
             if not path.is_file():
-                raise InputError(f"{file} names {path}, which is not there", "every file that it names", "Restore it")
-        result.append((name, Described(paths[0], paths[1] if len(paths) > 1 else None, camera_to_world)))
+                raise InputError(f"{file} names {path}, which does not exist", "every named file", "Restore it")
+        result.append((name, FrameEntry(paths[0], paths[1] if len(paths) > 1 else None, camera_to_world)))
     return result
 
 
 def _array(value: Any) -> np.ndarray:
-    """An array of finite numbers; empty where the value is none."""
+    """Array of finite numbers; empty for any other value."""
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):

@@ -1,4 +1,4 @@
-"""REIM-NeRF's preprocessed C3VD: fisheye pictures, normalised poses, and distance maps (Psychogyios et al., 2023)."""
+"""Data manager for REIM-NeRF's preprocessed C3VD (Psychogyios et al., 2023): fisheye images and distance maps."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from jaxtyping import Bool
 from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.datamanagers.reading.image_names import unposed_images, warn_of_unposed
 from coliags_plugin.datamanagers.reading.images import read_mask
-from coliags_plugin.datamanagers.reading.picture_names import others_beside, warn_of_others
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
 from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.datamanagers.reim_nerf.files import RayDistance, Sequence, ray_cosines, read_sequence, recognise
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
-from coliags_plugin.datamanagers.seen import seen_marks
+from coliags_plugin.datamanagers.seen import find_seen_masks
 from coliags_plugin.datamanagers.splits import Split
 
 MASK_FILE = "rgb_mask.png"
@@ -29,19 +29,19 @@ class ReimNerfSettings(SceneSettings):
     split: Split = Field(
         "own",
         description="Test frames: 'own': trains on transforms_train.json and tests on transforms_true_test.json, as "
-        "REIM-NeRF does; its validation frames are in neither. Others as for every format.",
+        "REIM-NeRF does; its validation frames are in neither. Others as for every data manager.",
     )
-    mask: bool = Field(True, description=f"Ignore what {MASK_FILE} marks.")
+    mask: bool = Field(True, description=f"Ignore the pixels masked by {MASK_FILE}.")
 
 
 class ReimNerfDataManager(RecordedDataManager):
-    """Reads what REIM-NeRF's preprocessing writes, back in millimetres and C3VD's world (docs/layouts/reim-nerf.md)."""
+    """Reads REIM-NeRF's preprocessed C3VD in millimetres and C3VD's world frame (docs/layouts/reim-nerf.md)."""
 
     Settings = ReimNerfSettings
 
     settings: ReimNerfSettings
     name = "reim-nerf"
-    #: REIM-NeRF trains and evaluates at a fifth of a raw frame.
+    #: REIM-NeRF trains and evaluates at a fifth of the raw size.
     fits = (270, 216)
     seen_split = "own"
 
@@ -57,7 +57,7 @@ class ReimNerfDataManager(RecordedDataManager):
         if settings.split == "own" and "true_test" not in sequence.parts:
             raise InputError(
                 f"{path} has no transforms_true_test.json",
-                "the frames that split 'own' tests on",
+                "the test frames of split 'own'",
                 "Add it, or choose another split",
             )
         file, lens = sequence.files["train"], sequence.lens
@@ -68,7 +68,7 @@ class ReimNerfDataManager(RecordedDataManager):
         )
         size = sequence.distmap_scale / 65535.0 / sequence.scene_scale
         form = RayDistance(size, rectification.nearest(ray_cosines(lens)))
-        seen = seen_marks(path / "truth", len(sequence.frames))
+        seen = find_seen_masks(path / "truth", len(sequence.frames))
         shots = [
             Shot(
                 frame.image.stem,
@@ -82,7 +82,7 @@ class ReimNerfDataManager(RecordedDataManager):
             for index, frame in enumerate(sequence.frames)
         ]
         large = [found for frame in sequence.frames for found in (frame.image, frame.distances)]
-        warn_of_others(path, others_beside([frame.image for frame in sequence.frames], large))
+        warn_of_unposed(path, unposed_images([frame.image for frame in sequence.frames], large))
         parts = sequence.parts
         return Recording(
             kind="REIM-NeRF layout",
@@ -109,12 +109,12 @@ class ReimNerfDataManager(RecordedDataManager):
 
 
 def _shows(mask: Path, width: int, height: int) -> Bool[np.ndarray, "H W"]:
-    """Stored pixels that count: the mask is white where a pixel is to be ignored."""
+    """Valid stored pixels: the mask file is white where a pixel is ignored."""
     if not mask.is_file():
-        raise InputError(f"no file {mask}", "the mask of what lies outside the lens's circle", "Or set mask: false")
+        raise InputError(
+            f"no file {mask}", "the mask of pixels outside the lens's image circle", "Restore it, or set mask: false"
+        )
     ignored = read_mask(mask)
     if ignored.shape != (height, width):
-        raise InputError(
-            f"{mask} is {ignored.shape[1]} x {ignored.shape[0]}", f"the pictures' size, {width} x {height}"
-        )
+        raise InputError(f"{mask} is {ignored.shape[1]} x {ignored.shape[0]}", f"the images' size, {width} x {height}")
     return np.asarray(~ignored)

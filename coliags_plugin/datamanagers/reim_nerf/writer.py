@@ -1,4 +1,4 @@
-"""Writing REIM-NeRF's layout of preprocessed C3VD (docs/layouts/reim-nerf.md)."""
+"""Writes REIM-NeRF's layout of preprocessed C3VD (docs/layouts/reim-nerf.md)."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ MASK = "rgb_mask.png"
 
 @dataclass
 class ReimNerfWriter:
-    """Writes the frames of one sequence, then what belongs to all of them.
+    """Writes the frames of one sequence, then its mask and JSON files.
 
     Attributes:
-        folder: Of the sequence.
-        lens: Of all frames, at their size.
+        folder: Folder of the sequence.
+        lens: Lens of all frames, at their size.
         scene_scale: Normalised units per mm.
-        distmap_scale: Normalised distance of the number 65535.
+        distmap_scale: Normalised distance of the stored value 65535.
     """
 
     folder: Path
@@ -38,10 +38,10 @@ class ReimNerfWriter:
     _ranges: dict[int, tuple[float, float]] = field(default_factory=dict)
 
     def write_frame(self, index: int, image: UInt8[np.ndarray, "H W 3"], z_depth: Float[np.ndarray, "H W"]) -> None:
-        """Write a frame; its distance map ends at C3VD's 100 mm.
+        """Write a frame; z-depth is clipped at C3VD's 100 mm.
 
         Args:
-            index: Of the frame, counted from 0.
+            index: Index of the frame, from 0.
             image: RGB, as the lens shows it. [H, W, 3]
             z_depth: mm; 0 where unknown. [H, W]
         """
@@ -63,13 +63,13 @@ class ReimNerfWriter:
         shows: Bool[np.ndarray, "H W"],
         parts: dict[str, list[int]],
     ) -> None:
-        """Write the mask and a JSON file for each part; every frame has been written.
+        """Write the mask and a JSON file per part, after all frames.
 
         Args:
             camera_to_world: OpenCV axes, mm. [N, 4, 4]
-            shift: What is added to positions before they are scaled, mm. [3]
-            shows: Pixels that show something. [H, W]
-            parts: Indices of the frames of each part, by its name.
+            shift: Offset added to positions before scaling, mm. [3]
+            shows: Valid pixels. [H, W]
+            parts: Frame indices by name of the part.
         """
         write_image(self.folder / MASK, np.where(shows, 0, 255).astype(np.uint8))
         frames = [self._frame(index, pose, shift) for index, pose in enumerate(camera_to_world)]

@@ -1,1 +1,1 @@
-"""Pictures, depth and a trajectory in TUM's form."""
+"""TUM RGB-D: images, depth and a trajectory."""

@@ -1,4 +1,4 @@
-"""Which picture, pose and depth file belong together, by the times in their names or by their order."""
+"""Association of images, poses and depth files by timestamps or by order."""
 
 from __future__ import annotations
 
@@ -12,31 +12,31 @@ from jaxtyping import Float, Int
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.poses.trajectory import natural_order
 
-#: A name that is a time: seconds with a fraction, as TUM's are, and perhaps a word behind it.
+#: A file stem that is a timestamp in seconds with a fraction, as TUM's, with an optional suffix.
 _TIME = re.compile(r"(\d+\.\d+)(?:_[a-z]+)?", re.IGNORECASE)
 
 
 def is_time(name: str) -> bool:
-    """Whether a file's stem is a time in seconds, told from a frame number by its decimal point."""
+    """Whether a file stem is a timestamp in seconds; unlike a frame number it has a decimal point."""
     return _TIME.fullmatch(name) is not None
 
 
 def times(paths: Sequence[Path]) -> Float[np.ndarray, "N"]:
-    """The times that files are named by; whole numbers are taken as times too. [N]
+    """Timestamps from file names; integers are accepted too. [N]
 
     Raises:
-        InputError: A name is neither.
+        InputError: A name is not a number.
     """
     return np.array([_time(path) for path in paths])
 
 
 def numbers(name: str) -> tuple[int, ...]:
-    """All whole numbers in a name: pictures and depth files of one frame have the same, however they are padded."""
+    """All integers in a name, which identify the frame of images and depth files regardless of padding."""
     return tuple(int(digits) for digits in re.findall(r"\d+", name))
 
 
 def by_number(paths: Sequence[Path]) -> dict[tuple[int, ...], Path]:
-    """Files in the order that people count in, 2 before 10, by the numbers in their names.
+    """Files in natural order, 2 before 10, by the numbers in their names.
 
     Raises:
         InputError: A name has no number, or two have the same.
@@ -56,21 +56,18 @@ def by_number(paths: Sequence[Path]) -> dict[tuple[int, ...], Path]:
 def nearest_in_time(
     wanted: Float[np.ndarray, "N"], known: Float[np.ndarray, "M"], tolerance: float
 ) -> Int[np.ndarray, "N"]:
-    """For every wanted time the known one that belongs to it.
-
-    Closest pairs are made first, and nothing belongs to two, as TUM's own tools do it: where poses are fewer than
-    pictures, a pose goes to the picture it was taken with and not to that one's neighbours too.
+    """Match timestamps one to one, closest pairs first, as TUM's tools do.
 
     Args:
-        wanted: Times, in any order. [N]
-        known: Times, in any order. [M]
-        tolerance: The largest difference.
+        wanted: Timestamps, in any order. [N]
+        known: Timestamps to match them with, in any order. [M]
+        tolerance: Largest difference.
 
     Returns:
-        Indices into ``known``, -1 where none is left within the tolerance. [N]
+        Indices into ``known``, -1 without a match within the tolerance. [N]
     """
     order = np.argsort(known, kind="stable")
-    # Names carry microseconds: rounding must not decide about a pair exactly as far apart as allowed.
+    # Names are rounded to microseconds; pairs exactly at the tolerance must match.
     reach = tolerance + 1e-6
     low = np.searchsorted(known[order], wanted - reach, side="left")
     high = np.searchsorted(known[order], wanted + reach, side="right")
@@ -94,5 +91,5 @@ def _time(path: Path) -> float:
     if path.stem.isdecimal():
         return float(path.stem)
     raise InputError(
-        f"{path}: its name is no time", "names that are seconds, for instance 1305031102.175304.png", "Rename it"
+        f"{path}: its name is not a timestamp", "a name in seconds, for instance 1305031102.175304.png", "Rename it"
     )

@@ -1,4 +1,4 @@
-"""Finding what belongs to a scene in TUM's RGB-D form: pictures, depth, trajectory and intrinsics."""
+"""Finding the files of a scene in TUM's RGB-D layout: images, depth, trajectory and intrinsics."""
 
 from __future__ import annotations
 
@@ -21,27 +21,27 @@ from coliags_plugin.poses import tum
 from coliags_plugin.poses.colmap import read_text_cameras
 from coliags_plugin.poses.text import read_text, shortened
 
-PICTURE_FOLDERS = ("rgb", "color", "images")
+IMAGE_FOLDERS = ("rgb", "color", "images")
 DEPTH_FOLDERS = ("depth", "depths")
 MASK_FOLDERS = ("mask", "masks")
 TRAJECTORIES = ("groundtruth.txt", "poses.txt", "traj.txt", "trajectory.txt", "*_poses.txt")
 CAMERA_FILES = ("camera.json", "intrinsics.txt", "cameras.txt")
 EXPECTED = (
-    f"{', '.join(f'{name}/' for name in PICTURE_FOLDERS)} with pictures, a TUM trajectory ({', '.join(TRAJECTORIES)}) "
+    f"{', '.join(f'{name}/' for name in IMAGE_FOLDERS)} with images, a TUM trajectory ({', '.join(TRAJECTORIES)}) "
     f"and one of {', '.join(CAMERA_FILES)}"
 )
-#: Where the principal point of a picture may lie, as a share of its size, when nothing says which size it is for.
+#: Where the principal point of an image may lie, as a share of its size, when nothing says which size it is for.
 _MIDDLE = (0.3, 0.7)
 
 
 @dataclass(frozen=True)
 class CameraFile:
-    """What a file says about the camera.
+    """Contents of a camera file.
 
     Attributes:
         path: The file.
         intrinsics: Of the images.
-        depth_scale: Depth steps per scene unit; None where the file does not say.
+        depth_scale: Depth steps per scene unit; None if not given.
     """
 
     path: Path
@@ -50,33 +50,33 @@ class CameraFile:
 
 
 def recognise(folder: Path) -> str | None:
-    """What in the folder says that it is such a scene; None where nothing does."""
-    pictures = next((name for name in PICTURE_FOLDERS if (folder / name).is_dir()), None)
+    """The files that identify this layout; None if the folder has another one."""
+    images = next((name for name in IMAGE_FOLDERS if (folder / name).is_dir()), None)
     trajectory = next((path for path in _trajectories(folder) if tum.recognise(path)), None)
-    if pictures is None or trajectory is None:
+    if images is None or trajectory is None:
         return None
-    return f"the TUM trajectory {trajectory.name} beside {pictures}/"
+    return f"the TUM trajectory {trajectory.name} beside {images}/"
 
 
-def find_pictures(folder: Path) -> list[Path]:
-    """The colour pictures, in no order.
+def find_images(folder: Path) -> list[Path]:
+    """The colour images, unordered.
 
     Raises:
-        InputError: There is no folder of pictures, or more than one, or it holds none.
+        InputError: There is no folder of images, or more than one, or it is empty.
     """
     if not folder.is_dir():
         raise InputError(f"no folder {folder}", EXPECTED, "Check the path")
-    found = _only(folder, PICTURE_FOLDERS)
+    found = _only(folder, IMAGE_FOLDERS)
     if found is None:
         raise InputError(f"{folder} holds {inventory(folder)}", EXPECTED, "Name the scene's own folder")
-    pictures = [path for path in found.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
-    if not pictures:
-        raise InputError(f"{found} holds {inventory(found)}", "PNG or JPEG pictures")
-    return pictures
+    images = [path for path in found.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
+    if not images:
+        raise InputError(f"{found} holds {inventory(found)}", "PNG or JPEG images")
+    return images
 
 
 def find_depths(folder: Path) -> list[Path]:
-    """The depth files, in no order; none where there is no folder of them.
+    """The depth files, unordered; empty without a folder of them.
 
     Raises:
         InputError: There is more than one such folder.
@@ -85,31 +85,31 @@ def find_depths(folder: Path) -> list[Path]:
     return [] if found is None else [path for path in found.iterdir() if path.suffix.lower() in DEPTH_SUFFIXES]
 
 
-def find_masks(folder: Path, pictures: Sequence[Path]) -> dict[str, Path]:
-    """Masks by the stem of their picture; none where there is no folder of them.
+def find_masks(folder: Path, images: Sequence[Path]) -> dict[str, Path]:
+    """Mask files by the stem of their image; empty without a folder of them.
 
     Raises:
-        InputError: There is more than one such folder, or a picture has no mask.
+        InputError: There is more than one such folder, or an image has no mask.
     """
     found = _only(folder, MASK_FOLDERS)
     if found is None:
         return {}
     masks = {path.stem: path for path in found.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES}
-    lone = next((picture for picture in pictures if picture.stem not in masks), None)
+    lone = next((image for image in images if image.stem not in masks), None)
     if lone is not None:
         raise InputError(
             f"{found} has no mask for {lone.name}",
-            "a mask of the same name for every picture, or no such folder",
+            "a mask of the same name for every image, or no such folder",
             "Restore the missing ones, or move the folder away",
         )
-    return {picture.stem: masks[picture.stem] for picture in pictures}
+    return {image.stem: masks[image.stem] for image in images}
 
 
 def lacks_trajectory(folder: Path) -> bool:
-    """Whether a folder holds pictures and depth in this form, and nothing that may be their poses."""
+    """Whether a folder holds images, depth and intrinsics in this layout, but no trajectory."""
     return (
         folder.is_dir()
-        and any((folder / name).is_dir() for name in PICTURE_FOLDERS)
+        and any((folder / name).is_dir() for name in IMAGE_FOLDERS)
         and any((folder / name).is_dir() for name in DEPTH_FOLDERS)
         and any((folder / name).is_file() for name in CAMERA_FILES)
         and not any(tum.recognise(path) for path in _trajectories(folder))
@@ -120,59 +120,59 @@ def find_trajectory(folder: Path, named: str | None) -> Path:
     """The trajectory file.
 
     Args:
-        folder: Of the scene.
-        named: Its name, where the user gives one; relative to the folder, or absolute.
+        folder: Folder of the scene.
+        named: File name given by the user, relative to the folder or absolute; None: search for it.
 
     Raises:
-        InputError: There is none, or more than one and none is named.
+        InputError: There is none, or there are several and none is given.
     """
     if named is not None:
         if not (folder / named).is_file():
-            raise InputError(f"no file {folder / named}", "a TUM trajectory", "Mend the option trajectory")
+            raise InputError(f"no file {folder / named}", "a TUM trajectory", "Correct the option trajectory")
         return folder / named
     found = _trajectories(folder)
     if not found:
         raise InputError(
-            f"{folder} has pictures but no {' or '.join(TRAJECTORIES)}",
+            f"{folder} has images but no {' or '.join(TRAJECTORIES)}",
             EXPECTED,
-            "Add it, or let coliags poses track find one from depth",
+            "Add it, or estimate one from depth by coliags poses track",
         )
     if len(found) > 1:
         raise InputError(
             f"{folder} has the trajectories {', '.join(path.name for path in found)}",
-            "one",
+            "one trajectory",
             f"Choose with the option trajectory, for instance --set datamanager.trajectory={found[0].name}",
         )
     return found[0]
 
 
-def find_camera(folder: Path, picture: Path) -> CameraFile:
+def find_camera(folder: Path, image: Path) -> CameraFile:
     """The camera: of ``camera.json``, else of ``intrinsics.txt``, else of COLMAP's ``cameras.txt``.
 
     Args:
-        folder: Of the scene.
-        picture: One of its pictures, for the size where the file does not say it.
+        folder: Folder of the scene.
+        image: One of its images, for the size if the file has none.
 
     Raises:
-        InputError: There is no such file, or it is not as it should be.
+        InputError: There is no such file, or it is invalid.
     """
     for name, read in zip(CAMERA_FILES, (_read_json, _read_intrinsics_txt, _read_cameras_txt), strict=True):
         if (folder / name).is_file():
-            return read(folder / name, picture)
-    raise InputError(f"{folder} has pictures but no {', '.join(CAMERA_FILES)}", EXPECTED, "Add the camera")
+            return read(folder / name, image)
+    raise InputError(f"{folder} has images but no {', '.join(CAMERA_FILES)}", EXPECTED, "Add the camera")
 
 
 def find_mesh(folder: Path) -> Path | None:
-    """The only OBJ file of the folder; None where there is none, or several."""
+    """The OBJ file of the folder; None if there is none or several."""
     found = sorted(folder.glob("*.obj"))
     return found[0] if len(found) == 1 else None
 
 
 def read_obj_points(path: Path) -> PointCloud:
-    """The vertices of an OBJ file, and their colours where every vertex has one behind its position, from 0 to 1.
+    """Read the vertices of an OBJ file, and their colours (0 to 1 behind the position) if all have one.
 
     Raises:
-        InputError: The file cannot be read, or a vertex line holds no three or six numbers.
+        InputError: The file cannot be read, or a vertex line does not hold three or six numbers.
     """
     rows: list[list[float]] = []
     for number, line in enumerate(read_text(path, "an OBJ file").splitlines(), start=1):
@@ -196,7 +196,9 @@ def _only(folder: Path, names: tuple[str, ...]) -> Path | None:
     found = [folder / name for name in names if (folder / name).is_dir()]
     if len(found) > 1:
         raise InputError(
-            f"{folder} holds {' and '.join(f'{path.name}/' for path in found)}", "one of them", "Move the other away"
+            f"{folder} holds {' and '.join(f'{path.name}/' for path in found)}",
+            "only one of them",
+            "Move the other away",
         )
     return found[0] if found else None
 
@@ -206,7 +208,7 @@ def _trajectories(folder: Path) -> list[Path]:
     return sorted(found)
 
 
-def _read_json(path: Path, picture: Path) -> CameraFile:
+def _read_json(path: Path, image: Path) -> CameraFile:
     intrinsics = read_intrinsics(path)
     scale = json.loads(path.read_text(encoding="utf-8-sig")).get("depth_scale")
     if scale is None:
@@ -216,7 +218,7 @@ def _read_json(path: Path, picture: Path) -> CameraFile:
     return CameraFile(path, intrinsics, float(scale))
 
 
-def _read_intrinsics_txt(path: Path, picture: Path) -> CameraFile:
+def _read_intrinsics_txt(path: Path, image: Path) -> CameraFile:
     words = [word for line in read_text(path, "numbers").splitlines() for word in line.replace(",", " ").split()]
     try:
         values = [float(word) for word in words]
@@ -229,24 +231,23 @@ def _read_intrinsics_txt(path: Path, picture: Path) -> CameraFile:
         values = [fx, fy, cx, cy]
     if len(values) != 4 or not np.all(np.isfinite(values)) or min(values[:2]) <= 0.0:
         raise InputError(f"{path}: '{shortened(' '.join(words))}'", "fx fy cx cy, or the nine numbers of K; pixels")
-    width, height = size_of(picture)
+    width, height = size_of(image)
     fx, fy, cx, cy = values
     if not all(_MIDDLE[0] < share < _MIDDLE[1] for share in (cx / width, cy / height)):
         raise InputError(
-            f"{path}: the principal point ({cx:g}, {cy:g}) is far from the middle of {picture.name}, "
-            f"{width} x {height}",
-            "intrinsics of the pictures as they are stored",
+            f"{path}: the principal point ({cx:g}, {cy:g}) is far from the middle of {image.name}, {width} x {height}",
+            "intrinsics of the images as they are stored",
             "Scale them, or say their size in a camera.json with fx, fy, cx, cy, w, h if that is where it is",
         )
     # OpenCV's K: pixel centres at integers.
     return CameraFile(path, Intrinsics(fx, fy, cx + 0.5, cy + 0.5, width, height))
 
 
-def _read_cameras_txt(path: Path, picture: Path) -> CameraFile:
+def _read_cameras_txt(path: Path, image: Path) -> CameraFile:
     cameras = list(read_text_cameras(path).values())
     if len(cameras) != 1:
         raise InputError(f"{path} has {len(cameras)} cameras", "one, PINHOLE or SIMPLE_PINHOLE")
     camera = cameras[0]
     if isinstance(camera, str):
-        raise InputError(f"{path}: {camera}", "PINHOLE or SIMPLE_PINHOLE", "Undistort the pictures first")
+        raise InputError(f"{path}: {camera}", "PINHOLE or SIMPLE_PINHOLE", "Undistort the images first")
     return CameraFile(path, camera)

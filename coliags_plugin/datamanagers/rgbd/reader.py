@@ -1,4 +1,4 @@
-"""Pictures, depth and a trajectory in TUM's RGB-D form: what SLAM systems and Gaussian Pancakes read and write."""
+"""Data manager for TUM's RGB-D layout, as read and written by SLAM systems and Gaussian Pancakes."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from coliags_plugin.datamanagers.rgbd.files import (
     CameraFile,
     find_camera,
     find_depths,
+    find_images,
     find_masks,
     find_mesh,
-    find_pictures,
     find_trajectory,
     lacks_trajectory,
     read_obj_points,
     recognise,
 )
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
-from coliags_plugin.datamanagers.seen import seen_marks
+from coliags_plugin.datamanagers.seen import find_seen_masks
 from coliags_plugin.poses import tum
 from coliags_plugin.poses.trajectory import Trajectory
 
@@ -45,40 +45,40 @@ class RGBDSettings(SceneSettings):
 
     depth: Literal["metric", "none"] = Field(
         "metric",
-        description="'metric': depth files hold z-depth in even steps. 'none': leave them alone, for depth that is "
-        "relative, as Gaussian Pancakes' may be.",
+        description="'metric': depth files hold linearly scaled z-depth. 'none': ignore them, for relative depth, as "
+        "Gaussian Pancakes' may be.",
     )
     depth_scale: float | None = Field(
         None,
         gt=0.0,
-        description="Depth steps per scene unit, the unit of the trajectory. None: as camera.json says. TUM's own "
-        "files have 5000 per metre.",
+        description="Depth steps per scene unit, the unit of the trajectory. None: from camera.json. TUM's files have "
+        "5000 per metre.",
     )
     association: Literal["auto", "time", "order"] = Field(
         "auto",
-        description="What puts pictures, poses and depth together: 'time': pictures are named by their time; 'order': "
-        "line n of the trajectory belongs to picture n; 'auto': time, where names have a decimal point.",
+        description="How images, poses and depth are associated: 'time': by the timestamps in image names; 'order': "
+        "line n of the trajectory belongs to image n; 'auto': time, if names have a decimal point.",
     )
     max_time_difference: float = Field(
-        0.02, ge=0.0, description="For association by time: the largest difference, seconds. 0.02 is TUM's own."
+        0.02, ge=0.0, description="Association by time: largest difference, seconds. 0.02 is TUM's value."
     )
     trajectory: str | None = Field(
-        None, description="The trajectory file where there are several; relative to the scene folder, or absolute."
+        None, description="The trajectory file, if there are several; relative to the scene folder, or absolute."
     )
 
 
 @dataclass(frozen=True)
 class _Frames:
-    """What belongs together, in video order."""
+    """Associated image files, depth files and pose indices, in video order."""
 
-    pictures: Sequence[Path]
+    images: Sequence[Path]
     depths: Sequence[Path | None]
     poses: Sequence[int]
     facts: dict[str, Any]
 
 
 class RGBDDataManager(RecordedDataManager):
-    """Reads pictures, depth and a TUM trajectory (docs/layouts/rgbd.md)."""
+    """Reads images, depth and a TUM trajectory (docs/layouts/rgbd.md)."""
 
     Settings = RGBDSettings
 
@@ -102,34 +102,32 @@ class RGBDDataManager(RecordedDataManager):
     def open(self, path: Path) -> Recording:
         """See :class:`RecordedDataManager`."""
         settings = self.settings
-        pictures = find_pictures(path)
+        images = find_images(path)
         depths = find_depths(path) if settings.depth == "metric" else []
-        file, trajectory = self._trajectory(path, pictures)
-        by_time = self._by_time(pictures)
+        file, trajectory = self._trajectory(path, images)
+        by_time = self._by_time(images)
         pair = self._paired_by_time if by_time else self._paired_by_order
-        frames = pair(pictures, depths, trajectory, file or path)
-        camera = find_camera(path, frames.pictures[0])
+        frames = pair(images, depths, trajectory, file or path)
+        camera = find_camera(path, frames.images[0])
         scale = self._depth_scale(camera, path) if depths else None
         form = None if scale is None else DepthSteps(1.0 / scale)
         size = self.working_size(camera.intrinsics.width, camera.intrinsics.height)
         rectification = Rectification.of_pinhole(camera.intrinsics, camera.path, size)
-        complete = len(frames.pictures) == len(pictures) == len(trajectory)
-        seen = seen_marks(path / "truth", len(pictures), complete)
-        masks = find_masks(path, frames.pictures)
+        complete = len(frames.images) == len(images) == len(trajectory)
+        seen = find_seen_masks(path / "truth", len(images), complete)
+        masks = find_masks(path, frames.images)
         shots = [
             Shot(
-                picture.stem,
-                picture,
+                image.stem,
+                image,
                 rectification,
                 trajectory.camera_to_world[pose],
                 depth,
                 form,
-                mask=masks.get(picture.stem),
+                mask=masks.get(image.stem),
                 seen=seen.get(index),
             )
-            for index, (picture, depth, pose) in enumerate(
-                zip(frames.pictures, frames.depths, frames.poses, strict=True)
-            )
+            for index, (image, depth, pose) in enumerate(zip(frames.images, frames.depths, frames.poses, strict=True))
         ]
         facts: dict[str, Any] = {
             "layout": "TUM RGB-D",
@@ -152,58 +150,58 @@ class RGBDDataManager(RecordedDataManager):
             kind=f"TUM RGB-D, associated by {frames.facts['by']}",
             shots=shots,
             facts=facts,
-            fingerprint=fingerprint(path, (*frames.pictures, *frames.depths, *masks.values()), (file, camera.path)),
+            fingerprint=fingerprint(path, (*frames.images, *frames.depths, *masks.values()), (file, camera.path)),
             own_points=(lambda: _points(points)) if points is not None else None,
             points_source=points,
         )
 
-    def _trajectory(self, path: Path, pictures: Sequence[Path]) -> tuple[Path | None, Trajectory]:
-        """The poses, and the file they come from."""
+    def _trajectory(self, path: Path, images: Sequence[Path]) -> tuple[Path | None, Trajectory]:
+        """The trajectory and its file."""
         file = find_trajectory(path, self.settings.trajectory)
         return file, tum.read(file)
 
-    def _by_time(self, pictures: Sequence[Path]) -> bool:
+    def _by_time(self, images: Sequence[Path]) -> bool:
         if self.settings.association != "auto":
             return self.settings.association == "time"
-        timed = [is_time(path.stem) for path in pictures]
+        timed = [is_time(path.stem) for path in images]
         if any(timed) and not all(timed):
             raise InputError(
-                f"{pictures[timed.index(False)]} is not named by a time, but {pictures[timed.index(True)].name} is",
-                "names of one kind",
+                f"{images[timed.index(False)]} is not named by a timestamp, but {images[timed.index(True)].name} is",
+                "only timestamps, or only frame numbers",
                 "Rename, or choose with the option association",
             )
         return all(timed)
 
     def _paired_by_time(
-        self, pictures: Sequence[Path], depths: Sequence[Path], trajectory: Trajectory, file: Path
+        self, images: Sequence[Path], depths: Sequence[Path], trajectory: Trajectory, file: Path
     ) -> _Frames:
         tolerance = self.settings.max_time_difference
-        taken = times(pictures)
+        taken = times(images)
         order = np.argsort(taken, kind="stable")
-        pictures, taken = [pictures[index] for index in order], taken[order]
+        images, taken = [images[index] for index in order], taken[order]
         same = np.flatnonzero(np.diff(taken) == 0.0)
         if len(same):
             first = int(same[0])
-            raise InputError(f"{pictures[first]} and {pictures[first + 1].name} have the same time", "one of them")
+            raise InputError(f"{images[first]} and {images[first + 1].name} have the same timestamp", "one of them")
         known = np.zeros(0) if trajectory.timestamps is None else trajectory.timestamps
         pose = nearest_in_time(taken, known, tolerance)
         if not (pose >= 0).any():
             raise InputError(
-                f"no pose of {file} is within {tolerance:g} of a picture: pictures from {taken[0]:.6f} to "
+                f"no pose of {file} is within {tolerance:g} of an image: images from {taken[0]:.6f} to "
                 f"{taken[-1]:.6f}, poses from {known.min():.6f} to {known.max():.6f}",
-                "times of one clock in names and trajectory, in seconds",
-                "Shift the trajectory's times, or set association: order if line n belongs to picture n",
+                "timestamps of one clock in names and trajectory, in seconds",
+                "Shift the trajectory's timestamps, or set association: order if line n belongs to image n",
             )
         posed = pose >= 0
-        depth = np.full(len(pictures), -1)
+        depth = np.full(len(images), -1)
         complete = posed.copy()
         if depths:
             depth[posed] = nearest_in_time(taken[posed], times(depths), tolerance)
             complete &= depth >= 0
         if not complete.any():
             raise InputError(
-                f"no depth file within {tolerance:g} of a picture that has a pose",
-                "depth files named by times of the pictures' clock",
+                f"no depth file within {tolerance:g} of an image that has a pose",
+                "depth files named by timestamps of the images' clock",
                 "Rename them, or set depth: none",
             )
         kept = np.flatnonzero(complete)
@@ -213,39 +211,39 @@ class RGBDDataManager(RecordedDataManager):
         }
         if sum(dropped.values()):
             log.warning(
-                "%s: of %d pictures %d have no pose and %d no depth within %g s; they are left out",
+                "%s: of %d images %d have no pose and %d no depth within %g s; they are left out",
                 file.parent,
-                len(pictures),
+                len(images),
                 *dropped.values(),
                 tolerance,
             )
         difference = np.abs(taken[kept] - known[pose[kept]]).max()
         facts = {"by": "time", **dropped, "largest_difference_s": float(difference)}
         return _Frames(
-            [pictures[index] for index in kept],
+            [images[index] for index in kept],
             [depths[depth[index]] if depths else None for index in kept],
             [int(pose[index]) for index in kept],
             facts,
         )
 
     def _paired_by_order(
-        self, pictures: Sequence[Path], depths: Sequence[Path], trajectory: Trajectory, file: Path
+        self, images: Sequence[Path], depths: Sequence[Path], trajectory: Trajectory, file: Path
     ) -> _Frames:
-        numbered = by_number(pictures)
+        numbered = by_number(images)
         if len(trajectory) != len(numbered):
             raise InputError(
-                f"{file} has {len(trajectory)} poses for {len(numbered)} pictures",
-                "a pose for every picture, in order",
-                "Restore the missing ones; or set association: time, if pictures are named by the times in that file",
+                f"{file} has {len(trajectory)} poses for {len(numbered)} images",
+                "a pose for every image, in order",
+                "Restore the missing ones; or set association: time, if images are named by its timestamps",
             )
         self._check_times_say_the_same(numbered, trajectory, file)
         deep = by_number(depths)
         if deep and deep.keys() != numbered.keys():
             lone = min(deep.keys() ^ numbered.keys())
             raise InputError(
-                f"{file.parent} has {len(numbered)} pictures and {len(deep)} depth files; frame "
+                f"{file.parent} has {len(numbered)} images and {len(deep)} depth files; frame "
                 f"{' '.join(map(str, lone))} has only one of the two",
-                "a depth file for every picture, or none at all",
+                "a depth file for every image, or none at all",
                 "Restore the missing files, or set depth: none",
             )
         return _Frames(
@@ -255,7 +253,7 @@ class RGBDDataManager(RecordedDataManager):
     def _check_times_say_the_same(
         self, numbered: dict[tuple[int, ...], Path], trajectory: Trajectory, file: Path
     ) -> None:
-        """Refuse frame numbers as times of which most, but not all, are the pictures' numbers: poses went astray."""
+        """Refuse a trajectory whose timestamps are frame numbers that match most, but not all, images."""
         if trajectory.timestamps is None or self.settings.association == "order":
             return
         named = np.array([key[0] if len(key) == 1 else -1 for key in numbered], np.float64)
@@ -263,10 +261,10 @@ class RGBDDataManager(RecordedDataManager):
         if 0.5 < agrees.mean() < 1.0 or (set(named) == set(trajectory.timestamps) and not agrees.all()):
             index = int(np.argmin(agrees))
             raise InputError(
-                f"{file}: pose {index} is of time {trajectory.timestamps[index]:g}, but picture {index} is "
+                f"{file}: pose {index} has timestamp {trajectory.timestamps[index]:g}, but image {index} is "
                 f"{list(numbered.values())[index].name}",
-                "line n for picture n, or the times as names",
-                "Set association: time if the names are the times, or order if the times mean nothing",
+                "line n for image n, or timestamps equal to the image names",
+                "Set association: time if the names are timestamps, or order if the timestamps are meaningless",
             )
 
     def _depth_scale(self, camera: CameraFile, path: Path) -> float:
@@ -275,14 +273,14 @@ class RGBDDataManager(RecordedDataManager):
             raise InputError(
                 f"{camera.path}: depth_scale = {said:g}, but the option depth_scale is {given:g}",
                 "one depth_scale",
-                "Leave the option out, or mend the file",
+                "Leave the option out, or correct the file",
             )
         scale = said if said is not None else given
         if scale is None:
             raise InputError(
-                f"{path} has depth files, but nothing says how many of their steps make one unit of the trajectory",
-                '"depth_scale" in camera.json, or the option depth_scale; TUM\'s own files have 5000 steps a metre',
-                "Say it, for instance --set datamanager.depth_scale=5000, or set depth: none if depth is relative",
+                f"{path} has depth files, but their number of steps per unit of the trajectory is not given",
+                '"depth_scale" in camera.json, or the option depth_scale; TUM\'s files have 5000 steps per metre',
+                "Set it, for instance --set datamanager.depth_scale=5000, or set depth: none if depth is relative",
             )
         return scale
 
@@ -292,12 +290,12 @@ def _points(path: Path) -> PointCloud:
 
 
 class UnposedRGBDDataManager(RGBDDataManager):
-    """Reads what :class:`RGBDDataManager` does, without a trajectory: every camera is at the origin.
+    """RGB-D data manager without a trajectory: every camera is at the origin.
 
-    Registered under no name, so that nothing trains on such poses.
+    Not in the registry, so that it cannot be used for training.
     """
 
-    def _trajectory(self, path: Path, pictures: Sequence[Path]) -> tuple[Path | None, Trajectory]:
-        nowhere = np.tile(np.eye(4), (len(pictures), 1, 1))
-        # A pose for every image, at its own time where it has one: images are paired with depth alone.
-        return None, Trajectory(nowhere, timestamps=times(pictures) if self._by_time(pictures) else None)
+    def _trajectory(self, path: Path, images: Sequence[Path]) -> tuple[Path | None, Trajectory]:
+        identity = np.tile(np.eye(4), (len(images), 1, 1))
+        # Each image's pose has its own timestamp, so that only depth has to be matched.
+        return None, Trajectory(identity, timestamps=times(images) if self._by_time(images) else None)

@@ -1,4 +1,4 @@
-"""Writing a scene in TUM's RGB-D form, as this package and most SLAM systems read it."""
+"""Writes scenes in TUM's RGB-D layout."""
 
 from __future__ import annotations
 
@@ -18,37 +18,37 @@ from coliags_plugin.datamanagers.rgbd.association import is_time, times
 from coliags_plugin.poses import tum
 from coliags_plugin.poses.trajectory import Trajectory
 
-#: The largest number of 16 bits.
+#: Largest 16-bit value.
 _LARGEST = 65_535
 TRAJECTORY, CAMERA = "trajectory.txt", "camera.json"
 
 
 def write_frame(
     folder: Path,
-    picture: str,
+    name: str,
     image: UInt8[np.ndarray, "H W 3"],
     z_depth: Float[np.ndarray, "H W"],
     scale: float,
     mask: Bool[np.ndarray, "H W"] | None = None,
 ) -> None:
-    """Write a picture, its depth and, where there is one, its mask, all under one file name.
+    """Write an image, its depth and its optional mask under the same file name.
 
     Args:
-        folder: Of the scene.
-        picture: The file name, a time in seconds or a number.
+        folder: Folder of the scene.
+        name: File name, a timestamp in seconds or a number.
         image: RGB. [H, W, 3]
         z_depth: As for :func:`depth_steps`. [H, W]
         scale: Steps per unit of length.
         mask: True where a pixel counts. [H, W]
     """
-    write_image(folder / "rgb" / picture, image)
-    write_image(folder / "depth" / picture, depth_steps(z_depth, scale))
+    write_image(folder / "rgb" / name, image)
+    write_image(folder / "depth" / name, depth_steps(z_depth, scale))
     if mask is not None:
-        write_mask(folder / "mask" / picture, mask)
+        write_mask(folder / "mask" / name, mask)
 
 
 def write_lists(folder: Path, stamps: Sequence[str]) -> None:
-    """Write ``rgb.txt`` and ``depth.txt``, which TUM's tools read: pictures named by their times in seconds."""
+    """Write TUM's file lists ``rgb.txt`` and ``depth.txt`` for images named by timestamps in seconds."""
     for kind in ("rgb", "depth"):
         lines = ["# timestamp filename", *(f"{stamp} {kind}/{stamp}.png" for stamp in stamps)]
         atomic_write(folder / f"{kind}.txt", "\n".join(lines) + "\n")
@@ -62,61 +62,59 @@ def write_rgbd_scene(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Path:
-    """Write a scene that the ``rgbd`` data manager reads with no option (docs/layouts/rgbd.md 1).
+    """Write a scene that the ``rgbd`` data manager reads without options (docs/layouts/rgbd.md 1).
 
-    Frames named by their times (docs/layouts/rgbd.md) keep their names, and the trajectory has these times; others are
-    numbered, and their numbers are the times. Masks are written where a frame has one.
-    Depth is in the finest of the steps 1, 1/2, 1/5, 1/10, ... that reach the farthest pixel.
+    Frames named by timestamps (docs/layouts/rgbd.md) keep their names, and the trajectory has these timestamps; others
+    are numbered, and their numbers are the timestamps. Masks are written for frames that have one. The depth step is
+    the smallest of 1, 1/2, 1/5, 1/10, ... whose 16-bit range contains the largest depth.
 
     Args:
-        folder: The folder to make.
-        frames: In video order, all of one camera; the poses in them are not used.
+        folder: The folder to create.
+        frames: In video order, all of one camera; their poses are not used.
         camera_to_world: Rigid, OpenCV axes, the unit of the depth. [N, 4, 4]
-        overwrite: Replace what is there.
-        progress: Told how far it is.
+        overwrite: Replace an existing folder.
+        progress: Progress callback.
 
     Returns:
         The trajectory's file.
 
     Raises:
-        InputError: There are no frames or other numbers of poses; a frame has no depth, or another camera; or the
+        InputError: There are no frames; the number of poses differs; a frame has no depth, or another camera; or the
             folder exists or cannot be written.
     """
     if not frames or len(frames) != len(camera_to_world):
         raise InputError(f"{len(frames)} frames and {len(camera_to_world)} poses", "one pose for each frame")
     intrinsics = frames[0].camera.intrinsics
     scale = depth_scale(max(_farthest(frame) for frame in frames))
-    pictures = [f"{frame.name}.png" for frame in frames]
+    names = [f"{frame.name}.png" for frame in frames]
     timed = all(is_time(frame.name) for frame in frames) and bool(
-        (np.diff(times([Path(picture) for picture in pictures])) > 0.0).all()
+        (np.diff(times([Path(name) for name in names])) > 0.0).all()
     )
     if not timed:
-        pictures = [f"{index:04d}.png" for index in range(len(frames))]
+        names = [f"{index:04d}.png" for index in range(len(frames))]
     with atomic_folder(folder, overwrite) as scratch:
         for index, frame in enumerate(frames):
             if frame.camera.intrinsics != intrinsics:
-                raise InputError(f"frame {frame.name} has a camera of its own", "one pinhole for all frames")
+                raise InputError(f"frame {frame.name} has another camera", "one pinhole for all frames")
             mask = None if frame.mask is None else frame.mask.numpy()
-            write_frame(scratch, pictures[index], frame.image.numpy(), _depth(frame), scale, mask)
+            write_frame(scratch, names[index], frame.image.numpy(), _depth(frame), scale, mask)
             if progress is not None:
                 progress("write frames", index + 1, len(frames))
-        tum.write(
-            scratch / TRAJECTORY, Trajectory(camera_to_world, timestamps=times([Path(picture) for picture in pictures]))
-        )
+        tum.write(scratch / TRAJECTORY, Trajectory(camera_to_world, timestamps=times([Path(name) for name in names])))
         size = {"w": intrinsics.width, "h": intrinsics.height}
         write_camera_json(scratch / CAMERA, intrinsics, **size, depth_scale=scale)
     return folder / TRAJECTORY
 
 
 def depth_scale(farthest: float) -> float:
-    """Steps per unit of length: the largest of 1, 2, 5 times a power of ten that reaches so far in 16 bits."""
+    """Steps per unit of length: the largest of 1, 2, 5 times a power of ten for which the depth fits into 16 bits."""
     finest = _LARGEST / farthest
     power = 10.0 ** np.floor(np.log10(finest))
     return float(next(power * digit for digit in (5, 2, 1) if power * digit <= finest))
 
 
 def depth_steps(depth: Float[np.ndarray, "H W"], scale: float) -> UInt16[np.ndarray, "H W"]:
-    """z-depth as stored; 0 where it is unknown, or too far for 16 bits. [H, W]"""
+    """z-depth in 16-bit steps; 0 where unknown or out of range. [H, W]"""
     known = np.isfinite(depth) & (depth > 0.0)
     steps = np.maximum(np.rint(np.where(known, depth, 0.0) * scale), 1)
     return np.where(known & (steps <= _LARGEST), steps, 0).astype(np.uint16)

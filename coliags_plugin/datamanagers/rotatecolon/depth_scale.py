@@ -1,4 +1,4 @@
-"""Do depth and points agree in scale? Surfaces seen from several places tell."""
+"""Estimates the scale of depth relative to points on the same surface."""
 
 from __future__ import annotations
 
@@ -11,21 +11,20 @@ from jaxtyping import Float
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.recording import Shot
 
-#: Frames and pixels of each that are looked at, and points they are compared with, at most.
+#: Most frames, pixels per frame and points that are compared.
 _FRAMES, _PIXELS, _POINTS = 6, 100, 50_000
-#: Factors tried: from a third to three times, then ever finer around the best.
+#: Grid search over the scale, coarse to fine: (largest factor, number of steps) of each round.
 _ROUNDS = ((3.0, 31), (1.08, 17), (1.01, 11))
 
 
 @dataclass(frozen=True)
 class ScaleFit:
-    """How far back-projected depth is from points of the same surface.
+    """Fit of back-projected depth to points of the same surface.
 
     Attributes:
-        factor: Depth times this lies closest to the points.
-        distance: Median distance of back-projected pixels from their nearest point, as a share of their z-depth,
-            with depth as it is.
-        distance_at_best: The same with depth times ``factor``.
+        factor: Scale of depth that minimises the distance to the points.
+        distance: Median distance of back-projected pixels to their nearest point, relative to z-depth, at scale 1.
+        distance_at_best: The same at scale ``factor``.
     """
 
     factor: float
@@ -34,18 +33,15 @@ class ScaleFit:
 
     @property
     def disagrees(self) -> bool:
-        """Whether depth times another factor fits far better: by more than 5 %, at less than half of the distance."""
+        """Whether the best scale is more than 5 % off 1 and halves the distance."""
         return abs(self.factor - 1.0) > 0.05 and self.distance_at_best < 0.5 * self.distance
 
 
 def fit_scale(shots: Sequence[Shot], points: Float[np.ndarray, "N 3"]) -> ScaleFit | None:
-    """Compare the depth of a few frames, as stored, with points of the surface.
-
-    Points need only lie on the surface; which of them belongs to which pixel is not known. So each pixel is compared
-    with the point nearest to where its depth puts it, and the scale is right that brings pixels closest to points.
+    """Fit the scale of the depth of a few frames to points of the surface, by nearest-neighbour distances.
 
     Args:
-        shots: Frames, of which some may have depth; pinhole pictures.
+        shots: Frames of pinhole images; some may have no depth.
         points: World of the poses. [N, 3]
 
     Returns:
@@ -87,7 +83,7 @@ def fit_scale(shots: Sequence[Shot], points: Float[np.ndarray, "N 3"]) -> ScaleF
 def _sampled(
     shot: Shot, generator: np.random.Generator
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "P 3"], Float[np.ndarray, "P"]]:
-    """Some pixels of known depth: the camera's centre, world directions with z = 1 in the camera, z-depths."""
+    """Camera centre, world ray directions (z = 1 in the camera frame) and z-depths of random pixels of known depth."""
     if shot.depth is None or shot.depth_format is None:
         raise InputError(f"{shot.name} has no depth", "a frame with depth")
     rectification = shot.rectification

@@ -1,4 +1,4 @@
-"""Depth in OpenEXR files, as Blender renders it: named channels of floating-point numbers."""
+"""Depth in OpenEXR files, as written by Blender."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from jaxtyping import Float32, Shaped
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.reading.depth_formats import DepthFormat
 
-#: Blender writes 1e10 where a ray meets nothing; from here on it is no depth in any unit.
-NOTHING = 1e6
+#: Stored depth from this value on is background; Blender writes 1e10.
+BACKGROUND = 1e6
 
 
 @dataclass(frozen=True)
 class ExrDepth(DepthFormat):
-    """One channel, proportional to z-depth; whatever is not finite, not positive or beyond ``NOTHING`` is unknown.
+    """One channel proportional to z-depth; unknown where not finite, not positive or at least ``BACKGROUND``.
 
     Attributes:
-        channel: Its full name.
-        divisor: Stored numbers over this are scene units.
+        channel: Full name of the channel.
+        divisor: Divisor from stored values to scene units.
     """
 
     channel: str
@@ -30,7 +30,7 @@ class ExrDepth(DepthFormat):
     def read(self, path: Path) -> Shaped[np.ndarray, "H W"]:
         """See :class:`DepthFormat`; float32, 0 where unknown."""
         stored = read_exr_channel(path, self.channel)
-        known = np.isfinite(stored) & (stored > 0.0) & (stored < NOTHING)
+        known = np.isfinite(stored) & (stored > 0.0) & (stored < BACKGROUND)
         return np.where(known, stored, np.float32(0.0))
 
     def z_depth(self, stored: Shaped[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
@@ -39,10 +39,10 @@ class ExrDepth(DepthFormat):
 
 
 def read_exr_channel(path: Path, channel: str) -> Float32[np.ndarray, "H W"]:
-    """A channel of an EXR file, by its full name, from whichever part has it.
+    """Read a channel of an EXR file by its full name, from any part.
 
     Raises:
-        InputError: The file cannot be read whole, or has no such channel; the message names those it has.
+        InputError: The file is damaged or has no such channel; the message names its channels.
     """
     import OpenEXR
 
@@ -50,7 +50,7 @@ def read_exr_channel(path: Path, channel: str) -> Float32[np.ndarray, "H W"]:
         raise InputError(f"no file {path}", "an OpenEXR file")
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            # A damaged file has no parts.
+            # OpenEXR returns no parts for a damaged file.
             channels = {name: found.pixels for part in file.parts for name, found in part.channels.items()}
     except (OSError, RuntimeError, ValueError) as error:
         raise _damaged(path) from error
@@ -68,6 +68,6 @@ def read_exr_channel(path: Path, channel: str) -> Float32[np.ndarray, "H W"]:
 def _damaged(path: Path) -> InputError:
     return InputError(
         f"{path} ({path.stat().st_size} bytes) cannot be decoded",
-        "a whole OpenEXR file",
+        "a complete OpenEXR file",
         "It is damaged or cut short: fetch it again",
     )

@@ -1,4 +1,4 @@
-"""Where the files of a RotateColon scene are, and what its JSON says (docs/layouts/rotatecolon.md 1, 2)."""
+"""Finding the files of a RotateColon scene and reading its JSON (docs/layouts/rotatecolon.md 1, 2)."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ POINTS = "init_point_cloud.ply"
 
 @dataclass(frozen=True)
 class ViewFiles:
-    """Pictures of one JSON file.
+    """Images, depth files and poses of one JSON file.
 
     Attributes:
-        transforms: The file.
-        images: In order of their numbers.
-        depths: Of the same pictures; None where there is not one.
+        transforms: The JSON file.
+        images: Image files in order of their numbers.
+        depths: Their depth files; None if there are none.
         camera_to_world: Rigid, OpenCV axes, the data's units. [N, 4, 4]
         angle: Horizontal field of view, radians.
-        unposed: Number of pictures in the folder that the file says nothing about.
+        unposed: Number of images without a pose.
     """
 
     transforms: Path
@@ -47,7 +47,7 @@ class ViewFiles:
 
 
 def recognise(folder: Path) -> str | None:
-    """What in the folder says that it is a RotateColon scene; None where nothing does."""
+    """The files that identify a RotateColon scene; None if the folder is none."""
     if (folder / TRAIN).is_file() and (folder / TRAIN_VIEWS).is_dir():
         return f"{TRAIN} beside {TRAIN_VIEWS}/"
     return None
@@ -57,7 +57,7 @@ def find_train(folder: Path) -> ViewFiles:
     """The training views.
 
     Raises:
-        InputError: The folder is missing or holds something else; or as :func:`find_views`.
+        InputError: The folder is missing or has another layout; or as :func:`find_views`.
     """
     if not folder.is_dir():
         raise InputError(f"no folder {folder}", LAYOUT, "Check the path")
@@ -67,44 +67,44 @@ def find_train(folder: Path) -> ViewFiles:
 
 
 def find_test(folder: Path, test_folder: str) -> ViewFiles | None:
-    """The test views, which have no depth; None where the data have none.
+    """The test views, without depth; None if there are none.
 
     Raises:
-        InputError: There are poses but no pictures; or as :func:`find_views`.
+        InputError: There are poses but no images; or as :func:`find_views`.
     """
     if not (folder / TEST).is_file():
         return None
     if not (folder / test_folder).is_dir():
         raise InputError(
             f"{folder} has {TEST} but no folder {test_folder}",
-            "the pictures of the test views",
+            "the images of the test views",
             "Set test_folder to the folder they are in",
         )
     return find_views(folder / TEST, folder / test_folder, None)
 
 
-def find_views(transforms: Path, pictures: Path, depth: Path | None) -> ViewFiles:
-    """Poses, and the pictures and depth files they belong to.
+def find_views(transforms: Path, images: Path, depth: Path | None) -> ViewFiles:
+    """Find the images and depth files of the poses in a JSON file.
 
     Raises:
-        InputError: The JSON cannot be read, or a pose is not rigid; a frame is no number, stands twice or has no
-            picture; or some but not all frames have a depth file.
+        InputError: The JSON cannot be read, or a pose is not rigid; a frame has no number, is repeated or has no
+            image; or only some frames have a depth file.
     """
     trajectory = read_transforms(transforms)
-    found = numbered(pictures, "", frozenset({".png"}))
+    found = numbered(images, "", frozenset({".png"}))
     stated = _numbers(transforms, trajectory.names_or_numbers())
     order = sorted(range(len(stated)), key=stated.__getitem__)
     numbers = [stated[index] for index in order]
     for number in numbers:
         if number not in found:
             raise InputError(
-                f"{transforms}: frame {number} has no picture {pictures / f'{number:04d}.png'}",
-                "a picture for every frame",
+                f"{transforms}: frame {number} has no image {images / f'{number:04d}.png'}",
+                "an image for every frame",
                 "Restore it, or remove the frame",
             )
     unposed = len(found) - len(numbers)
     if unposed:
-        log.warning("%s: %d pictures of %s have no pose and are left out", transforms, unposed, pictures.name)
+        log.warning("%s: %d images of %s have no pose and are left out", transforms, unposed, images.name)
     return ViewFiles(
         transforms,
         tuple(found[number] for number in numbers),
@@ -116,7 +116,7 @@ def find_views(transforms: Path, pictures: Path, depth: Path | None) -> ViewFile
 
 
 def _numbers(transforms: Path, names: Sequence[str]) -> list[int]:
-    """The frames' numbers, which ``file_path`` holds, with a folder and a suffix or without."""
+    """Frame numbers from ``file_path``, with or without folder and suffix."""
     numbers: list[int] = []
     seen: set[int] = set()
     for name in names:
@@ -125,7 +125,7 @@ def _numbers(transforms: Path, names: Sequence[str]) -> list[int]:
             raise InputError(f"{transforms}: file_path '{name}'", "the frame's number, for instance '12'")
         number = int(stem)
         if number in seen:
-            raise InputError(f"{transforms}: frame {number} stands twice", "one pose for each picture")
+            raise InputError(f"{transforms}: frame {number} is repeated", "one pose for each image")
         seen.add(number)
         numbers.append(number)
     return numbers
@@ -142,8 +142,8 @@ def _depths(numbers: Sequence[int], folder: Path | None) -> tuple[Path, ...] | N
         raise InputError(
             f"{folder} has {len(numbers) - len(lacking)} depth files for {len(numbers)} frames; frame {lacking[0]} has "
             "none",
-            "a depth file for every picture, or none at all",
-            "Restore the missing files: archives cut short are common",
+            "a depth file for every image, or none at all",
+            "Restore the missing files: incomplete archives are common",
         )
     return tuple(found[number] for number in numbers)
 

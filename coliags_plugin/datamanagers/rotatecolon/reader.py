@@ -1,4 +1,4 @@
-"""RotateColon, PR-Endo's rendered colon whose test views are turned as no training view is."""
+"""Data manager for RotateColon, PR-Endo's rendered colon with rotated test views."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from coliags_plugin.datamanagers.rotatecolon.depth_scale import fit_scale
 from coliags_plugin.datamanagers.rotatecolon.exr_depth import ExrDepth
 from coliags_plugin.datamanagers.rotatecolon.files import POINTS, ViewFiles, find_test, find_train, recognise
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
-from coliags_plugin.datamanagers.seen import ROTATION, seen_marks
+from coliags_plugin.datamanagers.seen import ROTATION, find_seen_masks
 from coliags_plugin.datamanagers.splits import Split
 
 log = logging.getLogger(__name__)
 
-#: The colour PR-Endo and the authors' code give every initial point, whatever the file says.
+#: The colour that PR-Endo and the authors' code give all initial points, ignoring the file's colours.
 PINK = (188, 99, 76)
-#: The test set of the split's own, in the absence of which the data's test views are it.
+#: Name of the split's test set, or of the dataset's test views if the split holds out none.
 _MAIN_SET = "test"
 
 
@@ -38,28 +38,28 @@ class RotateColonSettings(SceneSettings):
     depth_divisor: float = Field(
         1.4,
         gt=0.0,
-        description="Stored depth over this is in units of the poses. Of unknown origin: PR-Endo's code has it, and "
-        "nothing says why (docs/layouts/rotatecolon.md 4).",
+        description="Divisor from stored depth to units of the poses. Taken from PR-Endo's code, which does not "
+        "explain it (docs/layouts/rotatecolon.md 4).",
     )
     depth_channel: str = Field("ViewLayer.Depth.Z", description="The EXR channel that holds depth.")
-    test_folder: str = Field("test_views_1", description="The folder of the pictures of transforms_test.json.")
-    split: Split = Field("all-train", description="As for all data; the test views come apart from the video.")
-    initial_points: InitialPoints = Field("data", description="As for all data; init_point_cloud.ply.")
+    test_folder: str = Field("test_views_1", description="The folder of the images of transforms_test.json.")
+    split: Split = Field("all-train", description="As for all data managers; the test views are a separate set.")
+    initial_points: InitialPoints = Field("data", description="As for all data managers; init_point_cloud.ply.")
 
 
 class RotateColonDataManager(RecordedDataManager):
     """Reads a RotateColon scene; see docs/layouts/rotatecolon.md.
 
     The views of transforms_test.json, which have no depth, are the test set ``test``; where a split holds out training
-    views, these are ``test`` and the others ``rotation``. ``truth/seen/NNNN_seen.png`` marks what all training views
-    see of the views of transforms_test.json.
+    views, these are ``test`` and the others ``rotation``. ``truth/seen/NNNN_seen.png`` are the masks of the pixels of
+    transforms_test.json's views that training views see.
     """
 
     Settings = RotateColonSettings
 
     settings: RotateColonSettings
     name = "rotatecolon"
-    #: What is published was made at the pictures' own size.
+    #: Published results use the stored size.
     fits = None
     seen_split = "all-train"
 
@@ -77,7 +77,7 @@ class RotateColonDataManager(RecordedDataManager):
         name = ROTATION if holds_out else _MAIN_SET
         test_sets = {}
         if test is not None:
-            seen = seen_marks(path / "truth", len(test.images), complete=not train.unposed and not test.unposed)
+            seen = find_seen_masks(path / "truth", len(test.images), complete=not train.unposed and not test.unposed)
             test_sets[name], facts[name] = self._shots(test, seen, "test-")
         points = path / POINTS
         facts["depth_against_points"] = self._compared(shots, points)
@@ -125,7 +125,7 @@ class RotateColonDataManager(RecordedDataManager):
         return shots, facts
 
     def _compared(self, shots: list[Shot], points: Path) -> dict[str, float] | None:
-        """How well depth and the initial points agree; None where one of them is absent."""
+        """Scale agreement of depth and initial points; None if one of them is missing."""
         if not points.is_file():
             return None
         fit = fit_scale(shots, load_points(points).positions.double().numpy())
@@ -134,7 +134,7 @@ class RotateColonDataManager(RecordedDataManager):
         divisor = self.settings.depth_divisor
         if fit.disagrees:
             log.warning(
-                "%s: depth / %g lies off the points by %.2g of its length, depth / %.4g by %.2g; "
+                "%s: depth / %g is off the points by %.2g of the depth, depth / %.4g by %.2g; "
                 "consider depth_divisor (docs/layouts/rotatecolon.md 4)",
                 points,
                 divisor,

@@ -1,4 +1,4 @@
-"""Writing RotateColon's layout: Blender's views and EXR depth (docs/layouts/rotatecolon.md)."""
+"""Writes RotateColon's layout: Blender's views and EXR depth (docs/layouts/rotatecolon.md)."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from coliags_plugin.datamanagers.rotatecolon.files import POINTS, TEST, TRAIN, T
 from coliags_plugin.poses.rigid import FLIP_Y_AND_Z
 
 TEST_VIEWS = "test_views_1"
-#: Stored depth per mm, as in the data; and what Blender stores where a ray meets nothing.
-_DEPTH_FACTOR, _NOTHING = 1.4, 1e10
+#: Stored depth per mm, as in the dataset, and Blender's depth of the background.
+_DEPTH_FACTOR, _BACKGROUND = 1.4, 1e10
 
 
 def write_view(folder: Path, index: int, image: UInt8[np.ndarray, "H W 3"], z_depth: Float[np.ndarray, "H W"]) -> None:
     """Write a training view.
 
     Args:
-        folder: Of the scene.
-        index: Of the view, counted from 0.
+        folder: Folder of the scene.
+        index: Index of the view, from 0.
         image: RGB. [H, W, 3]
         z_depth: mm; 0 where there is no wall. [H, W]
     """
     write_image(folder / TRAIN_VIEWS / f"{index:04d}.png", image)
-    stored = np.where(z_depth > 0.0, z_depth * _DEPTH_FACTOR, _NOTHING).astype(np.float32)
+    stored = np.where(z_depth > 0.0, z_depth * _DEPTH_FACTOR, _BACKGROUND).astype(np.float32)
     _write_exr(folder / TRAIN_DEPTH / f"{index:04d}.exr", image, stored)
 
 
@@ -41,7 +41,7 @@ def write_transforms(folder: Path, camera_to_world: Float[np.ndarray, "N 4 4"], 
     """Write the JSON of the training or of the test views.
 
     Args:
-        folder: Of the scene.
+        folder: Folder of the scene.
         camera_to_world: OpenCV axes, mm. [N, 4, 4]
         angle: Horizontal field of view, radians.
         test: Whether they are the test views.
@@ -59,7 +59,7 @@ def write_points(folder: Path, positions: Float[np.ndarray, "N 3"], colors: UInt
 
 
 def _write_exr(path: Path, image: UInt8[np.ndarray, "H W 3"], depth: Float[np.ndarray, "H W"]) -> None:
-    """Several channels, named as Blender names them."""
+    """Write an EXR file with Blender's channel names."""
     import OpenEXR
 
     linear = ((image / 255.0) ** 2.2).astype(np.float16)

@@ -1,4 +1,4 @@
-"""What a folder layout has to say for a phantom to be written in it."""
+"""Base class of phantom layouts."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from coliags_plugin.lenses.models import Lens
 from coliags_plugin.lenses.pinhole import PinholeLens
 from coliags_plugin.phantom.trajectory import every_8th
 
-#: ``video``: the sequence itself. ``rotation``: the test views at its places, turned away from it.
+#: ``video``: the sequence itself. ``rotation``: the rotated test views at its positions.
 Part = Literal["video", "rotation"]
 
 #: Intrinsics of C3VD's undistorted frames (docs/phantom.md 3); the calibration counts from integers, hence + 0.5.
@@ -28,8 +28,8 @@ class PhantomFrame:
     """One frame of a phantom.
 
     Attributes:
-        part: What the frame belongs to.
-        index: Within its part, counted from 0.
+        part: Part that the frame belongs to.
+        index: Index within its part, from 0.
         color: RGB. [H, W, 3]
         z_depth: mm; 0 where there is no wall. [H, W]
         normals: Unit, camera axes, towards the camera; 0 where there is no wall. [H, W, 3]
@@ -44,12 +44,12 @@ class PhantomFrame:
 
 @dataclass(frozen=True)
 class WallPoints:
-    """Points of the wall that training frames see, as structure from motion would have found them.
+    """Points of the wall that training frames see, as a stand-in for structure-from-motion points.
 
     Attributes:
         positions: World, mm. [N, 3]
-        colors: RGB as a training frame photographed them. [N, 3]
-        seen_in: Which of the points a frame of the sequence sees, by the frame's index. [N]
+        colors: RGB from a training frame. [N, 3]
+        seen_in: Mask of the points that a frame of the sequence sees, by frame index. [N]
     """
 
     positions: Float[np.ndarray, "N 3"]
@@ -58,27 +58,27 @@ class WallPoints:
 
 
 class Layout(ABC):
-    """How one phantom lies in a folder.
+    """Interface of a folder layout that a phantom is written in.
 
     A folder is written in this order: every frame of the video, every rotation view, then :meth:`write_sequence` for
-    the video and for the rotation views, then :meth:`write_points`. ``phantom.json`` and ``truth/`` are not the
-    layout's: they are the same beside every layout.
+    the video and for the rotation views, then :meth:`write_points`. ``phantom.json`` and ``truth/`` are the same in
+    every layout and not written by it.
     """
 
-    #: Width and height, pixels, where none are asked for.
+    #: Default width and height, pixels.
     default_size: ClassVar[tuple[int, int]] = (338, 270)
-    #: Whether there is a place for rotation views; where there is none, none are taken.
+    #: Whether the layout supports rotation views; otherwise none are rendered.
     has_rotation: ClassVar[bool] = False
-    #: Whether there is a place for initial points; where there is none, none are drawn.
+    #: Whether the layout supports initial points.
     has_points: ClassVar[bool] = False
     #: Whether the mesh and its coverage belong to the layout, as ``coverage_mesh.obj``.
     has_coverage_mesh: ClassVar[bool] = False
 
     def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
-        """The lens of frames of this size, and which of their pixels are lit. The mask is [H, W].
+        """The lens of frames of this size, and the mask of lit pixels [H, W].
 
-        Unless a layout says otherwise: C3VD's undistorted camera, scaled by width; its principal point keeps its
-        distance from the middle. All of its pixels are lit.
+        Default: C3VD's undistorted camera, scaled by width, its principal point at the same distance from the middle;
+        all pixels are lit.
         """
         k = _C3VD_PINHOLE
         scale = width / k.width
@@ -87,10 +87,9 @@ class Layout(ABC):
         return PinholeLens(k.fx * scale, k.fy * scale, cx, cy, width, height), np.ones((height, width), bool)
 
     def is_test(self, index: int) -> bool:
-        """Whether a frame of the video is held out by the split that goes with the layout.
+        """Whether a frame of the video is held out by the layout's split; default: 0, 8, 16, ...
 
-        0, 8, 16, ... unless a layout says otherwise. Points, rotation views and the masks of what training frames saw
-        go by it.
+        Points, rotation views and seen masks depend on it.
         """
         return every_8th(index)
 
@@ -99,29 +98,29 @@ class Layout(ABC):
         """Write one frame.
 
         Args:
-            folder: Of the phantom.
-            frame: What was taken.
+            folder: Folder of the phantom.
+            frame: The frame.
         """
 
     @abstractmethod
     def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
-        """Write what belongs to all frames of a part: poses and, where the layout has one, the camera.
+        """Write the poses and, if part of the layout, the camera of all frames of a part.
 
         Args:
-            folder: Of the phantom.
-            part: What the frames belong to.
+            folder: Folder of the phantom.
+            part: Part that the frames belong to.
             poses: Camera-to-world, OpenCV axes, mm. Each [4, 4]
-            lens: Of all of them, from :meth:`lens`.
+            lens: Lens of all frames, from :meth:`lens`.
         """
 
     def write_points(
         self, folder: Path, points: WallPoints, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens
     ) -> None:
-        """Write initial points; called where :attr:`has_points`. ``poses`` are those of the video."""
-        raise NotImplementedError(f"{type(self).__name__} has no place for points")
+        """Write initial points; called if :attr:`has_points`. ``poses`` are those of the video."""
+        raise NotImplementedError(f"{type(self).__name__} does not support points")
 
     def seen_mask(self, folder: Path, part: Part, index: int) -> Path:
-        """Where the mask goes that says what training frames saw of a test frame."""
+        """Path of the seen mask of a test frame."""
         return folder / ("truth" if part == "video" else part) / "seen" / f"{index:04d}_seen.png"
 
 
@@ -136,6 +135,6 @@ def pinhole_of(lens: Lens) -> Intrinsics:
     return lens.pinhole
 
 
-def place(folder: Path, part: Part) -> Path:
-    """The folder of a part where rotation views lie in ``rotation/`` in the layout of the sequence itself."""
+def part_folder(folder: Path, part: Part) -> Path:
+    """Folder of a part, for layouts with rotation views in ``rotation/``."""
     return folder if part == "video" else folder / part

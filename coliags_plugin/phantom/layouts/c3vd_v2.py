@@ -12,7 +12,7 @@ from coliags_plugin.datamanagers.c3vd.writer import write_poses
 from coliags_plugin.datamanagers.c3vd_v2.lens import CANDIDATE_LENS
 from coliags_plugin.datamanagers.c3vd_v2.writer import write_frame, write_lens
 from coliags_plugin.lenses.models import Lens, octagon_mask
-from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, place
+from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, part_folder
 
 
 class C3VDv2Layout(Layout):
@@ -28,9 +28,9 @@ class C3VDv2Layout(Layout):
 
     def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
         """See :class:`Layout`."""
-        write_frame(place(folder, frame.part), frame.index, frame.color, frame.z_depth, frame.normals)
+        write_frame(part_folder(folder, frame.part), frame.index, frame.color, frame.z_depth, frame.normals)
 
     def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
         """See :class:`Layout`. The lens is described at the size it is calibrated for."""
-        write_poses(place(folder, part) / "pose.txt", np.stack(poses))
+        write_poses(part_folder(folder, part) / "pose.txt", np.stack(poses))
         write_lens(folder, CANDIDATE_LENS)

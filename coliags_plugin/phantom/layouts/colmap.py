@@ -1,4 +1,4 @@
-"""Pictures with a COLMAP sparse model (docs/layouts/colmap.md)."""
+"""Images with a COLMAP sparse model (docs/layouts/colmap.md)."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points, write_model, write_picture
+from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points, write_image_and_mask, write_model
 from coliags_plugin.lenses.models import Lens
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints, pinhole_of
 from coliags_plugin.poses.colmap import colmap_poses, posed_model
 from coliags_plugin.poses.rigid import inverse
 
-#: A feature detector finds a point in one of so many of the pictures that show it.
+#: A point is observed in one of this many images that show it, like a detected feature.
 _FOUND_IN_ONE_OF = 3
 
 
 class ColmapLayout(Layout):
-    """images/ and a binary model of one PINHOLE camera in sparse/0, its points with the pictures they are seen in."""
+    """images/ and a binary model of one PINHOLE camera in sparse/0, its points with the images they are seen in."""
 
     has_points = True
 
     def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
         """See :class:`Layout`; depth and normals are not part of this layout."""
-        write_picture(folder, _name(frame.index), frame.color)
+        write_image_and_mask(folder, _name(frame.index), frame.color)
 
     def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
         """See :class:`Layout`; poses are part of the model."""
@@ -33,7 +33,7 @@ class ColmapLayout(Layout):
     def write_points(
         self, folder: Path, points: WallPoints, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens
     ) -> None:
-        """See :class:`Layout`. Points seen in fewer than two pictures are left out, as COLMAP leaves them out."""
+        """See :class:`Layout`. Points seen in fewer than two images are left out, as COLMAP leaves them out."""
         names = [_name(index) for index in range(len(poses))]
         model = posed_model(colmap_poses(np.stack(poses)), names, [pinhole_of(lens)], [0] * len(poses))
         numbers = np.arange(len(points.positions))

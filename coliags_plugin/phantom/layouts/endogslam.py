@@ -1,4 +1,4 @@
-"""C3VD as EndoGSLAM prepares it, with what EndoGSLAM would find (docs/layouts/c3vd-endogslam.md 1)."""
+"""EndoGSLAM's layout of C3VD with a simulated result of EndoGSLAM (docs/layouts/c3vd-endogslam.md 1)."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from coliags_plugin.datamanagers.c3vd_endogslam.reader import PREPARED_PINHOLE
 from coliags_plugin.datamanagers.c3vd_endogslam.writer import write_frame, write_params
 from coliags_plugin.lenses.models import Lens
 from coliags_plugin.lenses.pinhole import PinholeLens
-from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints, pinhole_of, place
+from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints, part_folder, pinhole_of
 from coliags_plugin.phantom.trajectory import TEST_EVERY
 from coliags_plugin.poses.trajectory import Trajectory
 
 
 class EndoGSLAMLayout(Layout):
-    """color/, 8-bit depth/, pose.txt, and params.npz of a flawless EndoGSLAM run on the training frames."""
+    """color/, 8-bit depth/, pose.txt, and params.npz of an ideal EndoGSLAM run on the training frames."""
 
     default_size = (PREPARED_PINHOLE.width, PREPARED_PINHOLE.height)
     has_rotation = True
@@ -31,16 +31,16 @@ class EndoGSLAMLayout(Layout):
         return index % TEST_EVERY == TEST_EVERY - 1
 
     def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
-        """The camera that EndoGSLAM takes undistorted frames for, stretched to the size. All pixels are lit."""
+        """EndoGSLAM's camera of undistorted frames, scaled to the size. All pixels are lit."""
         return PinholeLens.of(PREPARED_PINHOLE.resized(width, height)), np.ones((height, width), bool)
 
     def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
         """See :class:`Layout`; normals are not part of this layout."""
-        write_frame(place(folder, frame.part), frame.index, frame.color, frame.z_depth)
+        write_frame(part_folder(folder, frame.part), frame.index, frame.color, frame.z_depth)
 
     def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
         """See :class:`Layout`."""
-        write_poses(place(folder, part) / "pose.txt", np.stack(poses))
+        write_poses(part_folder(folder, part) / "pose.txt", np.stack(poses))
 
     def write_points(
         self, folder: Path, points: WallPoints, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens

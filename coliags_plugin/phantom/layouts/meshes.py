@@ -1,4 +1,4 @@
-"""Writing the wall: PLY and OBJ."""
+"""Writes the wall's mesh as PLY and OBJ."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from coliags_plugin.phantom.colon import ColonSurface
 
 
 def write_mesh(path: Path, surface: ColonSurface, vertex_albedo: Float[np.ndarray, "V 3"]) -> None:
-    """The wall as a binary PLY; vertex colours are the albedo, encoded with gamma 2.2."""
+    """Write the wall as a binary PLY; vertex colours are the albedo, encoded with gamma 2.2."""
     colors = np.rint(255.0 * np.clip(vertex_albedo, 0.0, 1.0) ** (1.0 / 2.2)).astype(np.uint8)
     places, shades = point_properties(surface.vertices), dict(zip(("red", "green", "blue"), colors.T, strict=True))
     normals = dict(zip(("nx", "ny", "nz"), surface.normals.T, strict=True))
@@ -20,7 +20,7 @@ def write_mesh(path: Path, surface: ColonSurface, vertex_albedo: Float[np.ndarra
 
 
 def write_coverage_obj(path: Path, surface: ColonSurface, observed: Bool[np.ndarray, "F"]) -> None:
-    """The wall as C3VD's coverage mesh: face corners ``v/vt`` with vt 1 for observed triangles and 2 for others."""
+    """Write C3VD's coverage mesh: face corners ``v/vt`` with vt 1 for observed triangles and 2 for others."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w") as file:
         file.write("# millimetres; vt 1 = observed, vt 2 = not observed\n")

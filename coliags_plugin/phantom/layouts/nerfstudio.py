@@ -1,4 +1,4 @@
-"""nerfstudio's layout, taken through a lens (docs/layouts/nerfstudio.md)."""
+"""nerfstudio's layout with a distorting lens (docs/layouts/nerfstudio.md)."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from coliags_plugin.lenses.models import Lens
 from coliags_plugin.lenses.opencv import OpenCVLens
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame
 
-#: Millimetres in a depth step: up to 655 mm.
+#: Millimetres per depth step: up to 655 mm.
 DEPTH_UNIT = 0.01
-#: A mild barrel, so that whoever forgets to undistort is found out.
+#: A mild barrel distortion, so that missing undistortion is noticed.
 _K1, _K2, _P1, _P2 = -0.2, 0.05, 0.001, -0.002
 
 
@@ -23,7 +23,7 @@ class NerfstudioLayout(Layout):
     """images/, depth/ and a transforms.json in millimetres with an OPENCV camera."""
 
     def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
-        """The usual camera, behind a lens that OpenCV's model describes."""
+        """The default camera with OpenCV's lens distortion."""
         plain, lit = super().lens(width, height)
         return OpenCVLens(**vars(plain.pinhole), k1=_K1, k2=_K2, p1=_P1, p2=_P2), lit
 
@@ -34,5 +34,5 @@ class NerfstudioLayout(Layout):
     def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
         """See :class:`Layout`."""
         if not isinstance(lens, OpenCVLens):
-            raise TypeError("the nerfstudio layout is taken through OpenCV's lens")
+            raise TypeError("the nerfstudio layout needs OpenCV's lens model")
         write_transforms(folder, np.stack(poses), lens, DEPTH_UNIT)

@@ -19,7 +19,7 @@ _DATA, _SCENE, _ITERATION = "C3VD", "phantom", 30_000
 
 
 class PREndoLayout(Layout):
-    """C3VD/phantom without poses, and beside it what EndoGSLAM, given all frames, made of it, as 3DGS PLY too."""
+    """C3VD/phantom without poses, and the result of an ideal EndoGSLAM run on all frames, also as a 3DGS PLY."""
 
     default_size = EndoGSLAMLayout.default_size
     has_points = True
@@ -37,7 +37,7 @@ class PREndoLayout(Layout):
         write_frame(folder / _DATA / _SCENE, frame.index, frame.color, frame.z_depth)
 
     def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
-        """See :class:`Layout`; poses stand in params.npz."""
+        """See :class:`Layout`; poses are in params.npz."""
 
     def write_points(
         self, folder: Path, points: WallPoints, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens
@@ -49,5 +49,5 @@ class PREndoLayout(Layout):
         write_gaussians(results / "point_cloud" / f"iteration_{_ITERATION}" / "point_cloud.ply", means, points.colors)
 
     def seen_mask(self, folder: Path, part: Part, index: int) -> Path:
-        """Beside the pictures, where whoever is given the scene's own folder looks."""
+        """In the scene's folder, beside the images."""
         return super().seen_mask(folder / _DATA / _SCENE, part, index)

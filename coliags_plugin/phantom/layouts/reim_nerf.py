@@ -15,14 +15,14 @@ from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame
 
 #: Normalised units per mm. REIM-NeRF's own are 0.0092 to 0.0229, so that a scene lies between -1 and 1.
 SCENE_SCALE = 0.0095
-#: Normalised distance of the number 65535.
+#: Normalised distance of the stored value 65535.
 DISTMAP_SCALE = math.pi
 #: The scene's middle, mm ahead of the path's.
 _AHEAD = 30.0
 
 
 class ReimNerfLayout(Layout):
-    """Fisheye pictures in a circle, distance maps, rgb_mask.png, and a JSON file for each part."""
+    """Circular fisheye images, distance maps, rgb_mask.png, and a JSON file per part."""
 
     default_size = (1350, 1080)
 
@@ -55,7 +55,7 @@ class ReimNerfLayout(Layout):
         self._of(folder, lens.width, lens.height).write_sequence(stacked, shift, shows, _parts(len(poses)))
 
     def _of(self, folder: Path, width: int, height: int) -> ReimNerfWriter:
-        """The writer of a folder, which remembers how far each frame's depth reaches."""
+        """The writer of a folder, which keeps the depth range of each frame."""
         if self._writer is None or self._writer.folder != folder:
             self._writer = ReimNerfWriter(folder, _lens(width, height), SCENE_SCALE, DISTMAP_SCALE)
         return self._writer
@@ -73,7 +73,7 @@ def _validates(index: int) -> bool:
 
 
 def _parts(count: int) -> dict[str, list[int]]:
-    """REIM-NeRF's own division: every fifth frame, of those every fifth but the first for validation."""
+    """REIM-NeRF's split: every fifth frame, of those every fifth but the first for validation."""
     fifth = range(0, count, 5)
     return {
         "train": [index for index in fifth if not _validates(index)],

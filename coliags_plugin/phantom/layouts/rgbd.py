@@ -15,14 +15,14 @@ from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame
 from coliags_plugin.poses import tum
 from coliags_plugin.poses.trajectory import Trajectory
 
-#: Depth steps per mm: 0.002 mm each, up to 131 mm; farther is unknown, as for TUM's own sensor.
+#: Depth steps per mm: 0.002 mm each, up to 131 mm; farther is unknown, as for TUM's sensor.
 DEPTH_SCALE = 500.0
 #: Seconds: TUM's clock and frame rate.
 _START, _RATE = 1_305_031_102.0, 30.0
 
 
 class RGBDLayout(Layout):
-    """Pictures and depth named by their time, groundtruth.txt, camera.json, and the lists that TUM's tools read."""
+    """Images and depth named by timestamps, groundtruth.txt, camera.json, and TUM's file lists."""
 
     def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
         """See :class:`Layout`; normals are not part of this layout."""

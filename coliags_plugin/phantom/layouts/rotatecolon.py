@@ -19,13 +19,13 @@ _ANGLE = 2.0 * math.atan(169.0 / 200.8769)
 
 
 class RotateColonLayout(Layout):
-    """Blender's files: views and EXR depth to train on, turned views without depth to test on."""
+    """Blender's files: training views with EXR depth, and rotated test views without depth."""
 
     has_rotation = True
     has_points = True
 
     def is_test(self, index: int) -> bool:
-        """None: the test views are the rotation views."""
+        """Never: the test views are the rotation views."""
         return False
 
     def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
@@ -52,5 +52,5 @@ class RotateColonLayout(Layout):
         write_points(folder, points.positions, points.colors)
 
     def seen_mask(self, folder: Path, part: Part, index: int) -> Path:
-        """In the truth: the data set itself has none."""
+        """In ``truth/``: the dataset has no seen masks."""
         return folder / "truth" / "seen" / f"{index:04d}_seen.png"

@@ -1,4 +1,4 @@
-"""From frame to frame: the path before it is corrected."""
+"""Frame-to-frame odometry with recovery from lost frames, before pose-graph optimisation."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from coliags_plugin.core.progress import Progress
 from coliags_plugin.poses.rigid import inverse, rigid
 from coliags_plugin.reconstruction.odometry.registration import Edge
 
-#: (source, target, guess) -> an edge to believe, or None.
+#: (source, target, guess) -> a verified edge, or None.
 Register = Callable[[int, int, Float[np.ndarray, "4 4"]], Edge | None]
 
 
 @dataclass(frozen=True, eq=False)
 class Bridge:
-    """A guess in place of an edge, where tracking was lost for good.
+    """Constant-velocity guess in place of an edge, where tracking was lost.
 
     Attributes:
-        source, target: Frames between which nothing was found.
-        source_to_target: Constant velocity's guess. [4, 4]
+        source, target: Frames without an edge between them.
+        source_to_target: Motion at constant velocity. [4, 4]
     """
 
     source: int
@@ -34,17 +34,17 @@ class Bridge:
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """A path found from frame to frame.
+    """Trajectory from frame-to-frame odometry.
 
     Attributes:
-        placed: Frames that an edge or a bridge gives a pose, in order; the others are lost.
+        posed: Frames that have a pose by an edge or a bridge, in order; the others are lost.
         camera_to_world: Their poses; world: the first of them. [P, 4, 4]
-        edges: Between neighbours among them.
-        bridges: Where there is no edge.
-        failed: Neighbouring frames (i, i + 1) that could not be laid together.
+        edges: Edges between consecutive posed frames.
+        bridges: Guesses where there is no edge.
+        failed: Consecutive frames (i, i + 1) that could not be registered.
     """
 
-    placed: tuple[int, ...]
+    posed: tuple[int, ...]
     camera_to_world: Float[np.ndarray, "P 4 4"]
     edges: tuple[Edge, ...]
     bridges: tuple[Bridge, ...]
@@ -52,17 +52,17 @@ class Chain:
 
 
 def chain(count: int, register: Register, max_gap: int, progress: Progress | None = None) -> Chain:
-    """Lay every frame to the last one whose place is known.
+    """Register every frame to the last posed one.
 
-    A frame that cannot be laid there is tried against its predecessor, in case the camera has jumped: then a new
-    stretch begins, where constant velocity puts it. Frames that fit neither are passed over. After ``max_gap`` of them
-    constant velocity puts the next frame in place, for tracking to begin anew there.
+    A frame for which this fails is registered to its predecessor instead, in case the camera has jumped; then a new
+    segment starts at the pose that constant velocity predicts. Frames that match neither are skipped. After
+    ``max_gap`` skipped frames the next one gets its constant-velocity pose, and tracking restarts there.
 
     Args:
         count: Number of frames.
-        register: Lays a source to a target frame.
-        max_gap: Frames that may be passed over in a row.
-        progress: Told how far it is.
+        register: Registers a source to a target frame.
+        max_gap: Largest number of consecutive frames to skip.
+        progress: Progress callback.
     """
     poses = {0: np.eye(4)}
     anchor, velocity = 0, np.eye(4)
@@ -73,7 +73,7 @@ def chain(count: int, register: Register, max_gap: int, progress: Progress | Non
         edge = register(frame, anchor, power(velocity, frame - anchor))
         if edge is None:
             failed.append((frame - 1, frame))
-            # Its predecessor was passed over: is it the past that is missing, rather than this frame?
+            # If the predecessor was skipped, the camera may have jumped: try to register to it.
             fresh = register(frame, frame - 1, velocity) if frame - 1 > anchor else None
             start = frame - 1 if fresh is not None else frame
             if fresh is not None or frame - anchor > max_gap:
@@ -90,47 +90,47 @@ def chain(count: int, register: Register, max_gap: int, progress: Progress | Non
             anchor = frame
         if progress is not None:
             progress("track frames", frame, count - 1)
-    placed = tuple(sorted(poses))
-    return Chain(placed, np.stack([poses[frame] for frame in placed]), tuple(edges), tuple(bridges), tuple(failed))
+    posed = tuple(sorted(poses))
+    return Chain(posed, np.stack([poses[frame] for frame in posed]), tuple(edges), tuple(bridges), tuple(failed))
 
 
-def filled(
-    placed: tuple[int, ...], camera_to_world: Float[np.ndarray, "P 4 4"], count: int
+def fill_gaps(
+    posed: tuple[int, ...], camera_to_world: Float[np.ndarray, "P 4 4"], count: int
 ) -> Float[np.ndarray, "N 4 4"]:
-    """Poses of all frames: lost ones at constant velocity between their neighbours, or on from the last two. [N, 4, 4]
+    """Poses of all frames, lost ones interpolated or extrapolated at constant velocity. [N, 4, 4]
 
     Args:
-        placed: Frames with a pose, in order; the first is 0.
+        posed: Frames with a pose, in order; the first is 0.
         camera_to_world: Their poses. [P, 4, 4]
         count: Number of frames.
     """
     result = np.tile(np.eye(4), (count, 1, 1))
-    result[list(placed)] = camera_to_world
+    result[list(posed)] = camera_to_world
     velocity = np.eye(4)
-    for before, after in pairwise(placed):
+    for before, after in pairwise(posed):
         motion = inverse(result[before][None])[0] @ result[after]
         velocity = power(motion, 1.0 / (after - before))
         for frame in range(before + 1, after):
             result[frame] = result[before] @ power(velocity, frame - before)
-    for frame in range(placed[-1] + 1, count):
+    for frame in range(posed[-1] + 1, count):
         result[frame] = result[frame - 1] @ velocity
     return result
 
 
 def power(motion: Float[np.ndarray, "4 4"], exponent: float) -> Float[np.ndarray, "4 4"]:
-    """A rigid motion done so many times, or in part: along its screw. [4, 4]"""
+    """Real power of a rigid transform, along its screw axis: the exponential of its scaled logarithm. [4, 4]"""
     if exponent == 1.0:
         return motion
-    turn = Rotation.from_matrix(motion[:3, :3]).as_rotvec()
-    along = np.linalg.solve(_shift_of_turn(turn), motion[:3, 3])
-    shift = _shift_of_turn(exponent * turn) @ (exponent * along)
-    return rigid(Rotation.from_rotvec(exponent * turn).as_matrix()[None], shift[None])[0]
+    rotvec = Rotation.from_matrix(motion[:3, :3]).as_rotvec()
+    velocity = np.linalg.solve(_left_jacobian(rotvec), motion[:3, 3])
+    translation = _left_jacobian(exponent * rotvec) @ (exponent * velocity)
+    return rigid(Rotation.from_rotvec(exponent * rotvec).as_matrix()[None], translation[None])[0]
 
 
-def _shift_of_turn(turn: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """What a steady velocity in turning axes adds up to, turning by a rotation vector: the integral of the rotation."""
-    angle = float(np.linalg.norm(turn))
-    x, y, z = turn
+def _left_jacobian(rotvec: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Left Jacobian of SO(3) at a rotation vector."""
+    angle = float(np.linalg.norm(rotvec))
+    x, y, z = rotvec
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     # sinc is exact near 0; (1 - cos a) / a^2 = sinc(a / 2)^2 / 2.
     first = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2

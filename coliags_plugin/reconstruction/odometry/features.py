@@ -1,4 +1,4 @@
-"""A first guess of a motion too large to be found by descending from anywhere near."""
+"""Initial guess of a large motion between two frames, by SIFT matches and RANSAC PnP."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.poses.rigid import rigid
 from coliags_plugin.reconstruction.odometry.frames import PreparedFrame
 
-#: Of normalised pictures, whose contrast is the same everywhere: hence a low threshold.
+#: The contrast threshold is low because the images are normalised to uniform contrast.
 _FEATURES, _CONTRAST = 1500, 0.01
-#: Lowe's ratio; a loose one, as the sample consensus that follows discards what is wrong.
+#: Lowe's ratio; loose, as RANSAC rejects outliers afterwards.
 _RATIO = 0.9
 _ROUNDS, _REPROJECTION_PX, _FEWEST = 500, 3.0, 12
 
@@ -22,17 +22,17 @@ _ROUNDS, _REPROJECTION_PX, _FEWEST = 500, 3.0, 12
 def motion_by_features(
     source: PreparedFrame, target: PreparedFrame, intrinsics: Intrinsics
 ) -> Float[np.ndarray, "4 4"] | None:
-    """Match SIFT features, and find where the source's, in space, must stand to be seen at the target's.
+    """Estimate the motion between two frames by SIFT matches and RANSAC PnP on the source's back-projected features.
 
-    OpenCV's sample consensus begins with the same random numbers each time.
+    OpenCV's RANSAC uses a fixed seed.
 
     Args:
-        source: A frame; its depth places the features.
-        target: The other.
-        intrinsics: Of both.
+        source: Frame whose depth back-projects the features.
+        target: The other frame.
+        intrinsics: Intrinsics of both.
 
     Returns:
-        Source camera to target camera, to be refined; None where too few features agree. [4, 4]
+        Source camera to target camera, as an initial guess; None with too few matches or inliers. [4, 4]
     """
     sift = cv2.SIFT_create(nfeatures=_FEATURES, contrastThreshold=_CONTRAST)  # type: ignore[attr-defined]
     here, there = _features(sift, source), _features(sift, target)
@@ -54,7 +54,7 @@ def motion_by_features(
     known = z > 0.0
     if known.sum() < _FEWEST:
         return None
-    found, turn, shift, inliers = cv2.solvePnPRansac(
+    found, rotvec, translation, inliers = cv2.solvePnPRansac(
         points[known],
         seen[known],
         k,
@@ -65,11 +65,11 @@ def motion_by_features(
     )
     if not found or inliers is None or len(inliers) < _FEWEST:
         return None
-    return rigid(cv2.Rodrigues(turn)[0][None], np.asarray(shift, np.float64).reshape(1, 3))[0]
+    return rigid(cv2.Rodrigues(rotvec)[0][None], np.asarray(translation, np.float64).reshape(1, 3))[0]
 
 
 def _features(sift: Any, frame: PreparedFrame) -> tuple[Float[np.ndarray, "K 2"], np.ndarray]:
-    """Places, as OpenCV counts them (pixel centres at integers), and descriptors, where depth is known."""
-    picture = np.rint(frame.intensity * 255.0).astype(np.uint8)
-    keypoints, descriptors = sift.detectAndCompute(picture, (frame.depth > 0.0).astype(np.uint8))
+    """Pixels (centres at integers, as in OpenCV) and descriptors of features with known depth."""
+    image = np.rint(frame.intensity * 255.0).astype(np.uint8)
+    keypoints, descriptors = sift.detectAndCompute(image, (frame.depth > 0.0).astype(np.uint8))
     return np.array([point.pt for point in keypoints], np.float64).reshape(-1, 2), descriptors

@@ -1,4 +1,4 @@
-"""What is tracked, and how a picture is made comparable with its neighbours although the lamp moves."""
+"""RGB-D frames prepared for registration: brightness normalised for the moving light, highlights masked."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.morphology import dilated
 from coliags_plugin.core.scenes import Frame
 
-#: Frames that a scene's unit of length is found from.
+#: Number of frames that the median depth is computed from.
 _SAMPLED = 16
-#: Above this in every channel a pixel is the lamp's mirror image, not the wall.
+#: A pixel above this in every channel is a specular highlight.
 _HIGHLIGHT = 200
 #: Margin around a highlight, and standard deviation of the window that brightness is normalised over; shares of the
-#: picture's width. At 338 px they are 2 px and 8 px: of 5, 8, 15 and 30 px, 5 and 8 drifted least (docs/poses.md 11).
+#: image's width. At 338 px they are 2 px and 8 px: of 5, 8, 15 and 30 px, 5 and 8 drifted least (docs/poses.md 11).
 _HIGHLIGHT_MARGIN, _WINDOW = 0.006, 0.024
-#: Linear light below this is noise, and so is a contrast below that.
+#: Noise floors of intensity and of contrast.
 _DARK, _FLAT = 0.02, 0.02
-#: Of the pixels that depth is interpolated from, all must be known; the rest is rounding.
+#: Depth is interpolated only between known pixels; the tolerance is for rounding.
 _ALL_KNOWN = 0.999
-#: Standard deviations of the window that span the whole range of normalised intensity.
+#: Local standard deviations that the range of normalised intensity spans.
 _SPAN = 8.0
 
 
 @dataclass(frozen=True, eq=False)
 class RgbdFrame:
-    """One picture with its depth, from nobody knows where.
+    """An RGB image with depth, without a pose.
 
     Attributes:
-        name: What to call it.
+        name: Name of the frame.
         image: RGB. [H, W, 3]
         depth: z-depth, any unit of length; not finite or not positive where unknown. [H, W]
-        mask: False where a pixel is to be ignored; None where every pixel counts. [H, W]
+        mask: False where a pixel is ignored; None: all are used. [H, W]
     """
 
     name: str
@@ -50,8 +50,8 @@ class PreparedFrame:
     """A frame ready for registration.
 
     Attributes:
-        intensity: Brightness relative to its surroundings, 0 to 1, 0.5 where it is theirs. [H, W]
-        depth: z-depth in the video's own unit; 0 where unknown, masked or a highlight. [H, W]
+        intensity: Locally normalised brightness, 0 to 1, 0.5 at the local mean. [H, W]
+        depth: z-depth in units of the video's median depth; 0 where unknown, masked or a highlight. [H, W]
     """
 
     intensity: Float32[np.ndarray, "H W"]
@@ -59,13 +59,13 @@ class PreparedFrame:
 
 
 class Video(Sequence[RgbdFrame]):
-    """The pictures and depth of frames, read one at a time; their cameras stay behind.
+    """Images and depth of frames without their poses, read one at a time.
 
     Args:
         frames: In video order.
 
     Raises:
-        InputError: A frame has no depth, when it is asked for.
+        InputError: A frame without depth is read.
     """
 
     def __init__(self, frames: Sequence[Frame]) -> None:
@@ -76,25 +76,25 @@ class Video(Sequence[RgbdFrame]):
         return len(self._frames)
 
     def __getitem__(self, index: int) -> RgbdFrame:  # type: ignore[override]  # no slices
-        """Read a frame."""
+        """Frame at an index."""
         frame = self._frames[index]
         depth, mask = frame.depth, frame.mask
         if depth is None:
             raise InputError(
                 f"frame {frame.name} has no depth",
-                "depth for every frame: odometry takes the unit of length and the shape of the wall from it",
-                "Without depth use coliags poses sfm, which finds poses from pictures alone",
+                "depth for every frame: RGB-D odometry registers surfaces and takes the unit of length from it",
+                "Without depth use coliags poses sfm, which estimates poses from images alone",
             )
         return RgbdFrame(frame.name, frame.image.numpy(), depth.numpy(), None if mask is None else mask.numpy())
 
 
 class PreparedVideo:
-    """Frames prepared when they are first asked for; the latest stay in memory.
+    """Lazily prepared frames with a cache of the most recently used.
 
     Args:
-        video: What to prepare.
+        video: Frames to prepare.
         unit: Length that becomes 1.
-        keep: Frames that stay in memory.
+        keep: Number of cached frames.
         enlarge: Factor on their size.
     """
 
@@ -103,7 +103,7 @@ class PreparedVideo:
         self._kept: dict[int, PreparedFrame] = {}
 
     def __getitem__(self, index: int) -> PreparedFrame:
-        """A prepared frame."""
+        """Prepared frame at an index."""
         found = self._kept.pop(index, None)
         if found is None:
             found = prepare(self._video[index], self._unit)
@@ -115,15 +115,14 @@ class PreparedVideo:
 
 
 def prepare(frame: RgbdFrame, unit: float) -> PreparedFrame:
-    """Normalise brightness, and leave out what is masked, unknown or a highlight.
+    """Normalise brightness locally, and set depth to 0 where masked, unknown or a highlight.
 
-    The lamp rides on the camera: a patch of wall gets brighter as the camera nears and darker towards the edge of the
-    picture, by far more than its texture differs. What does not change with the light is the ratio to neighbours
-    within the same fall of light. So the logarithm of the brightness is taken, its local mean subtracted, and the rest
-    divided by the local standard deviation.
+    The light source moves with the camera, so that the brightness of a surface point varies between frames by more
+    than the texture's contrast; its ratio to neighbouring pixels does not. So the local mean of the logarithm of
+    brightness is subtracted, and the result divided by the local standard deviation.
 
     Args:
-        frame: A frame.
+        frame: RGB-D frame.
         unit: Length that becomes 1.
     """
     image, width = frame.image, frame.image.shape[1]
@@ -142,7 +141,7 @@ def prepare(frame: RgbdFrame, unit: float) -> PreparedFrame:
 
 
 def enlarged(frame: PreparedFrame, factor: int) -> PreparedFrame:
-    """A frame sampled more finely; depth where all pixels around are known."""
+    """Upsampled frame; depth only where all interpolated pixels are known."""
     height, width = frame.depth.shape
     size = width * factor, height * factor
     known = cv2.resize((frame.depth > 0.0).astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
@@ -154,18 +153,18 @@ def enlarged(frame: PreparedFrame, factor: int) -> PreparedFrame:
 
 
 def typical_depth(video: Sequence[RgbdFrame]) -> float:
-    """Median of known depth over frames spread along the video: the unit that thresholds are meant in.
+    """Median known depth over frames sampled evenly from the video: the unit of the thresholds.
 
     Raises:
-        InputError: No depth is known in any of them.
+        InputError: None of them has known depth.
     """
-    places = np.unique(np.linspace(0, len(video) - 1, min(_SAMPLED, len(video))).round().astype(int))
-    depths = [video[int(place)].depth[::4, ::4].ravel() for place in places]
+    indices = np.unique(np.linspace(0, len(video) - 1, min(_SAMPLED, len(video))).round().astype(int))
+    depths = [video[int(index)].depth[::4, ::4].ravel() for index in indices]
     known = np.concatenate(depths)
     known = known[np.isfinite(known) & (known > 0.0)]
     if not len(known):
         raise InputError(
-            f"{len(places)} of {len(video)} frames were looked at, and none has a pixel of known depth",
+            f"{len(indices)} of {len(video)} frames were sampled, and none has a pixel of known depth",
             "depth files that are not empty",
             "Check the depth folder and its scale",
         )
@@ -175,6 +174,6 @@ def typical_depth(video: Sequence[RgbdFrame]) -> float:
 def _local_mean(
     weight: Float32[np.ndarray, "H W"], deviation: float
 ) -> Callable[[np.ndarray], Float[np.ndarray, "H W"]]:
-    """A Gaussian-weighted mean over the pixels that count."""
+    """Gaussian-weighted local mean over the valid pixels."""
     share = cv2.GaussianBlur(weight, (0, 0), deviation) + 1e-6
     return lambda values: cv2.GaussianBlur(values * weight, (0, 0), deviation) / share

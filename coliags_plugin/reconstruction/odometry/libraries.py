@@ -1,4 +1,4 @@
-"""open3d for work that has to come out the same every time."""
+"""Context manager for deterministic open3d."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from coliags_plugin.core.errors import InputError
 
 
 @contextmanager
-def exact_open3d() -> Iterator[Any]:
-    """open3d, silent and on one thread: on several it adds up in another order each time, and poses differ by 1e-6.
+def deterministic_open3d() -> Iterator[Any]:
+    """open3d, silent and on one thread: with several the order of summation varies, and poses differ by 1e-6.
 
-    open3d before 0.20 cannot be told how many threads to use.
+    open3d before 0.20 cannot limit its threads.
 
     Raises:
-        InputError: It cannot be imported.
+        InputError: open3d cannot be imported.
     """
     try:
         import open3d
     except (ImportError, OSError) as error:
         raise InputError(
-            f"open3d does not import here ({error})",
+            f"open3d cannot be imported ({error})",
             "open3d, which registers frames and optimises the pose graph",
             "Install it with `pip install open3d`; on Debian and Ubuntu it also needs the package libusb-1.0-0",
         ) from error

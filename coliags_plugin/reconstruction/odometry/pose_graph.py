@@ -1,7 +1,7 @@
-"""The path that agrees best with all edges, by open3d's pose-graph optimisation.
+"""Pose-graph optimisation by open3d, and selection of frame pairs for its edges.
 
-Choi, Zhou and Koltun, "Robust reconstruction of indoor scenes" (CVPR 2015): edges that may be wrong carry a weight
-that the optimiser may take from them.
+Choi, Zhou and Koltun, "Robust reconstruction of indoor scenes" (CVPR 2015): uncertain edges have line-process weights,
+by which the optimiser disables outliers.
 """
 
 from __future__ import annotations
@@ -16,52 +16,52 @@ from coliags_plugin.poses.rigid import inverse
 from coliags_plugin.reconstruction.odometry.chain import Bridge
 from coliags_plugin.reconstruction.odometry.registration import DEPTH_TRUNCATION, Edge
 
-#: Information of a guess, against some 1e4 of an edge: it holds the graph together and gives way to anything.
-_GUESSED = 1e-2
+#: Information of a bridge, small against some 1e4 of an edge: it only keeps the graph connected.
+_BRIDGE_INFORMATION = 1e-2
 
 InformedEdge = tuple[Edge, Float[np.ndarray, "6 6"]]
 
 
 def optimise(
     open3d: Any,
-    placed: Sequence[int],
+    posed: Sequence[int],
     camera_to_world: Float[np.ndarray, "P 4 4"],
     certain: Sequence[InformedEdge],
     uncertain: Sequence[InformedEdge],
     bridges: Sequence[Bridge],
     prune: float,
 ) -> tuple[Float[np.ndarray, "P 4 4"], tuple[Edge, ...]]:
-    """Correct a path.
+    """Optimise a pose graph.
 
     Args:
         open3d: The library.
-        placed: The frames of the path, in order.
-        camera_to_world: Where they were found to be; world: the first of them. [P, 4, 4]
-        certain: Edges between neighbours, with their information.
-        uncertain: Edges of which some may be wrong.
-        bridges: Guesses.
+        posed: The posed frames, in order.
+        camera_to_world: Their initial poses; world: the first of them. [P, 4, 4]
+        certain: Odometry edges with their information matrices.
+        uncertain: Further edges, some of which may be outliers.
+        bridges: Constant-velocity guesses.
         prune: Weight below which an uncertain edge is dropped.
 
     Returns:
-        The corrected path in the same world, and the uncertain edges that were dropped. [P, 4, 4]
+        The optimised poses in the same world, and the uncertain edges that were dropped. [P, 4, 4]
     """
     registration = open3d.pipelines.registration
-    place = {frame: index for index, frame in enumerate(placed)}
+    node = {frame: index for index, frame in enumerate(posed)}
     graph = registration.PoseGraph()
     for pose in camera_to_world:
         graph.nodes.append(registration.PoseGraphNode(pose))
 
-    def add(edge: Edge | Bridge, information: np.ndarray, doubted: bool) -> None:
+    def add(edge: Edge | Bridge, information: np.ndarray, is_uncertain: bool) -> None:
         graph.edges.append(
             registration.PoseGraphEdge(
-                place[edge.source], place[edge.target], edge.source_to_target, information, uncertain=doubted
+                node[edge.source], node[edge.target], edge.source_to_target, information, uncertain=is_uncertain
             )
         )
 
     for edge, information in certain:
         add(edge, information, False)
     for bridge in bridges:
-        add(bridge, _GUESSED * np.eye(6), False)
+        add(bridge, _BRIDGE_INFORMATION * np.eye(6), False)
     for edge, information in uncertain:
         add(edge, information, True)
     registration.global_optimization(
@@ -75,40 +75,40 @@ def optimise(
             reference_node=0,
         ),
     )
-    poses = np.stack([np.asarray(node.pose) for node in graph.nodes])
-    # open3d leaves out what it dropped.
+    poses = np.stack([np.asarray(entry.pose) for entry in graph.nodes])
+    # open3d removes dropped edges from the graph.
     kept = {(edge.source_node_id, edge.target_node_id) for edge in graph.edges}
-    dropped = tuple(edge for edge, _ in uncertain if (place[edge.source], place[edge.target]) not in kept)
+    dropped = tuple(edge for edge, _ in uncertain if (node[edge.source], node[edge.target]) not in kept)
     poses = inverse(poses[:1])[0] @ poses
     poses[0] = np.eye(4)
     return poses, dropped
 
 
-def further_pairs(placed: Sequence[int], skips: Sequence[int]) -> list[tuple[int, int]]:
-    """(source, target) of edges that span several frames, later frame first."""
-    known = set(placed)
-    return [(frame, frame - skip) for skip in sorted(set(skips)) for frame in placed if frame - skip in known]
+def skip_pairs(posed: Sequence[int], skips: Sequence[int]) -> list[tuple[int, int]]:
+    """Frame pairs (source, target) a fixed number of frames apart, later frame first."""
+    known = set(posed)
+    return [(frame, frame - skip) for skip in sorted(set(skips)) for frame in posed if frame - skip in known]
 
 
-def revisited_pairs(
-    placed: Sequence[int],
+def revisit_pairs(
+    posed: Sequence[int],
     camera_to_world: Float[np.ndarray, "P 4 4"],
     apart: int,
     distance: float,
     angle_deg: float,
     every: int,
 ) -> list[tuple[int, int]]:
-    """(source, target) of frames far apart in time that stand close together and look the same way.
+    """Loop-closure candidates (source, target): frames far apart in time with similar poses.
 
     Args:
-        placed: Frames with a pose, in order.
+        posed: Posed frames, in order.
         camera_to_world: Their poses. [P, 4, 4]
-        apart: Frames that have to lie between.
+        apart: Least number of frames in between.
         distance: Largest distance of their centres.
         angle_deg: Largest angle between their optical axes, degrees.
-        every: Look for one for every so-many-th frame: the nearest.
+        every: Stride of source frames; each is paired with its nearest candidate.
     """
-    frames, centers, axes = np.asarray(placed), camera_to_world[:, :3, 3], camera_to_world[:, :3, 2]
+    frames, centers, axes = np.asarray(posed), camera_to_world[:, :3, 3], camera_to_world[:, :3, 2]
     pairs = []
     for index in range(0, len(frames), every):
         earlier = np.flatnonzero(frames[index] - frames > apart)

@@ -1,4 +1,4 @@
-"""How one frame lies to another, and whether to believe it."""
+"""Pairwise RGB-D registration by open3d's multi-scale odometry, and measures of its quality."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from coliags_plugin.reconstruction.odometry.frames import PreparedFrame
 
 Term = Literal["hybrid", "point-to-plane", "intensity"]
 
-#: Depths that differ by more do not belong together; loss turns linear beyond the others. open3d's own values, which
-#: are metres for rooms; here the unit is the video's median depth.
+#: Largest depth difference of a correspondence, and thresholds of the Huber losses of depth and intensity: open3d's
+#: default values, in units of the video's median depth instead of metres.
 DEPTH_TRUNCATION, _DEPTH_HUBER, _INTENSITY_HUBER = 0.07, 0.05, 0.1
-#: Iterations from the coarsest picture to the finest, fewer levels for small pictures.
+#: Iterations of the pyramid levels, coarsest first, and the least side of a level in pixels.
 _ITERATIONS, _COARSEST = (20, 10, 10), 30
 _CONVERGED = 1e-7
-#: Of the four pixels that depth is interpolated from, all must be known; the rest is rounding.
+#: Depth is interpolated only between four known pixels; the tolerance is for rounding.
 _ALL_KNOWN = 0.999
 _METHODS = {"hybrid": "Hybrid", "point-to-plane": "PointToPlane", "intensity": "Intensity"}
 
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """The motion between two frames.
+    """Relative motion between two frames.
 
     Attributes:
         source, target: Indices of the frames.
-        source_to_target: Source camera to target camera, the video's own unit of length. [4, 4]
-        fitness: Share of the source's pixels of known depth that meet the target's surface.
-        depth_rmse: How far from it those that do, along the optical axis; the video's own unit.
-        correlation: Of normalised intensities, source and target, at those.
-        residual: Mean squared residual that open3d ended with.
+        source_to_target: Source camera to target camera, in units of the video's median depth. [4, 4]
+        fitness: Share of the source's pixels of known depth that are inliers on the target's surface.
+        depth_rmse: RMSE of the inliers' z-depth, in units of the video's median depth.
+        correlation: Correlation of the normalised intensities of source and target at the inliers.
+        residual: open3d's final mean squared residual.
     """
 
     source: int
@@ -48,16 +48,16 @@ class Edge:
     residual: float
 
 
-class Registrar:
+class FrameRegistration:
     """Registers prepared frames by open3d's RGB-D odometry, coarse to fine.
 
     Hybrid and intensity are Park et al., "Colored point cloud registration revisited" (ICCV 2017) and Steinbruecker et
     al., "Real-time visual odometry from dense RGB-D images" (ICCV workshops 2011), as open3d has them.
 
     Args:
-        open3d: The library, from :func:`exact_open3d`.
-        intrinsics: Of all frames.
-        term: What is minimised.
+        open3d: The library, from :func:`deterministic_open3d`.
+        intrinsics: Intrinsics of all frames.
+        term: Residual to minimise.
     """
 
     def __init__(self, open3d: Any, intrinsics: Intrinsics, term: Term) -> None:
@@ -80,16 +80,16 @@ class Registrar:
         target: PreparedFrame,
         guess: Float[np.ndarray, "4 4"],
     ) -> Edge | None:
-        """Find the motion from a source to a target frame.
+        """Estimate the motion from a source to a target frame.
 
         Args:
             frames: Their indices.
-            source: The frame to lay.
-            target: The frame to lay it to.
-            guess: Where to begin; source camera to target camera. [4, 4]
+            source: Source frame.
+            target: Target frame.
+            guess: Initial source-to-target transform. [4, 4]
 
         Returns:
-            What was found, to be judged; None where open3d gives up or what it finds is no motion.
+            The edge, not yet verified; None if open3d fails or returns a transform that is not rigid.
         """
         odometry = self._open3d.t.pipelines.odometry
         try:
@@ -104,7 +104,7 @@ class Registrar:
                 self._method,
                 self._loss,
             )
-        except RuntimeError:  # a singular system: nothing to hold on to
+        except RuntimeError:  # singular system
             return None
         motion = _rigid(found.transformation.numpy())
         if motion is None:
@@ -113,7 +113,7 @@ class Registrar:
         return Edge(*frames, motion, fitness, depth_rmse, correlation, float(found.inlier_rmse))
 
     def information(self, edge: Edge, source: PreparedFrame, target: PreparedFrame) -> Float[np.ndarray, "6 6"]:
-        """How firmly the frames' surfaces hold an edge, as open3d's pose graph wants it. [6, 6]"""
+        """Information matrix of an edge for open3d's pose graph. [6, 6]"""
         odometry = self._open3d.t.pipelines.odometry
         matrix = odometry.compute_odometry_information_matrix(
             self._rgbd(source).depth,
@@ -137,20 +137,20 @@ class Registrar:
 def agreement(
     source: PreparedFrame, target: PreparedFrame, source_to_target: Float[np.ndarray, "4 4"], intrinsics: Intrinsics
 ) -> tuple[float, float, float]:
-    """How well two frames agree under a motion, whatever found it.
+    """Fitness, depth RMSE and intensity correlation of two frames under a given motion.
 
-    Overlap and depth alone say little: a smooth tube slid along itself still fits. Texture does not, so brightness is
-    compared even where it was not used to find the motion.
+    Overlap and depth alone do not detect sliding along a smooth tube; intensity does, so it is compared even if the
+    motion was estimated from depth alone.
 
     Args:
-        source: One frame.
-        target: The other.
+        source: Source frame.
+        target: Target frame.
         source_to_target: Source camera to target camera. [4, 4]
-        intrinsics: Of both.
+        intrinsics: Intrinsics of both.
 
     Returns:
-        Share of the source's pixels of known depth that meet the target's surface, how far from it those are along the
-        optical axis (root mean square), and the correlation of intensities there (0 where one is flat).
+        Share of the source's pixels of known depth that are inliers on the target's surface, the RMSE of their
+        z-depth, and the correlation of their intensities (0 where one is constant).
     """
     step = 2 if min(source.depth.shape) > 2 * _COARSEST else 1
     row, column = np.nonzero(source.depth[::step, ::step])
@@ -180,11 +180,11 @@ def agreement(
     return float(meets.mean()), float(np.sqrt(np.mean((z - there)[meets] ** 2))), correlation
 
 
-def _sampled(picture: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Values between pixels, 0 outside the picture. remap takes no more than 32767 rows, hence the pieces."""
+def _sampled(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Bilinear samples, 0 outside the image; in chunks, as cv2.remap takes at most 32767 rows."""
     pieces = [
         cv2.remap(
-            picture,
+            image,
             u[at : at + 32_000],
             v[at : at + 32_000],
             cv2.INTER_LINEAR,
@@ -197,7 +197,7 @@ def _sampled(picture: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def _rigid(matrix: np.ndarray) -> Float[np.ndarray, "4 4"] | None:
-    """The matrix made exactly rigid; None where it is far from that."""
+    """Nearest rigid transform; None where the matrix is far from rigid."""
     if not np.isfinite(matrix).all():
         return None
     left, values, right = np.linalg.svd(matrix[:3, :3])

@@ -1,4 +1,4 @@
-"""Options of tracking."""
+"""Options of RGB-D odometry."""
 
 from __future__ import annotations
 
@@ -12,42 +12,40 @@ Method = Literal["auto", "hybrid", "point-to-plane", "intensity"]
 
 
 class TrackingSettings(Settings):
-    """How poses are found from pictures and depth; lengths are relative to the video's median depth."""
+    """Options of RGB-D odometry; lengths are relative to the video's median depth."""
 
     method: Method = Field(
         "auto",
-        description="What two frames are laid together by. 'hybrid': depth and brightness; holds up when depth is "
-        "noisy. 'point-to-plane': depth alone; several times better where depth is exact, far worse where it is not. "
-        "'intensity': brightness alone. 'auto': point-to-plane where a few pairs of frames show that depth is exact "
-        "and brightness agrees, else hybrid.",
+        description="Residual of pairwise registration. 'hybrid': depth and brightness; robust to noisy depth. "
+        "'point-to-plane': depth alone; several times more accurate with exact depth, far worse otherwise. "
+        "'intensity': brightness alone. 'auto': point-to-plane if a few test pairs indicate exact depth and similar "
+        "brightness correlation, else hybrid.",
     )
     enlarge: int = Field(
         1,
         ge=1,
         le=4,
-        description="Factor on the pictures' size while frames are laid together. open3d compares a pixel with the "
-        "nearest one of the other picture; 2 halves what that errs by, and takes four times as long.",
+        description="Upsampling factor for registration. open3d compares a pixel with the nearest pixel of the other "
+        "image; 2 halves that rounding error and takes four times as long.",
     )
     min_fitness: float = Field(
-        0.2, gt=0.0, lt=1.0, description="Smallest share of a frame that must meet the other's surface."
+        0.2, gt=0.0, lt=1.0, description="Least share of a frame's pixels that are inliers on the other's surface."
     )
     min_correlation: float = Field(
         0.5,
         gt=0.0,
         lt=1.0,
-        description="Smallest correlation of normalised brightness between two frames laid together. Right motions "
-        "have 0.7 to 0.95 on phantoms, wrong ones less than 0.5; lower it for pictures with much noise.",
+        description="Least correlation of normalised brightness between registered frames. Correct motions have 0.7 "
+        "to 0.95 on phantoms, wrong ones less than 0.5; lower it for noisy images.",
     )
     max_gap: int = Field(
-        8, ge=1, description="Frames that may be lost in a row before the camera is taken to be elsewhere."
+        8, ge=1, description="Largest number of consecutive lost frames before tracking restarts at a guessed pose."
     )
-    pose_graph: bool = Field(True, description="Whether edges over several frames and revisits correct the path.")
+    pose_graph: bool = Field(True, description="Whether to optimise a pose graph with further edges.")
     skips: tuple[Annotated[int, Field(ge=2)], ...] = Field(
-        (2, 4, 8), description="Frames that the pose graph's further edges span."
+        (2, 4, 8), description="Frame distances of the pose graph's further edges."
     )
-    revisits: bool = Field(
-        True, description="Whether frames that the path says look at the same place again are laid together too."
-    )
+    revisits: bool = Field(True, description="Whether to add loop-closure edges between frames at similar poses.")
     prune: float = Field(
-        0.25, ge=0.0, le=1.0, description="Edges that the optimised path contradicts below this confidence are dropped."
+        0.25, ge=0.0, le=1.0, description="Weight below which the optimisation drops a further edge as an outlier."
     )

@@ -1,4 +1,1 @@
-"""Structure from motion: surface points from pictures, and poses where there are none.
-
-Plain modules, like all of ``poses``: nothing here knows a room. COLMAP does the geometry.
-"""
+"""Structure from motion and triangulation with known poses, by COLMAP."""

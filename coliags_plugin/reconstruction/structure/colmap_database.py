@@ -1,4 +1,4 @@
-"""Features and matches in the form COLMAP takes them: its database."""
+"""Writes features and matches to a COLMAP database."""
 
 from __future__ import annotations
 
@@ -16,20 +16,21 @@ if TYPE_CHECKING:
 def write_database(
     path: Path,
     cameras: Sequence[pycolmap.Camera],
-    pictures: Sequence[tuple[str, int]],
+    images: Sequence[tuple[str, int]],
     features: Sequence[Features],
     matches: Mapping[tuple[int, int], Pairs],
     verified: bool,
 ) -> None:
-    """Make a database. Picture i gets COLMAP's image and frame number i + 1, camera k its camera and rig number k + 1.
+    """Create a database; image i gets COLMAP's image and frame ID i + 1, camera k its camera and rig ID k + 1.
 
     Args:
-        path: The file to make.
-        cameras: Their numbers are set.
-        pictures: Name, and which camera took it.
-        features: Of each picture.
-        matches: Of pairs of pictures, counted from 0.
-        verified: Whether the matches obey a geometry of two views already; otherwise COLMAP has to find one.
+        path: The file to create.
+        cameras: Their IDs are set.
+        images: Name and camera index of each image.
+        features: Features of each image.
+        matches: Matches by pair of image indices.
+        verified: Whether to store the matches as inliers of a verified two-view geometry; otherwise COLMAP has to
+            verify them.
     """
     import numpy as np
     import pycolmap
@@ -42,7 +43,7 @@ def write_database(
             rig = pycolmap.Rig(rig_id=number)
             rig.add_ref_sensor(camera.sensor_id)
             database.write_rig(rig, use_rig_id=True)
-        for number, ((name, camera_index), found) in enumerate(zip(pictures, features, strict=True), start=1):
+        for number, ((name, camera_index), found) in enumerate(zip(images, features, strict=True), start=1):
             image = pycolmap.Image(name=name, camera_id=camera_index + 1, image_id=number)
             database.write_image(image, use_image_id=True)
             frame = pycolmap.Frame(frame_id=number, rig_id=camera_index + 1)

@@ -1,4 +1,4 @@
-"""Frames as a COLMAP model."""
+"""Converts posed frames to a COLMAP reconstruction."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ if TYPE_CHECKING:
 
 
 def frame_model(frames: Sequence[Frame], names: Sequence[str] | None = None) -> pycolmap.Reconstruction:
-    """A model of posed frames without points: frame i is COLMAP's image i + 1, and each pinhole stands in it once.
+    """A reconstruction of posed frames without points: frame i is COLMAP's image i + 1, equal cameras are shared.
 
     Args:
         frames: Their poses and cameras.
-        names: Of the pictures; None: ``0.png``, ``1.png``, ...
+        names: Image names; None: ``0.png``, ``1.png``, ...
     """
     import pycolmap
 
     camera_to_world = np.stack([frame.camera.camera_to_world.cpu().double().numpy() for frame in frames])
     names = [f"{index}.png" for index in range(len(frames))] if names is None else names
     cameras: dict[Intrinsics, int] = {}
-    taken_by = [cameras.setdefault(frame.camera.intrinsics, len(cameras)) for frame in frames]
+    camera_indices = [cameras.setdefault(frame.camera.intrinsics, len(cameras)) for frame in frames]
     world_to_camera = [pycolmap.Rigid3d(matrix[:3]) for matrix in inverse(camera_to_world)]
-    return posed_model(world_to_camera, names, list(cameras), taken_by)
+    return posed_model(world_to_camera, names, list(cameras), camera_indices)

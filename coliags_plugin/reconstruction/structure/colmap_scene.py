@@ -1,4 +1,4 @@
-"""A triangulated video as a scene in COLMAP's layout, which ``coliags train`` reads."""
+"""Writes a triangulated video as a scene in COLMAP's layout."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points, write_model, write_picture
+from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points, write_image_and_mask, write_model
 from coliags_plugin.reconstruction.structure.colmap_model import frame_model
-from coliags_plugin.reconstruction.structure.pictures import file_names
+from coliags_plugin.reconstruction.structure.image_files import file_names
 from coliags_plugin.reconstruction.structure.triangulation import Triangulation
 
 
@@ -23,28 +23,27 @@ def write_colmap_scene(
     held_out: Sequence[Frame] = (),
     overwrite: bool = False,
 ) -> None:
-    """Write pictures, masks and a sparse model: ``images/NAME.png``, ``masks/NAME.png``, ``sparse/0/*.bin``.
+    """Write images, masks and a sparse model: ``images/NAME.png``, ``masks/NAME.png``, ``sparse/0/*.bin``.
 
     Poses, intrinsics and the unit of length are those of the frames.
 
     Args:
-        folder: The folder to make.
-        frames: What was triangulated. Frames without a mask get none.
-        triangulation: Its points.
-        held_out: Further frames of the same video, which see no points; they get the places that their ``index`` gives
-            them among the others.
-        overwrite: Replace the folder where it exists.
+        folder: The folder to create.
+        frames: The triangulated frames. No mask is written for frames without one.
+        triangulation: Points of these frames.
+        held_out: Further frames of the same video, without observations; sorted among the others by ``index``.
+        overwrite: Replace the folder if it exists.
 
     Raises:
-        InputError: The points belong to other frames, or the folder exists or cannot be written.
+        InputError: The triangulation has another number of frames, or the folder exists or cannot be written.
     """
     if len(triangulation.observations) != len(frames):
         raise InputError(
             f"a triangulation of {len(triangulation.observations)} frames, and {len(frames)} frames", "the same frames"
         )
-    blind = SeenPoints(np.empty((0, 2)), np.empty(0, np.int64))
+    no_points = SeenPoints(np.empty((0, 2)), np.empty(0, np.int64))
     seen = [SeenPoints(observations.pixels, observations.points) for observations in triangulation.observations]
-    video = [*zip(frames, seen, strict=True), *((frame, blind) for frame in held_out)]
+    video = [*zip(frames, seen, strict=True), *((frame, no_points) for frame in held_out)]
     video.sort(key=lambda pair: pair[0].index)
     posed = [frame for frame, _ in video]
     names = file_names([frame.name for frame in posed], ".png")
@@ -54,5 +53,5 @@ def write_colmap_scene(
     with atomic_folder(folder, overwrite) as scratch:
         for frame, name in zip(posed, names, strict=True):
             mask = None if frame.mask is None else frame.mask.cpu().numpy()
-            write_picture(scratch, name, frame.image.cpu().numpy(), mask)
+            write_image_and_mask(scratch, name, frame.image.cpu().numpy(), mask)
         write_model(scratch, model)

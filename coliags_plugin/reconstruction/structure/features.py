@@ -1,4 +1,4 @@
-"""SIFT features of endoscopic pictures: dark, soft, lit from the camera, and full of highlights."""
+"""SIFT features of endoscopic images, with local contrast enhancement and specular highlights masked."""
 
 from __future__ import annotations
 
@@ -14,42 +14,44 @@ from coliags_plugin.core.settings import Settings
 
 
 class FeatureSettings(Settings):
-    """What is looked for in a picture. COLMAP's own defaults find a hundred points on a colon's wall."""
+    """Options of SIFT extraction. COLMAP's defaults find about a hundred points on a colon's wall."""
 
     local_contrast: float = Field(
         default=4.0,
         ge=0.0,
-        description="Clip limit of the contrast-limited histogram equalisation that the grey picture goes through, on "
+        description="Clip limit of CLAHE (contrast-limited adaptive histogram equalisation) of the grey image, on "
         "8 x 8 tiles; 0: none.",
     )
     peak_threshold: float = Field(
-        default=0.001, gt=0.0, description="Least contrast of a feature, of 1. COLMAP's own is 0.0067."
+        default=0.001, gt=0.0, description="SIFT peak (contrast) threshold. COLMAP's default is 0.0067."
     )
-    max_features: int = Field(default=4000, ge=1, description="At most so many in a picture; the largest are kept.")
+    max_features: int = Field(
+        default=4000, ge=1, description="Largest number of features per image; those of the largest scale are kept."
+    )
     upright: bool = Field(
         default=True,
-        description="Features have no orientation: more of them match, as long as the camera rolls by less than some "
-        "20 degrees between the pictures that are compared.",
+        description="Upright SIFT, without orientation: more features match, as long as the camera rolls by less than "
+        "about 20 degrees between matched images.",
     )
     highlight_level: int = Field(
-        default=250, ge=1, le=256, description="Brightness, of 255, from which on a pixel is a highlight; 256: none is."
+        default=250, ge=1, le=256, description="Brightness (of 255) from which a pixel is a highlight; 256: none is."
     )
     highlight_ratio: float = Field(
         default=1.5,
         gt=1.0,
-        description="A pixel this many times as bright as its surroundings, and brighter by at least 20 of 255, is a "
-        "highlight too: those move with the lamp.",
+        description="A pixel this many times as bright as its surroundings, and brighter by at least 20 of 255, is "
+        "also a highlight; highlights move with the light source.",
     )
-    margin: int = Field(default=3, ge=0, description="Pixels around highlights and masks that yield no features.")
+    margin: int = Field(default=3, ge=0, description="Dilation of highlights and masks, pixels.")
 
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """What was found in one picture.
+    """Keypoints and descriptors of one image.
 
     Attributes:
         keypoints: Column, row, scale (pixels) and orientation (radians); pixel centres at integers + 0.5. [N, 4]
-        descriptors: Of unit length. [N, 128]
+        descriptors: L2-normalised. [N, 128]
     """
 
     keypoints: Float32[np.ndarray, "N 4"]
@@ -65,12 +67,12 @@ class Features:
         return len(self.keypoints)
 
 
-#: Finds the features of an RGB picture, leaving out what its mask, if any, has False.
+#: Extracts the features of an RGB image where its mask, if any, is True.
 Extractor = Callable[[UInt8[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"] | None], Features]
 
 
 def feature_extractor(settings: FeatureSettings) -> Extractor:
-    """COLMAP's SIFT behind local contrast and masks; made once for many pictures.
+    """Create a feature extractor: CLAHE, COLMAP's SIFT, and rejection of masked features; reusable for many images.
 
     Call it within :func:`~coliags_plugin.reconstruction.structure.quiet.quiet_colmap`.
     """
@@ -104,7 +106,7 @@ def feature_extractor(settings: FeatureSettings) -> Extractor:
 def usable(
     image: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"] | None, settings: FeatureSettings
 ) -> Bool[np.ndarray, "H W"]:
-    """Where features may lie: away from highlights, which move with the lamp, and from what is masked. [H, W]"""
+    """Pixels where features are accepted: neither masked nor near a highlight. [H, W]"""
     excluded = highlights(image, settings)
     if mask is not None:
         excluded |= ~mask
@@ -112,13 +114,13 @@ def usable(
 
 
 def highlights(image: UInt8[np.ndarray, "H W 3"], settings: FeatureSettings) -> Bool[np.ndarray, "H W"]:
-    """Mirror reflections of the lamp: saturated, or much brighter than what is around. [H, W]"""
+    """Specular highlights: pixels that are saturated or much brighter than their surroundings. [H, W]"""
     import cv2
 
     brightest = image.max(axis=2)
     if settings.highlight_level > 255:
         return np.zeros(brightest.shape, bool)
-    # Wide enough that a highlight never fills half of it.
+    # The window is wide enough that a highlight never fills half of it.
     surroundings = cv2.medianBlur(brightest, 2 * (max(image.shape[:2]) // 25) + 1).astype(np.float32)
-    standing_out = brightest > np.maximum(surroundings * settings.highlight_ratio, surroundings + 20.0)
-    return np.asarray((brightest >= settings.highlight_level) | standing_out)
+    is_outlier = brightest > np.maximum(surroundings * settings.highlight_ratio, surroundings + 20.0)
+    return np.asarray((brightest >= settings.highlight_level) | is_outlier)

@@ -1,20 +1,20 @@
-"""COLMAP made silent while it works; what it would say is in its results."""
+"""Context manager that silences and seeds COLMAP."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-#: glog's level above which only what ends the process is told.
+#: glog's level FATAL.
 _FATAL = 3
 
 
 @contextmanager
 def quiet_colmap(seed: int) -> Iterator[None]:
-    """COLMAP without its log, its random numbers begun anew.
+    """Silence COLMAP's log and seed its global random generator.
 
     Args:
-        seed: Of COLMAP's own generator, which is the only one it has.
+        seed: Seed of COLMAP's global generator.
     """
     import pycolmap
 

@@ -1,4 +1,4 @@
-"""Points and where they were seen, as arrays; and how far to trust them."""
+"""Point tracks as arrays, with reprojection residuals, triangulation angles and depth uncertainty."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from coliags_plugin.core.cameras import Camera
 if TYPE_CHECKING:
     import pycolmap
 
-#: Observations are never believed to be better than this, pixels.
+#: Lower bound of the estimated noise of an observation, pixels.
 LEAST_NOISE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """N points, seen K times in all.
+    """Tracks of N points with K observations in all.
 
     Attributes:
         positions: World. [N, 3]
-        points: Which point was seen. [K]
-        frames: In which frame. [K]
-        pixels: Where; centres at integers + 0.5. [K, 2]
+        points: Point index of each observation. [K]
+        frames: Frame index of each observation. [K]
+        pixels: Observed pixels, centres at integers + 0.5. [K, 2]
     """
 
     positions: Float[np.ndarray, "N 3"]
@@ -36,7 +36,7 @@ class Tracks:
 
     @classmethod
     def of(cls, model: pycolmap.Reconstruction, frame_count: int) -> Tracks:
-        """The points of a model whose images are numbered from 1, in the order of their numbers."""
+        """Tracks of a COLMAP model with image IDs from 1, points ordered by ID."""
         numbers = sorted(model.points3D)
         row = {number: index for index, number in enumerate(numbers)}
         points, frames, pixels = [], [], []
@@ -59,28 +59,28 @@ class Tracks:
 
     @property
     def lengths(self) -> Int[np.ndarray, "N"]:
-        """In how many frames each point was seen. [N]"""
+        """Number of frames that observe each point. [N]"""
         return np.bincount(self.points, minlength=len(self))
 
     def only(self, kept: Bool[np.ndarray, "N"]) -> Tracks:
-        """Some of the points, numbered anew."""
+        """Subset of the points, reindexed."""
         seen = kept[self.points]
         number = np.cumsum(kept) - 1
         return Tracks(self.positions[kept], number[self.points[seen]], self.frames[seen], self.pixels[seen])
 
     def local(self, cameras: Sequence[Camera]) -> Float[np.ndarray, "K 3"]:
-        """The points in the axes of the cameras that saw them. [K, 3]"""
+        """Points in the frames of their observing cameras. [K, 3]"""
         poses = _poses(cameras)[self.frames]
         return np.einsum("kji,kj->ki", poses[:, :3, :3], self.positions[self.points] - poses[:, :3, 3])
 
     def residuals(self, cameras: Sequence[Camera]) -> tuple[Float[np.ndarray, "K 2"], Float[np.ndarray, "K"]]:
-        """Projections less observations, pixels, and z-depths. [K, 2], [K]"""
+        """Reprojection residuals (projection minus observation, pixels) and z-depths. [K, 2], [K]"""
         local, k = self.local(cameras), _intrinsics(cameras)[self.frames]
         return local[:, :2] / local[:, 2:] * k[:, :2] + k[:, 2:] - self.pixels, local[:, 2]
 
 
 def widest_angles(tracks: Tracks, cameras: Sequence[Camera]) -> Float[np.ndarray, "N"]:
-    """A lower bound of the widest angle between the rays of each point, degrees: twice that to their mean. [N]"""
+    """Upper bound of the widest angle between a point's rays, degrees: twice the largest angle to their mean. [N]"""
     poses = _poses(cameras)[tracks.frames]
     rays = tracks.positions[tracks.points] - poses[:, :3, 3]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -94,12 +94,12 @@ def widest_angles(tracks: Tracks, cameras: Sequence[Camera]) -> Float[np.ndarray
 
 
 def uncertainty(tracks: Tracks, cameras: Sequence[Camera]) -> tuple[float, Float[np.ndarray, "N"]]:
-    """How well the observations fix the points, poses taken for exact.
+    """Observation noise and the depth uncertainty it propagates to, for exact poses.
 
     Returns:
-        The standard deviation of an observation along each axis that the residuals show, pixels, at least
-        ``LEAST_NOISE``; and the standard deviation of each point's z-depth that follows, as a share of it, mean over
-        the cameras that saw it. [N]
+        The standard deviation of an observation along each axis, estimated from the residuals, pixels, at least
+        ``LEAST_NOISE``; and the resulting standard deviation of each point's z-depth relative to it, mean over the
+        observing cameras. [N]
     """
     if not len(tracks):
         return LEAST_NOISE, np.empty(0)
@@ -115,7 +115,7 @@ def uncertainty(tracks: Tracks, cameras: Sequence[Camera]) -> tuple[float, Float
     jacobians = jacobians @ rotations.transpose(0, 2, 1)
     information = np.zeros((len(tracks), 3, 3))
     np.add.at(information, tracks.points, jacobians.transpose(0, 2, 1) @ jacobians)
-    # Rays that are nearly parallel leave it singular: their depth is as good as unknown.
+    # Nearly parallel rays make it singular; the damping gives them a very large uncertainty.
     scale = np.trace(information, axis1=1, axis2=2)[:, None, None]
     covariances = np.linalg.inv(information + 1e-12 * scale * np.eye(3))
     axes = rotations[:, :, 2]

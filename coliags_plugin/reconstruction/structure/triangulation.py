@@ -1,4 +1,4 @@
-"""Surface points from pictures whose poses are known."""
+"""Triangulation of surface points from images with known poses, by COLMAP."""
 
 from __future__ import annotations
 
@@ -29,61 +29,71 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-#: Fewer points are no result.
+#: Least number of points of a valid result.
 FEWEST_POINTS = 10
 
 
 class TriangulationSettings(Settings):
-    """How frames are matched and which points are kept. Pixels are those of the frames given."""
+    """Options of matching and point filtering. Pixels are those of the given frames."""
 
     features: FeatureSettings = FeatureSettings()
-    """What is looked for in a picture."""
+    """Feature extraction."""
     overlap: int = Field(
         default=6,
         ge=1,
-        description="Frames are matched with those 1 to this many places on, and 2, 4, 8, ..., 2^(this - 1) places on.",
+        description="Sequential matching: each frame with the next 1, 2, ..., overlap frames, and with those 2, 4, "
+        "..., 2^(overlap - 1) frames ahead.",
     )
-    exhaustive_up_to: int = Field(default=12, ge=0, description="So many frames or fewer are matched each with each.")
+    exhaustive_up_to: int = Field(default=12, ge=0, description="Up to this many frames are matched exhaustively.")
     max_epipolar_error: float = Field(
-        default=1.5, gt=0.0, description="Pixels that a match may be off the epipolar geometry of the given poses."
+        default=1.5,
+        gt=0.0,
+        description="Largest Sampson distance of a match from the epipolar geometry of the given poses, pixels.",
     )
     max_ratio: float = Field(
-        default=0.7, gt=0.0, le=1.0, description="Of a match's distance to that of the next best which the poses allow."
+        default=0.7,
+        gt=0.0,
+        le=1.0,
+        description="Largest ratio in Lowe's ratio test, among candidates that satisfy the epipolar constraint.",
     )
-    max_distance: float = Field(default=0.7, gt=0.0, le=2.0, description="Between matching descriptors of unit length.")
-    max_reprojection_error: float = Field(default=1.5, gt=0.0, description="Pixels from an observation to its point.")
+    max_distance: float = Field(
+        default=0.7, gt=0.0, le=2.0, description="Largest L2 distance between matched unit-length descriptors."
+    )
+    max_reprojection_error: float = Field(
+        default=1.5, gt=0.0, description="Largest reprojection error of an observation, pixels."
+    )
     min_angle: float = Field(
         default=0.5,
         gt=0.0,
         lt=90.0,
-        description="Least angle between two of the rays that meet in a point, degrees. A colonoscope moves along its "
-        "line of sight: COLMAP's own 1.5 leaves little.",
+        description="Least triangulation angle of a point, degrees. A colonoscope moves along its optical axis, where "
+        "COLMAP's default of 1.5 leaves few points.",
     )
-    min_track_length: int = Field(default=3, ge=2, description="Frames that have to see a point.")
+    min_track_length: int = Field(default=3, ge=2, description="Least number of frames that observe a point.")
     max_depth_uncertainty: float = Field(
         default=0.03,
         gt=0.0,
-        description="Largest standard deviation of a point's z-depth, as a share of it, that follows from the noise of "
-        "the observations and where they were taken from.",
+        description="Largest standard deviation of a point's z-depth, relative to it, propagated from the noise of the "
+        "observations.",
     )
     min_share: float = Field(
         default=0.01,
         ge=0.0,
         le=1.0,
-        description="Least share of the points found that are kept. Under true poses it is a tenth to a half; chance "
-        "matches under false ones leave less than a hundredth.",
+        description="Least share of triangulated points that pass the filters; fewer are an error. With correct poses "
+        "it is a tenth to a half; with wrong ones less than a hundredth.",
     )
-    seed: int = Field(default=0, ge=0, description="Of COLMAP's random samples.")
+    seed: int = Field(default=0, ge=0, description="Seed of COLMAP's random samples.")
 
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """What one frame sees of the points.
+    """Observations of triangulated points in one frame.
 
     Attributes:
-        pixels: Where they were seen; column and row, pixel centres at integers + 0.5. [K, 2]
+        pixels: Observed column and row, pixel centres at integers + 0.5. [K, 2]
         depth: z-depth of the points in this frame, scene units. [K]
-        points: Which points. [K]
+        points: Point indices. [K]
     """
 
     pixels: Float[np.ndarray, "K 2"]
@@ -93,18 +103,18 @@ class Observations:
 
 @dataclass(frozen=True, eq=False)
 class Triangulation:
-    """Points on the surface, and which frame saw them where.
+    """Triangulated surface points and their observations.
 
     Attributes:
         positions: World, scene units. [N, 3]
-        colors: RGB, mean over the frames that see the point. [N, 3]
-        errors: Mean distance between a point's projections and its observations, pixels. [N]
-        depth_uncertainty: Standard deviation of z-depth, as a share of it; mean over the observing frames. [N]
-        track_lengths: Frames that see the point. [N]
-        observations: Of each frame.
-        pixel_noise: Standard deviation of an observation, pixels along each axis, that the residuals show.
-        matches: How many pairs of features were matched, over all pairs of frames.
-        found: How many points there were before the thin and the uncertain ones were left out.
+        colors: RGB, mean over the observations. [N, 3]
+        errors: Mean reprojection error, pixels. [N]
+        depth_uncertainty: Standard deviation of z-depth relative to it, mean over the observing frames. [N]
+        track_lengths: Number of frames that observe the point. [N]
+        observations: Observations of each frame.
+        pixel_noise: Standard deviation of an observation along each axis, estimated from the residuals, pixels.
+        matches: Number of feature matches over all pairs of frames.
+        found: Number of points before filtering.
     """
 
     positions: Float[np.ndarray, "N 3"]
@@ -122,7 +132,7 @@ class Triangulation:
         return len(self.positions)
 
     def summary(self) -> str:
-        """What came out, in one line."""
+        """One-line summary."""
         return (
             f"{len(self)} points of {self.found} found, seen in {self.track_lengths.mean():.1f} frames each, "
             f"mean reprojection error {self.errors.mean():.2f} px, "
@@ -133,30 +143,31 @@ class Triangulation:
 def triangulate(
     frames: Sequence[Frame], settings: TriangulationSettings | None = None, progress: Progress | None = None
 ) -> Triangulation:
-    """Find surface points by COLMAP's triangulation; poses and intrinsics stay as they are.
+    """Triangulate surface points by COLMAP with fixed poses and intrinsics; deterministic.
 
-    SIFT features are matched along the epipolar lines of the given poses, joined to tracks and triangulated; points are
-    kept that enough frames see, from far enough apart, with little enough left over. The same input gives the same
-    points.
+    SIFT features are matched along the epipolar lines of the given poses, joined into tracks and triangulated; points
+    are filtered by track length, triangulation angle, reprojection error and depth uncertainty.
 
     Args:
-        frames: In video order; pictures of pinhole cameras, of any sizes.
-        settings: Default: those of a colonoscopy video of some 300 to 800 pixels.
-        progress: Told how far it is.
+        frames: In video order; pinhole cameras, images of any size.
+        settings: Default: for colonoscopy videos of some 300 to 800 pixels.
+        progress: Progress callback.
 
     Raises:
-        InputError: There are fewer than two frames, the camera does not move, or hardly any points are found, as under
-            poses that are not the frames'.
+        InputError: There are fewer than two frames, the camera does not move, or too few points are found, as with
+            wrong poses.
     """
     settings = settings or TriangulationSettings()
     if len(frames) < 2:
-        raise InputError(f"{len(frames)} frames", "two at least, from different places", "Give more of the video")
+        raise InputError(
+            f"{len(frames)} frames", "at least two, from different camera positions", "Give more of the video"
+        )
     centers = np.stack([frame.camera.center.cpu().double().numpy() for frame in frames])
     if not np.ptp(centers, axis=0).max() > 0.0:
         raise InputError(
-            f"all {len(frames)} cameras are in one place",
-            "poses from different places",
-            "A camera that only turns shows no depth; check the poses",
+            f"all {len(frames)} cameras are at the same position",
+            "poses at different positions",
+            "A purely rotating camera gives no depth; check the poses",
         )
     with quiet_colmap(settings.seed):
         features = []
@@ -187,9 +198,8 @@ def triangulate(
         if not count:
             raise InputError(
                 f"no features of {len(frames)} frames ({np.mean(counts):.0f} a frame) match along their epipolar lines",
-                "frames that show the same surface, and their true poses",
-                "Check the poses (coliags data check), or set max_epipolar_error higher or features.peak_threshold "
-                "lower",
+                "overlapping frames with correct poses",
+                "Check the poses (coliags data check), raise max_epipolar_error or lower features.peak_threshold",
             )
         with tempfile.TemporaryDirectory() as scratch:
             database = Path(scratch) / "database.db"
@@ -203,18 +213,18 @@ def triangulate(
                 matches,
                 verified=True,
             )
-            model = _triangulated(posed, database, Path(scratch), frames, settings)
+            model = _triangulate_tracks(posed, database, Path(scratch), frames, settings)
     return _result(frames, Tracks.of(model, len(frames)), settings, count)
 
 
-def _triangulated(
+def _triangulate_tracks(
     model: pycolmap.Reconstruction,
     database: Path,
     scratch: Path,
     frames: Sequence[Frame],
     settings: TriangulationSettings,
 ) -> pycolmap.Reconstruction:
-    """The model with points. Every pixel tolerance of COLMAP's is the one of the settings."""
+    """The model with triangulated points; the settings' reprojection error replaces COLMAP's pixel tolerances."""
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()
@@ -223,13 +233,13 @@ def _triangulated(
     options.random_seed = settings.seed
     options.mapper.filter_max_reproj_error = settings.max_reprojection_error
     options.mapper.filter_min_tri_angle = settings.min_angle
-    pixels, widest = settings.max_reprojection_error, min(frame.camera.fx for frame in frames)
+    pixels, shortest_focal = settings.max_reprojection_error, min(frame.camera.fx for frame in frames)
     triangulation = options.triangulation
     triangulation.random_seed = settings.seed
     triangulation.min_angle = settings.min_angle
     triangulation.ignore_two_view_tracks = False
     triangulation.merge_max_reproj_error = triangulation.complete_max_reproj_error = pixels
-    degrees = float(np.degrees(np.arctan(pixels / widest)))
+    degrees = float(np.degrees(np.arctan(pixels / shortest_focal)))
     triangulation.create_max_angle_error = triangulation.continue_max_angle_error = degrees
     (scratch / "model").mkdir()
     return pycolmap.triangulate_points(model, str(database), str(scratch), str(scratch / "model"), True, options, False)
@@ -244,12 +254,12 @@ def _result(frames: Sequence[Frame], tracks: Tracks, settings: TriangulationSett
     certain = shares <= settings.max_depth_uncertainty
     if certain.sum() < max(FEWEST_POINTS, settings.min_share * found):
         raise InputError(
-            f"of {found} points that {matches} matches make, {len(tracks)} are seen in {settings.min_track_length} "
-            f"frames or more under {settings.min_angle:g} degrees or more, and {certain.sum()} of these have a depth "
-            f"that is certain to {100.0 * settings.max_depth_uncertainty:g} %",
-            f"{FEWEST_POINTS} at least, and {100.0 * settings.min_share:g} % of those found",
-            "Check the poses first (coliags data check); else take frames farther apart, or set min_track_length "
-            "lower, or max_depth_uncertainty or max_reprojection_error higher",
+            f"of {found} points from {matches} matches, {len(tracks)} are seen in {settings.min_track_length} "
+            f"frames or more at an angle of {settings.min_angle:g} degrees or more, and {certain.sum()} of these have "
+            f"a depth uncertainty of {100.0 * settings.max_depth_uncertainty:g} % or less",
+            f"at least {FEWEST_POINTS}, and {100.0 * settings.min_share:g} % of the points found",
+            "Check the poses first (coliags data check); else take frames farther apart, lower min_track_length, or "
+            "raise max_depth_uncertainty or max_reprojection_error",
         )
     tracks, shares = tracks.only(certain), shares[certain]
     residuals, depth = tracks.residuals(cameras)

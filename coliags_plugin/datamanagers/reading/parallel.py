@@ -1,4 +1,4 @@
-"""Many files at once: reading and decoding wait for disks and leave processors idle otherwise."""
+"""Thread pool for reading and decoding files in parallel."""
 
 from __future__ import annotations
 
@@ -12,25 +12,23 @@ from coliags_plugin.core.progress import Progress
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
-#: Files read at once at most: more threads than this wait for the disk.
+#: Largest number of threads: more would wait for the disk.
 _READERS = 8
 
 
-def side_by_side(
+def parallel_map(
     function: Callable[[_Item], _Result], items: Sequence[_Item], what: str, progress: Progress | None = None
 ) -> list[_Result]:
-    """What a function gives for each item, in their order; it is called from several threads.
-
-    Results are held until all are there: keep them small.
+    """Apply a function to every item in a thread pool and return the results in order.
 
     Args:
-        function: Reads and digests one item.
-        items: What to call it with.
-        what: The job's name, for ``progress``.
-        progress: Told how much is done.
+        function: Function of one item; its result should be small, as all are held in memory.
+        items: Items.
+        what: Name of the task, for ``progress``.
+        progress: Progress callback.
 
     Raises:
-        Exception: What the function raised for the first item it failed with; the rest is left undone.
+        Exception: The exception of the first item that failed; the remaining items are cancelled.
     """
     results = []
     with ThreadPoolExecutor(min(_READERS, os.cpu_count() or 1)) as pool:

@@ -1,4 +1,4 @@
-"""What pictures that lie anywhere are called."""
+"""Unique frame names from image paths, and images without poses."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ log = logging.getLogger(__name__)
 
 
 def short_names(paths: Sequence[str]) -> list[str]:
-    """Unique names, fit for files, of pictures given by their relative paths.
+    """Unique names of images given by relative paths, usable as file names.
 
-    Folders common to all are left out and further ones joined by a dash; suffixes go where names stay unique.
+    Common parent folders are removed and the remaining ones joined by a dash; suffixes are dropped if names stay
+    unique.
 
     Raises:
-        InputError: Two cannot be told apart.
+        InputError: Two names would be equal.
     """
     whole = [PurePosixPath(posixpath.normpath(path)) for path in paths]
     common = len(PurePosixPath(os.path.commonpath([path.parent for path in whole])).parts)
@@ -29,17 +30,17 @@ def short_names(paths: Sequence[str]) -> list[str]:
         if len(set(names)) == len(names):
             return names
     double = next(name for index, name in enumerate(names) if name in names[:index])
-    raise InputError(f"two pictures would be called '{double}'", "names that differ in more than / and -", "Rename one")
+    raise InputError(f"two images would be called '{double}'", "names that differ in more than / and -", "Rename one")
 
 
-def others_beside(used: Sequence[Path], but: Iterable[Path | None] = ()) -> list[Path]:
-    """Pictures in the folders of the used ones that are not used: those that nobody gave a pose.
+def unposed_images(used: Sequence[Path], excluded: Iterable[Path | None] = ()) -> list[Path]:
+    """Images without a pose in the folders of those with one.
 
     Args:
-        used: Pictures with a pose.
-        but: Files that are something else: depth, masks.
+        used: Images with a pose.
+        excluded: Other files in these folders: depth, masks.
     """
-    known = {*used, *but}
+    known = {*used, *excluded}
     suffixes = {path.suffix.lower() for path in used}
     return [
         path
@@ -49,13 +50,13 @@ def others_beside(used: Sequence[Path], but: Iterable[Path | None] = ()) -> list
     ]
 
 
-def warn_of_others(file: Path, others: Sequence[Path]) -> None:
-    """Say which pictures are left out because ``file`` has no pose for them; nothing where there are none."""
+def warn_of_unposed(file: Path, others: Sequence[Path]) -> None:
+    """Log a warning that names the images without a pose in ``file``, if any."""
     if others:
         named = first_few([path.name for path in others])
-        log.warning("%s: %d pictures have no pose and are left out: %s", file, len(others), named)
+        log.warning("%s: %d images have no pose and are left out: %s", file, len(others), named)
 
 
 def first_few(names: Sequence[str]) -> str:
-    """The first three of some names, for messages."""
+    """The first three names, for messages."""
     return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")

@@ -1,0 +1,74 @@
+"""Finding and reading image files without poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, UInt8
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.poses.trajectory import natural_order
+
+#: Suffixes of image files, in lower case.
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+
+_FFMPEG = "make images with ffmpeg -i VIDEO -vf fps=10 FOLDER/%05d.png"
+
+
+def list_images(folder: Path) -> list[Path]:
+    """Image files of a folder in natural order, 2 before 10.
+
+    Raises:
+        InputError: The folder does not exist or holds fewer than two images.
+    """
+    if folder.is_file():
+        raise InputError(f"{folder} is a file", "a folder of images", f"{_FFMPEG}, if it is a video")
+    if not folder.is_dir():
+        raise InputError(f"no folder {folder}", "a folder of images", "Check the path")
+    found = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
+    if len(found) < 2:
+        raise InputError(
+            f"{folder} holds {len(found)} images",
+            f"at least two ({', '.join(IMAGE_SUFFIXES)})",
+            f"Give the folder of the frames; from a video, {_FFMPEG}",
+        )
+    return [found[index] for index in natural_order([path.name for path in found])]
+
+
+def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
+    """Read an image as 8-bit RGB, converting other formats.
+
+    Raises:
+        InputError: It cannot be read.
+    """
+    import cv2
+
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}", "a readable image") from error
+    # Ignore the EXIF orientation, as COLMAP's cameras do.
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    if image is None:
+        raise InputError(f"{path} ({len(data)} bytes) cannot be decoded", "a complete image", "Fetch it again")
+    return np.ascontiguousarray(image[..., ::-1])
+
+
+def read_mask(path: Path) -> Bool[np.ndarray, "H W"]:
+    """Read a mask: True where the image is not black.
+
+    Raises:
+        InputError: It cannot be read.
+    """
+    return np.asarray(read_image(path).max(axis=2) > 0)
+
+
+def file_names(names: Sequence[str], suffix: str) -> list[str]:
+    """File names that sort in frame order; prefixed by the index where the names do not."""
+    plain = [name.replace("/", "-") for name in names]
+    if natural_order(plain) != list(range(len(plain))) or len(set(plain)) < len(plain):
+        plain = [f"{index:05d}_{name}" for index, name in enumerate(plain)]
+    return [f"{name}{suffix}" for name in plain]
