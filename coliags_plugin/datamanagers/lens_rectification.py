@@ -1,7 +1,7 @@
-"""Rectification of pictures from many lenses, each undistorted when it is read.
+"""Rectification of images from many lenses, without keeping the undistortion maps of all of them.
 
-A :class:`Rectification` of its own for every camera would hold its undistortion maps for as long as the scene lives:
-some 10 MB each, and COLMAP likes to give every picture a camera.
+A :class:`Rectification` for every camera would hold its undistortion maps of some 10 MB for the lifetime of the scene,
+and COLMAP models often have one camera per image.
 """
 
 from __future__ import annotations
@@ -12,30 +12,30 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Shaped, UInt8
+from jaxtyping import Bool, Shaped, UInt8
 
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.datamanagers.rectification import Rectification, undistorted_camera
 from coliags_plugin.lenses.models import Lens
 from coliags_plugin.lenses.undistortion import Undistortion
 
-#: Undistortions kept at a time: as many as pictures are read side by side.
+#: Undistortions kept at a time: as many as images are read in parallel.
 _KEPT = 8
 
 Undistorter = Callable[[Lens, Intrinsics], Undistortion]
 
 
 def undistorter() -> Undistorter:
-    """Makes undistortions, and keeps the latest few."""
+    """Factory of undistortions with a cache of the latest few."""
     return lru_cache(maxsize=_KEPT)(Undistortion)
 
 
 @dataclass(frozen=True, kw_only=True)
 class LensRectification(Rectification):
-    """A rectification of pictures through a lens that holds no maps.
+    """Rectification of images through a lens that holds no maps.
 
     Attributes:
-        lens: Of the stored pictures.
+        lens: Of the stored images.
         undistort: Where its undistortion comes from, shared by those of a scene.
     """
 
@@ -63,11 +63,6 @@ class LensRectification(Rectification):
     def nearest(self, values: Shaped[np.ndarray, "H W"]) -> Shaped[np.ndarray, "h w"]:
         """See :class:`Rectification`."""
         return self._made.nearest(values, 0)
-
-    def pixels(self, stored: Float[np.ndarray, "K 2"]) -> Float[np.ndarray, "K 2"]:
-        """See :class:`Rectification`."""
-        k = self.pinhole
-        return np.asarray(self.lens.unproject(stored)[:, :2] * (k.fx, k.fy) + (k.cx, k.cy))
 
     @property
     def valid(self) -> Bool[np.ndarray, "h w"] | None:

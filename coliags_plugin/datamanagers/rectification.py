@@ -1,4 +1,4 @@
-"""How stored pictures become working pictures: another size, and a pinhole camera instead of a lens."""
+"""Rectification of stored images: undistortion to a pinhole camera and resizing to the working size."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from coliags_plugin.lenses.undistortion import Undistortion
 #: How far a raw frame's aspect ratio may be from the lens's: rounding to whole pixels, but no cropping.
 ASPECT_TOLERANCE = 0.02
 
-#: How far a principal point may be from the middle of a picture, as a share of it, before that is worth a warning.
+#: Distance of a principal point from the image centre, as a share of the image size, above which there is a warning.
 FAR_FROM_MIDDLE = 0.2
 
 #: The paper's working size, a quarter of C3VD's raw frame.
@@ -31,7 +31,7 @@ def fitted(width: int, height: int, within: tuple[int, int] | None) -> tuple[int
     """The largest size that fits another, keeps the aspect ratio and enlarges nothing, pixels.
 
     Args:
-        width: Of the stored pictures, pixels.
+        width: Of the stored images, pixels.
         height: Likewise.
         within: Width and height to fit, pixels; None: none, and the stored size is kept.
     """
@@ -45,13 +45,13 @@ def fitted(width: int, height: int, within: tuple[int, int] | None) -> tuple[int
 
 @dataclass(frozen=True)
 class Rectification:
-    """How the stored pictures of one camera become working pictures.
+    """Rectification of the stored images of one camera to its working images.
 
     Attributes:
-        source_width, source_height: Size of the stored pictures, pixels.
+        source_width, source_height: Size of the stored images, pixels.
         pinhole: The camera of the working images.
-        described_by: The file that says how large the stored pictures are, for errors.
-        undistortion: For pictures taken through a lens; None where they are pinhole pictures already.
+        described_by: The file with the size of the stored images, for errors.
+        undistortion: For images taken through a lens; None for pinhole images.
     """
 
     source_width: int
@@ -69,14 +69,14 @@ class Rectification:
         focal_scale: float = 1.0,
         shows: Bool[np.ndarray, "H W"] | None = None,
     ) -> Rectification:
-        """The rectification of pictures taken through a lens: undistorted to its nominal pinhole.
+        """The rectification of images taken through a lens: undistorted to its nominal pinhole.
 
         Args:
-            lens: Of the stored pictures, at their size.
-            described_by: The file the lens or its size comes from.
+            lens: Of the stored images, at their size.
+            described_by: The file that describes the lens or its size.
             size: Working width and height, pixels.
             focal_scale: Factor on the nominal focal length.
-            shows: Stored pixels that show something; None for all. [H, W]
+            shows: Stored pixels with image content; None for all. [H, W]
         """
         pinhole = undistorted_camera(lens, size, focal_scale)
         return cls(lens.width, lens.height, pinhole, described_by, Undistortion(lens, pinhole, shows))
@@ -101,46 +101,31 @@ class Rectification:
         return Camera.of(self.pinhole, torch.from_numpy(camera_to_world.astype(np.float32)))
 
     def image(self, rgb: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w 3"]:
-        """A colour picture at the working size."""
+        """A colour image at the working size."""
         if self.undistortion is None:
             return resize_rgb(rgb, self.width, self.height)
         return self.undistortion.image(rgb)
 
     def nearest(self, values: Shaped[np.ndarray, "H W"]) -> Shaped[np.ndarray, "h w"]:
-        """Values at the working size, unmixed; 0 where there is no source."""
+        """Values at the working size by nearest neighbour; 0 where there is no source."""
         if self.undistortion is None:
             return resize_nearest(values, self.width, self.height)
         return self.undistortion.nearest(values, 0)
 
-    def pixels(self, stored: Float[np.ndarray, "K 2"]) -> Float[np.ndarray, "K 2"]:
-        """Where places of the stored picture lie in the working one.
-
-        Args:
-            stored: (column, row), centres at integers + 0.5. [K, 2]
-
-        Returns:
-            (column, row), centres at integers + 0.5, inside the image or not; NaN where the lens does not reach. [K, 2]
-        """
-        if self.undistortion is None:
-            scale = np.array([self.width / self.source_width, self.height / self.source_height])
-            return np.asarray(stored * scale)
-        k = self.pinhole
-        return np.asarray(self.undistortion.lens.unproject(stored)[:, :2] * (k.fx, k.fy) + (k.cx, k.cy))
-
     @property
     def valid(self) -> Bool[np.ndarray, "h w"] | None:
-        """Working pixels that show something; None where all do."""
+        """Working pixels with image content; None where all have."""
         if self.undistortion is None or self.undistortion.valid.all():
             return None
         return self.undistortion.valid
 
     def doubt(self) -> str | None:
-        """What looks like intrinsics of another resolution; None where nothing does."""
+        """Warning where the intrinsics seem to be of another resolution; None otherwise."""
         off = max(abs(self.pinhole.cx / self.width - 0.5), abs(self.pinhole.cy / self.height - 0.5))
         if off <= FAR_FROM_MIDDLE:
             return None
         return (
-            f"{self.described_by}: the principal point is {off:.0%} of the picture ({self.source_width} x "
+            f"{self.described_by}: the principal point is {off:.0%} of the image ({self.source_width} x "
             f"{self.source_height}) from its middle: are the intrinsics those of another resolution?"
         )
 
@@ -153,21 +138,21 @@ class Rectification:
             "intrinsics": {"fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy, "pixel_centers": "integers + 0.5"},
         }
 
-    def checked(self, path: Path, picture: np.ndarray) -> np.ndarray:
-        """A stored picture as it is.
+    def checked(self, path: Path, image: np.ndarray) -> np.ndarray:
+        """A stored image, unchanged, after a check of its size.
 
         Raises:
             InputError: It is of another size.
         """
-        height, width = picture.shape[:2]
+        height, width = image.shape[:2]
         if (width, height) != (self.source_width, self.source_height):
             raise InputError(
                 f"{path} is {width} x {height}, but {self.described_by} says {self.source_width} x "
                 f"{self.source_height}",
-                "pictures of one size, the one their intrinsics are for",
-                "Write that picture again, or mend the size where it is said",
+                "images of one size, that of their intrinsics",
+                "Write that image again, or correct the size in that file",
             )
-        return picture
+        return image
 
 
 def undistorted_camera(lens: Lens, size: tuple[int, int], focal_scale: float) -> Intrinsics:
@@ -177,16 +162,16 @@ def undistorted_camera(lens: Lens, size: tuple[int, int], focal_scale: float) ->
 
 
 def whole_frame(lens: Lens, image: Path) -> Lens:
-    """The lens at the size of a picture that shows all of what the lens is calibrated for.
+    """The lens at the size of an image that shows the whole calibrated frame.
 
     Raises:
-        InputError: The picture is a crop, so that the calibration does not apply to it.
+        InputError: The image is a crop, so that the calibration does not apply to it.
     """
     height, width = read_rgb(image).shape[:2]
     if abs((width / height) / (lens.width / lens.height) - 1.0) > ASPECT_TOLERANCE:
         raise InputError(
             f"{image} is {width} x {height}",
             f"the whole raw frame that the lens is calibrated for, {lens.width} x {lens.height} or scaled from it",
-            "Undistort cropped pictures yourself and give them in the undistorted layout",
+            "Undistort cropped images yourself and give them in the undistorted layout",
         )
     return lens.resized(width, height)

@@ -78,7 +78,7 @@ def evaluate(trained: TrainedRun, protocol_name: str) -> Path:
             for frame in frames:
                 comparison = scorer.compare(trained.model, frame, trained.device)
                 _add_scores(scores[set_name], frame, scorer, comparison)
-                _write_pictures(scratch, set_name, frame, comparison)
+                _write_images(scratch, set_name, frame, comparison)
                 done += 1
                 progress.update(done)
         write_json(scratch / "metrics.json", _summary(trained, scorer.protocol, scorer.metrics, scores))
@@ -92,7 +92,7 @@ def _add_scores(scores: _SetScores, frame: Frame, scorer: Scorer, comparison: Co
         scores.add(frame.name, scorer.score(within_seen(comparison, frame), SEEN_METRICS), SEEN_SUFFIX)
 
 
-def _write_pictures(folder: Path, set_name: str, frame: Frame, comparison: Comparison) -> None:
+def _write_images(folder: Path, set_name: str, frame: Frame, comparison: Comparison) -> None:
     name = f"{set_name}/{frame.name}"
     write_png(folder / "renders" / f"{name}.png", eight_bit(comparison.rgb))
     write_png(folder / "truth" / f"{name}.png", frame.image)
@@ -101,8 +101,8 @@ def _write_pictures(folder: Path, set_name: str, frame: Frame, comparison: Compa
     known = torch.where(comparison.depth_valid, comparison.true_depth, torch.nan)
     write_depth_tiff(folder / "depth" / f"{name}.tiff", comparison.depth)
     write_depth_tiff(folder / "true_depth" / f"{name}.tiff", known)
-    picture = colorize_depth_error(comparison.depth, known, comparison.depth_valid, DEPTH_ERROR_LIMIT_MM)
-    write_png(folder / "errors" / f"{name}.png", picture)
+    errors = colorize_depth_error(comparison.depth, known, comparison.depth_valid, DEPTH_ERROR_LIMIT_MM)
+    write_png(folder / "errors" / f"{name}.png", errors)
 
 
 def _columns(metrics: Mapping[str, Metric], scores: Mapping[str, _SetScores]) -> list[str]:

@@ -24,7 +24,7 @@ from coliags_plugin.outputs.colormaps import (
 from coliags_plugin.outputs.image_files import eight_bit, write_png
 from coliags_plugin.outputs.video import write_video
 
-#: Full scale of the colour error pictures, parts of full scale.
+#: Upper limit of the colour error images, as a share of the colour range.
 RGB_ERROR_LIMIT = 0.2
 
 
@@ -90,8 +90,8 @@ def _write_frame(folder: Path, frame: Frame, output: RenderOutput, limits: tuple
     valid = frame.valid.cpu()
     write_png(folder / "rgb_error" / name, colorize_rgb_error(output.rgb.cpu(), frame.image, valid, RGB_ERROR_LIMIT))
     if frame.depth is not None:
-        picture = colorize_depth_error(depth.cpu(), frame.depth, valid, DEPTH_ERROR_LIMIT_MM)
-        write_png(folder / "depth_error" / name, picture)
+        errors = colorize_depth_error(depth.cpu(), frame.depth, valid, DEPTH_ERROR_LIMIT_MM)
+        write_png(folder / "depth_error" / name, errors)
 
 
 def _film(

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from coliags_plugin.lenses.models import Array, CalibratedLens
 
-#: Directions further from the optical axis than this are not looked at, radians. A pinhole picture never shows them.
+#: Largest angle from the optical axis in the table, radians. A pinhole image never shows larger ones.
 _WIDEST = np.deg2rad(89.9)
 #: The grid of directions a lens is probed on: round the axis, and away from it.
 _AROUND, _AWAY = 256, 256
@@ -26,7 +26,7 @@ _TOLERANCE = 1e-6
 class MappedLens(CalibratedLens):
     """A lens given as a map from directions to pixels; where it may be used, and its inverse, are found from that map.
 
-    Distortion polynomials are fitted inside a picture and turn back somewhere beyond it, where one pixel gets a second,
+    Distortion polynomials are fitted inside an image and turn back somewhere beyond it, where one pixel gets a second,
     meaningless direction. So from the optical axis outwards, in every direction, the map is followed as long as it
     keeps its orientation (its Jacobian's determinant stays positive); what lies beyond is NaN. Inside, the map is
     inverted by Newton's method, to 1e-6 pixels.

@@ -1,4 +1,4 @@
-"""Resampling distorted pictures into pinhole pictures."""
+"""Resampling of distorted images to pinhole images."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from coliags_plugin.lenses.models import Lens, undistortion_map
 
 
 class Undistortion:
-    """Turns pictures taken through one lens into pictures of one pinhole camera.
+    """Resampling of the images of one lens to those of one pinhole camera.
 
-    Colour is averaged, not picked: where one pixel of the result covers several source pixels, it is the mean of
-    ``supersampling`` x ``supersampling`` bilinear samples spread over it, so that nothing aliases. Everything that must
-    not be mixed (depth, masks) is taken from the nearest source pixel, in its own type. z-depth needs no conversion:
+    Where one pixel of the result covers several source pixels, its colour is the mean of ``supersampling`` x
+    ``supersampling`` bilinear samples spread over it, which avoids aliasing. Values that must not be mixed (depth,
+    masks) are taken from the nearest source pixel, in their own type. z-depth needs no conversion:
     both cameras share their optical axis.
 
     Args:
-        lens: The lens of the source pictures.
+        lens: The lens of the source images.
         pinhole: The camera of the result.
-        source_mask: Source pixels that show something. None means all. [H_source, W_source]
+        source_mask: Source pixels with image content. None means all. [H_source, W_source]
 
     Attributes:
         supersampling: Bilinear samples per result pixel, along each side.
-        valid: Result pixels made only of source pixels that show something. [height, width]
+        valid: Result pixels made only of source pixels with image content. [height, width]
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class Undistortion:
         self.valid: np.ndarray = np.all(fine_valid.reshape(height, s, width, s), axis=(1, 3))
 
     def image(self, rgb: UInt8[np.ndarray, "H_source W_source 3"]) -> UInt8[np.ndarray, "H W 3"]:
-        """A colour picture, resampled. Pixels outside :attr:`valid` are mixed with the picture's border."""
+        """Resample a colour image. Pixels outside :attr:`valid` are mixed with the image's border."""
         import cv2
 
         fine = cv2.remap(rgb, self._fine_columns, self._fine_rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -1,4 +1,4 @@
-"""Pictures to bytes."""
+"""Encoding of images."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def read(path):
 
 @pytest.mark.parametrize("suffix", [".png", ".tiff"])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_lossless_pictures_keep_their_numbers(suffix, dtype, tmp_path):
+def test_lossless_images_keep_their_numbers(suffix, dtype, tmp_path):
     pixels = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, (5, 7, 3)).astype(dtype)
     write_image(tmp_path / "folder" / f"rgb{suffix}", pixels)
     np.testing.assert_array_equal(read(tmp_path / "folder" / f"rgb{suffix}")[..., ::-1], pixels)

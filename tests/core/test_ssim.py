@@ -13,7 +13,7 @@ few = settings(max_examples=15, deadline=None)
 
 
 def images(height, width, seed=0, dtype=torch.float64, channels=3):
-    """A smooth-ish picture and a disturbed copy of it."""
+    """A smooth image and a disturbed copy of it."""
     generator = torch.Generator().manual_seed(seed)
     truth = torch.rand(height, width, channels, dtype=dtype, generator=generator)
     rendered = (truth + 0.2 * torch.randn(height, width, channels, dtype=dtype, generator=generator)).clamp(0, 1)

@@ -508,8 +508,9 @@ def test_points_fall_where_they_were_seen_in_the_loaders_undistorted_images(shar
         camera = shot.rectification.camera(shot.camera_to_world).to(dtype=torch.float64)
         found, depth = camera.project(torch.from_numpy(data.positions[image.points]))
         assert (depth > 0).all()
-        seen = shot.rectification.pixels(image.observed)
-        stored = data.cameras[image.camera].pinhole.fx / shot.rectification.pinhole.fx
+        k = shot.rectification.pinhole
+        seen = data.cameras[image.camera].unproject(image.observed)[:, :2] * (k.fx, k.fy) + (k.cx, k.cy)
+        stored = data.cameras[image.camera].pinhole.fx / k.fx
         errors.append(stored * np.linalg.norm(found.numpy() - seen, axis=1))
         numbers.append(image.points)
     by_point = np.concatenate(numbers)

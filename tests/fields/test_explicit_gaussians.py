@@ -48,7 +48,7 @@ def test_points_without_colours_are_grey_and_no_points_are_refused():
         make(replace(wall_scene(), points=PointCloud(torch.zeros(0, 3))))
 
 
-def test_culling_changes_no_picture():
+def test_culling_changes_no_image():
     field, camera = make(), camera_at(0.3, 0.2, 3.0, yaw=0.3)
     with torch.no_grad():
         field.scales += torch.randn(field.scales.shape, generator=torch.Generator().manual_seed(1))

@@ -27,10 +27,10 @@ def test_every_pixel_shows_what_its_pinhole_ray_sees(name, size):
     lens = LENSES[name].resized(675, 540)
     pinhole = LENSES[name].resized(*size).pinhole
     tangents = np.nan_to_num(seen_by(lens))
-    picture = np.rint(np.clip(128.0 + 100.0 * tangents, 0, 255)).astype(np.uint8)
+    image = np.rint(np.clip(128.0 + 100.0 * tangents, 0, 255)).astype(np.uint8)
     undistortion = Undistortion(lens, pinhole, octagon_mask(675, 540))
     assert undistortion.valid.all()
-    result = undistortion.image(np.dstack([picture, picture[..., :1]]))
+    result = undistortion.image(np.dstack([image, image[..., :1]]))
     x = (np.arange(size[0]) + 0.5 - pinhole.cx) / pinhole.fx
     y = (np.arange(size[1]) + 0.5 - pinhole.cy) / pinhole.fy
     # One grey level is 0.01; rounding at the start, in OpenCV's 1/32 pixel and at the end add up to less than two.
@@ -55,19 +55,19 @@ def test_nearest_is_within_half_a_source_pixel_and_keeps_16_bits(name):
 
 def test_shrinking_by_a_whole_number_is_the_mean_of_blocks():
     lens = STRAIGHT.resized(240, 192)
-    picture = np.random.default_rng(0).integers(0, 256, (192, 240, 3), dtype=np.uint8)
+    image = np.random.default_rng(0).integers(0, 256, (192, 240, 3), dtype=np.uint8)
     undistortion = Undistortion(lens, lens.resized(60, 48).pinhole)
     assert undistortion.supersampling == 4
-    blocks = picture.reshape(48, 4, 60, 4, 3).mean(axis=(1, 3))
-    np.testing.assert_allclose(undistortion.image(picture), blocks, atol=0.51)
+    blocks = image.reshape(48, 4, 60, 4, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(undistortion.image(image), blocks, atol=0.51)
 
 
 def test_same_size_without_distortion_changes_nothing():
     lens = STRAIGHT.resized(240, 192)
-    picture = np.random.default_rng(0).integers(0, 256, (192, 240, 3), dtype=np.uint8)
+    image = np.random.default_rng(0).integers(0, 256, (192, 240, 3), dtype=np.uint8)
     undistortion = Undistortion(lens, lens.pinhole)
-    np.testing.assert_array_equal(undistortion.image(picture), picture)
-    np.testing.assert_array_equal(undistortion.nearest(picture[..., 0], 0), picture[..., 0])
+    np.testing.assert_array_equal(undistortion.image(image), image)
+    np.testing.assert_array_equal(undistortion.nearest(image[..., 0], 0), image[..., 0])
 
 
 def test_fine_stripes_turn_grey_instead_of_aliasing():
@@ -89,8 +89,8 @@ def test_no_pixel_of_the_dark_corners_gets_in():
     wide = replace(nominal, fx=nominal.fx * 0.45, fy=nominal.fy * 0.45)
     undistortion = Undistortion(lens, wide, octagon)
     assert 0.5 < undistortion.valid.mean() < 0.97
-    picture = np.where(octagon[..., None], 200, 0).astype(np.uint8).repeat(3, axis=2)
-    assert (undistortion.image(picture)[undistortion.valid] == 200).all()
+    image = np.where(octagon[..., None], 200, 0).astype(np.uint8).repeat(3, axis=2)
+    assert (undistortion.image(image)[undistortion.valid] == 200).all()
     assert (undistortion.nearest(octagon, 0)[undistortion.valid]).all()
 
 

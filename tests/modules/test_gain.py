@@ -60,7 +60,7 @@ def test_shading_multiplies_the_colours_alone():
 
 
 def test_known_gains_are_found(tmp_path):
-    """An evenly lit wall whose pictures were multiplied by 0.74 to 1.1: found to one percent, up to a common factor."""
+    """An evenly lit wall whose images were multiplied by 0.74 to 1.1: found to one percent, up to a common factor."""
     generator = torch.Generator().manual_seed(3)
     scene = wall_scene(frames=10, width=48, height=36, lamp=False)
     gains = torch.exp(torch.rand(len(scene.train), generator=generator) * 0.4 - 0.3)

@@ -39,7 +39,7 @@ from tests.renderers.test_torch_renderer import (
 )
 
 BACKGROUND = (0.3, 0.1, 0.9)
-#: gsplat's cap on alpha, as the definition's setting; with it both draw the same picture.
+#: gsplat's cap on alpha, as the definition's setting; with it both draw the same image.
 SAME_CAP = {"alpha_max": 0.999}
 
 

@@ -446,7 +446,7 @@ def test_centres_land_where_the_camera_projects_them():
 
 
 def test_an_off_centre_view_is_a_window_of_a_larger_one():
-    # Moving the principal point by whole pixels moves the picture; only the Jacobian's margin knows the image's edge.
+    # Moving the principal point by whole pixels moves the image; only the Jacobian's margin knows the image's edge.
     gaussians = random_gaussians(60, 8, scale=(0.02, 0.1), spread=0.3)
     whole = render_gaussians(gaussians, pinhole(40, 30, 30.0, 30.0), OUTPUTS)
     window = render_gaussians(gaussians, pinhole(25, 20, 30.0, 30.0, 20.0 - 9, 15.0 - 6), OUTPUTS)

@@ -42,7 +42,7 @@ def camera_of(
         raise InputError(f"{place}: camera_model is {model}", f"one of {', '.join(_MODELS)}")
     width, height = _size(values, place) if "w" in values or "h" in values else image_size()
     fx, fy = _focal_lengths(values, place, width, height)
-    # Without a principal point the middle of the picture is meant, however pixels are counted.
+    # The default principal point is the image centre in either convention.
     shift = 0.0 if pixel_centers == "half" else 0.5
     cx = number(values, "cx", place) + shift if "cx" in values else 0.5 * width
     cy = number(values, "cy", place) + shift if "cy" in values else 0.5 * height

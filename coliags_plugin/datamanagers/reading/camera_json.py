@@ -26,7 +26,7 @@ def read_intrinsics(path: Path) -> Intrinsics:
         missing = [key for key in keys if not isinstance(data, dict) or key not in data]
         raise InputError(
             f"{path} has no {', '.join(missing)}",
-            "fx, fy, cx, cy in pixels (centres at integers) and the picture's w, h",
+            "fx, fy, cx, cy in pixels (centres at integers) and the image's w, h",
             "Add them",
         )
     values = [data[key] for key in keys]
@@ -45,7 +45,7 @@ def write_camera_json(path: Path, intrinsics: Intrinsics, **more: float) -> None
     Args:
         path: Where to.
         intrinsics: Of all images.
-        more: ``w`` and ``h``, the picture's size in pixels, and whatever else a format keeps there, in this order.
+        more: ``w`` and ``h``, the image size in pixels, and other values of a format, in this order.
     """
     k = intrinsics
     write_json(path, {"fx": k.fx, "fy": k.fy, "cx": k.cx - 0.5, "cy": k.cy - 0.5, **more})
