@@ -68,7 +68,7 @@ def test_convert_says_what_it_read_and_what_it_lost(truth, tmp_path, caplog):
     assert "mean looking direction (" in said
     assert "the input has no image names: using 0000.png" in said
     assert "tum does not store names: dropped" in said
-    assert "no timestamps: frame numbers stand in" in said
+    assert "no timestamps: frame numbers are written instead" in said
 
 
 def test_images_give_names(truth, tmp_path, capsys):
