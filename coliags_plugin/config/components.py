@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any
 
-from pydantic import PlainSerializer, PlainValidator
+from pydantic import PlainSerializer, PlainValidator, ValidationError
 from pydantic_core import PydanticCustomError
 
 from coliags_plugin.config.registry import REGISTRIES
@@ -55,6 +55,27 @@ def make_component(kind: str, node: Any) -> Component:
     except InputError as error:
         raise PydanticCustomError("unknown_component", "{text}", {"text": str(error)}) from error
     return Component(kind, node["name"], settings_class.model_validate(options))
+
+
+def named_component(kind: str, node: Any, asking: str) -> Component:
+    """Validate a node outside method configs into a component.
+
+    Args:
+        kind: The registry's kind.
+        node: ``{"name": ..., options...}``.
+        asking: Origin of the node, for the message.
+
+    Raises:
+        InputError: The name is unknown, or an option is.
+    """
+    try:
+        return make_component(kind, node)
+    except PydanticCustomError as error:
+        raise InputError(f"{asking}: {error}") from error
+    except ValidationError as error:
+        name, first = node["name"], error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        raise InputError(f"{asking}: option '{where}' of '{name}': {first['msg']}") from error
 
 
 def _dump(component: Component) -> dict[str, Any]:

@@ -63,5 +63,5 @@ def _file_in(package: str, name: str) -> Path:
     raise InputError(
         f"entry point '{name}' in {ENTRY_POINTS} names package {package}, which has no {name}.yaml",
         "a package with that file",
-        "Mend or uninstall it",
+        "Correct or uninstall it",
     )

@@ -15,7 +15,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
 from runpy import run_path
-from typing import Any
+from typing import Any, TypeGuard
 
 from coliags_plugin.core.errors import InputError, did_you_mean
 
@@ -28,12 +28,12 @@ class Registry:
     Args:
         kind: Plural noun, for instance ``"renderers"``.
         builtins: Name to ``"module:Class"``.
-        noun: Noun for one of them in errors; default: the kind and "component".
+        noun: Singular of the kind, for errors.
     """
 
-    def __init__(self, kind: str, builtins: Mapping[str, str], noun: str = "") -> None:
+    def __init__(self, kind: str, builtins: Mapping[str, str], noun: str) -> None:
         self.kind = kind
-        self.noun = noun or f"{kind} component"
+        self.noun = noun
         self._targets: dict[str, Any] = {}
         self._sources: dict[str, str] = {}
         self._complete = False
@@ -85,8 +85,20 @@ class Registry:
             )
         target = self._targets[name]
         if isinstance(target, str):
-            target = self._targets[name] = _load(target)
+            target = self._targets[name] = self._imported(name, target)
         return target
+
+    def _imported(self, name: str, target: str) -> Any:
+        try:
+            return _load(target)
+        except (ImportError, AttributeError, ValueError) as error:
+            if self._sources[name] == "built in":
+                raise
+            raise InputError(
+                f"{self.noun} '{name}' from {self._sources[name]} cannot be imported: {error}",
+                "module:Class",
+                "Correct it, or uninstall the package",
+            ) from error
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.names())
@@ -107,6 +119,14 @@ def _load(target: str) -> Any:
     return getattr(import_module(module), attribute)
 
 
+def _is_components(found: Any) -> TypeGuard[dict[str, dict[str, Any]]]:
+    return (
+        isinstance(found, dict)
+        and set(found) <= set(REGISTRIES)
+        and all(isinstance(named, dict) for named in found.values())
+    )
+
+
 @cache
 def _plugin_files(path_list: str) -> dict[str, dict[str, dict[str, Any]]]:
     found: dict[str, dict[str, dict[str, Any]]] = {}
@@ -115,13 +135,13 @@ def _plugin_files(path_list: str) -> dict[str, dict[str, dict[str, Any]]]:
             raise InputError(
                 f"{PLUGIN_PATH_VARIABLE} names '{path}', which is not a file",
                 "a path list of Python files",
-                f"Mend or unset {PLUGIN_PATH_VARIABLE}",
+                f"Correct or unset {PLUGIN_PATH_VARIABLE}",
             )
         components = run_path(path).get("COMPONENTS")
-        if not isinstance(components, dict) or not set(components) <= set(REGISTRIES):
+        if not _is_components(components):
             raise InputError(
                 f"{path} defines COMPONENTS = {components!r}",
-                f"a dict from kind to components, the kinds being {', '.join(REGISTRIES)}",
+                f"{{kind: {{name: class}}}}, the kinds being {', '.join(REGISTRIES)}",
             )
         found[path] = components
     return found
@@ -140,6 +160,7 @@ datamanagers = Registry(
         "rgbd": "coliags_plugin.datamanagers.rgbd.reader:RGBDDataManager",
         "rotatecolon": "coliags_plugin.datamanagers.rotatecolon.reader:RotateColonDataManager",
     },
+    noun="data manager",
 )
 fields = Registry(
     "fields",
@@ -147,6 +168,7 @@ fields = Registry(
         "anchors": "coliags_plugin.fields.anchors:AnchorField",
         "gaussians": "coliags_plugin.fields.explicit_gaussians:ExplicitGaussians",
     },
+    noun="field",
 )
 geometry_heads = Registry(
     "geometry_heads",
@@ -154,6 +176,7 @@ geometry_heads = Registry(
         "plain": "coliags_plugin.fields.geometry_heads:PlainGeometryHead",
         "imve": "coliags_plugin.fields.geometry_heads:IMVEGeometryHead",
     },
+    noun="geometry head",
 )
 appearance_heads = Registry(
     "appearance_heads",
@@ -161,6 +184,7 @@ appearance_heads = Registry(
         "plain": "coliags_plugin.fields.appearance_heads:PlainAppearanceHead",
         "imia": "coliags_plugin.fields.appearance_heads:IMIAAppearanceHead",
     },
+    noun="appearance head",
 )
 renderers = Registry(
     "renderers",
@@ -171,6 +195,7 @@ renderers = Registry(
         "torch": "coliags_plugin.renderers.torch_renderer:TorchRenderer",
         "volume": "coliags_plugin.renderers.volume_renderer:VolumeRenderer",
     },
+    noun="renderer",
 )
 modules = Registry(
     "modules",
@@ -178,6 +203,7 @@ modules = Registry(
         "gain": "coliags_plugin.modules.gain:FrameGain",
         "pose-correction": "coliags_plugin.modules.pose_correction:PoseCorrection",
     },
+    noun="view module",
 )
 samplers = Registry(
     "samplers",
@@ -185,6 +211,7 @@ samplers = Registry(
         "frames": "coliags_plugin.engine.samplers:FrameSampler",
         "pixels": "coliags_plugin.engine.samplers:PixelSampler",
     },
+    noun="sampler",
 )
 strategies = Registry(
     "strategies",
@@ -193,6 +220,7 @@ strategies = Registry(
         "none": "coliags_plugin.strategies.none:NoStrategy",
         "anchor-growth": "coliags_plugin.strategies.anchor_growth:AnchorGrowth",
     },
+    noun="strategy",
 )
 losses = Registry(
     "losses",
@@ -203,6 +231,7 @@ losses = Registry(
         "sparse-depth": "coliags_plugin.losses.sparse_depth:SparseDepthLoss",
         "scale-volume": "coliags_plugin.losses.scale_volume:ScaleVolumeLoss",
     },
+    noun="loss",
 )
 metrics = Registry(
     "metrics",
@@ -217,6 +246,7 @@ metrics = Registry(
         "depth_median_error": "coliags_plugin.metrics.depth:DepthMedianError",
         "depth_abs_rel": "coliags_plugin.metrics.depth:DepthAbsRel",
     },
+    noun="metric",
 )
 protocols = Registry(
     "protocols",
@@ -224,6 +254,7 @@ protocols = Registry(
         "paper": "coliags_plugin.metrics.protocols:PaperProtocol",
         "authors-code": "coliags_plugin.metrics.protocols:AuthorsCodeProtocol",
     },
+    noun="protocol",
 )
 pose_formats = Registry(
     "pose_formats",

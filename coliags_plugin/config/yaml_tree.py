@@ -134,6 +134,8 @@ def merge(base: Node, over: Node) -> Node:
 
     A component whose ``name`` changes keeps nothing of the options inherited for the old name.
     """
+    if isinstance(base.value, str) and over.is_mapping:
+        base = Node({"name": base}, base.origin)  # a bare name is short for a component without options
     if not base.is_mapping or not over.is_mapping:
         return over
     names = [node.value["name"].value if "name" in node.value else None for node in (base, over)]
@@ -160,11 +162,17 @@ def override(tree: Node, assignment: str) -> Node:
     if not equals or ".".join(keys) != path.strip():
         raise InputError(f"--set {assignment}", "key.path=value, for instance field.geometry_head.frequencies=8")
     origin = f"--set {assignment}"
-    value = parse_value(text)
-    node = Node({k: Node(v, origin) for k, v in value.items()} if isinstance(value, dict) else value, origin)
+    node = _nodes(parse_value(text), origin)
     for key in reversed(keys):
         node = Node({key.strip('"'): node}, origin)
     return merge(tree, node)
+
+
+def _nodes(value: Any, origin: str) -> Node:
+    """A plain value as a tree of nodes, all of one origin."""
+    if not isinstance(value, dict):
+        return Node(value, origin)
+    return Node({str(key): _nodes(child, origin) for key, child in value.items()}, origin)
 
 
 def override_all(tree: Node, assignments: Iterable[str]) -> Node:

@@ -92,6 +92,9 @@ class ViewModule(nn.Module, ABC):
     """Per-view module: adjusts the camera before and the output after rendering; may learn parameters per frame."""
 
     Settings: ClassVar[type[Settings]]
+    #: Whether :meth:`shade` depends on where in the image a pixel lies: ``output`` may be some pixels of a view, as an
+    #: image of P rows and one column, unless this refuses samplers of pixels.
+    whole_image: ClassVar[bool] = False
 
     @property
     def wants(self) -> frozenset[str]:
@@ -129,7 +132,8 @@ class ViewModule(nn.Module, ABC):
         """The output as the camera would have recorded it, for instance with its gain.
 
         Args:
-            output: Rendered, and shaded by the modules before this one.
+            output: Rendered, and shaded by the modules before this one: a view or, unless :attr:`whole_image`, some of
+                its pixels.
             view: See :meth:`adjust_camera`.
         """
         return output

@@ -32,7 +32,8 @@ class InputError(ReportedError):
             parts.append(f"Expected {expected.rstrip('.')}")
         if do:
             parts.append(do.rstrip("."))
-        super().__init__(". ".join(parts) + ".")
+        text = ". ".join(parts)
+        super().__init__(text if text.endswith("?") else f"{text}.")
 
 
 class InterruptedRunError(ReportedError):
@@ -52,7 +53,7 @@ class UnavailableError(Exception):
     """
 
 
-#: Former names of options and what they are called now ("Renamed options" in the changelog); hints name the new ones.
+#: Former and present names of options ("Renamed options" in the changelog); hints name the new ones.
 RENAMED_OPTIONS = {"near": "near_plane", "far": "far_plane", "low_pass": "eps2d"}
 
 

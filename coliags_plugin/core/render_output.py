@@ -78,6 +78,8 @@ class RenderOutput:
             return self.rgb
         if name == "alpha":
             return self.alpha
+        if name not in self.maps:
+            raise KeyError(f"output '{name}' was not requested; the component that reads it must list it in `wants`")
         return self.maps[name]
 
 

@@ -161,6 +161,22 @@ def restore_model(checkpoint: Checkpoint, config: MethodConfig, scene: Scene, re
     return Model(field, renderer, modules)
 
 
+def restore_strategy(checkpoint: Checkpoint, strategy: Strategy, name: str) -> None:
+    """Load a strategy's counters.
+
+    Raises:
+        InputError: The checkpoint lacks one.
+    """
+    try:
+        strategy.load_state_dict(checkpoint.part("strategy"))
+    except KeyError as error:
+        raise InputError(
+            f"the checkpoint has no counter {error} of strategy '{name}'",
+            "one written by this version of the strategy",
+            "Train again with --overwrite",
+        ) from error
+
+
 def restore_optimizers(checkpoint: Checkpoint, optimizers: Optimizers) -> None:
     """Load Adam's moments."""
     for key, value in checkpoint.part("optimizer").items():

@@ -10,8 +10,8 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.renderers.choice import ChosenRenderer
 
-#: What messages call the attributes of a target that losses need.
-_DATA = {"depth": "depth", "sparse_depth": "depth at single points"}
+#: Descriptions of target attributes for messages; others are called by their names.
+_DATA = {"sparse_depth": "depth at single points"}
 
 
 def check_components(
@@ -57,6 +57,13 @@ def _check_sampler(config: MethodConfig, chosen: ChosenRenderer, losses: Mapping
                 "losses of single pixels",
                 f"Remove it with --set losses.{key}=null, or set --set sampler=frames",
             )
+    for name, node in config.modules.items():
+        if node.target.whole_image:
+            raise InputError(
+                f"module '{name}' needs whole images, and sampler '{config.sampler.name}' gives single pixels",
+                "modules that shade single pixels",
+                f"Remove it with --set modules.{name}=null, or set --set sampler=frames",
+            )
 
 
 def _check_splats(config: MethodConfig, losses: Mapping[str, Loss]) -> None:
@@ -70,7 +77,8 @@ def _check_splats(config: MethodConfig, losses: Mapping[str, Loss]) -> None:
 
 
 def _check_data(scene: Scene, losses: Mapping[str, Loss]) -> None:
-    there = {name for name in _DATA if any(getattr(frame, name) is not None for frame in scene.train)}
+    needed = {name for loss in losses.values() for name in loss.needs}
+    there = {name for name in needed | {"sparse_depth"} if any(getattr(f, name, None) is not None for f in scene.train)}
     for key, loss in losses.items():
         for missing in sorted(loss.needs - there):
             instead = ""

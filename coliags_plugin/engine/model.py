@@ -30,12 +30,14 @@ class Model(nn.Module):
         super().__init__()
         self.field = field
         self.renderer = renderer
-        self._modules_by_name = nn.ModuleDict(view_modules)
+        # A ModuleDict would refuse names of its own attributes, such as "train" and "keys".
+        self._view_modules = nn.ModuleList(view_modules.values())
+        self._names = tuple(view_modules)
 
     @property
     def view_modules(self) -> dict[str, ViewModule]:
         """The view modules by name."""
-        return dict(self._modules_by_name.items())  # type: ignore[arg-type]
+        return dict(zip(self._names, self._view_modules, strict=True))  # type: ignore[arg-type]
 
     def render(
         self,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -9,9 +10,9 @@ from typing import Any
 import torch
 
 from coliags_plugin.config import registry
-from coliags_plugin.config.components import make_component
+from coliags_plugin.config.components import named_component
 from coliags_plugin.contracts import Comparison, Metric, Protocol
-from coliags_plugin.core.errors import UnavailableError
+from coliags_plugin.core.errors import InputError, UnavailableError
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.model import Model
 
@@ -37,14 +38,19 @@ class Scorer:
         only: Of its metrics only these; all where None.
 
     Raises:
-        InputError: There is no such protocol.
+        InputError: There is no such protocol, its own name differs, or it names an unknown metric.
     """
 
     def __init__(self, protocol: str, only: Sequence[str] | None = None) -> None:
         self.protocol: Protocol = registry.protocols.get(protocol)()
+        if self.protocol.name != protocol:
+            raise InputError(
+                f"protocol '{protocol}' from {registry.protocols.source(protocol)} has the name '{self.protocol.name}'",
+                "the name that it is registered under",
+            )
         self.wants = tuple(sorted({"rgb", "alpha"} | self.protocol.wants))
         self.metrics: dict[str, Metric] = {
-            key: _metric(name, options)
+            key: _metric(name, options, f"protocol '{protocol}', metric '{key}'")
             for key, (name, options) in self.protocol.metrics.items()
             if only is None or key in only
         }
@@ -63,9 +69,14 @@ class Scorer:
             if names is not None and name not in names:
                 continue
             try:
-                scores.values[name] = metric(comparison)
+                value = metric(comparison)
             except UnavailableError as error:
                 scores.reasons[name] = str(error)
+                continue
+            if math.isfinite(value):
+                scores.values[name] = value
+            else:
+                scores.reasons[name] = f"the metric is {value}"
         return scores
 
 
@@ -78,7 +89,7 @@ def within_seen(comparison: Comparison, frame: Frame) -> Comparison:
     return replace(comparison, valid=comparison.valid & seen, depth_valid=depth_valid)
 
 
-def _metric(name: str, options: Mapping[str, Any]) -> Metric:
-    component = make_component("metrics", {"name": name, **options})
+def _metric(name: str, options: Mapping[str, Any], asking: str) -> Metric:
+    component = named_component("metrics", {"name": name, **options}, asking)
     metric: Metric = component.target(component.settings)
     return metric

@@ -114,7 +114,7 @@ class Trainer:
         self.optimizers = self._optimizers()
         checkpoints.restore_optimizers(saved, self.optimizers)
         checkpoints.restore_generators(saved, self.generators)
-        self.strategy.load_state_dict(saved.part("strategy"))
+        checkpoints.restore_strategy(saved, self.strategy, self.method.config.strategy.name)
         self.sampler.queue = list(saved.queue)
         self.step = saved.step
 
@@ -218,6 +218,7 @@ class Trainer:
 
     def provenance(self) -> dict[str, Any]:
         """Provenance of the run."""
+        footprint = self.scene.pixel_footprint
         return {
             "method": self.method.name,
             "seed": self.seed,
@@ -231,7 +232,7 @@ class Trainer:
                 "name": self.scene.name,
                 "path": self.scene_path,
                 "extent": self.scene.extent,
-                "pixel_footprint": self.scene.pixel_footprint,
+                "pixel_footprint": footprint if math.isfinite(footprint) else None,  # without points there is none
                 "points": len(self.scene.points),
                 "provenance": self.scene.provenance,
             },

@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Mapping
 
-from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.scenes import Scene, View
 
 
@@ -13,11 +13,12 @@ class FrameRows:
     """Lookup of parameter rows by view.
 
     Args:
-        scene: Whose training frames have a row each, in their order.
+        scene: Scene whose training frames have one row each, in their order.
     """
 
     def __init__(self, scene: Scene) -> None:
         self.rows: Mapping[str, int] = {frame.name: row for row, frame in enumerate(scene.train)}
+        self._held_out = {frame.name for frames in scene.test_sets.values() for frame in frames}
         by_time = sorted((float(frame.index), row) for row, frame in enumerate(scene.train))
         self._times = [time for time, _ in by_time]
         self._rows_by_time = [row for _, row in by_time]
@@ -30,12 +31,12 @@ class FrameRows:
         return self.rows.get(view.name) if view is not None and view.trained else None
 
     def neighbours(self, time: float) -> tuple[int, int, float]:
-        """Rows of the training frames before and after a time, and how far it is from the first to the second.
+        """Rows of the training frames before and after a time, and its relative position between them, in [0, 1].
 
         Beyond the ends both are the nearest frame's.
         """
-        place = bisect_right(self._times, time)
-        before, after = max(0, place - 1), min(place, len(self._times) - 1)
+        index = bisect_right(self._times, time)
+        before, after = max(0, index - 1), min(index, len(self._times) - 1)
         span = self._times[after] - self._times[before]
         share = (time - self._times[before]) / span if span > 0 else 0.0
         return self._rows_by_time[before], self._rows_by_time[after], share
@@ -46,7 +47,12 @@ class FrameRows:
         Raises:
             InputError: No training frame has that name.
         """
-        if name not in self.rows:
-            shown = ", ".join(list(self.rows)[:6])
-            raise InputError(f"{asking} names frame '{name}'", f"a training frame: {shown}, ...")
-        return self.rows[name]
+        if name in self.rows:
+            return self.rows[name]
+        shown = ", ".join(list(self.rows)[:6]) + (", ..." if len(self.rows) > 6 else "")
+        held_out = ", which is held out" if name in self._held_out else ""
+        raise InputError(
+            f"{asking} names frame '{name}'{held_out}",
+            f"a training frame, one of {shown}",
+            did_you_mean(name, self.rows),
+        )

@@ -8,7 +8,8 @@ from typing import Any
 
 import torch
 
-from coliags_plugin.config.components import Component, make_component
+from coliags_plugin.config import registry
+from coliags_plugin.config.components import Component, named_component
 from coliags_plugin.contracts import Renderer
 from coliags_plugin.core.errors import InputError
 
@@ -37,7 +38,11 @@ def choose_renderer(component: Component, primitive: str, device: torch.device) 
     if not alternatives:
         obstacle = component.target.obstacle(primitive, device)
         if obstacle:
-            raise InputError(f"renderer '{component.name}' {obstacle}", "a renderer that can serve the field")
+            raise InputError(
+                f"renderer '{component.name}' {obstacle}",
+                "a renderer that can serve the field",
+                _others(primitive, device),
+            )
         return ChosenRenderer(component.name, component.target(component.settings), "named by the config")
     return choose_among(alternatives, primitive, device)
 
@@ -55,11 +60,22 @@ def choose_among(configs: Sequence[Mapping[str, Any]], primitive: str, device: t
     """
     refused: list[str] = []
     for config in configs:
-        candidate = make_component("renderers", dict(config))
+        candidate = named_component("renderers", dict(config), "renderer auto, prefer")
         obstacle = candidate.target.obstacle(primitive, device)
         if not obstacle:
             found = candidate.target.availability().reason
             reason = "; ".join([*refused, f"auto chose {candidate.name}: {found}"])
             return ChosenRenderer(candidate.name, candidate.target(candidate.settings), reason)
         refused.append(f"{candidate.name} {obstacle}")
-    raise InputError(f"no renderer can serve: {'; '.join(refused)}", f"one for {primitive} on {device.type}")
+    raise InputError(
+        f"no renderer can serve: {'; '.join(refused)}",
+        f"one for {primitive} on {device.type}",
+        _others(primitive, device),
+    )
+
+
+def _others(primitive: str, device: torch.device) -> str:
+    """Hint that names the renderers of a primitive on a device; empty without any."""
+    classes = {name: registry.renderers.get(name) for name in registry.renderers}
+    able = [name for name, found in classes.items() if primitive in found.primitives and device.type in found.devices]
+    return f"Set --set renderer=NAME, NAME being {' or '.join(able)}" if able else ""

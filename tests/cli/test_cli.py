@@ -188,9 +188,7 @@ def test_bad_settings(capsys, scene, tmp_path, assignment, part):
 
 
 def test_unknown_renderer(capsys, scene):
-    assert "no renderers component 'magic'" in refused(
-        capsys, "train", "coliags", "--data", scene, "--renderer", "magic"
-    )
+    assert "no renderer 'magic'" in refused(capsys, "train", "coliags", "--data", scene, "--renderer", "magic")
 
 
 def test_unknown_protocol(capsys, trained):

@@ -137,7 +137,7 @@ def test_bases_may_be_paths_beside_the_file(method_file):
         ("base: coliags\nschedule:\n  steps: many\n", ["mine.yaml:3", "schedule.steps", "'many'"]),
         ("base: coliags\nschedule:\n  steps: 1.5\n", ["mine.yaml:3", "schedule.steps", "1.5"]),
         ("base: coliags\nschedule:\n  steps: 0\n", ["mine.yaml:3", "greater than or equal to 1"]),
-        ("base: coliags\nrenderer: {name: cuda-magic}\n", ["mine.yaml:2", "no renderers component 'cuda-magic'"]),
+        ("base: coliags\nrenderer: {name: cuda-magic}\n", ["mine.yaml:2", "no renderer 'cuda-magic'"]),
         ("base: coliags\nlosses:\n  extra: {weight: 1.0}\n", ["mine.yaml:3", "needs 'name'", "depth-l1"]),
         ("base: coliags\nlosses:\n  l1: {weight: heavy}\n", ["mine.yaml:3", "losses.l1.weight", "heavy"]),
         (
@@ -228,3 +228,13 @@ def test_scalars_are_read_as_yaml_1_2(text, value):
 
 def test_an_empty_file_is_an_empty_mapping():
     assert parse_tree("", "x").plain() == {}
+
+
+def test_a_bare_name_may_be_given_options_later():
+    method = load_method("coliags", ["sampler=pixels", "sampler.pixels=7", "renderer={name: torch}"])
+    assert method.config.sampler.name == "pixels" and method.config.sampler.settings.pixels == 7
+
+
+def test_a_mapping_may_be_changed_further():
+    overrides = ["losses={l1: {name: l1, weight: 1.0}}", "losses.l1.weight=0.5"]
+    assert load_method("coliags", overrides).config.losses["l1"].settings.weight == 0.5

@@ -32,13 +32,13 @@ def test_a_registry_says_what_its_components_are_called():
 
 
 def test_duplicate_name_is_refused():
-    registry = Registry("things", {"one": "math:pi"})
+    registry = Registry("things", {"one": "math:pi"}, "thing")
     with pytest.raises(InputError, match="already taken by built in"):
         registry.register("one", "math:e")
 
 
 def test_listing_imports_nothing():
-    registry = Registry("things", {"ghost": "no_such_module:Ghost"})
+    registry = Registry("things", {"ghost": "no_such_module:Ghost"}, "thing")
     assert registry.names() == ["ghost"]
 
 
@@ -48,7 +48,7 @@ def test_entry_points_are_found(monkeypatch):
         return [metadata.EntryPoint("pi", "math:pi", group)] if wanted else []
 
     monkeypatch.setattr(registry_module, "entry_points", fake)
-    registry = Registry("things", {})
+    registry = Registry("things", {}, "thing")
     assert registry.get("pi") == pytest.approx(3.14159, abs=1e-4)
     assert "entry point" in registry.source("pi")
 
@@ -57,21 +57,29 @@ def test_plugin_path_files_are_found(monkeypatch, tmp_path):
     plugin = tmp_path / "mine.py"
     plugin.write_text("class Mine: pass\nCOMPONENTS = {'fields': {'mine': Mine}}\n")
     monkeypatch.setenv("COLIAGS_PLUGIN_PATH", str(plugin))
-    registry = Registry("fields", {})
+    registry = Registry("fields", {}, "thing")
     assert registry.get("mine").__name__ == "Mine"
     assert registry.source("mine") == str(plugin)
 
 
-@pytest.mark.parametrize("text", ["x = 1\n", "COMPONENTS = {'nonsense': {}}\n"])
+@pytest.mark.parametrize("text", ["x = 1\n", "COMPONENTS = {'nonsense': {}}\n", "COMPONENTS = {'fields': ['mine']}\n"])
 def test_bad_plugin_file_is_an_input_error(monkeypatch, tmp_path, text):
     plugin = tmp_path / "bad.py"
     plugin.write_text(text)
     monkeypatch.setenv("COLIAGS_PLUGIN_PATH", str(plugin))
     with pytest.raises(InputError, match="COMPONENTS"):
-        Registry("fields", {}).names()
+        Registry("fields", {}, "thing").names()
+
+
+@pytest.mark.parametrize("target", ["no_such_module:Ghost", "math:no_such_name", "math"])
+def test_a_plugin_that_cannot_be_imported_is_named(target):
+    registry = Registry("things", {}, "thing")
+    registry.register("ghost", target, "entry point of another package")
+    with pytest.raises(InputError, match="'ghost' from entry point of another package cannot be imported"):
+        registry.get("ghost")
 
 
 def test_missing_plugin_file_is_an_input_error(monkeypatch, tmp_path):
     monkeypatch.setenv("COLIAGS_PLUGIN_PATH", str(tmp_path / "gone.py"))
     with pytest.raises(InputError, match="not a file"):
-        Registry("fields", {}).names()
+        Registry("fields", {}, "thing").names()

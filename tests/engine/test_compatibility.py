@@ -9,8 +9,13 @@ import torch
 
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.engine.compatibility import _check_data, _check_sampler
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer
+from coliags_plugin.losses.photometric import L1Loss
+from coliags_plugin.modules.gain import FrameGain
+from coliags_plugin.renderers.choice import ChosenRenderer
+from coliags_plugin.renderers.volume_renderer import VolumeRenderer
 from tests.scenes import SMALL, wall_scene
 
 LOSSES = ("l1", "d-ssim", "scale-volume")
@@ -61,6 +66,21 @@ def test_refused_by_name_before_anything_is_written(tmp_path, method, overrides,
         start(tmp_path / "run", overrides, method)
     assert message in str(caught.value)
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("name", ["train", "keys", "type", "field"])
+def test_any_identifier_names_a_module(tmp_path, name):
+    overrides = [f"modules.{name}=gain", f'optimizers."{name}.gain"={{lr: 0.1}}']
+    assert set(start(tmp_path / "run", overrides).model.view_modules) == {name}
+
+
+def test_a_loss_may_need_any_attribute_of_a_target(monkeypatch):
+    monkeypatch.setattr(L1Loss, "needs", frozenset({"mask"}))
+    losses, scene = {"l1": L1Loss(L1Loss.Settings(weight=1.0))}, wall_scene()
+    with pytest.raises(InputError, match="needs mask, and no training frame"):
+        _check_data(scene, losses)
+    train = [replace(frame, mask=frame.valid) for frame in scene.train]
+    _check_data(replace(scene, train=train), losses)
 
 
 def test_module_names_are_plain_words():
@@ -122,3 +142,22 @@ def test_a_checkpoint_of_other_modules_is_refused(tmp_path):
     fewer = replace(wall_scene(), train=wall_scene().train[:3])
     with pytest.raises(InputError, match="module 'exposure' does not fit"):
         start(tmp_path / "run", modules, scene=fewer).resume()
+
+
+def test_a_checkpoint_without_a_counter_of_the_strategy_is_refused(tmp_path, monkeypatch):
+    trainer = start(tmp_path / "run")
+    trainer.start()
+    trainer.take_step()
+    trainer.save()
+    later = start(tmp_path / "run")
+    monkeypatch.setattr(type(later.strategy), "counters", (*later.strategy.counters, "born"))
+    with pytest.raises(InputError, match="no counter 'born' of strategy 'anchor-growth'"):
+        later.resume()
+
+
+def test_modules_of_whole_images_are_refused_with_batches_of_pixels(monkeypatch):
+    config = load_method("scaffold-gs", ["modules.exposure=gain", "sampler=pixels"]).config
+    monkeypatch.setattr(FrameGain, "whole_image", True)
+    chosen = ChosenRenderer("volume", VolumeRenderer(VolumeRenderer.Settings()), "")
+    with pytest.raises(InputError, match="module 'exposure' needs whole images, and sampler 'pixels'"):
+        _check_sampler(config, chosen, {})

@@ -11,7 +11,7 @@ from coliags_plugin.core.render_output import RenderOutput, Splats
 from coliags_plugin.core.scenes import Frame
 
 
-def _output(rgb, scales=None, **maps):
+def _output(rgb, scales=None, alpha=None, **maps):
     scales = torch.zeros(0, 3) if scales is None else scales
     count = len(scales)
     gaussians = Gaussians(
@@ -19,7 +19,7 @@ def _output(rgb, scales=None, **maps):
         torch.arange(count), torch.arange(count),
     )  # fmt: skip
     splats = Splats(gaussians, torch.zeros(count, 2), torch.zeros(count))
-    return RenderOutput(rgb, torch.ones(rgb.shape[:2]), None, maps, splats)
+    return RenderOutput(rgb, torch.ones(rgb.shape[:2]) if alpha is None else alpha, None, maps, splats)
 
 
 def _frame(image, depth=None, mask=None):
@@ -30,7 +30,7 @@ def _frame(image, depth=None, mask=None):
 
 @pytest.fixture
 def make_output():
-    """A RenderOutput of these colours, scales and maps."""
+    """A RenderOutput of these colours, scales, alpha and maps."""
     return _output
 
 

@@ -49,13 +49,13 @@ def test_a_finite_scalar_with_a_graph_whatever_the_mask(
         if mask is not None:
             rgb[~mask] = torch.nan
             depth[~mask] = torch.inf
-    drawn = (depth + 1).requires_grad_()
+    drawn = {kind: (depth + 1).requires_grad_() for kind in ("alpha", *DEPTH_KINDS)}
     scales = torch.rand(5, 3, generator=generator).requires_grad_()
-    term = make(name)(make_output(rgb, scales, depth_accumulated=drawn), make_frame(image, depth, mask))
+    term = make(name)(make_output(rgb, scales, **drawn), make_frame(image, depth, mask))
     assert term.shape == ()
     assert term.isfinite()
     term.backward()
-    for tensor in (rgb, drawn, scales):
+    for tensor in (rgb, scales, *drawn.values()):
         assert tensor.grad is None or tensor.grad.isfinite().all()
     if share == 0.0 and name != "scale-volume":
         assert term.item() == 0.0
@@ -63,14 +63,17 @@ def test_a_finite_scalar_with_a_graph_whatever_the_mask(
 
 @pytest.mark.parametrize("name", ["l1", "d-ssim"])
 def test_ignored_pixels_get_no_gradient_and_a_full_mask_changes_nothing(
-    name, make_output, make_frame, generator, image, rgb
+    name, make_output, make_frame, generator, image, rgb, depth
 ):
     mask = torch.rand(HEIGHT, WIDTH, generator=generator) < 0.6
-    make(name)(make_output(rgb), make_frame(image, mask=mask)).backward()
-    assert not rgb.grad[~mask].any()
-    assert rgb.grad[mask].any()
-    full = make(name)(make_output(rgb), make_frame(image, mask=torch.ones_like(mask)))
-    assert torch.equal(full, make(name)(make_output(rgb), make_frame(image)))
+    drawn = {kind: torch.rand(HEIGHT, WIDTH, generator=generator).requires_grad_() for kind in ("alpha", *DEPTH_KINDS)}
+    output = make_output(rgb, **drawn)
+    make(name)(output, make_frame(image, depth, mask)).backward()
+    grads = [tensor.grad for tensor in (rgb, *drawn.values()) if tensor.grad is not None]
+    assert not any(grad[~mask].any() for grad in grads)
+    assert any(grad[mask].any() for grad in grads)
+    full = make(name)(output, make_frame(image, depth, torch.ones_like(mask)))
+    assert torch.equal(full, make(name)(output, make_frame(image, depth)))
 
 
 def test_double_precision_stays_double(make_output, make_frame, image, rgb, depth):

@@ -46,6 +46,9 @@ def test_options():
     assert module.gain(View("x", 6.0, False)).log().item() == pytest.approx(0.3 - 0.1)
     with pytest.raises(InputError, match="gain names frame 'nobody'"):
         make(reference="nobody")
+    (held_out, *_) = wall_scene().test_sets["test"]
+    with pytest.raises(InputError, match=f"gain names frame '{held_out.name}', which is held out"):
+        FrameGain.from_scene(wall_scene(), FrameGain.Settings(reference=held_out.name), torch.Generator())
 
 
 def test_shading_multiplies_the_colours_alone():

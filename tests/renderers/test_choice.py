@@ -39,8 +39,10 @@ def test_auto_passes_its_options_on():
 def test_an_impossible_pair_names_both_sides():
     with pytest.raises(InputError, match=r"draws gaussians3d, the field is made of radiance"):
         choose_renderer(make_component("renderers", "torch"), "radiance", CPU)
-    with pytest.raises(InputError, match="no renderer can serve"):
+    with pytest.raises(InputError, match=r"no renderer can serve.*--set renderer=NAME, NAME being volume"):
         choose_renderer(make_component("renderers", "auto"), "radiance", CPU)
+    with pytest.raises(InputError, match=r"renderer auto, prefer: .*Did you mean 'volume'"):
+        choose_renderer(make_component("renderers", {"name": "auto", "prefer": ("volum",)}), "radiance", CPU)
 
 
 def test_an_unavailable_renderer_says_why(monkeypatch):

@@ -5,6 +5,7 @@ from pydantic import Field
 from torch import nn
 
 from coliags_plugin.contracts import GaussianField
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.settings import Settings
 
@@ -30,6 +31,8 @@ class RoundGaussians(GaussianField):
     @classmethod
     def from_scene(cls, scene, settings, generator):
         """One at every initial point."""
+        if not len(scene.points):
+            raise InputError("the scene has no initial points", "one at least", "Set datamanager.initial_points")
         field = cls(settings, len(scene.points))
         field.means.data.copy_(scene.points.positions)
         return field

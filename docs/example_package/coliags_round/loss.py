@@ -1,12 +1,11 @@
 """Smoothness of the rendered depth."""
 
-from kornia.losses import total_variation
-
 from coliags_plugin.contracts import Loss, LossSettings
+from coliags_plugin.core.masked import masked_mean
 
 
 class SmoothDepthLoss(Loss):
-    """Mean total variation of the expected depth, scene units."""
+    """Mean difference of the expected depth of neighbours, both of them valid, scene units."""
 
     Settings = LossSettings
     whole_image = True
@@ -14,4 +13,6 @@ class SmoothDepthLoss(Loss):
 
     def __call__(self, step):
         """The unweighted term."""
-        return total_variation(step.output["depth_expected"][None], reduction="mean").mean()
+        depth, valid = step.output["depth_expected"], step.target.valid
+        down = masked_mean(depth.diff(dim=0).abs(), valid[1:] & valid[:-1])
+        return down + masked_mean(depth.diff(dim=1).abs(), valid[:, 1:] & valid[:, :-1])

@@ -10,9 +10,10 @@ from coliags_plugin.core.settings import Settings
 
 
 class Vignette(ViewModule):
-    """Darkens colours with the square of the distance to the principal point, by a learnt factor."""
+    """Darkens colours with the distance from the principal point, by a learnt factor."""
 
     Settings = Settings
+    whole_image = True  # shade asks where a pixel lies
     untrained_views = "all views have the same vignette"
 
     def __init__(self):
@@ -29,9 +30,9 @@ class Vignette(ViewModule):
         return {"falloff": [self.falloff]}
 
     def shade(self, output, view):
-        """Multiply the colours by 1 / (1 + falloff * tan^2 of the angle to the optical axis)."""
+        """Multiply the colours by exp(-falloff * tan^2 of the angle to the optical axis)."""
         camera = output.camera
         columns = (torch.arange(camera.width, device=output.rgb.device) + 0.5 - camera.cx) / camera.fx
         rows = (torch.arange(camera.height, device=output.rgb.device) + 0.5 - camera.cy) / camera.fy
         squared = columns.square() + rows.square()[:, None]
-        return replace(output, rgb=output.rgb / (1.0 + self.falloff.exp() * squared)[..., None].to(output.rgb))
+        return replace(output, rgb=output.rgb * (-self.falloff * squared).exp()[..., None].to(output.rgb))

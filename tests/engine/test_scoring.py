@@ -1,0 +1,57 @@
+"""Scores of single views: metrics that are not available, and protocols that are not valid."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from coliags_plugin.config import registry
+from coliags_plugin.contracts import Comparison
+from coliags_plugin.core.errors import InputError, UnavailableError
+from coliags_plugin.engine.scoring import Scorer
+from coliags_plugin.metrics.image import PSNR
+from coliags_plugin.metrics.protocols import PaperProtocol
+
+
+def comparison(error=0.1):
+    truth = torch.full((16, 16, 3), 0.5)
+    return Comparison(truth + error, truth, torch.ones(16, 16, dtype=torch.bool))
+
+
+@pytest.mark.parametrize(
+    ("value", "reason"), [(float("nan"), "the metric is nan"), (float("-inf"), "the metric is -inf")]
+)
+def test_a_metric_that_is_not_finite_is_unavailable(value, reason, monkeypatch):
+    monkeypatch.setattr(PSNR, "__call__", lambda self, comparison: value)
+    scores = Scorer("paper", only=("psnr", "ssim")).score(comparison())
+    assert scores.reasons == {"psnr": reason} and set(scores.values) == {"ssim"}
+
+
+def test_an_unavailable_metric_keeps_its_reason(monkeypatch):
+    def unavailable(self, comparison):
+        raise UnavailableError("no weights")
+
+    monkeypatch.setattr(PSNR, "__call__", unavailable)
+    scores = Scorer("paper", only=("psnr",)).score(comparison())
+    assert scores.reasons == {"psnr": "no weights"} and not scores.values
+
+
+@pytest.mark.parametrize(
+    ("metrics", "message"),
+    [
+        ({"sharpness": ("sharpnes", {})}, "protocol 'mine', metric 'sharpness': no metric 'sharpnes'"),
+        ({"psnr": ("psnr", {"peek": 1.0})}, "protocol 'mine', metric 'psnr': option 'peek' of 'psnr'"),
+    ],
+)
+def test_metrics_of_a_protocol_that_are_not_valid_are_named(metrics, message, monkeypatch):
+    mine = type("Mine", (PaperProtocol,), {"name": "mine", "metrics": metrics})
+    monkeypatch.setitem(registry.protocols._targets, "mine", mine)
+    with pytest.raises(InputError, match=message):
+        Scorer("mine")
+
+
+def test_a_protocol_under_another_name_is_refused(monkeypatch):
+    monkeypatch.setitem(registry.protocols._targets, "mine", PaperProtocol)
+    monkeypatch.setitem(registry.protocols._sources, "mine", "entry point x:Y")
+    with pytest.raises(InputError, match="protocol 'mine' from entry point x:Y has the name 'paper'"):
+        Scorer("mine")
