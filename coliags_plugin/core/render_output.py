@@ -18,11 +18,11 @@ from coliags_plugin.core.gaussians import Gaussians
 OUTPUTS = (
     "rgb",
     "alpha",
-    "depth_accumulated",  # sum_i w_i z_i: the paper's D (Eq. 2); falls short where alpha < 1
+    "depth_accumulated",  # sum_i w_i z_i: the paper's D (Eq. 2); too small where alpha < 1
     "depth_expected",  # sum_i w_i z_i / sum_i w_i
     "depth_median",  # z of the Gaussian at which transmittance falls to one half
-    "inverse_depth_accumulated",  # sum_i w_i / z_i: what the authors' code trains on and scores
-    "normals",  # sum_i w_i n_i, camera axes, n_i the shortest axis turned towards the camera
+    "inverse_depth_accumulated",  # sum_i w_i / z_i: used by the authors' code for training and evaluation
+    "normals",  # sum_i w_i n_i, camera axes, n_i the shortest axis, facing the camera
 )
 
 DEPTH_KINDS = tuple(name for name in OUTPUTS if "depth" in name)

@@ -59,7 +59,7 @@ class SceneCheck:
             "initial_points": len(self.scene.points),
             "depth": None if self.depth is None else asdict(self.depth),
             "path": None if self.path is None else asdict(self.path),
-            "pictures": asdict(self.images),
+            "images": asdict(self.images),
             "pairs": [[source.name, target.name] for source, target in self.pairs],
             "agreement": {name: asdict(found) for name, found in self.agreement.items()},
             "best_depth_scale": None if self.scale is None else {"factor": self.scale[0], "depth_error": self.scale[1]},

@@ -16,20 +16,20 @@ from coliags_plugin.fields.mlp import first_layer, mlp
 
 
 class AppearanceSettings(Settings):
-    """Options of every appearance head.
+    """Options common to all appearance heads.
 
-    ``bias_init`` is where the biases of hidden units that see the distance start: "scene_distances" moves each unit's
-    kink over the distances that occur (docs/methods.md 3.4), "pytorch" leaves PyTorch's default start, the paper's.
+    ``bias_init`` initialises the biases of hidden units with the distance as an input: "scene_distances" spreads the
+    units' kinks over the distances of the scene (docs/methods.md 3.4), "pytorch" is PyTorch's default, as in the paper.
     """
 
     hidden: int = Field(default=32, ge=1)  # units of each hidden layer
-    bias_init: Literal["scene_distances", "pytorch"] = "scene_distances"  # as above
+    bias_init: Literal["scene_distances", "pytorch"] = "scene_distances"  # see above
 
 
 class PlainAppearanceSettings(AppearanceSettings):
     """Options of the plain appearance head."""
 
-    distance: bool = False  # Scaffold-GS's add_color_dist: also show the raw distance
+    distance: bool = False  # Scaffold-GS's add_color_dist: distance as a further input
 
 
 class PlainAppearanceHead(AppearanceHead):

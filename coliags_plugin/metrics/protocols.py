@@ -32,8 +32,8 @@ class PaperProtocol(Protocol):
     name: ClassVar[str] = "paper"
     version: ClassVar[int] = 1
     description: ClassVar[str] = (
-        "Float images and depth_accumulated (sum w z), no quantisation; masked pixels and unknown depths count for "
-        "nothing. SSIM 11x11 sigma 1.5; LPIPS VGG fed [0, 1]."
+        "Float images and depth_accumulated (sum w z), no quantisation; masked pixels and unknown depths are "
+        "ignored. SSIM 11x11 sigma 1.5; LPIPS VGG fed [0, 1]."
     )
     wants: ClassVar[frozenset[str]] = frozenset({"depth_accumulated"})
     metrics: ClassVar[MetricTable] = MappingProxyType(
@@ -79,7 +79,7 @@ class AuthorsCodeProtocol(Protocol):
     version: ClassVar[int] = 2
     description: ClassVar[str] = (
         "8-bit images; depth 1/(sum w/z) as 16 bit over 150 mm against truth as 16 bit over 100 mm, both wrapping "
-        "around; no mask, pixels where nothing was drawn and unknown true depth count as 0, clipped true depth as its "
+        "around; no mask, empty pixels and unknown true depth count as 0, clipped true depth as its "
         "limit. SSIM 11x11 sigma 1.5; LPIPS VGG fed [0, 1]."
     )
     wants: ClassVar[frozenset[str]] = frozenset({"inverse_depth_accumulated"})

@@ -190,7 +190,7 @@ class TestPoses:
         np.testing.assert_allclose(found[training(count)], drift(from_first(count)[training(count)]), atol=1e-4)
         facts = load(folder).provenance["slam"]
         assert facts["frames"] == count - count // 8
-        assert facts["pictures"] == ("every" if count < 8 else "all but 7, 15, 23, ...")
+        assert facts["images"] == ("every" if count < 8 else "all but 7, 15, 23, ...")
 
     def test_poses_of_all_frames_go_to_all_frames(self, mine):
         write_params(mine / "params.npz", np.arange(10), drift)
@@ -212,7 +212,7 @@ class TestPoses:
         assert facts["ate_rmse_mm"] == pytest.approx(np.sqrt((errors**2).mean()), abs=1e-4)
         assert facts["ate_max_mm"] == pytest.approx(errors.max(), abs=1e-4)
         assert facts["mean_rotation_error_deg"] > 0.1
-        assert "rigid fit" in facts["other_pictures"]
+        assert "rigid fit" in facts["other_images"]
 
     def test_a_rigid_error_is_undone_to_the_digit(self, mine):
         """As if the map had been made in a turned world: then test frames turn with it."""

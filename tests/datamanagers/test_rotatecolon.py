@@ -185,7 +185,7 @@ class TestFiles:
         change(mine / "transforms.json", lambda content: content["frames"].pop(4))
         scene = load(mine)
         assert [frame.name for frame in scene.train] == [f"{index:04d}" for index in range(9) if index != 4]
-        assert scene.provenance["pictures_without_pose"] == 1
+        assert scene.provenance["images_without_pose"] == 1
         assert "1 images of train_views have no pose" in caplog.text
 
     def test_without_test_views_there_is_no_test_set(self, mine):

@@ -155,8 +155,8 @@ def _align_slam(path: Path, params: EndoGslamParams, files: PreparedFiles, file:
     facts = {
         "params": str(path),
         "frames": poses,
-        "pictures": "every" if poses == count else "all but 7, 15, 23, ...",
-        "other_pictures": None if poses == count else "true poses, brought into the mapped world by a rigid fit",
+        "images": "every" if poses == count else "all but 7, 15, 23, ...",
+        "other_images": None if poses == count else "true poses, brought into the mapped world by a rigid fit",
         "compared_with_pose_file": compared,
         "ate_rmse_mm": ate,
         "ate_max_mm": float(errors.max()),

@@ -117,7 +117,7 @@ class RotateColonDataManager(RecordedDataManager):
         facts = {
             "layout": "rotatecolon",
             "transforms": files.transforms.name,
-            "pictures_without_pose": files.unposed,
+            "images_without_pose": files.unposed,
             "depth_divisor": None if files.depths is None else settings.depth_divisor,
             **rectification.facts(),
             "pose_convention": "camera-to-world, OpenGL axes",
