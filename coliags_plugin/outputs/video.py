@@ -62,7 +62,7 @@ def write_video(frames: Iterable[UInt8[np.ndarray, "H W 3"] | Tensor], path: Pat
         scratch.replace(path)
     finally:
         scratch.unlink(missing_ok=True)
-    _LOG.info("wrote %s: %d frames at %g a second", path, count, fps)
+    _LOG.info("encoded %s: %d frames, %g per second", path.name, count, fps)
 
 
 def _encode(frames: Iterable[np.ndarray | Tensor], scratch: Path, fps: float) -> int:
