@@ -51,9 +51,13 @@ def make_component(kind: str, node: Any) -> Component:
         raise PydanticCustomError("no_name", "a component needs 'name', one of {known}", {"known": known})
     options = {key: value for key, value in node.items() if key != "name"}
     try:
-        settings_class = REGISTRIES[kind].get(node["name"]).Settings
+        settings_class = getattr(REGISTRIES[kind].get(node["name"]), "Settings", None)
     except InputError as error:
         raise PydanticCustomError("unknown_component", "{text}", {"text": str(error)}) from error
+    if settings_class is None:
+        source = REGISTRIES[kind].source(node["name"])
+        text = f"'{node['name']}' from {source} has no class attribute 'Settings', which defines its options"
+        raise PydanticCustomError("no_settings", "{text}", {"text": text})
     return Component(kind, node["name"], settings_class.model_validate(options))
 
 

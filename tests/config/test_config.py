@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import yaml
 
+from coliags_plugin.config import registry
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.config.method_files import method_descriptions, method_names
 from coliags_plugin.config.yaml_tree import parse_tree, parse_value
@@ -238,3 +239,10 @@ def test_a_bare_name_may_be_given_options_later():
 def test_a_mapping_may_be_changed_further():
     overrides = ["losses={l1: {name: l1, weight: 1.0}}", "losses.l1.weight=0.5"]
     assert load_method("coliags", overrides).config.losses["l1"].settings.weight == 0.5
+
+
+def test_a_component_without_settings_is_named(monkeypatch):
+    monkeypatch.setitem(registry.losses._targets, "bare", object)
+    monkeypatch.setitem(registry.losses._sources, "bare", "entry point x:Bare")
+    with pytest.raises(InputError, match="'bare' from entry point x:Bare has no class attribute 'Settings'"):
+        load_method("coliags", ["losses.extra=bare"])
