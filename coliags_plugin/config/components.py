@@ -12,7 +12,7 @@ from pydantic_core import PydanticCustomError
 
 from coliags_plugin.config.registry import REGISTRIES
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.settings import Settings, first_error
 
 
 @dataclass(frozen=True)
@@ -77,9 +77,8 @@ def named_component(kind: str, node: Any, asking: str) -> Component:
     except PydanticCustomError as error:
         raise InputError(f"{asking}: {error}") from error
     except ValidationError as error:
-        name, first = node["name"], error.errors()[0]
-        where = ".".join(map(str, first["loc"]))
-        raise InputError(f"{asking}: option '{where}' of '{name}': {first['msg']}") from error
+        key, message, _ = first_error(error)
+        raise InputError(f"{asking}: option '{key}' of '{node['name']}': {message}") from error
 
 
 def _dump(component: Component) -> dict[str, Any]:

@@ -178,7 +178,7 @@ def _resolve(path: Path, seen: tuple[Path, ...]) -> Node:
 
 
 #: Errors of this package, with messages of their own.
-_TELLING = frozenset({"no_name", "unknown_key", "unknown_component", "value_error", "zero_end"})
+_TELLING = frozenset({"no_name", "unknown_key", "unknown_component", "no_settings", "value_error", "zero_end"})
 
 
 def _describe(error: ValidationError, tree: Node) -> list[str]:

@@ -47,7 +47,7 @@ class Renderer(ABC):
 
     @classmethod
     def alternatives(cls, settings: Any) -> Sequence[Mapping[str, Any]]:
-        """Configs of the renderers that it stands for, in order of preference; empty for a renderer of its own."""
+        """Configs of the renderers to choose from, in order of preference; empty where it renders by itself."""
         return ()
 
     @classmethod

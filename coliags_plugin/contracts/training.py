@@ -73,10 +73,10 @@ class ParameterRows(TypingProtocol):
         """
 
     def reset_rows(self, group: str, rows: Bool[Tensor, "M"] | None = None) -> None:
-        """Forget the moments of rows, of all of them where none are given. [M]"""
+        """Reset Adam's moments of some rows, or of all rows without ``rows``. [M]"""
 
     def replace_values(self, group: str, values: Tensor) -> None:
-        """Put other values in the place of a group's, and forget their moments. [M, ...]"""
+        """Replace the values of a group and reset their moments. [M, ...]"""
 
 
 class Strategy(ABC):
@@ -125,7 +125,7 @@ class Strategy(ABC):
         return {name: getattr(self, name) for name in self.counters}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restore what :meth:`state_dict` gave."""
+        """Load counters from a checkpoint."""
         for name in self.counters:
             setattr(self, name, state[name])
 

@@ -58,7 +58,7 @@ RENAMED_OPTIONS = {"near": "near_plane", "far": "far_plane", "low_pass": "eps2d"
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Hint that names the known word nearest to an unknown one; empty where none is near."""
+    """Hint with the known word most similar to an unknown one; empty where none is similar."""
     words = list(known)
     renamed = RENAMED_OPTIONS.get(word, "")
     close = [renamed] if renamed in words else get_close_matches(word, words, n=1, cutoff=0.5)

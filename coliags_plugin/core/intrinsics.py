@@ -1,4 +1,4 @@
-"""The intrinsics of a pinhole camera: the one camera model everything else is made of."""
+"""Intrinsics of a pinhole camera."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Intrinsics:
     height: int
 
     def __post_init__(self) -> None:
-        """Refuse what is no pinhole.
+        """Check that the values are valid.
 
         Raises:
             InputError: A number is not finite, or a focal length or size not positive.
@@ -52,5 +52,5 @@ class Intrinsics:
         return replace(self, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y, width=width, height=height)
 
     def opencv_matrix(self) -> Float[np.ndarray, "3 3"]:
-        """K for what counts pixel centres at integers: OpenCV, open3d, EndoGSLAM's files. float64. [3, 3]"""
+        """K for pixel centres at integers, as in OpenCV, open3d and EndoGSLAM's files. float64. [3, 3]"""
         return np.array([[self.fx, 0.0, self.cx - 0.5], [0.0, self.fy, self.cy - 0.5], [0.0, 0.0, 1.0]])

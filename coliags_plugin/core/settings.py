@@ -48,6 +48,12 @@ class Settings(BaseModel):
         return data
 
 
+def first_error(error: ValidationError) -> tuple[str, str, Any]:
+    """Dotted key, message and rejected value of the first problem that a validation found."""
+    first = error.errors()[0]
+    return ".".join(str(part) for part in first["loc"]), first["msg"], first["input"]
+
+
 def refuse_zero_ends(settings: Settings, start: str, end: str) -> None:
     """Refuse a logarithmic schedule with an end that is not above 0 (docs/methods.md 2.3).
 

@@ -11,13 +11,14 @@ from pydantic import ValidationError
 from pydantic_core import PydanticCustomError
 
 from coliags_plugin.config import registry
-from coliags_plugin.config.components import Component, make_component
+from coliags_plugin.config.components import make_component
 from coliags_plugin.config.method_config import LoadedMethod, MethodConfig, load_method, method_tree
 from coliags_plugin.config.yaml_tree import Node, override_all
 from coliags_plugin.contracts import DataManager
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Scene
+from coliags_plugin.core.settings import first_error
 from coliags_plugin.datamanagers.recognition import find_format, unposed_format
 from coliags_plugin.datamanagers.recorded import NoPointsError
 from coliags_plugin.engine.progress import progress_callback
@@ -79,10 +80,10 @@ def open_scene(
     name = find_format(path) if data_format is None else data_format
     given = override_all(Node({}, "options"), options).plain()
     try:
-        return _opened(path, name, given, progress)
+        return _manager(name, given).load(path, progress)
     except NoPointsError as error:
         log.warning("%s", error)
-        return _opened(path, name, {**given, "initial_points": "none"}, progress)
+        return _manager(name, {**given, "initial_points": "none"}).load(path, progress)
 
 
 def open_video(
@@ -105,8 +106,7 @@ def open_video(
     options = (*options, "split=all-train", "initial_points=none")
     name = data_format or unposed_format(path)
     if name is not None and registry.datamanagers.get(name).recognise_unposed(path):
-        component = _component(name, override_all(Node({}, "options"), options).plain())
-        manager: DataManager = component.target(component.settings)
+        manager = _manager(name, override_all(Node({}, "options"), options).plain())
         unposed = manager.without_poses()
         if unposed is not manager:
             log.info("%s: format %s without poses", path, name)
@@ -114,18 +114,13 @@ def open_video(
     return open_scene(path, data_format, options, progress), True
 
 
-def _opened(path: Path, name: str, options: Mapping[str, Any], progress: Progress | None) -> Scene:
-    component = _component(name, options)
-    scene: Scene = component.target(component.settings).load(path, progress)
-    return scene
-
-
-def _component(name: str, options: Mapping[str, Any]) -> Component:
+def _manager(name: str, options: Mapping[str, Any]) -> DataManager:
     try:
-        return make_component("datamanagers", {**options, "name": name})
+        component = make_component("datamanagers", {**options, "name": name})
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"--set {key}: {first['msg']}", f"an option of the format {name}") from error
+        key, message, _ = first_error(error)
+        raise InputError(f"--set {key}: {message}", f"an option of the format {name}") from error
     except PydanticCustomError as error:
         raise InputError(error.message()) from error
+    manager: DataManager = component.target(component.settings)
+    return manager

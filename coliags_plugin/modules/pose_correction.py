@@ -17,7 +17,7 @@ from coliags_plugin.core.settings import Settings
 from coliags_plugin.modules.frame_rows import FrameRows
 
 #: Approximate number of scene points that the median depth is computed from.
-_POINTS_ASKED = 4096
+_DEPTH_POINTS = 4096
 
 
 class PoseCorrectionSettings(Settings):
@@ -84,7 +84,7 @@ class PoseCorrection(ViewModule):
 
 def _median_depth(camera: Camera, scene: Scene) -> float:
     """Median z-depth of some of the scene's points in view, scene units; 0 where none is."""
-    points = scene.points.positions[:: max(1, len(scene.points) // _POINTS_ASKED)]
+    points = scene.points.positions[:: max(1, len(scene.points) // _DEPTH_POINTS)]
     pixels, depths = camera.project(points.to(camera.camera_to_world))
     inside = ((pixels >= 0) & (pixels <= pixels.new_tensor([camera.width, camera.height]))).all(dim=1) & (depths > 0)
     return float(depths[inside].median()) if inside.any() else 0.0

@@ -11,7 +11,7 @@ from pydantic import Field, ValidationError, field_validator
 
 from coliags_plugin.config.registry import phantom_layouts
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.settings import Settings, first_error
 
 _T = TypeVar("_T")
 
@@ -221,9 +221,8 @@ def phantom_settings(options: Mapping[str, Any]) -> PhantomSettings:
     try:
         return PhantomSettings(**options)
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "options"
+        key, message, value = first_error(error)
         raise InputError(
-            f"phantom setting {where}: {first['msg']} (got {first['input']!r})",
+            f"phantom setting {key or 'options'}: {message} (got {value!r})",
             do="docs/phantom.md lists every setting with its unit and range",
         ) from error

@@ -49,5 +49,5 @@ class AutoRenderer(Renderer):
         self, field: Any, camera: Camera, wants: Sequence[str] = ("rgb", "alpha"), pixels: Tensor | None = None
     ) -> RenderOutput:
         """Render with the first alternative that can."""
-        chosen = choose_among(self.alternatives(self.settings), field.primitive, camera.camera_to_world.device)
+        chosen = choose_among("auto", self.alternatives(self.settings), field.primitive, camera.camera_to_world.device)
         return chosen.renderer.render(field, camera, wants, pixels)

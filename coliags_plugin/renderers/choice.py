@@ -44,13 +44,16 @@ def choose_renderer(component: Component, primitive: str, device: torch.device) 
                 _others(primitive, device),
             )
         return ChosenRenderer(component.name, component.target(component.settings), "named by the config")
-    return choose_among(alternatives, primitive, device)
+    return choose_among(component.name, alternatives, primitive, device)
 
 
-def choose_among(configs: Sequence[Mapping[str, Any]], primitive: str, device: torch.device) -> ChosenRenderer:
+def choose_among(
+    chooser: str, configs: Sequence[Mapping[str, Any]], primitive: str, device: torch.device
+) -> ChosenRenderer:
     """Make the first of several renderers that can render a field.
 
     Args:
+        chooser: Registered name of the renderer that they are alternatives of.
         configs: Name and options of each renderer, the most preferred first.
         primitive: Of the field.
         device: Of the field.
@@ -60,11 +63,11 @@ def choose_among(configs: Sequence[Mapping[str, Any]], primitive: str, device: t
     """
     refused: list[str] = []
     for config in configs:
-        candidate = named_component("renderers", dict(config), "renderer auto, prefer")
+        candidate = named_component("renderers", dict(config), f"renderer {chooser}, prefer")
         obstacle = candidate.target.obstacle(primitive, device)
         if not obstacle:
             found = candidate.target.availability().reason
-            reason = "; ".join([*refused, f"auto chose {candidate.name}: {found}"])
+            reason = "; ".join([*refused, f"{chooser} chose {candidate.name}: {found}"])
             return ChosenRenderer(candidate.name, candidate.target(candidate.settings), reason)
         refused.append(f"{candidate.name} {obstacle}")
     raise InputError(

@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.settings import first_error
 
 #: Suffix of metrics over the pixels that a training frame also sees.
 SEEN_SUFFIX = "_seen"
@@ -144,10 +145,9 @@ def _read_run(folder: Path, protocol: str) -> EvaluatedRun:
     try:
         record = EvaluationRecord.model_validate(_read_json(path))
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "the file"
+        key, message, _ = first_error(error)
         raise InputError(
-            f"{path}: {where}: {first['msg']}", "what `coliags eval` writes", _again(folder, protocol)
+            f"{path}: {key or 'the file'}: {message}", "what `coliags eval` writes", _again(folder, protocol)
         ) from error
     provenance_path = folder / "provenance.json"
     provenance = _read_json(provenance_path) if provenance_path.is_file() else {}

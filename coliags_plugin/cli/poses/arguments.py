@@ -77,15 +77,15 @@ def settings_of(kind: type[S], assignments: Sequence[str], prefix: str = "") -> 
     from pydantic import ValidationError
 
     from coliags_plugin.config.yaml_tree import Node, override_all
+    from coliags_plugin.core.settings import first_error
 
     tree = override_all(Node({}, "options"), assignments)
     try:
         # Merged with the defaults, as a nested part's defaults may differ from its class's.
         return kind.model_validate(_upon(kind().model_dump(), tree.plain()))
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"--set {prefix}{key}: {first['msg']} (got {first['input']!r})") from error
+        key, message, value = first_error(error)
+        raise InputError(f"--set {prefix}{key}: {message} (got {value!r})") from error
 
 
 def settings_among(kind: type[S], assignments: Sequence[str], prefix: str) -> tuple[S, list[str]]:
