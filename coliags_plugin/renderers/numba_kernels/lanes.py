@@ -7,6 +7,8 @@ NEON ones. Nothing is reassociated and nothing assumes finite numbers; ``fma`` i
 ``Lanes`` holds numbers and ``LaneMask`` truth values. A scalar operand is repeated in all lanes. Operands of arithmetic
 may also be tuples of lanes of one length; the operation then goes through the tuple. Lengths are part of numba's types,
 so what is compiled has no loop over them. Tables are flat, contiguous float32 arrays, without bounds checks.
+
+``DoubleLanes`` holds sixteen float64. Where one operand of arithmetic is of this type, the others are widened.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ WIDTH = 16
 _FLOAT = ir.FloatType()
 _INT = ir.IntType(32)
 _LANES = ir.VectorType(_FLOAT, WIDTH)
+_DOUBLES = ir.VectorType(ir.DoubleType(), WIDTH)
 _INTS = ir.VectorType(_INT, WIDTH)
 _MASK = ir.VectorType(ir.IntType(1), WIDTH)
 
@@ -36,6 +39,13 @@ class Lanes(types.Type):
         super().__init__(name="Lanes")
 
 
+class DoubleLanes(types.Type):
+    """Sixteen float64."""
+
+    def __init__(self) -> None:
+        super().__init__(name="DoubleLanes")
+
+
 class LaneMask(types.Type):
     """Sixteen truth values."""
 
@@ -44,6 +54,7 @@ class LaneMask(types.Type):
 
 
 lanes = Lanes()
+double_lanes = DoubleLanes()
 lane_mask = LaneMask()
 
 
@@ -51,6 +62,12 @@ lane_mask = LaneMask()
 class _LanesModel(models.PrimitiveModel):
     def __init__(self, dmm: Any, fe_type: Any) -> None:
         super().__init__(dmm, fe_type, _LANES)
+
+
+@register_model(DoubleLanes)
+class _DoubleLanesModel(models.PrimitiveModel):
+    def __init__(self, dmm: Any, fe_type: Any) -> None:
+        super().__init__(dmm, fe_type, _DOUBLES)
 
 
 @register_model(LaneMask)
@@ -67,8 +84,9 @@ def _constant(values: Sequence[float], kind: Any = _LANES) -> Any:
 
 
 def _call(builder: ir.IRBuilder, name: str, *arguments: Any) -> Any:
-    """Call an LLVM intrinsic whose operands and result are all vectors of one type."""
+    """Call an LLVM intrinsic whose operands and result are all lanes, or all double lanes."""
     kind = arguments[0].type
+    name += ".v16f64" if kind == _DOUBLES else ".v16f32"
     function = builder.module.globals.get(name)
     if function is None:
         function = ir.Function(builder.module, ir.FunctionType(kind, [kind] * len(arguments)), name)
@@ -82,7 +100,8 @@ def _shuffle(builder: ir.IRBuilder, a: Any, b: Any, picks: Sequence[int | None])
 
 
 def _repeat(builder: ir.IRBuilder, scalar: Any) -> Any:
-    first = builder.insert_element(ir.Constant(_LANES, ir.Undefined), scalar, ir.Constant(_INT, 0))
+    kind = ir.VectorType(scalar.type, WIDTH)
+    first = builder.insert_element(ir.Constant(kind, ir.Undefined), scalar, ir.Constant(_INT, 0))
     return _shuffle(builder, first, first, [0] * WIDTH)
 
 
@@ -91,17 +110,37 @@ def _is_scalar(numba_type: types.Type) -> bool:
 
 
 def _is_numeric(numba_type: types.Type) -> bool:
-    return isinstance(numba_type, Lanes) or _is_scalar(numba_type)
+    return isinstance(numba_type, (Lanes, DoubleLanes)) or _is_scalar(numba_type)
 
 
-def _as_lanes(builder: ir.IRBuilder, value: Any, numba_type: types.Type) -> Any:
-    """A number or lanes, as lanes."""
+def _elements(operands: Sequence[types.Type]) -> list[types.Type]:
+    """The types of all operands, of the elements where they are tuples."""
+    return [
+        kind
+        for operand in operands
+        for kind in (operand if isinstance(operand, types.BaseTuple) else [operand])
+    ]  # fmt: skip
+
+
+def _result_type(operands: Sequence[types.Type]) -> types.Type:
+    """Double lanes where any operand is of them."""
+    return double_lanes if any(isinstance(kind, DoubleLanes) for kind in _elements(operands)) else lanes
+
+
+def _as_lanes(builder: ir.IRBuilder, value: Any, numba_type: types.Type, kind: types.Type = lanes) -> Any:
+    """A number or lanes, as lanes or double lanes."""
+    wide = isinstance(kind, DoubleLanes)
     if isinstance(numba_type, Lanes):
+        return builder.fpext(value, _DOUBLES) if wide else value
+    if isinstance(numba_type, DoubleLanes):
         return value
+    scalar = ir.DoubleType() if wide else _FLOAT
     if isinstance(numba_type, types.Integer):
-        value = builder.sitofp(value, _FLOAT)
-    elif numba_type.bitwidth > 32:
-        value = builder.fptrunc(value, _FLOAT)
+        value = builder.sitofp(value, scalar)
+    elif wide and numba_type.bitwidth < 64:
+        value = builder.fpext(value, scalar)
+    elif not wide and numba_type.bitwidth > 32:
+        value = builder.fptrunc(value, scalar)
     return _repeat(builder, value)
 
 
@@ -116,16 +155,17 @@ def _tuple_length(operands: Sequence[types.Type]) -> int | None:
     return lengths.pop() if len(lengths) == 1 else None
 
 
-def _element(builder: ir.IRBuilder, value: Any, numba_type: types.Type, index: int) -> Any:
-    """One element of a tuple, or what stands for all of them, as lanes."""
+def _element(builder: ir.IRBuilder, value: Any, numba_type: types.Type, index: int, kind: types.Type = lanes) -> Any:
+    """One element of a tuple, or what stands for all of them, as lanes or double lanes."""
     if isinstance(numba_type, types.BaseTuple):
-        return _as_lanes(builder, builder.extract_value(value, index), numba_type[index])
-    return _as_lanes(builder, value, numba_type)
+        return _as_lanes(builder, builder.extract_value(value, index), numba_type[index], kind)
+    return _as_lanes(builder, value, numba_type, kind)
 
 
 def _pack(builder: ir.IRBuilder, vectors: Sequence[Any]) -> Any:
     """LLVM's form of numba's tuple of lanes."""
-    packed = ir.Constant(ir.ArrayType(_LANES, len(vectors)), ir.Undefined)
+    kind = vectors[0].type if vectors else _LANES
+    packed = ir.Constant(ir.ArrayType(kind, len(vectors)), ir.Undefined)
     for index, vector in enumerate(vectors):
         packed = builder.insert_value(packed, vector, index)
     return packed
@@ -150,34 +190,35 @@ def _write(builder: ir.IRBuilder, value: Any, address: Any) -> None:
     builder.store(value, address).align = 4
 
 
-def _lanewise(name: str, arity: int, emit: Callable[..., Any], result: types.Type = lanes) -> Any:
+def _lanewise(name: str, arity: int, emit: Callable[..., Any], result: types.Type | None = None) -> Any:
     """An operation on numbers, lane by lane.
 
     Args:
         name: For error messages.
         arity: How many operands.
         emit: Gets the builder and one vector for each operand, and gives the vector of the result.
-        result: Type of the result, of one element where operands are tuples.
+        result: Type of the result, of one element where operands are tuples; None for that of the operands.
     """
 
     def typed(*operands: types.Type) -> Any:
         length = _tuple_length(operands)
-        elements = [
-            kind
-            for operand in operands
-            for kind in (operand if length is not None and isinstance(operand, types.BaseTuple) else [operand])
-        ]
-        if not all(_is_numeric(kind) for kind in elements):
+        if any(isinstance(operand, types.BaseTuple) for operand in operands) != (length is not None):
             return None
+        if not all(_is_numeric(kind) for kind in _elements(operands)):
+            return None
+        kind = _result_type(operands)
 
         def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
             pairs = list(zip(arguments, signature.args, strict=True))
             if length is None:
-                return emit(builder, *(_as_lanes(builder, *pair) for pair in pairs))
-            vectors = [emit(builder, *(_element(builder, *pair, index) for pair in pairs)) for index in range(length)]
+                return emit(builder, *(_as_lanes(builder, *pair, kind) for pair in pairs))
+            vectors = [
+                emit(builder, *(_element(builder, *pair, index, kind) for pair in pairs)) for index in range(length)
+            ]
             return _pack(builder, vectors)
 
-        return (result if length is None else types.UniTuple(result, length))(*operands), generate
+        given = kind if result is None else result
+        return (given if length is None else types.UniTuple(given, length))(*operands), generate
 
     # numba reads the number of operands from the signature.
     by_arity: dict[int, Callable[..., Any]] = {
@@ -212,7 +253,7 @@ sub = _lanewise("sub", 2, lambda builder, a, b: builder.fsub(a, b))
 #: a b
 mul = _lanewise("mul", 2, lambda builder, a, b: builder.fmul(a, b))
 #: a b + c
-fma = _lanewise("fma", 3, lambda builder, a, b, c: _call(builder, "llvm.fmuladd.v16f32", a, b, c))
+fma = _lanewise("fma", 3, lambda builder, a, b, c: _call(builder, "llvm.fmuladd", a, b, c))
 #: a / b, rounded correctly
 div = _lanewise("div", 2, lambda builder, a, b: builder.fdiv(a, b))
 #: a / b to a unit or two in the last place, for ordinary numbers
@@ -220,19 +261,24 @@ quick_div = _lanewise("quick_div", 2, lambda builder, a, b: builder.fdiv(a, b, f
 #: -a
 neg = _lanewise("neg", 1, lambda builder, a: builder.fneg(a))
 #: Square root
-sqrt = _lanewise("sqrt", 1, lambda builder, a: _call(builder, "llvm.sqrt.v16f32", a))
+sqrt = _lanewise("sqrt", 1, lambda builder, a: _call(builder, "llvm.sqrt", a))
 #: Logarithm to base 2, by the C library one number at a time: not for inner loops
-log2 = _lanewise("log2", 1, lambda builder, a: _call(builder, "llvm.log2.v16f32", a))
+log2 = _lanewise("log2", 1, lambda builder, a: _call(builder, "llvm.log2", a))
 #: The integer at or above
-ceil = _lanewise("ceil", 1, lambda builder, a: _call(builder, "llvm.ceil.v16f32", a))
+ceil = _lanewise("ceil", 1, lambda builder, a: _call(builder, "llvm.ceil", a))
 #: The integer at or below
-floor = _lanewise("floor", 1, lambda builder, a: _call(builder, "llvm.floor.v16f32", a))
+floor = _lanewise("floor", 1, lambda builder, a: _call(builder, "llvm.floor", a))
 #: A number in all lanes
 splat = _lanewise("splat", 1, lambda builder, a: a)
 #: The smaller; b where either is not a number
 smaller = _lanewise("smaller", 2, lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))
 #: The larger; b where either is not a number
 larger = _lanewise("larger", 2, lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))
+
+#: float64 of float32
+widen = _lanewise("widen", 1, lambda builder, a: builder.fpext(a, _DOUBLES), double_lanes)
+#: The nearest float32 of float64
+narrow = _lanewise("narrow", 1, lambda builder, a: builder.fptrunc(a, _LANES), lanes)
 
 # Comparisons are False where either is not a number.
 less = _comparison("less", "<")
@@ -249,20 +295,21 @@ def select(typingctx: Any, mask: Any, chosen: Any, other: Any) -> Any:
     length = _tuple_length((chosen, other))
     if not isinstance(mask, LaneMask):
         return None
+    kind = _result_type((chosen, other))
 
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
         pairs = list(zip(arguments[1:], signature.args[1:], strict=True))
         if length is None:
-            return builder.select(arguments[0], *(_as_lanes(builder, *pair) for pair in pairs))
+            return builder.select(arguments[0], *(_as_lanes(builder, *pair, kind) for pair in pairs))
         return _pack(
             builder,
             [
-                builder.select(arguments[0], *(_element(builder, *pair, index) for pair in pairs))
+                builder.select(arguments[0], *(_element(builder, *pair, index, kind) for pair in pairs))
                 for index in range(length)
             ],
         )
 
-    return (lanes if length is None else _tuple_of_lanes(length))(mask, chosen, other), generate
+    return (kind if length is None else types.UniTuple(kind, length))(mask, chosen, other), generate
 
 
 @intrinsic
@@ -310,7 +357,7 @@ def _emit_exp2(builder: ir.IRBuilder, power: Any) -> Any:
     fraction = builder.fsub(power, builder.fsub(biased, bias))
     value = _constant([_EXP2_COEFFICIENTS[-1]] * WIDTH)
     for coefficient in _EXP2_COEFFICIENTS[-2::-1]:
-        value = _call(builder, "llvm.fmuladd.v16f32", value, fraction, _constant([coefficient] * WIDTH))
+        value = _call(builder, "llvm.fmuladd", value, fraction, _constant([coefficient] * WIDTH))
     # Shifted to the exponent's place, the integer adds to it.
     exponent = builder.shl(builder.bitcast(biased, _INTS), _constant([23] * WIDTH, _INTS))
     return builder.bitcast(builder.add(builder.bitcast(value, _INTS), exponent), _LANES)
@@ -524,15 +571,16 @@ def dot(typingctx: Any, a: Any, b: Any, start: Any) -> Any:
     length = _tuple_length((a, b))
     if length is None or not _is_numeric(start):
         return None
+    kind = _result_type((a, b, start))
 
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
-        total = _as_lanes(builder, arguments[2], signature.args[2])
+        total = _as_lanes(builder, arguments[2], signature.args[2], kind)
         for index in range(length):
-            factors = (_element(builder, arguments[k], signature.args[k], index) for k in range(2))
-            total = _call(builder, "llvm.fmuladd.v16f32", *factors, total)
+            factors = (_element(builder, arguments[k], signature.args[k], index, kind) for k in range(2))
+            total = _call(builder, "llvm.fmuladd", *factors, total)
         return total
 
-    return lanes(a, b, start), generate
+    return kind(a, b, start), generate
 
 
 @intrinsic
@@ -543,23 +591,47 @@ def lane_sums(typingctx: Any, vectors: Any) -> Any:
 
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
         parts = [_element(builder, arguments[0], signature.args[0], index) for index in range(len(vectors))]
-        undefined = ir.Constant(_LANES, ir.Undefined)
-        run = WIDTH
-        # Each vector is made of 16 / run runs, and each run adds up to one of the sums. Two vectors become one with
-        # twice as many runs of half the length.
-        while run > 1:
-            parts += [undefined] * (len(parts) % 2)
-            half = run // 2
-            low = [lane for start in range(0, 2 * WIDTH, run) for lane in range(start, start + half)]
-            pairs = zip(parts[::2], parts[1::2], strict=True)
-            parts = [
-                builder.fadd(_shuffle(builder, a, b, low), _shuffle(builder, a, b, [lane + half for lane in low]))
-                for a, b in pairs
-            ]
-            run = half
-        return parts[0]
+        return _summed(builder, parts)
 
     return lanes(vectors), generate
+
+
+@intrinsic
+def store_lane_sums(typingctx: Any, table: Any, index: Any, further: Any, vectors: Any) -> Any:
+    """The sums of all lanes of each vector of a tuple: sixteen to ``table[index]`` and on, any others from ``further`` on."""
+    if not (_is_table(table) and isinstance(vectors, types.BaseTuple)):
+        return None
+
+    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+        parts = [_element(builder, arguments[3], signature.args[3], place) for place in range(len(vectors))]
+        address = _address(context, builder, signature.args[0], *arguments[:2])
+        _write(builder, _summed(builder, parts[:WIDTH]), address)
+        address = _address(context, builder, signature.args[0], arguments[0], arguments[2], _FLOAT)
+        for place, part in enumerate(parts[WIDTH:]):
+            total = builder.extract_element(_summed(builder, [part]), ir.Constant(_INT, 0))
+            _write(builder, total, builder.gep(address, [ir.Constant(_INT, place)]))
+        return context.get_dummy_value()
+
+    return types.none(table, types.intp, types.intp, vectors), generate
+
+
+def _summed(builder: ir.IRBuilder, parts: list[Any]) -> Any:
+    """The sums of all lanes of at most sixteen vectors."""
+    undefined = ir.Constant(_LANES, ir.Undefined)
+    run = WIDTH
+    # Each vector is made of 16 / run runs, and each run adds up to one of the sums. Two vectors become one with
+    # twice as many runs of half the length.
+    while run > 1:
+        parts = parts + [undefined] * (len(parts) % 2)
+        half = run // 2
+        low = [lane for start in range(0, 2 * WIDTH, run) for lane in range(start, start + half)]
+        pairs = zip(parts[::2], parts[1::2], strict=True)
+        parts = [
+            builder.fadd(_shuffle(builder, a, b, low), _shuffle(builder, a, b, [lane + half for lane in low]))
+            for a, b in pairs
+        ]
+        run = half
+    return parts[0]
 
 
 @intrinsic

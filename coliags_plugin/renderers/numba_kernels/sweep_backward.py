@@ -31,7 +31,6 @@ from coliags_plugin.renderers.numba_kernels.lanes import (
     lowest_bit,
     mul,
     neg,
-    number,
     prefetch_to_write,
     quick_div,
     repeat,
@@ -48,9 +47,9 @@ from coliags_plugin.renderers.numba_kernels.tiles import (
     OFFSET_E,
     OFFSET_F,
     block_corner,
+    copy_from_image,
     fetch_chunk,
     inside,
-    place_in_blocks,
     tile_corner,
 )
 
@@ -121,29 +120,18 @@ def _read_tile(tile, grid, extras, channels, of_images, state):
         store(state, at + _ALPHA, 0.0)
         store_all(state, at + _CHANNELS, repeat(0.0, channels))
     for channel in range(3):
-        _copy_from_image(of_images.rgb, 3, channel, tile, grid, _CHANNELS + 16 * channel, state)
-    _copy_from_image(of_images.alpha, 1, 0, tile, grid, _ALPHA, state)
+        copy_from_image(of_images.rgb, 3, channel, tile, grid, _CHANNELS + 16 * channel, state, _STATE)
+    copy_from_image(of_images.alpha, 1, 0, tile, grid, _ALPHA, state, _STATE)
     at = _CHANNELS + 48
     if extras.depth:
-        _copy_from_image(of_images.depth, 1, 0, tile, grid, at, state)
-        _copy_from_image(of_images.expected, 1, 0, tile, grid, _BEHIND, state)
+        copy_from_image(of_images.depth, 1, 0, tile, grid, at, state, _STATE)
+        copy_from_image(of_images.expected, 1, 0, tile, grid, _BEHIND, state, _STATE)
         at += 16
     if extras.inverse_depth:
-        _copy_from_image(of_images.inverse_depth, 1, 0, tile, grid, at, state)
+        copy_from_image(of_images.inverse_depth, 1, 0, tile, grid, at, state, _STATE)
         at += 16
     for axis in range(3):
-        _copy_from_image(of_images.normals, 3, axis, tile, grid, at + 16 * axis, state)
-
-
-@part
-def _copy_from_image(image, depth, channel, tile, grid, vector, state):
-    """Copy one of the ``depth`` channels of an image to one vector of a tile's blocks; from an empty one nothing."""
-    if len(image):
-        corner_x, corner_y, across, down = tile_corner(tile, grid)
-        for y in range(down):
-            first = ((corner_y + y) * grid.width + corner_x) * depth + channel
-            for x in range(across):
-                state[vector + place_in_blocks(x, y, _STATE)] = number(image, first + x * depth)
+        copy_from_image(of_images.normals, 3, axis, tile, grid, at + 16 * axis, state, _STATE)
 
 
 @part

@@ -26,7 +26,6 @@ from coliags_plugin.renderers.numba_kernels.lanes import (
     load_all,
     mul,
     neg,
-    number,
     repeat,
     select,
     smaller,
@@ -41,9 +40,10 @@ from coliags_plugin.renderers.numba_kernels.tiles import (
     OFFSET_E,
     OFFSET_F,
     block_corner,
+    copy_to_image,
     fetch_chunk,
     inside,
-    place_in_blocks,
+    list_by_block,
     tile_corner,
 )
 
@@ -115,39 +115,13 @@ def _sweep_tile(tile, projections, bins, view, grid, channels, median, rows, sta
     while first < last and alive:
         end = min(first + CHUNK, last)
         fetch_chunk(first, end, alive, corner_x, corner_y, projections, bins.cells, rows, blocks)
-        _list_by_block(end - first, blocks, listed, counts)
+        list_by_block(end - first, layout.ROW, blocks, listed, counts)
         for block in range(layout.BLOCKS):
             count = counts[block]
             if count and not _sweep_block(block, count, listed[CHUNK * block :], rows, channels, median, view, state):
                 alive &= ~(1 << block)
         first = end
     return first
-
-
-@part
-def _list_by_block(count, blocks, listed, counts):
-    """List the rows of a chunk that touch each block, front to back.
-
-    Branch-free, as branches would be unpredictable, and four blocks at a time: every row is written to every list, and
-    kept where the length of the list is incremented.
-
-    Args:
-        count: Entries of the chunk.
-        blocks: The blocks that each touches.
-        listed: Out: places of rows. [CHUNK for each block]
-        counts: Out: how many. [blocks]
-    """
-    for block in range(0, layout.BLOCKS, 4):
-        a, b, c, d = CHUNK * block, CHUNK * (block + 1), CHUNK * (block + 2), CHUNK * (block + 3)
-        for entry in range(count):
-            row, touched = layout.ROW * entry, blocks[entry] >> block
-            listed[a], listed[b], listed[c], listed[d] = row, row, row, row
-            a += touched & 1
-            b += touched >> 1 & 1
-            c += touched >> 2 & 1
-            d += touched >> 3 & 1
-        counts[block], counts[block + 1] = a - CHUNK * block, b - CHUNK * (block + 1)
-        counts[block + 2], counts[block + 3] = c - CHUNK * (block + 2), d - CHUNK * (block + 3)
 
 
 @part
@@ -216,29 +190,18 @@ def _finish_tile(tile, channels, view, has_depth, state, composited):
 def _write_tile(tile, grid, extras, state, images):
     """Copy a tile's pixels from its blocks to the images."""
     for channel in range(3):
-        _copy_to_image(_CHANNELS + 16 * channel, state, tile, grid, 3, channel, images.rgb)
-    _copy_to_image(_ALPHA, state, tile, grid, 1, 0, images.alpha)
+        copy_to_image(_CHANNELS + 16 * channel, state, _STATE, tile, grid, 3, channel, images.rgb)
+    copy_to_image(_ALPHA, state, _STATE, tile, grid, 1, 0, images.alpha)
     at = _CHANNELS + 48
     if extras.depth:
-        _copy_to_image(at, state, tile, grid, 1, 0, images.depth)
-        _copy_to_image(_EXPECTED, state, tile, grid, 1, 0, images.expected)
+        copy_to_image(at, state, _STATE, tile, grid, 1, 0, images.depth)
+        copy_to_image(_EXPECTED, state, _STATE, tile, grid, 1, 0, images.expected)
         at += 16
     if extras.inverse_depth:
-        _copy_to_image(at, state, tile, grid, 1, 0, images.inverse_depth)
+        copy_to_image(at, state, _STATE, tile, grid, 1, 0, images.inverse_depth)
         at += 16
     if extras.normals:
         for axis in range(3):
-            _copy_to_image(at + 16 * axis, state, tile, grid, 3, axis, images.normals)
+            copy_to_image(at + 16 * axis, state, _STATE, tile, grid, 3, axis, images.normals)
         at += 48
-    _copy_to_image(at, state, tile, grid, 1, 0, images.median)
-
-
-@part
-def _copy_to_image(vector, state, tile, grid, depth, channel, image):
-    """Copy one vector of a tile's blocks to one of the ``depth`` channels of an image; to an empty one nothing."""
-    if len(image):
-        corner_x, corner_y, across, down = tile_corner(tile, grid)
-        for y in range(down):
-            first = ((corner_y + y) * grid.width + corner_x) * depth + channel
-            for x in range(across):
-                image[first + x * depth] = number(state, vector + place_in_blocks(x, y, _STATE))
+    copy_to_image(at, state, _STATE, tile, grid, 1, 0, images.median)

@@ -86,6 +86,58 @@ def place_in_blocks(x, y, stride):
 
 
 @part
+def list_by_block(count, stride, blocks, listed, counts):
+    """List the rows of a chunk that touch each block, front to back.
+
+    Branch-free, as branches would be unpredictable, and four blocks at a time: every row is written to every list, and
+    kept where the length of the list is incremented.
+
+    Args:
+        count: Entries of the chunk.
+        stride: Numbers of a fetched row.
+        blocks: The blocks that each touches.
+        listed: Out: places of rows. [CHUNK for each block]
+        counts: Out: how many. [blocks]
+    """
+    for block in range(0, layout.BLOCKS, 4):
+        a, b, c, d = CHUNK * block, CHUNK * (block + 1), CHUNK * (block + 2), CHUNK * (block + 3)
+        for entry in range(count):
+            row, touched = stride * entry, blocks[entry] >> block
+            listed[a], listed[b], listed[c], listed[d] = row, row, row, row
+            a += touched & 1
+            b += touched >> 1 & 1
+            c += touched >> 2 & 1
+            d += touched >> 3 & 1
+        counts[block], counts[block + 1] = a - CHUNK * block, b - CHUNK * (block + 1)
+        counts[block + 2], counts[block + 3] = c - CHUNK * (block + 2), d - CHUNK * (block + 3)
+
+
+@part
+def copy_to_image(vector, state, stride, tile, grid, depth, channel, image):
+    """Copy one vector of a tile's blocks to one of the ``depth`` channels of an image; to an empty one nothing.
+
+    The vectors of the blocks are ``stride`` numbers apart.
+    """
+    if len(image):
+        corner_x, corner_y, across, down = tile_corner(tile, grid)
+        for y in range(down):
+            first = ((corner_y + y) * grid.width + corner_x) * depth + channel
+            for x in range(across):
+                image[first + x * depth] = number(state, vector + place_in_blocks(x, y, stride))
+
+
+@part
+def copy_from_image(image, depth, channel, tile, grid, vector, state, stride):
+    """The opposite of :func:`copy_to_image`; from an empty image nothing is copied."""
+    if len(image):
+        corner_x, corner_y, across, down = tile_corner(tile, grid)
+        for y in range(down):
+            first = ((corner_y + y) * grid.width + corner_x) * depth + channel
+            for x in range(across):
+                state[vector + place_in_blocks(x, y, stride)] = number(image, first + x * depth)
+
+
+@part
 def order_tiles(starts, order):
     """Order tiles by decreasing length of their lists, to balance the threads.
 
