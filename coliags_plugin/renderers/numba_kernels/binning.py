@@ -7,19 +7,23 @@ threads handle on their own; the result is the same however many there are.
 
 from __future__ import annotations
 
-from coliags_plugin.renderers.numba_kernels import layout
-from coliags_plugin.renderers.numba_kernels.compilation import kernel, part
+from coliags_plugin.renderers.numba_kernels import layout, surfel_layout
+from coliags_plugin.renderers.numba_kernels.compilation import inline, kernel, part
 from coliags_plugin.renderers.numba_kernels.geometry import squared_distance_to_box
 from coliags_plugin.renderers.numba_kernels.lanes import (
     add,
     at_most,
     bits,
     broadcast,
+    dot,
     fma,
     lane_columns,
     lane_rows,
+    larger,
+    mul,
     number,
     prefetch,
+    smaller,
     splat,
     sub,
 )
@@ -32,7 +36,7 @@ _AHEAD = 8
 
 
 @kernel
-def find_pairs(counters, projections, view, grid, keys, pairs, entry_counts):
+def find_pairs(counters, projections, view, grid, circle, keys, pairs, entry_counts):
     """Pair the Gaussians with the tiles they touch.
 
     Args:
@@ -40,6 +44,8 @@ def find_pairs(counters, projections, view, grid, keys, pairs, entry_counts):
         projections: What projection wrote.
         view: See ``layout``.
         grid: The tiles.
+        circle: An empty tuple for 3D Gaussians. One with an element for surfels, which also reach a circle; records are
+            their outlines then.
         keys: See ``sorting``. [Gaussians drawn]
         pairs: Out, with room for all tiles within bounds. The pairs of a stretch may be anywhere among the others.
         entry_counts: Out: pairs of each Gaussian. [Gaussians drawn]
@@ -53,7 +59,7 @@ def find_pairs(counters, projections, view, grid, keys, pairs, entry_counts):
         begin = take(counters, 1, _tiles_within_bounds(first, last, keys, projections.bounds))
         pairs.begins[stretch] = begin
         pairs.ends[stretch] = _find_stretch(
-            first, last, begin, stretch * grid.tiles, projections, view, grid, keys, pairs, entry_counts
+            first, last, begin, stretch * grid.tiles, projections, view, grid, circle, keys, pairs, entry_counts
         )
 
 
@@ -69,7 +75,7 @@ def _tiles_within_bounds(first, last, keys, bounds):
 
 
 @part
-def _find_stretch(first, last, pair, counted, projections, view, grid, keys, pairs, entry_counts):
+def _find_stretch(first, last, pair, counted, projections, view, grid, circle, keys, pairs, entry_counts):
     """Pair the Gaussians with indices ``first`` to ``last`` in the sorted list.
 
     Writes the pairs from ``pair`` on, and counts those of each tile from ``counted`` on.
@@ -106,6 +112,11 @@ def _find_stretch(first, last, pair, counted, projections, view, grid, keys, pai
                 nearest = squared_distance_to_box(
                     u_xx, u_yx, u_yy, slope_upright, slope_level, left, right, top, bottom
                 )
+                if len(circle) > 0:
+                    x = number(records, row + surfel_layout.CIRCLE_X) - mean_x
+                    y = number(records, row + surfel_layout.CIRCLE_Y) - mean_y
+                    edges = (sub(left, x), sub(right, x), sub(top, y), sub(bottom, y))
+                    nearest = smaller(nearest, _squared_distance_from_circle(edges, view))
                 blocks = bits(at_most(nearest, reach))
                 if blocks:
                     tile = tile_row * grid.columns + column
@@ -116,6 +127,16 @@ def _find_stretch(first, last, pair, counted, projections, view, grid, keys, pai
                     pair += 1
         entry_counts[place] = pair - begin
     return pair
+
+
+@inline
+def _squared_distance_from_circle(edges, view):
+    """Smallest squared distance from the centre to boxes whose sides are given as offsets from it, scaled."""
+    left, right, top, bottom = edges
+    scale = broadcast(view, layout.VIEW_PIXEL_SCALE)
+    x, y = add(larger(left, 0.0), smaller(right, 0.0)), add(larger(top, 0.0), smaller(bottom, 0.0))
+    away = mul(scale, (x, y))
+    return dot(away, away, 0.0)
 
 
 @kernel

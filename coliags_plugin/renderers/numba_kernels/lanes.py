@@ -287,6 +287,7 @@ greater = _comparison("greater", ">")
 at_least = _comparison("at_least", ">=")
 
 both = _of_masks("both", lambda builder, a, b: builder.and_(a, b))
+either = _of_masks("either", lambda builder, a, b: builder.or_(a, b))
 
 
 @intrinsic

@@ -78,6 +78,8 @@ VIEW_LOG2_ALPHA_MIN = 24  # the cuts
 VIEW_ALPHA_MAX = 25
 VIEW_TRANSMITTANCE_MIN = 26
 VIEW_BACKGROUND = 27
+VIEW_PIXEL_SCALE = 30  # U_FACTOR over the standard deviation of the surfels' filter, per pixel
+VIEW_DISTORTION = 31  # factor of squared differences of reciprocal depths in the distortion
 
 
 class Parameters(NamedTuple):
@@ -86,7 +88,7 @@ class Parameters(NamedTuple):
     Attributes:
         means: [3 for each Gaussian]
         quats: w first. [4 for each Gaussian]
-        scales: [3 for each Gaussian]
+        scales: [3 for each Gaussian, 2 for each surfel]
         opacities: [1 for each Gaussian]
         colors: [3 for each Gaussian]
     """
@@ -188,7 +190,8 @@ class Images(NamedTuple):
 
     Attributes:
         rgb, normals: [3 for each pixel]
-        alpha, depth, inverse_depth, expected, median: [1 for each pixel]; ``expected`` is depth over alpha.
+        alpha, depth, inverse_depth, expected, median, distortion: [1 for each pixel]; ``expected`` is depth over alpha,
+            and only surfels have a distortion.
     """
 
     rgb: Any
@@ -198,6 +201,7 @@ class Images(NamedTuple):
     expected: Any
     normals: Any
     median: Any
+    distortion: Any
 
 
 class Scratch(NamedTuple):

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
-from coliags_plugin.renderers.numba_kernels import binning, layout, sorting, sweep_backward, sweep_forward
+from coliags_plugin.renderers.numba_kernels import binning, layout, sorting
 from coliags_plugin.renderers.numba_kernels.buffers import ArenaPool, Results
-from coliags_plugin.renderers.numba_kernels.projection import project
-from coliags_plugin.renderers.numba_kernels.projection_backward import gather, project_backward
 from coliags_plugin.renderers.numba_kernels.threads import Crew
 
 Array = npt.NDArray[Any]
@@ -38,27 +37,45 @@ class TooManyPairsError(Exception):
     """The Gaussians cover more tiles than the lists can hold; the argument is the number of tiles."""
 
 
-class Pipeline:
+class Layer(NamedTuple):
+    """What one pair of sweeps composites.
+
+    Attributes:
+        records: One row for each Gaussian. [16 each]
+        view: Camera and options, see ``layout``.
+        channels: Any tuple as long as there are channels in the records.
+        own: What is composited besides, in the form that the sweeps take it.
+    """
+
+    records: Array
+    view: Array
+    channels: tuple[int, ...]
+    own: Any
+
+
+class Pipeline(ABC):
     """Rendering of N Gaussians from one camera, stage by stage, with the intermediate tables.
 
     Args:
         view: Camera and options, see ``layout``.
         width, height: Pixels.
-        extras: What to composite besides colour.
-        expected: Also depth over alpha; needs depth among the extras.
-        median: Also the median depth.
+        wanted: The images to draw; depth is among them if expected is. [fields of layout.Images]
     """
 
-    def __init__(
-        self, view: Array, width: int, height: int, extras: layout.Extras, expected: bool, median: bool
-    ) -> None:
+    #: Scales of a Gaussian.
+    scales: ClassVar[int]
+    #: First of the channels' columns of records, and of sums.
+    first_channel: ClassVar[int]
+    first_channel_sum: ClassVar[int]
+    #: How many feature channels one sweep composites, and the images that hold them.
+    feature_channels: ClassVar[int]
+    feature_images: ClassVar[tuple[str, ...]]
+
+    def __init__(self, view: Array, width: int, height: int, wanted: Collection[str]) -> None:
         columns = -(-width // layout.TILE)
         self._view = view
         self._grid = layout.Grid(width, height, columns, columns * -(-height // layout.TILE))
-        self._extras = extras
-        self._expected = expected
-        self._median = (0,) * median
-        self._channels = (0,) * (3 + extras.depth + extras.inverse_depth + 3 * extras.normals)
+        self._wanted = wanted
         self._arena = _arenas.lend(self)
         self._count = 0
         self._tail: layout.Parameters
@@ -67,21 +84,74 @@ class Pipeline:
         self._composited: Array
         self._feature_composited: Array
 
+    # --- the kernels of one primitive ---------------------------------------------------------------------------------
+
+    @abstractmethod
+    def _main_layer(self) -> Layer:
+        """Colours and all that is wanted besides."""
+
+    @abstractmethod
+    def _feature_layer(self, records: Array, view: Array) -> Layer:
+        """Feature channels."""
+
+    @abstractmethod
+    def _outlines(self) -> tuple[layout.Projections, tuple[int, ...]]:
+        """What ``find_pairs`` takes as projections and circle."""
+
+    @abstractmethod
+    def _sums_size(self, layer: Layer, rows: int) -> int:
+        """Numbers in the sums of so many Gaussians or entries."""
+
+    @abstractmethod
+    def _composited_vectors(self, layer: Layer) -> int:
+        """Vectors that a forward sweep leaves of each block."""
+
+    @abstractmethod
+    def _run_project(self, run: Run, gaussians: layout.Parameters, means2d: Array, radii: Array) -> None:
+        """Project."""
+
+    @abstractmethod
+    def _run_sweep(self, run: Run, layer: Layer, composited: Array, images: layout.Images) -> None:
+        """Composite."""
+
+    @abstractmethod
+    def _run_sweep_backward(
+        self, run: Run, layer: Layer, composited: Array, of_images: layout.Images, entry_sums: Array
+    ) -> None:
+        """Find the sums of entries."""
+
+    @abstractmethod
+    def _run_gather(self, run: Run, layer: Layer, entry_sums: Array, sums: Array, of_means2d: Array) -> None:
+        """Find the sums of Gaussians, and the derivative with respect to the projected centres."""
+
+    @abstractmethod
+    def _run_project_backward(
+        self,
+        run: Run,
+        gaussians: layout.Parameters,
+        sums: Array,
+        given_means2d: Array,
+        of_gaussians: layout.Parameters,
+        of_pose: Array,
+    ) -> None:
+        """Find the derivatives with respect to Gaussians and pose."""
+
+    # --- stages -------------------------------------------------------------------------------------------------------
+
     def project(self, gaussians: layout.Parameters) -> tuple[Array, Array, Array]:
         """Project Gaussians.
 
         Returns:
-            Projected centres in pixels, radii in pixels, and the records, padded to whole groups. [N, 2], [N], [16 each]
+            Projected centres in pixels, radii in pixels, and a table without content of the shape of the Gaussians'
+            sums, which stands for all else in the graph of derivatives. [N, 2], [N], [16 each or more]
 
         Raises:
             UnusableGaussianError: One is not finite, has no direction or a negative scale.
         """
         self._count = count = len(gaussians.opacities)
-        groups = -(-count // layout.GROUP)
-        filled = groups * layout.GROUP
-        take = self._arena.take
-        self._tail = _tail(gaussians, count)
-        self._projections = projections = layout.Projections(
+        groups, filled, take = -(-count // layout.GROUP), self._filled, self._arena.take
+        self._tail = _tail(gaussians, count, self.scales)
+        self._projections = layout.Projections(
             records=take("records", layout.ROW * filled),
             depths=take("depths", filled),
             bounds=take("bounds", 4 * filled),
@@ -90,12 +160,10 @@ class Pipeline:
         )
         means2d, radii = _results.take(filled, 2), _results.take(filled)
         with _workers() as run:
-            run(
-                project, count, gaussians, self._tail, self._view, self._extras, projections, means2d.reshape(-1), radii
-            )  # fmt: skip
-        if count and projections.parcels[::2].min() < 0:
+            self._run_project(run, gaussians, means2d.reshape(-1), radii)
+        if count and self._projections.parcels[::2].min() < 0:
             raise UnusableGaussianError
-        return means2d[:count], radii[:count], projections.records
+        return means2d[:count], radii[:count], take("links", self._sums_size(self._main_layer(), filled))
 
     def composite(self) -> layout.Images:
         """Draw the Gaussians projected.
@@ -106,28 +174,25 @@ class Pipeline:
         Raises:
             TooManyPairsError: They cover too many tiles.
         """
-        grid, extras = self._grid, self._extras
-        wanted = (True, True, extras.depth, extras.inverse_depth, self._expected, extras.normals, bool(self._median))
+        grid, layer = self._grid, self._main_layer()
         images = layout.Images(
             *(
-                _results.take(grid.height, grid.width, *((3,) if name in ("rgb", "normals") else ())) if want else None
-                for name, want in zip(layout.Images._fields, wanted, strict=True)
+                _results.take(grid.height, grid.width, *((3,) if name in ("rgb", "normals") else ()))
+                if name in self._wanted
+                else None
+                for name in layout.Images._fields
             )
         )
-        size = layout.BLOCKS * grid.tiles * 16 * (1 + len(self._channels))
         with _workers() as run:
             self._bin(run)
-            self._composited = self._arena.take("composited", size)
-            run(
-                sweep_forward.sweep_forward, self._projections, self._bins, self._view, grid, extras, self._channels,
-                self._median, self._scratch(run, sweep_forward), self._composited, _flat_images(images),
-            )  # fmt: skip
+            self._composited = self._arena.take("composited", self._composited_size(layer))
+            self._run_sweep(run, layer, self._composited, _flat_images(images))
         return images
 
     def composite_features(self, features: Array) -> Array:
         """Composite further channels of the Gaussians over 0, after :meth:`composite` and over the same bins.
 
-        Eight channels at a time take the place of colour, depths and normal in the records.
+        Some channels at a time take the place of the others in the records.
 
         Args:
             features: [N, C]
@@ -135,21 +200,17 @@ class Pipeline:
         Returns:
             [H, W, C]
         """
-        grid, extras, width = self._grid, layout.FEATURES, layout.MAX_CHANNELS
-        channels, count = (0,) * width, features.shape[1]
-        size = layout.BLOCKS * grid.tiles * 16 * (1 + width)
+        grid, width, count = self._grid, self.feature_channels, features.shape[1]
         sweeps = -(-count // width)
+        size = self._composited_size(self._features_layer(features, 0))
         result = np.empty((grid.height, grid.width, width * sweeps), np.float32)
         self._feature_composited = self._arena.take("feature_composited", sweeps * size)
         with _workers() as run:
             for sweep in range(sweeps):
                 images = self._feature_images()
-                run(
-                    sweep_forward.sweep_forward, self._with_features(features, sweep), self._bins, self._dark_view(),
-                    grid, extras, channels, (), self._scratch(run, sweep_forward),
-                    self._feature_composited[sweep * size : (sweep + 1) * size], _flat_images(images),
-                )  # fmt: skip
-                result[..., width * sweep : width * (sweep + 1)] = _joined(images)
+                composited = self._feature_composited[sweep * size : (sweep + 1) * size]
+                self._run_sweep(run, self._features_layer(features, sweep), composited, _flat_images(images))
+                result[..., width * sweep : width * (sweep + 1)] = self._joined(images)
         return result[..., :count]
 
     def composite_features_backward(self, features: Array, of_features: Array) -> tuple[Array, Array, Array]:
@@ -161,12 +222,12 @@ class Pipeline:
 
         Returns:
             Derivative with respect to the projected centres, the sums of each Gaussian without those of the channels,
-            and the derivative with respect to the features. [N, 2], [16 each], [N, C]
+            and the derivative with respect to the features. [N, 2], [16 each or more], [N, C]
         """
-        grid, width = self._grid, layout.MAX_CHANNELS
-        filled = self._count + -self._count % layout.GROUP
-        size = layout.BLOCKS * grid.tiles * 16 * (1 + width)
-        entry_sums = self._arena.take("entry_sums", layout.ROW * int(self._bins.starts[-1]))
+        width, filled, first_sum = self.feature_channels, self._filled, self.first_channel_sum
+        layer = self._features_layer(features, 0)
+        size = self._composited_size(layer)
+        entry_sums = self._arena.take("entry_sums", self._sums_size(layer, int(self._bins.starts[-1])))
         part, of_part = self._arena.take("feature_sums", layout.ROW * filled), np.empty((filled, 2), np.float32)
         total, of_means2d = np.zeros((filled, layout.ROW), np.float32), np.zeros((filled, 2), np.float32)
         result = np.empty_like(features)
@@ -174,45 +235,19 @@ class Pipeline:
             for first in range(0, features.shape[1], width):
                 sweep = first // width
                 given = self._feature_images()
-                _part_into(of_features[..., first : first + width], given)
-                projections = self._with_features(features, sweep)
-                run(
-                    sweep_backward.sweep_backward, projections, self._bins, self._dark_view(), grid, layout.FEATURES,
-                    (0,) * width, self._scratch(run, sweep_backward),
-                    self._feature_composited[sweep * size : (sweep + 1) * size], _flat_images(given), entry_sums,
-                )  # fmt: skip
-                run(gather, projections, self._bins, entry_sums, part, of_part.reshape(-1))
+                self._part_into(of_features[..., first : first + width], given)
+                layer = self._features_layer(features, sweep)
+                composited = self._feature_composited[sweep * size : (sweep + 1) * size]
+                self._run_sweep_backward(run, layer, composited, _flat_images(given), entry_sums)
+                self._run_gather(run, layer, entry_sums, part, of_part.reshape(-1))
                 rows = part.reshape(filled, layout.ROW)
-                total[:, : layout.SUM_CHANNELS] += rows[:, : layout.SUM_CHANNELS]
+                total[:, :first_sum] += rows[:, :first_sum]
                 of_means2d += of_part
                 columns = min(width, features.shape[1] - first)
-                channels = rows[: self._count, layout.SUM_CHANNELS : layout.SUM_CHANNELS + columns]
-                result[:, first : first + columns] = channels
-        return of_means2d[: self._count], total.reshape(-1), result
-
-    def _with_features(self, features: Array, sweep: int) -> layout.Projections:
-        """The projections with a part of the features as channels."""
-        width = layout.MAX_CHANNELS
-        part = features[:, width * sweep : width * (sweep + 1)]
-        records = self._arena.take("feature_records", len(self._projections.records))
-        records[:] = self._projections.records
-        rows = records.reshape(-1, layout.ROW)[: self._count]
-        rows[:, layout.CHANNELS : layout.CHANNELS + width] = 0.0
-        rows[:, layout.CHANNELS : layout.CHANNELS + part.shape[1]] = part
-        return self._projections._replace(records=records)
-
-    def _dark_view(self) -> Array:
-        """The view with a black background."""
-        view = self._view.copy()
-        view[layout.VIEW_BACKGROUND : layout.VIEW_BACKGROUND + 3] = 0.0
-        return view
-
-    def _feature_images(self) -> layout.Images:
-        """Images for eight channels."""
-        height, width = self._grid.height, self._grid.width
-        rgb, normals = (np.zeros((height, width, 3), np.float32) for _ in range(2))
-        depth, inverse_depth = (np.zeros((height, width), np.float32) for _ in range(2))
-        return layout.Images(rgb, None, depth, inverse_depth, None, normals, None)
+                result[:, first : first + columns] = rows[: self._count, first_sum : first_sum + columns]
+        sums = np.zeros(self._sums_size(self._main_layer(), filled), np.float32)
+        sums[: layout.ROW * filled] = total.reshape(-1)
+        return of_means2d[: self._count], sums, result
 
     def composite_backward(self, of_images: layout.Images) -> tuple[Array, Array]:
         """Derivatives of :meth:`composite`, any number of times.
@@ -222,19 +257,15 @@ class Pipeline:
 
         Returns:
             Derivative with respect to the projected centres, and the sums of each Gaussian, which are good until the
-            next call. [N, 2], [16 each]
+            next call. [N, 2], [16 each or more]
         """
-        filled = self._count + -self._count % layout.GROUP
-        entry_sums = self._arena.take("entry_sums", layout.ROW * int(self._bins.starts[-1]))
-        gaussian_sums = self._arena.take("gaussian_sums", layout.ROW * filled)
+        layer, filled, take = self._main_layer(), self._filled, self._arena.take
+        entry_sums = take("entry_sums", self._sums_size(layer, int(self._bins.starts[-1])))
+        gaussian_sums = take("gaussian_sums", self._sums_size(layer, filled))
         of_means2d = _results.take(filled, 2)
         with _workers() as run:
-            run(
-                sweep_backward.sweep_backward, self._projections, self._bins, self._view, self._grid, self._extras,
-                self._channels, self._scratch(run, sweep_backward), self._composited, _flat_images(of_images),
-                entry_sums,
-            )  # fmt: skip
-            run(gather, self._projections, self._bins, entry_sums, gaussian_sums, of_means2d.reshape(-1))
+            self._run_sweep_backward(run, layer, self._composited, _flat_images(of_images), entry_sums)
+            self._run_gather(run, layer, entry_sums, gaussian_sums, of_means2d.reshape(-1))
         return of_means2d[: self._count], gaussian_sums
 
     def project_backward(
@@ -250,23 +281,65 @@ class Pipeline:
         Returns:
             Derivatives with respect to the Gaussians, and to the upper three rows of ``camera_to_world``. [3, 4]
         """
-        filled = self._count + -self._count % layout.GROUP
+        filled = self._filled
         given = self._arena.take("given_means2d", 2 * filled)
         given[: 2 * self._count] = 0.0 if of_means2d is None else of_means2d.reshape(-1)
         given[2 * self._count :] = 0.0
         if gaussian_sums is None:
-            gaussian_sums = np.zeros(layout.ROW * filled, np.float32)
+            gaussian_sums = np.zeros(self._sums_size(self._main_layer(), filled), np.float32)
         of_pose = self._arena.take("of_pose", layout.ROW * -(-self._count // layout.PARCEL))
-        results = layout.Parameters(*(_results.take(filled, width) for width in (3, 4, 3, 1, 3)))
+        results = layout.Parameters(*(_results.take(filled, width) for width in (3, 4, self.scales, 1, 3)))
+        flat = layout.Parameters(*(result.reshape(-1) for result in results))
         with _workers() as run:
-            run(
-                project_backward, self._count, gaussians, self._tail, self._view, self._extras, self._projections,
-                gaussian_sums, given, layout.Parameters(*(result.reshape(-1) for result in results)), of_pose,
-            )  # fmt: skip
+            self._run_project_backward(run, gaussians, gaussian_sums, given, flat, of_pose)
         columns = of_pose.reshape(-1, layout.ROW)[:, :12].sum(axis=0, dtype=np.float64).reshape(4, 3)
         return layout.Parameters(*(result[: self._count] for result in results)), columns.T
 
-    def _bin(self, run: _Run) -> None:
+    # --- features -----------------------------------------------------------------------------------------------------
+
+    def _features_layer(self, features: Array, sweep: int) -> Layer:
+        """A part of the features as channels, over black."""
+        width = self.feature_channels
+        part = features[:, width * sweep : width * (sweep + 1)]
+        records = self._arena.take("feature_records", len(self._projections.records))
+        records[:] = self._projections.records
+        rows = records.reshape(-1, layout.ROW)[: self._count, self.first_channel :]
+        rows[:, :width] = 0.0
+        rows[:, : part.shape[1]] = part
+        view = self._view.copy()
+        view[layout.VIEW_BACKGROUND : layout.VIEW_BACKGROUND + 3] = 0.0
+        return self._feature_layer(records, view)
+
+    def _feature_images(self) -> layout.Images:
+        """Images for the channels of a sweep."""
+        size = (self._grid.height, self._grid.width)
+        return layout.Images(
+            *(
+                np.zeros((*size, 3) if name in ("rgb", "normals") else size, np.float32)
+                if name in self.feature_images
+                else None
+                for name in layout.Images._fields
+            )
+        )
+
+    def _joined(self, images: layout.Images) -> Array:
+        """The channels of a sweep from the images that hold them. [H, W, feature_channels]"""
+        size = (self._grid.height, self._grid.width, -1)
+        parts = [getattr(images, name).reshape(size) for name in self.feature_images]
+        return np.concatenate(parts, axis=-1)[..., : self.feature_channels]
+
+    def _part_into(self, channels: Array, images: layout.Images) -> None:
+        """Split at most as many channels into images; the inverse of :meth:`_joined`. [H, W, C]"""
+        size, taken = (self._grid.height, self._grid.width, -1), 0
+        for name in self.feature_images:
+            image = getattr(images, name).reshape(size)
+            part = channels[..., taken : taken + image.shape[2]]
+            image[..., : part.shape[2]] = part
+            taken += image.shape[2]
+
+    # --- bins ---------------------------------------------------------------------------------------------------------
+
+    def _bin(self, run: Run) -> None:
         """List the Gaussians of each tile."""
         take, grid = self._arena.take, self._grid
         drawn, within_bounds = (int(total) for total in self._projections.parcels.reshape(-1, 2).sum(axis=0))
@@ -290,18 +363,19 @@ class Pipeline:
             ends=take("pair_ends", stretches, np.int64),
             tile_counts=take("tile_counts", stretches * grid.tiles, np.int32),
         )
-        run(binning.find_pairs, self._projections, self._view, grid, bins.keys, pairs, bins.entry_counts)
+        projections, circle = self._outlines()
+        run(binning.find_pairs, projections, self._view, grid, circle, bins.keys, pairs, bins.entry_counts)
         binning.place_entries(grid, pairs, bins)
         run(binning.sort_pairs, grid, pairs, bins)
 
-    def _sorted_keys(self, run: _Run, drawn: int) -> Array:
+    def _sorted_keys(self, run: Run, drawn: int) -> Array:
         """Indices of the Gaussians drawn, nearest first."""
         take = self._arena.take
         keys, moved = take("keys", drawn, np.int64), take("moved", drawn, np.int64)
         if not drawn:
             return keys
         if drawn < _WORTH_SHARING_SORT:
-            run = _Run(1)
+            run = Run(1)
         counts = self._projections.parcels[::2]
         lowest, highest = np.empty_like(counts), np.empty_like(counts)
         depth_bits = self._projections.depths.view(np.int32)
@@ -319,13 +393,22 @@ class Pipeline:
             keys, moved = moved, keys
         return keys
 
-    def _scratch(self, run: _Run, sweep: Any) -> layout.Scratch:
+    @property
+    def _filled(self) -> int:
+        """Gaussians with the last group filled up."""
+        return self._count + -self._count % layout.GROUP
+
+    def _composited_size(self, layer: Layer) -> int:
+        """Numbers that a forward sweep leaves."""
+        return 16 * layout.BLOCKS * self._grid.tiles * self._composited_vectors(layer)
+
+    def _scratch(self, run: Run, sweep: Any) -> layout.Scratch:
         """Memory for all threads of a sweep."""
         numbers = self._arena.take("numbers", run.workers * sweep.NUMBERS)
         return layout.Scratch(numbers, self._arena.take("integers", run.workers * sweep.INTEGERS, np.int32))
 
 
-class _Run:
+class Run:
     """Runs kernels on a given number of threads."""
 
     def __init__(self, workers: int) -> None:
@@ -336,38 +419,21 @@ class _Run:
 
 
 @contextmanager
-def _workers() -> Iterator[_Run]:
+def _workers() -> Iterator[Run]:
     """Lock the thread pool, as one view uses all cores; with as many threads as torch uses."""
     with _crew.turn:
-        yield _Run(torch.get_num_threads())
+        yield Run(torch.get_num_threads())
 
 
 def _flat_images(images: layout.Images) -> layout.Images:
     return layout.Images(*(np.empty(0, np.float32) if image is None else image.reshape(-1) for image in images))
 
 
-def _joined(images: layout.Images) -> Array:
-    """Eight channels from the images that held them. [H, W, 8]"""
-    return np.concatenate(
-        [images.rgb, images.depth[..., None], images.inverse_depth[..., None], images.normals], axis=-1
-    )
-
-
-def _part_into(channels: Array, images: layout.Images) -> None:
-    """Split up to eight channels into images; the inverse of :func:`_joined`. [H, W, C]"""
-    filled = np.zeros((*channels.shape[:2], layout.MAX_CHANNELS), np.float32)
-    filled[..., : channels.shape[2]] = channels
-    images.rgb[:] = filled[..., :3]
-    images.depth[:] = filled[..., 3]
-    images.inverse_depth[:] = filled[..., 4]
-    images.normals[:] = filled[..., 5:]
-
-
-def _tail(gaussians: layout.Parameters, count: int) -> layout.Parameters:
+def _tail(gaussians: layout.Parameters, count: int, scales: int) -> layout.Parameters:
     """The Gaussians behind the last full group, filled up with ones that are not drawn."""
     first = count // layout.GROUP * layout.GROUP
     tails = []
-    for array, width, filling in zip(gaussians, (3, 4, 3, 1, 3), (0.0, 1.0, 0.0, 0.0, 0.0), strict=True):
+    for array, width, filling in zip(gaussians, (3, 4, scales, 1, 3), (0.0, 1.0, 0.0, 0.0, 0.0), strict=True):
         tail = np.full(layout.GROUP * width, filling, np.float32)
         tail[: width * (count - first)] = array[width * first :]
         tails.append(tail)

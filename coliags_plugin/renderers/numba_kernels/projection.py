@@ -104,7 +104,7 @@ def _project_groups(first, last, source, gaussians, view, extras, projections, m
         )
         opacity = load(gaussians.opacities, row)
         at = project_axes(mean, quat, view)
-        usable = usable and bits(_are_usable(mean, at.squared_norm, scale, opacity, color)) == 0xFFFF
+        usable = usable and bits(are_usable(mean, at.squared_norm, scale, opacity, color)) == 0xFFFF
 
         row_x, row_y = mul(at.local_x, scale), mul(at.local_y, scale)
         sharp_xx, sharp_yy = dot(row_x, row_x, 0.0), dot(row_y, row_y, 0.0)
@@ -131,8 +131,8 @@ def _project_groups(first, last, source, gaussians, view, extras, projections, m
 
         tau = mul(add(reach, layout.REACH_SLACK), 1.0 / layout.U_FACTOR_SQUARED)
         half_x, half_y = sqrt(mul(tau, xx)), sqrt(mul(tau, yy))
-        column_first, column_last = _tile(sub(mean_x, half_x), right_edge), _tile(add(mean_x, half_x), right_edge)
-        row_first, row_last = _tile(sub(mean_y, half_y), bottom_edge), _tile(add(mean_y, half_y), bottom_edge)
+        column_first, column_last = tile_at(sub(mean_x, half_x), right_edge), tile_at(add(mean_x, half_x), right_edge)
+        row_first, row_last = tile_at(sub(mean_y, half_y), bottom_edge), tile_at(add(mean_y, half_y), bottom_edge)
         store_columns(projections.bounds, 4 * layout.GROUP * group, (column_first, column_last, row_first, row_last))
         area = mul(add(sub(column_last, column_first), 1.0), add(sub(row_last, row_first), 1.0))
         tiles += int(lane(lane_sums((select(shown, area, 0.0),)), 0))
@@ -154,7 +154,7 @@ def _project_groups(first, last, source, gaussians, view, extras, projections, m
 
 
 @inline
-def _are_usable(mean, squared_norm, scale, opacity, color):
+def are_usable(mean, squared_norm, scale, opacity, color):
     """Whether all numbers are finite, scales are not negative, and the quaternion has a direction."""
     # 0 times infinity or NaN is NaN.
     none = (0.0, 0.0, 0.0)
@@ -165,7 +165,7 @@ def _are_usable(mean, squared_norm, scale, opacity, color):
 
 
 @inline
-def _tile(position, edge):
+def tile_at(position, edge):
     """Column or row of the tile at a position, clamped to those in the image; finite whatever the position."""
     return larger(smaller(floor(mul(position, 1.0 / layout.TILE)), floor(mul(edge, 1.0 / layout.TILE))), 0.0)
 

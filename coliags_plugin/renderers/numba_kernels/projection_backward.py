@@ -64,7 +64,7 @@ def gather(counters, projections, bins, entry_sums, gaussian_sums, of_means2d):
         first = take(counters, 0, per_parcel)
         if first >= groups:
             break
-        _clear_undrawn(first, min(first + per_parcel, groups), projections.drawn, gaussian_sums, of_means2d)
+        clear_undrawn(first, min(first + per_parcel, groups), projections.drawn, gaussian_sums, of_means2d)
     while True:
         stretch = take(counters, 1, 1)
         if stretch >= stretches:
@@ -75,7 +75,7 @@ def gather(counters, projections, bins, entry_sums, gaussian_sums, of_means2d):
 
 
 @part
-def _clear_undrawn(first, last, drawn, gaussian_sums, of_means2d):
+def clear_undrawn(first, last, drawn, gaussian_sums, of_means2d):
     """Write zeros for the Gaussians of groups ``first`` to ``last`` that are not drawn."""
     for group in range(first, last):
         flags = drawn[group] ^ 0xFFFF
@@ -218,7 +218,7 @@ def _project_groups_backward(
         of_down = add(of_down, select(shown, fma(of_y, at.offset, to_down), nothing))
         of_forward = add(of_forward, select(shown, fma(of_z, at.offset, to_forward), nothing))
 
-        of_quat = _quaternion_derivative(at.quaternion, of_a, of_b, of_c)
+        of_quat = quaternion_derivative(at.quaternion, of_a, of_b, of_c)
         # Its length does not matter.
         along = dot(of_quat, at.quaternion, 0.0)
         of_quat = mul(at.inverse_norm, fma(neg(along), at.quaternion, of_quat))
@@ -258,7 +258,7 @@ def _extra_sums(sums, extras):
 
 
 @inline
-def _quaternion_derivative(quaternion, a, b, c):
+def quaternion_derivative(quaternion, a, b, c):
     """Derivative with respect to a unit quaternion, w first, from that with respect to the rows of its rotation."""
     w, x, y, z = quaternion
     turn_x, turn_y, turn_z = sub(c[1], b[2]), sub(a[2], c[0]), sub(b[0], a[1])

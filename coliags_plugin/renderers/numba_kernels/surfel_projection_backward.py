@@ -1,0 +1,251 @@
+"""Backward pass of the projection of surfels: gradients of surfels and camera pose from sums over entries.
+
+With P = p + u a + v b the intersection of a ray with the disc's plane, (A, B, N) the functions of a ray in
+``surfel_geometry`` and (g_u, g_v, g_z) the derivatives with respect to u, v and z,
+
+    dL/dP = -(g_u A / s_u + g_v B / s_v - (g_u u + g_v v + g_z z) N)
+
+so the sums of ``surfel_layout``, of these three factors times 1, u and v, suffice for p, a and b.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from coliags_plugin.renderers.numba_kernels import layout, surfel_layout
+from coliags_plugin.renderers.numba_kernels.compilation import inline, kernel, part
+from coliags_plugin.renderers.numba_kernels.lanes import (
+    add,
+    broadcast,
+    broadcast_all,
+    div,
+    dot,
+    fma,
+    from_bits,
+    greater,
+    lane,
+    lane_sums,
+    load,
+    load_columns,
+    mul,
+    narrow,
+    neg,
+    number,
+    prefetch,
+    prefetch_to_write,
+    repeat,
+    select,
+    splat,
+    store,
+    store_columns,
+    sub,
+    widen,
+)
+from coliags_plugin.renderers.numba_kernels.projection_backward import clear_undrawn, quaternion_derivative
+from coliags_plugin.renderers.numba_kernels.sorting import NUMBER
+from coliags_plugin.renderers.numba_kernels.surfel_geometry import place
+from coliags_plugin.renderers.numba_kernels.threads import take
+
+#: Turns products of two of the scaled e and f into those of standard deviations; and of one.
+_PLAIN_SQUARE = 1.0 / layout.U_FACTOR_SQUARED
+_PLAIN = 1.0 / layout.U_FACTOR
+#: Prefetch distance, surfels.
+_AHEAD = 16
+
+
+@kernel
+def gather_surfels(counters, records, drawn, bins, view, channels, entry_sums, surfel_sums, of_means2d):
+    """Sum the gradient sums of each surfel's entries.
+
+    Args:
+        counters: Work counters for dynamic scheduling; entries 0 and 1 must be 0.
+        records, drawn, bins: What projection and binning wrote.
+        view: See ``layout``.
+        channels: Any tuple as long as there are channels.
+        entry_sums: What the backward sweep wrote.
+        surfel_sums: Out: likewise, padded to whole groups; 0 where not drawn. [16 for each surfel, and perhaps 1]
+        of_means2d: Out: derivative with respect to the projected centres, likewise. [2 for each surfel]
+    """
+    groups, count, stretches = len(drawn), len(bins.keys), len(bins.stretch_entries) - 1
+    per_parcel = layout.PARCEL // layout.GROUP
+    while True:
+        first = take(counters, 0, per_parcel)
+        if first >= groups:
+            break
+        last = min(first + per_parcel, groups)
+        clear_undrawn(first, last, drawn, surfel_sums, of_means2d)
+        if len(channels) > surfel_layout.ROW_CHANNELS:
+            for group in range(first, last):
+                if drawn[group] != 0xFFFF:
+                    _clear_further(group, drawn[group], groups, surfel_sums)
+    while True:
+        stretch = take(counters, 1, 1)
+        if stretch >= stretches:
+            break
+        first, last = count * stretch // stretches, count * (stretch + 1) // stretches
+        entry = bins.stretch_entries[stretch]
+        _gather_stretch(first, last, entry, groups, records, bins, view, channels, entry_sums, surfel_sums, of_means2d)
+
+
+@part
+def _clear_further(group, flags, groups, surfel_sums):
+    """Write zeros for the seventeenth sums of a group's surfels that are not drawn."""
+    first = layout.GROUP * (layout.ROW * groups + group)
+    for place in range(layout.GROUP):
+        if not flags >> place & 1:
+            surfel_sums[first + place] = 0.0
+
+
+@part
+def _gather_stretch(first, last, entry, groups, records, bins, view, channels, entry_sums, surfel_sums, of_means2d):
+    """Surfels with indices ``first`` to ``last`` in the sorted list, whose entries are those from ``entry`` on."""
+    scale, square = number(view, layout.VIEW_PIXEL_SCALE), np.float32(_PLAIN_SQUARE)
+    entries_further, surfels_further = layout.ROW * bins.starts[-1], layout.ROW * layout.GROUP * groups
+    for place in range(first, last):
+        ahead = bins.keys[min(place + _AHEAD, last - 1)] & NUMBER
+        prefetch(records, layout.ROW * ahead)
+        prefetch_to_write(surfel_sums, layout.ROW * ahead)
+        prefetch_to_write(of_means2d, 2 * ahead)
+        index = bins.keys[place] & NUMBER
+        row = layout.ROW * index
+        total, further = splat(0.0), np.float32(0.0)
+        for _ in range(bins.entry_counts[place]):
+            total = add(total, load(entry_sums, layout.ROW * entry))
+            if len(channels) > surfel_layout.ROW_CHANNELS:
+                further += number(entry_sums, entries_further + entry)
+            entry += 1
+        store(surfel_sums, row, total)
+        if len(channels) > surfel_layout.ROW_CHANNELS:
+            surfel_sums[surfels_further + index] = further
+        e, f = square * lane(total, surfel_layout.SUM_E), square * lane(total, surfel_layout.SUM_F)
+        c = lane(total, surfel_layout.SUM_C)
+        for axis in range(2):
+            of_center = number(records, row + surfel_layout.U_X + axis) * e
+            of_center += number(records, row + surfel_layout.V_X + axis) * f
+            of_center += number(records, row + surfel_layout.Q_X + axis) * c
+            of_means2d[2 * index + axis] = scale * of_center
+
+
+@kernel
+def project_surfels_backward(
+    counters, count, surfels, tail, view, channels, drawn, surfel_sums, given_means2d, of_surfels, of_pose
+):
+    """Derivatives of the loss with respect to surfels and pose, from the sums of each surfel.
+
+    Args:
+        counters: Work counters for dynamic scheduling; entry 0 must be 0.
+        count, surfels, tail, view: As for ``project_surfels``.
+        channels: Any tuple as long as there are channels.
+        drawn: What that wrote.
+        surfel_sums: What :func:`gather_surfels` wrote.
+        given_means2d: Derivative with respect to the projected centres, padded to whole groups. [2 for each surfel]
+        of_surfels: Out, padded to whole groups. [layout.Parameters]
+        of_pose: Out: derivative with respect to the camera's three axes and its centre in the world, one row for each
+            parcel. [16 for each parcel]
+    """
+    whole_groups = count // layout.GROUP
+    per_parcel = layout.PARCEL // layout.GROUP
+    while True:
+        parcel = take(counters, 0, 1)
+        if parcel * layout.PARCEL >= count:
+            break
+        first = parcel * per_parcel
+        last = min(first + per_parcel, whole_groups)
+        pose = _project_groups_backward(
+            first, last, first, repeat(0.0, (0,) * 12), surfels, view, channels, drawn, surfel_sums, given_means2d,
+            of_surfels,
+        )  # fmt: skip
+        if last * layout.GROUP < min((parcel + 1) * layout.PARCEL, count):
+            pose = _project_groups_backward(
+                last, last + 1, 0, pose, tail, view, channels, drawn, surfel_sums, given_means2d, of_surfels
+            )
+        store(of_pose, layout.ROW * parcel, lane_sums(pose))
+
+
+@part
+def _project_groups_backward(
+    first, last, source, pose, surfels, view, channels, drawn, surfel_sums, given_means2d, of_surfels
+):
+    """Groups ``first`` to ``last``, reading from group ``source`` of the surfels on. Returns ``pose``, added to."""
+    three = (0, 0, 0)
+    right = broadcast_all(view, layout.VIEW_RIGHT, three)
+    down = broadcast_all(view, layout.VIEW_DOWN, three)
+    forward = broadcast_all(view, layout.VIEW_FORWARD, three)
+    fx, fy = broadcast(view, layout.VIEW_FX), broadcast(view, layout.VIEW_FY)
+    filtered = mul(_PLAIN_SQUARE, broadcast(view, layout.VIEW_PIXEL_SCALE))
+    of_right, of_down, of_forward, of_center = pose[0:3], pose[3:6], pose[6:9], pose[9:12]
+    nothing = repeat(0.0, three)
+    for group in range(first, last):
+        shown = from_bits(drawn[group])
+        row = layout.GROUP * (group - first + source)
+        mean, scale = load_columns(surfels.means, 3 * row, three), load_columns(surfels.scales, 2 * row, (0, 0))
+        quat, opacity = load_columns(surfels.quats, 4 * row, (0, 0, 0, 0)), load(surfels.opacities, row)
+        at = place(mean, quat, view)
+        row = layout.GROUP * group
+        sums = load_columns(surfel_sums, layout.ROW * row, (0,) * 16)
+        by_x, by_y = load_columns(given_means2d, 2 * row, (0, 0))
+
+        # The filter's centre moves with the surfel, and is no part of the derivative with respect to means2d.
+        by_x = fma(filtered, sums[surfel_layout.SUM_DX], by_x)
+        by_y = fma(filtered, sums[surfel_layout.SUM_DY], by_y)
+        of_x, of_y = mul(mul(fx, by_x), at.inverse_z), mul(mul(fy, by_y), at.inverse_z)
+        lost = fma(of_x, at.x, mul(of_y, at.y))
+        of_z = mul(sub(sums[surfel_layout.SUM_C], lost), at.inverse_z)
+
+        ee, ef, ff = mul(_PLAIN_SQUARE, widen((sums[surfel_layout.SUM_EE], sums[surfel_layout.SUM_EF], sums[surfel_layout.SUM_FF])))
+        ce, cf = mul(mul(_PLAIN, widen((sums[surfel_layout.SUM_CE], sums[surfel_layout.SUM_CF]))), scale)
+        ratio = div(widen(scale[0]), scale[1])
+        of_scale = narrow((div(ee, scale[0]), div(ff, scale[1])))
+        of_first = fma(ee, at.of_first, fma(mul(ef, ratio), at.of_second, mul(ce, at.of_z)))
+        of_second = fma(div(ef, ratio), at.of_first, fma(ff, at.of_second, mul(cf, at.of_z)))
+        of_normal = mul(0.0, at.normal)
+        if len(channels) > 3:
+            # In camera axes, turned by its sign.
+            given = _normal_sums(sums, surfel_sums, layout.ROW * layout.GROUP * len(drawn) + row)
+            given = mul(select(greater(at.height, 0.0), -1.0, 1.0), given)
+            of_normal = fma(given[0], right, fma(given[1], down, mul(widen(given[2]), forward)))
+
+        of_right = _turned(of_right, right, at, of_x, of_first, of_second, of_normal, shown)
+        of_down = _turned(of_down, down, at, of_y, of_first, of_second, of_normal, shown)
+        of_forward = _turned(of_forward, forward, at, of_z, of_first, of_second, of_normal, shown)
+        of_mean = narrow(fma(of_x, right, fma(of_y, down, mul(of_z, forward))))
+        of_mean = select(shown, of_mean, nothing)
+        of_center = sub(of_center, of_mean)
+
+        a = (of_first[0], of_second[0], of_normal[0])
+        b = (of_first[1], of_second[1], of_normal[1])
+        c = (of_first[2], of_second[2], of_normal[2])
+        of_quat = quaternion_derivative(at.quaternion, a, b, c)
+        # Its length does not matter.
+        along = dot(of_quat, at.quaternion, 0.0)
+        of_quat = narrow(mul(at.inverse_norm, fma(neg(along), at.quaternion, of_quat)))
+        of_color = (
+            sums[surfel_layout.SUM_CHANNELS], sums[surfel_layout.SUM_CHANNELS + 1], sums[surfel_layout.SUM_CHANNELS + 2]
+        )  # fmt: skip
+        store_columns(of_surfels.means, 3 * row, of_mean)
+        store_columns(of_surfels.quats, 4 * row, select(shown, of_quat, repeat(0.0, (0, 0, 0, 0))))
+        store_columns(of_surfels.scales, 2 * row, select(shown, of_scale, repeat(0.0, (0, 0))))
+        store(of_surfels.opacities, row, select(shown, div(sums[surfel_layout.SUM_V], opacity), 0.0))
+        store_columns(of_surfels.colors, 3 * row, select(shown, of_color, nothing))
+    return of_right + of_down + of_forward + of_center
+
+
+@inline
+def _normal_sums(sums, surfel_sums, further):
+    """The sums of the normal's components; the last is behind the rows of sixteen."""
+    first = surfel_layout.SUM_CHANNELS + 3
+    return sums[first], sums[first + 1], load(surfel_sums, further)
+
+
+@inline
+def _turned(total, axis, at, of_offset, of_first, of_second, of_normal, shown):
+    """Derivative with respect to one of the camera's axes, added to ``total``.
+
+    All depend on this axis by the products with it of offset and local axes, whose derivatives are ``of_offset`` and the
+    products of the axis with those of the local axes.
+    """
+    change = mul(of_offset, at.offset)
+    change = fma(dot(axis, of_first, 0.0), at.first, change)
+    change = fma(dot(axis, of_second, 0.0), at.second, change)
+    change = narrow(fma(dot(axis, of_normal, 0.0), at.normal, change))
+    return add(total, select(shown, change, (0.0, 0.0, 0.0)))
