@@ -16,22 +16,23 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput, Splats
-from coliags_plugin.renderers.checks import check_gaussian_outputs
+from coliags_plugin.renderers.checks import check_gaussian_outputs, is_surfels
 from coliags_plugin.renderers.projection import JACOBIAN_MARGIN
 from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer
 
-#: Tensors of the Gaussians and the width of their rows; None for one-dimensional ones.
+#: Tensors of the Gaussians and the width of their rows; None for one-dimensional ones. Surfels have two scales.
 _SHAPES = {"means": 3, "quats_wxyz": 4, "scales": 3, "opacities": None, "colors": 3}
-#: Names of the images in the order of the kernels.
-_IMAGES = (
-    "rgb",
-    "alpha",
-    "depth_accumulated",
-    "inverse_depth_accumulated",
-    "depth_expected",
-    "normals",
-    "depth_median",
-)
+#: Output by name of the kernels' image.
+_IMAGES = {
+    "rgb": "rgb",
+    "alpha": "alpha",
+    "depth": "depth_accumulated",
+    "inverse_depth": "inverse_depth_accumulated",
+    "expected": "depth_expected",
+    "normals": "normals",
+    "median": "depth_median",
+    "distortion": "distortion",
+}
 
 
 class CpuRendererSettings(CutSettings):
@@ -39,10 +40,10 @@ class CpuRendererSettings(CutSettings):
 
 
 class CpuRenderer(SplattingRenderer):
-    """CPU renderer of float32 Gaussians by numba kernels. See ``docs/rendering.md``, section "The cpu backend"."""
+    """CPU renderer of float32 3D Gaussians and surfels: ``docs/rendering.md``, section "The cpu backend"."""
 
     Settings = CpuRendererSettings
-    primitives: ClassVar[frozenset[str]] = frozenset({"gaussians3d"})
+    primitives: ClassVar[frozenset[str]] = frozenset({"gaussians3d", "surfels"})
     devices: ClassVar[frozenset[str]] = frozenset({"cpu"})
     name: ClassVar[str] = "cpu"
 
@@ -66,40 +67,35 @@ def render_gaussians(
     wants: Sequence[str] = ("rgb", "alpha"),
     settings: CpuRendererSettings | None = None,
 ) -> RenderOutput:
-    """Render 3D Gaussians from a camera.
+    """Render 3D Gaussians, or surfels where they have two scales, from a camera.
 
-    Everything but ``depth_median`` and ``radii`` is differentiable, once, in the Gaussians and in
+    Everything but ``radii`` and, of 3D Gaussians, ``depth_median`` is differentiable, once, in the Gaussians and in
     ``camera.camera_to_world``; ``means2d.grad`` is set by ``backward``. The first call on a machine compiles the
     kernels, which takes about half a minute.
 
     Args:
-        gaussians: 3D Gaussians, float32, on the CPU.
+        gaussians: Float32, on the CPU.
         camera: Camera of the view; its pose is cast to float32.
         wants: Names from :data:`coliags_plugin.core.render_output.OUTPUTS`; rgb and alpha are always included.
         settings: Defaults if None.
 
     Raises:
-        InputError: An output is unknown; a tensor is of the wrong shape, dtype or device; a Gaussian is not finite, has
-            a quaternion of length 0 or a negative scale; the camera's parameters are not usable.
+        InputError: An output is unknown or not of these Gaussians; a tensor is of the wrong shape, dtype or device; a
+            Gaussian is not finite, has a quaternion of length 0 or a negative scale; the camera cannot be used.
     """
     from coliags_plugin.renderers.numba_kernels import autograd, layout, pipeline
+    from coliags_plugin.renderers.numba_kernels.gaussian_pipeline import GaussianPipeline
+    from coliags_plugin.renderers.numba_kernels.surfel_pipeline import SurfelPipeline
 
     settings = settings or CpuRendererSettings()
     check_gaussian_outputs(wants, gaussians)
     _check_tensors(gaussians)
     pose = camera.camera_to_world.to(device="cpu", dtype=torch.float32)
-    view = pipeline.Pipeline(
-        _view_table(camera, pose, settings),
-        camera.width,
-        camera.height,
-        layout.Extras(
-            depth="depth_accumulated" in wants or "depth_expected" in wants,
-            inverse_depth="inverse_depth_accumulated" in wants,
-            normals="normals" in wants,
-        ),
-        expected="depth_expected" in wants,
-        median="depth_median" in wants,
-    )
+    wanted = {image for image, name in _IMAGES.items() if name in ("rgb", "alpha", *wants)}
+    if "expected" in wanted:
+        wanted.add("depth")
+    stages = SurfelPipeline if is_surfels(gaussians) else GaussianPipeline
+    view = stages(_view_table(camera, pose, settings), camera.width, camera.height, wanted)
     channels = [name for name in wants if name in gaussians.features]
     try:
         means2d, radii, images, features = autograd.render(
@@ -116,7 +112,7 @@ def render_gaussians(
             "less than 2^31",
             "Check their scales",
         ) from None
-    by_name: dict[str, Tensor] = dict(zip(_IMAGES, images, strict=True))
+    by_name: dict[str, Tensor] = {name: getattr(images, image) for image, name in _IMAGES.items()}
     by_name |= dict(zip(channels, features, strict=True))
     maps = {name: by_name[name] for name in wants if name not in ("rgb", "alpha")}
     return RenderOutput(images.rgb, images.alpha, camera, maps, Splats(gaussians, means2d, radii))
@@ -143,6 +139,7 @@ def _view_table(camera: Camera, pose: Tensor, settings: CpuRendererSettings) -> 
         *(settings.near_plane, settings.eps2d, camera.width, camera.height),
         *(math.log2(settings.alpha_min), settings.alpha_max, settings.transmittance_min),
         *settings.background,
+        *(math.sqrt(0.5 / math.log(2.0)) / settings.surfel_filter, settings.distortion_slope**2),
     ]
     if not np.isfinite(table).all():
         raise InputError(f"a camera with numbers that are not finite: {camera}", "finite intrinsics and pose")
@@ -152,16 +149,15 @@ def _view_table(camera: Camera, pose: Tensor, settings: CpuRendererSettings) -> 
 def _check_tensors(gaussians: Gaussians) -> None:
     """Check shape, dtype and device; values are checked during projection."""
     count = len(gaussians.means) if gaussians.means.ndim else 0
-    checked = [(name, getattr(gaussians, name), width) for name, width in _SHAPES.items()]
+    shapes = {**_SHAPES, "scales": 2 if is_surfels(gaussians) else 3}
+    checked = [(name, getattr(gaussians, name), width) for name, width in shapes.items()]
     checked += [(f"feature {name}", value, value.shape[1]) for name, value in gaussians.features.items()]
     for name, tensor, width in checked:
         shape = (count,) if width is None else (count, width)
         if tuple(tensor.shape) != shape:
             raise InputError(
                 f"{name} of shape {list(tensor.shape)}",
-                f"{list(shape)}, for means of shape {list(gaussians.means.shape)}"
-                + ("; three scales each" if name == "scales" else ""),
-                "Choose a renderer that serves surfels" if name == "scales" and tensor.shape[-1:] == (2,) else "",
+                f"{list(shape)}, for means of shape {list(gaussians.means.shape)}",
             )
         if tensor.dtype != torch.float32:
             raise InputError(

@@ -1,4 +1,9 @@
-"""Autograd functions of the pipeline: Gaussians -> records, records -> images, records -> feature images."""
+"""Autograd functions of the pipeline: Gaussians -> projections -> images and feature images.
+
+Between them goes, beside the projected centres, a tensor of links, whose content does not matter: the gradients it
+receives are the sums that the layouts describe, from which the derivatives of the Gaussians follow more directly and with
+less cancellation than from those of the projections.
+"""
 
 from __future__ import annotations
 
@@ -33,33 +38,29 @@ def render(
         UnusableGaussianError: A Gaussian is not finite, has no direction or a negative scale.
         TooManyPairsError: The Gaussians cover too many tiles.
     """
-    means2d, records, radii = _Project.apply(*gaussians, pose, pipeline)  # type: ignore[no-untyped-call]
+    means2d, links, radii = _Project.apply(*gaussians, pose, pipeline)  # type: ignore[no-untyped-call]
     if means2d.requires_grad:
         means2d.retain_grad()
-    images = _Composite.apply(means2d, records, pipeline)  # type: ignore[no-untyped-call]
+    images = _Composite.apply(means2d, links, pipeline)  # type: ignore[no-untyped-call]
     channels: list[Tensor] = []
     if features:
-        drawn = _CompositeFeatures.apply(means2d, records, torch.cat(list(features), dim=1), pipeline)  # type: ignore[no-untyped-call]
+        drawn = _CompositeFeatures.apply(means2d, links, torch.cat(list(features), dim=1), pipeline)  # type: ignore[no-untyped-call]
         channels = list(torch.split(drawn, [feature.shape[1] for feature in features], dim=-1))
     return means2d, radii, layout.Images(*images), channels
 
 
 class _Project(torch.autograd.Function):
-    """Gaussians -> projected centres, records, radii.
-
-    The gradients received for ``records`` are sums that ``layout`` describes, not derivatives of its columns: the
-    derivatives of the Gaussians follow from them more directly and without cancellation.
-    """
+    """Gaussians -> projected centres, links, radii."""
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
         *gaussians, _, pipeline = arguments
-        means2d, radii, records = (torch.from_numpy(array) for array in pipeline.project(_flat_gaussians(gaussians)))
+        means2d, radii, links = (torch.from_numpy(array) for array in pipeline.project(_flat_gaussians(gaussians)))
         ctx.save_for_backward(*gaussians)
         ctx.pipeline = pipeline
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(radii)
-        return means2d, records, radii
+        return means2d, links, radii
 
     @staticmethod
     @once_differentiable
@@ -73,16 +74,16 @@ class _Project(torch.autograd.Function):
 
 
 class _Composite(torch.autograd.Function):
-    """Projected centres and records -> images. The records contain the centres' values, too."""
+    """Projected centres and links -> images."""
 
     @staticmethod
-    def forward(ctx: Any, means2d: Tensor, records: Tensor, pipeline: Pipeline) -> tuple[Tensor | None, ...]:
+    def forward(ctx: Any, means2d: Tensor, links: Tensor, pipeline: Pipeline) -> tuple[Tensor | None, ...]:
         arrays = pipeline.composite()
         images = layout.Images(*(None if array is None else torch.from_numpy(array) for array in arrays))
         ctx.pipeline = pipeline
         ctx.set_materialize_grads(False)
-        if images.median is not None:
-            ctx.mark_non_differentiable(images.median)
+        constant = [getattr(images, name) for name in pipeline.constant_images]
+        ctx.mark_non_differentiable(*(image for image in constant if image is not None))
         return tuple(images)
 
     @staticmethod
@@ -95,10 +96,10 @@ class _Composite(torch.autograd.Function):
 
 
 class _CompositeFeatures(torch.autograd.Function):
-    """Projected centres, records and features -> the features' images, after :class:`_Composite`."""
+    """Projected centres, links and features -> the features' images, after :class:`_Composite`."""
 
     @staticmethod
-    def forward(ctx: Any, means2d: Tensor, records: Tensor, features: Tensor, pipeline: Pipeline) -> Tensor:
+    def forward(ctx: Any, means2d: Tensor, links: Tensor, features: Tensor, pipeline: Pipeline) -> Tensor:
         ctx.save_for_backward(features)
         ctx.pipeline = pipeline
         return torch.from_numpy(pipeline.composite_features(np.asarray(features.detach().contiguous())))

@@ -14,6 +14,7 @@ class GaussianPipeline(Pipeline):
     """Rendering of 3D Gaussians. What layers composite of their own are extras and the median depth."""
 
     scales: ClassVar[int] = 3
+    constant_images: ClassVar[tuple[str, ...]] = ("median",)
     first_channel: ClassVar[int] = layout.CHANNELS
     first_channel_sum: ClassVar[int] = layout.SUM_CHANNELS
     feature_channels: ClassVar[int] = layout.MAX_CHANNELS

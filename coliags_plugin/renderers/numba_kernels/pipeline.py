@@ -64,6 +64,8 @@ class Pipeline(ABC):
 
     #: Scales of a Gaussian.
     scales: ClassVar[int]
+    #: Images without derivatives.
+    constant_images: ClassVar[tuple[str, ...]]
     #: First of the channels' columns of records, and of sums.
     first_channel: ClassVar[int]
     first_channel_sum: ClassVar[int]
@@ -415,6 +417,7 @@ class Run:
         self.workers = workers
 
     def __call__(self, kernel: Callable[..., Any], *arguments: Any) -> None:
+        """Run a kernel, which gets four work counters first."""
         _crew.run(self.workers, kernel, np.zeros(4, np.int64), *arguments)
 
 

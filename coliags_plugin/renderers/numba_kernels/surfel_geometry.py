@@ -60,7 +60,7 @@ class Placed(NamedTuple):
 
 
 @inline
-def place(mean, quat, view):
+def place_surfels(mean, quat, view):
     """Everything but scales. ``mean`` and ``quat`` are tuples of lanes, ``view`` the table ``layout`` describes."""
     offset = sub(widen(mean), broadcast_all(view, layout.VIEW_CENTER, (0, 0, 0)))
     z = dot(offset, broadcast_all(view, layout.VIEW_FORWARD, (0, 0, 0)), 0.0)

@@ -19,6 +19,7 @@ class SurfelPipeline(Pipeline):
     """Rendering of surfels. What layers composite of their own are measures, which differ from pixel to pixel."""
 
     scales: ClassVar[int] = 2
+    constant_images: ClassVar[tuple[str, ...]] = ()
     first_channel: ClassVar[int] = surfel_layout.CHANNELS
     first_channel_sum: ClassVar[int] = surfel_layout.SUM_CHANNELS
     feature_channels: ClassVar[int] = surfel_layout.ROW_CHANNELS
@@ -27,9 +28,7 @@ class SurfelPipeline(Pipeline):
     _outline_rows: Array
 
     def _main_layer(self) -> Layer:
-        measures = surfel_layout.Measures(
-            *((0,) * (name in self._wanted) for name in surfel_layout.Measures._fields)
-        )
+        measures = surfel_layout.Measures(*((0,) * (name in self._wanted) for name in surfel_layout.Measures._fields))
         channels = (0,) * (3 + 3 * ("normals" in self._wanted))
         return Layer(self._projections.records, self._view, channels, measures)
 

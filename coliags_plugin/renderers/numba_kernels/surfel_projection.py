@@ -5,7 +5,7 @@ The formulas are those of ``docs/rendering.md``, section "Surfels".
 
 from __future__ import annotations
 
-from coliags_plugin.renderers.numba_kernels import layout, surfel_layout
+from coliags_plugin.renderers.numba_kernels import layout
 from coliags_plugin.renderers.numba_kernels.compilation import inline, kernel, part
 from coliags_plugin.renderers.numba_kernels.geometry import squared_distance_to_box
 from coliags_plugin.renderers.numba_kernels.lanes import (
@@ -41,7 +41,7 @@ from coliags_plugin.renderers.numba_kernels.lanes import (
     sub,
 )
 from coliags_plugin.renderers.numba_kernels.projection import are_usable, tile_at
-from coliags_plugin.renderers.numba_kernels.surfel_geometry import place
+from coliags_plugin.renderers.numba_kernels.surfel_geometry import place_surfels
 from coliags_plugin.renderers.numba_kernels.threads import take
 
 #: Added to the squared distance to the rim, in standard deviations, and to the squared half-axes of its image, square
@@ -110,7 +110,7 @@ def _project_groups(first, last, source, surfels, view, projections, outlines, m
         squared_norm = dot(quat, quat, 0.0)
         all_scales = (scale[0], scale[1], scale[1])
         usable = usable and bits(are_usable(mean, squared_norm, all_scales, opacity, color)) == 0xFFFF
-        at = place(mean, quat, view)
+        at = place_surfels(mean, quat, view)
 
         slope_x, slope_y = mul(at.x, at.inverse_z), mul(at.y, at.inverse_z)
         mean_x = narrow(fma(fx, slope_x, broadcast(view, layout.VIEW_CX)))
@@ -145,7 +145,12 @@ def _project_groups(first, last, source, surfels, view, projections, outlines, m
         u_xx, u_yy = select(crosses, 0.0, (u_xx, u_yy))
         u_yx = neg(mul(u_yy, slope_upright))
 
-        left, end, top, bottom = sub(0.5, center_x), sub(right_edge, center_x), sub(0.5, center_y), sub(bottom_edge, center_y)
+        left, end, top, bottom = (
+            sub(0.5, center_x),
+            sub(right_edge, center_x),
+            sub(0.5, center_y),
+            sub(bottom_edge, center_y),
+        )
         in_ellipse = squared_distance_to_box(u_xx, u_yx, u_yy, slope_upright, slope_level, left, end, top, bottom)
         out_x = sub(smaller(larger(mean_x, 0.5), right_edge), mean_x)
         out_y = sub(smaller(larger(mean_y, 0.5), bottom_edge), mean_y)
@@ -156,8 +161,14 @@ def _project_groups(first, last, source, surfels, view, projections, outlines, m
         shown = both(shown, either(less(at.height, 0.0), greater(at.height, 0.0)))
 
         half_x, half_y, radius = sqrt(xx), sqrt(yy), div(sqrt(level), pixel_scale)
-        left, end = smaller(sub(center_x, half_x), sub(mean_x, radius)), larger(add(center_x, half_x), add(mean_x, radius))
-        top, bottom = smaller(sub(center_y, half_y), sub(mean_y, radius)), larger(add(center_y, half_y), add(mean_y, radius))
+        left, end = (
+            smaller(sub(center_x, half_x), sub(mean_x, radius)),
+            larger(add(center_x, half_x), add(mean_x, radius)),
+        )
+        top, bottom = (
+            smaller(sub(center_y, half_y), sub(mean_y, radius)),
+            larger(add(center_y, half_y), add(mean_y, radius)),
+        )
         half = select(crosses, half_size, mul(0.5, larger(sub(end, left), sub(bottom, top))))
         store(radii, layout.GROUP * group, select(shown, ceil(half), 0.0))
         left, end = select(crosses, 0.0, left), select(crosses, right_edge, end)

@@ -43,7 +43,7 @@ from coliags_plugin.renderers.numba_kernels.lanes import (
 )
 from coliags_plugin.renderers.numba_kernels.projection_backward import clear_undrawn, quaternion_derivative
 from coliags_plugin.renderers.numba_kernels.sorting import NUMBER
-from coliags_plugin.renderers.numba_kernels.surfel_geometry import place
+from coliags_plugin.renderers.numba_kernels.surfel_geometry import place_surfels
 from coliags_plugin.renderers.numba_kernels.threads import take
 
 #: Turns products of two of the scaled e and f into those of standard deviations; and of one.
@@ -180,7 +180,7 @@ def _project_groups_backward(
         row = layout.GROUP * (group - first + source)
         mean, scale = load_columns(surfels.means, 3 * row, three), load_columns(surfels.scales, 2 * row, (0, 0))
         quat, opacity = load_columns(surfels.quats, 4 * row, (0, 0, 0, 0)), load(surfels.opacities, row)
-        at = place(mean, quat, view)
+        at = place_surfels(mean, quat, view)
         row = layout.GROUP * group
         sums = load_columns(surfel_sums, layout.ROW * row, (0,) * 16)
         by_x, by_y = load_columns(given_means2d, 2 * row, (0, 0))
@@ -192,7 +192,9 @@ def _project_groups_backward(
         lost = fma(of_x, at.x, mul(of_y, at.y))
         of_z = mul(sub(sums[surfel_layout.SUM_C], lost), at.inverse_z)
 
-        ee, ef, ff = mul(_PLAIN_SQUARE, widen((sums[surfel_layout.SUM_EE], sums[surfel_layout.SUM_EF], sums[surfel_layout.SUM_FF])))
+        ee, ef, ff = mul(
+            _PLAIN_SQUARE, widen((sums[surfel_layout.SUM_EE], sums[surfel_layout.SUM_EF], sums[surfel_layout.SUM_FF]))
+        )
         ce, cf = mul(mul(_PLAIN, widen((sums[surfel_layout.SUM_CE], sums[surfel_layout.SUM_CF]))), scale)
         ratio = div(widen(scale[0]), scale[1])
         of_scale = narrow((div(ee, scale[0]), div(ff, scale[1])))

@@ -35,7 +35,6 @@ from coliags_plugin.renderers.numba_kernels.lanes import (
     smaller,
     splat,
     store,
-    store_all,
     store_lane_sums,
     sub,
 )
@@ -200,7 +199,17 @@ def _sweep_tile(tile, records, bins, view, grid, channels, measures, rows, state
             row, mine = FETCHED * (entry - first), blocks[entry - first] & alive
             number = cells[layout.CELL * entry + 2]
             alive = _sweep_entry(
-                row, mine, alive, rows, channels, measures, view, state, layout.ROW * number, further + number, entry_sums
+                row,
+                mine,
+                alive,
+                rows,
+                channels,
+                measures,
+                view,
+                state,
+                layout.ROW * number,
+                further + number,
+                entry_sums,
             )
         first = end
 
