@@ -1,10 +1,13 @@
-"""Milliseconds of drawing one view and of its gradients, by renderer and number of Gaussians.
+"""Milliseconds of drawing one view and of its gradients, by renderer, primitive and number of Gaussians.
 
     python benchmarks/rasterizer.py --counts 20000,50000,100000,200000 --backends torch,cpu --json FILE
 
 Projection, sorting, compositing of colour, alpha and depth, and, for the second figure, the gradients of means,
-quaternions, scales, opacities and colours. Renderers take turns, so that what else the machine does hits all of them;
-figures are medians. A renderer so slow that all its turns would take longer than --patience skips some.
+quaternions, scales, opacities and colours. Renderers and primitives take turns, so that what else the machine does hits
+all of them; figures are medians. A renderer so slow that all its turns would take longer than --patience skips some.
+
+Surfels have the first two scales of the 3D Gaussians, and so do flat 3D Gaussians, whose third is a thousandth of the
+smaller: what surfels cost in addition is their ratio to these.
 
 On a machine that is busy with other work, --threads 1 --clock processor counts only the time that it gave to this.
 """
@@ -35,6 +38,9 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.renderers.choice import choose_renderer
 
+#: What is drawn, and the renderers' name for it.
+PRIMITIVES = {"gaussians3d": "gaussians3d", "flat": "gaussians3d", "surfels": "surfels"}
+FLATNESS = 1e-3
 INPUTS = ("means", "quats_wxyz", "scales", "opacities", "colors")
 WANTS = ("rgb", "alpha", "depth_accumulated")
 #: Turns at least, however slow.
@@ -49,6 +55,8 @@ class Options:
     """Numbers of Gaussians, comma separated."""
     backends: str = "torch,cpu"
     """Renderers by name, comma separated; gsplat needs a CUDA device. Ratios are to the first."""
+    primitives: str = "gaussians3d"
+    """Primitives, comma separated: gaussians3d, flat, surfels. The last column is their time relative to the first."""
     repeats: int = 25
     """Timed turns; two more come first to warm up."""
     threads: int | None = None
@@ -62,10 +70,13 @@ class Options:
 
 
 class Case:
-    """One renderer with one set of Gaussians, on the device it runs on."""
+    """One renderer with one set of Gaussians of one primitive, on the device it runs on."""
 
-    def __init__(self, renderer: Renderer, device: torch.device, gaussians: Gaussians, clock: str) -> None:
+    def __init__(
+        self, renderer: Renderer, device: torch.device, primitive: str, gaussians: Gaussians, clock: str
+    ) -> None:
         self.renderer = renderer
+        self.primitive = primitive
         self.device = device
         self.clock = time.perf_counter if clock == "wall" else time.process_time
         moved = {name: getattr(gaussians, name).to(device).requires_grad_() for name in INPUTS}
@@ -84,7 +95,7 @@ class Case:
         for name in INPUTS:
             getattr(self.gaussians, name).grad = None
         began = self._now()
-        output = self.renderer.render(Handed(self.gaussians, "gaussians3d"), self.camera, WANTS)
+        output = self.renderer.render(Handed(self.gaussians, self.primitive), self.camera, WANTS)
         drawn = self._now()
         torch.autograd.backward([output[name] for name in WANTS], self.cotangents)
         return 1e3 * (drawn - began), 1e3 * (self._now() - began)
@@ -105,7 +116,15 @@ class Case:
         return self.clock()
 
 
-def find_renderers(names: list[str]) -> dict[str, tuple[Renderer, torch.device]]:
+def shaped(gaussians: Gaussians, primitive: str) -> Gaussians:
+    """The same Gaussians as flat ones or as surfels."""
+    scales = gaussians.scales[:, :2].contiguous()
+    if primitive == "flat":
+        scales = torch.cat([scales, FLATNESS * scales.amin(dim=1, keepdim=True)], dim=1)
+    return gaussians if primitive == "gaussians3d" else replace(gaussians, scales=scales)
+
+
+def find_renderers(names: list[str], primitive: str) -> dict[str, tuple[Renderer, torch.device]]:
     """Each renderer and where it runs: on the CPU if it can.
 
     Raises:
@@ -115,13 +134,13 @@ def find_renderers(names: list[str]) -> dict[str, tuple[Renderer, torch.device]]
     for name in names:
         devices = getattr(REGISTRIES["renderers"].get(name), "devices", {"cpu"})
         device = torch.device("cpu" if "cpu" in devices else "cuda")
-        found[name] = (choose_renderer(make_component("renderers", name), "gaussians3d", device).renderer, device)
+        found[name] = (choose_renderer(make_component("renderers", name), primitive, device).renderer, device)
     return found
 
 
-def measure(cases: dict[str, Case], repeats: int, patience: float) -> None:
+def measure(cases: dict[tuple[str, str], Case], repeats: int, patience: float) -> None:
     """Let the cases take turns."""
-    turns: dict[str, int] = {}
+    turns: dict[tuple[str, str], int] = {}
     for name, case in cases.items():
         case.draw()
         seconds = case.draw()[1] / 1e3
@@ -136,21 +155,32 @@ def main(options: Options) -> None:
     """Run, print a table, and write JSON where asked."""
     if options.threads is not None:
         torch.set_num_threads(options.threads)
-    names = options.backends.split(",")
-    renderers = find_renderers(names)
+    names, primitives = options.backends.split(","), options.primitives.split(",")
+    for primitive in primitives:
+        if primitive not in PRIMITIVES:
+            raise InputError(f"no primitive '{primitive}'", f"some of {', '.join(PRIMITIVES)}")
+    renderers = {primitive: find_renderers(names, PRIMITIVES[primitive]) for primitive in primitives}
     rows: list[dict[str, Any]] = []
     shown: list[dict[str, Any]] = []
     for count in map(int, options.counts.split(",")):
         gaussians = wall(count)
-        cases = {name: Case(*renderers[name], gaussians, options.clock) for name in names}
+        cases = {
+            (name, primitive): Case(
+                *renderers[primitive][name], PRIMITIVES[primitive], shaped(gaussians, primitive), options.clock
+            )
+            for name in names
+            for primitive in primitives
+        }
         measure(cases, options.repeats, options.patience)
-        medians = {name: case.medians() for name, case in cases.items()}
-        for name, (forward, both) in medians.items():
-            row = {"backend": name, "count": count, "forward_ms": forward, "forward_backward_ms": both}
+        medians = {case: cases[case].medians() for case in cases}
+        for (name, primitive), (forward, both) in medians.items():
+            row = {"backend": name, "primitive": primitive, "count": count}
+            row |= {"forward_ms": forward, "forward_backward_ms": both}
             rows.append(row)
-            first_forward, first_both = medians[names[0]]
+            first_forward, first_both = medians[names[0], primitive]
             ratios = {"faster, forward": first_forward / forward, "faster, both": first_both / both}
-            shown.append({**row, **ratios, "turns": len(cases[name].both)})
+            ratios[f"both, of {primitives[0]}"] = both / medians[name, primitives[0]][1]
+            shown.append({**row, **ratios, "turns": len(cases[name, primitive].both)})
     print(", ".join(f"{key}: {value}" for key, value in describe_machine().items()), end="\n\n")
     print(markdown_table(shown))
     write_results(options.json, rows)
