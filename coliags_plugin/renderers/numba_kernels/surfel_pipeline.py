@@ -26,6 +26,7 @@ class SurfelPipeline(Pipeline):
     feature_images: ClassVar[tuple[str, ...]] = ("rgb", "normals")
 
     _outline_rows: Array
+    _remainders: Array
 
     def _main_layer(self) -> Layer:
         measures = surfel_layout.Measures(*((0,) * (name in self._wanted) for name in surfel_layout.Measures._fields))
@@ -48,14 +49,15 @@ class SurfelPipeline(Pipeline):
 
     def _run_project(self, run: Run, gaussians: layout.Parameters, means2d: Array, radii: Array) -> None:
         self._outline_rows = self._arena.take("outlines", len(self._projections.records))
+        self._remainders = self._arena.take("remainders", len(means2d))
         run(
             project_surfels, self._count, gaussians, self._tail, self._view, self._projections, self._outline_rows,
-            means2d, radii,
+            self._remainders, means2d, radii,
         )  # fmt: skip
 
     def _run_sweep(self, run: Run, layer: Layer, composited: Array, images: layout.Images) -> None:
         run(
-            surfel_sweep_forward.sweep_surfels, layer.records, self._bins, layer.view, self._grid, layer.channels,
+            surfel_sweep_forward.sweep_surfels, layer.records, self._remainders, self._bins, layer.view, self._grid, layer.channels,
             layer.own, self._scratch(run, surfel_sweep_forward), composited, images,
         )  # fmt: skip
 
@@ -63,7 +65,7 @@ class SurfelPipeline(Pipeline):
         self, run: Run, layer: Layer, composited: Array, of_images: layout.Images, entry_sums: Array
     ) -> None:
         run(
-            surfel_sweep_backward.sweep_surfels_backward, layer.records, self._bins, layer.view, self._grid,
+            surfel_sweep_backward.sweep_surfels_backward, layer.records, self._remainders, self._bins, layer.view, self._grid,
             layer.channels, layer.own, self._scratch(run, surfel_sweep_backward), composited, of_images, entry_sums,
         )  # fmt: skip
 

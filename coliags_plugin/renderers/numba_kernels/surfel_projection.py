@@ -53,7 +53,7 @@ _LARGEST_SLOPE = 1e10
 
 
 @kernel
-def project_surfels(counters, count, surfels, tail, view, projections, outlines, means2d, radii):
+def project_surfels(counters, count, surfels, tail, view, projections, outlines, remainders, means2d, radii):
     """Project all surfels and compute their extents.
 
     Args:
@@ -64,6 +64,7 @@ def project_surfels(counters, count, surfels, tail, view, projections, outlines,
         view: See ``layout``.
         projections: Out; its records as ``surfel_layout`` describes them.
         outlines: Out: likewise, padded to whole groups. [16 for each surfel]
+        remainders: Out: what float32 leaves of the projected centres, pixels, padded to whole groups. [2 for each surfel]
         means2d: Out: projected centres, pixels, padded to whole groups. [2 for each surfel]
         radii: Out: pixels, 0 where not drawn, padded to whole groups. [1 for each surfel]
     """
@@ -75,9 +76,13 @@ def project_surfels(counters, count, surfels, tail, view, projections, outlines,
             break
         first = parcel * per_parcel
         last = min(first + per_parcel, whole_groups)
-        drawn, tiles = _project_groups(first, last, first, surfels, view, projections, outlines, means2d, radii)
+        drawn, tiles = _project_groups(
+            first, last, first, surfels, view, projections, outlines, remainders, means2d, radii
+        )
         if last * layout.GROUP < min((parcel + 1) * layout.PARCEL, count):
-            more, more_tiles = _project_groups(last, last + 1, 0, tail, view, projections, outlines, means2d, radii)
+            more, more_tiles = _project_groups(
+                last, last + 1, 0, tail, view, projections, outlines, remainders, means2d, radii
+            )
             drawn = -1 if drawn < 0 or more < 0 else drawn + more
             tiles += more_tiles
         projections.parcels[2 * parcel] = drawn
@@ -85,7 +90,7 @@ def project_surfels(counters, count, surfels, tail, view, projections, outlines,
 
 
 @part
-def _project_groups(first, last, source, surfels, view, projections, outlines, means2d, radii):
+def _project_groups(first, last, source, surfels, view, projections, outlines, remainders, means2d, radii):
     """Project groups ``first`` to ``last``, reading from group ``source`` of the surfels on.
 
     Returns:
@@ -113,8 +118,13 @@ def _project_groups(first, last, source, surfels, view, projections, outlines, m
         at = place_surfels(mean, quat, view)
 
         slope_x, slope_y = mul(at.x, at.inverse_z), mul(at.y, at.inverse_z)
-        mean_x = narrow(fma(fx, slope_x, broadcast(view, layout.VIEW_CX)))
-        mean_y = narrow(fma(fy, slope_y, broadcast(view, layout.VIEW_CY)))
+        wide_x, wide_y = (
+            fma(fx, slope_x, broadcast(view, layout.VIEW_CX)),
+            fma(fy, slope_y, broadcast(view, layout.VIEW_CY)),
+        )
+        mean_x, mean_y = narrow(wide_x), narrow(wide_y)
+        remainder = narrow((sub(wide_x, mean_x), sub(wide_y, mean_y)))
+        store_columns(remainders, 2 * layout.GROUP * group, remainder)
         per_x, per_y = div(at.z, mul(fx, pixel_scale)), div(at.z, mul(fy, pixel_scale))
         u_x, u_y = _slopes(at.of_first, right, down, per_x, per_y, scale[0])
         v_x, v_y = _slopes(at.of_second, right, down, per_x, per_y, scale[1])

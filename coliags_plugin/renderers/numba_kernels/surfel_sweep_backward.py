@@ -77,13 +77,13 @@ _PER_SQUARE = -2.0 * math.log(2.0)
 
 @kernel
 def sweep_surfels_backward(
-    counters, records, bins, view, grid, channels, measures, scratch, composited, of_images, entry_sums
+    counters, records, remainders, bins, view, grid, channels, measures, scratch, composited, of_images, entry_sums
 ):
     """Compute the gradient sums over the pixels of each entry.
 
     Args:
         counters: Work counters for dynamic scheduling; entries 0 and 1 must be 0.
-        records, bins, composited: As the forward sweep left them.
+        records, remainders, bins, composited: As the forward sweep left them.
         view: See ``layout``.
         grid: The image and its tiles.
         channels: Any tuple as long as there are channels.
@@ -106,7 +106,21 @@ def sweep_surfels_backward(
         if bins.starts[tile] < bins.reached[tile]:
             _read_tile(tile, grid, view, channels, of_images, state)
             _prepare_tile(tile, channels, measures, view, composited, state)
-            _sweep_tile(tile, records, bins, view, grid, channels, measures, rows, state, blocks, further, entry_sums)
+            _sweep_tile(
+                tile,
+                records,
+                remainders,
+                bins,
+                view,
+                grid,
+                channels,
+                measures,
+                rows,
+                state,
+                blocks,
+                further,
+                entry_sums,
+            )
         for entry in range(bins.reached[tile], bins.starts[tile + 1]):
             number = bins.cells[layout.CELL * entry + 2]
             store(entry_sums, layout.ROW * number, 0.0)
@@ -181,7 +195,9 @@ def _prepare_tile(tile, channels, measures, view, composited, state):
 
 
 @part
-def _sweep_tile(tile, records, bins, view, grid, channels, measures, rows, state, blocks, further, entry_sums):
+def _sweep_tile(
+    tile, records, remainders, bins, view, grid, channels, measures, rows, state, blocks, further, entry_sums
+):
     """Sweep through those of one tile's entries that were reached."""
     corner_x, corner_y, across, down = tile_corner(tile, grid)
     cells = bins.cells
@@ -192,7 +208,7 @@ def _sweep_tile(tile, records, bins, view, grid, channels, measures, rows, state
     first, last = bins.starts[tile], bins.reached[tile]
     while first < last:
         end = min(first + CHUNK, last)
-        fetch_surfels(first, end, alive, corner_x, corner_y, records, view, cells, rows, blocks)
+        fetch_surfels(first, end, alive, corner_x, corner_y, records, remainders, view, cells, rows, blocks)
         for entry in range(first, end):
             ahead = cells[layout.CELL * min(entry + _AHEAD, last - 1) + 2]
             prefetch_to_write(entry_sums, layout.ROW * ahead)

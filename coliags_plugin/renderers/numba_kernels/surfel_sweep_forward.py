@@ -64,12 +64,12 @@ INTEGERS = CHUNK + layout.BLOCKS * CHUNK + layout.BLOCKS
 
 
 @kernel
-def sweep_surfels(counters, records, bins, view, grid, channels, measures, scratch, composited, images):
+def sweep_surfels(counters, records, remainders, bins, view, grid, channels, measures, scratch, composited, images):
     """Composite all tiles.
 
     Args:
         counters: Work counters for dynamic scheduling; entries 0 and 1 must be 0.
-        records, bins: What projection and binning wrote; ``bins.reached`` is written here.
+        records, remainders, bins: What projection and binning wrote; ``bins.reached`` is written here.
         view: See ``layout``.
         grid: The image and its tiles.
         channels: Any tuple as long as there are channels.
@@ -88,13 +88,15 @@ def sweep_surfels(counters, records, bins, view, grid, channels, measures, scrat
         if place >= grid.tiles:
             break
         tile = bins.order[place]
-        bins.reached[tile] = _sweep_tile(tile, records, bins, view, grid, channels, measures, rows, state, blocks)
+        bins.reached[tile] = _sweep_tile(
+            tile, records, remainders, bins, view, grid, channels, measures, rows, state, blocks
+        )
         _finish_tile(tile, channels, measures, view, state, composited)
         _write_tile(tile, grid, channels, measures, state, images)
 
 
 @part
-def _sweep_tile(tile, records, bins, view, grid, channels, measures, rows, state, blocks):
+def _sweep_tile(tile, records, remainders, bins, view, grid, channels, measures, rows, state, blocks):
     """Sweep through one tile's entries; leaves its pixels in ``state``.
 
     Returns:
@@ -114,7 +116,7 @@ def _sweep_tile(tile, records, bins, view, grid, channels, measures, rows, state
     first, last = bins.starts[tile], bins.starts[tile + 1]
     while first < last and alive:
         end = min(first + CHUNK, last)
-        fetch_surfels(first, end, alive, corner_x, corner_y, records, view, bins.cells, rows, blocks)
+        fetch_surfels(first, end, alive, corner_x, corner_y, records, remainders, view, bins.cells, rows, blocks)
         list_by_block(end - first, FETCHED, blocks, listed, counts)
         for block in range(layout.BLOCKS):
             count = counts[block]

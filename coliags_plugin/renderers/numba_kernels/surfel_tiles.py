@@ -38,29 +38,32 @@ _AHEAD = 32
 
 
 @part
-def fetch_surfels(first, last, alive, corner_x, corner_y, records, view, cells, rows, blocks):
+def fetch_surfels(first, last, alive, corner_x, corner_y, records, remainders, view, cells, rows, blocks):
     """Fetch entries ``first`` to ``last`` of a tile.
 
     Args:
         first, last: Among ``cells``.
         alive: Blocks with transmittance left, one bit each.
         corner_x, corner_y: First pixel of the tile.
-        records, view, cells: See ``layout`` and ``surfel_layout``.
+        records, remainders, view, cells: See ``project_surfels``, ``layout`` and ``surfel_layout``.
         rows: Out. [FETCHED for each entry]
         blocks: Out: those of the alive blocks that the entry touches. [1 for each entry]
     """
     scale, near = number(view, layout.VIEW_PIXEL_SCALE), number(view, layout.VIEW_NEAR)
     middle_x, middle_y = np.float32(corner_x + layout.TILE // 2), np.float32(corner_y + layout.TILE // 2)
     for entry in range(first, last):
-        prefetch(records, layout.ROW * cells[layout.CELL * min(entry + _AHEAD, last - 1)])
+        ahead = cells[layout.CELL * min(entry + _AHEAD, last - 1)]
+        prefetch(records, layout.ROW * ahead)
+        prefetch(remainders, 2 * ahead)
         index = cells[layout.CELL * entry]
         mine = cells[layout.CELL * entry + 1] & alive
         blocks[entry - first] = mine
         if mine:
             source, target = layout.ROW * index, FETCHED * (entry - first)
             store(rows, target, load(records, source))
-            rows[target + surfel_layout.MEAN_X] = scale * (number(records, source + surfel_layout.MEAN_X) - middle_x)
-            rows[target + surfel_layout.MEAN_Y] = scale * (number(records, source + surfel_layout.MEAN_Y) - middle_y)
+            x = number(records, source + surfel_layout.MEAN_X) - middle_x + number(remainders, 2 * index)
+            y = number(records, source + surfel_layout.MEAN_Y) - middle_y + number(remainders, 2 * index + 1)
+            rows[target + surfel_layout.MEAN_X], rows[target + surfel_layout.MEAN_Y] = scale * x, scale * y
             depth = number(records, source + surfel_layout.DEPTH)
             rows[target + INVERSE_DEPTH] = np.float32(1.0) / depth
             rows[target + LARGEST_Q] = min(depth / near, np.float32(_LARGE))
