@@ -16,7 +16,14 @@ from numba import types
 from numba.core.registry import cpu_target
 
 from coliags_plugin.renderers import cpu_renderer
-from coliags_plugin.renderers.numba_kernels import compilation, sweep_backward, sweep_forward
+from coliags_plugin.renderers.numba_kernels import (
+    compilation,
+    surfel_layout,
+    surfel_sweep_backward,
+    surfel_sweep_forward,
+    sweep_backward,
+    sweep_forward,
+)
 from tests.renderers.test_torch_renderer import cast, scene
 
 # --- registers --------------------------------------------------------------------------------------------------------
@@ -25,9 +32,14 @@ FLOATS, INTS = types.float32[::1], types.int32[::1]
 CHANNELS = 4
 CHANNEL_TUPLE = types.UniTuple(types.int64, CHANNELS)
 NOTHING = types.UniTuple(types.int64, 0)
+COLORS = types.UniTuple(types.int64, 3)
+#: Depth, of all measures.
+MEASURES = types.NamedTuple((types.UniTuple(types.int64, 1), NOTHING, NOTHING, NOTHING), surfel_layout.Measures)
 
 #: The inner loop of each sweep, the types it is called with, and how many multiply-adds it takes for a block of sixteen
 #: pixels: five for U d and its square, five for 2^x, and those of the channels; backward has these twice, and moments.
+#: For surfels six are for the intersection and the two squared distances, and the depth is one more; backward has eight
+#: moments, the depth once.
 INNER_LOOPS = {
     "forward": (
         sweep_forward._sweep_block,
@@ -38,6 +50,19 @@ INNER_LOOPS = {
         sweep_backward._sweep_entry,
         (types.int64, types.int64, types.int64, FLOATS, CHANNEL_TUPLE, FLOATS, FLOATS, types.int64, FLOATS),
         5 + 5 + 2 * CHANNELS + 3,
+    ),
+    "forward, surfels": (
+        surfel_sweep_forward._sweep_block,
+        (types.int64, types.int32, INTS, FLOATS, COLORS, MEASURES, FLOATS, FLOATS),
+        6 + 5 + 3 + 1,
+    ),
+    "backward, surfels": (
+        surfel_sweep_backward._sweep_entry,
+        (
+            *(types.int64, types.int64, types.int64, FLOATS, COLORS, MEASURES, FLOATS, FLOATS),
+            *(types.int64, types.int64, FLOATS),
+        ),
+        6 + 5 + 2 * 3 + 1 + 7,
     ),
 }
 
