@@ -15,6 +15,7 @@ from coliags_plugin.renderers.numba_kernels.lanes import (
     at_most,
     bits,
     broadcast,
+    broadcast_all,
     dot,
     fma,
     lane_columns,
@@ -23,11 +24,14 @@ from coliags_plugin.renderers.numba_kernels.lanes import (
     mul,
     number,
     prefetch,
+    select,
     smaller,
     splat,
+    sqrt,
     sub,
 )
 from coliags_plugin.renderers.numba_kernels.sorting import NUMBER
+from coliags_plugin.renderers.numba_kernels.surfel_geometry import may_show
 from coliags_plugin.renderers.numba_kernels.threads import take
 from coliags_plugin.renderers.numba_kernels.tiles import order_tiles
 
@@ -113,10 +117,7 @@ def _find_stretch(first, last, pair, counted, projections, view, grid, circle, k
                     u_xx, u_yx, u_yy, slope_upright, slope_level, left, right, top, bottom
                 )
                 if len(circle) > 0:
-                    x = number(records, row + surfel_layout.CIRCLE_X) - mean_x
-                    y = number(records, row + surfel_layout.CIRCLE_Y) - mean_y
-                    edges = (sub(left, x), sub(right, x), sub(top, y), sub(bottom, y))
-                    nearest = smaller(nearest, _squared_distance_from_circle(edges, view))
+                    nearest = _nearest_of_surfel(nearest, reach, records, row, left, right, top, bottom, view)
                 blocks = bits(at_most(nearest, reach))
                 if blocks:
                     tile = tile_row * grid.columns + column
@@ -130,13 +131,37 @@ def _find_stretch(first, last, pair, counted, projections, view, grid, circle, k
 
 
 @inline
-def _squared_distance_from_circle(edges, view):
-    """Smallest squared distance from the centre to boxes whose sides are given as offsets from it, scaled."""
-    left, right, top, bottom = edges
-    scale = broadcast(view, layout.VIEW_PIXEL_SCALE)
-    x, y = add(larger(left, 0.0), smaller(right, 0.0)), add(larger(top, 0.0), smaller(bottom, 0.0))
-    away = mul(scale, (x, y))
-    return dot(away, away, 0.0)
+def _nearest_of_surfel(in_ellipse, reach, records, row, left, right, top, bottom, view):
+    """Smallest squared distance of a surfel's reach to boxes, given that of its ellipse.
+
+    The sides of the boxes are offsets from the ellipse's centre.
+    """
+    if number(records, row + layout.U_XX) == 0.0:
+        in_ellipse = _nearest_of_crossing(reach, records, row, left, right, top, bottom, view)
+    shift_x, shift_y = _circle(records, row)
+    x = add(larger(sub(left, shift_x), 0.0), smaller(sub(right, shift_x), 0.0))
+    y = add(larger(sub(top, shift_y), 0.0), smaller(sub(bottom, shift_y), 0.0))
+    away = mul(broadcast(view, layout.VIEW_PIXEL_SCALE), (x, y))
+    return smaller(in_ellipse, dot(away, away, 0.0))
+
+
+@part
+def _nearest_of_crossing(reach, records, row, left, right, top, bottom, view):
+    """Stands for the distance where a disc crosses the near plane: ``reach`` in boxes where it may be seen."""
+    scale, (shift_x, shift_y) = broadcast(view, layout.VIEW_PIXEL_SCALE), _circle(records, row)
+    half_x, half_y = mul(0.5, sub(right, left)), mul(0.5, sub(bottom, top))
+    x, y = sub(add(left, half_x), shift_x), sub(add(top, half_y), shift_y)
+    x, y, half_x, half_y = mul(scale, (x, y, half_x, half_y))
+    slopes = broadcast_all(records, row + surfel_layout.SLOPES, (0,) * 6)
+    seen = may_show(slopes, sqrt(reach), broadcast(records, row + layout.U_YY), x, y, half_x, half_y)
+    return select(seen, reach, add(reach, 1.0))
+
+
+@inline
+def _circle(records, row):
+    """The centre of the circle that a surfel reaches, from that of its ellipse."""
+    x = number(records, row + surfel_layout.CIRCLE_X) - number(records, row + layout.MEAN_X)
+    return x, number(records, row + surfel_layout.CIRCLE_Y) - number(records, row + layout.MEAN_Y)
 
 
 @kernel

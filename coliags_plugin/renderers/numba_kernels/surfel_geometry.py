@@ -1,4 +1,4 @@
-"""Geometry shared by the projection of surfels and its derivative, in float64.
+"""Geometry shared by the stages of surfels. That of projection and its derivative is in float64.
 
 Seen nearly edge-on, a disc magnifies the rounding of its position and axes by the reciprocal of the angle; in float64
 that of the projection does not matter. Sixteen surfels at a time; a vector in space is a tuple of three double lanes.
@@ -12,17 +12,26 @@ from coliags_plugin.renderers.numba_kernels import layout
 from coliags_plugin.renderers.numba_kernels.compilation import inline
 from coliags_plugin.renderers.numba_kernels.geometry import cross, rotation_rows
 from coliags_plugin.renderers.numba_kernels.lanes import (
+    add,
+    at_least,
+    both,
     broadcast,
     broadcast_all,
     div,
     dot,
+    fma,
     greater,
+    larger,
     mul,
+    neg,
     select,
     sqrt,
     sub,
     widen,
 )
+
+#: More than rounding can be of a sum of products, relative to the sum of their magnitudes.
+_ROUNDING = 1e-5
 
 
 class Placed(NamedTuple):
@@ -93,3 +102,45 @@ def place_surfels(mean, quat, view):
         mul(cross(offset, first), inverse_height),
         mul(normal, inverse_height),
     )
+
+
+@inline
+def may_show(slopes, rim, largest_q, x, y, half_x, half_y):
+    """Whether the part of a disc beyond the near plane may be seen in a box of the image. Never False where it is.
+
+    The square around the disc and the near plane bound it by lines: it is not seen in a box beyond one of these.
+
+    Args:
+        slopes: The columns of ``surfel_layout`` from U_X to Q_Y.
+        rim: Length of (e, f) at the disc's rim.
+        largest_q: Where the disc is at the near plane.
+        x, y: The box's middle from the projected centre, scaled pixels.
+        half_x, half_y: Half its edges, likewise.
+    """
+    u_x, u_y, v_x, v_y, q_x, q_y = slopes
+    u = (fma(u_x, x, mul(u_y, y)), u_x, u_y, add(_size(mul(u_x, x)), _size(mul(u_y, y))))
+    v = (fma(v_x, x, mul(v_y, y)), v_x, v_y, add(_size(mul(v_x, x)), _size(mul(v_y, y))))
+    magnitude = add(add(_size(mul(q_x, x)), _size(mul(q_y, y))), 1.0)
+    q = (fma(q_x, x, fma(q_y, y, 1.0)), q_x, q_y, magnitude)
+    end = (sub(largest_q, q[0]), neg(q_x), neg(q_y), add(largest_q, magnitude))
+    edge = mul(rim, q)
+    found = both(_reaches_zero(q, half_x, half_y), _reaches_zero(end, half_x, half_y))
+    for side in (u, v):
+        size = add(edge[3], side[3])
+        over = (sub(edge[0], side[0]), sub(edge[1], side[1]), sub(edge[2], side[2]), size)
+        under = (add(edge[0], side[0]), add(edge[1], side[1]), add(edge[2], side[2]), size)
+        found = both(found, both(_reaches_zero(over, half_x, half_y), _reaches_zero(under, half_x, half_y)))
+    return found
+
+
+@inline
+def _size(a):
+    return larger(a, neg(a))
+
+
+@inline
+def _reaches_zero(function, half_x, half_y):
+    """Whether a linear function is at least 0 anywhere in a box: value in the middle, slopes, and size of its terms."""
+    value, slope_x, slope_y, magnitude = function
+    most = add(value, fma(_size(slope_x), half_x, mul(_size(slope_y), half_y)))
+    return at_least(fma(magnitude, _ROUNDING, most), 0.0)

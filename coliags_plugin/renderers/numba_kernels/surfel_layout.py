@@ -27,10 +27,15 @@ DEPTH = 9
 CHANNELS = 10
 MAX_CHANNELS = 6
 
-# ``outlines`` are rows with the columns of 3D Gaussians' ``records`` that binning reads: of the ellipse where the disc's
-# image ends. Where the disc crosses the near plane |U d| is 0 everywhere. The low-pass filter's circle is around
+# Columns of ``outlines``, for binning: as those of 3D Gaussians' ``records``, of the ellipse where the disc's image ends;
+# then the centre of the low-pass filter's circle, and the columns of ``records`` from ``U_X`` to ``Q_Y``. Where the disc
+# crosses the near plane its image may be no ellipse: ``layout.U_XX`` is 0, and where ``layout.U_YY`` would be there is
+# the largest q.
 CIRCLE_X = 6
 CIRCLE_Y = 7
+SLOPES = 8
+#: Stands for infinity as largest q: nothing that passes is infinite.
+LARGE = 1e30
 
 # Columns of sums. With v the derivative of the loss with respect to ln(alpha), and c that with respect to scaling the
 # intersection (u, v, z) about the camera, in all of its coordinates but per unit of the logarithm of the scale,

@@ -5,7 +5,7 @@ The formulas are those of ``docs/rendering.md``, section "Surfels".
 
 from __future__ import annotations
 
-from coliags_plugin.renderers.numba_kernels import layout
+from coliags_plugin.renderers.numba_kernels import layout, surfel_layout
 from coliags_plugin.renderers.numba_kernels.compilation import inline, kernel, part
 from coliags_plugin.renderers.numba_kernels.geometry import squared_distance_to_box
 from coliags_plugin.renderers.numba_kernels.lanes import (
@@ -41,7 +41,7 @@ from coliags_plugin.renderers.numba_kernels.lanes import (
     sub,
 )
 from coliags_plugin.renderers.numba_kernels.projection import are_usable, tile_at
-from coliags_plugin.renderers.numba_kernels.surfel_geometry import place_surfels
+from coliags_plugin.renderers.numba_kernels.surfel_geometry import may_show, place_surfels
 from coliags_plugin.renderers.numba_kernels.threads import take
 
 #: Added to the squared distance to the rim, in standard deviations, and to the squared half-axes of its image, square
@@ -152,7 +152,6 @@ def _project_groups(first, last, source, surfels, view, projections, outlines, r
         determinant = fma(across, across, padding)
         slope_upright, slope_level = div(xy, xx), div(xy, yy)
         u_xx, u_yy = sqrt(div(level, xx)), sqrt(mul(level, div(xx, determinant)))
-        u_xx, u_yy = select(crosses, 0.0, (u_xx, u_yy))
         u_yx = neg(mul(u_yy, slope_upright))
 
         left, end, top, bottom = (
@@ -185,6 +184,14 @@ def _project_groups(first, last, source, surfels, view, projections, outlines, r
         top, bottom = select(crosses, 0.0, top), select(crosses, bottom_edge, bottom)
         column_first, column_last = tile_at(left, right_edge), tile_at(end, right_edge)
         row_first, row_last = tile_at(top, bottom_edge), tile_at(bottom, bottom_edge)
+        # Most discs that cross the near plane are beside the camera: drawn, but in no tile.
+        slopes, largest_q = (u_x, u_y, v_x, v_y, q_x, q_y), smaller(div(z, near), surfel_layout.LARGE)
+        size_x, size_y = mul(0.5, sub(right_edge, 0.5)), mul(0.5, sub(bottom_edge, 0.5))
+        middle = mul(pixel_scale, (sub(add(size_x, 0.5), mean_x), sub(add(size_y, 0.5), mean_y)))
+        size_x, size_y = mul(pixel_scale, (size_x, size_y))
+        seen = may_show(slopes, sqrt(level), largest_q, middle[0], middle[1], size_x, size_y)
+        absent = select(either(seen, at_most(in_circle, level)), 0.0, select(crosses, 1.0, 0.0))
+        column_first, column_last = select(greater(absent, 0.0), (0.0, -1.0), (column_first, column_last))
         store_columns(projections.bounds, 4 * layout.GROUP * group, (column_first, column_last, row_first, row_last))
         area = mul(add(sub(column_last, column_first), 1.0), add(sub(row_last, row_first), 1.0))
         tiles += int(lane(lane_sums((select(shown, area, 0.0),)), 0))
@@ -194,11 +201,11 @@ def _project_groups(first, last, source, surfels, view, projections, outlines, r
 
         store_columns(means2d, 2 * layout.GROUP * group, (mean_x, mean_y))
         store(projections.depths, layout.GROUP * group, z)
-        zero = mul(z, 0.0)
+        u_xx, u_yy = select(crosses, (0.0, largest_q), (u_xx, u_yy))
         outline = (u_xx, u_yx, u_yy, center_x, center_y, log2_opacity, mean_x, mean_y)
-        outline = outline + (zero, zero, zero, zero, zero, zero) + (slope_upright, slope_level)
+        outline = outline + slopes + (slope_upright, slope_level)
         store_columns(outlines, layout.ROW * layout.GROUP * group, outline)
-        record = (u_x, u_y, v_x, v_y, q_x, q_y, mean_x, mean_y, log2_opacity, z) + color + normal
+        record = slopes + (mean_x, mean_y, log2_opacity, z) + color + normal
         store_columns(projections.records, layout.ROW * layout.GROUP * group, record)
     return (drawn if usable else -1), tiles
 

@@ -145,9 +145,9 @@ def _read_tile(tile, grid, view, channels, of_images, state):
         for vector in range(_BEHIND, _STATE, 16):
             store(state, at + vector, 0.0)
     for channel in range(3):
-        copy_from_image(of_images.rgb, 3, channel, tile, grid, _CHANNELS + 16 * channel, state, _STATE)
+        _copy_from_image(of_images.rgb, 3, channel, tile, grid, _CHANNELS + 16 * channel, state)
         if len(channels) > 3:
-            copy_from_image(of_images.normals, 3, channel, tile, grid, _CHANNELS + 48 + 16 * channel, state, _STATE)
+            _copy_from_image(of_images.normals, 3, channel, tile, grid, _CHANNELS + 48 + 16 * channel, state)
     for image, vector in (
         (of_images.alpha, _ALPHA),
         (of_images.depth, _DEPTH),
@@ -156,7 +156,12 @@ def _read_tile(tile, grid, view, channels, of_images, state):
         (of_images.median, _MEDIAN),
         (of_images.distortion, _OF_SQUARE),
     ):
-        copy_from_image(image, 1, 0, tile, grid, vector, state, _STATE)
+        _copy_from_image(image, 1, 0, tile, grid, vector, state)
+
+
+@part
+def _copy_from_image(image, depth, channel, tile, grid, vector, state):
+    copy_from_image(image, depth, channel, tile, grid, vector, state, _STATE)
 
 
 @part

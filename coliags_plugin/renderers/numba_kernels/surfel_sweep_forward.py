@@ -223,9 +223,9 @@ def _finish_tile(tile, channels, measures, view, state, composited):
 def _write_tile(tile, grid, channels, measures, state, images):
     """Copy a tile's pixels from its blocks to the images."""
     for channel in range(3):
-        copy_to_image(_CHANNELS + 16 * channel, state, _STATE, tile, grid, 3, channel, images.rgb)
+        _copy_to_image(_CHANNELS + 16 * channel, state, tile, grid, 3, channel, images.rgb)
         if len(channels) > 3:
-            copy_to_image(_CHANNELS + 48 + 16 * channel, state, _STATE, tile, grid, 3, channel, images.normals)
+            _copy_to_image(_CHANNELS + 48 + 16 * channel, state, tile, grid, 3, channel, images.normals)
     for vector, image in (
         (_ALPHA, images.alpha),
         (_DEPTH, images.depth),
@@ -234,4 +234,9 @@ def _write_tile(tile, grid, channels, measures, state, images):
         (_MEDIAN, images.median),
         (_DISTORTION, images.distortion),
     ):
-        copy_to_image(vector, state, _STATE, tile, grid, 1, 0, image)
+        _copy_to_image(vector, state, tile, grid, 1, 0, image)
+
+
+@part
+def _copy_to_image(vector, state, tile, grid, depth, channel, image):
+    copy_to_image(vector, state, _STATE, tile, grid, depth, channel, image)

@@ -31,8 +31,6 @@ from coliags_plugin.renderers.numba_kernels.tiles import block_corner
 INVERSE_DEPTH = layout.ROW
 LARGEST_Q = layout.ROW + 1
 FETCHED = layout.ROW + 4
-#: Stands for infinity in ``LARGEST_Q``: nothing that passes is infinite.
-_LARGE = 1e30
 #: Prefetch distance of records, entries.
 _AHEAD = 32
 
@@ -66,7 +64,7 @@ def fetch_surfels(first, last, alive, corner_x, corner_y, records, remainders, v
             rows[target + surfel_layout.MEAN_X], rows[target + surfel_layout.MEAN_Y] = scale * x, scale * y
             depth = number(records, source + surfel_layout.DEPTH)
             rows[target + INVERSE_DEPTH] = np.float32(1.0) / depth
-            rows[target + LARGEST_Q] = min(depth / near, np.float32(_LARGE))
+            rows[target + LARGEST_Q] = min(depth / near, np.float32(surfel_layout.LARGE))
 
 
 @inline

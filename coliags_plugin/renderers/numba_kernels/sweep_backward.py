@@ -120,18 +120,23 @@ def _read_tile(tile, grid, extras, channels, of_images, state):
         store(state, at + _ALPHA, 0.0)
         store_all(state, at + _CHANNELS, repeat(0.0, channels))
     for channel in range(3):
-        copy_from_image(of_images.rgb, 3, channel, tile, grid, _CHANNELS + 16 * channel, state, _STATE)
-    copy_from_image(of_images.alpha, 1, 0, tile, grid, _ALPHA, state, _STATE)
+        _copy_from_image(of_images.rgb, 3, channel, tile, grid, _CHANNELS + 16 * channel, state)
+    _copy_from_image(of_images.alpha, 1, 0, tile, grid, _ALPHA, state)
     at = _CHANNELS + 48
     if extras.depth:
-        copy_from_image(of_images.depth, 1, 0, tile, grid, at, state, _STATE)
-        copy_from_image(of_images.expected, 1, 0, tile, grid, _BEHIND, state, _STATE)
+        _copy_from_image(of_images.depth, 1, 0, tile, grid, at, state)
+        _copy_from_image(of_images.expected, 1, 0, tile, grid, _BEHIND, state)
         at += 16
     if extras.inverse_depth:
-        copy_from_image(of_images.inverse_depth, 1, 0, tile, grid, at, state, _STATE)
+        _copy_from_image(of_images.inverse_depth, 1, 0, tile, grid, at, state)
         at += 16
     for axis in range(3):
-        copy_from_image(of_images.normals, 3, axis, tile, grid, at + 16 * axis, state, _STATE)
+        _copy_from_image(of_images.normals, 3, axis, tile, grid, at + 16 * axis, state)
+
+
+@part
+def _copy_from_image(image, depth, channel, tile, grid, vector, state):
+    copy_from_image(image, depth, channel, tile, grid, vector, state, _STATE)
 
 
 @part

@@ -190,18 +190,23 @@ def _finish_tile(tile, channels, view, has_depth, state, composited):
 def _write_tile(tile, grid, extras, state, images):
     """Copy a tile's pixels from its blocks to the images."""
     for channel in range(3):
-        copy_to_image(_CHANNELS + 16 * channel, state, _STATE, tile, grid, 3, channel, images.rgb)
-    copy_to_image(_ALPHA, state, _STATE, tile, grid, 1, 0, images.alpha)
+        _copy_to_image(_CHANNELS + 16 * channel, state, tile, grid, 3, channel, images.rgb)
+    _copy_to_image(_ALPHA, state, tile, grid, 1, 0, images.alpha)
     at = _CHANNELS + 48
     if extras.depth:
-        copy_to_image(at, state, _STATE, tile, grid, 1, 0, images.depth)
-        copy_to_image(_EXPECTED, state, _STATE, tile, grid, 1, 0, images.expected)
+        _copy_to_image(at, state, tile, grid, 1, 0, images.depth)
+        _copy_to_image(_EXPECTED, state, tile, grid, 1, 0, images.expected)
         at += 16
     if extras.inverse_depth:
-        copy_to_image(at, state, _STATE, tile, grid, 1, 0, images.inverse_depth)
+        _copy_to_image(at, state, tile, grid, 1, 0, images.inverse_depth)
         at += 16
     if extras.normals:
         for axis in range(3):
-            copy_to_image(at + 16 * axis, state, _STATE, tile, grid, 3, axis, images.normals)
+            _copy_to_image(at + 16 * axis, state, tile, grid, 3, axis, images.normals)
         at += 48
-    copy_to_image(at, state, _STATE, tile, grid, 1, 0, images.median)
+    _copy_to_image(at, state, tile, grid, 1, 0, images.median)
+
+
+@part
+def _copy_to_image(vector, state, tile, grid, depth, channel, image):
+    copy_to_image(vector, state, _STATE, tile, grid, depth, channel, image)

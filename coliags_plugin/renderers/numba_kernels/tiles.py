@@ -112,11 +112,11 @@ def list_by_block(count, stride, blocks, listed, counts):
         counts[block + 2], counts[block + 3] = c - CHUNK * (block + 2), d - CHUNK * (block + 3)
 
 
-@part
+@inline
 def copy_to_image(vector, state, stride, tile, grid, depth, channel, image):
     """Copy one vector of a tile's blocks to one of the ``depth`` channels of an image; to an empty one nothing.
 
-    The vectors of the blocks are ``stride`` numbers apart.
+    The vectors of the blocks are ``stride`` numbers apart: a constant where this is inlined, for speed.
     """
     if len(image):
         corner_x, corner_y, across, down = tile_corner(tile, grid)
@@ -126,7 +126,7 @@ def copy_to_image(vector, state, stride, tile, grid, depth, channel, image):
                 image[first + x * depth] = number(state, vector + place_in_blocks(x, y, stride))
 
 
-@part
+@inline
 def copy_from_image(image, depth, channel, tile, grid, vector, state, stride):
     """The opposite of :func:`copy_to_image`; from an empty image nothing is copied."""
     if len(image):
