@@ -29,7 +29,7 @@ import torch
 import tyro
 from machine import describe_machine, markdown_table, write_results
 from train_step import Handed
-from workload import camera, wall
+from workload import camera, lining, wall
 
 from coliags_plugin.config.components import make_component
 from coliags_plugin.config.registry import REGISTRIES
@@ -57,6 +57,8 @@ class Options:
     """Renderers by name, comma separated; gsplat needs a CUDA device. Ratios are to the first."""
     primitives: str = "gaussians3d"
     """Primitives, comma separated: gaussians3d, flat, surfels. The last column is their time relative to the first."""
+    scene: Literal["wall", "lining"] = "wall"
+    """A tube's wall of Gaussians turned at random before the camera, or lying in it and all around the camera."""
     repeats: int = 25
     """Timed turns; two more come first to warm up."""
     threads: int | None = None
@@ -163,7 +165,7 @@ def main(options: Options) -> None:
     rows: list[dict[str, Any]] = []
     shown: list[dict[str, Any]] = []
     for count in map(int, options.counts.split(",")):
-        gaussians = wall(count)
+        gaussians = {"wall": wall, "lining": lining}[options.scene](count)
         cases = {
             (name, primitive): Case(
                 *renderers[primitive][name], PRIMITIVES[primitive], shaped(gaussians, primitive), options.clock

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -37,6 +38,21 @@ def wall(count: int, seed: int = 0) -> Gaussians:
     quats = torch.randn(count, 4, generator=generator)
     index = torch.arange(count)
     return Gaussians(means, quats, scales, uniform(*OPACITIES, count), uniform(0.0, 1.0, count, 3), index, index)
+
+
+def lining(count: int, seed: int = 0) -> Gaussians:
+    """The same, but lying in the wall with their third axis across it, and from behind the camera on.
+
+    So trained ones lie, and those beside the camera reach across its near plane.
+    """
+    made = wall(count, seed)
+    x, y, z = made.means.unbind(1)
+    share = (z - NEAREST) / (FARTHEST - NEAREST)
+    means = torch.stack([x, y, share * (FARTHEST + NEAREST) - NEAREST], dim=1)
+    # A quarter turn of the third axis to the radius, after any turn about it.
+    angle, turn = torch.atan2(y, x), 0.5 * made.quats_wxyz[:, 0]
+    quats = torch.stack([turn.cos(), (turn - angle).sin(), (turn - angle).cos(), turn.sin()], dim=1)
+    return replace(made, means=means, quats_wxyz=quats)
 
 
 def camera() -> Camera:

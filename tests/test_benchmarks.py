@@ -28,6 +28,13 @@ def test_the_training_step_by_stages():
     assert "| render ms |" in table and "| cpu | 300 |" in table
 
 
+@pytest.mark.parametrize("scene", ["wall", "lining"])
+def test_surfels_beside_3d_gaussians(scene):
+    options = ("--counts", 300, "--repeats", 1, "--patience", 0.01, "--scene", scene)
+    table = run("rasterizer.py", "--backends", "cpu", "--primitives", "flat,surfels", *options)
+    assert "| cpu | flat | 300 |" in table and "| cpu | surfels | 300 |" in table and "| both, of flat |" in table
+
+
 @pytest.mark.parametrize("method", ["coliags", "3dgs"])
 def test_a_training_curve(method, tmp_path):
     write_wall(tmp_path / "wall")
