@@ -1,8 +1,8 @@
 """Writes docs/method_table.md: what every method optimises, its losses and strategy, and the source of each constant.
 
 Everything is read from the method configs: values from the resolved config, the source of a constant from the comment
-on its line or, without one, on the line of the key that it belongs to. ``python docs/tools/methods.py`` writes the page;
-with ``--check`` it only says whether the page is what it would write.
+on its line or, without one, on the line of the key that it belongs to. ``python docs/tools/methods.py`` writes the
+page; with ``--check`` it only says whether the page is what it would write.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ HEAD = """\
 # Methods at a glance
 
 Generated from `method_configs/` by `make method-table`: do not edit this page. Formulas and differences from released
-code are in [methods.md](methods.md) and in the pages on [rivals](rivals/gaussian-pancakes.md); the meaning of options is
-in [options.md](options.md). Ablations (`method_configs/ablations/`) change one part of `coliags` each and are not listed.
+code are in [methods.md](methods.md) and in the pages on rivals; the meaning of options is in [options.md](options.md).
+Ablations (`method_configs/ablations/`) change one part of `coliags` each and are not listed.
 
 Step numbers are written for the run length in the column `steps` and keep their share of a run of another length;
 intervals (`every`, `reset_every`) do not change with it ([configs.md](configs.md)).
