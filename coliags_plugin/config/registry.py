@@ -228,8 +228,10 @@ losses = Registry(
         "l1": "coliags_plugin.losses.photometric:L1Loss",
         "d-ssim": "coliags_plugin.losses.photometric:DSSIMLoss",
         "depth-l1": "coliags_plugin.losses.depth:DepthL1Loss",
+        "depth-huber": "coliags_plugin.losses.depth:DepthHuberLoss",
         "sparse-depth": "coliags_plugin.losses.sparse_depth:SparseDepthLoss",
         "scale-volume": "coliags_plugin.losses.scale_volume:ScaleVolumeLoss",
+        "surface-normals": "coliags_plugin.losses.surface_normals:SurfaceNormalsLoss",
     },
     noun="loss",
 )

@@ -77,6 +77,8 @@ class Trainer:
         self.model = Model(field, self.chosen.renderer, modules).to(device)
         self.wants = tuple(sorted({"rgb", "alpha"}.union(*(loss.wants for loss in self.losses.values()))))
         self.model.check_outputs(self.wants, "the losses")
+        for loss in self.losses.values():
+            loss.check(self.model)
         self.optimizers = self._optimizers()
         self.step = 0
         self.seconds = 0.0
