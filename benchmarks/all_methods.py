@@ -37,9 +37,9 @@ COLUMNS = {
     "LPIPS": ("test", "lpips_squeeze"),
     "depth MSE mm2": ("test", "depth_mse"),
     "inner": ("test", "depth_mse_inner"),
-    "median": ("test", "depth_mse_median"),
-    "rotation PSNR dB": ("rotation", "psnr"),
-    "rotation depth MSE mm2": ("rotation", "depth_mse"),
+    "median error mm": ("test", "depth_median_error"),
+    "rotation PSNR dB": ("rotation", "psnr_seen"),
+    "rotation depth MSE mm2": ("rotation", "depth_mse_seen"),
 }
 #: Steps of the run that measures the time of a step.
 PROBE_STEPS = 12
