@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import ClassVar, Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from pydantic import Field
 from torch import Tensor
 
 from coliags_plugin.contracts import Loss, LossSettings, TrainingStep
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.masked import masked_mean, zero_outside
+from coliags_plugin.core.scenes import Target
 
 #: :data:`coliags_plugin.core.render_output.DEPTH_KINDS` as a literal type; a test compares the two.
 DepthKind = Literal["depth_accumulated", "depth_expected", "depth_median", "inverse_depth_accumulated"]
@@ -52,20 +53,32 @@ class DepthL1Loss(Loss):
         Raises:
             InputError: The target has no depth at all.
         """
-        target = step.target
-        if target.depth is None:
-            raise InputError(
-                f"frame '{target.name}' has no depth",
-                "ground-truth depth for every training frame, since the losses include depth-l1",
-                "Remove the term with --set losses.depth=null",
-            )
-        known = torch.isfinite(target.depth) & target.valid
+        depth, known = known_depth(step.target, "depth-l1")
         rendered = step.output[self.settings.depth]
         if self.settings.depth == "inverse_depth_accumulated":
             rendered = _reciprocal(rendered, self.settings.empty_depth)
-        truth = target.depth.to(rendered.dtype)
+        truth = depth.to(rendered.dtype)
         difference = zero_outside(rendered, known) - zero_outside(truth, known)
         return masked_mean(difference.abs(), known)
+
+
+def known_depth(target: Target, loss: str) -> tuple[Float[Tensor, "H W"], Bool[Tensor, "H W"]]:
+    """The true z-depth and where it is known and valid.
+
+    Args:
+        target: What is compared with.
+        loss: Name of the asking loss.
+
+    Raises:
+        InputError: The target has no depth at all.
+    """
+    if target.depth is None:
+        raise InputError(
+            f"frame '{target.name}' has no depth",
+            f"ground-truth depth for every training frame, since the losses include {loss}",
+            "Remove the term with --set losses.depth=null",
+        )
+    return target.depth, torch.isfinite(target.depth) & target.valid
 
 
 def _reciprocal(inverse_depth: Float[Tensor, "H W"], empty_depth: float) -> Float[Tensor, "H W"]:
