@@ -39,7 +39,9 @@ class OptimizerSettings(Settings):
     final_lr: float | None = Field(default=None, ge=0)  # at the last step; None: as at the first
     times_extent: bool = False  # multiply both rates by the scene's extent (docs/methods.md 2.1)
     halve_at: tuple[Share, ...] = ()  # shares of the run, between 0 and 1, after each of which the rate is halved
-    eps: float = Field(default=1e-15, gt=0)  # Adam's epsilon; the default is the splatting methods' (docs/methods.md 2.3)
+    eps: float = Field(
+        default=1e-15, gt=0
+    )  # Adam's epsilon; the default is the splatting methods' (docs/methods.md 2.3)
 
     @model_validator(mode="after")
     def _ends_above_zero(self) -> Self:

@@ -61,8 +61,9 @@ class SceneNormalisation(nn.Module):
 
 
 def surface_distances(scene: Scene) -> Float[Tensor, "2"]:
-    """0.9 times the smallest and 1.1 times the largest distance of an initial point from a training camera, over those
-    in view; occlusion is not tested. Scene units. [2]
+    """Smallest and largest distance of a training camera from the initial points in its view, times 0.9 and 1.1.
+
+    Occlusion is not tested. Scene units. [2]
 
     Raises:
         InputError: No camera has a point in view.

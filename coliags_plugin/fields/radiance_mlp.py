@@ -45,12 +45,10 @@ class RadianceMLP(nn.Module):
         """
         embedded = cosine_embedding(positions.flatten(0, 1), self.settings.position_frequencies)
         hidden = embedded
+        layer: Any
         for index, layer in enumerate(self.trunk):
-            weight, bias = layer.weight, layer.bias
-            if index == self.settings.skip:
-                hidden = first_layer(hidden, embedded, weight, bias)
-            else:
-                hidden = functional.linear(hidden, weight, bias)
+            again = index == self.settings.skip
+            hidden = first_layer(hidden, embedded, layer.weight, layer.bias) if again else layer(hidden)
             hidden = hidden.relu_()
         return hidden
 
@@ -81,7 +79,7 @@ class RadianceMLP(nn.Module):
         if settings.light:
             lamp = cosine_embedding(light, settings.light_frequencies)
             seen = torch.cat([seen, lamp.expand(len(seen), -1)], dim=1)
-        from_feature, from_ray = self.color.weight.split([settings.width, seen.shape[1]], dim=1)
+        from_feature, from_ray = self.color.weight[:, : settings.width], self.color.weight[:, settings.width :]
         constant = self.color.bias + from_feature @ self.feature.bias
         of_ray = functional.linear(seen, from_ray, constant)
         of_point = functional.linear(hidden, from_feature @ self.feature.weight)
