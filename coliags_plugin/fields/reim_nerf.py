@@ -48,8 +48,8 @@ class ReimNerfSettings(Settings):
 class ReimNerf(RadianceField):
     """Two networks from position to density, and from position, direction and lamp position to colour.
 
-    Psychogyios et al., "REIM-NeRF: Realistic Endoscopic Illumination Modelling for NeRF", 2023. Networks compute in
-    normalised coordinates; positions and densities are given and returned in scene units.
+    After Psychogyios et al., "Realistic Endoscopic Illumination Modeling for NeRF-Based Data Generation" (MICCAI 2023).
+    The networks compute in normalised coordinates; positions are taken, and densities returned, in scene units.
 
     Attributes:
         normalisation: Scene units to the networks' coordinates.
