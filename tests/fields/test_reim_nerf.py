@@ -202,6 +202,13 @@ def trainer(folder, overrides=(), scene=None, steps=20):
     return Trainer(method, scene or wall_scene(), "wall", RunFolder(folder), 0, torch.device("cpu"))
 
 
+def test_without_the_lamp_the_method_is_nerf(tmp_path):
+    lit, plain = (trainer(tmp_path / "run", [f"field.light={light}"]) for light in ("true", "false"))
+    sizes = [run.model.field.fine_network.color.in_features for run in (lit, plain)]
+    assert sizes[0] - sizes[1] == 27
+    assert math.isfinite(plain.take_step()["loss"])
+
+
 def test_a_run_resumes_to_the_bit_and_renders_alike_twice(tmp_path):
     straight, broken = (trainer(tmp_path / name) for name in ("straight", "broken"))
     for run in (straight, broken):

@@ -194,6 +194,22 @@ def test_the_coarse_level_has_gradients_only_through_outputs_of_its_own():
     assert other.density.grad != 0
 
 
+def test_colours_of_the_coarse_level_are_computed_for_its_image_alone():
+    class Silent(Ball):
+        def query_density(self, positions, directions, camera):
+            return Ball.query(self, positions, directions, camera).density
+
+        def query(self, positions, directions, camera):
+            raise RuntimeError("asked for colours")
+
+    camera, field = camera_at(0, 0, 0), Levels(Silent())
+    silent = make(**REFINED).render(field, camera, ("depth_accumulated", "depth_accumulated_coarse"))
+    spoken = make(**REFINED).render(Levels(Ball()), camera, ("depth_accumulated", "rgb_coarse"))
+    assert torch.equal(silent.rgb, spoken.rgb)
+    with pytest.raises(RuntimeError, match="asked for colours"):
+        make(**REFINED).render(field, camera, ("rgb_coarse",))
+
+
 def test_chance_places_samples_in_training_alone():
     camera, field = camera_at(0, 0, 0), Fog(0.2, start=5.0)
     wants, pixels = ("depth_accumulated",), torch.tensor([[3, 4], [5, 6]])
