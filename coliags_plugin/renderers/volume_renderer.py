@@ -182,7 +182,7 @@ class VolumeRenderer(Renderer):
             if name == "ray_lengths":
                 maps[name] = lines.lengths
             elif name in early:
-                maps[name] = (first or final).output(name.removesuffix(_COARSE), background)
+                maps[name] = (final if first is None else first).output(name.removesuffix(_COARSE), background)
             elif name not in ("rgb", "alpha"):
                 maps[name] = final.output(name, background)
         return RenderOutput(final.output("rgb", background), final.output("alpha", background), camera, maps)
