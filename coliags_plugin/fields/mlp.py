@@ -1,4 +1,4 @@
-"""Two-layer MLP of the heads."""
+"""Layers of the fields' MLPs."""
 
 from __future__ import annotations
 
@@ -21,6 +21,16 @@ def mlp(inputs: int, hidden: int, outputs: int, generator: torch.Generator) -> n
             layer.weight.uniform_(-bound, bound, generator=generator)
             layer.bias.uniform_(-bound, bound, generator=generator)
     return nn.Sequential(layers[0], nn.ReLU(), layers[1])
+
+
+def glorot_linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
+    """Linear layer with Glorot's uniform weights, within sqrt(6 / (inputs + outputs)), and biases of 0."""
+    layer = nn.Linear(inputs, outputs)
+    bound = math.sqrt(6.0 / (inputs + outputs))
+    with torch.no_grad():
+        layer.weight.uniform_(-bound, bound, generator=generator)
+        layer.bias.zero_()
+    return layer
 
 
 def first_layer(
