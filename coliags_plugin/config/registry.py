@@ -167,6 +167,7 @@ fields = Registry(
     {
         "anchors": "coliags_plugin.fields.anchors:AnchorField",
         "gaussians": "coliags_plugin.fields.explicit_gaussians:ExplicitGaussians",
+        "lit-gaussians": "coliags_plugin.fields.lit_gaussians:LitGaussians",
     },
     noun="field",
 )
@@ -228,6 +229,8 @@ losses = Registry(
         "l1": "coliags_plugin.losses.photometric:L1Loss",
         "d-ssim": "coliags_plugin.losses.photometric:DSSIMLoss",
         "depth-l1": "coliags_plugin.losses.depth:DepthL1Loss",
+        "attribute-variance": "coliags_plugin.losses.attribute_variance:AttributeVarianceLoss",
+        "diffuse-factor": "coliags_plugin.losses.diffuse_factor:DiffuseFactorLoss",
         "sparse-depth": "coliags_plugin.losses.sparse_depth:SparseDepthLoss",
         "scale-volume": "coliags_plugin.losses.scale_volume:ScaleVolumeLoss",
     },

@@ -2,7 +2,7 @@
 
 from coliags_plugin.contracts.data import DataManager
 from coliags_plugin.contracts.evaluation import Comparison, Metric, Protocol
-from coliags_plugin.contracts.fields import Field, GaussianField, RadianceField, RadianceSamples
+from coliags_plugin.contracts.fields import Field, GaussianField, LitField, RadianceField, RadianceSamples
 from coliags_plugin.contracts.heads import AppearanceHead, GeometryHead, Head
 from coliags_plugin.contracts.losses import Loss, LossSettings
 from coliags_plugin.contracts.rendering import Availability, Renderer, ViewModule
@@ -26,6 +26,7 @@ __all__ = [
     "GaussianField",
     "GeometryHead",
     "Head",
+    "LitField",
     "Loss",
     "LossSettings",
     "Metric",
