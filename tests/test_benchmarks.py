@@ -13,6 +13,7 @@ import pytest
 from tests.scenes import write_wall
 
 ROOT = Path(__file__).parents[1]
+METHODS = ROOT / "method_configs"
 
 
 def run(script, *argv):
@@ -24,8 +25,14 @@ def run(script, *argv):
 
 
 def test_the_training_step_by_stages():
-    table = run("train_step.py", "--anchors", 300, "--steps", 1, "--size", "48x36", "--renderers", "cpu")
+    table = run("train_stages.py", "--anchors", 300, "--steps", 1, "--size", "48x36", "--renderers", "cpu")
     assert "| render ms |" in table and "| cpu | 300 |" in table
+
+
+def test_the_training_step_of_every_method():
+    table = run("train_step.py", "--gaussians", 500, "--steps", 1, "--size", "48x36")
+    names = [row.split("|")[1].strip() for row in table.splitlines() if row.startswith("| ")][1:]
+    assert names[0] == "coliags" and sorted(names) == sorted(path.stem for path in METHODS.glob("*.yaml"))
 
 
 @pytest.mark.parametrize("method", ["coliags", "3dgs"])

@@ -231,8 +231,10 @@ losses = Registry(
         "depth-l1": "coliags_plugin.losses.depth:DepthL1Loss",
         "attribute-variance": "coliags_plugin.losses.attribute_variance:AttributeVarianceLoss",
         "diffuse-factor": "coliags_plugin.losses.diffuse_factor:DiffuseFactorLoss",
+        "depth-huber": "coliags_plugin.losses.depth:DepthHuberLoss",
         "sparse-depth": "coliags_plugin.losses.sparse_depth:SparseDepthLoss",
         "scale-volume": "coliags_plugin.losses.scale_volume:ScaleVolumeLoss",
+        "surface-normals": "coliags_plugin.losses.surface_normals:SurfaceNormalsLoss",
     },
     noun="loss",
 )

@@ -41,7 +41,7 @@ def test_normals_of_a_plane_do_not_depend_on_the_frame():
 
 
 def test_too_few_points_are_refused():
-    with pytest.raises(InputError, match="10 initial points for normals from 10 neighbours. Expected at least 11"):
+    with pytest.raises(InputError, match=r"10 initial points for normals from 10 neighbours\. Expected at least 11"):
         point_normals(torch.rand(10, 3), 10)
 
 
