@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from functools import cache
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from coliags_plugin.fields.mlp import linear_layers
+
+#: Of the products in training; auto: bfloat16 on CPUs that have instructions for it, otherwise float32.
+Precision = Literal["auto", "float32", "bfloat16"]
 
 
 class DiffuseNetwork(nn.Module):
@@ -19,13 +23,15 @@ class DiffuseNetwork(nn.Module):
     Args:
         hidden: Units of each hidden layer.
         depth: Hidden layers.
+        precision: See :data:`Precision`.
         generator: Of the initial weights.
     """
 
     INPUTS = 11
 
-    def __init__(self, hidden: int, depth: int, generator: torch.Generator) -> None:
+    def __init__(self, hidden: int, depth: int, precision: Precision, generator: torch.Generator) -> None:
         super().__init__()
+        self.precision = precision
         self.layers = nn.ModuleList(linear_layers((self.INPUTS, *[hidden] * depth, 3), generator))
         last: Any = self.layers[-1]
         nn.init.ones_(last.bias)
@@ -46,9 +52,24 @@ class DiffuseNetwork(nn.Module):
             lamps: Unit vectors to the lamp. [N, 3]
         """
         cosines = (normals * lamps).sum(1, keepdim=True)
-        values = torch.cat([albedos, distances, normals, lamps, cosines], dim=1)
-        *hidden, last = self.layers
-        for layer in hidden:
-            values = torch.relu_(layer(values))
-        factors: Tensor = last(values)
-        return factors
+        inputs = torch.cat([albedos, distances, normals, lamps, cosines], dim=1)
+        dtype = self._dtype(inputs)
+        layers: list[Any] = list(self.layers)
+        values = inputs.to(dtype)
+        for layer in layers[:-1]:
+            values = torch.relu_(nn.functional.linear(values, layer.weight.to(dtype), layer.bias.to(dtype)))
+        # The bias, near 1, is added to the small rest in full precision.
+        return nn.functional.linear(values, layers[-1].weight.to(dtype)).to(inputs.dtype) + layers[-1].bias
+
+    def _dtype(self, inputs: Tensor) -> torch.dtype:
+        if not self.training or inputs.dtype != torch.float32 or self.precision == "float32":
+            return inputs.dtype
+        fast = self.precision == "bfloat16" or (inputs.device.type == "cpu" and _cpu_multiplies_bfloat16())
+        return torch.bfloat16 if fast else inputs.dtype
+
+
+@cache
+def _cpu_multiplies_bfloat16() -> bool:
+    """Whether the CPU has instructions for products of bfloat16; others take longer for them than for float32."""
+    capabilities = getattr(torch.cpu, "get_capabilities", dict)()
+    return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))

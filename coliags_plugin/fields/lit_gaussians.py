@@ -23,7 +23,7 @@ from coliags_plugin.core.rotations import third_axes
 from coliags_plugin.core.scenes import PointCloud, Scene
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.fields.cook_torrance import Cosines, fresnel, lambert, specular
-from coliags_plugin.fields.diffuse_network import DiffuseNetwork
+from coliags_plugin.fields.diffuse_network import DiffuseNetwork, Precision
 from coliags_plugin.fields.explicit_field import ExplicitField, ExplicitFieldSettings
 
 logger = logging.getLogger(__name__)
@@ -56,6 +56,7 @@ class LitGaussiansSettings(ExplicitFieldSettings):
     network_from: int = Option(default=1000, ge=0)  # step after which the network corrects the diffuse reflection
     hidden: int = Option(default=128, ge=1)  # units of each hidden layer of the network
     depth: int = Option(default=3, ge=1)  # hidden layers of the network
+    network_precision: Precision = "auto"  # of its products in training; auto: bfloat16 where the CPU is made for it
     input_noise: float = Option(default=0.001, ge=0)  # standard deviation, on the network's inputs while training
 
     @model_validator(mode="after")
@@ -100,7 +101,7 @@ class LitGaussians(ExplicitField, LitField):
         self.lamp_parameters = nn.Parameter(
             torch.tensor([settings.lamp_intensity, settings.lamp_falloff, settings.lamp_exponent])
         )
-        self.diffuse_network = DiffuseNetwork(settings.hidden, settings.depth, torch.Generator())
+        self.diffuse_network = _network(settings, torch.Generator())
         self.register_buffer("extent", torch.ones(()))
         for name in ("seed", "step"):
             self.register_buffer(name, torch.zeros((), dtype=torch.int64))
@@ -118,7 +119,7 @@ class LitGaussians(ExplicitField, LitField):
                 "all training cameras are at one place", "cameras that move: lengths are measured in their extent"
             )
         field = super().from_scene(scene, settings, generator)
-        field.diffuse_network = DiffuseNetwork(settings.hidden, settings.depth, generator)
+        field.diffuse_network = _network(settings, generator)
         field.seed.copy_(torch.randint(2**62, (), generator=generator))
         field.extent.fill_(scene.extent)
         with torch.no_grad():
@@ -252,3 +253,7 @@ def _initial_albedos(points: PointCloud, pink_share: float) -> Float[Tensor, "N 
             logger.warning("the initial points have no colours: all start with that of mucosa")
         return pink.pow(GAMMA)
     return torch.lerp(points.colors.to(torch.float32) / 255.0, pink, pink_share).pow(GAMMA)
+
+
+def _network(settings: LitGaussiansSettings, generator: torch.Generator) -> DiffuseNetwork:
+    return DiffuseNetwork(settings.hidden, settings.depth, settings.network_precision, generator)
