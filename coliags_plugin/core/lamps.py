@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
@@ -12,6 +13,8 @@ from torch import Tensor
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.settings import Settings
 
+_Finite = Annotated[float, Option(allow_inf_nan=False)]
+
 
 class Lamp(Settings):
     """Point light that moves with the camera; by default at its optical centre, alike in all directions.
@@ -19,8 +22,8 @@ class Lamp(Settings):
     Light towards a direction at an angle t to the lamp's axis is multiplied by max(cos t, 0)^power.
     """
 
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # from the optical centre, camera axes, scene units (mm)
-    turn: tuple[float, float] = (0.0, 0.0)  # of its axis from the optical axis, about camera x, then y, degrees
+    offset: tuple[_Finite, _Finite, _Finite] = (0.0, 0.0, 0.0)  # from the optical centre, camera axes, scene units (mm)
+    turn: tuple[_Finite, _Finite] = (0.0, 0.0)  # of its axis from the optical axis, about camera x, then y, degrees
     power: float = Option(default=0.0, ge=0.0, allow_inf_nan=False)  # see above; 0: alike in all directions
     intensity: float = Option(default=1.0, ge=0.0, allow_inf_nan=False)  # factor of the trained intensity
 
@@ -36,8 +39,8 @@ class Lamp(Settings):
     def axis(self, camera: Camera) -> Float[Tensor, "3"]:
         """Unit vector in the world along which it shines most. [3]
 
-        Turned by (a, b) degrees it is (sin b cos a, -sin a, cos b cos a) in camera axes: a > 0 turns it up (towards -y),
-        b > 0 to the right (towards +x).
+        Turned by (a, b) degrees it is (sin b cos a, -sin a, cos b cos a) in camera axes: a > 0 turns it up (towards
+        -y), b > 0 to the right (towards +x).
         """
         up, right = (math.radians(angle) for angle in self.turn)
         local = (math.sin(right) * math.cos(up), -math.sin(up), math.cos(right) * math.cos(up))

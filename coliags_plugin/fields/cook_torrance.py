@@ -76,9 +76,7 @@ def lambert(cosines: Cosines, reflected: Float[Tensor, "N"]) -> Float[Tensor, "N
     return (1.0 - reflected) * cosines.normal_lamp / math.pi
 
 
-def specular(
-    cosines: Cosines, reflected: Float[Tensor, "N"], roughness: Float[Tensor, "N"]
-) -> Float[Tensor, "N"]:
+def specular(cosines: Cosines, reflected: Float[Tensor, "N"], roughness: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
     """Cook-Torrance BRDF F D G / (4 <N, V> <N, L>), times <N, L>. 1 / sr. [N]
 
     With G = G1(<N, V>) G1(<N, L>), G1(t) = t / (t (1 - k) + k), k = (roughness + 1)^2 / 8, whose numerators cancel the

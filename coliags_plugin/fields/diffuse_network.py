@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cache
 from typing import Any, Literal
 
@@ -71,5 +72,5 @@ class DiffuseNetwork(nn.Module):
 @cache
 def _cpu_multiplies_bfloat16() -> bool:
     """Whether the CPU has instructions for products of bfloat16; others take longer for them than for float32."""
-    capabilities = getattr(torch.cpu, "get_capabilities", dict)()
+    capabilities: Mapping[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
     return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))

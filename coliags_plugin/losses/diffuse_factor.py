@@ -35,7 +35,7 @@ class DiffuseFactorLoss(Loss):
         return self.share(step) * (1.0 - factors).square().sum() / max(factors.numel(), 1)
 
     def share(self, step: TrainingStep) -> float:
-        """f at this step."""
+        """F at this step."""
         schedule, options = step.schedule, self.settings
         start = schedule.at(options.from_step)
         end = schedule.steps if options.until_step is None else schedule.at(options.until_step)
