@@ -35,7 +35,7 @@ MIN_LIGHT = 1e-6
 #: Of mucosa, gamma-encoded RGB in [0, 1].
 PINK = (188 / 255, 99 / 255, 76 / 255)
 #: A Gaussian of lower opacity is drawn nowhere.
-_MIN_OPACITY = 1.0 / 255.0
+MIN_OPACITY = 1.0 / 255.0
 #: Shortest distance to the lamp, scene units.
 _MIN_DISTANCE = 1e-6
 
@@ -167,7 +167,7 @@ class LitGaussians(ExplicitField, LitField):
         """The Gaussians in the camera's view with the light they reflect towards it."""
         camera = camera.to(self.means.device, self.means.dtype)
         visible = self._visible(camera)
-        visible = visible[self.opacities.detach()[visible].sigmoid() >= _MIN_OPACITY]
+        visible = visible[self.opacities.detach()[visible].sigmoid() >= MIN_OPACITY]
         means, log_scales, quats, logits, albedos, roughness, f0 = (
             getattr(self, name).index_select(0, visible) for name in self.row_parameters
         )
