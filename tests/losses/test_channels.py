@@ -12,12 +12,14 @@ from coliags_plugin.config import registry
 from coliags_plugin.contracts import Schedule, TrainingStep
 from coliags_plugin.core.errors import InputError
 
+SCHEDULE = Schedule(100, 100)
+
 
 @pytest.fixture
 def value(make_output):
     """A loss of Gaussians with this channel."""
 
-    def value(name, values, step=1, schedule=Schedule(100, 100), **options):
+    def value(name, values, step=1, schedule=SCHEDULE, **options):
         output = make_output(torch.zeros(2, 2, 3), torch.zeros(len(values), 3))
         channel = options.get("attribute", "diffuse_factor")
         splats = replace(output.splats, gaussians=replace(output.splats.gaussians, features={channel: values}))
