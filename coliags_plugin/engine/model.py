@@ -73,7 +73,7 @@ class Model(nn.Module):
     @property
     def outputs(self) -> frozenset[str]:
         """Names of all available outputs."""
-        return self.renderer.outputs | self.feature_channels
+        return self.renderer.outputs_of(self.field.primitive) | self.feature_channels
 
     @property
     def feature_channels(self) -> frozenset[str]:

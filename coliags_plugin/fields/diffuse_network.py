@@ -23,17 +23,17 @@ class DiffuseNetwork(nn.Module):
 
     Args:
         hidden: Units of each hidden layer.
-        depth: Hidden layers.
+        hidden_layers: Their number.
         precision: See :data:`Precision`.
         generator: Of the initial weights.
     """
 
     INPUTS = 11
 
-    def __init__(self, hidden: int, depth: int, precision: Precision, generator: torch.Generator) -> None:
+    def __init__(self, hidden: int, hidden_layers: int, precision: Precision, generator: torch.Generator) -> None:
         super().__init__()
         self.precision = precision
-        self.layers = nn.ModuleList(linear_layers((self.INPUTS, *[hidden] * depth, 3), generator))
+        self.layers = nn.ModuleList(linear_layers((self.INPUTS, *[hidden] * hidden_layers, 3), generator))
         last: Any = self.layers[-1]
         nn.init.ones_(last.bias)
 

@@ -54,7 +54,7 @@ class LitGaussiansSettings(ExplicitFieldSettings):
     lamp_exponent: float = Option(default=2.0, ge=0)  # initial p
     network_from: int = Option(default=1000, ge=0)  # step after which the network corrects the diffuse reflection
     hidden: int = Option(default=128, ge=1)  # units of each hidden layer of the network
-    depth: int = Option(default=3, ge=1)  # hidden layers of the network
+    hidden_layers: int = Option(default=3, ge=1)  # of the network
     network_precision: Precision = "auto"  # of its products in training; auto: bfloat16 where the CPU is made for it
     input_noise: float = Option(default=0.001, ge=0)  # standard deviation, on the network's inputs while training
 
@@ -255,4 +255,4 @@ def _initial_albedos(points: PointCloud, pink_share: float) -> Float[Tensor, "N 
 
 
 def _network(settings: LitGaussiansSettings, generator: torch.Generator) -> DiffuseNetwork:
-    return DiffuseNetwork(settings.hidden, settings.depth, settings.network_precision, generator)
+    return DiffuseNetwork(settings.hidden, settings.hidden_layers, settings.network_precision, generator)

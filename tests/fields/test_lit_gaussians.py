@@ -22,7 +22,7 @@ from tests.fields.test_cook_torrance import by_hand
 from tests.scenes import camera_at, wall_scene
 
 SCHEDULE = Schedule(100, 100)
-OPTIONS = {"network_from": 50, "hidden": 16, "depth": 2, "network_precision": "float32"}
+OPTIONS = {"network_from": 50, "hidden": 16, "hidden_layers": 2, "network_precision": "float32"}
 
 
 def colored_wall():
@@ -182,7 +182,7 @@ def test_the_network_is_inert_until_its_step():
 
 
 def test_a_new_network_changes_little():
-    field, camera = make(hidden=128, depth=3), camera_at(0, 0, 0)
+    field, camera = make(hidden=128, hidden_layers=3), camera_at(0, 0, 0)
     field.before_step(51, SCHEDULE)
     assert (field.gaussians(camera).features["diffuse_factor"] - 1).abs().max() < 0.25
 
