@@ -2,7 +2,14 @@
 
 from coliags_plugin.contracts.data import DataManager
 from coliags_plugin.contracts.evaluation import Comparison, Metric, Protocol
-from coliags_plugin.contracts.fields import Field, GaussianField, RadianceField, RadianceLevel, RadianceSamples
+from coliags_plugin.contracts.fields import (
+    Field,
+    GaussianField,
+    LitField,
+    RadianceField,
+    RadianceLevel,
+    RadianceSamples,
+)
 from coliags_plugin.contracts.heads import AppearanceHead, GeometryHead, Head
 from coliags_plugin.contracts.losses import Loss, LossSettings
 from coliags_plugin.contracts.rendering import Availability, Renderer, ViewModule
@@ -26,6 +33,7 @@ __all__ = [
     "GaussianField",
     "GeometryHead",
     "Head",
+    "LitField",
     "Loss",
     "LossSettings",
     "Metric",

@@ -15,6 +15,7 @@ from typing_extensions import Self
 from coliags_plugin.contracts.schedule import Schedule
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.lamps import Lamp
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
 
@@ -70,6 +71,14 @@ class GaussianField(Field):
     @abstractmethod
     def gaussians(self, camera: Camera) -> Gaussians:
         """The Gaussians this camera sees, differentiable with respect to the field's parameters and the pose."""
+
+
+class LitField(GaussianField):
+    """Gaussian field that models the lamp apart from the tissue, so that the lamp can be exchanged after training."""
+
+    @abstractmethod
+    def with_lamp(self, lamp: Lamp) -> Self:
+        """The field under another lamp; it shares the parameters."""
 
 
 @dataclass(frozen=True)

@@ -79,8 +79,12 @@ class Model(nn.Module):
     @property
     def outputs(self) -> frozenset[str]:
         """Names of all available outputs."""
-        channels = self.field.feature_channels if isinstance(self.field, GaussianField) else frozenset()
-        return self.renderer.outputs_of(self.field.primitive) | channels
+        return self.renderer.outputs_of(self.field.primitive) | self.feature_channels
+
+    @property
+    def feature_channels(self) -> frozenset[str]:
+        """Names of the field's feature channels."""
+        return self.field.feature_channels if isinstance(self.field, GaussianField) else frozenset()
 
     def check_outputs(self, wants: Sequence[str], asking: str) -> None:
         """Refuse outputs that the renderer does not have for this field, wanted by a caller or a view module.
