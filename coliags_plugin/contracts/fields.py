@@ -72,6 +72,10 @@ class GaussianField(Field):
     def gaussians(self, camera: Camera) -> Gaussians:
         """The Gaussians this camera sees, differentiable with respect to the field's parameters and the pose."""
 
+    def gaussians_in_training(self, camera: Camera, generator: torch.Generator) -> Gaussians:
+        """:meth:`gaussians` in a training step: with noise from the generator where there is any; default: without."""
+        return self.gaussians(camera)
+
 
 class LitField(GaussianField):
     """Gaussian field that models the lamp apart from the tissue, so that the lamp can be exchanged after training."""

@@ -202,7 +202,8 @@ class Trainer:
         for draw in draws:
             frame = self.frames[draw.frame].to(self.device)
             view = frame.view(trained=True)
-            outputs.append(self.model.render(frame.camera, self.wants, view, draw.pixels, self.generators["rays"]))
+            generator = self.generators["rendering"]
+            outputs.append(self.model.render(frame.camera, self.wants, view, draw.pixels, generator))
             targets.append(frame.target if draw.pixels is None else frame.target_at(draw.pixels))
         return concatenate_pixels(outputs), concatenate_targets(targets)
 

@@ -43,6 +43,7 @@ class DiffuseNetwork(nn.Module):
         distances: Float[Tensor, "N 1"],
         normals: Float[Tensor, "N 3"],
         lamps: Float[Tensor, "N 3"],
+        in_training: bool,
     ) -> Float[Tensor, "N 3"]:
         """Factors, of any sign. [N, 3]
 
@@ -51,10 +52,11 @@ class DiffuseNetwork(nn.Module):
             distances: To the lamp, in extents of the scene. [N, 1]
             normals: Unit vectors, on the side of the camera. [N, 3]
             lamps: Unit vectors to the lamp. [N, 3]
+            in_training: Whether products may be of the reduced precision.
         """
         cosines = (normals * lamps).sum(1, keepdim=True)
         inputs = torch.cat([albedos, distances, normals, lamps, cosines], dim=1)
-        dtype = self._dtype(inputs)
+        dtype = self._reduced_dtype(inputs) if in_training else inputs.dtype
         layers: list[Any] = list(self.layers)
         values = inputs.to(dtype)
         for layer in layers[:-1]:
@@ -62,8 +64,8 @@ class DiffuseNetwork(nn.Module):
         # The bias, near 1, is added to the small rest in full precision.
         return nn.functional.linear(values, layers[-1].weight.to(dtype)).to(inputs.dtype) + layers[-1].bias
 
-    def _dtype(self, inputs: Tensor) -> torch.dtype:
-        if not self.training or inputs.dtype != torch.float32 or self.precision == "float32":
+    def _reduced_dtype(self, inputs: Tensor) -> torch.dtype:
+        if inputs.dtype != torch.float32 or self.precision == "float32":
             return inputs.dtype
         fast = self.precision == "bfloat16" or (inputs.device.type == "cpu" and _cpu_multiplies_bfloat16())
         return torch.bfloat16 if fast else inputs.dtype

@@ -76,8 +76,6 @@ class LitGaussians(ExplicitField, LitField):
         f0: Reflectance at normal incidence. [N]
         lamp_parameters: Intensity, falloff k and exponent p. [3]
         extent: Of the scene, the unit of distances to the lamp, scene units. []
-        seed: Of the noise. []
-        step: Of training, or the last. []
         network_on: Whether the network corrects the diffuse reflection. []
     """
 
@@ -87,8 +85,6 @@ class LitGaussians(ExplicitField, LitField):
     scale_count: ClassVar[int] = 2
 
     extent: Tensor
-    seed: Tensor
-    step: Tensor
     network_on: Tensor
 
     def __init__(self, settings: Any, count: int) -> None:
@@ -102,8 +98,6 @@ class LitGaussians(ExplicitField, LitField):
         )
         self.diffuse_network = _network(settings, torch.Generator())
         self.register_buffer("extent", torch.ones(()))
-        for name in ("seed", "step"):
-            self.register_buffer(name, torch.zeros((), dtype=torch.int64))
         self.register_buffer("network_on", torch.zeros((), dtype=torch.bool))
 
     @classmethod
@@ -119,7 +113,6 @@ class LitGaussians(ExplicitField, LitField):
             )
         field = super().from_scene(scene, settings, generator)
         field.diffuse_network = _network(settings, generator)
-        field.seed.copy_(torch.randint(2**62, (), generator=generator))
         field.extent.fill_(scene.extent)
         with torch.no_grad():
             field.albedos.copy_(_initial_albedos(scene.points, settings.pink_share))
@@ -146,8 +139,7 @@ class LitGaussians(ExplicitField, LitField):
         return other
 
     def before_step(self, step: int, schedule: Schedule) -> None:
-        """Count the steps, and move parameters that the optimizers brought out of bounds back to these."""
-        self.step.fill_(step)
+        """Switch the network on, and move parameters that the optimizers brought out of bounds back to these."""
         self.network_on.fill_(step > schedule.at(self.settings.network_from))
         self._project()
 
@@ -165,6 +157,13 @@ class LitGaussians(ExplicitField, LitField):
 
     def gaussians(self, camera: Camera) -> Gaussians:
         """The Gaussians in the camera's view with the light they reflect towards it."""
+        return self._gaussians(camera, None)
+
+    def gaussians_in_training(self, camera: Camera, generator: torch.Generator) -> Gaussians:
+        """The same with noise on the network's inputs, and its products in ``network_precision``."""
+        return self._gaussians(camera, generator)
+
+    def _gaussians(self, camera: Camera, generator: torch.Generator | None) -> Gaussians:
         camera = camera.to(self.means.device, self.means.dtype)
         visible = self._visible(camera)
         visible = visible[self.opacities.detach()[visible].sigmoid() >= MIN_OPACITY]
@@ -175,7 +174,7 @@ class LitGaussians(ExplicitField, LitField):
         albedos = albedos.clamp_min(0.0)
         roughness = roughness.clamp(*self.settings.roughness_range)
         f0 = f0.clamp(*self.settings.f0_range)
-        light, factors = self._reflected(camera, means, third_axes(quats), albedos, roughness, f0)
+        light, factors = self._reflected(camera, means, third_axes(quats), albedos, roughness, f0, generator)
         return Gaussians(
             means=means,
             quats_wxyz=quats,
@@ -200,6 +199,7 @@ class LitGaussians(ExplicitField, LitField):
         albedos: Float[Tensor, "V 3"],
         roughness: Float[Tensor, "V"],
         f0: Float[Tensor, "V"],
+        generator: torch.Generator | None,
     ) -> tuple[Float[Tensor, "V 3"], Float[Tensor, "V 3"]]:
         """Linear light from Gaussians to the camera, and the factors of their diffuse reflection. [V, 3], [V, 3]"""
         views = camera.center - means
@@ -217,7 +217,7 @@ class LitGaussians(ExplicitField, LitField):
         arriving = intensity / (1.0 + falloff * distances[:, 0].pow(exponent))
         if self.lamp != Lamp():
             arriving = arriving * self.lamp.spread(-lamps, camera)
-        factors = self._factors(albedos, distances, normals, lamps)
+        factors = self._factors(albedos, distances, normals, lamps, generator)
         mirrored = fresnel(cosines, f0)
         diffuse = (albedos * factors).clamp_min(0.0) * lambert(cosines, mirrored)[:, None]
         light = diffuse + specular(cosines, mirrored, roughness)[:, None]
@@ -229,18 +229,17 @@ class LitGaussians(ExplicitField, LitField):
         distances: Float[Tensor, "V 1"],
         normals: Float[Tensor, "V 3"],
         lamps: Float[Tensor, "V 3"],
+        generator: torch.Generator | None,
     ) -> Float[Tensor, "V 3"]:
         """Factors of the diffuse reflection: 1 before the network counts. [V, 3]"""
         if not self.network_on:
             return torch.ones_like(albedos)
-        if self.training and self.settings.input_noise > 0:
-            generator = torch.Generator(albedos.device).manual_seed(int(self.seed + self.step))
-            noise = torch.randn(len(albedos), 7, generator=generator, device=albedos.device)
-            noise = self.settings.input_noise * noise.to(albedos.dtype)
+        if generator is not None and self.settings.input_noise > 0:
+            noise = self.settings.input_noise * torch.randn(len(albedos), 7, generator=generator).to(albedos)
             distances = distances + noise[:, :1]
             normals = nn.functional.normalize(normals + noise[:, 1:4], dim=1)
             lamps = nn.functional.normalize(lamps + noise[:, 4:], dim=1)
-        factors: Tensor = self.diffuse_network(albedos, distances, normals, lamps)
+        factors: Tensor = self.diffuse_network(albedos, distances, normals, lamps, generator is not None)
         return factors
 
 

@@ -79,7 +79,7 @@ def test_training_recovers_the_fall_off_and_the_roughness(tmp_path):
     trainer = Trainer(load_method("pr-endo", overrides), scene, "lit", RunFolder(tmp_path / "run"), 0, CPU)
     trainer.start()
     trainer.train()
-    field = trainer.model.field.eval()
+    field = trainer.model.field
     intensity, falloff, exponent = field.lamp_parameters.tolist()
     distances = torch.linspace(7.0, 35.0, 30) / scene.extent
     arriving = intensity / (1 + falloff * distances**exponent)

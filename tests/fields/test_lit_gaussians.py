@@ -50,7 +50,7 @@ def varied(**options):
 
 
 def trained(**options):
-    """As varied, in training at a step at which the network counts, with weights that matter."""
+    """As varied, at a step at which the network counts, with weights that matter."""
     field = varied(**options)
     with torch.no_grad():
         for layer in field.diffuse_network.layers:
@@ -189,7 +189,6 @@ def test_a_new_network_changes_little():
 
 def test_factors_multiply_the_diffuse_light_alone():
     field, camera = trained(), camera_at(0, 0, 0)
-    field.eval()
     with torch.no_grad():
         whole = field.gaussians(camera)
         field.albedos.zero_()
@@ -203,36 +202,26 @@ def test_factors_multiply_the_diffuse_light_alone():
     torch.testing.assert_close(diffuse, plain * factors, rtol=1e-3, atol=1e-5)
 
 
-def test_noise_is_of_training_alone_and_repeatable():
-    field, camera = trained(), camera_at(0, 0, 0)
-    here = field.gaussians(camera).features["diffuse_factor"]
-    assert torch.equal(here, field.gaussians(camera).features["diffuse_factor"])
-    field.before_step(61, SCHEDULE)
-    assert not torch.equal(here, field.gaussians(camera).features["diffuse_factor"])
-    restored = type(field).from_state(field.state_dict(), field.settings)  # as a resumed run has it
-    assert torch.equal(restored.gaussians(camera).colors, field.gaussians(camera).colors)
-    clean = field.eval().gaussians(camera).features["diffuse_factor"]
-    field.before_step(62, SCHEDULE)
-    assert torch.equal(clean, field.gaussians(camera).features["diffuse_factor"])
-    assert 0 < (here - clean).abs().mean() < 0.01
-    silent = trained(input_noise=0.0).gaussians(camera).features["diffuse_factor"]
-    torch.testing.assert_close(silent, clean)
+def in_training(field, seed=5):
+    return field.gaussians_in_training(camera_at(0, 0, 0), torch.Generator().manual_seed(seed))
 
 
-def test_two_fields_of_different_seeds_have_different_noise():
-    first, second = make(), make()
-    assert torch.equal(first.seed, second.seed)
-    component = make_component("fields", {"name": "lit-gaussians", **OPTIONS})
-    other = component.target.from_scene(colored_wall(), component.settings, torch.Generator().manual_seed(4))
-    assert not torch.equal(first.seed, other.seed)
+def test_noise_is_of_training_alone_and_the_generators():
+    field = trained()
+    noisy, again, other = (in_training(field, seed).features["diffuse_factor"] for seed in (5, 5, 6))
+    assert torch.equal(noisy, again) and not torch.equal(noisy, other)
+    clean = field.gaussians(camera_at(0, 0, 0)).features["diffuse_factor"]
+    assert 0 < (noisy - clean).abs().mean() < 0.01
+    silent = trained(input_noise=0.0, network_precision="float32")
+    torch.testing.assert_close(in_training(silent).features["diffuse_factor"], clean)
 
 
 def test_half_precision_is_of_training_alone_and_changes_little():
     camera = camera_at(0, 0, 0)
-    full, half = trained(), trained(network_precision="bfloat16")
-    difference = (full.gaussians(camera).colors - half.gaussians(camera).colors).abs()
+    full, half = trained(network_precision="float32"), trained(network_precision="bfloat16")
+    difference = (in_training(full).colors - in_training(half).colors).abs()
     assert 0 < difference.max() < 0.01
-    assert torch.equal(full.eval().gaussians(camera).colors, half.eval().gaussians(camera).colors)
+    assert torch.equal(full.gaussians(camera).colors, half.gaussians(camera).colors)
 
 
 def test_parameters_return_from_beyond_their_bounds_with_a_gradient():

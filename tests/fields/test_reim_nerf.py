@@ -228,10 +228,10 @@ def test_a_run_resumes_to_the_bit_and_renders_alike_twice(tmp_path):
         first, second = (model.render(camera, ("depth_accumulated",)) for model in (straight.model, resumed.model))
     assert torch.equal(first.rgb, second.rgb)
     assert torch.equal(first["depth_accumulated"], second["depth_accumulated"])
-    # Chance comes in: another state of the generator of rays, another step.
+    # Chance comes in: another state of the generator, another step.
     other = trainer(tmp_path / "broken")
     other.resume()
-    other.generators["rays"].manual_seed(5)
+    other.generators["rendering"].manual_seed(5)
     assert other.take_step()["loss"] != rows[3]["loss"]
 
 
@@ -247,10 +247,10 @@ def test_noise_and_jitter_are_of_training_alone(tmp_path):
     assert torch.equal(silent.rgb, still.rgb)
 
 
-def test_a_checkpoint_from_before_the_rays_had_a_generator_still_loads(tmp_path):
+def test_a_checkpoint_from_before_rendering_had_a_generator_still_loads(tmp_path):
     run = trainer(tmp_path / "run")
     run.start()
-    del run.generators["rays"]
+    del run.generators["rendering"]
     run.save()
     trainer(tmp_path / "run").resume()
 
