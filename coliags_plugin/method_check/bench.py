@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from coliags_plugin.config.method_config import LoadedMethod
+from coliags_plugin.config.method_config import LoadedMethod, MethodConfig
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.checkpoints import Checkpoint, read_checkpoint
 from coliags_plugin.engine.data_formats import load_method_for
@@ -55,6 +55,11 @@ class Bench:
     trained: TrainedRun = field(init=False)
 
     @property
+    def config(self) -> MethodConfig | None:
+        """The method's config; None where it could not be read."""
+        return self.loaded.config if hasattr(self, "loaded") else None
+
+    @property
     def half(self) -> int:
         """The step in the middle of a run, of which there is a checkpoint."""
         return self.steps // 2
@@ -90,7 +95,7 @@ class Bench:
 
 @contextmanager
 def as_in_new_process() -> Iterator[None]:
-    """torch's global random numbers as they are when Python has just started, and afterwards as they were.
+    """Global random numbers of torch as they are when Python has just started, and afterwards as they were.
 
     Two runs in one process then draw the same ones, as they would in two; and a resumed run does not go on with them.
     """

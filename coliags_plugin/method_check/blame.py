@@ -71,7 +71,7 @@ def _place(error: BaseException, config: MethodConfig | None) -> str:
         [frame for frame in frames if _within(frame.filename, [_PACKAGE])],
     ):
         if chosen:
-            return f"{chosen[-1].filename}:{chosen[-1].lineno}"
+            return f"{_short(chosen[-1].filename)}:{chosen[-1].lineno}"
     return ""
 
 
@@ -85,6 +85,11 @@ def _roots(target: Any) -> Iterator[Path]:
         code = getattr(unwrap(function) if callable(function) else function, "__code__", None)
         if isinstance(code, CodeType):
             yield Path(code.co_filename)
+
+
+def _short(path: str) -> Path:
+    """Relative to the working directory where it lies within."""
+    return Path(path).relative_to(Path.cwd()) if _within(path, [Path.cwd()]) else Path(path)
 
 
 def _within(path: str | Path, roots: Any) -> bool:

@@ -116,4 +116,4 @@ def _run(check: Check, bench: Bench, passed: set[str]) -> Result:
     except InterruptedRunError as error:
         raise KeyboardInterrupt from error
     except Exception as error:
-        return result("failed", describe(error, getattr(getattr(bench, "loaded", None), "config", None)), traceback.format_exc())
+        return result("failed", describe(error, bench.config), traceback.format_exc())

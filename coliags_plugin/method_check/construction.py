@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 
+from pydantic import ValidationError
+from pydantic_core import PydanticCustomError
+
+from coliags_plugin.config.components import make_component
 from coliags_plugin.config.method_config import load_method
-from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.data_formats import load_scene
 from coliags_plugin.method_check.bench import Bench, as_in_new_process
 from coliags_plugin.method_check.blame import components
@@ -34,9 +37,10 @@ def refuses_options(bench: Bench) -> str:
     """Every component refuses an option that it does not have, by name."""
     there = components(bench.loaded.config)
     for path, component in there.items():
+        options = {"name": component.name, **component.settings.model_dump(), NO_OPTION: 1}
         try:
-            bench.load([f"{path}.name={component.name}", f"{path}.{NO_OPTION}=1"])
-        except InputError as error:
+            make_component(component.kind, options)
+        except (ValidationError, PydanticCustomError) as error:
             if NO_OPTION in str(error):
                 continue
             raise CheckFailedError(f"{path}.{NO_OPTION}=1 is refused without being named: {error}") from error
@@ -76,5 +80,5 @@ def has_all_groups(bench: Bench) -> str:
         if not parameters:
             raise CheckFailedError(f"parameter group '{group}' is empty")
         if any(id(parameter) in strangers for parameter in parameters):
-            raise CheckFailedError(f"parameter group '{group}' holds a parameter that is none of the model's attributes")
+            raise CheckFailedError(f"parameter group '{group}' holds a parameter that is no attribute of the model")
     return ", ".join(groups)

@@ -40,7 +40,7 @@ def inactive_terms(bench: Bench) -> list[str]:
 
 def every_term_counts(bench: Bench) -> str:
     """Every loss term is active at some step of the run."""
-    losses, written_for = bench.loaded.config.losses, bench.loaded.config.schedule.written_for
+    losses, written_for = bench.trainer.losses, bench.loaded.config.schedule.written_for
     idle = inactive_terms(bench)
     if idle:
         told = ", ".join(f"'{key}' (after step {losses[key].settings.from_step} of {written_for})" for key in idle)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import dataclass
+from itertools import pairwise
 
 from torch import nn
 
@@ -45,7 +46,7 @@ def keeps_rows_together(bench: Bench) -> str:
         apart = continues_alike(trainer, resumed, bench)
     if apart:
         raise CheckFailedError(f"resumed after the event of step {changed_at}: {apart}")
-    events = sum(a != b for a, b in zip(counts, counts[1:], strict=False))
+    events = sum(a != b for a, b in pairwise(counts))
     return f"{start.count} to {before.count} rows in {events} events; resumed after step {changed_at} to the same bits"
 
 
@@ -68,7 +69,7 @@ class _Census:
     Attributes:
         count: Elements of the field.
         parameters: Rows of the groups of one parameter.
-        buffers: Rows of the field's buffers.
+        buffers: Rows of the field's own buffers; those of its parts may be of another kind.
         counters: Rows of the strategy's counters.
     """
 
@@ -82,7 +83,7 @@ class _Census:
         self.count = model.field.element_count
         groups = {name: group for name, group in model.field.parameter_groups().items() if len(group) == 1}
         self.parameters = {name: len(group[0]) for name, group in groups.items() if group[0].ndim}
-        self.buffers = {name: len(value) for name, value in model.field.named_buffers() if value.ndim}
+        self.buffers = {name: len(value) for name, value in model.field.named_buffers(recurse=False) if value.ndim}
         self.counters = {name: len(value) for name, value in trainer.strategy.state_dict().items() if value.ndim}
 
 

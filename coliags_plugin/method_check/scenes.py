@@ -17,14 +17,15 @@ from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.phantom.generate import generate
 from coliags_plugin.phantom.settings import phantom_settings
 
-#: Small and coarse: two seconds to make, and few pixels to render.
+#: Small and coarse: a second to make, and few pixels to render. Two of the frames are held out.
 PHANTOM = {
     "frames": 12,
-    "width": 48,
-    "height": 40,
+    "width": 40,
+    "height": 32,
     "rotation_views": 0,
     "polyps": 1,
     "path_length": 20.0,
+    "interreflection": 0.0,
     "mesh_spacing": 2.0,
     "texture_spacing": 0.5,
 }
@@ -56,19 +57,20 @@ def _phantom(layout: str) -> TemporaryDirectory[str]:
     return folder
 
 
-def reach(scene: Scene) -> float | None:
-    """The largest z-depth known in a few training frames, else of the initial points; None without any."""
+def depth_range(scene: Scene) -> tuple[float, float] | None:
+    """Smallest and largest z-depth known in a few training frames, else of the initial points; None without any."""
     depths = [frame.depth for frame in scene.train[:4]]
     known = torch.cat([torch.zeros(0), *(depth[depth.isfinite()].flatten() for depth in depths if depth is not None)])
     if len(known) == 0 and len(scene.points):
         camera = scene.train[0].camera
-        known = camera.project(scene.points.positions.to(camera.camera_to_world))[1]
-    return float(known.max()) if len(known) else None
+        depth = camera.project(scene.points.positions.to(camera.camera_to_world))[1]
+        known = depth[depth > 0]
+    return (float(known.min()), float(known.max())) if len(known) else None
 
 
 def without_depth(scene: Scene) -> Scene:
     """The scene without depth of any kind; its points stay."""
-    return replace(scene, train=[_frame(frame, depth=None, depth_at_least=None, sparse_depth=None) for frame in scene.train])
+    return replace(scene, train=[_without_depth(frame.to("cpu")) for frame in scene.train])
 
 
 def without_points(scene: Scene) -> Scene:
@@ -102,5 +104,5 @@ def _masked(frame: Frame, spoilt: bool) -> Frame:
     return replace(masked, image=torch.where(ignored[..., None], 255 - frame.image, frame.image), depth=depth)
 
 
-def _frame(frame: Frame, **changes: None) -> Frame:
-    return replace(frame.to("cpu"), **changes)
+def _without_depth(frame: Frame) -> Frame:
+    return replace(frame, depth=None, depth_at_least=None, sparse_depth=None)

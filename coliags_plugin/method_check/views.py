@@ -16,12 +16,12 @@ from coliags_plugin.core.scenes import Frame, View
 from coliags_plugin.engine.model import Model
 from coliags_plugin.method_check.bench import Bench, difference
 from coliags_plugin.method_check.results import CheckFailedError, CheckSkippedError
-from coliags_plugin.method_check.scenes import reach
+from coliags_plugin.method_check.scenes import depth_range
 
 #: Alpha from which a pixel has a depth.
 _OPAQUE = 0.95
-#: Depth may exceed the largest in the scene by this factor: a model is not good yet after a few steps.
-_MARGIN = 4.0
+#: Depth may leave the range of the scene by this factor: a model is not good yet after a few steps.
+_MARGIN = 10.0
 _ROUNDING = 1e-4
 NO_OUTPUT = "no_such_output"
 
@@ -29,7 +29,7 @@ NO_OUTPUT = "no_such_output"
 def renders_every_output(bench: Bench) -> str:
     """Every output has its shape and finite values in range, for views of the video, another size and a free camera."""
     model, frame = bench.trainer.model, bench.scene.train[0]
-    far = reach(bench.scene)
+    depths = depth_range(bench.scene)
     views: dict[str, tuple[Camera, View | None]] = {
         "a training view": (frame.camera, frame.view(trained=True)),
         "an untrained view": (frame.camera, replace(frame.view(trained=False), name="no such frame", time=0.5)),
@@ -37,7 +37,7 @@ def renders_every_output(bench: Bench) -> str:
         "a free camera": (_resized(frame.camera), None),
     }
     for what, (camera, view) in views.items():
-        wrong = _wrong(_render(model, camera, view), model, camera, far)
+        wrong = _wrong(_render(model, camera, view), model, camera, depths)
         if wrong:
             raise CheckFailedError(f"{what} of {camera.width} x {camera.height} pixels: {wrong}")
     return f"{', '.join(sorted(model.outputs))} at {len(views)} views"
@@ -47,10 +47,8 @@ def _resized(camera: Camera) -> Camera:
     """The camera with fewer pixels, an odd number of them, over the same field of view."""
     width, height = (max(1, int(0.35 * side)) * 2 + 1 for side in (camera.width, camera.height))
     across, down = width / camera.width, height / camera.height
-    size = {"width": width, "height": height}
-    return replace(
-        camera, fx=camera.fx * across, fy=camera.fy * down, cx=camera.cx * across, cy=camera.cy * down, **size
-    )
+    intrinsics = (camera.fx * across, camera.fy * down, camera.cx * across, camera.cy * down)
+    return Camera(*intrinsics, width, height, camera.camera_to_world)
 
 
 @torch.no_grad()
@@ -63,7 +61,7 @@ def maps(output: RenderOutput) -> dict[str, Tensor]:
     return {"rgb": output.rgb, "alpha": output.alpha, **output.maps}
 
 
-def _wrong(output: RenderOutput, model: Model, camera: Camera, far: float | None) -> str:
+def _wrong(output: RenderOutput, model: Model, camera: Camera, depths: tuple[float, float] | None) -> str:
     """The first thing wrong with an output; empty without."""
     there = maps(output)
     for name in sorted(model.outputs):
@@ -82,10 +80,12 @@ def _wrong(output: RenderOutput, model: Model, camera: Camera, far: float | None
     for name in sorted(model.outputs & set(DEPTH_KINDS)):
         depth = there[name][alpha > _OPAQUE]
         z = 1.0 / depth if name.startswith("inverse") else depth
-        if far is not None and len(z) and not (z.min() > 0 and z.max() <= _MARGIN * far):
+        if depths is None or not len(z):
+            continue
+        if not (z.min() >= depths[0] / _MARGIN and z.max() <= depths[1] * _MARGIN):
             return (
                 f"{name} is between {float(depth.min()):.4g} and {float(depth.max()):.4g} where alpha > {_OPAQUE}, "
-                f"and the scene ends at {far:.4g}"
+                f"and the scene lies between z = {depths[0]:.4g} and {depths[1]:.4g}"
             )
     return ""
 
