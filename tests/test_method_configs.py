@@ -1,0 +1,32 @@
+"""Every method of method_configs/ keeps the contract of all methods."""
+
+from __future__ import annotations
+
+import pytest
+
+from coliags_plugin.config.method_config import load_method
+from coliags_plugin.config.method_files import method_folder
+from coliags_plugin.method_check.check import CHECKS, check_method
+
+METHODS = sorted(
+    path.relative_to(method_folder()).with_suffix("").as_posix() for path in method_folder().rglob("*.yaml")
+)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_contract(method, tmp_path):
+    results = {result.name: result for result in check_method(method, tmp_path)}
+    assert [f"{result.name}: {result.detail}" for result in results.values() if result.status == "failed"] == []
+    config = load_method(method).config
+    inapplicable = {
+        "pixels": not config.renderer.target.renders_pixels,
+        "rows": config.strategy.target.serves is None,
+    }
+    assert {name for name, result in results.items() if result.status == "skipped"} == {
+        name for name, holds in inapplicable.items() if holds
+    }
+    assert list(results) == [check.name for check in CHECKS]
+
+
+def test_there_are_methods_to_check():
+    assert {"coliags", "scaffold-gs", "3dgs", "ablations/none"} <= set(METHODS)
