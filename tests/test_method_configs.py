@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import pytest
+import torch
 
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.config.method_files import method_folder
 from coliags_plugin.method_check.check import CHECKS, check_method
 
-METHODS = sorted(
-    path.relative_to(method_folder()).with_suffix("").as_posix() for path in method_folder().rglob("*.yaml")
-)
+FOLDER = method_folder()
+METHODS = sorted(path.relative_to(FOLDER).with_suffix("").as_posix() for path in FOLDER.rglob("*.yaml"))
+
+
+@pytest.fixture(autouse=True)
+def one_thread(two_threads):
+    """On so few pixels a second thread costs more than it gains."""
+    torch.set_num_threads(1)
 
 
 @pytest.mark.parametrize("method", METHODS)
