@@ -343,6 +343,17 @@ def test_the_page_of_options_is_what_the_settings_say():
     assert (DOCS / "options.md").read_text() == page, "make options"
 
 
+def test_the_table_of_methods_is_what_the_configs_say():
+    page = run_path(str(DOCS / "tools" / "methods.py"))["page"]()
+    assert (DOCS / "method_table.md").read_text() == page, "make method-table"
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in (ROOT / "method_configs").glob("*.yaml")))
+def test_every_constant_has_a_source(name):
+    constants = run_path(str(DOCS / "tools" / "methods.py"))["constants"]
+    assert [".".join(path) for path, _, source in constants(name) if not source] == []
+
+
 def test_protocols_page_names_every_protocol_metric_and_version():
     page = (DOCS / "protocols.md").read_text()
     for name in REGISTRIES["protocols"]:
