@@ -27,6 +27,7 @@ from coliags_plugin.datamanagers.recognition import formats
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
 from coliags_plugin.datamanagers.splits import held_out
 from coliags_plugin.engine.randomness import PURPOSES
+from coliags_plugin.method_check.check import CHECKS
 from coliags_plugin.phantom.settings import PRESETS, PhantomSettings
 from tests.scenes import SMALL, write_wall
 
@@ -312,6 +313,12 @@ def test_every_key_of_a_method_is_in_the_table():
     said = (DOCS / "configs.md").read_text()
     for key, field in ScheduleSettings.model_fields.items():
         assert re.search(rf"`{key}`\s+\({field.default}\b", said), key
+
+
+def test_the_table_of_checks_is_the_list():
+    assert [row[0] for row in table_rows("configs.md", "| check | what must hold |")] == [
+        check.name for check in CHECKS
+    ]
 
 
 def test_rates_in_the_table_are_coliags():

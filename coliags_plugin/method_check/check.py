@@ -82,11 +82,13 @@ def check_method(
         steps: Length of the runs, 10 or more; schedules are scaled to it.
 
     Raises:
-        InputError: No such method, or ``steps`` is too small.
+        InputError: No such method or data, or ``steps`` is too small.
     """
     method_tree(method, overrides)
     if steps < LEAST_STEPS:
         raise InputError(f"--steps {steps}", f"{LEAST_STEPS} or more")
+    if data is not None and not data.exists():
+        raise InputError(f"no folder {data}", "a scene", "Check the path, or leave --data out")
     scene = data or write_phantom(method, overrides, folder)
     bench = Bench(method, tuple(overrides), scene, data_format, steps, folder)
     passed: set[str] = set()

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from coliags_plugin.method_check.results import Result, Status
 
-_TICKS: dict[Status, str] = {"passed": "\u2713", "failed": "\u2717", "skipped": "\u2013"}
+_TICKS: dict[Status, str] = {"passed": "\u2713", "failed": "\u2717", "skipped": "-"}
 _WORDS: dict[Status, str] = {"passed": "ok  ", "failed": "FAIL", "skipped": "-   "}
 
 
