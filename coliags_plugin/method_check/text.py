@@ -19,7 +19,8 @@ def line(result: Result, width: int, encoding: str) -> str:
         encoding: Of where it is printed; words stand for ticks, and escapes for characters, that it does not have.
     """
     try:
-        mark = _TICKS[result.status].encode(encoding).decode(encoding)
+        "".join(_TICKS.values()).encode(encoding)
+        mark = _TICKS[result.status]
     except UnicodeEncodeError:
         mark = _WORDS[result.status]
     seconds = f"{result.seconds:6.1f} s" if result.status != "skipped" else 8 * " "
