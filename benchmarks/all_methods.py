@@ -52,7 +52,7 @@ class Options:
     data: Path
     """Scene."""
     out: Path
-    """Folder of the runs, the table (table.md, table.json) and the contact sheet (sheet.png)."""
+    """Folder of the runs, of their table as Markdown and JSON, and of the contact sheet."""
     methods: str = PAPER
     """Methods by name, comma separated."""
     timed: str = "reim-nerf"

@@ -167,6 +167,7 @@ fields = Registry(
     {
         "anchors": "coliags_plugin.fields.anchors:AnchorField",
         "gaussians": "coliags_plugin.fields.explicit_gaussians:ExplicitGaussians",
+        "surfels": "coliags_plugin.fields.surfels:Surfels",
     },
     noun="field",
 )
@@ -232,6 +233,8 @@ losses = Registry(
         "sparse-depth": "coliags_plugin.losses.sparse_depth:SparseDepthLoss",
         "scale-volume": "coliags_plugin.losses.scale_volume:ScaleVolumeLoss",
         "surface-normals": "coliags_plugin.losses.surface_normals:SurfaceNormalsLoss",
+        "normal-consistency": "coliags_plugin.losses.surfel_regularization:NormalConsistencyLoss",
+        "distortion": "coliags_plugin.losses.surfel_regularization:DistortionLoss",
     },
     noun="loss",
 )

@@ -31,6 +31,7 @@ class Renderer(ABC):
 
     Settings: ClassVar[type[Settings]]
     primitives: ClassVar[frozenset[str]]
+    #: Of every primitive; :meth:`outputs_of` says which of one.
     outputs: ClassVar[frozenset[str]]
     #: torch device types
     devices: ClassVar[frozenset[str]]
@@ -44,6 +45,15 @@ class Renderer(ABC):
     @abstractmethod
     def availability(cls) -> Availability:
         """Whether this machine can run it."""
+
+    @classmethod
+    def outputs_of(cls, primitive: str) -> frozenset[str]:
+        """Outputs of a field, its own feature channels not counted.
+
+        Args:
+            primitive: Of the field.
+        """
+        return cls.outputs
 
     @classmethod
     def alternatives(cls, settings: Any) -> Sequence[Mapping[str, Any]]:

@@ -23,7 +23,11 @@ OUTPUTS = (
     "depth_median",  # z of the Gaussian at which transmittance falls to one half
     "inverse_depth_accumulated",  # sum_i w_i / z_i: used by the authors' code for training and evaluation
     "normals",  # sum_i w_i n_i, camera axes, n_i the shortest axis, facing the camera
+    "distortion",  # sum_{j<i} w_i w_j (m_i - m_j)^2, m a depth in [0, 1]; surfels only
 )
+
+#: Outputs that only surfels have.
+SURFEL_OUTPUTS = frozenset({"distortion"})
 
 DEPTH_KINDS = tuple(name for name in OUTPUTS if "depth" in name)
 

@@ -74,7 +74,7 @@ class Model(nn.Module):
     def outputs(self) -> frozenset[str]:
         """Names of all available outputs."""
         channels = self.field.feature_channels if isinstance(self.field, GaussianField) else frozenset()
-        return self.renderer.outputs | channels
+        return self.renderer.outputs_of(self.field.primitive) | channels
 
     def check_outputs(self, wants: Sequence[str], asking: str) -> None:
         """Refuse outputs that the renderer does not have for this field, wanted by a caller or a view module.

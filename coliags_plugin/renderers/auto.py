@@ -10,9 +10,10 @@ from torch import Tensor
 
 from coliags_plugin.contracts import Availability, Renderer
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.render_output import OUTPUTS, RenderOutput
+from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.renderers.choice import choose_among
+from coliags_plugin.renderers.splatting import SplattingRenderer
 
 
 class AutoSettings(Settings):
@@ -31,8 +32,13 @@ class AutoRenderer(Renderer):
 
     Settings: ClassVar[type[Settings]] = AutoSettings
     primitives = frozenset({"gaussians3d", "surfels"})
-    outputs = frozenset(OUTPUTS)
+    outputs = SplattingRenderer.outputs
     devices = frozenset({"cpu", "cuda"})
+
+    @classmethod
+    def outputs_of(cls, primitive: str) -> frozenset[str]:
+        """Those of the splatting renderers."""
+        return SplattingRenderer.outputs_of(primitive)
 
     @classmethod
     def availability(cls) -> Availability:

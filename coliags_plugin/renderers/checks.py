@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable
 from coliags_plugin.contracts import Field
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.gaussians import Gaussians
-from coliags_plugin.core.render_output import OUTPUTS
+from coliags_plugin.core.render_output import OUTPUTS, SURFEL_OUTPUTS
 
 
 def check_primitive(field: Field, primitives: Collection[str], renderer: str) -> None:
@@ -36,6 +36,20 @@ def check_outputs(wants: Iterable[str], known: Iterable[str]) -> None:
             raise InputError(f"no renderer output '{name}'", f"some of {', '.join(known)}", did_you_mean(name, known))
 
 
+def is_surfels(gaussians: Gaussians) -> bool:
+    """Whether Gaussians are surfels, with two scales each.
+
+    Raises:
+        InputError: They have neither two nor three scales.
+    """
+    scales = gaussians.scales
+    if scales.ndim != 2 or scales.shape[1] not in (2, 3):
+        raise InputError(
+            f"Gaussians with scales of shape {list(scales.shape)}", "three scales each, [N, 3], or two for surfels"
+        )
+    return scales.shape[1] == 2
+
+
 def check_gaussian_outputs(wants: Iterable[str], gaussians: Gaussians) -> None:
     """Refuse outputs that are neither a splatting renderer's nor features of the Gaussians, and malformed features.
 
@@ -43,6 +57,13 @@ def check_gaussian_outputs(wants: Iterable[str], gaussians: Gaussians) -> None:
         InputError: See above.
     """
     check_outputs(wants, (*OUTPUTS, *gaussians.features))
+    of_surfels = sorted(SURFEL_OUTPUTS & {*wants} - {*gaussians.features})
+    if of_surfels and not is_surfels(gaussians):
+        raise InputError(
+            f"output {', '.join(of_surfels)} of 3D Gaussians",
+            "surfels, which alone have it",
+            "Choose a field of surfels, or leave it out",
+        )
     for name, values in gaussians.features.items():
         if values.ndim != 2 or len(values) != len(gaussians):
             raise InputError(f"feature {name} of shape {list(values.shape)}", f"[{len(gaussians)}, channels]")

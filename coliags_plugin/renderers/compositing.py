@@ -9,35 +9,17 @@ its transpose. And the backward pass sweeps front to back once more instead of s
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-#: Elements of the largest temporary tensors, by device type: to fit the L2 caches, or to fill the device.
-_CHUNK_ELEMENTS = {"cpu": 2**18, "cuda": 2**24}
-#: Fewest and most pairs of one tile composited at a time.
-_MIN_RANKS, _MAX_RANKS = 32, 128
+from coliags_plugin.renderers.sweeping import Chunk, Cuts, crossing_of_half, sweep
+
 #: Finite stand-in for log(0), far below every alpha_min.
 _LOG_ZERO = -1e4
-
-
-@dataclass(frozen=True)
-class Cuts:
-    """Thresholds of compositing (docs/methods.md 2.2).
-
-    Attributes:
-        alpha_max: Upper bound of alpha.
-        alpha_min: Contributions of smaller alpha are skipped.
-        transmittance_min: Compositing stops before the Gaussian that would bring the transmittance below this.
-    """
-
-    alpha_max: float
-    alpha_min: float
-    transmittance_min: float
 
 
 def log_alpha_polynomials(
@@ -106,73 +88,19 @@ def median_depths(
     """Depth of the pair that brings the transmittance to one half or less; 0 where none does. [tiles, P]"""
     medians = depths.new_zeros(len(starts) - 1, pixels.shape[1])
     for chunk in _sweep(_padded(polynomials), starts, pixels, cuts):
-        tiles, ranks, _ = chunk.weights.shape
-        crossing = (chunk.transmittances > 0.5).sum(1).clamp_max(ranks - 1)[:, None]
-        crosses = (chunk.before > 0.5) & (chunk.transmittances.gather(1, crossing).squeeze(1) <= 0.5)
-        crosses &= chunk.weights.gather(1, crossing).squeeze(1) > 0
-        rows = chunk.rows.view(tiles, ranks).gather(1, crossing.squeeze(1)).clamp_max(len(depths) - 1)
+        crossing, crosses = crossing_of_half(chunk)
+        rows = chunk.rows.view(chunk.weights.shape[:2]).gather(1, crossing).clamp_max(len(depths) - 1)
         medians[chunk.tiles] += torch.where(crosses, depths[rows], 0.0)
     return medians
 
 
-class _Chunk(NamedTuple):
-    """C consecutive pairs of each of G tiles, at all P pixels.
+def _sweep(padded: Tensor, starts: Tensor, pixels: Tensor, cuts: Cuts) -> Iterator[Chunk[None]]:
+    """Sweep over the pairs of all tiles, the polynomials :func:`_padded`. [M + 1, 6], [tiles + 1], [6, P]"""
 
-    Attributes:
-        tiles: Which tiles, no two the same. [G]
-        rows: Index of each pair in the list of pairs; M, one past its end, where a tile has fewer. [G * C]
-        before: Transmittance in front of the chunk; 0 where compositing has stopped. [G, P]
-        transmittances: The same behind each pair. [G, C, P]
-        alphas: [G, C, P]
-        ratios: alpha / (1 - alpha). [G, C, P]
-        weights: alpha times the transmittance in front of the pair. [G, C, P]
-    """
+    def evaluate(rows: Tensor) -> tuple[Tensor, None]:
+        return (padded.index_select(0, rows) @ pixels).exp_(), None
 
-    tiles: Tensor
-    rows: Tensor
-    before: Tensor
-    transmittances: Tensor
-    alphas: Tensor
-    ratios: Tensor
-    weights: Tensor
-
-
-def _sweep(padded: Tensor, starts: Tensor, pixels: Tensor, cuts: Cuts) -> Iterator[_Chunk]:
-    """Iterate over every tile's pairs front to back until they end or no pixel has transmittance left.
-
-    The arguments are those of :func:`composite`, the polynomials :func:`_padded`. [M + 1, 6], [tiles + 1], [6, P]
-    """
-    budget = _CHUNK_ELEMENTS.get(padded.device.type, _CHUNK_ELEMENTS["cuda"]) // pixels.shape[1]
-    alpha_below = _just_below(cuts.alpha_min, padded)
-    transmittance_below = _just_below(cuts.transmittance_min, padded)
-    # Tiles with similar numbers of pairs are grouped, so that few rows are padding.
-    counts, occupied = starts.diff().sort(descending=True, stable=True)
-    occupied = occupied[: int((counts > 0).sum())]
-    for group in torch.split(occupied, max(1, budget // _MIN_RANKS)):
-        tiles = group
-        first, end = starts[tiles], starts[tiles + 1]
-        before = padded.new_ones(len(tiles), pixels.shape[1])
-        while len(tiles):
-            longest = int((end - first).max())
-            ranks = min(longest, _MAX_RANKS, max(_MIN_RANKS, budget // len(tiles)))
-            rows = first[:, None] + torch.arange(ranks, device=first.device)
-            rows = torch.where(rows < end[:, None], rows, len(padded) - 1).flatten()
-            alphas = (padded.index_select(0, rows) @ pixels).view(len(tiles), ranks, -1)
-            alphas.exp_().clamp_(max=cuts.alpha_max)
-            torch.threshold_(alphas, alpha_below, 0.0)
-            through = 1 - alphas
-            ratios = alphas / through
-            through[:, 0] *= before
-            transmittances = through.cumprod_(1)
-            # Transmittance only falls, so setting it to zero below the bound stops compositing for good.
-            torch.threshold_(transmittances, transmittance_below, 0.0)
-            # alpha T in front = alpha / (1 - alpha) T behind, which is 0 for the pair that would cross the bound.
-            yield _Chunk(tiles, rows, before, transmittances, alphas, ratios, ratios * transmittances)
-            before = transmittances[:, -1].clone()
-            first = first + ranks
-            alive = (first < end) & (before.amax(-1) > 0)
-            if not bool(alive.all()):
-                tiles, first, end, before = tiles[alive], first[alive], end[alive], before[alive]
+    return sweep(evaluate, starts, padded.new_ones(pixels.shape[1]), cuts)
 
 
 class _Composite(torch.autograd.Function):
@@ -216,9 +144,3 @@ def _padded(polynomials: Tensor) -> Tensor:
     padded = torch.nn.functional.pad(polynomials, (0, 0, 0, 1))
     padded[-1, 0] = _LOG_ZERO
     return padded
-
-
-def _just_below(value: float, like: Tensor) -> float:
-    """The largest number under ``value``; ``threshold`` drops what equals its bound, and a cut keeps it."""
-    number = torch.tensor(value, dtype=like.dtype)
-    return float(torch.nextafter(number, torch.zeros_like(number)))

@@ -21,14 +21,12 @@ from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput, Splats
 from coliags_plugin.core.rotations import rotation_matrices
 from coliags_plugin.renderers import gsplat_library
-from coliags_plugin.renderers.checks import check_gaussian_outputs
+from coliags_plugin.renderers.checks import check_gaussian_outputs, is_surfels
 from coliags_plugin.renderers.splatting import SplattingRenderer, SplattingSettings
 from coliags_plugin.renderers.torch_renderer import TorchRendererSettings, render_gaussians
 
 #: Edge of gsplat's tiles, pixels: the only size it is tested with.
 _TILE_SIZE = 16
-#: gsplat composites up to this many channels without padding to a power of two.
-_ANY_CHANNELS = 4
 #: Quantity composited or read for each output beyond rgb and alpha.
 _NEEDS = {
     "depth_accumulated": "depth",
@@ -42,15 +40,15 @@ _NEEDS = {
 class GsplatRendererSettings(SplattingSettings):
     """Options of :class:`GsplatRenderer`. gsplat's other constants are fixed (docs/rendering.md).
 
-    Gaussians exactly at z = ``near_plane`` are drawn too; surfels have gsplat's own filter instead of ``eps2d``.
+    Gaussians exactly at z = ``near_plane`` are drawn too.
     """
 
 
 class GsplatRenderer(SplattingRenderer):
-    """Renderer of 3D Gaussians and surfels on CUDA, in float32. See ``docs/rendering.md``."""
+    """Renderer of 3D Gaussians on CUDA, in float32. See ``docs/rendering.md``."""
 
     Settings = GsplatRendererSettings
-    primitives: ClassVar[frozenset[str]] = frozenset({"gaussians3d", "surfels"})
+    primitives: ClassVar[frozenset[str]] = frozenset({"gaussians3d"})
     devices: ClassVar[frozenset[str]] = frozenset({"cuda"})
     name: ClassVar[str] = "gsplat"
 
@@ -82,7 +80,7 @@ def render_with_gsplat(
     wants: Sequence[str] = ("rgb", "alpha"),
     settings: GsplatRendererSettings | None = None,
 ) -> RenderOutput:
-    """Render 3D Gaussians, or surfels where they have two scales, from a camera.
+    """Render 3D Gaussians from a camera.
 
     Everything but ``depth_median`` and ``radii`` is differentiable, once, in the Gaussians and in
     ``camera.camera_to_world``; ``means2d.grad`` is set by ``backward``.
@@ -94,7 +92,7 @@ def render_with_gsplat(
         settings: Defaults if None.
 
     Raises:
-        InputError: An output is unknown, the Gaussians are not float32, or gsplat cannot be used here.
+        InputError: An output is unknown, the Gaussians are surfels or not float32, or gsplat cannot be used here.
     """
     settings = settings or GsplatRendererSettings()
     check_gaussian_outputs(wants, gaussians)
@@ -104,10 +102,12 @@ def render_with_gsplat(
             "float32, the only type of its kernels",
             "Convert the field, or choose renderer 'torch'",
         )
+    if is_surfels(gaussians):
+        raise InputError("surfels for the gsplat renderer", "3D Gaussians", "Choose renderer 'torch'")
     needs = {_NEEDS.get(name, name) for name in wants if name not in ("rgb", "alpha")}
     camera = camera.to(gaussians.means.device, gaussians.means.dtype)
     # gsplat 1.5 divides by the number of Gaussians, which crashes the process if there are none.
-    draw = _draw_nothing if len(gaussians) == 0 else _draw_surfels if _are_surfels(gaussians) else _draw_gaussians
+    draw = _draw_nothing if len(gaussians) == 0 else _draw_gaussians
     drawn = draw(gaussians, camera, needs, settings)
     maps = {}
     for name in wants:
@@ -187,59 +187,6 @@ def _draw_gaussians(gaussians: Gaussians, camera: Camera, needs: set[str], setti
     return _Drawn(sums["color"], alpha[0, ..., 0], sums, means2d, _largest(radii[0], visible, means2d))
 
 
-def _draw_surfels(gaussians: Gaussians, camera: Camera, needs: set[str], settings: GsplatRendererSettings) -> _Drawn:
-    """Render surfels by gsplat's implementation of 2D Gaussian splatting."""
-    library = gsplat_library.load()
-    sight, view, intrinsics = _view(gaussians, camera)
-    size = (camera.width, camera.height)
-    thickness = torch.ones_like(gaussians.scales[:, :1])  # required by the interface, not used
-    radii, boxes, depths, transforms, normals = library.fully_fused_projection_2dgs(
-        sight,
-        gaussians.quats_wxyz,
-        torch.cat([gaussians.scales, thickness], dim=-1),
-        view[None],
-        intrinsics[None],
-        *size,
-        near_plane=settings.near_plane,
-    )
-    # Of what is not drawn gsplat leaves everything but the radii uninitialised.
-    visible = (radii[0] > 0).all(-1)
-    depths = torch.where(visible, depths[0], 1.0)
-    means2d, boxes, transforms = _pass_through_centers(
-        torch.where(visible[:, None], boxes[0], 0.0), torch.where(visible[:, None, None], transforms[0], 1.0)
-    )
-    parts = {"color": gaussians.colors}
-    if "inverse_depth" in needs:
-        parts["inverse_depth"] = depths.reciprocal()[:, None]
-    parts |= {name: gaussians.features[name] for name in gaussians.features if name in needs}
-    if needs & {"depth", "median"}:
-        width = 1 + sum(part.shape[1] for part in parts.values())
-        if width > _ANY_CHANNELS:
-            # gsplat pads channels to a power of two with uninitialised memory, from which NaN would reach the
-            # gradients.
-            parts["filling"] = depths.new_zeros(len(depths), (1 << (width - 1).bit_length()) - width)
-        parts["depth"] = depths[:, None]  # the last channel, from which gsplat takes the median
-    features = torch.cat(list(parts.values()), dim=-1)
-    image, alpha, normals, _, medians = library.rasterize_to_pixels_2dgs(
-        boxes[None],
-        transforms[None],
-        features[None],
-        gaussians.opacities[None],
-        normals,
-        torch.zeros_like(boxes)[None],
-        *size,
-        _TILE_SIZE,
-        *_tiles(library, boxes, radii, depths, size),
-        backgrounds=_backgrounds(features, settings),
-    )
-    alpha = alpha[0, ..., 0]
-    sums = _split(image[0], parts)
-    sums["normal"] = normals[0]
-    # Where more than half of the light is left at the end, gsplat's median is the last surfel's depth.
-    sums["median"] = torch.where(alpha >= 0.5, medians[0, ..., 0], 0.0).detach()
-    return _Drawn(sums["color"], alpha, sums, means2d, _largest(radii[0], visible, means2d))
-
-
 def _draw_nothing(gaussians: Gaussians, camera: Camera, needs: set[str], settings: GsplatRendererSettings) -> _Drawn:
     """Render no Gaussians: the background, connected to the graph so that ``backward`` works."""
     means2d = _retaining(gaussians.means[:, :2].clone())
@@ -252,10 +199,6 @@ def _draw_nothing(gaussians: Gaussians, camera: Camera, needs: set[str], setting
         sums["median"] = alpha.detach()
     rgb = alpha[..., None] + alpha.new_tensor(settings.background)
     return _Drawn(rgb, alpha, sums, means2d, gaussians.opacities.detach())
-
-
-def _are_surfels(gaussians: Gaussians) -> bool:
-    return gaussians.scales.shape[-1] == 2
 
 
 def _view(
@@ -278,24 +221,6 @@ def _tiles(
     columns, rows = (-(-pixels // _TILE_SIZE) for pixels in size)
     _, keys, lists = library.isect_tiles(centers[None], radii, depths[None], _TILE_SIZE, columns, rows)
     return library.isect_offset_encode(keys, 1, columns, rows), lists
-
-
-def _pass_through_centers(
-    boxes: Float[Tensor, "N 2"], transforms: Float[Tensor, "N 3 3"]
-) -> tuple[Float[Tensor, "N 2"], Float[Tensor, "N 2"], Float[Tensor, "N 3 3"]]:
-    """Projected centres of the surfels, inserted into the graph so that they receive gradients. [N, 2]
-
-    gsplat has no such tensor: ``transforms`` maps a surfel's plane to the image, with the centre in its last column,
-    and ``boxes`` are the centres of the bounding boxes, around which its low-pass filter is drawn. Both are returned
-    with unchanged values, but computed from the projected centres.
-    """
-    place = transforms[:, :, 2]
-    centers = place[:, :2] / place[:, 2:]
-    means2d = _retaining(centers.clone())
-    column = torch.cat([means2d * place[:, 2:], place[:, 2:]], dim=-1)
-    # This difference is zero; it removes the centres' own share from the gradient of the boxes.
-    boxes = boxes + (means2d - centers)
-    return means2d, boxes, torch.cat([transforms[:, :, :2], column[:, :, None]], dim=-1)
 
 
 def _facing_normals(gaussians: Gaussians, sight: Float[Tensor, "N 3"], camera: Camera) -> Float[Tensor, "N 3"]:

@@ -80,20 +80,37 @@ def project_gaussians(gaussians: Gaussians, camera: Camera, near_plane: float, e
     axes = rotations * gaussians.scales[:, None, :]
     row_x = (camera.fx / z)[:, None] * (axes[:, 0] - slope_x[:, None] * axes[:, 2])
     row_y = (camera.fy / z)[:, None] * (axes[:, 1] - slope_y[:, None] * axes[:, 2])
-    sharp_xx, sharp_yy = row_x.square().sum(-1), row_y.square().sum(-1)
-    xx, xy, yy = sharp_xx + eps2d, (row_x * row_y).sum(-1), sharp_yy + eps2d
-    # xx yy - xy^2 cancels for needles; this sum of squares is the same number (Cauchy-Binet) and does not.
-    determinant = torch.linalg.cross(row_x, row_y).square().sum(-1) + eps2d * (sharp_xx + sharp_yy) + eps2d * eps2d
-    u_xx, u_yy = xx.rsqrt(), (xx / determinant).sqrt()
+    covariances, whitenings = filtered_covariances(row_x, row_y, eps2d)
     return ProjectedGaussians(
         means_camera=local,
         rotations=rotations,
         means2d=means2d,
         depths=z,
-        covariances=torch.stack([xx, xy, yy], dim=-1),
-        whitenings=torch.stack([u_xx, -u_yy * xy / xx, u_yy], dim=-1),
+        covariances=covariances,
+        whitenings=whitenings,
         in_front=in_front,
     )
+
+
+def filtered_covariances(
+    row_x: Float[Tensor, "N 3"], row_y: Float[Tensor, "N 3"], eps2d: float
+) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]]:
+    """Covariances V V^T + eps2d I of image points and their whitenings, without cancellation for needles.
+
+    Args:
+        row_x: First row of V, pixels. [N, 3]
+        row_y: Second row of V, pixels. [N, 3]
+        eps2d: Square pixels.
+
+    Returns:
+        As :class:`ProjectedGaussians` has them. [N, 3], [N, 3]
+    """
+    sharp_xx, sharp_yy = row_x.square().sum(-1), row_y.square().sum(-1)
+    xx, xy, yy = sharp_xx + eps2d, (row_x * row_y).sum(-1), sharp_yy + eps2d
+    # xx yy - xy^2 cancels for needles; this sum of squares is the same number (Cauchy-Binet) and does not.
+    determinant = torch.linalg.cross(row_x, row_y).square().sum(-1) + eps2d * (sharp_xx + sharp_yy) + eps2d * eps2d
+    u_xx, u_yy = xx.rsqrt(), (xx / determinant).sqrt()
+    return torch.stack([xx, xy, yy], dim=-1), torch.stack([u_xx, -u_yy * xy / xx, u_yy], dim=-1)
 
 
 def facing_normals(projected: ProjectedGaussians, scales: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
@@ -102,9 +119,14 @@ def facing_normals(projected: ProjectedGaussians, scales: Float[Tensor, "N 3"]) 
     Differentiable in the rotations; the choice of axis and sign is not.
     """
     shortest = scales.argmin(-1)
-    normals = projected.rotations.gather(2, shortest[:, None, None].expand(-1, 3, 1)).squeeze(-1)
-    away = (normals * projected.means_camera).sum(-1, keepdim=True) > 0
-    return torch.where(away, -normals, normals)
+    axes = projected.rotations.gather(2, shortest[:, None, None].expand(-1, 3, 1)).squeeze(-1)
+    return facing(axes, projected.means_camera)
+
+
+def facing(axes: Float[Tensor, "N 3"], means_camera: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    """Axes at points, both in camera axes, turned around where they point away from the camera. [N, 3]"""
+    away = (axes * means_camera).sum(-1, keepdim=True) > 0
+    return torch.where(away, -axes, axes)
 
 
 def _slope_limits(focal: float, principal: float, size: int) -> tuple[float, float]:

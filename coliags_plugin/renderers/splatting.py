@@ -8,12 +8,13 @@ from typing import ClassVar
 
 import pydantic
 from torch import Tensor
+from typing_extensions import Self
 
 from coliags_plugin.contracts import GaussianField, Renderer
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
-from coliags_plugin.core.render_output import OUTPUTS, RenderOutput
+from coliags_plugin.core.render_output import OUTPUTS, SURFEL_OUTPUTS, RenderOutput
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.renderers.checks import check_primitive
 
@@ -38,14 +39,34 @@ class CutSettings(SplattingSettings):
     """Contributions of smaller alpha are skipped."""
     transmittance_min: float = pydantic.Field(default=1e-4, ge=0, lt=1)
     """Compositing stops before the Gaussian that would bring the transmittance below this."""
+    surfel_filter: float = pydantic.Field(default=0.70710678, gt=0)
+    """Standard deviation of the low-pass filter of surfels, pixels."""
+    distortion_far: float = pydantic.Field(default=100.0, gt=0)
+    """z-depth that the output ``distortion`` maps to 1; ``near_plane`` is mapped to 0. Scene units."""
+
+    @pydantic.model_validator(mode="after")
+    def _near_before_far(self) -> Self:
+        if self.distortion_far <= self.near_plane:
+            raise ValueError(f"distortion_far {self.distortion_far} does not lie beyond near_plane {self.near_plane}")
+        return self
+
+    @property
+    def distortion_slope(self) -> float:
+        """Factor of -1/z in the depths whose differences ``distortion`` measures, scene units."""
+        return self.distortion_far * self.near_plane / (self.distortion_far - self.near_plane)
 
 
 class SplattingRenderer(Renderer):
     """Base class of renderers that splat a :class:`GaussianField` into whole images."""
 
-    outputs: ClassVar[frozenset[str]] = frozenset(OUTPUTS)
+    outputs: ClassVar[frozenset[str]] = frozenset(OUTPUTS) - SURFEL_OUTPUTS
     #: Name in messages.
     name: ClassVar[str]
+
+    @classmethod
+    def outputs_of(cls, primitive: str) -> frozenset[str]:
+        """Surfels have more outputs than 3D Gaussians."""
+        return cls.outputs | SURFEL_OUTPUTS if primitive == "surfels" else cls.outputs
 
     def render(
         self,

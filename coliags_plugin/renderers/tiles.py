@@ -15,7 +15,7 @@ from torch import Tensor
 from coliags_plugin.renderers.projection import ProjectedGaussians
 
 #: Slack on the squared Mahalanobis radius, so that rounding here never drops a pixel that compositing would draw.
-_RADIUS_SLACK = 1e-2
+RADIUS_SLACK = 1e-2
 
 
 @dataclass(frozen=True)
@@ -60,6 +60,13 @@ class TileGrid:
         """Pixel centres of a tile, row by row, from its midpoint; dtype and device as ``like``. [P, 2]"""
         axis = torch.arange(self.size, dtype=like.dtype, device=like.device) + 0.5 - 0.5 * self.size
         return torch.stack([axis.repeat(self.size), axis.repeat_interleave(self.size)], dim=-1)
+
+    def boxes(
+        self, column: Int[Tensor, "M"], row: Int[Tensor, "M"], dtype: torch.dtype
+    ) -> tuple[Float[Tensor, "M 2"], Float[Tensor, "M 2"]]:
+        """Corners of the rectangles of pixel centres of tiles. [M, 2], [M, 2]"""
+        low = torch.stack([column, row], dim=-1).to(dtype) * self.size + 0.5
+        return low, low + (self.size - 1)
 
     def to_image(self, values: Float[Tensor, "tiles F P"]) -> Float[Tensor, "H W F"]:
         """Assemble tiles into an image, cropped to its size. [H, W, F]"""
@@ -108,7 +115,7 @@ def gaussian_extents(
     halves = (tau.clamp_min(0)[:, None] * projected.covariances[:, ::2]).sqrt()
     low = torch.full_like(projected.means2d, 0.5)
     high = low.new_tensor([grid.width - 0.5, grid.height - 0.5]).expand_as(low)
-    nearest = _squared_distance_to_box(projected.means2d, projected.covariances, projected.whitenings, low, high)
+    nearest = squared_distance_to_box(projected.means2d, projected.covariances, projected.whitenings, low, high)
     return Extents(tau, halves, projected.in_front & (tau >= 0) & (nearest <= tau))
 
 
@@ -119,35 +126,55 @@ def bin_gaussians(projected: ProjectedGaussians, extents: Extents, grid: TileGri
     # Sorting once by depth and stably by tile afterwards leaves every tile's list front to back; Gaussians of equal
     # depth keep the order they came in.
     drawn = drawn[torch.argsort(projected.depths[drawn], stable=True)]
-    tau = extents.squared_radii[drawn] + _RADIUS_SLACK
+    tau = extents.squared_radii[drawn] + RADIUS_SLACK
     means2d, covariances = projected.means2d[drawn], projected.covariances[drawn]
     halves = (tau[:, None] * covariances[:, ::2]).sqrt()
-    last = means2d.new_tensor([grid.columns - 1, grid.rows - 1])
-    first_tile = ((means2d - halves) / grid.size).floor().clamp_min(0).minimum(last).long()
-    last_tile = ((means2d + halves) / grid.size).floor().clamp_min(0).minimum(last).long()
+    owner, column, row = tiles_of_boxes(means2d - halves, means2d + halves, grid)
+    low, high = grid.boxes(column, row, means2d.dtype)
+    table = torch.cat([means2d, covariances, projected.whitenings[drawn], tau[:, None]], dim=-1).index_select(0, owner)
+    nearest = squared_distance_to_box(table[:, :2], table[:, 2:5], table[:, 5:8], low, high)
+    kept = (nearest <= table[:, 8]).nonzero().squeeze(-1)
+    return pairs_by_tile(drawn[owner[kept]], column[kept], row[kept], grid)
+
+
+def tiles_of_boxes(
+    low: Float[Tensor, "N 2"], high: Float[Tensor, "N 2"], grid: TileGrid
+) -> tuple[Int[Tensor, "M"], Int[Tensor, "M"], Int[Tensor, "M"]]:
+    """Pairs of a box and a tile that it touches, in the order of the boxes.
+
+    Args:
+        low: Upper left corners of the boxes, pixels. [N, 2]
+        high: Lower right corners, pixels. [N, 2]
+        grid: The tiles. A box beside the image is assigned to tiles at its edge.
+
+    Returns:
+        Index of the box, column and row of the tile. [M], [M], [M]
+    """
+    last = low.new_tensor([grid.columns - 1, grid.rows - 1])
+    first_tile = (low / grid.size).floor().clamp_min(0).minimum(last).long()
+    last_tile = (high / grid.size).floor().clamp_min(0).minimum(last).long()
     across, down = (last_tile - first_tile + 1).unbind(-1)
 
     counts = across * down
     owner = torch.repeat_interleave(counts)
     place = torch.arange(len(owner), device=owner.device) - (counts.cumsum(0) - counts)[owner]
-    # Narrow integers: the division and the sort below are several times as fast on them.
+    # Narrow integers: this division, and the sort by tile, are several times as fast on them.
     place, across_of_owner = place.int(), across.int()[owner]
     row = torch.div(place, across_of_owner, rounding_mode="floor")
     column = place - row * across_of_owner + first_tile[:, 0].int()[owner]
-    row = row + first_tile[:, 1].int()[owner]
+    return owner, column, row + first_tile[:, 1].int()[owner]
 
-    low = torch.stack([column, row], dim=-1).to(means2d.dtype) * grid.size + 0.5
-    high = low + (grid.size - 1)
-    table = torch.cat([means2d, covariances, projected.whitenings[drawn], tau[:, None]], dim=-1).index_select(0, owner)
-    nearest = _squared_distance_to_box(table[:, :2], table[:, 2:5], table[:, 5:8], low, high)
-    kept = (nearest <= table[:, 8]).nonzero().squeeze(-1)
 
-    tile, by_tile = torch.sort((row * grid.columns + column)[kept], stable=True)
+def pairs_by_tile(
+    gaussian: Int[Tensor, "M"], column: Int[Tensor, "M"], row: Int[Tensor, "M"], grid: TileGrid
+) -> TilePairs:
+    """Sort pairs by tile; within a tile they keep their order. [M], [M], [M]"""
+    tile, order = torch.sort(row * grid.columns + column, stable=True)
     starts = torch.searchsorted(tile, torch.arange(grid.count + 1, dtype=tile.dtype, device=tile.device))
-    return TilePairs(gaussian=drawn[owner[kept[by_tile]]], tile=tile.long(), starts=starts)
+    return TilePairs(gaussian=gaussian[order], tile=tile.long(), starts=starts)
 
 
-def _squared_distance_to_box(
+def squared_distance_to_box(
     means2d: Float[Tensor, "M 2"],
     covariances: Float[Tensor, "M 3"],
     whitenings: Float[Tensor, "M 3"],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import ClassVar
 
 import pydantic
@@ -13,20 +14,19 @@ from torch import Tensor
 from coliags_plugin.contracts import Availability
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
-from coliags_plugin.core.render_output import RenderOutput, Splats
-from coliags_plugin.renderers.checks import check_gaussian_outputs
-from coliags_plugin.renderers.compositing import Cuts, composite, log_alpha_polynomials, median_depths, monomials
-from coliags_plugin.renderers.projection import ProjectedGaussians, facing_normals, project_gaussians
+from coliags_plugin.core.render_output import OUTPUTS, RenderOutput, Splats
+from coliags_plugin.renderers.checks import check_gaussian_outputs, is_surfels
+from coliags_plugin.renderers.compositing import composite, log_alpha_polynomials, median_depths, monomials
+from coliags_plugin.renderers.projection import facing_normals, project_gaussians
 from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer
+from coliags_plugin.renderers.surfel_compositing import SurfelRules, composite_surfels, pair_rows
+from coliags_plugin.renderers.surfel_projection import project_surfels
+from coliags_plugin.renderers.surfel_tiles import bin_surfels, surfel_extents
+from coliags_plugin.renderers.sweeping import Cuts
 from coliags_plugin.renderers.tiles import TileGrid, bin_gaussians, gaussian_extents
 
-#: Per-Gaussian quantity composited for each output beyond rgb and alpha. The median depth is not a weighted sum.
-_SUMMED = {
-    "depth_accumulated": "depth",
-    "depth_expected": "depth",
-    "inverse_depth_accumulated": "inverse_depth",
-    "normals": "normal",
-}
+#: Outputs in the order of :attr:`coliags_plugin.renderers.surfel_compositing.CompositedSurfels.depths`.
+_OF_SURFELS = ("depth_accumulated", "inverse_depth_accumulated", "distortion", "depth_median")
 
 
 class TorchRendererSettings(CutSettings):
@@ -37,10 +37,10 @@ class TorchRendererSettings(CutSettings):
 
 
 class TorchRenderer(SplattingRenderer):
-    """Reference renderer of 3D Gaussians, on any device, in float32 or float64. See ``docs/rendering.md``."""
+    """Reference renderer of 3D Gaussians and surfels, on any device, in float32 or float64: ``docs/rendering.md``."""
 
     Settings = TorchRendererSettings
-    primitives: ClassVar[frozenset[str]] = frozenset({"gaussians3d"})
+    primitives: ClassVar[frozenset[str]] = frozenset({"gaussians3d", "surfels"})
     devices: ClassVar[frozenset[str]] = frozenset({"cpu", "cuda"})
     name: ClassVar[str] = "torch"
 
@@ -62,79 +62,131 @@ def render_gaussians(
     wants: Sequence[str] = ("rgb", "alpha"),
     settings: TorchRendererSettings | None = None,
 ) -> RenderOutput:
-    """Render 3D Gaussians from a camera.
+    """Render 3D Gaussians, or surfels where they have two scales, from a camera.
 
-    Everything but ``depth_median`` and ``radii`` is differentiable, once, in the Gaussians and in
+    Everything but ``radii`` and, of 3D Gaussians, ``depth_median`` is differentiable, once, in the Gaussians and in
     ``camera.camera_to_world``; ``means2d.grad`` is set by ``backward``.
 
     Args:
-        gaussians: 3D Gaussians, all of one dtype (float32 or float64) on one device. The result is of that dtype.
+        gaussians: All of one dtype (float32 or float64) on one device. The result is of that dtype.
         camera: Camera of the view; its pose is cast to the Gaussians' dtype and device.
         wants: Names from :data:`coliags_plugin.core.render_output.OUTPUTS`; rgb and alpha are always included.
         settings: Defaults if None.
 
     Raises:
-        InputError: An output is unknown or the Gaussians are surfels.
+        InputError: An output is unknown or not of these Gaussians, or they have neither two nor three scales.
     """
     settings = settings or TorchRendererSettings()
     check_gaussian_outputs(wants, gaussians)
+    draw = _draw_surfels if is_surfels(gaussians) else _draw_gaussians
+    drawn = draw(gaussians, camera, wants, settings)
+    rgb = drawn.rgb + (1 - drawn.alpha)[..., None] * drawn.rgb.new_tensor(settings.background)
+    maps = {}
+    for name in wants:
+        if name == "depth_expected":
+            maps[name] = _expected(drawn.maps["depth_accumulated"], drawn.alpha)
+        elif name not in ("rgb", "alpha"):
+            maps[name] = drawn.maps[name]
+    if drawn.means2d.requires_grad:
+        drawn.means2d.retain_grad()
+    return RenderOutput(rgb, drawn.alpha, camera, maps, Splats(gaussians, drawn.means2d, drawn.radii))
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """Composited images of one view.
+
+    Attributes:
+        rgb: Over black. [H, W, 3]
+        alpha: [H, W]
+        maps: The other outputs wanted, and the accumulated depth if the expected is. [H, W] or [H, W, C]
+        means2d: [N, 2]
+        radii: [N]
+    """
+
+    rgb: Float[Tensor, "H W 3"]
+    alpha: Float[Tensor, "H W"]
+    maps: dict[str, Tensor]
+    means2d: Float[Tensor, "N 2"]
+    radii: Float[Tensor, "N"]
+
+
+def _draw_gaussians(
+    gaussians: Gaussians, camera: Camera, wants: Sequence[str], settings: TorchRendererSettings
+) -> _Drawn:
     grid = TileGrid(camera.width, camera.height, settings.tile_size)
-    cuts = Cuts(settings.alpha_max, settings.alpha_min, settings.transmittance_min)
+    cuts = _cuts(settings)
     projected = project_gaussians(gaussians, camera, settings.near_plane, settings.eps2d)
-    if projected.means2d.requires_grad:
-        projected.means2d.retain_grad()
     extents = gaussian_extents(projected, gaussians.opacities, grid, settings.alpha_min)
     pairs = bin_gaussians(projected, extents, grid)
 
     # One table and one lookup: the gradient of a lookup is the most expensive step outside compositing.
     opacities = torch.where(extents.drawn, gaussians.opacities, 1.0)
-    features, columns = _features(gaussians, projected, wants)
-    table = torch.cat([projected.means2d, projected.whitenings, opacities.log()[:, None], features], dim=-1)
+    own: dict[str, Tensor] = {}
+    if {"depth_accumulated", "depth_expected"} & {*wants}:
+        own["depth_accumulated"] = projected.depths
+    if "inverse_depth_accumulated" in wants:
+        own["inverse_depth_accumulated"] = projected.depths.reciprocal()
+    if "normals" in wants:
+        own["normals"] = facing_normals(projected, gaussians.scales)
+    features = _features(gaussians, own, wants)
+    table = torch.cat([projected.means2d, projected.whitenings, opacities.log()[:, None], *features.values()], dim=-1)
     of_pairs = table.index_select(0, pairs.gaussian)
     offsets = grid.centers(pairs.tile, table.dtype) - of_pairs[:, :2]
     polynomials = log_alpha_polynomials(of_pairs[:, 5], of_pairs[:, 2:5], offsets)
     pixels = monomials(grid.offsets(table))
     sums = grid.to_image(composite(polynomials, of_pairs[:, 6:], pairs.starts, pixels, cuts))
-
-    alpha = sums[..., 3]
-    rgb = sums[..., :3] + (1 - alpha)[..., None] * sums.new_tensor(settings.background)
-    maps = {}
-    for name in wants:
-        if name == "depth_median":
-            medians = median_depths(polynomials, projected.depths.detach()[pairs.gaussian], pairs.starts, pixels, cuts)
-            maps[name] = grid.to_image(medians[:, None])[..., 0]
-        elif name in _SUMMED:
-            summed = sums[..., columns[_SUMMED[name]]]
-            maps[name] = _expected(summed, alpha) if name == "depth_expected" else summed
-        elif name in gaussians.features:
-            maps[name] = sums[..., columns[name]]
+    maps = _split(sums, features)
+    if "depth_median" in wants:
+        medians = median_depths(polynomials, projected.depths.detach()[pairs.gaussian], pairs.starts, pixels, cuts)
+        maps["depth_median"] = grid.to_image(medians[:, None])[..., 0]
     radii = torch.where(extents.drawn, extents.halves.amax(-1).ceil(), 0.0)
-    return RenderOutput(rgb, alpha, camera, maps, Splats(gaussians, projected.means2d, radii))
+    return _Drawn(maps.pop("rgb"), maps.pop("alpha"), maps, projected.means2d, radii)
 
 
-def _features(
-    gaussians: Gaussians, projected: ProjectedGaussians, wants: Sequence[str]
-) -> tuple[Float[Tensor, "N F"], dict[str, int | slice]]:
-    """Channels to composite and their columns: colour, 1 (its sum is alpha), then what the outputs need."""
-    parts = [gaussians.colors, torch.ones_like(projected.depths)[:, None]]
-    columns: dict[str, int | slice] = {}
-    width = 4
-    needed = {_SUMMED[name] for name in wants if name in _SUMMED}
-    if "depth" in needed:
-        parts.append(projected.depths[:, None])
-        columns["depth"], width = width, width + 1
-    if "inverse_depth" in needed:
-        parts.append(projected.depths.reciprocal()[:, None])
-        columns["inverse_depth"], width = width, width + 1
-    if "normal" in needed:
-        parts.append(facing_normals(projected, gaussians.scales))
-        columns["normal"], width = slice(width, width + 3), width + 3
-    for name in wants:
-        if name in gaussians.features:
-            feature = gaussians.features[name]
-            parts.append(feature)
-            columns[name], width = slice(width, width + feature.shape[1]), width + feature.shape[1]
-    return torch.cat(parts, dim=-1), columns
+def _draw_surfels(
+    gaussians: Gaussians, camera: Camera, wants: Sequence[str], settings: TorchRendererSettings
+) -> _Drawn:
+    grid = TileGrid(camera.width, camera.height, settings.tile_size)
+    near, low_pass = settings.near_plane, settings.surfel_filter
+    projected = project_surfels(gaussians, camera, near)
+    extents = surfel_extents(projected, gaussians.opacities, camera, grid, settings.alpha_min, near, low_pass)
+    pairs = bin_surfels(projected, extents, grid)
+
+    opacities = torch.where(extents.drawn, gaussians.opacities, 1.0)
+    features = _features(gaussians, {"normals": projected.normals} if "normals" in wants else {}, wants)
+    of_surfels = [projected.intersections, projected.filter_centers, opacities.log()[:, None], *features.values()]
+    of_pairs = torch.cat(of_surfels, dim=-1).index_select(0, pairs.gaussian)
+    origins = grid.centers(pairs.tile, of_pairs.dtype)
+    rows = pair_rows(of_pairs[:, :10], of_pairs[:, 10:12], of_pairs[:, 12], origins)
+    rules = SurfelRules(_cuts(settings), near, low_pass, depths=bool({*_OF_SURFELS, "depth_expected"} & {*wants}))
+    composited = composite_surfels(rows, of_pairs[:, 13:], pairs, grid.offsets(rows), rules)
+    maps = _split(grid.to_image(composited.features), features)
+    if rules.depths:
+        maps |= dict(zip(_OF_SURFELS, grid.to_image(composited.depths).unbind(-1), strict=True))
+        # m = far / (far - near) (1 - near / z) is linear in 1 / z.
+        maps["distortion"] = maps["distortion"] * settings.distortion_slope**2
+    return _Drawn(maps.pop("rgb"), maps.pop("alpha"), maps, projected.means2d, extents.radii)
+
+
+def _cuts(settings: TorchRendererSettings) -> Cuts:
+    return Cuts(settings.alpha_max, settings.alpha_min, settings.transmittance_min)
+
+
+def _features(gaussians: Gaussians, own: dict[str, Tensor], wants: Sequence[str]) -> dict[str, Float[Tensor, "N C"]]:
+    """Channels to composite by output: colour, 1 (its sum is alpha), some of their own, and feature channels wanted."""
+    parts = {"rgb": gaussians.colors, "alpha": torch.ones_like(gaussians.opacities), **own}
+    parts |= {name: gaussians.features[name] for name in wants if name in gaussians.features}
+    return {name: part[:, None] if part.ndim == 1 else part for name, part in parts.items()}
+
+
+def _split(sums: Float[Tensor, "H W F"], features: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Composited channels by output; the renderer's own single channels without the last dimension."""
+    parts = torch.split(sums, [part.shape[1] for part in features.values()], dim=-1)
+    return {
+        name: part[..., 0] if name in OUTPUTS and part.shape[-1] == 1 else part
+        for name, part in zip(features, parts, strict=True)
+    }
 
 
 def _expected(depth_accumulated: Float[Tensor, "H W"], alpha: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:

@@ -13,12 +13,12 @@ from typing_extensions import Self
 
 from coliags_plugin.contracts import Availability, RadianceField, Renderer
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.render_output import OUTPUTS, RenderOutput, concatenate_pixels
+from coliags_plugin.core.render_output import OUTPUTS, SURFEL_OUTPUTS, RenderOutput, concatenate_pixels
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.renderers.checks import check_outputs, check_primitive
 
 #: Every output of the splatting renderers that has a meaning without surfaces.
-_OUTPUTS = frozenset(OUTPUTS) - {"normals"}
+_OUTPUTS = frozenset(OUTPUTS) - SURFEL_OUTPUTS - {"normals"}
 
 
 class VolumeRendererSettings(Settings):
@@ -70,8 +70,8 @@ class VolumeRenderer(Renderer):
         Args:
             field: A radiance field.
             camera: Camera of the view.
-            wants: Names from :data:`coliags_plugin.core.render_output.OUTPUTS`, normals excepted; rgb and alpha are
-                always included. Depths are z-depths.
+            wants: Names from :data:`coliags_plugin.core.render_output.OUTPUTS`, normals and distortion excepted;
+                rgb and alpha are always included. Depths are z-depths.
             pixels: Columns and rows of the only pixels to render. [P, 2]
 
         Raises:

@@ -2,8 +2,7 @@
 
 Signatures, argument orders, shapes and assertions are those of gsplat 1.5.3 (Apache-2.0), read in its sources, and so
 are the constants and the habits that its callers must know: only radii are written of what is not drawn (here the rest
-is NaN), no Gaussians at all end the process (here an exception), and rasterize_to_pixels_2dgs fills up odd numbers of
-channels with uninitialised memory (here NaN). Shares no code with the package.
+is NaN), and no Gaussians at all end the process (here an exception). Shares no code with the package.
 """
 
 from __future__ import annotations
@@ -18,8 +17,7 @@ ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN = 0.999, 1 / 255, 1e-4
 #: What the arithmetic is done in. float64 leaves only the inputs' rounding; float32 is what the kernels do.
 PRECISION = torch.float64
 
-CHANNELS_3D = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32, 33, 64, 65, 128, 129, 256, 257, 512, 513)
-CHANNELS_2D = (1, 2, 3, 4, 8, 16, 32, 64, 128, 256, 512)
+CHANNELS = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32, 33, 64, 65, 128, 129, 256, 257, 512, 513)
 
 
 def module(calls=None):
@@ -38,11 +36,9 @@ def module(calls=None):
     fake.__version__ = "1.5.3"
     for function in (
         fully_fused_projection,
-        fully_fused_projection_2dgs,
         isect_tiles,
         isect_offset_encode,
         rasterize_to_pixels,
-        rasterize_to_pixels_2dgs,
     ):
         setattr(fake, function.__name__, recorded(function))
     return fake
@@ -136,45 +132,6 @@ def fully_fused_projection(
     return radii, _undrawn(centers, drawn), _undrawn(z, drawn), _undrawn(conics, drawn), None
 
 
-def fully_fused_projection_2dgs(
-    means,
-    quats,
-    scales,
-    viewmats,
-    Ks,
-    width,
-    height,
-    eps2d=0.3,
-    near_plane=0.01,
-    far_plane=1e10,
-    radius_clip=0.0,
-    packed=False,
-    sparse_grad=False,
-):
-    assert not packed and not sparse_grad
-    _check_inputs(means, quats, scales, viewmats, Ks)
-    turn, local = _placed(means, viewmats)
-    inside = ((local[:, 2] > near_plane) & (local[:, 2] < far_plane)).detach()
-    center = torch.where(inside[:, None], local, local.new_tensor([0.0, 0.0, 1.0]))
-    axes = turn @ _rotations(quats.to(PRECISION))
-    first, second = (axes[:, :, k] * scales[:, k, None].to(PRECISION) for k in (0, 1))
-    transforms = Ks[0].to(PRECISION) @ torch.stack([first, second, center], dim=-1)  # [N, 3, 3], rows u, v, w
-    row_u, row_v, row_w = transforms.unbind(1)
-    corner = transforms.new_tensor([1.0, 1.0, -1.0])
-    scaled = corner / (corner * row_w * row_w).sum(-1, keepdim=True)
-    boxes = torch.stack([(scaled * row_u * row_w).sum(-1), (scaled * row_v * row_w).sum(-1)], dim=-1)
-    normals = axes[:, :, 2]
-    normals = torch.where(((-normals * center).sum(-1, keepdim=True) > 0).detach(), normals, -normals)
-    with torch.no_grad():
-        squares = torch.stack([(scaled * row_u * row_u).sum(-1), (scaled * row_v * row_v).sum(-1)], dim=-1)
-        radius_x, radius_y = (3.33 * (boxes * boxes - squares).clamp_min(1e-4).sqrt()).ceil().unbind(-1)
-        drawn = inside & ((radius_x > radius_clip) | (radius_y > radius_clip))
-        drawn &= ~_outside(boxes, radius_x, radius_y, width, height)
-        radii = torch.where(drawn[:, None], torch.stack([radius_x, radius_y], dim=-1), 0).int()[None]
-    written = (_undrawn(value, drawn) for value in (boxes, center[:, 2], transforms, normals))
-    return (radii, *written)
-
-
 @torch.no_grad()
 def isect_tiles(
     means2d,
@@ -244,7 +201,7 @@ def rasterize_to_pixels(
     assert opacities.shape == (1, n) and masks is None and not packed and not absgrad
     assert backgrounds is None or backgrounds.shape == (1, channels)
     assert all(value.dtype == torch.float32 for value in (means2d, conics, colors, opacities))
-    padded, backgrounds = _padded(colors, backgrounds, CHANNELS_3D, 0.0)
+    padded, backgrounds = _padded(colors, backgrounds, CHANNELS)
     conics, centers = conics[0].to(PRECISION), means2d[0].to(PRECISION)
 
     def power(ids, pixels):
@@ -253,73 +210,25 @@ def rasterize_to_pixels(
         return 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
 
     size = (image_width, image_height, tile_size)
-    image, alpha, _ = _composite(power, padded[0], opacities[0], size, isect_offsets, flatten_ids, backgrounds)
+    image, alpha = _composite(power, padded[0], opacities[0], size, isect_offsets, flatten_ids, backgrounds)
     return image[..., :channels].float()[None], alpha.float()[None]
 
 
-def rasterize_to_pixels_2dgs(
-    means2d,
-    ray_transforms,
-    colors,
-    opacities,
-    normals,
-    densify,
-    image_width,
-    image_height,
-    tile_size,
-    isect_offsets,
-    flatten_ids,
-    backgrounds=None,
-    masks=None,
-    packed=False,
-    absgrad=False,
-    distloss=False,
-):
-    n, channels = means2d.shape[-2], colors.shape[-1]
-    assert means2d.shape == densify.shape == (1, n, 2) and ray_transforms.shape == (1, n, 3, 3)
-    assert colors.shape == (1, n, channels) and normals.shape == (1, n, 3) and opacities.shape == (1, n)
-    assert masks is None and not packed and not absgrad and not distloss
-    assert backgrounds is None or backgrounds.shape == (1, channels)
-    # The kernel's last channel stays the last, and what fills the gap is whatever was in memory.
-    padded, backgrounds = _padded(colors, backgrounds, CHANNELS_2D, torch.nan, before_last=True)
-    transforms, boxes = ray_transforms[0].to(PRECISION), means2d[0].to(PRECISION)
-
-    def power(ids, pixels):
-        row_u, row_v, row_w = (transforms[ids, k, None] for k in range(3))
-        plane_u = pixels[:, :1] * row_w - row_u
-        plane_v = pixels[:, 1:] * row_w - row_v
-        hit = torch.linalg.cross(plane_u, plane_v)
-        in_units = (hit[..., :2] / hit[..., 2:]).square().sum(-1)
-        filtered = 2.0 * (boxes[ids, None] - pixels).square().sum(-1)
-        return 0.5 * torch.minimum(in_units, filtered)
-
-    size = (image_width, image_height, tile_size)
-    features = torch.cat([padded[0], normals[0].to(padded.dtype)], dim=-1)
-    if backgrounds is not None:
-        backgrounds = torch.cat([backgrounds, backgrounds.new_zeros(1, 3)], dim=-1)
-    image, alpha, median = _composite(power, features, opacities[0], size, isect_offsets, flatten_ids, backgrounds)
-    kept = [*range(channels - 1), padded.shape[-1] - 1]
-    image, normal, median = image[..., kept], image[..., -3:], median[..., padded.shape[-1] - 1 :][..., :1]
-    return tuple(value.float()[None] for value in (image, alpha, normal, torch.zeros_like(alpha), median))
-
-
-def _padded(colors, backgrounds, supported, filling, before_last=False):
+def _padded(colors, backgrounds, supported):
     channels = colors.shape[-1]
     missing = 0 if channels in supported else (1 << (channels - 1).bit_length()) - channels
-    fill = colors.new_full((*colors.shape[:-1], missing), filling)
-    at = channels - 1 if before_last else channels
-    colors = torch.cat([colors[..., :at], fill, colors[..., at:]], dim=-1)
+    colors = torch.cat([colors, colors.new_zeros((*colors.shape[:-1], missing))], dim=-1)
     if backgrounds is not None:
         backgrounds = torch.cat([backgrounds, backgrounds.new_zeros(len(backgrounds), missing)], dim=-1)
     return colors.to(PRECISION), None if backgrounds is None else backgrounds.to(PRECISION)
 
 
 def _composite(power, features, opacities, size, offsets, lists, backgrounds):
-    """Image, alpha [H, W, 1] and the features of the last drawn with more than half of the light before it."""
+    """Image and alpha [H, W, 1]."""
     width, height, tile_size = size
     starts = [*offsets.flatten().tolist(), len(lists)]
     image = features.new_zeros(height, width, features.shape[-1])
-    alphas, median = features.new_zeros(height, width, 1), torch.zeros_like(image)
+    alphas = features.new_zeros(height, width, 1)
     for tile in range(offsets.numel()):
         row, column = divmod(tile, offsets.shape[-1])
         ids = lists[starts[tile] : starts[tile + 1]].long()
@@ -342,9 +251,4 @@ def _composite(power, features, opacities, size, offsets, lists, backgrounds):
         place = (v.flatten(), u.flatten())
         image = image.index_put(place, sums)
         alphas = alphas.index_put(place, 1 - light[:, None])
-        if len(ids):
-            number = torch.arange(1, len(ids) + 1)[:, None]
-            last = torch.where((weights > 0) & (before > 0.5), number, 0).amax(0)
-            of_last = torch.where((last > 0)[:, None], features[ids[last.clamp_min(1) - 1]], torch.zeros_like(sums))
-            median = median.index_put(place, of_last)
-    return image, alphas, median
+    return image, alphas

@@ -37,7 +37,7 @@ def test_auto_passes_its_options_on():
 
 
 def test_an_impossible_pair_names_both_sides():
-    with pytest.raises(InputError, match=r"draws gaussians3d, the field is made of radiance"):
+    with pytest.raises(InputError, match=r"draws gaussians3d, surfels, the field is made of radiance"):
         choose_renderer(make_component("renderers", "torch"), "radiance", CPU)
     with pytest.raises(InputError, match=r"no renderer can serve.*--set renderer=NAME, NAME being volume"):
         choose_renderer(make_component("renderers", "auto"), "radiance", CPU)

@@ -13,11 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.render_output import OUTPUTS
 from coliags_plugin.renderers import cpu_renderer, torch_renderer
 from coliags_plugin.renderers.numba_kernels import pipeline
 from tests.renderers.test_torch_renderer import (
     INPUTS,
+    OUTPUTS,
     SCENES,
     SUMS,
     cast,

@@ -86,14 +86,13 @@ def test_unusable_features_are_refused():
             cpu_renderer.render_gaussians(replace(gaussians, features={"one": spoiled}), camera, ("one",))
 
 
-@pytest.mark.parametrize("surfels", [False, True])
 @pytest.mark.parametrize("wants", [WANTS, ("many", "depth_median"), ("albedo", "one", "inverse_depth_accumulated")])
-def test_gsplat_composites_features_with_the_rest(monkeypatch, surfels, wants):
+def test_gsplat_composites_features_with_the_rest(monkeypatch, wants):
     """The stand-in for gsplat; its colours as a feature must come out as the colours do, whatever is asked beside."""
     monkeypatch.setattr(gsplat_library, "load", fake_gsplat.module)
     gaussians = gaussians_with_features(40, torch.float32)
     features = {**gaussians.features, "copy": gaussians.colors}
-    gaussians = replace(gaussians, features=features, scales=gaussians.scales[:, :2] if surfels else gaussians.scales)
+    gaussians = replace(gaussians, features=features)
     camera = pinhole(24, 18, 20.0, 20.0, dtype=torch.float32)
     output = gsplat_renderer.render_with_gsplat(gaussians, camera, ("copy", *wants))
     torch.testing.assert_close(output["copy"], output.rgb)

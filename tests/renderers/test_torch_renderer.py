@@ -15,12 +15,15 @@ from coliags_plugin.config import registry
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
-from coliags_plugin.core.render_output import OUTPUTS
-from coliags_plugin.renderers import compositing
+from coliags_plugin.core.render_output import OUTPUTS as ALL_OUTPUTS
+from coliags_plugin.core.render_output import SURFEL_OUTPUTS
+from coliags_plugin.renderers import sweeping
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings, render_gaussians
 from tests.renderers.naive_splatting import extent, splat
 
 INPUTS = ("means", "quats_wxyz", "scales", "opacities", "colors")
+#: Of 3D Gaussians.
+OUTPUTS = tuple(name for name in ALL_OUTPUTS if name not in SURFEL_OUTPUTS)
 SUMS = tuple(name for name in OUTPUTS if name != "depth_median")
 
 
@@ -504,7 +507,7 @@ def test_the_size_of_the_working_set_changes_nothing(elements, monkeypatch):
     gaussians, camera = scene("crowd in one tile")
     cotangents = {k: torch.ones(11, 12, *([3] * (k in ("rgb", "normals")))) for k in SUMS}
     plain, _, gradients = with_gradients(ours(), gaussians, camera, cotangents)
-    monkeypatch.setitem(compositing._CHUNK_ELEMENTS, "cpu", elements)
+    monkeypatch.setitem(sweeping.CHUNK_ELEMENTS, "cpu", elements)
     other, _, other_gradients = with_gradients(ours(), gaussians, camera, cotangents)
     for key in OUTPUTS:
         torch.testing.assert_close(other[key], plain[key], rtol=1e-10, atol=1e-10)
@@ -569,7 +572,7 @@ def test_the_registered_component_renders_a_field():
     renderer_class = registry.renderers.get("torch")
     assert renderer_class is TorchRenderer
     assert renderer_class.availability().ok
-    assert renderer_class.outputs == set(OUTPUTS) and renderer_class.primitives == {"gaussians3d"}
+    assert renderer_class.outputs == set(OUTPUTS) and renderer_class.primitives == {"gaussians3d", "surfels"}
     gaussians, camera = smooth_scene()
     output = renderer_class(renderer_class.Settings()).render(FieldOf(gaussians), camera, ("rgb", "depth_expected"))
     assert output.splats.gaussians is gaussians
@@ -586,11 +589,11 @@ def test_what_cannot_be_rendered_says_so():
         renderer.render(field, camera, pixels=torch.zeros(3, 2))
     with pytest.raises(InputError, match="Did you mean 'depth_median'"):
         renderer.render(field, camera, ("depth_medain",))
-    field.primitive = "surfels"
-    with pytest.raises(InputError, match="surfels"):
+    field.primitive = "radiance"
+    with pytest.raises(InputError, match="radiance"):
         renderer.render(field, camera)
     with pytest.raises(InputError, match="three scales"):
-        render_gaussians(dataclasses.replace(gaussians, scales=gaussians.scales[:, :2]), camera)
+        render_gaussians(dataclasses.replace(gaussians, scales=gaussians.scales[:, :1]), camera)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,265 @@
+"""Front-to-back alpha compositing of surfels, tile by tile, with a depth of their own at every pixel.
+
+The definition and its derivatives are written out in ``docs/rendering.md``, section "Surfels". As for 3D Gaussians
+(``compositing.py``), the backward pass sweeps front to back once more instead of storing anything per pixel and pair.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from coliags_plugin.renderers.sweeping import Chunk, Cuts, crossing_of_half, sweep
+from coliags_plugin.renderers.tiles import TilePairs
+
+#: Finite stand-in for log(0), far below every alpha_min.
+_LOG_ZERO = -1e4
+
+
+@dataclass(frozen=True)
+class SurfelRules:
+    """Constants of the compositing of surfels.
+
+    Attributes:
+        cuts: Thresholds common to all splats.
+        near_plane: A surfel is skipped at pixels where it is nearer than this z-depth.
+        surfel_filter: Standard deviation of the low-pass filter, pixels.
+        depths: Whether depths, their distortion and the median are wanted.
+    """
+
+    cuts: Cuts
+    near_plane: float
+    surfel_filter: float
+    depths: bool
+
+
+class CompositedSurfels(NamedTuple):
+    """Sums over the surfels of each tile at each of its pixels, w the weight of a surfel and z its depth there.
+
+    Attributes:
+        features: sum w f. [tiles, F, P]
+        depths: sum w z, sum w / z, sum over pairs i < j of w_i w_j (1/z_i - 1/z_j)^2, and the median depth; 0 unless
+            wanted. [tiles, 4, P]
+    """
+
+    features: Float[Tensor, "tiles F P"]
+    depths: Float[Tensor, "tiles 4 P"]
+
+
+def pair_rows(
+    intersections: Float[Tensor, "M 10"],
+    filter_centers: Float[Tensor, "M 2"],
+    log_opacities: Float[Tensor, "M"],
+    origins: Float[Tensor, "M 2"],
+) -> Float[Tensor, "M 13"]:
+    """What :func:`composite_surfels` reads of each pair.
+
+    These are the coefficients of U, V and W in 1, x, y of the offset from the tile's midpoint, D, the offset from there
+    to the filter's centre, and log(opacity).
+
+    Args:
+        intersections: :attr:`coliags_plugin.renderers.surfel_projection.ProjectedSurfels.intersections` of each pair's
+            surfel. [M, 10]
+        filter_centers: Pixels. [M, 2]
+        log_opacities: [M]
+        origins: Midpoints of the tiles, pixels. [M, 2]
+    """
+    slopes, at_center, plane_offsets = (
+        intersections[:, 2:8].reshape(-1, 3, 2),
+        intersections[:, 8],
+        intersections[:, 9:],
+    )
+    constants = (slopes * (origins - intersections[:, :2])[:, None]).sum(-1)
+    # At its projected centre a surfel has U = V = 0 exactly.
+    constants = constants + torch.nn.functional.pad(at_center[:, None], (2, 0))
+    planes = torch.cat([constants[..., None], slopes], dim=-1).flatten(1)
+    return torch.cat([planes, plane_offsets, filter_centers - origins, log_opacities[:, None]], dim=-1)
+
+
+def composite_surfels(
+    rows: Float[Tensor, "M 13"],
+    features: Float[Tensor, "M F"],
+    pairs: TilePairs,
+    offsets: Float[Tensor, "P 2"],
+    rules: SurfelRules,
+) -> CompositedSurfels:
+    """Composite the pairs of each tile at each of its pixels; differentiable (once) in ``rows`` and ``features``.
+
+    Args:
+        rows: :func:`pair_rows`, by tile and front to back. [M, 13]
+        features: What to composite beside depths. [M, F]
+        pairs: Their tiles.
+        offsets: Pixel centres of a tile from its midpoint. [P, 2]
+        rules: Constants.
+    """
+    pixels = torch.nn.functional.pad(offsets, (1, 0), value=1.0).T.contiguous()
+    return CompositedSurfels(*_CompositeSurfels.apply(rows, features, pairs.starts, pixels, rules))  # type: ignore[no-untyped-call]
+
+
+class _Hits(NamedTuple):
+    """Where the rays of a tile's P pixels meet R surfels; all finite.
+
+    Attributes:
+        inverse_w: 1 / W; 0 where the ray misses: W is 0, or the intersection is nearer than the near plane. [R, P]
+        u, v: Intersection in standard deviations; 0 where missed. [R, P]
+        depths: z-depth; 1 where missed. [R, P]
+        on_disc: Whether u^2 + v^2 counts, else the low-pass filter. [R, P]
+        from_center: Offset of the pixel from the filter's centre, pixels. [R, P], [R, P]
+    """
+
+    inverse_w: Float[Tensor, "R P"]
+    u: Float[Tensor, "R P"]
+    v: Float[Tensor, "R P"]
+    depths: Float[Tensor, "R P"]
+    on_disc: Bool[Tensor, "R P"]
+    from_center: tuple[Float[Tensor, "R P"], Float[Tensor, "R P"]]
+
+
+def _sweep(padded: Tensor, starts: Tensor, pixels: Tensor, rules: SurfelRules) -> Iterator[Chunk[_Hits]]:
+    """Sweep over the pairs of all tiles, the rows :func:`_padded`. [M + 1, 13], [tiles + 1], [3, P]"""
+
+    def evaluate(rows: Tensor) -> tuple[Tensor, _Hits]:
+        table = padded.index_select(0, rows)
+        u, v, w = (table[:, :9].reshape(-1, 3) @ pixels).view(len(rows), 3, -1).unbind(1)
+        inverse_w = w.reciprocal()
+        depths = table[:, 9:10] * inverse_w
+        # Infinite, or NaN, where W is 0.
+        hit = (depths >= rules.near_plane) & (depths < torch.inf)
+        inverse_w = torch.where(hit, inverse_w, 0.0)
+        u, v = u * inverse_w, v * inverse_w
+        x, y = pixels[1] - table[:, 10:11], pixels[2] - table[:, 11:12]
+        squared = u * u + v * v
+        filtered = (x * x + y * y) * rules.surfel_filter**-2
+        on_disc = squared <= filtered
+        alphas = torch.exp(table[:, 12:] - 0.5 * torch.where(on_disc, squared, filtered)).mul_(hit)
+        return alphas, _Hits(inverse_w, u, v, torch.where(hit, depths, 1.0), on_disc, (x, y))
+
+    return sweep(evaluate, starts, padded.new_ones(pixels.shape[1]), rules.cuts)
+
+
+class _Spread:
+    """Running weight, mean and sum of squared differences of 1/z over the surfels swept so far, per tile and pixel.
+
+    Merging means and squared differences, rather than differences of large sums, keeps float32 accurate for surfels
+    close to each other.
+    """
+
+    def __init__(self, like: Float[Tensor, "tiles P"]) -> None:
+        self.weight, self.mean, self.squares = (torch.zeros_like(like) for _ in range(3))
+
+    def add(self, tiles: Int[Tensor, "G"], weights: Float[Tensor, "G C P"], values: Float[Tensor, "G C P"]) -> None:
+        """Merge the surfels of a chunk."""
+        weight, before = weights.sum(1), self.weight[tiles]
+        mean = (weights * values).sum(1) / torch.where(weight > 0, weight, 1.0)
+        squares = (weights * (values - mean[:, None]).square()).sum(1)
+        step = (mean - self.mean[tiles]) * (weight / torch.where(weight > 0, before + weight, 1.0))
+        self.squares[tiles] += squares + before * step * (mean - self.mean[tiles])
+        self.mean[tiles] += step
+        self.weight[tiles] = before + weight
+
+
+class _CompositeSurfels(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, rows: Tensor, features: Tensor, starts: Tensor, pixels: Tensor, rules: SurfelRules
+    ) -> tuple[Tensor, Tensor]:
+        padded, padded_features = _padded(rows), torch.nn.functional.pad(features, (0, 0, 0, 1))
+        tiles = len(starts) - 1
+        sums = features.new_zeros(tiles, features.shape[1], pixels.shape[1])
+        depths = features.new_zeros(tiles, 4, pixels.shape[1])
+        spread = _Spread(depths[:, 0])
+        for chunk in _sweep(padded, starts, pixels, rules):
+            chunk_features = padded_features.index_select(0, chunk.rows).view(*chunk.weights.shape[:2], -1)
+            sums[chunk.tiles] += chunk_features.mT @ chunk.weights
+            if rules.depths:
+                z = chunk.evaluated.depths.view_as(chunk.weights)
+                crossing, crosses = crossing_of_half(chunk)
+                median = z.gather(1, crossing[:, None]).squeeze(1) * crosses
+                over_z = chunk.weights / z
+                depths[chunk.tiles] += torch.stack(
+                    [(chunk.weights * z).sum(1), over_z.sum(1), torch.zeros_like(median), median], dim=1
+                )
+                spread.add(chunk.tiles, chunk.weights, z.reciprocal())
+        depths[:, 2] = spread.weight * spread.squares
+        ctx.save_for_backward(
+            padded, padded_features, starts, pixels, sums, depths, spread.weight, spread.mean, spread.squares
+        )
+        ctx.rules = rules
+        return sums, depths
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, of_sums: Tensor, of_depths: Tensor) -> tuple[Tensor | None, ...]:
+        padded, padded_features, starts, pixels, sums, depths, weight, mean, squares = ctx.saved_tensors
+        rules: SurfelRules = ctx.rules
+        of_rows, of_features = torch.zeros_like(padded), torch.zeros_like(padded_features)
+        of_sums, of_depths = of_sums.contiguous(), of_depths.contiguous()
+        # First-order contribution to the loss of the pairs not yet swept; the third sum is quadratic in the weights.
+        behind = (sums * of_sums).sum(1)
+        if rules.depths:
+            behind += (
+                depths[:, 0] * of_depths[:, 0] + depths[:, 1] * of_depths[:, 1] + 2 * depths[:, 2] * of_depths[:, 2]
+            )
+        for chunk in _sweep(padded, starts, pixels, rules):
+            weights, hits = chunk.weights, chunk.evaluated
+            of_tile = of_sums[chunk.tiles]
+            chunk_features = padded_features.index_select(0, chunk.rows).view(*weights.shape[:2], -1)
+            of_features[chunk.rows] = (weights @ of_tile.mT).flatten(0, 1)
+            gained = chunk_features @ of_tile
+            of_z = None
+            if rules.depths:
+                of_accumulated, of_inverse, of_spread, of_median = of_depths[chunk.tiles][:, :, None].unbind(1)
+                z = hits.depths.view_as(weights)
+                over_z = z.reciprocal()
+                total, deviation = weight[chunk.tiles][:, None], over_z - mean[chunk.tiles][:, None]
+                gained += of_accumulated * z + of_inverse * over_z
+                gained += of_spread * (total * deviation.square() + squares[chunk.tiles][:, None])
+                of_over_z = of_inverse + 2 * of_spread * total * deviation
+                of_z = weights * (of_accumulated - of_over_z * over_z.square())
+                crossing, crosses = crossing_of_half(chunk)
+                of_z.scatter_add_(1, crossing[:, None], of_median * crosses[:, None])
+            gained.mul_(weights)
+            hidden = behind[chunk.tiles][:, None] - gained.cumsum(1)
+            behind[chunk.tiles] = hidden[:, -1]
+            # As in compositing.py. Behind the stop, and where alpha is clamped, it is 0.
+            of_log_alphas = gained.sub_(hidden.mul_(chunk.ratios))
+            of_log_alphas.mul_(weights > 0).mul_(chunk.alphas < rules.cuts.alpha_max)
+            of_rows[chunk.rows] = _of_rows(
+                hits, of_log_alphas.flatten(0, 1), None if of_z is None else of_z.flatten(0, 1), pixels, rules
+            )
+        return of_rows[:-1], of_features[:-1], None, None, None
+
+
+def _of_rows(
+    hits: _Hits,
+    of_log_alphas: Float[Tensor, "R P"],
+    of_z: Float[Tensor, "R P"] | None,
+    pixels: Tensor,
+    rules: SurfelRules,
+) -> Float[Tensor, "R 13"]:
+    """Gradients of :func:`pair_rows` from those of the logarithms of alpha and of z, with z = D / W. [R, 13]"""
+    on_disc = of_log_alphas * hits.on_disc * hits.inverse_w
+    of_u, of_v = -on_disc * hits.u, -on_disc * hits.v
+    of_w = -(of_u * hits.u + of_v * hits.v)
+    of_offset = torch.zeros_like(of_w[:, :1])
+    if of_z is not None:
+        of_offsets = of_z * hits.inverse_w
+        of_w = of_w - of_offsets * hits.depths
+        of_offset = of_offsets.sum(1, keepdim=True)
+    of_planes = torch.stack([of_u, of_v, of_w], dim=1) @ pixels.T
+    filtered = of_log_alphas * ~hits.on_disc * rules.surfel_filter**-2
+    of_center = torch.stack([(filtered * offset).sum(1) for offset in hits.from_center], dim=1)
+    return torch.cat([of_planes.flatten(1), of_offset, of_center, of_log_alphas.sum(1, keepdim=True)], dim=1)
+
+
+def _padded(rows: Tensor) -> Tensor:
+    """Rows with one more, whose alpha is 0 everywhere. [M + 1, 13]"""
+    padded = torch.nn.functional.pad(rows, (0, 0, 0, 1))
+    padded[-1, -1] = _LOG_ZERO
+    return padded

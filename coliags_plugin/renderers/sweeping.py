@@ -1,0 +1,125 @@
+"""Front-to-back sweep over the pairs of a tile and a Gaussian, in chunks, with the rules of compositing.
+
+What a Gaussian is, and so its alpha at a pixel, is the caller's. The rules are in ``docs/rendering.md``, section
+"Compositing".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+#: Elements of the largest temporary tensors, by device type: to fit the L2 caches, or to fill the device.
+CHUNK_ELEMENTS = {"cpu": 2**18, "cuda": 2**24}
+#: Fewest and most pairs of one tile composited at a time.
+_MIN_RANKS, _MAX_RANKS = 32, 128
+
+Evaluated = TypeVar("Evaluated")
+
+
+@dataclass(frozen=True)
+class Cuts:
+    """Thresholds of compositing (docs/methods.md 2.2).
+
+    Attributes:
+        alpha_max: Upper bound of alpha.
+        alpha_min: Contributions of smaller alpha are skipped.
+        transmittance_min: Compositing stops before the Gaussian that would bring the transmittance below this.
+    """
+
+    alpha_max: float
+    alpha_min: float
+    transmittance_min: float
+
+
+@dataclass(frozen=True)
+class Chunk(Generic[Evaluated]):
+    """C consecutive pairs of each of G tiles, at all P pixels.
+
+    Attributes:
+        tiles: Which tiles, no two the same. [G]
+        rows: Index of each pair in the list of pairs; M, one past its end, where a tile has fewer. [G * C]
+        before: Transmittance in front of the chunk; 0 where compositing has stopped. [G, P]
+        transmittances: The same behind each pair. [G, C, P]
+        alphas: [G, C, P]
+        ratios: alpha / (1 - alpha). [G, C, P]
+        weights: alpha times the transmittance in front of the pair. [G, C, P]
+        evaluated: What else came with the alphas.
+    """
+
+    tiles: Int[Tensor, "G"]
+    rows: Int[Tensor, "GC"]
+    before: Float[Tensor, "G P"]
+    transmittances: Float[Tensor, "G C P"]
+    alphas: Float[Tensor, "G C P"]
+    ratios: Float[Tensor, "G C P"]
+    weights: Float[Tensor, "G C P"]
+    evaluated: Evaluated
+
+
+def sweep(
+    evaluate: Callable[[Int[Tensor, "R"]], tuple[Float[Tensor, "R P"], Evaluated]],
+    starts: Int[Tensor, "tiles+1"],
+    ones: Float[Tensor, "P"],
+    cuts: Cuts,
+) -> Iterator[Chunk[Evaluated]]:
+    """Iterate over every tile's pairs front to back until they end or no pixel has transmittance left.
+
+    Args:
+        evaluate: Alphas of pairs at the pixels of their tiles before clamping and cut-off, in a tensor that may be
+            overwritten, and what else the caller wants of these pairs. The alpha of row M, one past the end, must be 0.
+        starts: First pair of each tile, and M. [tiles + 1]
+        ones: 1 for each pixel of a tile; its dtype and device are those of the result. [P]
+        cuts: Thresholds.
+    """
+    budget = CHUNK_ELEMENTS.get(ones.device.type, CHUNK_ELEMENTS["cuda"]) // len(ones)
+    alpha_below = _just_below(cuts.alpha_min, ones)
+    transmittance_below = _just_below(cuts.transmittance_min, ones)
+    # Tiles with similar numbers of pairs are grouped, so that few rows are padding.
+    counts, occupied = starts.diff().sort(descending=True, stable=True)
+    occupied = occupied[: int((counts > 0).sum())]
+    padding = int(starts[-1])
+    for group in torch.split(occupied, max(1, budget // _MIN_RANKS)):
+        tiles = group
+        first, end = starts[tiles], starts[tiles + 1]
+        before = ones.expand(len(tiles), -1)
+        while len(tiles):
+            longest = int((end - first).max())
+            ranks = min(longest, _MAX_RANKS, max(_MIN_RANKS, budget // len(tiles)))
+            rows = first[:, None] + torch.arange(ranks, device=first.device)
+            rows = torch.where(rows < end[:, None], rows, padding).flatten()
+            flat, evaluated = evaluate(rows)
+            alphas = flat.view(len(tiles), ranks, -1).clamp_(max=cuts.alpha_max)
+            torch.threshold_(alphas, alpha_below, 0.0)
+            through = 1 - alphas
+            ratios = alphas / through
+            through[:, 0] *= before
+            transmittances = through.cumprod_(1)
+            # Transmittance only falls, so setting it to zero below the bound stops compositing for good.
+            torch.threshold_(transmittances, transmittance_below, 0.0)
+            # alpha T in front = alpha / (1 - alpha) T behind, which is 0 for the pair that would cross the bound.
+            weights = ratios * transmittances
+            yield Chunk(tiles, rows, before, transmittances, alphas, ratios, weights, evaluated)
+            before = transmittances[:, -1].clone()
+            first = first + ranks
+            alive = (first < end) & (before.amax(-1) > 0)
+            if not bool(alive.all()):
+                tiles, first, end, before = tiles[alive], first[alive], end[alive], before[alive]
+
+
+def crossing_of_half(chunk: Chunk[Evaluated]) -> tuple[Int[Tensor, "G P"], Bool[Tensor, "G P"]]:
+    """Which pair of the chunk brings the transmittance to one half or less, and whether one does. [G, P], [G, P]"""
+    crossing = (chunk.transmittances > 0.5).sum(1, keepdim=True).clamp_max(chunk.weights.shape[1] - 1)
+    crosses = (chunk.before > 0.5) & (chunk.transmittances.gather(1, crossing).squeeze(1) <= 0.5)
+    return crossing.squeeze(1), crosses & (chunk.weights.gather(1, crossing).squeeze(1) > 0)
+
+
+def _just_below(value: float, like: Tensor) -> float:
+    """The largest number under ``value``; ``threshold`` drops what equals its bound, and a cut keeps it."""
+    number = torch.tensor(value, dtype=like.dtype)
+    return float(torch.nextafter(number, torch.zeros_like(number)))

@@ -1,0 +1,561 @@
+"""Surfels drawn by the torch renderer, against closed forms and against an independent naive renderer."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+from scipy.spatial.transform import Rotation
+
+from coliags_plugin.config import registry
+from coliags_plugin.contracts import GaussianField
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.render_output import OUTPUTS
+from coliags_plugin.engine.model import Model
+from coliags_plugin.renderers import surfel_compositing, sweeping, torch_renderer
+from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings, render_gaussians
+from coliags_plugin.renderers.volume_renderer import VolumeRenderer, VolumeRendererSettings
+from tests.renderers.naive_surfels import splat_surfels
+from tests.renderers.test_torch_renderer import INPUTS, cast, make, moved, pinhole, random_gaussians, relative, rigid
+from tests.renderers.test_torch_renderer import scene as scene_of_gaussians
+
+BACKGROUND = (0.3, 0.1, 0.9)
+#: Depth of an intersection that tells a ray and a disc are all but parallel, in scenes 9 deep at most: relative errors
+#: of such depths, and of what depends on them, are as much larger than those of the input.
+GRAZING = 50.0
+
+
+def as_surfels(gaussians):
+    return dataclasses.replace(gaussians, scales=gaussians.scales[:, :2].contiguous())
+
+
+def make_surfels(means, scales, opacities, colors=None, quats=None):
+    means = torch.as_tensor(means, dtype=torch.float64).reshape(-1, 3)
+    scales = torch.as_tensor(scales, dtype=torch.float64).expand(len(means), 2)
+    return as_surfels(make(means, torch.nn.functional.pad(scales, (0, 1)), opacities, colors, quats))
+
+
+def facing_along(normals, seed=0):
+    """Quaternions of discs of these normals, turned at random about them."""
+    generator = torch.Generator().manual_seed(seed)
+    normals = torch.nn.functional.normalize(normals, dim=-1)
+    random = torch.randn(normals.shape, generator=generator, dtype=torch.float64)
+    first = torch.nn.functional.normalize(torch.linalg.cross(random, normals), dim=-1)
+    axes = torch.stack([first, torch.linalg.cross(normals, first), normals], dim=-1)
+    xyzw = torch.from_numpy(Rotation.from_matrix(axes.numpy()).as_quat())
+    return xyzw[:, [3, 0, 1, 2]]
+
+
+def scene(name):
+    """A camera and surfels, both in a moved world frame, float64."""
+    if name not in ("edge-on", "tiny", "across the near plane", "in front of one another"):
+        gaussians, camera = scene_of_gaussians(name)
+        gaussians = as_surfels(gaussians)
+        return dataclasses.replace(gaussians, **{k: getattr(gaussians, k)[:80] for k in INPUTS}), camera
+    camera = pinhole(37, 26, 31.0, 27.0, 16.3, 14.9)
+    if name == "edge-on":
+        gaussians = random_gaussians(60, 1)
+        sight = torch.nn.functional.normalize(gaussians.means, dim=-1)
+        across = torch.linalg.cross(
+            sight, torch.randn(sight.shape, generator=torch.Generator().manual_seed(0)).double()
+        )
+        tilt = torch.logspace(-4, -1, len(sight), dtype=torch.float64)[:, None]
+        quats = facing_along(torch.nn.functional.normalize(across, dim=-1) + tilt * sight)
+        gaussians = dataclasses.replace(gaussians, quats_wxyz=quats)
+    elif name == "tiny":
+        gaussians = random_gaussians(80, 2, scale=(1e-6, 0.3))
+    elif name == "across the near plane":
+        gaussians = random_gaussians(40, 3, depth=(0.1, 1.0), scale=(0.1, 0.6), opacity=(0.02, 0.3))
+    else:
+        gaussians = random_gaussians(60, 4, depth=(2.0, 2.3), scale=(0.2, 0.6), opacity=(0.05, 0.4))
+    transform, quat = rigid(11)
+    return as_surfels(moved(gaussians, transform, quat)), dataclasses.replace(camera, camera_to_world=transform)
+
+
+#: Scenes and the accuracy of float32 that they allow: outputs, gradients.
+SCENES = {
+    "random": (1e-5, 1e-4),
+    "needles": (2e-4, 1e-3),
+    "around the camera": (1e-5, 1e-4),
+    "crowd in one tile": (2e-4, 2e-4),
+    "opaque": (1e-5, 3e-4),
+    "one pixel wide": (1e-5, 1e-4),
+    "one pixel": (1e-5, 1e-4),
+    "off centre": (1e-5, 1e-4),
+    "edge-on": (1e-3, 2e-3),
+    "tiny": (1e-5, 1e-4),
+    "across the near plane": (1e-5, 1e-4),
+    "in front of one another": (1e-5, 1e-4),
+}
+
+
+def drawn(gaussians, camera, cotangents, draw):
+    """Outputs and the gradients of everything."""
+    gaussians = cast(gaussians, grad=True)
+    pose = camera.camera_to_world.clone().requires_grad_()
+    outputs, splats = draw(gaussians, dataclasses.replace(camera, camera_to_world=pose))
+    sum((outputs[name] * cotangents[name].to(outputs[name])).sum() for name in OUTPUTS).backward()
+    return outputs, splats, {**{k: getattr(gaussians, k).grad for k in INPUTS}, "pose": pose.grad}
+
+
+def ours(**options):
+    def draw(gaussians, camera):
+        output = render_gaussians(gaussians, camera, OUTPUTS, TorchRendererSettings(background=BACKGROUND, **options))
+        return {name: output[name] for name in OUTPUTS}, output.splats
+
+    return draw
+
+
+def naive(gaussians, camera):
+    return splat_surfels(gaussians, camera, BACKGROUND)
+
+
+def random_cotangents(camera, seed=1):
+    generator = torch.Generator().manual_seed(seed)
+    shape = (camera.height, camera.width)
+    return {
+        k: torch.randn(*shape, *([3] * (k in ("rgb", "normals"))), generator=generator, dtype=torch.float64)
+        for k in OUTPUTS
+    }
+
+
+def without(pixels, cotangents):
+    return {k: torch.where(pixels[..., None] if v.ndim == 3 else pixels, 0.0, v) for k, v in cotangents.items()}
+
+
+# --- against the naive renderer ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_agrees_with_the_naive_renderer(name):
+    gaussians, camera = scene(name)
+    # Numbers that float32 holds exactly, so that both precisions see the same.
+    gaussians, camera = cast(gaussians, torch.float32), camera.to(dtype=torch.float32)
+    exact, exact_camera = cast(gaussians, torch.float64), camera.to(dtype=torch.float64)
+    grazing = naive(exact, exact_camera)[0]["farthest"] > GRAZING
+    assert grazing.float().mean() <= 0.05
+    cotangents = without(grazing, random_cotangents(camera))
+    true, centers, true_gradients = drawn(exact, exact_camera, cotangents, naive)
+    assert all(true[key].any() for key in OUTPUTS if (name, key) != ("one pixel", "depth_median"))
+    for dtype, bounds in ((torch.float64, (1e-11, 1e-9)), (torch.float32, SCENES[name])):
+        for tile_size in (5, 16) if dtype == torch.float64 else (8,):
+            case = (dtype, tile_size)
+            outputs, splats, gradients = drawn(
+                cast(gaussians, dtype), camera.to(dtype=dtype), cotangents, ours(tile_size=tile_size)
+            )
+            for key in OUTPUTS:
+                assert outputs[key].dtype == dtype
+                assert relative(outputs[key][~grazing], true[key][~grazing]) <= bounds[0], (*case, key)
+            for key, gradient in gradients.items():
+                allowed = 10 * bounds[1] if key == "pose" and dtype == torch.float32 else bounds[1]  # cancels
+                if (name, key) == ("crowd in one tile", "scales"):  # all filtered: zero, but for rounding in naive
+                    assert not gradient.any() and true_gradients[key].abs().max() < 1e-9
+                else:
+                    assert relative(gradient, true_gradients[key]) <= allowed, (*case, key)
+            for i, center in centers.items():
+                torch.testing.assert_close(splats.means2d[i].double(), center, rtol=1e-5, atol=1e-5)
+
+
+@settings(max_examples=150, deadline=None)
+@given(seed=st.integers(0, 2**31), tile_size=st.integers(1, 9), size=st.floats(1e-3, 3.0), depth=st.floats(0.21, 4.0))
+def test_tiles_miss_no_pixel_that_a_surfel_reaches(seed, tile_size, size, depth):
+    gaussians = as_surfels(
+        random_gaussians(
+            1, seed, depth=(depth, 1.5 * depth), scale=(0.1 * size, size), opacity=(0.003, 1.0), spread=1.5
+        )
+    )
+    camera = pinhole(13, 11, 9.0, 8.0)
+    output = render_gaussians(gaussians, camera, settings=TorchRendererSettings(tile_size=tile_size))
+    alpha = splat_surfels(gaussians, camera)[0]["alpha"]
+    torch.testing.assert_close(output.alpha, alpha, rtol=1e-9, atol=1e-12)
+    assert output.splats.radii.item() > 0 or not alpha.any()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_nor_in_float32_where_discs_are_seen_edge_on(seed, monkeypatch):
+    gaussians = random_gaussians(200, seed, depth=(0.21, 9.0), scale=(1e-3, 2.0), opacity=(0.004, 0.05))
+    sight = torch.nn.functional.normalize(gaussians.means, dim=-1)
+    across = torch.linalg.cross(sight, gaussians.quats_wxyz[:, :3])
+    tilt = torch.logspace(-7, 0, len(sight), dtype=torch.float64)[:, None]
+    quats = facing_along(torch.nn.functional.normalize(across, dim=-1) + tilt * sight)
+    gaussians = as_surfels(cast(dataclasses.replace(gaussians, quats_wxyz=quats), torch.float32))
+    camera = pinhole(61, 52, 60.0, 55.0, dtype=torch.float32)
+    plain = render_gaussians(gaussians, camera).alpha
+    extents_of = torch_renderer.surfel_extents
+
+    def reaching_everywhere(projected, opacities, *rest):
+        extents = extents_of(projected, opacities, *rest)
+        everywhere, edge = torch.ones_like(extents.everywhere), torch.tensor([61.0, 52.0]).expand_as(extents.high)
+        return dataclasses.replace(
+            extents, everywhere=everywhere, low=0 * edge, high=edge, drawn=projected.visible & (opacities >= 1 / 255)
+        )
+
+    monkeypatch.setattr(torch_renderer, "surfel_extents", reaching_everywhere)
+    missed = (render_gaussians(gaussians, camera).alpha - plain).abs().max()
+    assert missed < 1e-6  # of 1/255 at least, if any
+
+
+@pytest.mark.parametrize("elements", [1, 2000])
+def test_the_size_of_the_working_set_changes_nothing(elements, monkeypatch):
+    gaussians, camera = scene("in front of one another")
+    cotangents = random_cotangents(camera)
+    plain, _, gradients = drawn(gaussians, camera, cotangents, ours())
+    monkeypatch.setitem(sweeping.CHUNK_ELEMENTS, "cpu", elements)
+    monkeypatch.setattr(sweeping, "_MIN_RANKS", 3)
+    monkeypatch.setattr(sweeping, "_MAX_RANKS", 7)
+    other, _, other_gradients = drawn(gaussians, camera, cotangents, ours())
+    for key in OUTPUTS:
+        torch.testing.assert_close(other[key], plain[key], rtol=1e-10, atol=1e-10)
+    for key, gradient in gradients.items():
+        torch.testing.assert_close(other_gradients[key], gradient, rtol=1e-8, atol=1e-8)
+
+
+def test_two_calls_agree_to_the_bit():
+    gaussians = cast(as_surfels(random_gaussians(3000, 12, scale=(0.01, 0.08))), torch.float32)
+    camera = pinhole(64, 48, 55.0, 55.0, dtype=torch.float32)
+    first, second = (drawn(gaussians, camera, random_cotangents(camera), ours()) for _ in range(2))
+    assert all(torch.equal(first[0][k], second[0][k]) for k in OUTPUTS)
+    assert all(torch.equal(first[2][k], second[2][k]) for k in first[2])
+
+
+# --- derivatives ------------------------------------------------------------------------------------------------------
+
+
+def smooth_scene():
+    """Far from every cut-off and from the switch between disc and filter: wide, faint, no two depths alike."""
+    generator = torch.Generator().manual_seed(3)
+    means = 0.2 * torch.randn(4, 3, generator=generator, dtype=torch.float64)
+    means[:, 2] = torch.tensor([4.0, 2.0, 5.0, 3.0])
+    scales = torch.tensor([1.3, 1.8]) * (1 + 0.2 * torch.rand(4, 1, generator=generator, dtype=torch.float64))
+    normals = torch.tensor([0.0, 0.0, 1.0]) + 0.4 * torch.randn(4, 3, generator=generator, dtype=torch.float64)
+    colors = torch.rand(4, 3, generator=generator)
+    opacities = torch.tensor([0.3, 0.5, 0.4, 0.6])
+    return make_surfels(means, scales, opacities, colors, facing_along(normals)), pinhole(6, 5, 7.0, 8.0, 2.8, 2.6)
+
+
+def test_gradcheck_of_everything_in_the_surfels_and_the_pose():
+    gaussians, camera = smooth_scene()
+    cotangents = random_cotangents(camera, 4)
+
+    def render(pose, *values):
+        replaced = dataclasses.replace(gaussians, **dict(zip(INPUTS, values, strict=True)))
+        output = render_gaussians(replaced, dataclasses.replace(camera, camera_to_world=pose), OUTPUTS)
+        assert output["depth_median"].any()
+        return tuple((output[name] * cotangents[name]).sum() for name in OUTPUTS)
+
+    pose, quat = rigid(5)
+    gaussians = moved(gaussians, pose, quat)
+    inputs = [pose, *(getattr(gaussians, name) for name in INPUTS)]
+    assert torch.autograd.gradcheck(render, [value.clone().requires_grad_() for value in inputs])
+
+
+def test_gradcheck_holds_where_filter_cuts_and_clamps_act():
+    depths = torch.tensor([2.0, 3.0, 4.0, 5.0], dtype=torch.float64)
+    means = depths[:, None] * torch.tensor([[0.001, 0.002, 1], [0.03, -0.02, 1], [-0.02, 0.01, 1], [0, 0.05, 1]])
+    scales = depths[:, None] * torch.tensor([[0.09, 0.09], [0.2, 0.001], [0.09, 0.12], [0.002, 0.003]])
+    gaussians = make_surfels(means, scales, torch.tensor([1.0, 0.995, 0.999, 0.9]))
+    camera = pinhole(17, 3)
+    cotangents = random_cotangents(camera)
+    alone = dataclasses.replace(gaussians, **{k: getattr(gaussians, k)[:1] for k in INPUTS})
+    assert (render_gaussians(alone, camera).alpha == 0.99).any()
+    whole = render_gaussians(gaussians, camera, settings=TorchRendererSettings(transmittance_min=0.0)).alpha
+    assert (render_gaussians(gaussians, camera).alpha < whole).any()
+
+    def loss(*values):
+        replaced = dataclasses.replace(gaussians, **dict(zip(INPUTS, values, strict=True)))
+        output = render_gaussians(replaced, camera, OUTPUTS)
+        return sum((output[name] * cotangents[name]).sum() for name in OUTPUTS)
+
+    assert torch.autograd.gradcheck(loss, [getattr(gaussians, k).clone().requires_grad_() for k in INPUTS])
+
+
+@pytest.mark.parametrize("name", ["random", "in front of one another"])
+def test_gradient_of_means2d_is_that_of_moving_the_intersections_alone(name):
+    gaussians, camera = scene(name)
+    cotangents = random_cotangents(camera)
+    _, splats, _ = drawn(gaussians, camera, cotangents, ours())
+    shifts = torch.zeros(len(gaussians), 2, dtype=torch.float64, requires_grad=True)
+    outputs, centers = splat_surfels(gaussians, camera, BACKGROUND, shifts=shifts)
+    sum((outputs[key] * cotangents[key]).sum() for key in OUTPUTS).backward()
+    seen = list(centers)
+    assert relative(splats.means2d.grad[seen], shifts.grad[seen]) < 1e-9
+    # That derivative is itself a difference of the definition.
+    most = int(shifts.grad.norm(dim=1).argmax())
+
+    def loss(step):
+        moved_one = torch.zeros_like(shifts.detach()).index_put(tuple(torch.tensor([[most], [0]])), step)
+        outputs, _ = splat_surfels(gaussians, camera, BACKGROUND, shifts=moved_one)
+        return sum((outputs[key] * cotangents[key]).sum() for key in ("rgb", "normals"))
+
+    cotangents |= {key: torch.zeros(()) for key in OUTPUTS if key not in ("rgb", "normals")}
+    _, splats, _ = drawn(gaussians, camera, cotangents, ours())
+    step = 1e-6
+    difference = (loss(torch.tensor(step).double()) - loss(torch.tensor(-step).double())) / (2 * step)
+    torch.testing.assert_close(splats.means2d.grad[most, 0], difference, rtol=1e-4, atol=1e-6)
+
+
+def test_the_filter_s_gradient_reaches_the_means_but_not_means2d():
+    gaussians = cast(make_surfels([0.01, 0.02, 4.0], 1e-4, 0.8), grad=True)
+    output = render_gaussians(gaussians, pinhole())
+    (output.alpha * torch.arange(9.0)).sum().backward()
+    assert gaussians.means.grad[0, 0] != 0
+    assert not output.splats.means2d.grad.any() and not gaussians.scales.grad.any()
+
+
+def test_without_gradients_nothing_is_retained():
+    gaussians, camera = smooth_scene()
+    assert not render_gaussians(gaussians, camera).splats.means2d.requires_grad
+    with torch.no_grad():
+        output = render_gaussians(cast(gaussians, grad=True), camera, OUTPUTS)
+    assert not any(output[name].requires_grad for name in OUTPUTS) and not output.splats.means2d.requires_grad
+
+
+# --- closed forms -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("opacity", [0.3, 0.999])
+def test_a_disc_that_faces_the_camera(opacity):
+    z, scales = 5.0, (0.5, 0.75)
+    camera = pinhole()  # 9 x 7: the axis meets the centre of pixel (4, 3)
+    output = render_gaussians(make_surfels([0, 0, z], scales, opacity, [[0.2, 0.5, 1.0]]), camera, OUTPUTS)
+    alpha, beside = min(0.99, opacity), opacity * math.exp(-0.5 * (2 / camera.fx * z / scales[0]) ** 2)
+    above = opacity * math.exp(-0.5 * (2 / camera.fy * z / scales[1]) ** 2)
+    for (row, column), value in {(3, 4): alpha, (3, 6): beside, (1, 4): above}.items():
+        torch.testing.assert_close(output.alpha[row, column].item(), value)
+    covered = output.alpha > 0
+    torch.testing.assert_close(output["depth_accumulated"], output.alpha * z)
+    torch.testing.assert_close(output["depth_expected"], covered * torch.tensor(z).double())
+    torch.testing.assert_close(output["inverse_depth_accumulated"], output.alpha / z)
+    torch.testing.assert_close(output["depth_median"], (output.alpha >= 0.5) * torch.tensor(z).double())
+    torch.testing.assert_close(output["normals"], output.alpha[..., None] * torch.tensor([0, 0, -1.0]).double())
+    torch.testing.assert_close(output.splats.means2d, torch.tensor([[4.5, 3.5]], dtype=torch.float64))
+    tau = 2 * math.log(255 * opacity) + 0.01  # the slack of binning
+    assert output.splats.radii.tolist() == [math.ceil(math.sqrt(tau * (camera.fy * scales[1] / z) ** 2 + 1e-4))]
+
+
+def test_a_disc_smaller_than_a_pixel_is_drawn_by_the_filter():
+    camera = pinhole()
+    output = render_gaussians(make_surfels([0, 0, 5.0], 1e-5, 0.7), camera)
+    rows, columns = torch.meshgrid(torch.arange(7.0) - 3, torch.arange(9.0) - 4, indexing="ij")
+    expected = 0.7 * torch.exp(-(rows**2 + columns**2).double())
+    torch.testing.assert_close(output.alpha, torch.where(expected < 1 / 255, 0.0, expected), rtol=1e-7, atol=1e-12)
+    wider = render_gaussians(
+        make_surfels([0, 0, 5.0], 1e-5, 0.7), camera, settings=TorchRendererSettings(surfel_filter=2)
+    )
+    torch.testing.assert_close(wider.alpha[3, 6].item(), 0.7 * math.exp(-0.5))
+
+
+def slanted_plane(normal, distance, spacing, flat=None):
+    """Discs all over the plane ``normal`` . x = ``distance``, as surfels or as 3D Gaussians of thickness ``flat``."""
+    normal = torch.nn.functional.normalize(torch.tensor(normal, dtype=torch.float64), dim=0)
+    quats = facing_along(normal[None])
+    axes = torch.from_numpy(Rotation.from_quat(quats[:, [1, 2, 3, 0]].numpy()).as_matrix())[0]
+    steps = spacing * torch.arange(-13, 14, dtype=torch.float64)
+    along, across = torch.meshgrid(steps, steps, indexing="ij")
+    means = distance * normal + along.reshape(-1, 1) * axes[:, 0] + across.reshape(-1, 1) * axes[:, 1]
+    scales = torch.tensor([0.7 * spacing] * 2 + ([] if flat is None else [flat])).expand(len(means), -1)
+    quats, index = quats.expand(len(means), 4), torch.arange(len(means))
+    opacities = torch.full((len(means),), 0.9, dtype=torch.float64)
+    return normal, Gaussians(means, quats, scales.double(), opacities, torch.ones(len(means), 3).double(), index, index)
+
+
+def test_depths_and_normals_of_a_slanted_plane_are_exact_where_those_of_flat_gaussians_are_not():
+    camera = pinhole(24, 18, 30.0, 30.0)
+    normal, surfels = slanted_plane([0.5, -0.3, 1.0], 5.0, 0.4)
+    _, gaussians = slanted_plane([0.5, -0.3, 1.0], 5.0, 0.4, flat=1e-4)
+    depth = 5.0 / (camera.rays() @ normal)  # where n . z r = distance
+    output = render_gaussians(surfels, camera, ("depth_expected", "depth_median", "normals", "distortion"))
+    inside = output.alpha > 0.9
+    assert inside.float().mean() > 0.9
+    for name in ("depth_expected", "depth_median"):
+        of_surfels = float((output[name] - depth)[inside].abs().max())
+        of_gaussians = float((render_gaussians(gaussians, camera, (name,))[name] - depth)[inside].abs().max())
+        print(f"{name} of a plane 5 away: surfels {of_surfels:.1e}, flat Gaussians {of_gaussians:.1e}")
+        assert of_surfels < 1e-12 and of_gaussians > 0.1
+    torch.testing.assert_close(output["normals"], -output.alpha[..., None] * normal)
+    assert output["distortion"].abs().max() < 1e-28
+
+
+# --- distortion -------------------------------------------------------------------------------------------------------
+
+
+def test_distortion_of_two_discs_and_of_one():
+    near, far = 0.2, 100.0
+    discs = make_surfels([[0, 0, 3.0], [0, 0, 4.0]], 1e4, torch.tensor([0.4, 0.5], dtype=torch.float64))
+    output = render_gaussians(discs, pinhole(), ("distortion",))
+    first, second = (far / (far - near) * (1 - near / z) for z in (3.0, 4.0))
+    torch.testing.assert_close(
+        output["distortion"][3, 4].item(), 0.4 * 0.6 * 0.5 * (first - second) ** 2, rtol=1e-9, atol=0
+    )
+    nearer = render_gaussians(discs, pinhole(), ("distortion",), TorchRendererSettings(distortion_far=6.0))
+    first, second = (6.0 / 5.8 * (1 - near / z) for z in (3.0, 4.0))
+    torch.testing.assert_close(
+        nearer["distortion"][3, 4].item(), 0.4 * 0.6 * 0.5 * (first - second) ** 2, rtol=1e-9, atol=0
+    )
+    one, camera = scene("random")
+    one = dataclasses.replace(one, **{k: getattr(one, k)[:1] for k in INPUTS})
+    assert render_gaussians(one, camera, ("distortion",))["distortion"].max() < 1e-30
+
+
+def test_distortion_of_close_discs_survives_float32():
+    depths = torch.linspace(50.0, 50.2, 20, dtype=torch.float64)  # m differs by 1.6e-5, m^2 would need nine digits
+    discs = cast(make_surfels(torch.nn.functional.pad(depths[:, None], (2, 0)), 50.0, 0.1), torch.float32)
+    camera = pinhole()
+    true = splat_surfels(discs, camera)[0]["distortion"]
+    ours32 = render_gaussians(discs, camera.to(dtype=torch.float32), ("distortion",))["distortion"]
+    assert relative(ours32, true) < 1e-4
+
+
+# --- culling and emptiness --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("mean", "scales", "quat"),
+    [
+        ([0, 0, 0.2], 0.3, [1.0, 0, 0, 0]),
+        ([0, 0, -3.0], 0.3, [1.0, 0, 0, 0]),
+        ([0, 0, 3.0], 0.3, [0.5, 0.5, 0.5, 0.5]),  # exactly edge-on: its normal is the x axis
+        ([0, 0, 3.0], (0.3, 0.0), [1.0, 0, 0, 0]),
+        ([90.0, 0, 3.0], 0.3, [1.0, 0, 0, 0]),
+    ],
+)
+def test_what_is_not_drawn_gets_no_gradient(mean, scales, quat):
+    gaussians = cast(make_surfels(mean, scales, 0.7, quats=torch.tensor([quat])), grad=True)
+    pose = torch.eye(4, dtype=torch.float64).requires_grad_()
+    camera = dataclasses.replace(pinhole(), camera_to_world=pose)
+    output = render_gaussians(gaussians, camera, OUTPUTS, TorchRendererSettings(background=BACKGROUND))
+    assert torch.equal(output.rgb, torch.tensor(BACKGROUND, dtype=torch.float64).expand(7, 9, 3))
+    assert output.splats.radii.tolist() == [0] and not any(output[name].any() for name in OUTPUTS if name != "rgb")
+    sum(output[name].sum() for name in OUTPUTS).backward()
+    for gradient in (*(getattr(gaussians, name).grad for name in INPUTS), pose.grad, output.splats.means2d.grad):
+        assert not gradient.any()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_no_surfels_leave_the_background_and_a_graph(dtype):
+    gaussians = cast(make_surfels(torch.zeros(0, 3), torch.zeros(0, 2), torch.zeros(0)), dtype, grad=True)
+    output = render_gaussians(gaussians, pinhole(), OUTPUTS, TorchRendererSettings(background=BACKGROUND))
+    assert torch.equal(output.rgb[0, 0], torch.tensor(BACKGROUND, dtype=dtype))
+    sum(output[name].sum() for name in OUTPUTS).backward()
+    assert gaussians.means.grad.shape == (0, 3) and output.splats.means2d.grad.shape == (0, 2)
+
+
+def test_a_disc_is_cut_off_at_the_near_plane():
+    # Seen from 0.5 above a disc along the view, rays through the lower rows meet it ever nearer.
+    quats = torch.tensor([[1.0, 1.0, 0, 0]])  # normal along y
+    gaussians = make_surfels([0, 0.5, 2.0], 5.0, 0.9, quats=quats)
+    camera = pinhole(3, 40, 5.0, 5.0)
+    rows = torch.arange(40) + 0.5 - camera.cy
+    depth = 0.5 * camera.fy / rows
+    for near in (0.2, 0.4):
+        output = render_gaussians(gaussians, camera, ("depth_expected",), TorchRendererSettings(near_plane=near))
+        met = (output.alpha[:, 1] > 0.5) & (rows > 1)
+        assert torch.equal(met, (rows > 1) & (depth >= near))
+        torch.testing.assert_close(output["depth_expected"][met, 1], depth[met].double())
+
+
+def test_surfels_of_equal_depth_keep_the_order_they_came_in():
+    gaussians = make_surfels([[0, 0, 4.0], [0, 0, 4.0]], 0.3, 0.8, [[1.0, 0, 0], [0, 1.0, 0]])
+    torch.testing.assert_close(
+        render_gaussians(gaussians, pinhole()).rgb[3, 4], torch.tensor([0.8, 0.16, 0.0], dtype=torch.float64)
+    )
+
+
+def test_feature_channels_are_composited_as_colours_are():
+    gaussians, camera = scene("random")
+    gaussians = dataclasses.replace(gaussians, features={"copy": gaussians.colors, "one": torch.ones(80, 1).double()})
+    output = render_gaussians(gaussians, camera, ("copy", "normals", "one"))
+    torch.testing.assert_close(output["copy"], output.rgb)
+    torch.testing.assert_close(output["one"], output.alpha[..., None])
+
+
+# --- the component ----------------------------------------------------------------------------------------------------
+
+
+class Surfels(GaussianField):
+    """A field that holds surfels."""
+
+    primitive = "surfels"
+    feature_channels = frozenset()
+
+    def __init__(self, gaussians):
+        torch.nn.Module.__init__(self)
+        self._gaussians = gaussians
+
+    def gaussians(self, camera):
+        return self._gaussians
+
+
+Surfels.__abstractmethods__ = frozenset()
+
+
+def test_the_registered_component_renders_surfels_with_their_own_outputs():
+    renderer_class = registry.renderers.get("torch")
+    assert "surfels" in renderer_class.primitives
+    assert renderer_class.outputs_of("surfels") == set(OUTPUTS)
+    assert renderer_class.outputs_of("gaussians3d") == renderer_class.outputs == set(OUTPUTS) - {"distortion"}
+    assert registry.renderers.get("auto").outputs_of("surfels") == set(OUTPUTS)
+    gaussians, camera = smooth_scene()
+    model = Model(Surfels(gaussians), TorchRenderer(TorchRendererSettings()), {})
+    assert "distortion" in model.outputs
+    model.check_outputs(["distortion"], "a loss")
+    output = model.render(camera, ("distortion",))
+    torch.testing.assert_close(output["distortion"], render_gaussians(gaussians, camera, OUTPUTS)["distortion"])
+    with pytest.raises(InputError, match="no renderer output 'distortion'"):
+        field = Surfels(gaussians)
+        field.primitive = "radiance"
+        VolumeRenderer(VolumeRendererSettings()).render(field, camera, ("distortion",))
+
+
+def test_what_cannot_be_rendered_says_so():
+    gaussians, camera = smooth_scene()
+    solid = dataclasses.replace(gaussians, scales=torch.ones(4, 3).double())
+    with pytest.raises(InputError, match=r"distortion of 3D Gaussians.*surfels"):
+        render_gaussians(solid, camera, ("distortion",))
+    with pytest.raises(InputError, match=r"scales of shape \[4, 1\].*two for surfels"):
+        render_gaussians(dataclasses.replace(gaussians, scales=gaussians.scales[:, :1]), camera)
+
+
+@pytest.mark.parametrize("options", [{"surfel_filter": 0.0}, {"distortion_far": 0.2}, {"near_plane": 200.0}])
+def test_settings_are_checked(options):
+    with pytest.raises(ValidationError):
+        TorchRendererSettings(**options)
+
+
+def test_depths_cost_nothing_where_they_are_not_wanted(monkeypatch):
+    gaussians, camera = scene("random")
+
+    def never(*_):
+        raise AssertionError("depths were composited")
+
+    monkeypatch.setattr(surfel_compositing, "crossing_of_half", never)
+    render_gaussians(cast(gaussians, grad=True), camera, ("normals",)).rgb.sum().backward()
+    with pytest.raises(AssertionError):
+        render_gaussians(gaussians, camera, ("depth_expected",))
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", SCENES)
+def test_cuda_gives_the_numbers_of_the_cpu(name):
+    gaussians, camera = scene(name)
+    grazing = naive(gaussians, camera)[0]["farthest"] > GRAZING
+    cotangents = without(grazing, random_cotangents(camera))
+    for dtype, bounds in ((torch.float64, (1e-9, 1e-8)), (torch.float32, [10 * bound for bound in SCENES[name]])):
+        results = [
+            drawn(cast(gaussians, dtype, device), camera.to(device, dtype),
+                  {k: v.to(device) for k, v in cotangents.items()}, ours())
+            for device in ("cpu", "cuda")
+        ]  # fmt: skip
+        (on_cpu, _, cpu_gradients), (on_cuda, _, cuda_gradients) = results
+        for key in OUTPUTS:
+            assert on_cuda[key].device.type == "cuda"
+            assert relative(on_cuda[key].cpu()[~grazing], on_cpu[key].double()[~grazing]) <= bounds[0], (dtype, key)
+        for key, gradient in cpu_gradients.items():
+            if gradient.any():
+                assert relative(cuda_gradients[key].cpu(), gradient.double()) <= bounds[1], (dtype, key)
