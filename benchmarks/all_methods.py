@@ -82,7 +82,7 @@ def main(options: Options) -> None:
     rows = [row(run, options) for run in runs]
     header = ", ".join(f"{key}: {value}" for key, value in describe_machine().items())
     text = f"{header}; {options.jobs} runs at a time\n\n{markdown_table(rows)}\n"
-    (options.out / "table.md").write_text(text, encoding="utf-8")
+    (options.out / "table.txt").write_text(text, encoding="utf-8")
     write_results(options.out / "table.json", rows)
     write_png(options.out / "sheet.png", contact_sheet(runs, options))
     print(text)

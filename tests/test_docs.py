@@ -82,7 +82,7 @@ def cited(text: str) -> list[tuple[str, list[str]]]:
     """Pages named in a text, each with the section numbers that follow it, over the ends of commented lines too."""
     text = re.sub(r"\s*\n\s*(?:#:?|\|)?\s*", " ", text)
     number = r"\d+(?:\.\d+)*(?!\w)"
-    pattern = rf"(?<![\w/-])((?:docs/)?(?:layouts/)?[\w-]+\.md)(?:`*,? +({number}(?:(?:, | and ){number})*))?"
+    pattern = rf"(?<![\w/-])((?:docs/)?(?:layouts/|rivals/)?[\w-]+\.md)(?:`*,? +({number}(?:(?:, | and ){number})*))?"
     return [(page, re.findall(number, numbers or "")) for page, numbers in re.findall(pattern, text)]
 
 

@@ -79,6 +79,7 @@ class Trainer:
         self.model.check_outputs(self.wants, "the losses")
         for loss in self.losses.values():
             loss.check(self.model)
+        self.chosen.renderer.check_field(field)
         self.optimizers = self._optimizers()
         self.step = 0
         self.seconds = 0.0
@@ -201,7 +202,7 @@ class Trainer:
         for draw in draws:
             frame = self.frames[draw.frame].to(self.device)
             view = frame.view(trained=True)
-            outputs.append(self.model.render(frame.camera, self.wants, view, draw.pixels))
+            outputs.append(self.model.render(frame.camera, self.wants, view, draw.pixels, self.generators["rays"]))
             targets.append(frame.target if draw.pixels is None else frame.target_at(draw.pixels))
         return concatenate_pixels(outputs), concatenate_targets(targets)
 

@@ -6,13 +6,14 @@ from abc import abstractmethod
 from typing import ClassVar, Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from pydantic import Field
 from torch import Tensor
 
 from coliags_plugin.contracts import Loss, LossSettings, TrainingStep
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.masked import masked_mean, zero_outside
+from coliags_plugin.core.scenes import Target
 
 #: :data:`coliags_plugin.core.render_output.DEPTH_KINDS` as a literal type; a test compares the two.
 DepthKind = Literal["depth_accumulated", "depth_expected", "depth_median", "inverse_depth_accumulated"]
@@ -60,18 +61,11 @@ class DepthLoss(Loss):
         Raises:
             InputError: The target has no depth at all.
         """
-        target = step.target
-        if target.depth is None:
-            raise InputError(
-                f"frame '{target.name}' has no depth",
-                "ground-truth depth for every training frame, since the losses include one of depth",
-                "Remove the term with --set losses.depth=null",
-            )
-        known = torch.isfinite(target.depth) & target.valid
+        depth, known = known_depth(step.target)
         rendered = step.output[self.settings.depth]
         if self.settings.depth == "inverse_depth_accumulated":
             rendered = _reciprocal(rendered, self.settings.empty_depth)
-        truth = target.depth.to(rendered.dtype)
+        truth = depth.to(rendered.dtype)
         return masked_mean(self.penalty(zero_outside(rendered, known) - zero_outside(truth, known)), known)
 
 
@@ -90,7 +84,7 @@ class DepthL1Loss(DepthLoss):
 class DepthHuberLoss(DepthLoss):
     """Mean Huber loss of the depth: x^2 / 2 for |x| up to ``delta``, beyond it delta (|x| - delta / 2).
 
-    Used by Gaussian Pancakes and PR-Endo (docs/rivals).
+    Used by Gaussian Pancakes and PR-Endo (docs/rivals/gaussian-pancakes.md).
     """
 
     Settings: ClassVar[type[LossSettings]] = DepthHuberSettings
@@ -100,6 +94,24 @@ class DepthHuberLoss(DepthLoss):
         return torch.nn.functional.huber_loss(
             differences, torch.zeros_like(differences), reduction="none", delta=self.settings.delta
         )
+
+
+def known_depth(target: Target) -> tuple[Float[Tensor, "H W"], Bool[Tensor, "H W"]]:
+    """The true z-depth and where it is known and valid.
+
+    Args:
+        target: What is compared with.
+
+    Raises:
+        InputError: The target has no depth at all.
+    """
+    if target.depth is None:
+        raise InputError(
+            f"frame '{target.name}' has no depth",
+            "ground-truth depth for every training frame, since the losses include one of depth",
+            "Remove that term, for instance with --set losses.depth=null",
+        )
+    return target.depth, torch.isfinite(target.depth) & target.valid
 
 
 def _reciprocal(inverse_depth: Float[Tensor, "H W"], empty_depth: float) -> Float[Tensor, "H W"]:
