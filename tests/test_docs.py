@@ -16,6 +16,7 @@ import pytest
 import yaml
 
 from coliags_plugin import cli
+from coliags_plugin.cli.check import Check
 from coliags_plugin.cli.config import Config
 from coliags_plugin.cli.phantom import Phantom
 from coliags_plugin.cli.train import Train
@@ -27,6 +28,7 @@ from coliags_plugin.datamanagers.recognition import formats
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
 from coliags_plugin.datamanagers.splits import held_out
 from coliags_plugin.engine.randomness import PURPOSES
+from coliags_plugin.method_check.check import CHECKS
 from coliags_plugin.phantom.settings import PRESETS, PhantomSettings
 from tests.scenes import SMALL, write_wall
 
@@ -175,10 +177,14 @@ OF_THE_EXAMPLE = {path.stem for path in (DOCS / "example_package").rglob("*.yaml
 def test_commands_parse(page, command, monkeypatch, capsys):
     words = shlex.split(command, comments=True)
     argv = words[words.index("coliags") + 1 :]
-    if len(argv) == 1 and argv[0] in ("train", "eval", "render", "report", "phantom", "config", "poses"):
+    if len(argv) == 1 and argv[0] in ("train", "eval", "render", "report", "phantom", "config", "check", "poses"):
         argv.append("--help")  # the subcommand's name alone, in running text
     found = parsed(argv, monkeypatch)
-    if isinstance(found, (Train, Config)) and found.method not in OF_THE_EXAMPLE and not found.method.endswith(".yaml"):
+    if (
+        isinstance(found, (Train, Config, Check))
+        and found.method not in OF_THE_EXAMPLE
+        and not found.method.endswith(".yaml")
+    ):
         # A format's page speaks of scenes in that format.
         format_of_page = [f"datamanager.name={Path(page).stem}"] if "layouts" in page else []
         overrides = [*format_of_page, *found.set]
@@ -312,6 +318,12 @@ def test_every_key_of_a_method_is_in_the_table():
     said = (DOCS / "configs.md").read_text()
     for key, field in ScheduleSettings.model_fields.items():
         assert re.search(rf"`{key}`\s+\({field.default}\b", said), key
+
+
+def test_the_table_of_checks_is_the_list():
+    assert [row[0] for row in table_rows("configs.md", "| check | what must hold |")] == [
+        check.name for check in CHECKS
+    ]
 
 
 def test_rates_in_the_table_are_coliags():
