@@ -7,7 +7,7 @@ DEMO ?= demo
 DEMO_STEPS ?= 1200
 DEMO_FLAGS := --data $(DEMO)/phantom --steps $(DEMO_STEPS) --overwrite
 
-.PHONY: demo test test-slow lint docs options matrix install system clean
+.PHONY: demo test test-slow lint docs options method-table matrix install system clean
 
 demo: install
 	$(BIN)/coliags phantom $(DEMO)/phantom --seed 0 --overwrite
@@ -38,6 +38,10 @@ docs: install $(VENV)/installed-docs
 # docs/options.md, from the settings classes.
 options: install
 	$(BIN)/python docs/tools/options.py
+
+# docs/method_table.md, from the method configs.
+method-table: install
+	$(BIN)/python docs/tools/methods.py
 
 # The test suite on every Python that is here.
 matrix:

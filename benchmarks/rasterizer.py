@@ -28,7 +28,7 @@ os.environ.setdefault("GOMP_SPINCOUNT", "10000")
 import torch
 import tyro
 from machine import describe_machine, markdown_table, write_results
-from train_step import Handed
+from train_stages import Handed
 from workload import camera, lining, wall
 
 from coliags_plugin.config.components import make_component

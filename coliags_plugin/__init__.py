@@ -4,10 +4,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from coliags_plugin.api import evaluate, load_run, load_scene, train
+    from coliags_plugin.api import evaluate, load_run, load_scene, relight, train
 
 __version__ = "0.1.0"
-__all__ = ["evaluate", "load_run", "load_scene", "train"]
+__all__ = ["evaluate", "load_run", "load_scene", "relight", "train"]
 
 
 def __getattr__(name: str) -> Any:

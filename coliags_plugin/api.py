@@ -15,7 +15,7 @@ from typing import Any
 from coliags_plugin.config.method_config import method_name
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Scene
-from coliags_plugin.engine import evaluator
+from coliags_plugin.engine import evaluator, relighting
 from coliags_plugin.engine.data_formats import load_method_for, open_scene
 from coliags_plugin.engine.data_formats import load_scene as load_scene_of
 from coliags_plugin.engine.devices import choose_device
@@ -115,6 +115,19 @@ def load_run(run: str | Path, *, data: str | Path | None = None, device: str = "
         InputError: There is no run or checkpoint, or the data are missing or have changed.
     """
     return load_trained(Path(run), choose_device(device), None if data is None else Path(data))
+
+
+def relight(trained: TrainedRun, **lamp: Any) -> TrainedRun:
+    """Exchange the lamp of a loaded run, which shares the parameters, for rendering.
+
+    Args:
+        trained: The run.
+        lamp: Options of :class:`~coliags_plugin.core.lamps.Lamp`, for instance ``offset=(5.0, 0.0, 0.0)`` (mm).
+
+    Raises:
+        InputError: An option is unknown or invalid, or the run's field does not model the lamp.
+    """
+    return relighting.relight(trained, relighting.make_lamp(lamp))
 
 
 def evaluate(

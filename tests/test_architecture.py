@@ -20,7 +20,7 @@ LAYERS = (
     {"datamanagers", "fields", "renderers", "modules", "strategies", "losses", "metrics"},
     {"outputs"},
     {"engine", "phantom", "reconstruction"},
-    {"data_check", "reporting"},
+    {"data_check", "method_check", "reporting"},
     {"api"},
     {"cli"},
 )

@@ -10,9 +10,11 @@ from pathlib import Path
 
 import pytest
 
+from coliags_plugin.outputs.image_files import read_rgb
 from tests.scenes import write_wall
 
 ROOT = Path(__file__).parents[1]
+METHODS = ROOT / "method_configs"
 
 
 def run(script, *argv):
@@ -24,7 +26,7 @@ def run(script, *argv):
 
 
 def test_the_training_step_by_stages():
-    table = run("train_step.py", "--anchors", 300, "--steps", 1, "--size", "48x36", "--renderers", "cpu")
+    table = run("train_stages.py", "--anchors", 300, "--steps", 1, "--size", "48x36", "--renderers", "cpu")
     assert "| render ms |" in table and "| cpu | 300 |" in table
 
 
@@ -35,6 +37,12 @@ def test_surfels_beside_3d_gaussians(scene):
     assert "| cpu | flat | 300 |" in table and "| cpu | surfels | 300 |" in table and "| both, of flat |" in table
 
 
+def test_the_training_step_of_every_method():
+    table = run("train_step.py", "--gaussians", 500, "--steps", 1, "--size", "48x36")
+    names = [row.split("|")[1].strip() for row in table.splitlines() if row.startswith("| ")][1:]
+    assert names[0] == "coliags" and sorted(names) == sorted(path.stem for path in METHODS.glob("*.yaml"))
+
+
 @pytest.mark.parametrize("method", ["coliags", "3dgs"])
 def test_a_training_curve(method, tmp_path):
     write_wall(tmp_path / "wall")
@@ -43,3 +51,17 @@ def test_a_training_curve(method, tmp_path):
     rows = [json.loads(line) for line in (tmp_path / "run" / "curve.jsonl").read_text().splitlines()]
     assert [row["step"] for row in rows] == [2, 4]
     assert all(row["elements"] > 0 and row["psnr"] > 0 and row["depth_mse"] >= 0 for row in rows)
+
+
+def test_all_methods_on_a_scene(tmp_path):
+    write_wall(tmp_path / "wall")
+    options = ("--data", tmp_path / "wall", "--out", tmp_path / "runs", "--steps", 3)
+    run("all_methods.py", *options, "--methods", "coliags", "--timed", "3dgs")
+    rows = json.loads((tmp_path / "runs" / "table.json").read_text())
+    assert [row["method"] for row in rows] == ["coliags", "3dgs"]
+    assert all(row["peak MiB"] > 100 and float(row["PSNR dB"]) > 0 and row["steps"] >= 1 for row in rows)
+    sheet = read_rgb(tmp_path / "runs" / "sheet.png")
+    assert sheet.shape == (3 * 24, 2 * 32, 3)  # truth and two runs; colour and depth of the one test set
+    stamp = (tmp_path / "runs" / "coliags" / "config.yaml").stat().st_mtime_ns
+    run("all_methods.py", *options, "--methods", "coliags", "--timed", "3dgs")
+    assert (tmp_path / "runs" / "coliags" / "config.yaml").stat().st_mtime_ns == stamp

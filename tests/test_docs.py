@@ -16,6 +16,7 @@ import pytest
 import yaml
 
 from coliags_plugin import cli
+from coliags_plugin.cli.check import Check
 from coliags_plugin.cli.config import Config
 from coliags_plugin.cli.phantom import Phantom
 from coliags_plugin.cli.train import Train
@@ -27,6 +28,7 @@ from coliags_plugin.datamanagers.recognition import formats
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
 from coliags_plugin.datamanagers.splits import held_out
 from coliags_plugin.engine.randomness import PURPOSES
+from coliags_plugin.method_check.check import CHECKS
 from coliags_plugin.phantom.settings import PRESETS, PhantomSettings
 from tests.scenes import SMALL, write_wall
 
@@ -80,7 +82,7 @@ def cited(text: str) -> list[tuple[str, list[str]]]:
     """Pages named in a text, each with the section numbers that follow it, over the ends of commented lines too."""
     text = re.sub(r"\s*\n\s*(?:#:?|\|)?\s*", " ", text)
     number = r"\d+(?:\.\d+)*(?!\w)"
-    pattern = rf"(?<![\w/-])((?:docs/)?(?:layouts/)?[\w-]+\.md)(?:`*,? +({number}(?:(?:, | and ){number})*))?"
+    pattern = rf"(?<![\w/-])((?:docs/)?(?:layouts/|rivals/)?[\w-]+\.md)(?:`*,? +({number}(?:(?:, | and ){number})*))?"
     return [(page, re.findall(number, numbers or "")) for page, numbers in re.findall(pattern, text)]
 
 
@@ -175,10 +177,14 @@ OF_THE_EXAMPLE = {path.stem for path in (DOCS / "example_package").rglob("*.yaml
 def test_commands_parse(page, command, monkeypatch, capsys):
     words = shlex.split(command, comments=True)
     argv = words[words.index("coliags") + 1 :]
-    if len(argv) == 1 and argv[0] in ("train", "eval", "render", "report", "phantom", "config", "poses"):
+    if len(argv) == 1 and argv[0] in ("train", "eval", "render", "report", "phantom", "config", "check", "poses"):
         argv.append("--help")  # the subcommand's name alone, in running text
     found = parsed(argv, monkeypatch)
-    if isinstance(found, (Train, Config)) and found.method not in OF_THE_EXAMPLE and not found.method.endswith(".yaml"):
+    if (
+        isinstance(found, (Train, Config, Check))
+        and found.method not in OF_THE_EXAMPLE
+        and not found.method.endswith(".yaml")
+    ):
         # A format's page speaks of scenes in that format.
         format_of_page = [f"datamanager.name={Path(page).stem}"] if "layouts" in page else []
         overrides = [*format_of_page, *found.set]
@@ -314,6 +320,12 @@ def test_every_key_of_a_method_is_in_the_table():
         assert re.search(rf"`{key}`\s+\({field.default}\b", said), key
 
 
+def test_the_table_of_checks_is_the_list():
+    assert [row[0] for row in table_rows("configs.md", "| check | what must hold |")] == [
+        check.name for check in CHECKS
+    ]
+
+
 def test_rates_in_the_table_are_coliags():
     told = table_rows("methods.md", "| group | rate | final rate | |")
     rates = load_method("coliags").config.optimizers
@@ -341,6 +353,17 @@ def test_test_frames_of_the_sequences_are_counted_rightly():
 def test_the_page_of_options_is_what_the_settings_say():
     page = run_path(str(DOCS / "tools" / "options.py"))["page"]()
     assert (DOCS / "options.md").read_text() == page, "make options"
+
+
+def test_the_table_of_methods_is_what_the_configs_say():
+    page = run_path(str(DOCS / "tools" / "methods.py"))["page"]()
+    assert (DOCS / "method_table.md").read_text() == page, "make method-table"
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in (ROOT / "method_configs").glob("*.yaml")))
+def test_every_constant_has_a_source(name):
+    constants = run_path(str(DOCS / "tools" / "methods.py"))["constants"]
+    assert [".".join(path) for path, _, source in constants(name) if not source] == []
 
 
 def test_protocols_page_names_every_protocol_metric_and_version():

@@ -58,6 +58,12 @@ def test_the_example_trains_and_is_evaluated(coliags, tmp_path):
     assert scores["psnr"] > 5
 
 
+def test_the_example_keeps_the_contract(coliags, tmp_path):
+    done = coliags("check", "round-gaussians")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "19 passed, 0 failed, 2 skipped" in done.stdout
+
+
 def test_a_method_whose_file_is_missing_is_named(coliags, tmp_path):
     (info,) = (tmp_path / "site").glob("*.dist-info")
     (info / "entry_points.txt").write_text("[coliags_plugin.methods]\nghost = coliags_round\n", encoding="utf-8")

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import tyro
 
+from coliags_plugin.cli.check import Check
 from coliags_plugin.cli.config import Config
 from coliags_plugin.cli.data import Data
 from coliags_plugin.cli.doctor import Doctor
@@ -31,6 +32,7 @@ Command = (
     | Annotated[List, tyro.conf.subcommand("list")]
     | Annotated[Config, tyro.conf.subcommand("config")]
     | Annotated[Data, tyro.conf.subcommand("data")]
+    | Annotated[Check, tyro.conf.subcommand("check")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
 )
 

@@ -12,6 +12,11 @@ from coliags_plugin.core.errors import InputError
 #: ``--set key=value``, repeatable.
 Assignments = Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="KEY=VALUE"), tyro.conf.UseAppendAction]
 
+#: ``--light key=value``, repeatable.
+LampOptions = Annotated[tuple[str, ...], tyro.conf.arg(name="light", metavar="KEY=VALUE"), tyro.conf.UseAppendAction]
+#: ``--channel NAME``, repeatable.
+Channels = Annotated[tuple[str, ...], tyro.conf.arg(name="channel", metavar="NAME"), tyro.conf.UseAppendAction]
+
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH")]
 OptionalText = Annotated[str | None, tyro.conf.arg(metavar="TEXT")]
 #: Name of a data manager; None: recognised from the files.

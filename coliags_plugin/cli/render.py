@@ -8,7 +8,7 @@ from typing import Literal
 
 import tyro
 
-from coliags_plugin.cli.arguments import OptionalPath
+from coliags_plugin.cli.arguments import Channels, LampOptions, OptionalPath
 
 
 @dataclass(frozen=True)
@@ -18,13 +18,19 @@ class Render:
     path: tyro.conf.Positional[Path]
     """Run folder."""
     output: OptionalPath = None
-    """Folder to create; default RUN/renders."""
+    """Folder to create; default RUN/renders, with --light RUN/relit."""
     frames: str = "test"
     """Which frames: train, all, or the name of a test set."""
     video: bool = True
     """Also write trajectory.mp4, rgb beside depth."""
     fps: float = 15.0
     """Frames per second of the video."""
+    light: LampOptions = ()
+    """Render under another lamp, for methods that model it: offset=[X,Y,Z] from the camera in its axes (mm),
+    turn=[A,B] about its x and y axes (degrees), power=P (exponent of the cosine to the lamp's axis), intensity=F
+    (factor)."""
+    channel: Channels = ()
+    """Also write a feature channel of the method's Gaussians, for instance albedo."""
     data: OptionalPath = None
     """The scene's folder, where it has moved since training."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -35,9 +41,13 @@ class Render:
     def run(self) -> None:
         """Render and print the output folder."""
         from coliags_plugin.api import load_run
+        from coliags_plugin.engine.relighting import read_lamp, relight
         from coliags_plugin.engine.rendering import render_run
 
-        output = self.output or self.path / "renders"
+        output = self.output or self.path / ("relit" if self.light else "renders")
+        lamp = read_lamp(self.light)
         trained = load_run(self.path, data=self.data, device=self.device)
-        render_run(trained, output, self.frames, self.video, self.fps, self.overwrite)
+        if self.light:
+            trained = relight(trained, lamp)
+        render_run(trained, output, self.frames, self.video, self.fps, self.overwrite, self.channel)
         print(output)

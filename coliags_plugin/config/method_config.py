@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 from typing_extensions import Self
@@ -25,16 +25,23 @@ from coliags_plugin.config.yaml_tree import Node, dump, merge, override_all, rea
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.settings import Settings, refuse_zero_ends
 
+#: Of the run, neither its start nor its end.
+Share = Annotated[float, Field(gt=0, lt=1)]
+
 
 class OptimizerSettings(Settings):
     """Adam for one parameter group of the field; the rate is constant, or log-linear to ``final_lr`` over the run.
 
-    A constant rate of 0 freezes the group; one that falls needs both ends above 0.
+    A constant rate of 0 freezes the group; one that falls needs both ends above 0. ``halve_at`` halves either.
     """
 
     lr: float = Field(ge=0)  # at the first step
     final_lr: float | None = Field(default=None, ge=0)  # at the last step; None: as at the first
     times_extent: bool = False  # multiply both rates by the scene's extent (docs/methods.md 2.1)
+    halve_at: tuple[Share, ...] = ()  # shares of the run, between 0 and 1, after each of which the rate is halved
+    eps: float = Field(
+        default=1e-15, gt=0
+    )  # Adam's epsilon; the default is the splatting methods' (docs/methods.md 2.3)
 
     @model_validator(mode="after")
     def _ends_above_zero(self) -> Self:

@@ -167,6 +167,9 @@ fields = Registry(
     {
         "anchors": "coliags_plugin.fields.anchors:AnchorField",
         "gaussians": "coliags_plugin.fields.explicit_gaussians:ExplicitGaussians",
+        "lit-gaussians": "coliags_plugin.fields.lit_gaussians:LitGaussians",
+        "surfels": "coliags_plugin.fields.surfels:Surfels",
+        "reim-nerf": "coliags_plugin.fields.reim_nerf:ReimNerf",
     },
     noun="field",
 )
@@ -227,9 +230,17 @@ losses = Registry(
     {
         "l1": "coliags_plugin.losses.photometric:L1Loss",
         "d-ssim": "coliags_plugin.losses.photometric:DSSIMLoss",
+        "mse": "coliags_plugin.losses.photometric:MSELoss",
         "depth-l1": "coliags_plugin.losses.depth:DepthL1Loss",
+        "attribute-variance": "coliags_plugin.losses.attribute_variance:AttributeVarianceLoss",
+        "diffuse-factor": "coliags_plugin.losses.diffuse_factor:DiffuseFactorLoss",
+        "depth-huber": "coliags_plugin.losses.depth:DepthHuberLoss",
+        "distance-l1": "coliags_plugin.losses.distance:DistanceL1Loss",
         "sparse-depth": "coliags_plugin.losses.sparse_depth:SparseDepthLoss",
         "scale-volume": "coliags_plugin.losses.scale_volume:ScaleVolumeLoss",
+        "surface-normals": "coliags_plugin.losses.surface_normals:SurfaceNormalsLoss",
+        "normal-consistency": "coliags_plugin.losses.surfel_regularization:NormalConsistencyLoss",
+        "distortion": "coliags_plugin.losses.surfel_regularization:DistortionLoss",
     },
     noun="loss",
 )

@@ -2,7 +2,14 @@
 
 from coliags_plugin.contracts.data import DataManager
 from coliags_plugin.contracts.evaluation import Comparison, Metric, Protocol
-from coliags_plugin.contracts.fields import Field, GaussianField, RadianceField, RadianceSamples
+from coliags_plugin.contracts.fields import (
+    Field,
+    GaussianField,
+    LitField,
+    RadianceField,
+    RadianceLevel,
+    RadianceSamples,
+)
 from coliags_plugin.contracts.heads import AppearanceHead, GeometryHead, Head
 from coliags_plugin.contracts.losses import Loss, LossSettings
 from coliags_plugin.contracts.rendering import Availability, Renderer, ViewModule
@@ -26,12 +33,14 @@ __all__ = [
     "GaussianField",
     "GeometryHead",
     "Head",
+    "LitField",
     "Loss",
     "LossSettings",
     "Metric",
     "ParameterRows",
     "Protocol",
     "RadianceField",
+    "RadianceLevel",
     "RadianceSamples",
     "Renderer",
     "Sampler",

@@ -15,6 +15,7 @@ from typing_extensions import Self
 from coliags_plugin.contracts.schedule import Schedule
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.lamps import Lamp
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
 
@@ -47,6 +48,11 @@ class Field(nn.Module, ABC):
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Trainable parameters by the name that a method config's ``optimizers`` uses."""
 
+    @property
+    def length_unit(self) -> float | Tensor:
+        """Scene units in one unit of the field's own coordinates; 1 where it uses the scene's. []"""
+        return 1.0
+
     def before_step(self, step: int, schedule: Schedule) -> None:
         """Called before each training step, counted from 1, by fields that change over the run.
 
@@ -66,6 +72,18 @@ class GaussianField(Field):
     def gaussians(self, camera: Camera) -> Gaussians:
         """The Gaussians this camera sees, differentiable with respect to the field's parameters and the pose."""
 
+    def gaussians_in_training(self, camera: Camera, generator: torch.Generator) -> Gaussians:
+        """:meth:`gaussians` in a training step: with noise from the generator where there is any; default: without."""
+        return self.gaussians(camera)
+
+
+class LitField(GaussianField):
+    """Gaussian field that models the lamp apart from the tissue, so that the lamp can be exchanged after training."""
+
+    @abstractmethod
+    def with_lamp(self, lamp: Lamp) -> Self:
+        """The field under another lamp; it shares the parameters."""
+
 
 @dataclass(frozen=True)
 class RadianceSamples:
@@ -80,10 +98,8 @@ class RadianceSamples:
     rgb: Float[Tensor, "P S 3"]
 
 
-class RadianceField(Field):
-    """Points and directions -> density and colour, for renderers that sample along rays."""
-
-    primitive: ClassVar[str] = "radiance"
+class RadianceLevel(ABC):
+    """Points and directions -> density and colour: a :class:`RadianceField`, or the coarse part of one."""
 
     @abstractmethod
     def query(
@@ -96,3 +112,35 @@ class RadianceField(Field):
             directions: Unit vectors from the camera. [P, 3]
             camera: Camera of the rays; its centre and optical axis are the lamp's too.
         """
+
+    def query_in_training(
+        self,
+        positions: Float[Tensor, "P S 3"],
+        directions: Float[Tensor, "P 3"],
+        camera: Camera,
+        generator: torch.Generator,
+    ) -> RadianceSamples:
+        """:meth:`query` in a training step: with noise from the generator where there is any; default: without."""
+        return self.query(positions, directions, camera)
+
+    def query_density(
+        self, positions: Float[Tensor, "P S 3"], directions: Float[Tensor, "P 3"], camera: Camera
+    ) -> Float[Tensor, "P S"]:
+        """Density of :meth:`query`, which may take less time without colours. [P, S]"""
+        return self.query(positions, directions, camera).density
+
+
+class RadianceField(Field, RadianceLevel):
+    """Density and colour in space, for renderers that sample along rays."""
+
+    primitive: ClassVar[str] = "radiance"
+
+    @property
+    def coarse_level(self) -> RadianceLevel:
+        """The level that decides where on a ray the field itself is sampled; by default the field itself."""
+        return self
+
+    @property
+    def ray_bounds(self) -> Float[Tensor, "2"] | None:
+        """Distances from a camera between which rays meet the surface, scene units; None where not known. [2]"""
+        return None

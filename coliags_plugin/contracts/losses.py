@@ -12,7 +12,7 @@ from torch import Tensor
 from typing_extensions import Self
 
 from coliags_plugin.contracts.schedule import Schedule, log_linear
-from coliags_plugin.contracts.training import TrainingStep
+from coliags_plugin.contracts.training import TrainedModel, TrainingStep
 from coliags_plugin.core.settings import Settings, refuse_zero_ends
 
 
@@ -34,6 +34,13 @@ class Loss(ABC):
     def wants(self) -> frozenset[str]:
         """Outputs beyond rgb and alpha that the renderer must deliver."""
         return frozenset()
+
+    def check(self, model: TrainedModel) -> None:  # noqa: B027 (optional)
+        """Refuse a model that lacks what the term reads.
+
+        Raises:
+            InputError: See above.
+        """
 
     @abstractmethod
     def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:

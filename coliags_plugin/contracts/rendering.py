@@ -97,6 +97,24 @@ class Renderer(ABC):
             InputError: The field, an output or ``pixels`` is not for this renderer.
         """
 
+    def render_in_training(
+        self,
+        field: Any,
+        camera: Camera,
+        wants: Sequence[str],
+        pixels: Int[Tensor, "P 2"] | None,
+        generator: torch.Generator,
+    ) -> RenderOutput:
+        """:meth:`render` in a training step: with random samples from the generator where there are any."""
+        return self.render(field, camera, wants, pixels)
+
+    def check_field(self, field: Any) -> None:  # noqa: B027 (optional)
+        """Refuse, before training, a field that lacks what the renderer's options need of it.
+
+        Raises:
+            InputError: See above.
+        """
+
 
 class ViewModule(nn.Module, ABC):
     """Per-view module: adjusts the camera before and the output after rendering; may learn parameters per frame."""

@@ -16,3 +16,23 @@ def rotation_matrices(quats_wxyz: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"
         *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     ]
     return torch.stack(rows, dim=-1).view(-1, 3, 3)
+
+
+def shortest_axes(quats_wxyz: Float[Tensor, "N 4"], scales: Float[Tensor, "N S"]) -> Float[Tensor, "N 3"]:
+    """Local axis of the smallest scale of each Gaussian, in the frame its rotation leads to.
+
+    The third axis where there are two scales. Differentiable in the quaternions; the choice of the axis is not.
+
+    Args:
+        quats_wxyz: Rotations, of any length. [N, 4]
+        scales: Three or two, or their logarithms. [N, S]
+    """
+    if scales.shape[1] == 2:
+        return third_axes(quats_wxyz)
+    return rotation_matrices(quats_wxyz).gather(2, scales.argmin(1)[:, None, None].expand(-1, 3, 1)).squeeze(2)
+
+
+def third_axes(quats_wxyz: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3"]:
+    """Third columns of :func:`rotation_matrices`. [N, 3]"""
+    w, x, y, z = torch.nn.functional.normalize(quats_wxyz, dim=-1).unbind(-1)
+    return torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=-1)

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.pixel_ids import pixel_ids
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,8 @@ class Target(_MaskedImage):
         mask: False where a pixel is to be ignored. None means every pixel counts. [H, W]
         depth: z-depth, mm; NaN where unknown. None where there is none. [H, W]
         sparse_depth: Depth at single points of a whole frame; None where there is none.
+        index: Of a whole frame in the video.
+        chosen: Identifiers of the pixels, if they are not those of a whole frame. [H, W]
     """
 
     name: str
@@ -84,6 +87,16 @@ class Target(_MaskedImage):
     mask: Bool[Tensor, "H W"] | None = None
     depth: Float[Tensor, "H W"] | None = None
     sparse_depth: SparseDepth | None = None
+    index: int = 0
+    chosen: Int[Tensor, "H W"] | None = None
+
+    @property
+    def ids(self) -> Int[Tensor, "H W"]:
+        """A number for every pixel that no other of the training frames has. [H, W]"""
+        if self.chosen is not None:
+            return self.chosen
+        height, width = self.image.shape[:2]
+        return pixel_ids(self.index, torch.arange(height * width, device=self.image.device).view(height, width))
 
 
 @dataclass(frozen=True)
@@ -116,7 +129,7 @@ class Frame(_MaskedImage):
     @property
     def target(self) -> Target:
         """The whole frame as a target."""
-        return Target(self.name, self.image, self.mask, self.depth, self.sparse_depth)
+        return Target(self.name, self.image, self.mask, self.depth, self.sparse_depth, self.index)
 
     def target_at(self, pixels: Int[Tensor, "P 2"]) -> Target:
         """Some pixels as a target.
@@ -129,7 +142,8 @@ class Frame(_MaskedImage):
         def taken(values: Tensor | None) -> Tensor | None:
             return None if values is None else values[row, column][:, None]
 
-        return Target(self.name, self.image[row, column][:, None], taken(self.mask), taken(self.depth))
+        image, chosen = self.image[row, column][:, None], pixel_ids(self.index, row * self.image.shape[1] + column)
+        return Target(self.name, image, taken(self.mask), taken(self.depth), chosen=chosen[:, None])
 
     def view(self, trained: bool) -> View:
         """This frame, for the modules of a model."""
@@ -218,5 +232,5 @@ def concatenate_targets(parts: Sequence[Target]) -> Target:
         depths = torch.cat(
             [nothing if part.depth is None else part.depth for part, nothing in zip(parts, unknown, strict=True)]
         )
-    images = torch.cat([part.image for part in parts])
-    return Target(", ".join(part.name for part in parts), images, masks, depths)
+    images, chosen = torch.cat([part.image for part in parts]), torch.cat([part.ids for part in parts])
+    return Target(", ".join(part.name for part in parts), images, masks, depths, chosen=chosen)

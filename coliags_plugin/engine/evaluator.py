@@ -63,8 +63,13 @@ def evaluate(trained: TrainedRun, protocol_name: str) -> Path:
         The evaluation's folder.
 
     Raises:
-        InputError: The protocol is unknown or wants what the renderer cannot deliver, or there is no test frame.
+        InputError: The protocol is unknown or wants what the renderer cannot deliver, there is no test frame, or the
+            run was relit.
     """
+    if trained.lamp is not None:
+        raise InputError(
+            "evaluation of a relit run", "the lamp that the data were recorded with", "Evaluate the run as loaded"
+        )
     scorer = Scorer(protocol_name)
     trained.model.check_outputs(scorer.wants, f"protocol '{protocol_name}'")
     sets = {name: frames for name, frames in trained.scene.test_sets.items() if frames}

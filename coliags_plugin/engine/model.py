@@ -45,6 +45,7 @@ class Model(nn.Module):
         wants: Sequence[str] = ("rgb", "alpha"),
         view: View | None = None,
         pixels: Tensor | None = None,
+        generator: torch.Generator | None = None,
     ) -> RenderOutput:
         """Render a view.
 
@@ -53,12 +54,17 @@ class Model(nn.Module):
             wants: Names of outputs; rgb, alpha and the outputs that modules need are always included.
             view: Which frame of the video it is; None for a free camera.
             pixels: Columns and rows of the only pixels to render. [P, 2]
+            generator: In training, of the random samples of renderers and fields that have any; None renders without
+                chance.
         """
         modules = self.view_modules.values()
         for module in modules:
             camera = module.adjust_camera(camera, view)
-        needed = dict.fromkeys([*wants, *(name for module in modules for name in sorted(module.wants))])
-        output = self.renderer.render(self.field, camera, tuple(needed), pixels)
+        needed = tuple(dict.fromkeys([*wants, *(name for module in modules for name in sorted(module.wants))]))
+        if generator is None:
+            output = self.renderer.render(self.field, camera, needed, pixels)
+        else:
+            output = self.renderer.render_in_training(self.field, camera, needed, pixels, generator)
         for module in modules:
             output = module.shade(output, view)
         return output
@@ -73,8 +79,12 @@ class Model(nn.Module):
     @property
     def outputs(self) -> frozenset[str]:
         """Names of all available outputs."""
-        channels = self.field.feature_channels if isinstance(self.field, GaussianField) else frozenset()
-        return self.renderer.outputs_of(self.field.primitive) | channels
+        return self.renderer.outputs_of(self.field.primitive) | self.feature_channels
+
+    @property
+    def feature_channels(self) -> frozenset[str]:
+        """Names of the field's feature channels."""
+        return self.field.feature_channels if isinstance(self.field, GaussianField) else frozenset()
 
     def check_outputs(self, wants: Sequence[str], asking: str) -> None:
         """Refuse outputs that the renderer does not have for this field, wanted by a caller or a view module.

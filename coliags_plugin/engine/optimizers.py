@@ -12,8 +12,6 @@ from coliags_plugin.contracts import log_linear
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.model import Model
 
-#: Everywhere in the splatting lineage (docs/methods.md 2.3).
-ADAM_EPSILON = 1e-15
 #: What belongs to a row beside its value.
 _GRADIENT, _MOMENTUM, _MEAN_SQUARE = "grad", "exp_avg", "exp_avg_sq"
 
@@ -41,7 +39,7 @@ class Optimizers:
         self.steps = steps
         self.extent = extent
         self.adam: dict[str, torch.optim.Optimizer] = {
-            name: torch.optim.Adam(parameters, lr=0.0, eps=ADAM_EPSILON, fused=True)
+            name: torch.optim.Adam(parameters, lr=0.0, eps=settings[name].eps, fused=True)
             for name, parameters in groups.items()
         }
 
@@ -49,6 +47,7 @@ class Optimizers:
         """The learning rate of a group at a step, counted from 1."""
         group = self.settings[name]
         rate = group.lr if group.final_lr is None else log_linear(group.lr, group.final_lr, step / self.steps)
+        rate *= 0.5 ** sum(step > share * self.steps for share in group.halve_at)
         return rate * self.extent if group.times_extent else rate
 
     def step(self, step: int) -> None:

@@ -6,7 +6,7 @@ import hashlib
 
 import torch
 
-PURPOSES = ("initialisation", "frame_order", "densification")
+PURPOSES = ("initialisation", "frame_order", "densification", "rendering")
 
 
 def generators(seed: int) -> dict[str, torch.Generator]:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import atomic_folder
+from coliags_plugin.config.yaml_tree import dump
+from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.files import atomic_folder, atomic_write
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.progress import ProgressReport
@@ -28,8 +30,18 @@ from coliags_plugin.outputs.video import write_video
 RGB_ERROR_LIMIT = 0.2
 
 
-def render_run(trained: TrainedRun, output: Path, frames: str, video: bool, fps: float, overwrite: bool) -> None:
+def render_run(
+    trained: TrainedRun,
+    output: Path,
+    frames: str,
+    video: bool,
+    fps: float,
+    overwrite: bool,
+    channels: Sequence[str] = (),
+) -> None:
     """Write colour, depth and error images of a set of frames, and a video along the trajectory.
+
+    A relit run has its lamp in ``lamp.yaml``, and no colour errors, there being no images under that lamp.
 
     Args:
         trained: The run.
@@ -38,11 +50,13 @@ def render_run(trained: TrainedRun, output: Path, frames: str, video: bool, fps:
         video: Also write ``trajectory.mp4``: every frame's view in video order, rgb beside depth.
         fps: Of the video.
         overwrite: Replace ``output`` where it exists.
+        channels: Feature channels of one or three numbers to write as images too, 1 as white.
 
     Raises:
-        InputError: No such frames, or the folder exists or cannot be written.
+        InputError: No such frames or channel, or the folder exists or cannot be written.
     """
     chosen = _choose(trained, frames)
+    _check_channels(trained, channels)
     path = _choose(trained, "all")
     limits = _depth_limits(trained, chosen)
     with (
@@ -50,11 +64,17 @@ def render_run(trained: TrainedRun, output: Path, frames: str, video: bool, fps:
         ProgressReport("render", len(chosen) + len(path) * video) as progress,
     ):
         for count, frame in enumerate(chosen, start=1):
-            _write_frame(folder, frame, _render(trained, frame), limits)
+            view = _render(trained, frame, channels)
+            _write_frame(folder, frame, view, limits, relit=trained.lamp is not None)
+            for channel in channels:
+                write_png(folder / channel / f"{frame.name}.png", eight_bit(_as_rgb(view[channel])))
             progress.update(count)
         write_png(folder / "depth_scale.png", color_bar(limits, "mm", "depth"))
         write_png(folder / "depth_error_scale.png", color_bar((0.0, DEPTH_ERROR_LIMIT_MM), "mm", "error"))
-        write_png(folder / "rgb_error_scale.png", color_bar((0.0, RGB_ERROR_LIMIT), "of full scale", "error"))
+        if trained.lamp is None:
+            write_png(folder / "rgb_error_scale.png", color_bar((0.0, RGB_ERROR_LIMIT), "of full scale", "error"))
+        else:
+            atomic_write(folder / "lamp.yaml", dump(trained.lamp.model_dump()))
         if video:
             write_video(_film(trained, path, limits, progress, len(chosen)), folder / "trajectory.mp4", fps)
 
@@ -69,10 +89,27 @@ def _choose(trained: TrainedRun, frames: str) -> list[Frame]:
     return groups[frames]
 
 
+def _check_channels(trained: TrainedRun, channels: Sequence[str]) -> None:
+    known = sorted(trained.model.feature_channels)
+    for channel in channels:
+        if channel not in known:
+            raise InputError(
+                f"method '{trained.method}' has no feature channel '{channel}'",
+                f"one of {', '.join(known)}" if known else "a method with feature channels, such as pr-endo",
+                did_you_mean(channel, known),
+            )
+
+
 @torch.no_grad()
-def _render(trained: TrainedRun, frame: Frame) -> RenderOutput:
+def _render(trained: TrainedRun, frame: Frame, channels: Sequence[str] = ()) -> RenderOutput:
     view = frame.view(trained=frame.name in trained.training_frames)
-    return trained.model.render(frame.camera.to(trained.device), ("rgb", "alpha", "depth_accumulated"), view)
+    wants = ("rgb", "alpha", "depth_accumulated", *channels)
+    return trained.model.render(frame.camera.to(trained.device), wants, view)
+
+
+def _as_rgb(channel: Tensor) -> Tensor:
+    """Three equal numbers per pixel where the channel has one. [H, W, 3]"""
+    return channel.reshape(*channel.shape[:2], -1).expand(-1, -1, 3)
 
 
 def _depth_limits(trained: TrainedRun, frames: list[Frame]) -> tuple[float, float]:
@@ -82,13 +119,15 @@ def _depth_limits(trained: TrainedRun, frames: list[Frame]) -> tuple[float, floa
     return 0.0, max(10.0, 10.0 * float(np.ceil(largest / 10.0)))
 
 
-def _write_frame(folder: Path, frame: Frame, output: RenderOutput, limits: tuple[float, float]) -> None:
+def _write_frame(folder: Path, frame: Frame, output: RenderOutput, limits: tuple[float, float], relit: bool) -> None:
     name = f"{frame.name}.png"
     depth = output["depth_accumulated"]
     write_png(folder / "rgb" / name, eight_bit(output.rgb))
     write_png(folder / "depth" / name, colorize_depth(depth, limits))
     valid = frame.valid.cpu()
-    write_png(folder / "rgb_error" / name, colorize_rgb_error(output.rgb.cpu(), frame.image, valid, RGB_ERROR_LIMIT))
+    if not relit:
+        errors = colorize_rgb_error(output.rgb.cpu(), frame.image, valid, RGB_ERROR_LIMIT)
+        write_png(folder / "rgb_error" / name, errors)
     if frame.depth is not None:
         errors = colorize_depth_error(depth.cpu(), frame.depth, valid, DEPTH_ERROR_LIMIT_MM)
         write_png(folder / "depth_error" / name, errors)

@@ -11,6 +11,7 @@ import torch
 
 from coliags_plugin.config.method_config import MethodConfig
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.lamps import Lamp
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.checkpoints import latest_checkpoint, read_checkpoint, restore_model
 from coliags_plugin.engine.data_formats import load_scene
@@ -21,7 +22,18 @@ from coliags_plugin.renderers.choice import choose_renderer
 
 @dataclass(frozen=True)
 class TrainedRun:
-    """Scene and model of a run at its latest checkpoint."""
+    """Scene and model of a run at its latest checkpoint.
+
+    Attributes:
+        run: Its folder.
+        config: Its method config.
+        method: Name of the method.
+        scene: What it was trained on.
+        model: The trained model.
+        step: Of the checkpoint.
+        device: Where it computes.
+        lamp: What it was relit with; None under the lamp that the data were recorded with.
+    """
 
     run: RunFolder
     config: MethodConfig
@@ -30,6 +42,7 @@ class TrainedRun:
     model: Model
     step: int
     device: torch.device
+    lamp: Lamp | None = None
 
     @cached_property
     def training_frames(self) -> frozenset[str]:

@@ -77,6 +77,9 @@ class Trainer:
         self.model = Model(field, self.chosen.renderer, modules).to(device)
         self.wants = tuple(sorted({"rgb", "alpha"}.union(*(loss.wants for loss in self.losses.values()))))
         self.model.check_outputs(self.wants, "the losses")
+        for loss in self.losses.values():
+            loss.check(self.model)
+        self.chosen.renderer.check_field(field)
         self.optimizers = self._optimizers()
         self.step = 0
         self.seconds = 0.0
@@ -199,7 +202,8 @@ class Trainer:
         for draw in draws:
             frame = self.frames[draw.frame].to(self.device)
             view = frame.view(trained=True)
-            outputs.append(self.model.render(frame.camera, self.wants, view, draw.pixels))
+            generator = self.generators["rendering"]
+            outputs.append(self.model.render(frame.camera, self.wants, view, draw.pixels, generator))
             targets.append(frame.target if draw.pixels is None else frame.target_at(draw.pixels))
         return concatenate_pixels(outputs), concatenate_targets(targets)
 

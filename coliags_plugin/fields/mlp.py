@@ -1,8 +1,10 @@
-"""Two-layer MLP of the heads."""
+"""Layers of the fields' multilayer perceptrons."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -10,17 +12,33 @@ from torch import Tensor, nn
 
 
 def mlp(inputs: int, hidden: int, outputs: int, generator: torch.Generator) -> nn.Sequential:
-    """Linear -> ReLU -> Linear, initialised as torch does by default but from an explicit generator.
+    """Linear -> ReLU -> Linear, initialised by :func:`linear_layers`."""
+    first, last = linear_layers((inputs, hidden, outputs), generator)
+    return nn.Sequential(first, nn.ReLU(), last)
+
+
+def linear_layers(widths: Sequence[int], generator: torch.Generator) -> list[nn.Linear]:
+    """Linear layers from each width to the next, initialised as torch does by default but from an explicit generator.
 
     Weights and biases are uniform within 1/sqrt(inputs) (docs/methods.md 3.4).
     """
-    layers = nn.Linear(inputs, hidden), nn.Linear(hidden, outputs)
+    layers = [nn.Linear(inputs, outputs) for inputs, outputs in pairwise(widths)]
     with torch.no_grad():
         for layer in layers:
             bound = 1.0 / math.sqrt(layer.in_features)
             layer.weight.uniform_(-bound, bound, generator=generator)
             layer.bias.uniform_(-bound, bound, generator=generator)
-    return nn.Sequential(layers[0], nn.ReLU(), layers[1])
+    return layers
+
+
+def glorot_linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
+    """Linear layer with Glorot's uniform weights, within sqrt(6 / (inputs + outputs)), and biases of 0."""
+    layer = nn.Linear(inputs, outputs)
+    bound = math.sqrt(6.0 / (inputs + outputs))
+    with torch.no_grad():
+        layer.weight.uniform_(-bound, bound, generator=generator)
+        layer.bias.zero_()
+    return layer
 
 
 def first_layer(

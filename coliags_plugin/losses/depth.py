@@ -1,24 +1,26 @@
-"""L1 loss of the rendered depth against a ground-truth depth map."""
+"""Losses of the rendered depth against a ground-truth depth map: L1 and Huber."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import ClassVar, Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from pydantic import Field
 from torch import Tensor
 
 from coliags_plugin.contracts import Loss, LossSettings, TrainingStep
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.masked import masked_mean, zero_outside
+from coliags_plugin.core.scenes import Target
 
 #: :data:`coliags_plugin.core.render_output.DEPTH_KINDS` as a literal type; a test compares the two.
 DepthKind = Literal["depth_accumulated", "depth_expected", "depth_median", "inverse_depth_accumulated"]
 
 
 class DepthL1Settings(LossSettings):
-    """Options of the depth loss."""
+    """Options of the L1 depth loss."""
 
     depth: DepthKind = Field(
         default="depth_accumulated", description="Which rendered depth is compared; the paper's D is depth_accumulated."
@@ -28,14 +30,17 @@ class DepthL1Settings(LossSettings):
     )
 
 
-class DepthL1Loss(Loss):
-    """Mean |D - D_true| in mm over the valid pixels of known true depth (the paper's L_depth; docs/methods.md 4.1).
+class DepthHuberSettings(DepthL1Settings):
+    """Options of the Huber depth loss."""
 
-    The paper writes a sum over pixels and the authors' code takes the mean; this is the mean. The authors' code also
-    pulls pixels of unknown depth towards 0; here they are ignored.
+    delta: float = Field(default=0.2, gt=0.0, description="Difference at which the loss becomes linear, scene units.")
 
-    For ``inverse_depth_accumulated`` (E = sum w/z, what the authors' code trains on) D = 1/E where E > 0. Where
-    nothing was drawn (E = 0) D is ``empty_depth``, which enters the value but has no gradient.
+
+class DepthLoss(Loss):
+    """Mean penalty of D - D_true over the valid pixels of known true depth.
+
+    For ``inverse_depth_accumulated`` (E = sum w/z, what the authors' code of the paper trains on) D = 1/E where E > 0.
+    Where nothing was drawn (E = 0) D is ``empty_depth``, which enters the value but has no gradient.
     """
 
     Settings: ClassVar[type[LossSettings]] = DepthL1Settings
@@ -46,26 +51,67 @@ class DepthL1Loss(Loss):
         """The rendered depth that is compared."""
         return frozenset({self.settings.depth})
 
+    @abstractmethod
+    def penalty(self, differences: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
+        """Penalty of each difference in depth. [H, W]"""
+
     def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
-        """The unweighted term, mm; 0 where no valid pixel has a true depth.
+        """The unweighted term; 0 where no valid pixel has a true depth.
 
         Raises:
             InputError: The target has no depth at all.
         """
-        target = step.target
-        if target.depth is None:
-            raise InputError(
-                f"frame '{target.name}' has no depth",
-                "ground-truth depth for every training frame, since the losses include depth-l1",
-                "Remove the term with --set losses.depth=null",
-            )
-        known = torch.isfinite(target.depth) & target.valid
+        depth, known = known_depth(step.target)
         rendered = step.output[self.settings.depth]
         if self.settings.depth == "inverse_depth_accumulated":
             rendered = _reciprocal(rendered, self.settings.empty_depth)
-        truth = target.depth.to(rendered.dtype)
-        difference = zero_outside(rendered, known) - zero_outside(truth, known)
-        return masked_mean(difference.abs(), known)
+        truth = depth.to(rendered.dtype)
+        return masked_mean(self.penalty(zero_outside(rendered, known) - zero_outside(truth, known)), known)
+
+
+class DepthL1Loss(DepthLoss):
+    """Mean |D - D_true| in mm over the valid pixels of known true depth (the paper's L_depth; docs/methods.md 4.1).
+
+    The paper writes a sum over pixels and the authors' code takes the mean; this is the mean. The authors' code also
+    pulls pixels of unknown depth towards 0; here they are ignored.
+    """
+
+    def penalty(self, differences: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
+        """Their absolute values, mm. [H, W]"""
+        return differences.abs()
+
+
+class DepthHuberLoss(DepthLoss):
+    """Mean Huber loss of the depth: x^2 / 2 for |x| up to ``delta``, beyond it delta (|x| - delta / 2).
+
+    Used by Gaussian Pancakes and PR-Endo (docs/rivals/gaussian-pancakes.md).
+    """
+
+    Settings: ClassVar[type[LossSettings]] = DepthHuberSettings
+
+    def penalty(self, differences: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
+        """Huber's function of them, mm squared. [H, W]"""
+        return torch.nn.functional.huber_loss(
+            differences, torch.zeros_like(differences), reduction="none", delta=self.settings.delta
+        )
+
+
+def known_depth(target: Target) -> tuple[Float[Tensor, "H W"], Bool[Tensor, "H W"]]:
+    """The true z-depth and where it is known and valid.
+
+    Args:
+        target: What is compared with.
+
+    Raises:
+        InputError: The target has no depth at all.
+    """
+    if target.depth is None:
+        raise InputError(
+            f"frame '{target.name}' has no depth",
+            "ground-truth depth for every training frame, since the losses include one of depth",
+            "Remove that term, for instance with --set losses.depth=null",
+        )
+    return target.depth, torch.isfinite(target.depth) & target.valid
 
 
 def _reciprocal(inverse_depth: Float[Tensor, "H W"], empty_depth: float) -> Float[Tensor, "H W"]:

@@ -1,10 +1,11 @@
-"""Photometric losses of the rendered against the ground-truth image: L1 and D-SSIM."""
+"""Photometric losses of the rendered against the ground-truth image: L1, mean square and D-SSIM."""
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 from jaxtyping import Float
+from pydantic import Field
 from torch import Tensor
 
 from coliags_plugin.contracts import Loss, LossSettings, TrainingStep
@@ -22,6 +23,31 @@ class L1Loss(Loss):
         rgb, mask = step.output.rgb, step.target.mask
         difference = zero_outside(rgb, mask) - zero_outside(step.target.rgb.to(rgb.dtype), mask)
         return masked_mean(difference.abs(), mask)
+
+
+class MSESettings(LossSettings):
+    """Options of the squared difference."""
+
+    image: Literal["rgb", "rgb_coarse"] = Field(
+        default="rgb", description="Which rendered image is compared; rgb_coarse is not shaded by view modules."
+    )
+
+
+class MSELoss(Loss):
+    """Mean squared difference over valid pixels and channels, as of NeRF."""
+
+    Settings: ClassVar[type[LossSettings]] = MSESettings
+
+    @property
+    def wants(self) -> frozenset[str]:
+        """The coarse image, if that is compared."""
+        return frozenset({self.settings.image} - {"rgb"})
+
+    def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
+        """The unweighted term, in units of full scale squared; 0 where no pixel is valid."""
+        rgb, mask = step.output[self.settings.image], step.target.mask
+        difference = zero_outside(rgb, mask) - zero_outside(step.target.rgb.to(rgb.dtype), mask)
+        return masked_mean(difference.square(), mask)
 
 
 class DSSIMLoss(Loss):

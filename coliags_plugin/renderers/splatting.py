@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 import pydantic
+import torch
 from torch import Tensor
 from typing_extensions import Self
 
@@ -87,6 +88,23 @@ class SplattingRenderer(Renderer):
         Raises:
             InputError: ``pixels`` is given, an output is unknown, or the field is not for this renderer.
         """
+        self._check(field, pixels)
+        return self.draw(field.gaussians(camera), camera, wants)
+
+    def render_in_training(
+        self,
+        field: GaussianField,
+        camera: Camera,
+        wants: Sequence[str],
+        pixels: Tensor | None,
+        generator: torch.Generator,
+    ) -> RenderOutput:
+        """:meth:`render` in a training step, with noise of the field from the generator where there is any."""
+        self._check(field, pixels)
+        return self.draw(field.gaussians_in_training(camera, generator), camera, wants)
+
+    def _check(self, field: GaussianField, pixels: Tensor | None) -> None:
+        """Refuse single pixels, and fields that are not for this renderer."""
         if pixels is not None:
             raise InputError(
                 f"the {self.name} renderer was requested to render single pixels",
@@ -94,7 +112,6 @@ class SplattingRenderer(Renderer):
                 "Leave pixels out, or choose a renderer of radiance fields",
             )
         check_primitive(field, self.primitives, self.name)
-        return self.draw(field.gaussians(camera), camera, wants)
 
     @abstractmethod
     def draw(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> RenderOutput:

@@ -1,9 +1,10 @@
-"""Volume rendering of radiance fields at evenly spaced depths."""
+"""Volume rendering of radiance fields, in one pass or from coarse to fine."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -11,25 +12,38 @@ from pydantic import Field, model_validator
 from torch import Tensor
 from typing_extensions import Self
 
-from coliags_plugin.contracts import Availability, RadianceField, Renderer
+from coliags_plugin.contracts import Availability, RadianceField, RadianceLevel, Renderer
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.render_output import OUTPUTS, SURFEL_OUTPUTS, RenderOutput, concatenate_pixels
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.renderers.checks import check_outputs, check_primitive
+from coliags_plugin.renderers.ray_compositing import CompositedRays, transmittances
+from coliags_plugin.renderers.ray_sampling import even_places, refined_places
 
 #: Every output of the splatting renderers that has a meaning without surfaces.
-_OUTPUTS = frozenset(OUTPUTS) - SURFEL_OUTPUTS - {"normals"}
+_COMPOSITED = frozenset(OUTPUTS) - SURFEL_OUTPUTS - {"normals"}
+#: Ending of the outputs of the first pass.
+_COARSE = "_coarse"
 
 
 class VolumeRendererSettings(Settings):
     """Options of :class:`VolumeRenderer`."""
 
-    near_plane: float = Field(default=0.2, gt=0)
-    """z-depth of the start of the first interval, scene units."""
-    far_plane: float = Field(default=100.0, gt=0)
-    """z-depth of the end of the last interval, scene units."""
+    near_plane: float | None = Field(default=0.2, gt=0)
+    """Start of the first interval in terms of ``spacing``, scene units; null: the field's own, a distance."""
+    far_plane: float | None = Field(default=100.0, gt=0)
+    """End of the last interval; null: the field's own."""
+    spacing: Literal["depth", "distance"] = "depth"
+    """The intervals are equal in z-depth, or in distance from the camera."""
     samples: int = Field(default=128, ge=2)
-    """Intervals per ray; the field is evaluated at their midpoints."""
+    """Intervals per ray; the field is evaluated at their midpoints, in training with ``jitter`` anywhere in them."""
+    importance_samples: int = Field(default=0, ge=0)
+    """Samples added where those of a first pass, through the field's coarse level, have weight; 0: a single pass."""
+    jitter: bool = False
+    """In training, place samples at random; rendering is not affected."""
+    opaque_end: bool = False
+    """The last sample of a ray absorbs everything where its density is above 0: rays end on tissue."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Background RGB."""
     rays_at_once: int = Field(default=8192, ge=1)
@@ -37,17 +51,29 @@ class VolumeRendererSettings(Settings):
 
     @model_validator(mode="after")
     def _near_before_far(self) -> Self:
-        if self.far_plane <= self.near_plane:
+        if self.near_plane is not None and self.far_plane is not None and self.far_plane <= self.near_plane:
             raise ValueError(f"far_plane {self.far_plane} does not lie beyond near_plane {self.near_plane}")
+        return self
+
+    @model_validator(mode="after")
+    def _bounds_are_distances(self) -> Self:
+        if self.spacing == "depth" and (self.near_plane is None or self.far_plane is None):
+            raise ValueError("near_plane or far_plane null with spacing 'depth': a field's own are distances")
+        return self
+
+    @model_validator(mode="after")
+    def _enough_to_refine(self) -> Self:
+        if self.importance_samples and self.samples < 3:
+            raise ValueError(f"importance_samples with samples {self.samples}: expected at least 3")
         return self
 
 
 class VolumeRenderer(Renderer):
-    """Volume renderer of radiance fields, for whole images or selected pixels."""
+    """Volume renderer of radiance fields, for whole images or selected pixels (docs/rendering.md)."""
 
     Settings: ClassVar[type[Settings]] = VolumeRendererSettings
     primitives: ClassVar[frozenset[str]] = frozenset({"radiance"})
-    outputs: ClassVar[frozenset[str]] = _OUTPUTS
+    outputs: ClassVar[frozenset[str]] = _COMPOSITED | {name + _COARSE for name in _COMPOSITED} | {"ray_lengths"}
     devices: ClassVar[frozenset[str]] = frozenset({"cpu", "cuda"})
     renders_pixels: ClassVar[bool] = True
 
@@ -57,6 +83,20 @@ class VolumeRenderer(Renderer):
     def availability(cls) -> Availability:
         """Always available: PyTorch only."""
         return Availability(True, "plain PyTorch, runs wherever PyTorch does")
+
+    def check_field(self, field: RadianceField) -> None:
+        """Refuse a field without bounds where the options leave them to it, and bounds without anything between them.
+
+        Raises:
+            InputError: See above.
+        """
+        near, far = (float(end) for end in self._bounds(field))
+        if near >= far:
+            raise InputError(
+                f"rays that start at {near:.4g} and end at {far:.4g} scene units",
+                "an end beyond the start",
+                "Change renderer.near_plane or renderer.far_plane",
+            )
 
     def render(
         self,
@@ -70,61 +110,153 @@ class VolumeRenderer(Renderer):
         Args:
             field: A radiance field.
             camera: Camera of the view.
-            wants: Names from :data:`coliags_plugin.core.render_output.OUTPUTS`, normals and distortion excepted;
-                rgb and alpha are always included. Depths are z-depths.
+            wants: Names from :data:`coliags_plugin.core.render_output.OUTPUTS`, normals and distortion excepted, with
+                ``_coarse`` behind for those of the first pass, or ``ray_lengths``, the length of a pixel's ray per
+                z-depth; rgb and alpha are always included. Depths are z-depths.
             pixels: Columns and rows of the only pixels to render. [P, 2]
 
         Raises:
-            InputError: The field is of another primitive, or an output is not delivered.
+            InputError: The field is of another primitive or has no bounds, or an output is not delivered.
         """
+        return self._render(field, camera, wants, pixels, None)
+
+    def render_in_training(
+        self,
+        field: RadianceField,
+        camera: Camera,
+        wants: Sequence[str],
+        pixels: Tensor | None,
+        generator: torch.Generator,
+    ) -> RenderOutput:
+        """:meth:`render` with samples at random places and the field's noise."""
+        return self._render(field, camera, wants, pixels, generator)
+
+    def _render(
+        self,
+        field: RadianceField,
+        camera: Camera,
+        wants: Sequence[str],
+        pixels: Tensor | None,
+        generator: torch.Generator | None,
+    ) -> RenderOutput:
         check_primitive(field, self.primitives, "volume")
         check_outputs(wants, sorted(self.outputs))
         like: Any = next(field.parameters())
         camera = camera.to(like.device, like.dtype)
         if pixels is not None:
-            return self._march(field, camera, camera.rays_at(pixels), wants)
+            return self._march(field, camera, camera.rays_at(pixels), wants, generator)
         rays = camera.rays().flatten(0, 1)
         split: Any = torch.split(rays, self.settings.rays_at_once)
-        parts = [self._march(field, camera, part, wants) for part in split]
-        whole = concatenate_pixels(parts)
+        whole = concatenate_pixels([self._march(field, camera, part, wants, generator) for part in split])
         shape = (camera.height, camera.width)
-        maps = {name: value.view(shape) for name, value in whole.maps.items()}
+        maps = {name: value.reshape(*shape, *value.shape[2:]) for name, value in whole.maps.items()}
         return RenderOutput(whole.rgb.view(*shape, 3), whole.alpha.view(shape), camera, maps)
 
     def _march(
-        self, field: RadianceField, camera: Camera, rays: Float[Tensor, "P 3"], wants: Sequence[str]
+        self,
+        field: RadianceField,
+        camera: Camera,
+        rays: Float[Tensor, "P 3"],
+        wants: Sequence[str],
+        generator: torch.Generator | None,
     ) -> RenderOutput:
-        """Composite along rays normalised to z = 1."""
+        """Sample and composite along rays normalised to z = 1."""
         options = self.settings
-        ends = (options.near_plane, options.far_plane)
-        edges = torch.linspace(*ends, options.samples + 1, dtype=rays.dtype, device=rays.device)
-        depths = 0.5 * (edges[1:] + edges[:-1])
-        lengths = rays.norm(dim=-1, keepdim=True)
-        samples = field.query(camera.center + depths[:, None] * rays[:, None], rays / lengths, camera)
-        absorbed = (samples.density * (edges[1:] - edges[:-1]) * lengths).cumsum(1)
-        transmittance = torch.exp(-torch.cat([torch.zeros_like(lengths), absorbed], dim=1))
-        weights = transmittance[:, :-1] - transmittance[:, 1:]
-        alpha = 1.0 - transmittance[:, -1:]
+        near, far = self._bounds(field)
+        lines = _Lines.of(rays, options.spacing == "distance", far - near)
         background = rays.new_tensor(options.background)
-        rgb = (weights[..., None] * samples.rgb).sum(1) + (1.0 - alpha) * background
-        maps = {
-            name: _depth_map(name, weights, depths, transmittance) for name in wants if name not in ("rgb", "alpha")
-        }
-        return RenderOutput(rgb[:, None], alpha, camera, maps)
+        chance = generator if options.jitter else None
+        early = [name for name in wants if name.endswith(_COARSE)]
+        places = even_places(near, far, options.samples, rays, chance)
+        first = None
+        if options.importance_samples:
+            # Where samples go has no gradient: without an output of its own the first pass needs neither that nor
+            # colours.
+            with torch.set_grad_enabled(torch.is_grad_enabled() and bool(early)):
+                colors = "rgb" + _COARSE in early
+                first = self._composite(field.coarse_level, camera, lines, places, generator, colors)
+            places = refined_places(places, first.weights.detach(), options.importance_samples, chance)
+        final = self._composite(field, camera, lines, places, generator, True)
+        maps = {}
+        for name in wants:
+            if name == "ray_lengths":
+                maps[name] = lines.lengths
+            elif name in early:
+                maps[name] = (final if first is None else first).output(name.removesuffix(_COARSE), background)
+            elif name not in ("rgb", "alpha"):
+                maps[name] = final.output(name, background)
+        return RenderOutput(final.output("rgb", background), final.output("alpha", background), camera, maps)
+
+    def _composite(
+        self,
+        level: RadianceLevel,
+        camera: Camera,
+        lines: _Lines,
+        places: Float[Tensor, "P S"],
+        generator: torch.Generator | None,
+        colors: bool,
+    ) -> CompositedRays:
+        """One pass through a level of the field."""
+        positions = camera.center + places[..., None] * lines.steps[:, None]
+        where = (positions, lines.directions, camera)
+        if generator is None and not colors:
+            density, rgb = level.query_density(*where), None
+        else:
+            samples = level.query(*where) if generator is None else level.query_in_training(*where, generator)
+            density, rgb = samples.density, samples.rgb
+        behind = transmittances(density, lines.stretches(places), self.settings.opaque_end)
+        return CompositedRays(places * lines.depth_per_place, behind, rgb)
+
+    def _bounds(self, field: RadianceField) -> tuple[Tensor | float, Tensor | float]:
+        """Where rays start and end, in terms of ``spacing``.
+
+        Raises:
+            InputError: The options leave it to the field, and it does not know.
+        """
+        near, far = self.settings.near_plane, self.settings.far_plane
+        if near is not None and far is not None:
+            return near, far
+        bounds = field.ray_bounds
+        if bounds is None:
+            raise InputError(
+                f"renderer.near_plane {near} and far_plane {far} for a field that does not know where its surface is",
+                "both in scene units",
+                "Set them with --set renderer.near_plane=... --set renderer.far_plane=...",
+            )
+        return bounds[0] if near is None else near, bounds[1] if far is None else far
 
 
-def _depth_map(
-    name: str, weights: Float[Tensor, "P S"], depths: Float[Tensor, "S"], transmittance: Float[Tensor, "P S+1"]
-) -> Float[Tensor, "P 1"]:
-    """A z-depth output by name. [P, 1]"""
-    if name == "inverse_depth_accumulated":
-        return (weights / depths).sum(1, keepdim=True)
-    if name == "depth_median":
-        reached = transmittance[:, 1:] <= 0.5
-        first = reached.to(torch.int8).argmax(1)
-        return torch.where(reached.any(1), depths[first], 0.0).detach()[:, None]
-    accumulated = (weights * depths).sum(1, keepdim=True)
-    if name == "depth_accumulated":
-        return accumulated
-    alpha = weights.sum(1, keepdim=True)
-    return torch.where(alpha > 0, accumulated / torch.where(alpha > 0, alpha, 1.0), 0.0)
+@dataclass(frozen=True)
+class _Lines:
+    """Rays, and places along them, measured in z-depth or in distance.
+
+    Attributes:
+        steps: From one unit of place to the next. [P, 3]
+        directions: Unit vectors. [P, 3]
+        lengths: Of the rays per z-depth. [P, 1]
+        length_per_place: Distance per unit of place. [P, 1]
+        depth_per_place: z-depth per unit of place. [P, 1]
+        reach: Of all the stretches together, in units of place.
+    """
+
+    steps: Float[Tensor, "P 3"]
+    directions: Float[Tensor, "P 3"]
+    lengths: Float[Tensor, "P 1"]
+    length_per_place: Float[Tensor, "P 1"]
+    depth_per_place: Float[Tensor, "P 1"]
+    reach: Tensor | float
+
+    @classmethod
+    def of(cls, rays: Float[Tensor, "P 3"], by_distance: bool, reach: Tensor | float) -> Self:
+        """Lines along rays normalised to z = 1. [P, 3]"""
+        lengths = rays.norm(dim=-1, keepdim=True)
+        directions, ones = rays / lengths, torch.ones_like(lengths)
+        if by_distance:
+            return cls(directions, directions, lengths, ones, 1.0 / lengths, reach)
+        return cls(rays, directions, lengths, lengths, ones, reach)
+
+    def stretches(self, places: Float[Tensor, "P S"]) -> Float[Tensor, "P S"]:
+        """Length of ray that each sample stands for: to the next; the last one's makes all of them ``reach``."""
+        between = places.diff(dim=1)
+        last = self.reach - (places[:, -1:] - places[:, :1])
+        return torch.cat([between, last], dim=1) * self.length_per_place

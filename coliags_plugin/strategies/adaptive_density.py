@@ -33,14 +33,18 @@ class AdaptiveDensitySettings(Settings):
     reset_opacity: float = Field(default=0.01, gt=0, lt=1)  # the most that a reset leaves
     max_radius: float | None = Field(default=20.0, gt=0)  # pixels; larger ones go after the first reset
     max_scale_share: float | None = Field(default=0.1, gt=0)  # of the extent; likewise
+    split_normal_share: float = Field(
+        default=1.0, ge=0
+    )  # of a split Gaussian's smallest deviation, in which its parts are spread along that axis
+    prune_above: int = Field(default=0, ge=0)  # an event prunes only where more Gaussians than this would stay
 
 
 class ExplicitRows(Protocol):
     """Protocol of fields of explicit Gaussians for adaptive density control.
 
     Attributes:
-        means, scales, quats, opacities: As in :class:`coliags_plugin.fields.explicit_gaussians.ExplicitGaussians`:
-            log scales, opacity logits. [N, 3], [N, 3], [N, 4], [N]
+        means, scales, quats, opacities: As in :class:`coliags_plugin.fields.explicit_field.ExplicitField`: log scales,
+            opacity logits. [N, 3], [N, 3] or [N, 2], [N, 4], [N]
         row_parameters: Names of the parameter groups with one row per Gaussian.
     """
 
@@ -49,6 +53,12 @@ class ExplicitRows(Protocol):
     quats: Tensor
     opacities: Tensor
     row_parameters: ClassVar[tuple[str, ...]]
+
+    def rows_added(self) -> None:
+        """Called after rows were appended to the parameters."""
+
+    def rows_kept(self, keep: Tensor) -> None:
+        """Called after rows were removed from the parameters. [N]"""
 
 
 class AdaptiveDensity(Strategy):
@@ -127,6 +137,7 @@ class AdaptiveDensity(Strategy):
         born["means"][parts] += self._shifts(born["scales"][parts], born["quats"][parts])
         born["scales"][parts] -= math.log(_SPLIT_SHRINK)
         rows.add_rows(born)
+        field.rows_added()
         self._extend(len(parents))
         keep = torch.ones(len(field.means), dtype=torch.bool, device=field.means.device)
         keep[splits] = False
@@ -134,10 +145,14 @@ class AdaptiveDensity(Strategy):
         return len(field.means) - before
 
     def _shifts(self, scales: Tensor, quats: Tensor) -> Tensor:
-        """Random offsets sampled from Gaussians, relative to their means. [S, 3]"""
+        """Random offsets sampled from Gaussians, relative to their means; surfels' lie in their planes. [S, 3]"""
         points = torch.randn(len(scales), 3, generator=self.generator).to(scales)
-        turned = rotation_matrices(nn.functional.normalize(quats, dim=1)) @ (points * scales.exp())[..., None]
-        return turned.squeeze(-1)
+        deviations = scales.exp()
+        if scales.shape[1] == 3 and self.settings.split_normal_share != 1.0:
+            smallest = deviations.argmin(1, keepdim=True)
+            deviations.scatter_(1, smallest, deviations.gather(1, smallest) * self.settings.split_normal_share)
+        axes = rotation_matrices(nn.functional.normalize(quats, dim=1))[:, :, : scales.shape[1]]
+        return (axes @ (points[:, : scales.shape[1]] * deviations)[..., None]).squeeze(-1)
 
     def _prune(self, field: ExplicitRows, rows: ParameterRows, step: int) -> int:
         """Remove transparent and, after the first reset, oversized Gaussians; returns their number."""
@@ -148,8 +163,8 @@ class AdaptiveDensity(Strategy):
                 gone |= self.largest_radius > options.max_radius
             if options.max_scale_share is not None:
                 gone |= field.scales.amax(dim=1).exp() > options.max_scale_share * self.extent
-        if gone.all():
-            return 0  # an empty field could not recover
+        if int((~gone).sum()) <= options.prune_above:
+            return 0  # at 0 too: an empty field could not recover
         self._keep(field, rows, ~gone)
         return int(gone.sum())
 
@@ -163,3 +178,4 @@ class AdaptiveDensity(Strategy):
         for name, value in self.state_dict().items():
             setattr(self, name, value[keep])
         rows.keep_rows(field.row_parameters, keep)
+        field.rows_kept(keep)

@@ -23,8 +23,7 @@ def method_file(tmp_path):
 
 
 @pytest.mark.parametrize("name", method_names())
-def test_every_shipped_method_is_valid_and_described(name):
-    assert load_method(name).config.optimizers
+def test_every_shipped_method_is_described(name):
     assert method_descriptions()[name]
 
 
@@ -82,12 +81,6 @@ def test_the_papers_embedding_sizes(sizes):
     field = load_method(f"ablations/embedding-{sizes[0]}-{sizes[1]}").config.field.settings
     found = (field.geometry_head.settings.frequencies, field.appearance_head.settings.frequencies)
     assert found == sizes
-
-
-def test_resolved_config_is_a_valid_method_config(method_file):
-    config = load_method("coliags").config
-    again = load_method(method_file(config.to_yaml())).config
-    assert again == config
 
 
 def test_changed_name_drops_inherited_options(method_file):

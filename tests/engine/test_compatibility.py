@@ -35,6 +35,11 @@ def start(folder, overrides=(), method="scaffold-gs", scene=None):
             ["strategy=anchor-growth"],
             "strategy 'anchor-growth' changes anchors, and field 'gaussians' has gaussians",
         ),
+        (
+            "3dgs",
+            ["losses.d={name: distortion, weight: 1.0}"],
+            "distortion, which CpuRenderer does not deliver for this field",
+        ),
         ("scaffold-gs", ["strategy=adaptive-density"], "strategy 'adaptive-density' changes gaussians"),
         ("scaffold-gs", ["sampler=pixels"], "sampler 'pixels' with renderer 'cpu', which draws whole images"),
         ("scaffold-gs", ["modules.exposure=gain"], "optimizers lacks the parameter groups exposure.gain"),

@@ -12,6 +12,7 @@ from coliags_plugin.config.components import make_component
 from coliags_plugin.contracts import Schedule
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud
+from coliags_plugin.fields.spherical_harmonics import basis
 from coliags_plugin.renderers.torch_renderer import render_gaussians
 from tests.scenes import camera_at, wall_scene
 
@@ -87,6 +88,33 @@ def test_colours_turn_with_the_view():
     base = colored_wall().points.colors[ahead.source_index[middle]] / 255.0
     slope = math.sqrt(3 / (4 * math.pi))
     torch.testing.assert_close(ahead.colors[middle], base + slope, rtol=0, atol=1e-4)
+
+
+def test_gradients_of_colours_are_the_basis_and_zero_where_colours_are_cut():
+    field, camera = make().double(), camera_at(0.3, -0.2, 1.0)
+    with torch.no_grad():
+        field.shN.copy_(0.05 * torch.randn(field.shN.shape, generator=torch.Generator().manual_seed(3)))
+        field.sh0[::2, :, 1] = -5.0  # green far below 0
+    field.degree.fill_(2)
+    seen = field.gaussians(camera)
+    upstream = torch.randn(seen.colors.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    (seen.colors * upstream).sum().backward()
+    rows = seen.source_index
+    directions = torch.nn.functional.normalize(field.means.detach()[rows] - camera.center, dim=1)
+    expected = basis(directions, 2)[:, :, None] * (upstream * (seen.colors > 0))[:, None]
+    torch.testing.assert_close(field.sh0.grad[rows], expected[:, :1])
+    torch.testing.assert_close(field.shN.grad[rows][:, :8], expected[:, 1:])
+    assert not field.shN.grad[:, 8:].any()  # of degree 3, not yet active
+    assert not field.sh0.grad[rows[rows % 2 == 0], 0, 1].any()
+
+
+def test_gradients_of_logarithms_and_logits():
+    field, camera = make().double(), camera_at(0, 0, 0)
+    seen = field.gaussians(camera)
+    (seen.scales.sum() + 3.0 * seen.opacities.sum()).backward()
+    rows = seen.source_index
+    torch.testing.assert_close(field.scales.grad[rows], seen.scales)
+    torch.testing.assert_close(field.opacities.grad[rows], 3.0 * seen.opacities * (1.0 - seen.opacities))
 
 
 def test_parameter_groups_are_named_as_in_gsplat():

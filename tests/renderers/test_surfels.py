@@ -18,7 +18,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import OUTPUTS
 from coliags_plugin.engine.model import Model
-from coliags_plugin.renderers import surfel_compositing
+from coliags_plugin.renderers import surfel_compositing, sweeping, torch_renderer
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings, render_gaussians
 from coliags_plugin.renderers.volume_renderer import VolumeRenderer, VolumeRendererSettings
 from tests.renderers.naive_surfels import splat_surfels
@@ -177,10 +177,32 @@ def test_tiles_miss_no_pixel_that_a_surfel_reaches(seed, tile_size, size, depth)
     assert output.splats.radii.item() > 0 or not alpha.any()
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_nor_in_float32_where_discs_are_seen_edge_on(seed, monkeypatch):
+    gaussians = random_gaussians(200, seed, depth=(0.21, 9.0), scale=(1e-3, 2.0), opacity=(0.004, 0.05))
+    sight = torch.nn.functional.normalize(gaussians.means, dim=-1)
+    across = torch.linalg.cross(sight, gaussians.quats_wxyz[:, :3])
+    tilt = torch.logspace(-7, 0, len(sight), dtype=torch.float64)[:, None]
+    quats = facing_along(torch.nn.functional.normalize(across, dim=-1) + tilt * sight)
+    gaussians = as_surfels(cast(dataclasses.replace(gaussians, quats_wxyz=quats), torch.float32))
+    camera = pinhole(61, 52, 60.0, 55.0, dtype=torch.float32)
+    plain = render_gaussians(gaussians, camera).alpha
+    extents_of = torch_renderer.surfel_extents
+
+    def reaching_everywhere(projected, opacities, *rest):
+        extents = extents_of(projected, opacities, *rest)
+        everywhere, edge = torch.ones_like(extents.everywhere), torch.tensor([61.0, 52.0]).expand_as(extents.high)
+        return dataclasses.replace(
+            extents, everywhere=everywhere, low=0 * edge, high=edge, drawn=projected.visible & (opacities >= 1 / 255)
+        )
+
+    monkeypatch.setattr(torch_renderer, "surfel_extents", reaching_everywhere)
+    missed = (render_gaussians(gaussians, camera).alpha - plain).abs().max()
+    assert missed < 1e-6  # of 1/255 at least, if any
+
+
 @pytest.mark.parametrize("elements", [1, 2000])
 def test_the_size_of_the_working_set_changes_nothing(elements, monkeypatch):
-    from coliags_plugin.renderers import sweeping
-
     gaussians, camera = scene("in front of one another")
     cotangents = random_cotangents(camera)
     plain, _, gradients = drawn(gaussians, camera, cotangents, ours())

@@ -91,6 +91,159 @@ def test_refusals():
         make(near_plane=2.0, far_plane=1.0)
 
 
+# --- from coarse to fine ----------------------------------------------------------------------------------------------
+
+
+class Ball(Fog):
+    """Dense within a ball of radius 1 about (0, 0, 6); counts where it is asked."""
+
+    def __init__(self, density=4000.0, center=(0.0, 0.0, 6.0)):
+        super().__init__(density)
+        self.center, self.asked = torch.tensor(center, dtype=torch.float64), []
+
+    def query(self, positions, directions, camera):
+        self.asked.append(positions.detach())
+        inside = ((positions - self.center).norm(dim=-1) < 1.0).to(positions)
+        return RadianceSamples(self.density * inside, 0.5 + 0.3 * (positions - self.center).tanh())
+
+
+class Levels(Ball):
+    """A ball whose coarse level is another, greener one."""
+
+    def __init__(self, other):
+        super().__init__()
+        self.other = other
+
+    @property
+    def coarse_level(self):
+        return self.other
+
+
+REFINED = {"near_plane": 3.0, "far_plane": 9.0, "samples": 48, "importance_samples": 64, "opaque_end": True}
+
+
+def ball_distance(camera):
+    """Distance along each ray to the ball, whether it is hit well within its rim, and whether it is missed."""
+    rays = nn.functional.normalize(camera.rays(), dim=-1)
+    offset = torch.tensor([0.0, 0.0, 6.0], dtype=torch.float64) - camera.center
+    along = (rays * offset).sum(-1)
+    nearest = (offset - along[..., None] * rays).norm(dim=-1)
+    return along - (1 - nearest.clamp_max(1).square()).sqrt(), nearest < 0.9, nearest >= 1
+
+
+@pytest.mark.parametrize("spacing", ["depth", "distance"])
+def test_depth_and_distance_of_a_ball_from_coarse_to_fine(spacing):
+    camera, field = camera_at(0.3, -0.2, 0.0, 40, 30), Ball()
+    wants = ("depth_accumulated", "depth_accumulated_coarse", "ray_lengths")
+    output = make(**REFINED, spacing=spacing).render(field, camera, wants)
+    distance, hit, outside = ball_distance(camera)
+    assert hit.sum() > 80 and outside.any()
+    torch.testing.assert_close(output["ray_lengths"], camera.rays().norm(dim=-1))
+    # The first coarse sample inside stands for half an interval of 6 / 48 before and behind it, where the importance
+    # samples then lie: if the surface does too, they find it, otherwise they begin within half an interval of it.
+    step = 6 / 48 if spacing == "distance" else 6 / 48 * output["ray_lengths"][hit]
+    coarse = (output["ray_lengths"] * output["depth_accumulated_coarse"] - distance)[hit]
+    fine = (output["ray_lengths"] * output["depth_accumulated"] - distance)[hit]
+    assert (coarse > 0).all() and (coarse < step).all()
+    found = coarse < 0.5 * step
+    assert 20 < found.sum() < len(found) - 20
+    assert (fine > 0).all() and (fine < 0.5 * step).all() and (fine < 1.01 * step / 64)[found].all()
+    assert (output.alpha[hit] == 1).all() and (output.alpha[outside] == 0).all()
+    first, second = field.asked
+    assert first.shape[1] == 48 and second.shape[1] == 48 + 64
+    reach = (second - camera.center).norm(dim=-1) - distance.flatten()[:, None]
+    near = (reach.abs() < 0.2).sum(1)[hit.flatten()]
+    assert near.min() >= 60  # importance samples lie at the surface
+
+
+def test_a_plane_seen_obliquely_is_at_the_ray_lengths_times_its_depth():
+    camera = camera_at(0, 0, 0, 24, 18)
+    field = Fog(5000.0, start=12.0)
+    renderer = make(near_plane=8.0, far_plane=20.0, samples=1200, spacing="distance")
+    output = renderer.render(field, camera, ("depth_accumulated", "ray_lengths"))
+    column, row = torch.meshgrid(torch.arange(24.0) + 0.5, torch.arange(18.0) + 0.5, indexing="xy")
+    tangents = ((column - camera.cx) / camera.fx) ** 2 + ((row - camera.cy) / camera.fy) ** 2
+    torch.testing.assert_close(output["ray_lengths"], (1 + tangents).sqrt().double(), rtol=1e-6, atol=0)
+    torch.testing.assert_close(output["depth_accumulated"], torch.full_like(output.alpha, 12.0), rtol=0, atol=0.011)
+
+
+def test_the_coarse_outputs_are_the_coarse_levels_and_one_pass_has_but_one():
+    camera, other = camera_at(0, 0, 0), Ball(center=(0.5, 0.0, 5.0))
+    wants = ("rgb_coarse", "alpha_coarse", "depth_median_coarse", "depth_median")
+    pixels = torch.tensor([[16, 11], [20, 11], [0, 0]])
+    both = make(**REFINED).render(Levels(other), camera, wants, pixels)
+    single = {name: value for name, value in REFINED.items() if name != "importance_samples"}
+    alone = make(**single).render(other, camera, wants, pixels)
+    assert both["rgb_coarse"].shape == (3, 1, 3)
+    for name in ("rgb", "alpha", "depth_median"):
+        assert torch.equal(both[f"{name}_coarse"], alone[name])
+    for name in ("rgb", "alpha"):
+        assert torch.equal(alone[name], alone[f"{name}_coarse"])
+    assert not torch.equal(both["depth_median"], both["depth_median_coarse"])
+    whole = make(**REFINED, rays_at_once=100).render(Levels(other), camera, wants)
+    assert whole["rgb_coarse"].shape == (24, 32, 3)
+    torch.testing.assert_close(whole["rgb_coarse"][11, 16], both["rgb_coarse"][0, 0])
+
+
+def test_the_coarse_level_has_gradients_only_through_outputs_of_its_own():
+    camera, other = camera_at(0, 0, 0), Ball(0.5)
+    field = Levels(other)
+    make(**REFINED).render(field, camera).rgb.sum().backward()
+    assert field.density.grad is not None and other.density.grad is None
+    make(**REFINED).render(field, camera, ("depth_accumulated_coarse",))["depth_accumulated_coarse"].sum().backward()
+    assert other.density.grad != 0
+
+
+def test_colours_of_the_coarse_level_are_computed_for_its_image_alone():
+    class Silent(Ball):
+        def query_density(self, positions, directions, camera):
+            return Ball.query(self, positions, directions, camera).density
+
+        def query(self, positions, directions, camera):
+            raise RuntimeError("asked for colours")
+
+    camera, field = camera_at(0, 0, 0), Levels(Silent())
+    silent = make(**REFINED).render(field, camera, ("depth_accumulated", "depth_accumulated_coarse"))
+    spoken = make(**REFINED).render(Levels(Ball()), camera, ("depth_accumulated", "rgb_coarse"))
+    assert torch.equal(silent.rgb, spoken.rgb)
+    with pytest.raises(RuntimeError, match="asked for colours"):
+        make(**REFINED).render(field, camera, ("rgb_coarse",))
+
+
+def test_chance_places_samples_in_training_alone():
+    camera, field = camera_at(0, 0, 0), Fog(0.2, start=5.0)
+    wants, pixels = ("depth_accumulated",), torch.tensor([[3, 4], [5, 6]])
+
+    def drawn(seed, **options):
+        renderer, generator = make(**REFINED, **options), torch.Generator().manual_seed(seed)
+        return renderer.render_in_training(field, camera, wants, pixels, generator)["depth_accumulated"]
+
+    still = make(**REFINED).render(field, camera, wants, pixels)["depth_accumulated"]
+    assert torch.equal(still, make(**REFINED, jitter=True).render(field, camera, wants, pixels)["depth_accumulated"])
+    assert torch.equal(still, drawn(0))
+    assert torch.equal(drawn(0, jitter=True), drawn(0, jitter=True))
+    assert not torch.equal(drawn(0, jitter=True), drawn(1, jitter=True))
+
+
+def test_bounds_of_the_field_and_their_refusals():
+    field, camera = Fog(50.0, start=12.0), camera_at(0, 0, 0)
+    open_ended = make(near_plane=None, far_plane=None, spacing="distance", samples=300)
+    with pytest.raises(InputError, match="does not know where its surface is"):
+        open_ended.check_field(field)
+    make().check_field(field)
+    bounded = type("Bounded", (Fog,), {"ray_bounds": torch.tensor([10.0, 25.0], dtype=torch.float64)})(50.0, 12.0)
+    open_ended.check_field(bounded)
+    given = make(near_plane=10.0, far_plane=25.0, spacing="distance", samples=300)
+    ours, theirs = (one.render(bounded, camera, ("depth_expected",)) for one in (open_ended, given))
+    assert torch.equal(ours["depth_expected"], theirs["depth_expected"])
+    with pytest.raises(InputError, match=r"start at 30 and end at 25"):
+        make(near_plane=30.0, far_plane=None, spacing="distance").check_field(bounded)
+    with pytest.raises(ValueError, match="spacing 'depth': a field's own are distances"):
+        make(near_plane=None)
+    with pytest.raises(ValueError, match="importance_samples with samples 2"):
+        make(samples=2, importance_samples=4)
+
+
 # --- a radiance field as a third party would add one ------------------------------------------------------------------
 
 

@@ -11,6 +11,7 @@ from coliags_plugin.config.components import make_component
 from coliags_plugin.contracts import Schedule
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput, Splats
+from coliags_plugin.core.rotations import rotation_matrices
 from tests.scenes import wall_scene
 from tests.strategies.steps import after_backward, stepped_optimizers
 
@@ -143,3 +144,51 @@ def test_never_prunes_everything():
     count = len(field.means)
     assert after_backward(make_strategy(), 600, field, rows, make_output([0], [0.0]))["pruned"] == 0
     assert len(field.means) == count
+
+
+def test_parts_spread_along_the_normal_by_a_share_of_the_deviation():
+    strategy, usual = make_strategy(split_normal_share=0.1), make_strategy()
+    scales, quats = torch.tensor([[0.5, 0.2, 0.1]] * 9).log(), torch.tensor([[1.0, 0, 0, 0]] * 9)
+    expected = usual._shifts(scales, quats) * torch.tensor([1.0, 1.0, 0.1])
+    torch.testing.assert_close(strategy._shifts(scales, quats), expected)
+
+
+def test_parts_of_surfels_stay_in_their_planes():
+    quats = torch.nn.functional.normalize(torch.randn(200, 4, generator=torch.Generator().manual_seed(2)), dim=1)
+    shifts = make_strategy(split_normal_share=0.1)._shifts(torch.tensor([[0.5, 0.01]] * 200).log(), quats)
+    axes = rotation_matrices(quats)
+    along = (axes.mT @ shifts[..., None]).squeeze(-1)
+    torch.testing.assert_close(along[:, 2], torch.zeros(200), rtol=0, atol=1e-6)
+    torch.testing.assert_close(along[:, :2].std(0), torch.tensor([0.5, 0.01]), rtol=0.15, atol=0)
+
+
+def test_prunes_only_where_enough_would_stay():
+    for prune_above, pruned in ((10_000, 0), (0, 1)):
+        field, rows = make_field()
+        with torch.no_grad():
+            field.opacities[2] = -6.0
+        strategy = make_strategy(prune_above=prune_above)
+        assert after_backward(strategy, 600, field, rows, make_output([3], [0.0]))["pruned"] == pruned
+
+
+def test_reference_normals_follow_their_gaussians():
+    component = make_component("fields", {"name": "gaussians", "normal_neighbours": 10})
+    field = component.target.from_scene(wall_scene(), component.settings, torch.Generator())
+    rows, strategy = stepped_optimizers(field, 0.0), make_strategy()
+    with torch.no_grad():
+        field.opacities.fill_(0.0)
+        field.scales.fill_(math.log(0.05))
+        field.scales[5] = math.log(0.5)
+        field.opacities[2] = -6.0
+        marks = torch.arange(len(field.means), dtype=torch.float32)
+        field.references.of_rows[:, 0] = marks
+        field.references.normals[:, 0] = marks
+    after_backward(strategy, 600, field, rows, make_output([3, 5], [0.1, 0.1]))
+    count = len(marks)
+    kept = [row for row in range(count) if row not in (2, 5)]
+    # Cloned from 3, and two parts of 5, whose nearest initial points lie around it.
+    assert field.reference_normals[: count - 2, 0].tolist() == kept
+    assert field.reference_normals[count - 2, 0] == 3
+    nearest = torch.cdist(field.means[-2:].detach(), field.references.points).argmin(1)
+    assert field.reference_normals[-2:, 0].tolist() == nearest.tolist()
+    assert len(field.reference_normals) == len(field.means)

@@ -1,0 +1,185 @@
+"""Trains and evaluates methods on one scene, and writes their table and a contact sheet of their views.
+
+    python benchmarks/all_methods.py --data SCENE --out RUNS --steps 3000
+
+Runs that are there already are kept, so the command can be interrupted and repeated. Methods of ``--timed`` are trained
+for as many steps as fit into the time that the slowest of the others took. Set COLIAGS_LPIPS_WEIGHTS for LPIPS.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import tyro
+from machine import describe_machine, markdown_table, write_results
+
+from coliags_plugin.config.method_config import load_method
+from coliags_plugin.outputs.colormaps import colorize_depth
+from coliags_plugin.outputs.image_files import read_depth_tiff, read_rgb, write_png
+from coliags_plugin.reporting.run_data import EvaluatedRun, read_runs
+
+PAPER = "3dgs,2dgs,scaffold-gs,gaussian-pancakes,pr-endo,coliags,3dgs-depth,scaffold-gs-depth"
+#: Column title -> test set and metric.
+COLUMNS = {
+    "PSNR dB": ("test", "psnr"),
+    "SSIM": ("test", "ssim"),
+    "LPIPS": ("test", "lpips_squeeze"),
+    "depth MSE mm2": ("test", "depth_mse"),
+    "inner": ("test", "depth_mse_inner"),
+    "median error mm": ("test", "depth_median_error"),
+    "rotation PSNR dB": ("rotation", "psnr_seen"),
+    "rotation depth MSE mm2": ("rotation", "depth_mse_seen"),
+}
+#: Steps of the run that measures the time of a step.
+PROBE_STEPS = 12
+
+
+@dataclass(frozen=True)
+class Options:
+    """Compare methods on one scene."""
+
+    data: Path
+    """Scene."""
+    out: Path
+    """Folder of the runs, of their table as Markdown and JSON, and of the contact sheet."""
+    methods: str = PAPER
+    """Methods by name, comma separated."""
+    timed: str = "reim-nerf"
+    """Methods to train for as long as the slowest of the others, comma separated; empty for none."""
+    steps: int = 3000
+    """Steps of the others."""
+    seed: int = 0
+    """Of all runs."""
+    jobs: int = 1
+    """Runs at a time, each with its share of the CPUs as threads."""
+    depth_limit: float = 80.0
+    """Upper end of the colours of depth, mm."""
+
+
+def main(options: Options) -> None:
+    """Train and evaluate what is missing, then write table and contact sheet."""
+    options.out.mkdir(parents=True, exist_ok=True)
+    methods = [name for name in options.methods.split(",") if name]
+    timed = [name for name in options.timed.split(",") if name]
+    with ThreadPoolExecutor(options.jobs) as pool:
+        list(pool.map(lambda name: complete(name, options.steps, options), methods))
+    slowest = max((spent(name, options)["seconds"] for name in methods), default=0.0)
+    for name in timed:
+        if not (options.out / f"{name}.json").is_file():
+            complete(name, max(1, round(slowest / seconds_per_step(name, options))), options)
+    runs = read_runs([options.out / name for name in (*methods, *timed)], "paper")
+    rows = [row(run, options) for run in runs]
+    header = ", ".join(f"{key}: {value}" for key, value in describe_machine().items())
+    text = f"{header}; {options.jobs} runs at a time\n\n{markdown_table(rows)}\n"
+    (options.out / "table.txt").write_text(text, encoding="utf-8")
+    write_results(options.out / "table.json", rows)
+    write_png(options.out / "sheet.png", contact_sheet(runs, options))
+    print(text)
+
+
+def complete(name: str, steps: int, options: Options) -> None:
+    """Train and evaluate one method unless its record is there."""
+    record, run = options.out / f"{name}.json", options.out / name
+    if record.is_file():
+        return
+    resume = ["--resume"] if (run / "config.yaml").is_file() else []
+    seconds, peak = call(["train", name, *_where(options, run), "--steps", str(steps), *resume], options)
+    call(["eval", str(run)], options)
+    record.write_text(json.dumps({"steps": steps, "seconds": seconds, "peak_mib": peak}), encoding="utf-8")
+
+
+def seconds_per_step(name: str, options: Options) -> float:
+    """Time of a step of a method, from a short run."""
+    run = options.out / f"{name}-probe"
+    call(["train", name, *_where(options, run), "--steps", str(PROBE_STEPS), "--overwrite"], options)
+    rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()]
+    return float(rows[-1]["seconds"]) / PROBE_STEPS
+
+
+def _where(options: Options, run: Path) -> list[str]:
+    return ["--data", str(options.data), "--output", str(run), "--seed", str(options.seed)]
+
+
+def call(argv: Sequence[str], options: Options) -> tuple[float, float]:
+    """Run one command of coliags; its wall time in seconds, and its peak resident memory in MiB."""
+    threads = max(1, (os.cpu_count() or 1) // options.jobs)
+    environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
+    began = time.monotonic()
+    command = [sys.executable, "-c", "from coliags_plugin.cli import main; raise SystemExit(main())", *argv]
+    child = subprocess.Popen(command, env=environment)
+    _, status, usage = os.wait4(child.pid, 0)
+    child.returncode = os.waitstatus_to_exitcode(status)
+    if child.returncode:
+        raise SystemExit(f"coliags {' '.join(argv)} ended with status {child.returncode}")
+    return time.monotonic() - began, usage.ru_maxrss / 1024
+
+
+def spent(name: str, options: Options) -> dict[str, Any]:
+    """The record of a method: steps, seconds, peak_mib."""
+    record: dict[str, Any] = json.loads((options.out / f"{name}.json").read_text(encoding="utf-8"))
+    return record
+
+
+def row(run: EvaluatedRun, options: Options) -> dict[str, Any]:
+    """A run's row of the table."""
+    means = {title: run.mean(*column) for title, column in COLUMNS.items()}
+    log = (run.folder / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
+    record, drawn = spent(run.folder.name, options), json.loads(log[-1]).get("gaussians", "none")
+    return {
+        "method": run.folder.name,
+        **{title: "" if value is None else f"{value:.4f}" for title, value in means.items()},
+        "steps": record["steps"],
+        "Gaussians drawn": drawn,
+        "seconds": round(record["seconds"]),
+        "peak MiB": round(record["peak_mib"]),
+    }
+
+
+def contact_sheet(runs: Sequence[EvaluatedRun], options: Options) -> np.ndarray:
+    """The truth and every run, one row each: a held-out and a rotated view, each beside its depth."""
+    chosen = [(name, frames) for name in ("test", "rotation") if (frames := _frames(runs[0].folder, name))]
+    views = [(name, frames[len(frames) // 2]) for name, frames in chosen]
+    rows = [_strip("truth", runs[0].folder, views, ("truth", "true_depth"), options)]
+    rows += [_strip(run.folder.name, run.folder, views, ("renders", "depth"), options) for run in runs]
+    return np.concatenate(rows)
+
+
+def _frames(run: Path, name: str) -> list[str]:
+    return sorted(path.stem for path in (run / "eval/paper/renders" / name).glob("*.png"))
+
+
+def _strip(
+    title: str, run: Path, views: Sequence[tuple[str, str]], kinds: tuple[str, str], options: Options
+) -> np.ndarray:
+    cells = []
+    for name, frame in views:
+        cells.append(read_rgb(run / "eval/paper" / kinds[0] / name / f"{frame}.png"))
+        depth = run / "eval/paper" / kinds[1] / name / f"{frame}.tiff"
+        shown = np.zeros_like(cells[-1])
+        if depth.is_file():
+            shown = np.asarray(colorize_depth(read_depth_tiff(depth), (0.0, options.depth_limit)))
+        cells.append(shown[: len(cells[-1])])
+    strip = np.ascontiguousarray(np.concatenate(cells, axis=1))
+    for color, width in (((0, 0, 0), 4), ((255, 255, 255), 1)):
+        cv2.putText(strip, title, (6, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.6, color, width, cv2.LINE_AA)
+    return strip
+
+
+if __name__ == "__main__":
+    # A typing error in a method's name is found before hours of training.
+    chosen = tyro.cli(Options)
+    for method in (*chosen.methods.split(","), *chosen.timed.split(",")):
+        if method:
+            load_method(method)
+    main(chosen)

@@ -1,0 +1,65 @@
+"""``coliags check``: check that a method keeps the contract of all methods."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from coliags_plugin.cli.arguments import Assignments, DataFormat, OptionalPath
+
+
+@dataclass(frozen=True)
+class Check:
+    """Check that a method trains, resumes, renders and fails as it should, on the CPU; exit status 1 if not."""
+
+    method: tyro.conf.Positional[str]
+    """Name of a method (`coliags list methods`) or path of a YAML file."""
+    data: OptionalPath = None
+    """A scene's folder; default: a small phantom."""
+    format: DataFormat = None
+    """Dataset format (`coliags list datamanagers`); default: recognised from the files."""
+    steps: int = 20
+    """Length of the runs; schedules are scaled to it."""
+    set: Assignments = ()
+    """Change a value of the method config, as for train."""
+    keep: bool = False
+    """Keep the folder with the phantom and the runs, and print its path."""
+    traceback: bool = False
+    """Print the whole traceback of every exception."""
+
+    def run(self) -> None:
+        """Print one line per check, then a summary."""
+        logger = logging.getLogger("coliags_plugin")
+        level, folder = logger.level, Path(tempfile.mkdtemp(prefix="coliags-check-"))
+        logger.setLevel(logging.WARNING)  # the plans of a dozen runs
+        try:
+            failed = self._print_results(folder)
+        finally:
+            logger.setLevel(level)
+            if not self.keep:
+                shutil.rmtree(folder, ignore_errors=True)
+        if failed:
+            sys.exit(1)
+
+    def _print_results(self, folder: Path) -> bool:
+        """Whether a check failed."""
+        from coliags_plugin.method_check.check import CHECKS, check_method
+        from coliags_plugin.method_check.text import line, summary, tracebacks
+
+        encoding, width = sys.stdout.encoding or "ascii", max(len(check.name) for check in CHECKS)
+        results = []
+        for result in check_method(self.method, folder, self.set, self.data, self.format, self.steps):
+            results.append(result)
+            print(line(result, width, encoding), flush=True)
+        print(summary(results))
+        if self.traceback:
+            print("".join(tracebacks(results, encoding)))
+        if self.keep:
+            print(folder)
+        return any(result.status == "failed" for result in results)

@@ -1,0 +1,65 @@
+"""Exchange of the lamp of a trained run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from pydantic import ValidationError
+
+from coliags_plugin.config.registry import fields
+from coliags_plugin.config.yaml_tree import parse_value
+from coliags_plugin.contracts import LitField
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.lamps import Lamp
+from coliags_plugin.core.settings import first_error
+from coliags_plugin.engine.model import Model
+from coliags_plugin.engine.trained import TrainedRun
+
+
+def read_lamp(options: Sequence[str]) -> Lamp:
+    """The lamp of ``key=value`` options, values read as YAML, the last one of a key last.
+
+    Raises:
+        InputError: An option is no ``key=value``, is unknown, or has an invalid value.
+    """
+    values: dict[str, Any] = {}
+    for option in options:
+        key, equals, text = option.partition("=")
+        if not equals:
+            raise InputError(f"--light {option}", "KEY=VALUE, for instance power=10")
+        values[key.strip()] = parse_value(text)
+    return make_lamp(values)
+
+
+def make_lamp(values: Mapping[str, Any]) -> Lamp:
+    """The lamp of plain values by name.
+
+    Raises:
+        InputError: A name is unknown, or a value is invalid.
+    """
+    try:
+        return Lamp.model_validate(dict(values))
+    except ValidationError as error:
+        key, message, value = first_error(error)
+        raise InputError(f"lamp option '{key}' = {value!r}: {message}") from error
+
+
+def relight(trained: TrainedRun, lamp: Lamp) -> TrainedRun:
+    """The run under another lamp; it shares the parameters.
+
+    Raises:
+        InputError: The run's field does not model the lamp apart from the tissue.
+    """
+    model = trained.model
+    if not isinstance(model.field, LitField):
+        lit = ", ".join(name for name in fields if issubclass(fields.get(name), LitField))
+        raise InputError(
+            f"another lamp for method '{trained.method}', whose field '{trained.config.field.name}' has the light in "
+            "its colours",
+            f"a method with one of these fields: {lit}",
+            "Train such a method, for instance pr-endo",
+        )
+    lit_model = Model(model.field.with_lamp(lamp), model.renderer, model.view_modules).eval()
+    return replace(trained, model=lit_model, lamp=lamp)

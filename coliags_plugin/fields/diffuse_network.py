@@ -1,0 +1,78 @@
+"""Network of PR-Endo that corrects the diffuse reflection."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from coliags_plugin.fields.mlp import linear_layers
+
+#: Of the products in training; auto: bfloat16 on CPUs that have instructions for it, otherwise float32.
+Precision = Literal["auto", "float32", "bfloat16"]
+
+
+class DiffuseNetwork(nn.Module):
+    """MLP: albedo, lamp distance, normal, direction to the lamp and their cosine -> factor of each channel.
+
+    Its last biases start at 1, so that a new network changes little (docs/rivals/pr-endo.md).
+
+    Args:
+        hidden: Units of each hidden layer.
+        hidden_layers: Their number.
+        precision: See :data:`Precision`.
+        generator: Of the initial weights.
+    """
+
+    INPUTS = 11
+
+    def __init__(self, hidden: int, hidden_layers: int, precision: Precision, generator: torch.Generator) -> None:
+        super().__init__()
+        self.precision = precision
+        self.layers = nn.ModuleList(linear_layers((self.INPUTS, *[hidden] * hidden_layers, 3), generator))
+        last: Any = self.layers[-1]
+        nn.init.ones_(last.bias)
+
+    def forward(
+        self,
+        albedos: Float[Tensor, "N 3"],
+        distances: Float[Tensor, "N 1"],
+        normals: Float[Tensor, "N 3"],
+        lamps: Float[Tensor, "N 3"],
+        in_training: bool,
+    ) -> Float[Tensor, "N 3"]:
+        """Factors, of any sign. [N, 3]
+
+        Args:
+            albedos: Linear RGB. [N, 3]
+            distances: To the lamp, in extents of the scene. [N, 1]
+            normals: Unit vectors, on the side of the camera. [N, 3]
+            lamps: Unit vectors to the lamp. [N, 3]
+            in_training: Whether products may be of the reduced precision.
+        """
+        cosines = (normals * lamps).sum(1, keepdim=True)
+        inputs = torch.cat([albedos, distances, normals, lamps, cosines], dim=1)
+        dtype = self._reduced_dtype(inputs) if in_training else inputs.dtype
+        layers: list[Any] = list(self.layers)
+        values = inputs.to(dtype)
+        for layer in layers[:-1]:
+            values = torch.relu_(nn.functional.linear(values, layer.weight.to(dtype), layer.bias.to(dtype)))
+        # The bias, near 1, is added to the small rest in full precision.
+        return nn.functional.linear(values, layers[-1].weight.to(dtype)).to(inputs.dtype) + layers[-1].bias
+
+    def _reduced_dtype(self, inputs: Tensor) -> torch.dtype:
+        if inputs.dtype != torch.float32 or self.precision == "float32":
+            return inputs.dtype
+        fast = self.precision == "bfloat16" or (inputs.device.type == "cpu" and _cpu_multiplies_bfloat16())
+        return torch.bfloat16 if fast else inputs.dtype
+
+
+@cache
+def _cpu_multiplies_bfloat16() -> bool:
+    """Whether the CPU has instructions for products of bfloat16; others take longer for them than for float32."""
+    capabilities: Mapping[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
+    return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))

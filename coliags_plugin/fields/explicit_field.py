@@ -1,0 +1,112 @@
+"""Base class of fields of explicit Gaussians, whose parameters have one row per Gaussian."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Bool, Float
+from pydantic import Field as Option
+from torch import Tensor, nn
+from typing_extensions import Self
+
+from coliags_plugin.contracts import GaussianField
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.rotations import shortest_axes
+from coliags_plugin.core.scenes import Scene
+from coliags_plugin.core.settings import Settings
+from coliags_plugin.fields.anchor_points import initial_positions, neighbour_log_scales
+from coliags_plugin.fields.frustum import DRAWN_SIGMAS, spheres_in_frustum
+from coliags_plugin.fields.reference_normals import ReferenceNormals
+
+
+class ExplicitFieldSettings(Settings):
+    """Options of all fields of explicit Gaussians (docs/methods.md 7.1)."""
+
+    initial_opacity: float = Option(default=0.1, gt=0, lt=1)  # of every Gaussian
+    near_plane: float = Option(default=0.2, ge=0)  # scene units; nearer Gaussians are culled
+    normal_neighbours: int | None = Option(
+        default=None, ge=3
+    )  # neighbours from which normals of the initial points are estimated, as references; null: no such normals
+
+
+class ExplicitField(GaussianField):
+    """One Gaussian per initial point, each with its own mean, covariance and opacity; subclasses add their colours."""
+
+    elements: ClassVar[str] = "gaussians"
+    #: Parameter groups, each with one row per Gaussian; named as in gsplat.
+    row_parameters: ClassVar[tuple[str, ...]] = ("means", "scales", "quats", "opacities")
+    #: Trained scales of a Gaussian.
+    scale_count: ClassVar[int] = 3
+
+    def __init__(self, settings: Any, count: int) -> None:
+        super().__init__()
+        self.settings = settings
+        self.means = nn.Parameter(torch.zeros(count, 3))
+        self.scales = nn.Parameter(torch.zeros(count, self.scale_count))  # logarithms
+        self.quats = nn.Parameter(torch.zeros(count, 4))
+        self.opacities = nn.Parameter(torch.zeros(count))  # logits
+        self.references: ReferenceNormals | None = None
+
+    @classmethod
+    def from_scene(cls, scene: Scene, settings: Any, generator: torch.Generator) -> Self:
+        """An isotropic Gaussian at every initial point, scaled to the distance of its neighbours.
+
+        Raises:
+            InputError: The scene has no points, or too few for reference normals.
+        """
+        positions = initial_positions(scene)
+        field = cls(settings, len(positions))
+        with torch.no_grad():
+            field.means.copy_(positions)
+            field.scales.copy_(neighbour_log_scales(positions.to(torch.float32))[:, None].expand(-1, cls.scale_count))
+            field.quats[:, 0] = 1.0
+            field.opacities.fill_(math.log(settings.initial_opacity / (1.0 - settings.initial_opacity)))
+        if settings.normal_neighbours is not None:
+            field.references = ReferenceNormals.of_points(positions, settings.normal_neighbours)
+        return field
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Tensor], settings: Any) -> Self:
+        """The field of a checkpoint, of any number of Gaussians."""
+        field = cls(settings, len(state["means"]))
+        if settings.normal_neighbours is not None:
+            field.references = ReferenceNormals(len(state["references.points"]), len(state["means"]))
+        field.load_state_dict(state)
+        return field
+
+    @property
+    def element_count(self) -> int:
+        """Number of Gaussians."""
+        return len(self.means)
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """One group for each kind of parameter."""
+        return {name: [getattr(self, name)] for name in self.row_parameters}
+
+    def rows_added(self) -> None:
+        """Extend what rows have besides parameters, after a strategy appended rows to these."""
+        if self.references is not None:
+            self.references.extend(self.means.detach())
+
+    def rows_kept(self, keep: Bool[Tensor, "N"]) -> None:
+        """Remove from what rows have besides parameters the rows that a strategy removed from these. [N]"""
+        if self.references is not None:
+            self.references.keep(keep)
+
+    def normals(self) -> Float[Tensor, "N 3"]:
+        """Shortest axis of every Gaussian, world frame, of either sign; differentiable in the rotations. [N, 3]"""
+        return shortest_axes(self.quats, self.scales)
+
+    @property
+    def reference_normals(self) -> Float[Tensor, "N 3"] | None:
+        """Normal of the initial point nearest to each Gaussian at its birth, of either sign; None without. [N, 3]"""
+        return None if self.references is None else self.references.of_rows
+
+    @torch.no_grad()
+    def _visible(self, camera: Camera) -> Tensor:
+        """Rows that the camera may see. [V]"""
+        reach = DRAWN_SIGMAS * self.scales.amax(dim=1).exp()
+        return spheres_in_frustum(self.means, reach, camera, self.settings.near_plane).nonzero().squeeze(1)

@@ -1,0 +1,257 @@
+"""Flat Gaussians with a material, lit by a lamp on the camera, as in PR-Endo."""
+
+from __future__ import annotations
+
+import copy
+import logging
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float
+from pydantic import Field as Option
+from pydantic import model_validator
+from torch import Tensor, nn
+from typing_extensions import Self
+
+from coliags_plugin.contracts import LitField, Schedule
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.lamps import Lamp
+from coliags_plugin.core.rotations import third_axes
+from coliags_plugin.core.scenes import PointCloud, Scene
+from coliags_plugin.core.settings import Settings
+from coliags_plugin.fields.cook_torrance import Cosines, fresnel, lambert, specular
+from coliags_plugin.fields.diffuse_network import DiffuseNetwork, Precision
+from coliags_plugin.fields.explicit_field import ExplicitField, ExplicitFieldSettings
+
+logger = logging.getLogger(__name__)
+
+#: Third standard deviation, scene units.
+THICKNESS = 1e-8
+#: Colours are linear light to the power of 1 / GAMMA, of at least MIN_LIGHT.
+GAMMA = 2.2
+MIN_LIGHT = 1e-6
+#: Of mucosa, gamma-encoded RGB in [0, 1].
+PINK = (188 / 255, 99 / 255, 76 / 255)
+#: A Gaussian of lower opacity is drawn nowhere.
+MIN_OPACITY = 1.0 / 255.0
+#: Shortest distance to the lamp, scene units.
+_MIN_DISTANCE = 1e-6
+
+
+class LitGaussiansSettings(ExplicitFieldSettings):
+    """Options of lit Gaussians; the defaults are PR-Endo's (docs/rivals/pr-endo.md)."""
+
+    max_scale_share: float = Option(default=0.1, gt=0)  # of the extent: upper bound of all scales
+    pink_share: float = Option(default=0.5, ge=0, le=1)  # of the colour of mucosa in the initial albedo
+    initial_roughness: float = Option(default=0.5, ge=0, le=1)  # of every Gaussian
+    initial_f0: float = Option(default=0.035, ge=0, le=1)  # reflectance of every Gaussian at normal incidence
+    roughness_range: tuple[float, float] = (0.05, 0.7)  # bounds of the roughness
+    f0_range: tuple[float, float] = (0.0, 0.035)  # bounds of the reflectance at normal incidence
+    lamp_intensity: float = Option(default=2.0, gt=0)  # initial, of the lamp
+    lamp_falloff: float = Option(default=0.95, ge=0)  # initial k in 1 / (1 + k d^p), d in extents
+    lamp_exponent: float = Option(default=2.0, ge=0)  # initial p
+    network_from: int = Option(default=1000, ge=0)  # step after which the network corrects the diffuse reflection
+    hidden: int = Option(default=128, ge=1)  # units of each hidden layer of the network
+    hidden_layers: int = Option(default=3, ge=1)  # of the network
+    network_precision: Precision = "auto"  # of its products in training; auto: bfloat16 where the CPU is made for it
+    input_noise: float = Option(default=0.001, ge=0)  # standard deviation, on the network's inputs while training
+
+    @model_validator(mode="after")
+    def _ranges_ascend(self) -> Self:
+        for name, lowest in (("roughness_range", 0.01), ("f0_range", 0.0)):
+            low, high = getattr(self, name)
+            if not lowest <= low < high <= 1.0:
+                raise ValueError(f"{name} [{low}, {high}]; expected two numbers that ascend between {lowest} and 1")
+        return self
+
+
+class LitGaussians(ExplicitField, LitField):
+    """Flat Gaussians whose colour is the light of a lamp that they reflect (docs/rivals/pr-endo.md).
+
+    Attributes:
+        albedos: Linear RGB, not below 0. [N, 3]
+        roughness: Square root of GGX's alpha. [N]
+        f0: Reflectance at normal incidence. [N]
+        lamp_parameters: Intensity, falloff k and exponent p. [3]
+        extent: Of the scene, the unit of distances to the lamp, scene units. []
+        network_on: Whether the network corrects the diffuse reflection. []
+    """
+
+    Settings: ClassVar[type[Settings]] = LitGaussiansSettings
+    primitive: ClassVar[str] = "gaussians3d"
+    row_parameters: ClassVar[tuple[str, ...]] = (*ExplicitField.row_parameters, "albedos", "roughness", "f0")
+    scale_count: ClassVar[int] = 2
+
+    extent: Tensor
+    network_on: Tensor
+
+    def __init__(self, settings: Any, count: int) -> None:
+        super().__init__(settings, count)
+        self.lamp = Lamp()
+        self.albedos = nn.Parameter(torch.zeros(count, 3))
+        self.roughness = nn.Parameter(torch.full((count,), settings.initial_roughness))
+        self.f0 = nn.Parameter(torch.full((count,), settings.initial_f0))
+        self.lamp_parameters = nn.Parameter(
+            torch.tensor([settings.lamp_intensity, settings.lamp_falloff, settings.lamp_exponent])
+        )
+        self.diffuse_network = _network(settings, torch.Generator())
+        self.register_buffer("extent", torch.ones(()))
+        self.register_buffer("network_on", torch.zeros((), dtype=torch.bool))
+
+    @classmethod
+    def from_scene(cls, scene: Scene, settings: Any, generator: torch.Generator) -> Self:
+        """A disc at every initial point, of its colour.
+
+        Raises:
+            InputError: The scene has no points, or too few for reference normals; or the cameras do not move.
+        """
+        if scene.extent == 0.0:
+            raise InputError(
+                "all training cameras are at one place", "cameras that move: lengths are measured in their extent"
+            )
+        field = super().from_scene(scene, settings, generator)
+        field.diffuse_network = _network(settings, generator)
+        field.extent.fill_(scene.extent)
+        with torch.no_grad():
+            field.albedos.copy_(_initial_albedos(scene.points, settings.pink_share))
+        field._project()
+        return field
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """One group for each kind of parameter, the lamp's and the network's."""
+        return {
+            **super().parameter_groups(),
+            "lamp": [self.lamp_parameters],
+            "diffuse_network": list(self.diffuse_network.parameters()),
+        }
+
+    @property
+    def feature_channels(self) -> frozenset[str]:
+        """Material of the Gaussians, and the network's factor."""
+        return frozenset({"albedo", "roughness", "f0", "diffuse_factor"})
+
+    def with_lamp(self, lamp: Lamp) -> Self:
+        """The field under another lamp; it shares the parameters."""
+        other = copy.copy(self)
+        other.lamp = lamp
+        return other
+
+    def before_step(self, step: int, schedule: Schedule) -> None:
+        """Switch the network on, and move parameters that the optimizers brought out of bounds back to these."""
+        self.network_on.fill_(step > schedule.at(self.settings.network_from))
+        self._project()
+
+    @torch.no_grad()
+    def _project(self) -> None:
+        """Bring parameters within their bounds, where clamping them passes gradients on."""
+        self.scales.clamp_max_(self._max_log_scale())
+        self.albedos.clamp_min_(0.0)
+        self.roughness.clamp_(*self.settings.roughness_range)
+        self.f0.clamp_(*self.settings.f0_range)
+        self.lamp_parameters.clamp_min_(0.0)
+
+    def _max_log_scale(self) -> Tensor:
+        return (self.settings.max_scale_share * self.extent).log()
+
+    def gaussians(self, camera: Camera) -> Gaussians:
+        """The Gaussians in the camera's view with the light they reflect towards it."""
+        return self._gaussians(camera, None)
+
+    def gaussians_in_training(self, camera: Camera, generator: torch.Generator) -> Gaussians:
+        """The same with noise on the network's inputs, and its products in ``network_precision``."""
+        return self._gaussians(camera, generator)
+
+    def _gaussians(self, camera: Camera, generator: torch.Generator | None) -> Gaussians:
+        camera = camera.to(self.means.device, self.means.dtype)
+        visible = self._visible(camera)
+        visible = visible[self.opacities.detach()[visible].sigmoid() >= MIN_OPACITY]
+        means, log_scales, quats, logits, albedos, roughness, f0 = (
+            getattr(self, name).index_select(0, visible) for name in self.row_parameters
+        )
+        scales = log_scales.clamp_max(self._max_log_scale()).exp()
+        albedos = albedos.clamp_min(0.0)
+        roughness = roughness.clamp(*self.settings.roughness_range)
+        f0 = f0.clamp(*self.settings.f0_range)
+        light, factors = self._reflected(camera, means, third_axes(quats), albedos, roughness, f0, generator)
+        return Gaussians(
+            means=means,
+            quats_wxyz=quats,
+            scales=torch.cat([scales, torch.full_like(scales[:, :1], THICKNESS)], dim=1),
+            opacities=logits.sigmoid(),
+            colors=light.clamp_min(MIN_LIGHT).pow(1.0 / GAMMA),
+            source_index=visible,
+            visible_sources=visible,
+            features={
+                "albedo": albedos,
+                "roughness": roughness[:, None],
+                "f0": f0[:, None],
+                "diffuse_factor": factors,
+            },
+        )
+
+    def _reflected(
+        self,
+        camera: Camera,
+        means: Float[Tensor, "V 3"],
+        axes: Float[Tensor, "V 3"],
+        albedos: Float[Tensor, "V 3"],
+        roughness: Float[Tensor, "V"],
+        f0: Float[Tensor, "V"],
+        generator: torch.Generator | None,
+    ) -> tuple[Float[Tensor, "V 3"], Float[Tensor, "V 3"]]:
+        """Linear light from Gaussians to the camera, and the factors of their diffuse reflection. [V, 3], [V, 3]"""
+        views = camera.center - means
+        lamps = views if self.lamp.at_camera else self.lamp.position(camera) - means
+        lengths = lamps.norm(dim=1, keepdim=True).clamp_min(_MIN_DISTANCE)
+        distances = lengths / self.extent
+        lamps = lamps / lengths
+        facing = (axes * views).sum(1)
+        normals = torch.where((facing < 0)[:, None], -axes, axes)
+        if self.lamp.at_camera:
+            cosines = Cosines.retroreflected((normals * lamps).sum(1).clamp_min(0.0))
+        else:
+            cosines = Cosines.of(normals, nn.functional.normalize(views, dim=1), lamps)
+        intensity, falloff, exponent = self.lamp_parameters.clamp_min(0.0).unbind()
+        arriving = intensity / (1.0 + falloff * distances[:, 0].pow(exponent))
+        if self.lamp != Lamp():
+            arriving = arriving * self.lamp.spread(-lamps, camera)
+        factors = self._factors(albedos, distances, normals, lamps, generator)
+        mirrored = fresnel(cosines, f0)
+        diffuse = (albedos * factors).clamp_min(0.0) * lambert(cosines, mirrored)[:, None]
+        light = diffuse + specular(cosines, mirrored, roughness)[:, None]
+        return light * arriving[:, None], factors
+
+    def _factors(
+        self,
+        albedos: Float[Tensor, "V 3"],
+        distances: Float[Tensor, "V 1"],
+        normals: Float[Tensor, "V 3"],
+        lamps: Float[Tensor, "V 3"],
+        generator: torch.Generator | None,
+    ) -> Float[Tensor, "V 3"]:
+        """Factors of the diffuse reflection: 1 before the network counts. [V, 3]"""
+        if not self.network_on:
+            return torch.ones_like(albedos)
+        if generator is not None and self.settings.input_noise > 0:
+            noise = self.settings.input_noise * torch.randn(len(albedos), 7, generator=generator).to(albedos)
+            distances = distances + noise[:, :1]
+            normals = nn.functional.normalize(normals + noise[:, 1:4], dim=1)
+            lamps = nn.functional.normalize(lamps + noise[:, 4:], dim=1)
+        factors: Tensor = self.diffuse_network(albedos, distances, normals, lamps, generator is not None)
+        return factors
+
+
+def _initial_albedos(points: PointCloud, pink_share: float) -> Float[Tensor, "N 3"]:
+    """Colours of the points, mixed with that of mucosa, as linear light; that of mucosa where they have none. [N, 3]"""
+    pink = torch.tensor(PINK).expand(len(points), 3)
+    if points.colors is None:
+        if pink_share < 1.0:
+            logger.warning("the initial points have no colours: all start with that of mucosa")
+        return pink.pow(GAMMA)
+    return torch.lerp(points.colors.to(torch.float32) / 255.0, pink, pink_share).pow(GAMMA)
+
+
+def _network(settings: LitGaussiansSettings, generator: torch.Generator) -> DiffuseNetwork:
+    return DiffuseNetwork(settings.hidden, settings.hidden_layers, settings.network_precision, generator)

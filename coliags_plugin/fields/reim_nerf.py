@@ -1,0 +1,183 @@
+"""REIM-NeRF: a neural radiance field of tissue lit by a moving lamp."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float
+from pydantic import Field as Option
+from pydantic import model_validator
+from torch import Tensor, nn
+from typing_extensions import Self
+
+from coliags_plugin.contracts import RadianceField, RadianceLevel, RadianceSamples
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scenes import Scene
+from coliags_plugin.core.settings import Settings
+from coliags_plugin.fields.normalisation import SceneNormalisation, surface_distances
+from coliags_plugin.fields.radiance_mlp import RadianceMLP
+
+logger = logging.getLogger(__name__)
+
+
+class ReimNerfSettings(Settings):
+    """Options of REIM-NeRF's field (docs/rivals/reim-nerf.md); the coarse and the fine network are alike."""
+
+    layers: int = Option(default=8, ge=1)  # of the trunk, from position to density
+    width: int = Option(default=256, ge=1)  # of the trunk
+    skip: int | None = Option(default=4, ge=1)  # layer, from 0, that sees the embedded position again; null: none
+    color_width: int = Option(default=128, ge=1)  # of the layer between feature and colour
+    position_frequencies: int = Option(default=10, ge=0)  # of the embedding
+    direction_frequencies: int = Option(default=4, ge=0)  # of the embedding
+    light_frequencies: int = Option(default=4, ge=0)  # of the embedding
+    light: bool = True  # whether the colour depends on the lamp's position, which is the camera's; without: NeRF
+    density_noise: float = Option(default=1.0, ge=0)  # standard deviation, in training, before ReLU, per field's unit
+
+    @model_validator(mode="after")
+    def _skip_within(self) -> Self:
+        if self.skip is not None and self.skip >= self.layers:
+            raise ValueError(f"skip {self.skip} with layers {self.layers}: expected a smaller number, or null")
+        return self
+
+
+class ReimNerf(RadianceField):
+    """Two networks from position to density, and from position, direction and lamp position to colour.
+
+    After Psychogyios et al., "Realistic Endoscopic Illumination Modeling for NeRF-Based Data Generation" (MICCAI 2023).
+    The networks compute in normalised coordinates; positions are taken, and densities returned, in scene units.
+
+    Attributes:
+        normalisation: Scene units to the networks' coordinates.
+        bounds: Distances between which rays are sampled, scene units. [2]
+    """
+
+    Settings: ClassVar[type[Settings]] = ReimNerfSettings
+
+    bounds: Tensor
+
+    def __init__(self, settings: Any, generator: torch.Generator) -> None:
+        super().__init__()
+        self.settings = settings
+        self.normalisation = SceneNormalisation()
+        self.register_buffer("bounds", torch.zeros(2))
+        self.coarse_network = RadianceMLP(settings, generator)
+        self.fine_network = RadianceMLP(settings, generator)
+
+    @classmethod
+    def from_scene(cls, scene: Scene, settings: Any, generator: torch.Generator) -> Self:
+        """Fresh networks, normalised by the scene's initial points.
+
+        Raises:
+            InputError: The scene has one training frame, or no points in view.
+        """
+        if len(scene.train) < 2:
+            raise InputError(
+                f"{len(scene.train)} training frame of scene '{scene.name}'",
+                "at least two, which show the tissue and its shading from different places",
+                "Give more frames, or another split: --set datamanager.split=...",
+            )
+        field = cls(settings, generator)
+        field.normalisation = SceneNormalisation.from_scene(scene)
+        field.bounds.copy_(surface_distances(scene))
+        near, far = field.bounds.tolist()
+        logger.info("unit of length %.4g scene units; surface at %.4g to %.4g", float(field.length_unit), near, far)
+        return field
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Tensor], settings: Any) -> Self:
+        """The field of a checkpoint."""
+        field = cls(settings, torch.Generator())
+        field.load_state_dict(state)
+        return field
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """One group for each network."""
+        return {"coarse": list(self.coarse_network.parameters()), "fine": list(self.fine_network.parameters())}
+
+    @property
+    def length_unit(self) -> Tensor:
+        """Scene units from 0 to 1 of the networks' coordinates. []"""
+        return self.normalisation.unit
+
+    @property
+    def ray_bounds(self) -> Float[Tensor, "2"]:
+        """See :attr:`bounds`. [2]"""
+        return self.bounds
+
+    @property
+    def coarse_level(self) -> RadianceLevel:
+        """The coarse network."""
+        return _Level(self.normalisation, self.coarse_network)
+
+    @property
+    def _fine_level(self) -> RadianceLevel:
+        return _Level(self.normalisation, self.fine_network)
+
+    def query(
+        self, positions: Float[Tensor, "P S 3"], directions: Float[Tensor, "P 3"], camera: Camera
+    ) -> RadianceSamples:
+        """The fine network's density and colour."""
+        return self._fine_level.query(positions, directions, camera)
+
+    def query_in_training(
+        self,
+        positions: Float[Tensor, "P S 3"],
+        directions: Float[Tensor, "P 3"],
+        camera: Camera,
+        generator: torch.Generator,
+    ) -> RadianceSamples:
+        """The fine network's, with noise."""
+        return self._fine_level.query_in_training(positions, directions, camera, generator)
+
+    def query_density(
+        self, positions: Float[Tensor, "P S 3"], directions: Float[Tensor, "P 3"], camera: Camera
+    ) -> Float[Tensor, "P S"]:
+        """The fine network's density. [P, S]"""
+        return self._fine_level.query_density(positions, directions, camera)
+
+
+@dataclass(frozen=True)
+class _Level(RadianceLevel):
+    """One of the networks, in scene units."""
+
+    normalisation: SceneNormalisation
+    network: RadianceMLP
+
+    def query(
+        self, positions: Float[Tensor, "P S 3"], directions: Float[Tensor, "P 3"], camera: Camera
+    ) -> RadianceSamples:
+        return self._samples(positions, directions, camera, None)
+
+    def query_in_training(
+        self,
+        positions: Float[Tensor, "P S 3"],
+        directions: Float[Tensor, "P 3"],
+        camera: Camera,
+        generator: torch.Generator,
+    ) -> RadianceSamples:
+        return self._samples(positions, directions, camera, generator)
+
+    def query_density(
+        self, positions: Float[Tensor, "P S 3"], directions: Float[Tensor, "P 3"], camera: Camera
+    ) -> Float[Tensor, "P S"]:
+        return self._density(self.network.hidden(self.normalisation(positions)), len(positions), None)
+
+    def _samples(
+        self, positions: Tensor, directions: Tensor, camera: Camera, generator: torch.Generator | None
+    ) -> RadianceSamples:
+        hidden = self.network.hidden(self.normalisation(positions))
+        rgb = self.network.colors(hidden, directions, self.normalisation(camera.center))
+        return RadianceSamples(self._density(hidden, len(positions), generator), rgb)
+
+    def _density(self, hidden: Tensor, rays: int, generator: torch.Generator | None) -> Tensor:
+        """Per scene unit. [P, S]"""
+        raw = self.network.raw_density(hidden, rays)
+        strength = self.network.settings.density_noise
+        if generator is not None and strength > 0:
+            raw = raw + strength * torch.randn(raw.shape, generator=generator, dtype=raw.dtype).to(raw.device)
+        return raw.relu() / self.normalisation.unit

@@ -1,0 +1,108 @@
+"""Scenes that methods are checked on: a small phantom, and scenes that lack something."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import torch
+
+from coliags_plugin.config import registry
+from coliags_plugin.config.method_config import method_tree
+from coliags_plugin.core.scenes import Frame, PointCloud, Scene
+from coliags_plugin.phantom.generate import generate
+from coliags_plugin.phantom.settings import phantom_settings
+
+#: Small and coarse: a second to make, and few pixels to render. Two of the frames are held out.
+PHANTOM = {
+    "frames": 12,
+    "width": 40,
+    "height": 32,
+    "rotation_views": 0,
+    "polyps": 1,
+    "path_length": 20.0,
+    "interreflection": 0.0,
+    "mesh_spacing": 2.0,
+    "texture_spacing": 0.5,
+}
+#: Has depth, from which initial points are fused.
+DEFAULT_LAYOUT = "c3vd"
+
+
+def write_phantom(method: str, overrides: Sequence[str], folder: Path) -> Path:
+    """Make the phantom that a method is checked on, in the layout of its data manager where there is one of that name.
+
+    Args:
+        method: Name or path of a method config.
+        overrides: ``key.path=value`` assignments.
+        folder: To make it in.
+
+    Raises:
+        InputError: No such method.
+    """
+    named = method_tree(method, overrides).find(["datamanager", "name"]).value
+    layout = named if named in registry.phantom_layouts else DEFAULT_LAYOUT
+    return shutil.copytree(_phantom(layout).name, folder / "phantom", dirs_exist_ok=True)
+
+
+@cache
+def _phantom(layout: str) -> TemporaryDirectory[str]:
+    """Made once in a process, and removed at its end."""
+    folder = TemporaryDirectory(prefix="coliags-phantom-")
+    generate(phantom_settings({"layout": layout, **PHANTOM}), Path(folder.name), overwrite=True)
+    return folder
+
+
+def depth_range(scene: Scene) -> tuple[float, float] | None:
+    """Smallest and largest z-depth known in a few training frames, else of the initial points; None without any."""
+    depths = [frame.depth for frame in scene.train[:4]]
+    known = torch.cat([torch.zeros(0), *(depth[depth.isfinite()].flatten() for depth in depths if depth is not None)])
+    if len(known) == 0 and len(scene.points):
+        camera = scene.train[0].camera
+        depth = camera.project(scene.points.positions.to(camera.camera_to_world))[1]
+        known = depth[depth > 0]
+    return (float(known.min()), float(known.max())) if len(known) else None
+
+
+def without_depth(scene: Scene) -> Scene:
+    """The scene without depth of any kind; its points stay."""
+    return replace(scene, train=[_without_depth(frame.to("cpu")) for frame in scene.train])
+
+
+def without_points(scene: Scene) -> Scene:
+    """The scene without initial points."""
+    return replace(scene, points=PointCloud(torch.zeros(0, 3)))
+
+
+def with_one_frame(scene: Scene) -> Scene:
+    """The scene with its first training frame only."""
+    return replace(scene, train=scene.train[:1])
+
+
+def with_ignored_pixels(scene: Scene, spoilt: bool) -> Scene:
+    """The scene with a part of every training image masked out.
+
+    Args:
+        scene: To change.
+        spoilt: Whether the ignored pixels have other colours, and depth that is NaN.
+    """
+    return replace(scene, train=[_masked(frame.to("cpu"), spoilt) for frame in scene.train])
+
+
+def _masked(frame: Frame, spoilt: bool) -> Frame:
+    height, width = frame.image.shape[:2]
+    ignored = torch.zeros(height, width, dtype=torch.bool)
+    ignored[height // 4 : height // 2, width // 4 : width // 2] = True
+    masked = replace(frame, mask=frame.valid & ~ignored)
+    if not spoilt:
+        return masked
+    depth = None if frame.depth is None else frame.depth.masked_fill(ignored, torch.nan)
+    return replace(masked, image=torch.where(ignored[..., None], 255 - frame.image, frame.image), depth=depth)
+
+
+def _without_depth(frame: Frame) -> Frame:
+    return replace(frame, depth=None, depth_at_least=None, sparse_depth=None)

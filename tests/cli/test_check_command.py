@@ -1,0 +1,113 @@
+"""``coliags check`` as a user meets it."""
+
+from __future__ import annotations
+
+import io
+import re
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from coliags_plugin.config import registry
+from coliags_plugin.method_check.check import CHECKS
+from coliags_plugin.method_check.results import Result
+from coliags_plugin.method_check.text import line, summary
+from tests.commands import refused, run
+from tests.scenes import write_wall
+
+PLUGIN = """
+from coliags_plugin.contracts import Loss, LossSettings
+
+
+class SharpLoss(Loss):
+    Settings = LossSettings
+
+    def __call__(self, step):
+        return step.output.rgb.sharpness()
+
+
+COMPONENTS = {"losses": {"sharp": SharpLoss}}
+"""
+#: Enough of a method to be checked in a second.
+SMALL = ("--steps", 10, "--set", "datamanager.points_count=500")
+
+
+@pytest.fixture(autouse=True)
+def one_thread(two_threads):
+    torch.set_num_threads(1)
+
+
+def test_a_sound_method(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    assert run("check", "3dgs", *SMALL) == 0
+    *lines, last = capsys.readouterr().out.splitlines()
+    names = sorted((check.name for check in CHECKS), key=len, reverse=True)
+    assert [re.match(rf"[✓-] ({'|'.join(names)}) ", text)[1] for text in lines] == [check.name for check in CHECKS]
+    assert re.fullmatch(r"20 passed, 0 failed, 1 skipped in \d+\.\d s", last)
+    assert not list(tmp_path.glob("coliags-check-*"))
+
+
+def test_a_crash_in_a_users_file_is_a_failed_check(tmp_path, capsys, monkeypatch):
+    (tmp_path / "sharp.py").write_text(PLUGIN)
+    monkeypatch.setenv("COLIAGS_PLUGIN_PATH", str(tmp_path / "sharp.py"))
+    monkeypatch.setattr(registry, "losses", None)
+    monkeypatch.setitem(registry.REGISTRIES, "losses", registry.Registry("losses", _BUILT_IN, "loss"))
+    sharp = ("--set", "losses.sharp={name: sharp, weight: 0.1}", "--traceback")
+    assert run("check", "3dgs", *SMALL, *sharp) == 1
+    out = capsys.readouterr().out
+    (failed,) = re.findall(r"^✗ .*$", out, re.MULTILINE)
+    assert re.search(
+        r"trains .* AttributeError: 'Tensor' object has no attribute 'sharpness' \(.*sharp\.py:9\)$", failed
+    )
+    assert re.search(r"^- learns +needs 'trains'$", out, re.MULTILINE)
+    assert re.search(r"^✓ groups ", out, re.MULTILINE)
+    assert "Traceback (most recent call last)" in out.split(" failed,")[1]
+
+
+_BUILT_IN = {name: registry.losses._targets[name] for name in ("l1", "d-ssim")}
+
+
+def test_what_is_kept_can_be_looked_at(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    assert run("check", "3dgs", "--data", write_wall(tmp_path / "wall", frames=17), *SMALL, "--keep") == 0
+    folder = Path(capsys.readouterr().out.splitlines()[-1])
+    assert (folder / "run" / "eval" / "paper" / "metrics.json").is_file()
+    assert not (folder / "phantom").exists()
+
+
+def test_input_that_cannot_be_checked(tmp_path, capsys):
+    assert "Did you mean 'coliags'" in refused(capsys, "check", "colliags")
+    assert "Expected 10 or more" in refused(capsys, "check", "coliags", "--steps", 9)
+    assert "no folder" in refused(capsys, "check", "coliags", "--data", tmp_path / "gone")
+
+
+def test_a_config_that_is_not_valid_fails_the_first_check(capsys):
+    assert run("check", "coliags", "--set", "field.voxels=1") == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert re.match(r"✗ resolves .* unknown key 'voxels'", lines[0])
+    assert {text[0] for text in lines[1:-1]} == {"-"}
+
+
+def test_words_stand_for_ticks_that_cannot_be_printed(monkeypatch, capsys):
+    results = [
+        Result("one", "passed", 0.04, "fine"),
+        Result("two", "failed", 1.0, "µ"),
+        Result("three", "skipped", 0, "no"),
+    ]
+    assert [line(result, 5, "utf-8") for result in results] == [
+        "✓ one      0.0 s  fine",
+        "✗ two      1.0 s  µ",
+        "- three           no",
+    ]
+    assert [line(result, 5, "ascii") for result in results] == [
+        "ok   one      0.0 s  fine",
+        r"FAIL two      1.0 s  \xb5",
+        "-    three           no",
+    ]
+    assert summary(results) == "1 passed, 1 failed, 1 skipped in 1.0 s"
+    written = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, encoding="ascii", write_through=True))
+    assert run("check", "coliags", "--set", "field.voxels=1") == 1
+    assert written.getvalue().startswith(b"FAIL resolves")

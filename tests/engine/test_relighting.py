@@ -1,0 +1,201 @@
+"""PR-Endo from end to end: what training recovers of a lamp, resuming, and other lamps after training."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import pytest
+import torch
+import yaml
+
+import coliags_plugin
+from coliags_plugin.config.method_config import load_method
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.lamps import Lamp
+from coliags_plugin.core.scenes import Frame, PointCloud, Scene
+from coliags_plugin.engine.checkpoints import latest_checkpoint, read_checkpoint
+from coliags_plugin.engine.relighting import read_lamp
+from coliags_plugin.engine.run_folder import RunFolder
+from coliags_plugin.engine.trainer import Trainer
+from coliags_plugin.outputs.image_files import read_rgb
+from tests.commands import refused, run
+from tests.scenes import camera_at, wall_scene, write_wall
+
+CPU = torch.device("cpu")
+INTENSITY, FALLOFF, EXPONENT, ROUGHNESS, F0 = 2.6, 0.5, 1.5, 0.4, 0.03
+
+
+def lit_wall(frames: int = 10) -> Scene:
+    """The wall z = 20 with the lamp at the camera, by rays that meet it, 6 to 33 mm away."""
+    cameras = [
+        camera_at(0.6 * index - 3, 0.5 * (index % 3) - 0.5, 14.0 - 3.0 * index, 40, 30) for index in range(frames)
+    ]
+    centers = torch.stack([camera.center for camera in cameras])
+    extent = 1.1 * (centers - centers.mean(0)).norm(dim=1).max()
+    made = []
+    for index, camera in enumerate(cameras):
+        rays = camera.rays()
+        points = camera.center + ((20.0 - camera.center[2]) / rays[..., 2])[..., None] * rays
+        distance = (points - camera.center).norm(dim=-1, keepdim=True)
+        cosine = (20.0 - camera.center[2]) / distance
+        arriving = INTENSITY / (1 + FALLOFF * (distance / extent) ** EXPONENT) * cosine
+        k, squared = (ROUGHNESS + 1) ** 2 / 8, ROUGHNESS**4
+        density = squared / (math.pi * (cosine**2 * (squared - 1) + 1) ** 2)
+        mirrored = F0 * density / (4 * (cosine * (1 - k) + k) ** 2)
+        light = arriving * (wall_albedo(points) * (1 - F0) / math.pi + mirrored)
+        made.append(Frame(f"{index:04d}", index, (light ** (1 / 2.2) * 255).round().byte(), camera))
+    x, y = torch.meshgrid(torch.arange(-22.0, 22, 0.8), torch.arange(-16.0, 16, 0.8), indexing="ij")
+    points = torch.stack([x, y, torch.full_like(x, 20.0)], -1).reshape(-1, 3)
+    return Scene("lit", made, {"test": made[:1]}, PointCloud(points), {"fingerprint": "lit"})
+
+
+def wall_albedo(points):
+    waves = torch.stack([torch.sin(0.3 * points[..., 0]), torch.cos(0.4 * points[..., 1]), 0 * points[..., 0]], -1)
+    return 0.25 + 0.08 * waves
+
+
+def test_training_recovers_the_fall_off_and_the_roughness(tmp_path):
+    """Intensity and albedo are known as a product only, as are intensity and reflectance, and fall-off up to a factor:
+
+    without changing any image, the lamp may be brighter and all materials darker.
+    """
+    overrides = [
+        "schedule.steps=240",
+        "field.initial_opacity=0.95",
+        "field.network_from=40000",  # the network could take over from the lamp
+        "optimizers.means={lr: 1.0e-9}",
+        "optimizers.scales.lr=1.0e-9",
+        "optimizers.quats.lr=1.0e-9",
+        "optimizers.opacities.lr=1.0e-9",
+        "optimizers.albedos.lr=0.004",
+        "optimizers.lamp={lr: 0.02, final_lr: 0.004}",
+        "optimizers.roughness.lr=0.006",
+        "optimizers.f0.lr=0.0003",
+        "strategy=none",
+        *(f"losses.{name}=null" for name in ("depth", "d-ssim", "diffuse-factor", "surface-normals", "albedo")),
+    ]
+    scene = lit_wall()
+    trainer = Trainer(load_method("pr-endo", overrides), scene, "lit", RunFolder(tmp_path / "run"), 0, CPU)
+    trainer.start()
+    trainer.train()
+    field = trainer.model.field
+    intensity, falloff, exponent = field.lamp_parameters.tolist()
+    distances = torch.linspace(7.0, 35.0, 30) / scene.extent
+    arriving = intensity / (1 + falloff * distances**exponent)
+    ratio = arriving / (INTENSITY / (1 + FALLOFF * distances**EXPONENT))
+    assert ratio.max() / ratio.min() < 1.03  # the start, 2 / (1 + 0.95 d^2), is off by a factor of 2.4
+    seen = field.gaussians(scene.train[5].camera)
+    assert seen.features["roughness"].mean().item() == pytest.approx(ROUGHNESS, abs=0.03)
+    scale = ratio.mean().item()
+    assert seen.features["f0"].mean().item() * scale == pytest.approx(F0, rel=0.1)
+    shares = seen.features["albedo"] * scale / wall_albedo(seen.means)
+    assert shares.log().mean(0).abs().max() < 0.05
+
+
+RESUMED = (
+    "schedule.steps=14",
+    "schedule.written_for=14",
+    "schedule.log_every=1",
+    "field.network_from=3",
+    "field.normal_neighbours=10",
+    "strategy.densify_from=2",
+    "strategy.until=12",
+    "strategy.every=4",
+    "strategy.gradient_threshold=1e-7",
+    "strategy.prune_above=0",
+    "losses.diffuse-factor={from_step: 3, until_step: 12}",
+)
+
+
+def resumable(path) -> Trainer:
+    return Trainer(load_method("pr-endo", RESUMED), wall_scene(), "wall", RunFolder(path), 0, CPU)
+
+
+def test_resume_is_bit_exact_with_noise_and_growth(tmp_path):
+    whole = resumable(tmp_path / "whole")
+    whole.start()
+    whole.train()
+    cut = resumable(tmp_path / "cut")
+    cut.start()
+    for _ in range(6):
+        cut.take_step()
+    cut.save()
+    resumed = resumable(tmp_path / "cut")
+    resumed.resume()
+    resumed.train()
+    states = [read_checkpoint(latest_checkpoint(each.run.checkpoints), "pr-endo", CPU) for each in (whole, resumed)]
+    assert states[0].step == states[1].step == 14
+    assert len(states[0].tensors["field/means"]) > len(wall_scene().points)
+    assert states[0].tensors.keys() == states[1].tensors.keys()
+    for name, tensor in states[0].tensors.items():
+        assert torch.equal(tensor, states[1].tensors[name]), name
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    scene = write_wall(tmp_path_factory.mktemp("data") / "wall")
+    overrides = ["datamanager.points_count=2000", "schedule.steps=5", "schedule.written_for=5"]
+    output = tmp_path_factory.mktemp("runs") / "run"
+    return coliags_plugin.train("pr-endo", scene, output, overrides=[*overrides, "losses.diffuse-factor=null"])
+
+
+def test_a_relit_run_renders_the_field_under_that_lamp(trained):
+    loaded = coliags_plugin.load_run(trained)
+    camera = loaded.scene.train[0].camera
+    before = loaded.model.render(camera).rgb
+    relit = coliags_plugin.relight(loaded, offset=(4.0, 0.0, 0.0), power=8.0)
+    assert relit.lamp == Lamp(offset=(4.0, 0.0, 0.0), power=8.0)
+    after = relit.model.render(camera).rgb
+    assert not torch.allclose(before, after, atol=0.02)
+    assert after.mean() < before.mean()
+    assert torch.equal(loaded.model.render(camera).rgb, before)
+    dark = coliags_plugin.relight(loaded, intensity=0.0).model.render(camera).rgb
+    assert dark.max() < 0.01
+    with pytest.raises(InputError, match="relit run"):
+        coliags_plugin.evaluate(relit)
+
+
+def test_render_under_another_lamp_says_which(trained, tmp_path):
+    out = tmp_path / "out"
+    light = ("--light", "offset=[5, 0, 0]", "--light", "turn=[0, 20]", "--light", "power=10")
+    assert run("render", trained, "--output", out, *light, "--channel", "albedo", "--channel", "roughness") == 0
+    lamp = yaml.safe_load((out / "lamp.yaml").read_text())
+    assert lamp == {"offset": [5, 0, 0], "turn": [0, 20], "power": 10, "intensity": 1.0}
+    kinds = {path.name for path in out.iterdir() if path.is_dir()}
+    assert kinds == {"rgb", "depth", "depth_error", "albedo", "roughness"}
+    roughness = read_rgb(out / "roughness" / "0000_color.png")
+    assert (roughness == roughness[:, :, :1]).all() and 20 < roughness.mean() < 180
+    assert run("render", trained, "--no-video", *light) == 0
+    assert (trained / "relit" / "lamp.yaml").is_file()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--light", "pwoer=3"], "unknown key 'pwoer'.*Did you mean 'power'"),
+        (["--light", "power"], "--light power. Expected KEY=VALUE"),
+        (["--light", "power=-1"], "'power' = -1: .*greater than or equal to 0"),
+        (["--light", "intensity=bright"], "'intensity' = 'bright'"),
+        (["--light", "offset=3"], "'offset' = 3: .*tuple"),
+        (["--light", "offset=[1, 2]"], "'offset.2'.*required"),
+        (["--light", "turn=[.nan, 0]"], "'turn.0' = nan"),
+        (["--channel", "albdo"], "no feature channel 'albdo'.*Did you mean 'albedo'"),
+    ],
+)
+def test_bad_options_are_one_message(trained, capsys, options, words):
+    message = " ".join(refused(capsys, "render", trained, *options).split())
+    assert re.search(words, message), message
+
+
+def test_a_method_without_a_lamp_is_refused_and_the_fields_with_one_are_listed(tmp_path):
+    scene = write_wall(tmp_path / "wall")
+    overrides = ["datamanager.points_count=500", "schedule.steps=2"]
+    plain = coliags_plugin.load_run(coliags_plugin.train("3dgs", scene, tmp_path / "run", overrides=overrides))
+    with pytest.raises(InputError, match=r"'3dgs', whose field 'gaussians'.*fields: lit-gaussians"):
+        coliags_plugin.relight(plain, power=3.0)
+
+
+def test_options_of_a_lamp_are_read_in_order():
+    assert read_lamp(["power=3", "power=4", "offset=[1,2,3]"]) == Lamp(power=4.0, offset=(1.0, 2.0, 3.0))
+    assert read_lamp([]) == Lamp() and Lamp().at_camera

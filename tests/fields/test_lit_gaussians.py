@@ -1,0 +1,308 @@
+"""Gaussians lit by a lamp: closed forms of their colours, the network's part, noise, bounds and other lamps."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from pydantic import ValidationError
+
+from coliags_plugin.config.components import make_component
+from coliags_plugin.contracts import Schedule
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.lamps import Lamp
+from coliags_plugin.core.scenes import PointCloud
+from coliags_plugin.fields import lit_gaussians
+from coliags_plugin.fields.lit_gaussians import GAMMA, PINK, THICKNESS
+from coliags_plugin.renderers.torch_renderer import render_gaussians
+from tests.fields.test_cook_torrance import by_hand
+from tests.scenes import camera_at, wall_scene
+
+SCHEDULE = Schedule(100, 100)
+OPTIONS = {"network_from": 50, "hidden": 16, "hidden_layers": 2, "network_precision": "float32"}
+
+
+def colored_wall():
+    scene = wall_scene()
+    count = len(scene.points)
+    colors = torch.randint(0, 256, (count, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+    return replace(scene, points=PointCloud(scene.points.positions, colors))
+
+
+def make(scene=None, **options):
+    component = make_component("fields", {"name": "lit-gaussians", **OPTIONS, **options})
+    return component.target.from_scene(scene or colored_wall(), component.settings, torch.Generator().manual_seed(3))
+
+
+def varied(**options):
+    """Materials and rotations that differ between Gaussians."""
+    field = make(**options)
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        field.roughness.uniform_(0.1, 0.6, generator=generator)
+        field.f0.uniform_(0.01, 0.03, generator=generator)
+        field.quats += 0.2 * torch.randn(field.quats.shape, generator=generator)
+        field.lamp_parameters.copy_(torch.tensor([2.5, 0.7, 1.6]))
+    return field
+
+
+def trained(**options):
+    """As varied, at a step at which the network counts, with weights that matter."""
+    field = varied(**options)
+    with torch.no_grad():
+        for layer in field.diffuse_network.layers:
+            layer.weight.mul_(3.0)
+    field.before_step(60, SCHEDULE)
+    return field
+
+
+def expected_colors(field, seen, camera, lamp_at, spread):
+    """The published colour of every Gaussian seen, in a loop, without the network."""
+    colors = []
+    axes = field.normals().detach().double()[seen.source_index].numpy()
+    intensity, falloff, exponent = field.lamp_parameters.tolist()
+    for mean, axis, row in zip(seen.means.detach().double().numpy(), axes, seen.source_index.tolist(), strict=True):
+        view, lamp = camera.center.numpy() - mean, lamp_at - mean
+        normal = axis if axis @ view >= 0 else -axis
+        distance = np.linalg.norm(lamp) / field.extent.item()
+        arriving = intensity / (1 + falloff * distance**exponent) * spread(-lamp / np.linalg.norm(lamp))
+        if normal @ lamp <= 0:
+            colors.append(np.full(3, 1e-6 ** (1 / GAMMA)))
+            continue
+        diffuse, mirrored = by_hand(view, lamp, normal, field.roughness[row].item(), field.f0[row].item())
+        light = (field.albedos[row].detach().double().numpy() * diffuse + mirrored) * arriving
+        colors.append(np.maximum(light, 1e-6) ** (1 / GAMMA))
+    return torch.tensor(np.array(colors), dtype=torch.float32)
+
+
+def test_colours_are_the_closed_form_under_the_camera_s_lamp():
+    field, camera = varied(), camera_at(0.5, -1.0, 4.0, yaw=0.2)
+    seen = field.gaussians(camera)
+    assert len(seen) > 300
+    expected = expected_colors(field, seen, camera, camera.center.numpy(), lambda directions: 1.0)
+    torch.testing.assert_close(seen.colors, expected, rtol=2e-4, atol=1e-5)
+
+
+def test_colours_are_the_closed_form_under_another_lamp():
+    field, camera = varied(), camera_at(0.5, -1.0, 4.0, yaw=0.2)
+    lamp = Lamp(offset=(3.0, -2.0, 1.0), turn=(20.0, -10.0), power=6.0, intensity=1.5)
+    seen = field.with_lamp(lamp).gaussians(camera)
+    pose = camera.camera_to_world.numpy()
+    position = pose[:3, 3] + pose[:3, :3] @ [3.0, -2.0, 1.0]
+    up, right = math.radians(20), math.radians(-10)
+    turned_up = np.array([0.0, -math.sin(up), math.cos(up)])  # about x: towards -y
+    about_y = np.array([[math.cos(right), 0, math.sin(right)], [0, 1, 0], [-math.sin(right), 0, math.cos(right)]])
+    axis = pose[:3, :3] @ about_y @ turned_up
+    expected = expected_colors(field, seen, camera, position, lambda out: 1.5 * max(out @ axis, 0.0) ** 6.0)
+    torch.testing.assert_close(seen.colors, expected, rtol=2e-4, atol=1e-5)
+    assert not torch.allclose(seen.colors, field.gaussians(camera).colors, atol=0.05)
+
+
+def test_moving_the_lamp_is_continuous_and_leaves_the_field_itself_alone():
+    field, camera = varied(), camera_at(0, 0, 0)
+    before = field.gaussians(camera).colors
+    nearby = field.with_lamp(Lamp(offset=(1e-4, 0.0, 0.0))).gaussians(camera).colors
+    torch.testing.assert_close(nearby, before, rtol=1e-3, atol=1e-4)
+    assert torch.equal(field.gaussians(camera).colors, before)
+    brighter = field.with_lamp(Lamp(intensity=2.0))
+    torch.testing.assert_close(brighter.gaussians(camera).colors, before * 2 ** (1 / GAMMA), rtol=1e-5, atol=0)
+    assert brighter.albedos is field.albedos
+
+
+def test_a_lamp_that_shines_away_lights_nothing():
+    seen = varied().with_lamp(Lamp(turn=(0.0, 180.0), power=1.0)).gaussians(camera_at(0, 0, 0))
+    torch.testing.assert_close(seen.colors, torch.full_like(seen.colors, 1e-6 ** (1 / GAMMA)))
+
+
+def test_half_of_the_light_arrives_at_the_documented_distance():
+    """1 / (1 + k (D / extent)^p) = 1/2 at D = extent k^(-1/p)."""
+    field = make()
+    with torch.no_grad():
+        field.f0.zero_()
+        field.lamp_parameters.copy_(torch.tensor([2.0, 0.4, 1.5]))
+    half = field.extent.item() * 0.4 ** (-1 / 1.5)
+    seen = field.gaussians(camera_at(0, 0, 20 - half))
+    middle = (seen.means[:, :2].square().sum(1)).argmin()
+    assert seen.means[middle, :2].abs().max() < 1e-6
+    light = field.albedos[seen.source_index[middle]] * 2.0 / math.pi * 0.5
+    torch.testing.assert_close(seen.colors[middle], light.pow(1 / GAMMA), rtol=1e-4, atol=0)
+
+
+def test_flat_faint_discs_with_mixed_linear_colours_at_the_points():
+    scene = colored_wall()
+    field = make(scene, pink_share=0.25)
+    seen = field.gaussians(camera_at(0, 0, -50))
+    torch.testing.assert_close(seen.opacities, torch.full((len(seen),), 0.1))
+    assert torch.equal(seen.scales[:, 2], torch.full((len(seen),), THICKNESS))
+    assert field.scales.shape[1] == 2
+    stored = scene.points.colors[seen.source_index] / 255.0
+    mixed = 0.75 * stored + 0.25 * torch.tensor(PINK)
+    torch.testing.assert_close(seen.features["albedo"], mixed.pow(GAMMA))
+    assert field.extent.item() == pytest.approx(scene.extent)
+
+
+def test_points_without_colours_are_pink_and_cameras_that_do_not_move_are_refused(caplog):
+    albedos = make(wall_scene()).albedos
+    torch.testing.assert_close(albedos, torch.tensor(PINK).pow(GAMMA).expand_as(albedos))
+    assert "no colours" in caplog.text
+    scene = colored_wall()
+    with pytest.raises(InputError, match="at one place"):
+        make(replace(scene, train=scene.train[:1]))
+    with pytest.raises(InputError, match="no initial points"):
+        make(replace(scene, points=PointCloud(torch.zeros(0, 3))))
+
+
+@pytest.mark.parametrize(
+    "option", [{"roughness_range": (0.7, 0.1)}, {"roughness_range": (0.0, 0.7)}, {"f0_range": (0, 2)}]
+)
+def test_ranges_ascend(option):
+    with pytest.raises(ValidationError, match="expected two numbers that ascend"):
+        make(**{name: tuple(map(float, value)) for name, value in option.items()})
+
+
+def test_the_network_is_inert_until_its_step():
+    field, camera = make(), camera_at(0, 0, 0)
+    field.before_step(50, SCHEDULE)
+    before = field.gaussians(camera)
+    before.colors.sum().backward()
+    assert torch.equal(before.features["diffuse_factor"], torch.ones(len(before), 3))
+    assert all(weight.grad is None for weight in field.diffuse_network.parameters())
+    with torch.no_grad():
+        for weight in field.diffuse_network.parameters():
+            weight.add_(1.0)
+    assert torch.equal(field.gaussians(camera).colors, before.colors)
+    field.before_step(51, SCHEDULE)
+    field.gaussians(camera).colors.sum().backward()
+    assert all(weight.grad.abs().sum() > 0 for weight in field.diffuse_network.parameters())
+    field.before_step(51, Schedule(200, 100))  # at step 100 of a run of twice the length
+    assert torch.equal(field.gaussians(camera).features["diffuse_factor"], before.features["diffuse_factor"])
+
+
+def test_a_new_network_changes_little():
+    field, camera = make(hidden=128, hidden_layers=3), camera_at(0, 0, 0)
+    field.before_step(51, SCHEDULE)
+    assert (field.gaussians(camera).features["diffuse_factor"] - 1).abs().max() < 0.25
+
+
+def test_factors_multiply_the_diffuse_light_alone():
+    field, camera = trained(), camera_at(0, 0, 0)
+    with torch.no_grad():
+        whole = field.gaussians(camera)
+        field.albedos.zero_()
+        mirrored = field.gaussians(camera).colors.pow(GAMMA)
+        diffuse = whole.colors.pow(GAMMA) - mirrored
+        field.albedos.copy_(trained().albedos)
+        field.network_on.fill_(False)
+        plain = field.gaussians(camera).colors.pow(GAMMA) - mirrored
+    factors = whole.features["diffuse_factor"].clamp_min(0.0)
+    assert factors.std() > 0.05
+    torch.testing.assert_close(diffuse, plain * factors, rtol=1e-3, atol=1e-5)
+
+
+def in_training(field, seed=5):
+    return field.gaussians_in_training(camera_at(0, 0, 0), torch.Generator().manual_seed(seed))
+
+
+def test_noise_is_of_training_alone_and_the_generators():
+    field = trained()
+    noisy, again, other = (in_training(field, seed).features["diffuse_factor"] for seed in (5, 5, 6))
+    assert torch.equal(noisy, again) and not torch.equal(noisy, other)
+    clean = field.gaussians(camera_at(0, 0, 0)).features["diffuse_factor"]
+    assert 0 < (noisy - clean).abs().mean() < 0.01
+    silent = trained(input_noise=0.0, network_precision="float32")
+    torch.testing.assert_close(in_training(silent).features["diffuse_factor"], clean)
+
+
+def test_half_precision_is_of_training_alone_and_changes_little():
+    camera = camera_at(0, 0, 0)
+    full, half = trained(network_precision="float32"), trained(network_precision="bfloat16")
+    difference = (in_training(full).colors - in_training(half).colors).abs()
+    assert 0 < difference.max() < 0.01
+    assert torch.equal(full.gaussians(camera).colors, half.gaussians(camera).colors)
+
+
+def test_parameters_return_from_beyond_their_bounds_with_a_gradient():
+    field, camera = make(), camera_at(0, 0, 0)
+    with torch.no_grad():
+        field.f0.fill_(0.05)
+        field.roughness.fill_(0.9)
+        field.albedos.fill_(-0.1)
+        field.scales.fill_(9.0)
+        field.lamp_parameters[1] = -1.0
+    field._visible = lambda camera: torch.arange(len(field.means))
+    drawn = field.gaussians(camera)
+    assert drawn.features["f0"].max().item() == pytest.approx(0.035)
+    assert drawn.features["roughness"].max().item() == pytest.approx(0.7)
+    assert drawn.features["albedo"].min() == 0.0
+    assert drawn.scales.max().item() == pytest.approx(0.1 * field.extent.item())
+    field.before_step(1, SCHEDULE)
+    again = field.gaussians(camera)
+    assert torch.equal(again.colors, drawn.colors)
+    (again.colors.sum() + again.scales.sum()).backward()
+    for name in ("f0", "roughness", "albedos", "scales"):
+        assert getattr(field, name).grad.abs().sum() > 0, name
+    assert field.lamp_parameters.tolist() == [2.0, 0.0, 2.0]
+
+
+def test_gradients_are_those_of_finite_differences():
+    field = trained(input_noise=0.0).double()
+    camera = camera_at(0.5, -1.0, 4.0)
+
+    def value():
+        seen = field.gaussians(camera)
+        weights = torch.linspace(0.5, 1.5, len(seen), dtype=torch.float64)[:, None]
+        return (weights * seen.colors).sum()
+
+    value().backward()
+    row = field.gaussians(camera).source_index[40]
+    lamp, weight = field.lamp_parameters, field.diffuse_network.layers[0].weight
+    checked = [(getattr(field, name), (row,)) for name in ("roughness", "f0")]
+    checked += [(getattr(field, name), (row, 1)) for name in ("means", "quats", "albedos")]
+    checked += [(lamp, (index,)) for index in range(3)] + [(weight, (2, 5))]
+    for parameter, index in checked:
+        with torch.no_grad():
+            step, ends = 1e-6, []
+            for sign in (1, -1):
+                parameter[index] += sign * step
+                ends.append(value().item())
+                parameter[index] -= sign * step
+        assert parameter.grad[index].item() == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=1e-4, abs=1e-7)
+
+
+def test_the_pose_gets_a_gradient():
+    field, camera = varied(), camera_at(0, 0, 0)
+    pose = camera.camera_to_world.float().requires_grad_()
+    field.gaussians(replace(camera, camera_to_world=pose)).colors.sum().backward()
+    assert pose.grad[:3, 3].abs().min() > 0
+
+
+def test_gaussians_too_faint_to_be_drawn_are_left_out(monkeypatch):
+    field, camera = varied(), camera_at(0.3, 0.2, 3.0, yaw=0.3)
+    with torch.no_grad():
+        field.opacities[::3] = math.log(0.999 / 254)  # just below 1/255
+        field.opacities[1::3] = 2.0
+    seen = field.gaussians(camera)
+    assert not (seen.source_index % 3 == 0).any()
+    monkeypatch.setattr(lit_gaussians, "MIN_OPACITY", 0.0)
+    everything = field.gaussians(camera)
+    assert len(seen) < len(everything)
+    images = [render_gaussians(each, camera).rgb for each in (seen, everything)]
+    torch.testing.assert_close(*images, rtol=0, atol=2e-6)
+
+
+def test_channels_are_composited():
+    field, camera = varied(), camera_at(0, 0, 0)
+    names = sorted(field.feature_channels)
+    assert names == ["albedo", "diffuse_factor", "f0", "roughness"]
+    output = render_gaussians(field.gaussians(camera), camera, ("rgb", *names))
+    assert output["albedo"].shape == (24, 32, 3)
+    middle = output["roughness"][12, 16] / output.alpha[12, 16]
+    assert 0.1 < middle.item() < 0.6
+
+
+def test_parameter_groups():
+    rows = ["means", "scales", "quats", "opacities", "albedos", "roughness", "f0"]
+    assert list(make().parameter_groups()) == [*rows, "lamp", "diffuse_network"]

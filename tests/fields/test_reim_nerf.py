@@ -1,0 +1,290 @@
+"""REIM-NeRF: sizes by hand, the lamp, units of length, refusals, and training."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from pydantic import ValidationError
+
+from coliags_plugin.config.method_config import load_method
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scenes import PointCloud
+from coliags_plugin.engine.run_folder import RunFolder
+from coliags_plugin.engine.trainer import Trainer
+from coliags_plugin.fields.embedding import cosine_embedding
+from coliags_plugin.fields.normalisation import surface_distances
+from coliags_plugin.fields.radiance_mlp import RadianceMLP
+from coliags_plugin.fields.reim_nerf import ReimNerf, ReimNerfSettings
+from coliags_plugin.renderers.volume_renderer import VolumeRenderer, VolumeRendererSettings
+from tests.renderers.test_volume_renderer import sphere_scene
+from tests.scenes import camera_at, wall_scene
+
+SMALL = {"layers": 3, "width": 32, "skip": 1, "color_width": 16}
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Matrices are small: on a busy machine a second thread is only waited for."""
+    torch.set_num_threads(1)
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def make(scene=None, **options):
+    settings = ReimNerfSettings(**{**SMALL, **options})
+    return ReimNerf.from_scene(scene or wall_scene(), settings, generator())
+
+
+# ------------------------------------------------------------------------------------------------------------- network
+
+
+def test_published_layers_and_parameters():
+    network = RadianceMLP(ReimNerfSettings(), generator())
+    assert [layer.in_features for layer in network.trunk] == [63, 256, 256, 256, 256 + 63, 256, 256, 256]
+    assert network.color.in_features == 256 + 27 + 27 and network.color.out_features == 128
+    by_hand = (63 + 1) * 256 + 6 * (256 + 1) * 256 + (256 + 63 + 1) * 256  # trunk
+    by_hand += (256 + 1) + (256 + 1) * 256 + (256 + 54 + 1) * 128 + (128 + 1) * 3  # density, feature, colour, rgb
+    assert sum(value.numel() for value in network.parameters()) == by_hand == 599_300
+    bound = math.sqrt(6 / (256 + 256))
+    assert 0.98 * bound < network.trunk[1].weight.abs().max() <= bound and not network.trunk[1].bias.any()
+    plain = RadianceMLP(ReimNerfSettings(light=False), generator())
+    assert plain.color.in_features == 256 + 27
+
+
+@pytest.mark.parametrize("light", [True, False])
+def test_the_network_is_that_of_a_plain_forward_pass(light):
+    """As it is usually written: everything concatenated, one layer after the other."""
+    settings = ReimNerfSettings(**SMALL, light=light)
+    network = RadianceMLP(settings, generator()).double()
+    with torch.no_grad():
+        for value in network.parameters():
+            value.add_(0.1 * torch.randn(value.shape, generator=generator(1), dtype=torch.float64))
+    positions = torch.rand(5, 7, 3, generator=generator(2), dtype=torch.float64) * 2 - 1
+    directions = torch.nn.functional.normalize(torch.randn(5, 3, generator=generator(3), dtype=torch.float64), dim=1)
+    lamp = torch.tensor([0.2, -0.4, 0.9], dtype=torch.float64)
+    embedded = cosine_embedding(positions, 10)
+    hidden = network.trunk[0](embedded).relu()
+    hidden = network.trunk[1](torch.cat([hidden, embedded], -1)).relu()
+    hidden = network.trunk[2](hidden).relu()
+    seen = [cosine_embedding(directions, 4), *([cosine_embedding(lamp, 4).expand(5, -1)] if light else [])]
+    per_point = torch.cat(seen, -1)[:, None].expand(-1, 7, -1)
+    rgb = network.rgb(network.color(torch.cat([network.feature(hidden), per_point], -1)).relu()).sigmoid()
+    found = network.hidden(positions)
+    torch.testing.assert_close(network.raw_density(found, 5), network.density(hidden)[..., 0])
+    torch.testing.assert_close(network.colors(found, directions, lamp), rgb)
+    ours = torch.autograd.grad(network.colors(network.hidden(positions), directions, lamp).sum(), network.color.weight)
+    theirs = torch.autograd.grad(rgb.sum(), network.color.weight)
+    torch.testing.assert_close(ours, theirs)
+
+
+def test_the_lamp_changes_colours_and_not_densities():
+    positions = torch.rand(4, 6, 3, generator=generator()) * 10 + torch.tensor([0.0, 0.0, 10.0])
+    directions = torch.nn.functional.normalize(torch.randn(4, 3, generator=generator(1)), dim=1)
+    here, there = camera_at(0, 0, 0), camera_at(3, -2, 1)
+    for light in (True, False):
+        field = make(light=light).float()
+        first, second = (field.query(positions, directions, camera.to(dtype=torch.float32)) for camera in (here, there))
+        assert torch.equal(first.density, second.density)
+        assert torch.equal(first.rgb, second.rgb) != light
+        assert torch.equal(first.density, field.query_density(positions, directions, here))
+
+
+# ----------------------------------------------------------------------------------------------------- units of length
+
+
+def moved(scene, factor, shift):
+    """The same scene in other units and elsewhere."""
+
+    def placed(frame):
+        pose = frame.camera.camera_to_world.clone()
+        pose[:3, 3] = factor * pose[:3, 3] + shift
+        return replace(frame, camera=replace(frame.camera, camera_to_world=pose), depth=frame.depth * factor)
+
+    points = PointCloud(factor * scene.points.positions.double() + shift)
+    return replace(scene, train=[placed(frame) for frame in scene.train], points=points)
+
+
+def test_a_scene_in_other_units_elsewhere_looks_the_same():
+    scene, factor, shift = wall_scene(), 8.0, torch.tensor([40.0, -30.0, 10.0], dtype=torch.float64)
+    other = moved(scene, factor, shift)
+    fields = [make(s).double() for s in (replace(scene, points=PointCloud(scene.points.positions.double())), other)]
+    for field in fields:
+        field.load_state_dict(field.state_dict() | {k: v for k, v in fields[0].state_dict().items() if "network" in k})
+    renderer = VolumeRenderer(
+        VolumeRendererSettings(near_plane=None, far_plane=None, spacing="distance", samples=16, importance_samples=16)
+    )
+    wants = ("depth_accumulated", "rgb_coarse")
+    ours, theirs = (
+        renderer.render(field, s.train[3].camera, wants) for field, s in zip(fields, (scene, other), strict=True)
+    )
+    assert 0.01 < ours.alpha.mean() < 0.9999
+    torch.testing.assert_close(theirs.rgb, ours.rgb, rtol=0, atol=2e-5)
+    torch.testing.assert_close(theirs.alpha, ours.alpha, rtol=0, atol=2e-5)
+    torch.testing.assert_close(theirs["depth_accumulated"], factor * ours["depth_accumulated"], rtol=1e-4, atol=1e-3)
+    assert float(fields[1].length_unit) == pytest.approx(factor * float(fields[0].length_unit))
+
+
+def test_points_are_centred_and_the_largest_coordinate_is_one():
+    scene = wall_scene()
+    field = make(scene)
+    inside = field.normalisation(scene.points.positions)
+    assert inside.abs().max().item() == pytest.approx(1.0)
+    assert inside.mean(0).abs().max().item() < 1e-5
+
+
+def test_rays_reach_a_tenth_beyond_the_points_in_view():
+    scene = wall_scene()
+    points = torch.tensor([[0.0, 0.0, 20.0], [0.0, 0.0, -5.0], [4.0, 1.0, 28.0], [300.0, 0.0, 20.0]])
+    near, far = surface_distances(replace(scene, points=PointCloud(points))).tolist()
+    distances = [(points[[0, 2]].double() - frame.camera.center).norm(dim=1) for frame in scene.train]
+    assert near == pytest.approx(0.9 * min(pair.min().item() for pair in distances))
+    assert far == pytest.approx(1.1 * max(pair.max().item() for pair in distances))
+
+
+# ------------------------------------------------------------------------------------------------------------ refusals
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda scene: replace(scene, train=scene.train[:1]), "1 training frame of scene 'wall'"),
+        (lambda scene: replace(scene, points=PointCloud(torch.zeros(0, 3))), "no initial points"),
+        (lambda scene: replace(scene, points=PointCloud(torch.ones(5, 3))), "all at one place"),
+        (
+            lambda scene: replace(scene, points=PointCloud(scene.points.positions * torch.tensor([1.0, 1.0, -1.0]))),
+            "no training camera has an initial point in view",
+        ),
+    ],
+)
+def test_scenes_that_will_not_do_are_refused(tmp_path, change, message):
+    with pytest.raises(InputError, match=message):
+        trainer(tmp_path / "run", scene=change(wall_scene()))
+    assert not (tmp_path / "run").exists()
+
+
+def test_other_refusals(tmp_path):
+    with pytest.raises(ValidationError, match="skip 3 with layers 3"):
+        ReimNerfSettings(layers=3, skip=3)
+    with pytest.raises(InputError, match="'depth' needs depth, and no training frame"):
+        trainer(tmp_path / "run", scene=wall_scene(depth=False))
+    with pytest.raises(InputError, match=r"start at 500 and end at"):
+        trainer(tmp_path / "run", ["renderer.near_plane=500.0"])
+    with pytest.raises(InputError, match="draws gaussians3d, surfels, the field is made of radiance"):
+        trainer(tmp_path / "run", ["renderer=torch"])
+    with pytest.raises(InputError, match="outputs needed by the losses: rgb_coarse"):
+        load = load_method("3dgs", ["losses.l1={name: mse, weight: 1.0, image: rgb_coarse}"])
+        Trainer(load, wall_scene(), "wall", RunFolder(tmp_path / "run"), 0, torch.device("cpu"))
+    assert not (tmp_path / "run").exists()
+
+
+# ------------------------------------------------------------------------------------------------------------ training
+
+TINY = (
+    *(f"field.{key}={value}" for key, value in SMALL.items()),
+    "field.position_frequencies=4",
+    "renderer.samples=16",
+    "renderer.importance_samples=16",
+    "sampler.pixels=128",
+    "sampler.frames=4",
+    "schedule.log_every=1",
+    "optimizers.coarse.lr=0.005",
+    "optimizers.fine.lr=0.005",
+)
+
+
+def trainer(folder, overrides=(), scene=None, steps=20):
+    method = load_method("reim-nerf", [*TINY, f"schedule.steps={steps}", *overrides])
+    return Trainer(method, scene or wall_scene(), "wall", RunFolder(folder), 0, torch.device("cpu"))
+
+
+def test_without_the_lamp_the_method_is_nerf(tmp_path):
+    lit, plain = (trainer(tmp_path / "run", [f"field.light={light}"]) for light in ("true", "false"))
+    sizes = [run.model.field.fine_network.color.in_features for run in (lit, plain)]
+    assert sizes[0] - sizes[1] == 27
+    assert math.isfinite(plain.take_step()["loss"])
+
+
+def test_a_run_resumes_to_the_bit_and_renders_alike_twice(tmp_path):
+    straight, broken = (trainer(tmp_path / name) for name in ("straight", "broken"))
+    for run in (straight, broken):
+        run.start()
+    rows = [straight.take_step() for _ in range(6)]
+    for _ in range(3):
+        broken.take_step()
+    broken.save()
+    resumed = trainer(tmp_path / "broken")
+    resumed.resume()
+    again = [resumed.take_step() for _ in range(3)]
+    assert again == rows[3:]
+    ours, theirs = straight.model.state_dict(), resumed.model.state_dict()
+    assert ours.keys() == theirs.keys() and all(torch.equal(ours[name], theirs[name]) for name in ours)
+    camera = wall_scene().train[0].camera
+    with torch.no_grad():
+        first, second = (model.render(camera, ("depth_accumulated",)) for model in (straight.model, resumed.model))
+    assert torch.equal(first.rgb, second.rgb)
+    assert torch.equal(first["depth_accumulated"], second["depth_accumulated"])
+    # Chance comes in: another state of the generator, another step.
+    other = trainer(tmp_path / "broken")
+    other.resume()
+    other.generators["rendering"].manual_seed(5)
+    assert other.take_step()["loss"] != rows[3]["loss"]
+
+
+def test_noise_and_jitter_are_of_training_alone(tmp_path):
+    run = trainer(tmp_path / "run", ["renderer.jitter=false"])
+    camera, pixels = wall_scene().train[0].camera, torch.tensor([[4, 5], [20, 12]])
+    still = run.model.render(camera, pixels=pixels)
+    noisy = [run.model.render(camera, pixels=pixels, generator=generator(seed)) for seed in (0, 0, 1)]
+    assert torch.equal(noisy[0].rgb, noisy[1].rgb) and not torch.equal(noisy[0].rgb, noisy[2].rgb)
+    assert torch.equal(still.rgb, run.model.render(camera, pixels=pixels).rgb)
+    silent = trainer(tmp_path / "run", ["renderer.jitter=false", "field.density_noise=0.0"])
+    silent = silent.model.render(camera, pixels=pixels, generator=generator())
+    assert torch.equal(silent.rgb, still.rgb)
+
+
+def test_a_checkpoint_from_before_rendering_had_a_generator_still_loads(tmp_path):
+    run = trainer(tmp_path / "run")
+    run.start()
+    del run.generators["rendering"]
+    run.save()
+    trainer(tmp_path / "run").resume()
+
+
+def test_every_term_falls(tmp_path):
+    run = trainer(tmp_path / "run", ["losses.depth.share=1.0", "losses.depth-coarse.share=1.0"], steps=40)
+    rows = [run.take_step() for _ in range(40)]
+    for name in ("mse", "mse-coarse", "depth", "depth-coarse"):
+        early, late = (sum(row["terms"][name] for row in part) for part in (rows[:5], rows[-5:]))
+        assert late < 0.6 * early, name
+
+
+def test_a_ball_is_learnt_in_colour_and_depth(tmp_path):
+    scene = sphere_scene()
+    frame = scene.train[0]
+    points = torch.cat([f.camera.unproject(f.depth.double())[f.depth.isfinite()] for f in scene.train])
+    scene = replace(scene, points=PointCloud(points))
+    options = ["losses.depth.share=1.0", "losses.depth-coarse.share=1.0", "renderer.opaque_end=false"]
+    options += ["sampler.pixels=320", "sampler.frames=10", "field.density_noise=0.0"]
+    options += ["optimizers.coarse.lr=0.01", "optimizers.fine.lr=0.01"]
+    run = trainer(tmp_path / "run", options, scene, steps=200)
+    rows = [run.take_step() for _ in range(200)]
+    assert sum(row["psnr"] for row in rows[-10:]) / 10 > 22
+    with torch.no_grad():
+        output = run.model.render(frame.camera, ("depth_accumulated",))
+    hit = frame.depth.isfinite()
+    assert output.alpha[hit].mean() > 0.95
+    assert (output["depth_accumulated"] - frame.depth)[hit].abs().median() < 0.1  # of a ball of radius 1, 6 away
+
+
+def test_rates_are_halved_at_shares_of_the_run(tmp_path):
+    run = trainer(tmp_path / "run", steps=8)
+    rates = [run.optimizers.rate("fine", step) for step in range(1, 9)]
+    assert rates == [0.005] * 4 + [0.0025] * 2 + [0.00125] * 2
+    assert {group["eps"] for adam in run.optimizers.adam.values() for group in adam.param_groups} == {1e-8}
+    with pytest.raises(InputError, match="halve_at"):
+        load_method("reim-nerf", ["optimizers.fine.halve_at=[1.5]"])

@@ -1,0 +1,187 @@
+"""Normals of depth maps, and the regularization losses of surfels."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from coliags_plugin.contracts import Schedule, TrainingStep
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.losses.depth_normals import depth_normals
+from coliags_plugin.renderers.torch_renderer import render_gaussians
+from tests.losses.terms import make
+from tests.renderers.test_torch_renderer import rigid
+
+
+def off_centre(width=23, height=17, pose=None):
+    pose = torch.eye(4, dtype=torch.float64) if pose is None else pose
+    return Camera(31.0, 27.0, 9.3, 8.9, width, height, pose)
+
+
+# --- normals of depth -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("normal", [[0.0, 0.0, -1.0], [0.4, -0.3, -0.8], [-0.6, 0.2, -0.5]])
+def test_normals_of_a_plane_are_exact(normal):
+    normal = torch.nn.functional.normalize(torch.tensor(normal, dtype=torch.float64), dim=0)
+    camera = off_centre()
+    depth = -5.0 / (camera.rays() @ normal)  # n . z r = -5: the plane is seen from its front
+    assert (depth > 0).all()
+    found = depth_normals(depth, dataclasses.replace(camera, camera_to_world=rigid(3)[0]))
+    torch.testing.assert_close(found[1:-1, 1:-1], normal.expand(15, 21, 3))
+    border = found.clone()
+    border[1:-1, 1:-1] = 0
+    assert not border.any()
+
+
+@pytest.mark.parametrize(("pixels", "bound"), [(24, 4e-3), (96, 3e-4)])
+def test_normals_of_a_sphere_converge_to_the_second_order(pixels, bound):
+    # Seen from inside at its centre plus an offset, so that all rays meet it.
+    centre, radius = torch.tensor([0.3, -0.2, 1.0], dtype=torch.float64), 4.0
+    camera = Camera(0.8 * pixels, 0.9 * pixels, 0.45 * pixels, 0.55 * pixels, pixels, pixels, torch.eye(4).double())
+    rays = camera.rays()
+    along, squared = (rays * centre).sum(-1), rays.square().sum(-1)
+    depth = (along + torch.sqrt(along**2 - squared * (centre @ centre - radius**2))) / squared
+    true = (centre - camera.unproject(depth)) / radius
+    error = (depth_normals(depth, camera) - true)[1:-1, 1:-1].norm(dim=-1)
+    assert error.max() < bound
+
+
+def test_unknown_depths_reach_their_neighbours_only():
+    camera, depth = off_centre(), torch.full((17, 23), 5.0, dtype=torch.float64)
+    spoiled, known = depth.clone(), torch.ones(17, 23, dtype=torch.bool)
+    spoiled[8, 10], known[8, 10] = torch.nan, False
+    spoiled.requires_grad_()
+    found, whole = depth_normals(spoiled, camera, known), depth_normals(depth, camera)
+    beside = torch.zeros_like(known)
+    beside[[7, 9, 8, 8], [10, 10, 9, 11]] = True
+    assert not found[beside].any()
+    torch.testing.assert_close(found[~beside], whole[~beside])
+    found[..., 0].sum().backward()
+    assert spoiled.grad.isfinite().all() and spoiled.grad[8, 10] == 0 and spoiled.grad.any()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (2, 5), (5, 2), (3, 3)])
+def test_maps_too_small_for_differences_have_no_normals(size):
+    found = depth_normals(torch.ones(size), Camera(5.0, 5.0, 1.0, 1.0, size[1], size[0], torch.eye(4)))
+    assert found.shape == (*size, 3)
+    assert found.any() == (size == (3, 3))
+
+
+def test_gradients_of_the_normals_of_depth():
+    camera = off_centre(6, 5)
+    depth = 5 + torch.rand(5, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    weights = torch.randn(5, 6, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    assert torch.autograd.gradcheck(lambda d: (depth_normals(d, camera) * weights).sum(), depth.requires_grad_())
+
+
+# --- losses -----------------------------------------------------------------------------------------------------------
+
+
+def plane(tilt, count=15, spacing=0.4, dtype=torch.float64):
+    """Surfels over a plane 5 in front of the camera tilted about the x axis, as leaves."""
+    half = math.radians(tilt) / 2
+    steps = spacing * (torch.arange(count, dtype=dtype) - count // 2)
+    x, y = (grid.flatten() for grid in torch.meshgrid(steps, steps, indexing="ij"))
+    means = torch.stack([x, y * math.cos(2 * half), 5 + y * math.sin(2 * half)], dim=-1)
+    n = len(means)
+    quats = torch.tensor([math.cos(half), math.sin(half), 0, 0], dtype=dtype).expand(n, 4).clone()
+    values = (means, quats, torch.full((n, 2), 0.8 * spacing), torch.full((n,), 0.9), torch.ones(n, 3))
+    leaves = [value.to(dtype).requires_grad_() for value in values]
+    return Gaussians(*leaves, torch.arange(n), torch.arange(n))
+
+
+def frame(make_frame, mask=None):
+    return make_frame(torch.zeros(17, 23, 3, dtype=torch.uint8), mask=mask)
+
+
+@pytest.mark.parametrize("depth", ["depth_expected", "depth_median"])
+@pytest.mark.parametrize("tilt", [0.0, 40.0])
+def test_a_plane_of_surfels_is_consistent(make_frame, depth, tilt):
+    term = make("normal-consistency", depth=depth)
+    assert term.loss.wants == {"normals", depth} and term.loss.whole_image
+    output = render_gaussians(plane(tilt), off_centre(), ("normals", depth))
+    alpha = output.alpha
+    inside = torch.zeros(17, 23, dtype=torch.bool)
+    inside[1:-1, 1:-1] = True
+    # <N, n> = alpha there, times the detached alpha; the border enters as 1.
+    expected = torch.where(inside, 1 - alpha**2, 1.0).mean()
+    assert term(output, frame(make_frame)).item() == pytest.approx(expected.item(), abs=1e-9)
+    assert expected < 0.3
+
+
+def test_inconsistent_surfels_are_turned_into_their_surface(make_frame):
+    surfels, term = plane(0.0, count=9, spacing=0.6), make("normal-consistency")
+    half = math.radians(25) / 2
+    with torch.no_grad():  # blinds that stand at 25 degrees to the wall they cover
+        surfels.quats_wxyz.copy_(torch.tensor([math.cos(half), math.sin(half), 0, 0]).expand_as(surfels.quats_wxyz))
+    least, values = 1 - 15 * 21 / (17 * 23), []  # the border's share
+    optimizer = torch.optim.Adam([surfels.quats_wxyz], lr=0.03)
+    for _ in range(20):
+        values.append(term(render_gaussians(surfels, off_centre(), tuple(term.loss.wants)), frame(make_frame)))
+        optimizer.zero_grad()
+        values[-1].backward()
+        optimizer.step()
+    assert values[-1] - least < 0.3 * (values[0] - least)
+
+
+def test_alpha_of_the_weight_has_no_gradient(make_frame, make_output):
+    normals = torch.zeros(17, 23, 3)
+    normals[..., 2] = -1.0
+    alpha = torch.full((17, 23), 0.5, requires_grad=True)
+    output = make_output(torch.zeros(17, 23, 3), alpha=alpha, normals=normals.requires_grad_(),
+                         depth_expected=torch.full((17, 23), 5.0, requires_grad=True))  # fmt: skip
+    output = dataclasses.replace(output, camera=off_centre())
+    value = make("normal-consistency")(output, frame(make_frame))
+    assert value.item() == pytest.approx(1 - 0.5 * 15 * 21 / (17 * 23), rel=1e-6)
+    value.backward()
+    assert alpha.grad is None and normals.grad.any()
+
+
+def test_ignored_pixels_count_for_nothing(make_frame):
+    mask = torch.ones(17, 23, dtype=torch.bool)
+    mask[4:9, 6:12] = False
+    for name in ("normal-consistency", "distortion"):
+        term = make(name)
+        output = render_gaussians(plane(30.0), off_centre(), tuple(term.loss.wants))
+        value = term(output, frame(make_frame, mask))
+        maps = {
+            key: torch.where(mask[..., None] if v.ndim == 3 else mask, v.detach(), torch.nan).requires_grad_()
+            for key, v in output.maps.items()
+        }
+        spoiled = dataclasses.replace(output, maps=maps)
+        other = term(spoiled, frame(make_frame, mask))
+        torch.testing.assert_close(other, value)
+        other.backward()
+        for key, v in maps.items():
+            assert v.grad.isfinite().all() and not v.grad[~mask].any(), (name, key)
+
+
+def test_distortion_is_the_mean_of_its_output(make_frame, make_output):
+    distortion = torch.rand(17, 23, generator=torch.Generator().manual_seed(0))
+    output = make_output(torch.zeros(17, 23, 3), distortion=distortion)
+    assert make("distortion")(output, frame(make_frame)).item() == pytest.approx(distortion.mean().item(), rel=1e-6)
+
+
+def test_distortion_draws_the_surfels_of_a_ray_together(make_frame):
+    means = torch.tensor([[0, 0, 4.0], [0, 0, 5.0]], dtype=torch.float64)
+    quats = torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64).expand(2, 4)
+    gaussians = Gaussians(
+        means.requires_grad_(), quats, torch.full((2, 2), 30.0).double(), torch.full((2,), 0.5).double(),
+        torch.ones(2, 3).double(), torch.arange(2), torch.arange(2),
+    )  # fmt: skip
+    make("distortion")(render_gaussians(gaussians, off_centre(), ("distortion",)), frame(make_frame)).backward()
+    assert means.grad[0, 2] < 0 < means.grad[1, 2]
+
+
+def test_single_pixels_are_refused(make_frame, make_output):
+    output = make_output(torch.zeros(4, 1, 3), normals=torch.zeros(4, 1, 3), depth_expected=torch.zeros(4, 1))
+    with pytest.raises(InputError, match="whole images"):
+        make("normal-consistency").loss(
+            TrainingStep(output, make_frame(torch.zeros(4, 1, 3)).target, None, 1, Schedule(1, 1))
+        )

@@ -1,0 +1,440 @@
+"""Small sound components, and copies of them each of which breaks the contract in one way."""
+
+from __future__ import annotations
+
+import itertools
+import random
+from dataclasses import replace
+
+import torch
+from pydantic import BaseModel, ConfigDict, field_validator
+from torch import nn
+
+from coliags_plugin.contracts import (
+    Draw,
+    GaussianField,
+    Loss,
+    LossSettings,
+    Protocol,
+    RadianceField,
+    RadianceSamples,
+    Sampler,
+    Strategy,
+    ViewModule,
+)
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.masked import masked_mean
+from coliags_plugin.core.settings import Settings
+from coliags_plugin.engine.samplers import FrameSampler
+from coliags_plugin.renderers.cpu_renderer import CpuRenderer
+from coliags_plugin.renderers.volume_renderer import VolumeRenderer
+
+
+class Balls(GaussianField):
+    """A round Gaussian at some of the initial points."""
+
+    class Settings(Settings):
+        """One option."""
+
+        size: float = 2.0
+
+    primitive = "gaussians3d"
+    elements = "balls"
+
+    def __init__(self, settings, count):
+        super().__init__()
+        self.settings = settings
+        self.means = nn.Parameter(torch.zeros(count, 3))
+        self.logits = nn.Parameter(torch.zeros(count, 4))
+        self.register_buffer("ages", torch.zeros(count))
+
+    @property
+    def element_count(self):
+        return len(self.means)
+
+    @classmethod
+    def from_scene(cls, scene, settings, generator):
+        if not len(scene.points):
+            raise InputError("no points", "some")
+        positions = scene.points.positions[::25]
+        field = cls(settings, len(positions))
+        field.means.data.copy_(positions)
+        return field
+
+    @classmethod
+    def from_state(cls, state, settings):
+        field = cls(settings, len(state["means"]))
+        field.load_state_dict(state)
+        return field
+
+    def gaussians(self, camera):
+        count = len(self.means)
+        rows, values = torch.arange(count), self.logits.sigmoid()
+        return Gaussians(
+            means=self.means,
+            quats_wxyz=torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(count, 4),
+            scales=torch.full((count, 3), self.settings.size),
+            opacities=values[:, 0],
+            colors=values[:, 1:],
+            source_index=rows,
+            visible_sources=rows,
+        )
+
+    def parameter_groups(self):
+        return {"means": [self.means], "logits": [self.logits]}
+
+
+class Fog(RadianceField):
+    """One density and one colour everywhere in front of a plane, and others behind it."""
+
+    Settings = Settings
+
+    def __init__(self):
+        super().__init__()
+        self.near = nn.Parameter(torch.tensor([-4.0, 0.0, 0.0, 0.0]))
+        self.far = nn.Parameter(torch.zeros(4))
+
+    @classmethod
+    def from_scene(cls, scene, settings, generator):
+        return cls()
+
+    @classmethod
+    def from_state(cls, state, settings):
+        field = cls()
+        field.load_state_dict(state)
+        return field
+
+    def query(self, positions, directions, camera):
+        behind = (positions - camera.center.to(positions)).norm(dim=-1, keepdim=True) > 25.0
+        values = torch.where(behind, self.far, self.near)
+        return RadianceSamples(nn.functional.softplus(values[..., 0]), values[..., 1:].sigmoid())
+
+    def parameter_groups(self):
+        return {"near": [self.near], "far": [self.far]}
+
+
+class Colour(Loss):
+    """Mean absolute difference of colours."""
+
+    Settings = LossSettings
+
+    def __call__(self, step):
+        return masked_mean((step.output.rgb - step.target.rgb).abs(), step.target.mask)
+
+
+class Division(Strategy):
+    """Doubles the first rows every few steps, and counts the steps of every row."""
+
+    class Settings(Settings):
+        """One interval."""
+
+        every: int = 1000
+        born: int = 3
+
+    serves = frozenset({"balls"})
+    counters = ("steps",)
+
+    def __init__(self, settings, generator, schedule, extent):
+        super().__init__(settings, generator, schedule, extent)
+        self.steps = torch.zeros(0)
+
+    def plan(self):
+        return f"every {self.settings.every} steps"
+
+    @torch.no_grad()
+    def after_backward(self, step, rows):
+        field, born = step.model.field, self.settings.born
+        if len(self.steps) == 0:
+            self.steps = torch.zeros(len(field.means))
+        self.steps += 1
+        if step.step % self.settings.every:
+            return {}
+        self.add(field, rows, born)
+        return {"grown": born}
+
+    def add(self, field, rows, born):
+        rows.add_rows({"means": field.means[:born] + 1.0, "logits": field.logits[:born]})
+        field.ages = torch.cat([field.ages, torch.zeros(born)])
+        self.steps = torch.cat([self.steps, torch.zeros(born)])
+
+
+class Plain(ViewModule):
+    """Changes nothing."""
+
+    Settings = Settings
+    untrained_views = "as all"
+
+    @classmethod
+    def from_scene(cls, scene, settings, generator):
+        return cls()
+
+    def parameter_groups(self):
+        return {}
+
+
+# Broken ones: what breaks is in the name of the class.
+
+
+class DoublesItsSize(Balls):
+    class Settings(Settings):
+        size: float = 2.0
+
+        @field_validator("size")
+        @classmethod
+        def _double(cls, size):
+            return 2.0 * size
+
+
+class LooseSettings(BaseModel):
+    model_config = ConfigDict(extra="allow", frozen=True)
+    weight: float
+    from_step: int = 0
+    until_step: int | None = None
+
+    def active(self, step, schedule):
+        return True
+
+    def weight_at(self, step, steps):
+        return self.weight
+
+
+class AcceptsAnyOption(Colour):
+    Settings = LooseSettings
+
+
+class CrashesWhenMade(Balls):
+    @classmethod
+    def from_scene(cls, scene, settings, generator):
+        return 1 / 0
+
+
+class CrashesInALibrary(Balls):
+    def gaussians(self, camera):
+        return torch.cat([self.means, torch.zeros(2, 2)])
+
+
+class HasAnUngroupedParameter(Balls):
+    def __init__(self, settings, count):
+        super().__init__(settings, count)
+        self.forgotten = nn.Parameter(torch.zeros(3))
+
+
+class SharesAParameter(Balls):
+    def parameter_groups(self):
+        return {"means": [self.means], "logits": [self.logits, self.means]}
+
+
+class TurnsNaN(Colour):
+    def __call__(self, step):
+        return super().__call__(step) * (torch.nan if step.step == 5 else 1.0)
+
+
+class Maximised(Colour):
+    def __call__(self, step):
+        return -super().__call__(step)
+
+
+class HasADetachedGroup(Balls):
+    def gaussians(self, camera):
+        return replace(super().gaussians(camera), means=self.means.detach())
+
+
+class LacksNormals(CpuRenderer):
+    def render(self, field, camera, wants=("rgb", "alpha"), pixels=None):
+        output = super().render(field, camera, wants, pixels)
+        output.maps.pop("normals", None)
+        return output
+
+
+class DepthInMetres(CpuRenderer):
+    def render(self, field, camera, wants=("rgb", "alpha"), pixels=None):
+        output = super().render(field, camera, wants, pixels)
+        if "depth_median" in output.maps:
+            output.maps["depth_median"] = output.maps["depth_median"] / 1000.0
+        return output
+
+
+class FlatNormals(CpuRenderer):
+    def render(self, field, camera, wants=("rgb", "alpha"), pixels=None):
+        output = super().render(field, camera, wants, pixels)
+        if "normals" in output.maps:
+            output.maps["normals"] = output.maps["normals"][..., 0]
+        return output
+
+
+class AlphaAboveOne(CpuRenderer):
+    def render(self, field, camera, wants=("rgb", "alpha"), pixels=None):
+        output = super().render(field, camera, wants, pixels)
+        return replace(output, alpha=1.5 * output.alpha)
+
+
+class NaNFeature(Balls):
+    feature_channels = frozenset({"albedo"})
+
+    def gaussians(self, camera):
+        albedo = torch.full((len(self.means), 1), torch.nan)
+        return replace(super().gaussians(camera), features={"albedo": albedo})
+
+
+class FixedSize(CpuRenderer):
+    def render(self, field, camera, wants=("rgb", "alpha"), pixels=None):
+        return super().render(field, replace(camera, width=40, height=32), wants, pixels)
+
+
+class CrashesForFreeCameras(Plain):
+    def adjust_camera(self, camera, view):
+        _ = view.name
+        return camera
+
+
+class RendersWithChance(Balls):
+    def gaussians(self, camera):
+        return replace(super().gaussians(camera), means=self.means + 0.01 * torch.randn(3))
+
+
+class IgnoresUnknownOutputs(CpuRenderer):
+    def render(self, field, camera, wants=("rgb", "alpha"), pixels=None):
+        return super().render(field, camera, [name for name in wants if name in self.outputs], pixels)
+
+
+class CrashesForUnknownOutputs(CpuRenderer):
+    def render(self, field, camera, wants=("rgb", "alpha"), pixels=None):
+        return super().render(field, camera, [{name: name for name in self.outputs}[name] for name in wants], pixels)
+
+
+class IgnoresPixels(CpuRenderer):
+    def render(self, field, camera, wants=("rgb", "alpha"), pixels=None):
+        return super().render(field, camera, wants)
+
+
+class SwapsPixels(VolumeRenderer):
+    def render(self, field, camera, wants=("rgb", "alpha"), pixels=None):
+        output = super().render(field, camera, wants, pixels)
+        return output if pixels is None else replace(output, rgb=output.rgb.flip(0) + 0.01)
+
+
+class ForgetsABuffer(Balls):
+    def __init__(self, settings, count):
+        super().__init__(settings, count)
+        self.glow = 0.0
+
+    def before_step(self, step, schedule):
+        self.glow = 0.01 * step
+
+    def gaussians(self, camera):
+        made = super().gaussians(camera)
+        return replace(made, colors=(made.colors + self.glow).clamp_max(1.0))
+
+
+class DiffersFromRunToRun(Colour):
+    def __call__(self, step):
+        return super().__call__(step) * random.uniform(0.9, 1.1)
+
+
+class TakesGlobalRandomNumbers(Colour):
+    def __call__(self, step):
+        return super().__call__(step) * (0.9 + 0.2 * torch.rand(()))
+
+
+class ForgetsItsPlace(FrameSampler):
+    def __init__(self, settings, sizes, generator):
+        super().__init__(settings, sizes, generator)
+        self.turns = itertools.count()
+
+    def next(self):
+        return [Draw(next(self.turns) % min(7, len(self.sizes)))]
+
+
+class HasAHiddenCounter(Division):
+    counters = ()
+
+    def after_backward(self, step, rows):
+        super().after_backward(step, rows)
+        step.model.field.logits.grad *= 1.0 / float(self.steps.max())
+        return {}
+
+
+class ReadsWhatIsThere(Balls):
+    @classmethod
+    def from_state(cls, state, settings):
+        field = cls(settings, len(next(iter(state.values()))))
+        field.load_state_dict(state, strict=False)
+        return field
+
+
+class ForgetsAGroup(Division):
+    def add(self, field, rows, born):
+        super().add(field, rows, born)
+        rows.keep_rows(["logits"], torch.arange(len(field.logits)) < len(field.logits) - 1)
+
+
+class ForgetsTheBuffer(Division):
+    def add(self, field, rows, born):
+        ages = field.ages
+        super().add(field, rows, born)
+        field.ages = ages
+
+
+class ForgetsTheCounter(Division):
+    def add(self, field, rows, born):
+        steps = self.steps
+        super().add(field, rows, born)
+        self.steps = steps
+
+
+class GoesPastAdam(Division):
+    def add(self, field, rows, born):
+        field.means = nn.Parameter(torch.cat([field.means, field.means[:born]]))
+        field.logits = nn.Parameter(torch.cat([field.logits, field.logits[:born]]))
+
+
+class ForgetsAfterAnEvent(Division):
+    """What it remembers of the last event is in no counter."""
+
+    born_last = 0
+
+    def add(self, field, rows, born):
+        super().add(field, rows, born + self.born_last)
+        self.born_last = born
+
+
+class WantsAlbedo(Protocol):
+    name, version, description = "wants-albedo", 1, "a broken one"
+    wants = frozenset({"albedo"})
+    metrics = {}  # noqa: RUF012
+
+    def compare(self, output, frame):
+        raise NotImplementedError
+
+
+class HasNoAccumulatedDepth(CpuRenderer):
+    outputs = CpuRenderer.outputs - {"depth_accumulated"}
+
+    def render(self, field, camera, wants=("rgb", "alpha"), pixels=None):
+        if "depth_accumulated" in wants:
+            raise InputError("depth_accumulated", "another output")
+        return super().render(field, camera, wants, pixels)
+
+
+class AssumesDepth(Colour):
+    def __call__(self, step):
+        return super().__call__(step) + 0.0 * step.target.depth.nanmean()
+
+
+class CountsMaskedPixels(Colour):
+    def __call__(self, step):
+        return (step.output.rgb - step.target.rgb).abs().mean()
+
+
+class CrashesAlone(Sampler):
+    """Wants two frames."""
+
+    Settings = Settings
+    whole_images = True
+
+    def next(self):
+        pairs = len(self.sizes) // 2
+        if not self.queue:
+            self.queue = torch.randint(2 * pairs, (4,), generator=self.generator).tolist()
+        return [Draw(self.queue.pop())]

@@ -1,0 +1,47 @@
+"""Every method of method_configs/ keeps the contract of all methods."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from coliags_plugin.config.method_config import load_method
+from coliags_plugin.config.method_files import method_folder
+from coliags_plugin.method_check.check import CHECKS, check_method
+
+FOLDER = method_folder()
+METHODS = sorted(path.relative_to(FOLDER).with_suffix("").as_posix() for path in FOLDER.rglob("*.yaml"))
+
+#: Networks so small that a CPU trains them in seconds, by the field's name.
+SMALL_NETWORKS = {
+    "reim-nerf": (
+        *("field.width=32", "field.color_width=16", "sampler.pixels=256"),
+        *("renderer.samples=16", "renderer.importance_samples=16"),
+    )
+}
+
+
+@pytest.fixture(autouse=True)
+def one_thread(two_threads):
+    """On so few pixels a second thread costs more than it gains."""
+    torch.set_num_threads(1)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_contract(method, tmp_path):
+    config = load_method(method).config
+    overrides = SMALL_NETWORKS.get(config.field.name, ())
+    results = {result.name: result for result in check_method(method, tmp_path, overrides)}
+    assert [f"{result.name}: {result.detail}" for result in results.values() if result.status == "failed"] == []
+    inapplicable = {
+        "pixels": not config.renderer.target.renders_pixels,
+        "rows": config.strategy.target.serves is None,
+    }
+    assert {name for name, result in results.items() if result.status == "skipped"} == {
+        name for name, holds in inapplicable.items() if holds
+    }
+    assert list(results) == [check.name for check in CHECKS]
+
+
+def test_there_are_methods_to_check():
+    assert {"coliags", "scaffold-gs", "3dgs", "ablations/none"} <= set(METHODS)
