@@ -12,6 +12,8 @@ from torch import Tensor, nn
 
 from coliags_plugin.fields.mlp import linear_layers
 
+#: Rows of a product of bfloat16 are a multiple of this: oneDNN compiles, and keeps in memory, a kernel for every size.
+_ROWS = 8192
 #: Of the products in training; auto: bfloat16 on CPUs that have instructions for it, otherwise float32.
 Precision = Literal["auto", "float32", "bfloat16"]
 
@@ -59,10 +61,13 @@ class DiffuseNetwork(nn.Module):
         dtype = self._reduced_dtype(inputs) if in_training else inputs.dtype
         layers: list[Any] = list(self.layers)
         values = inputs.to(dtype)
+        if dtype == torch.bfloat16:
+            values = nn.functional.pad(values, (0, 0, 0, -len(values) % _ROWS))
         for layer in layers[:-1]:
             values = torch.relu_(nn.functional.linear(values, layer.weight.to(dtype), layer.bias.to(dtype)))
         # The bias, near 1, is added to the small rest in full precision.
-        return nn.functional.linear(values, layers[-1].weight.to(dtype)).to(inputs.dtype) + layers[-1].bias
+        rest = nn.functional.linear(values, layers[-1].weight.to(dtype))[: len(inputs)]
+        return rest.to(inputs.dtype) + layers[-1].bias
 
     def _reduced_dtype(self, inputs: Tensor) -> torch.dtype:
         if inputs.dtype != torch.float32 or self.precision == "float32":

@@ -306,3 +306,15 @@ def test_channels_are_composited():
 def test_parameter_groups():
     rows = ["means", "scales", "quats", "opacities", "albedos", "roughness", "f0"]
     assert list(make().parameter_groups()) == [*rows, "lamp", "diffuse_network"]
+
+
+def test_padding_of_reduced_products_changes_no_gradient():
+    network = DiffuseNetwork(16, 2, "bfloat16", torch.Generator().manual_seed(0))
+    inputs = [torch.rand(50, width, generator=torch.Generator().manual_seed(width)) for width in (3, 1, 3, 3)]
+    network(*inputs, True).sum().backward()
+    padded = [parameter.grad.clone() for parameter in network.parameters()]
+    network.zero_grad()
+    network(*(value.repeat(_ROWS // 50 + 1, 1)[:_ROWS] for value in inputs), True)[:50].sum().backward()
+    for parameter, gradient in zip(network.parameters(), padded, strict=True):
+        torch.testing.assert_close(parameter.grad, gradient, rtol=2e-2, atol=1e-3)
+    assert padded[-1].tolist() == [50.0] * 3
