@@ -38,9 +38,11 @@ def test_surfels_beside_3d_gaussians(scene):
 
 
 def test_the_training_step_of_every_method():
-    table = run("train_step.py", "--gaussians", 500, "--steps", 1, "--size", "48x36")
-    names = [row.split("|")[1].strip() for row in table.splitlines() if row.startswith("| ")][1:]
-    assert names[0] == "coliags" and sorted(names) == sorted(path.stem for path in METHODS.glob("*.yaml"))
+    """But of reim-nerf, whose networks are as large on the smallest scene."""
+    methods = sorted({path.stem for path in METHODS.glob("*.yaml")} - {"reim-nerf"})
+    options = ("--gaussians", 500, "--steps", 1, "--size", "48x36")
+    table = run("train_step.py", "--methods", ",".join(methods), *options)
+    assert [row.split("|")[1].strip() for row in table.splitlines() if row.startswith("| ")][1:] == methods
 
 
 @pytest.mark.parametrize("method", ["coliags", "3dgs"])
