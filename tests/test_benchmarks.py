@@ -55,6 +55,7 @@ def test_a_training_curve(method, tmp_path):
     assert all(row["elements"] > 0 and row["psnr"] > 0 and row["depth_mse"] >= 0 for row in rows)
 
 
+@pytest.mark.slow
 def test_all_methods_on_a_scene(tmp_path):
     write_wall(tmp_path / "wall")
     options = ("--data", tmp_path / "wall", "--out", tmp_path / "runs", "--steps", 3)
