@@ -26,7 +26,7 @@ from machine import describe_machine, markdown_table, write_results
 
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.outputs.colormaps import colorize_depth
-from coliags_plugin.outputs.image_files import read_depth_tiff, read_rgb, write_png
+from coliags_plugin.outputs.image_files import encode_jpeg, read_depth_tiff, read_rgb
 from coliags_plugin.reporting.run_data import EvaluatedRun, read_runs
 
 PAPER = "3dgs,2dgs,scaffold-gs,gaussian-pancakes,pr-endo,coliags,3dgs-depth,scaffold-gs-depth"
@@ -84,7 +84,7 @@ def main(options: Options) -> None:
     text = f"{header}; {options.jobs} runs at a time\n\n{markdown_table(rows)}\n"
     (options.out / "table.txt").write_text(text, encoding="utf-8")
     write_results(options.out / "table.json", rows)
-    write_png(options.out / "sheet.png", contact_sheet(runs, options))
+    (options.out / "sheet.jpg").write_bytes(encode_jpeg(contact_sheet(runs, options), quality=88))
     print(text)
 
 
@@ -147,7 +147,7 @@ def row(run: EvaluatedRun, options: Options) -> dict[str, Any]:
 
 
 def contact_sheet(runs: Sequence[EvaluatedRun], options: Options) -> np.ndarray:
-    """The truth and every run, one row each: a held-out and a rotated view, each beside its depth."""
+    """The truth and every run, one row each: a held-out and a rotated view, each beside its depth; half size."""
     chosen = [(name, frames) for name in ("test", "rotation") if (frames := _frames(runs[0].folder, name))]
     views = [(name, frames[len(frames) // 2]) for name, frames in chosen]
     rows = [_strip("truth", runs[0].folder, views, ("truth", "true_depth"), options)]
@@ -170,9 +170,9 @@ def _strip(
         if depth.is_file():
             shown = np.asarray(colorize_depth(read_depth_tiff(depth), (0.0, options.depth_limit)))
         cells.append(shown[: len(cells[-1])])
-    strip = np.ascontiguousarray(np.concatenate(cells, axis=1))
-    for color, width in (((0, 0, 0), 4), ((255, 255, 255), 1)):
-        cv2.putText(strip, title, (6, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.6, color, width, cv2.LINE_AA)
+    strip = cv2.resize(np.concatenate(cells, axis=1), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    cv2.rectangle(strip, (0, 0), (9 * len(title), 18), (0, 0, 0), cv2.FILLED)
+    cv2.putText(strip, title, (4, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
     return strip
 
 

@@ -63,8 +63,8 @@ def test_all_methods_on_a_scene(tmp_path):
     rows = json.loads((tmp_path / "runs" / "table.json").read_text())
     assert [row["method"] for row in rows] == ["coliags", "3dgs"]
     assert all(row["peak MiB"] > 100 and float(row["PSNR dB"]) > 0 and row["steps"] >= 1 for row in rows)
-    sheet = read_rgb(tmp_path / "runs" / "sheet.png")
-    assert sheet.shape == (3 * 24, 2 * 32, 3)  # truth and two runs; colour and depth of the one test set
+    sheet = read_rgb(tmp_path / "runs" / "sheet.jpg")
+    assert sheet.shape == (3 * 12, 2 * 16, 3)  # truth and two runs; colour and depth of the one test set
     stamp = (tmp_path / "runs" / "coliags" / "config.yaml").stat().st_mtime_ns
     run("all_methods.py", *options, "--methods", "coliags", "--timed", "3dgs")
     assert (tmp_path / "runs" / "coliags" / "config.yaml").stat().st_mtime_ns == stamp
