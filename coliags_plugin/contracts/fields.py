@@ -50,7 +50,7 @@ class Field(nn.Module, ABC):
 
     @property
     def length_unit(self) -> float | Tensor:
-        """Scene units in one unit of the field's own coordinates; 1 where it uses the scene's. []"""
+        """Length of one unit of the field's own coordinates, scene units; 1 where it uses the scene's. []"""
         return 1.0
 
     def before_step(self, step: int, schedule: Schedule) -> None:
@@ -137,10 +137,10 @@ class RadianceField(Field, RadianceLevel):
 
     @property
     def coarse_level(self) -> RadianceLevel:
-        """The level that decides where on a ray the field itself is sampled; by default the field itself."""
+        """Coarse network, whose weights place the importance samples on a ray; by default the field itself."""
         return self
 
     @property
     def ray_bounds(self) -> Float[Tensor, "2"] | None:
-        """Distances from a camera between which rays meet the surface, scene units; None where not known. [2]"""
+        """Near and far ends of the sampled rays, distances from the camera in scene units; None where not known. [2]"""
         return None

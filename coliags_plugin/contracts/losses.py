@@ -36,10 +36,10 @@ class Loss(ABC):
         return frozenset()
 
     def check(self, model: TrainedModel) -> None:  # noqa: B027 (optional)
-        """Refuse a model that lacks what the term reads.
+        """Check, before training, that the model has what the term reads.
 
         Raises:
-            InputError: See above.
+            InputError: It lacks something.
         """
 
     @abstractmethod

@@ -109,7 +109,7 @@ class Renderer(ABC):
         return self.render(field, camera, wants, pixels)
 
     def check_field(self, field: Any) -> None:  # noqa: B027 (optional)
-        """Refuse, before training, a field that lacks what the renderer's options need of it.
+        """Check, before training, that a field has what the renderer's options need of it.
 
         Raises:
             InputError: See above.

@@ -33,11 +33,11 @@ class Lamp(Settings):
         return not any(self.offset)
 
     def position(self, camera: Camera) -> Float[Tensor, "3"]:
-        """Where it is in the world, scene units. [3]"""
+        """Position of the lamp in the world, scene units. [3]"""
         return camera.center + camera.camera_to_world[:3, :3] @ camera.camera_to_world.new_tensor(self.offset)
 
     def axis(self, camera: Camera) -> Float[Tensor, "3"]:
-        """Unit vector in the world along which it shines most. [3]
+        """Axis of the lamp, the direction of most light, as a unit vector in the world. [3]
 
         Turned by (a, b) degrees it is (sin b cos a, -sin a, cos b cos a) in camera axes: a > 0 turns it up (towards
         -y), b > 0 to the right (towards +x).

@@ -29,7 +29,17 @@ def shortest_axes(quats_wxyz: Float[Tensor, "N 4"], scales: Float[Tensor, "N S"]
     """
     if scales.shape[1] == 2:
         return third_axes(quats_wxyz)
-    return rotation_matrices(quats_wxyz).gather(2, scales.argmin(1)[:, None, None].expand(-1, 3, 1)).squeeze(2)
+    return shortest_columns(rotation_matrices(quats_wxyz), scales)
+
+
+def shortest_columns(rotations: Float[Tensor, "N 3 3"], scales: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    """Column of each rotation matrix that belongs to the smallest of three scales; the choice is not differentiable.
+
+    Args:
+        rotations: [N, 3, 3]
+        scales: Or their logarithms. [N, 3]
+    """
+    return rotations.gather(2, scales.argmin(1)[:, None, None].expand(-1, 3, 1)).squeeze(2)
 
 
 def third_axes(quats_wxyz: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3"]:

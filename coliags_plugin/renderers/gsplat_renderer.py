@@ -19,9 +19,10 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput, Splats
-from coliags_plugin.core.rotations import rotation_matrices
+from coliags_plugin.core.rotations import shortest_axes
 from coliags_plugin.renderers import gsplat_library
 from coliags_plugin.renderers.checks import check_gaussian_outputs, is_surfels
+from coliags_plugin.renderers.projection import facing
 from coliags_plugin.renderers.splatting import SplattingRenderer, SplattingSettings
 from coliags_plugin.renderers.torch_renderer import TorchRendererSettings, render_gaussians
 
@@ -225,11 +226,8 @@ def _tiles(
 
 def _facing_normals(gaussians: Gaussians, sight: Float[Tensor, "N 3"], camera: Camera) -> Float[Tensor, "N 3"]:
     """Shortest axis of each Gaussian in camera axes, oriented towards the camera. [N, 3]"""
-    shortest = gaussians.scales.argmin(-1)
-    axes = rotation_matrices(gaussians.quats_wxyz)
-    normals = axes.gather(2, shortest[:, None, None].expand(-1, 3, 1)).squeeze(-1)
-    away = (normals * sight).sum(-1, keepdim=True) > 0
-    return torch.where(away, -normals, normals) @ camera.camera_to_world[:3, :3]
+    normals = facing(shortest_axes(gaussians.quats_wxyz, gaussians.scales), sight)
+    return normals @ camera.camera_to_world[:3, :3]
 
 
 @torch.no_grad()

@@ -14,7 +14,7 @@ from torch import Tensor
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
-from coliags_plugin.core.rotations import rotation_matrices
+from coliags_plugin.core.rotations import rotation_matrices, shortest_columns
 
 #: Margin beyond the image, relative to half the field of view, within which the Jacobian is not clamped.
 JACOBIAN_MARGIN = 0.3
@@ -118,14 +118,17 @@ def facing_normals(projected: ProjectedGaussians, scales: Float[Tensor, "N 3"]) 
 
     Differentiable in the rotations; the choice of axis and sign is not.
     """
-    shortest = scales.argmin(-1)
-    axes = projected.rotations.gather(2, shortest[:, None, None].expand(-1, 3, 1)).squeeze(-1)
-    return facing(axes, projected.means_camera)
+    return facing(shortest_columns(projected.rotations, scales), projected.means_camera)
 
 
-def facing(axes: Float[Tensor, "N 3"], means_camera: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-    """Axes at points, both in camera axes, turned around where they point away from the camera. [N, 3]"""
-    away = (axes * means_camera).sum(-1, keepdim=True) > 0
+def facing(axes: Float[Tensor, "N 3"], sight: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    """Axes turned around where they point away from the camera. [N, 3]
+
+    Args:
+        axes: In any frame. [N, 3]
+        sight: From the camera to where the axes are, in the same frame. [N, 3]
+    """
+    away = (axes * sight).sum(-1, keepdim=True) > 0
     return torch.where(away, -axes, axes)
 
 
