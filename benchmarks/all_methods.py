@@ -94,9 +94,9 @@ def complete(name: str, steps: int, options: Options) -> None:
     if record.is_file():
         return
     resume = ["--resume"] if (run / "config.yaml").is_file() else []
-    seconds, peak = call(["train", name, *_where(options, run), "--steps", str(steps), *resume], options)
+    cost = call(["train", name, *_where(options, run), "--steps", str(steps), *resume], options)
     call(["eval", str(run)], options)
-    record.write_text(json.dumps({"steps": steps, "seconds": seconds, "peak_mib": peak}), encoding="utf-8")
+    record.write_text(json.dumps({"steps": steps, **cost}), encoding="utf-8")
 
 
 def seconds_per_step(name: str, options: Options) -> float:
@@ -111,8 +111,8 @@ def _where(options: Options, run: Path) -> list[str]:
     return ["--data", str(options.data), "--output", str(run), "--seed", str(options.seed)]
 
 
-def call(argv: Sequence[str], options: Options) -> tuple[float, float]:
-    """Run one command of coliags; its wall time in seconds, and its peak resident memory in MiB."""
+def call(argv: Sequence[str], options: Options) -> dict[str, float]:
+    """Run one command of coliags; its wall time and processor time in seconds, and its peak resident memory in MiB."""
     threads = max(1, (os.cpu_count() or 1) // options.jobs)
     environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
     began = time.monotonic()
@@ -122,11 +122,15 @@ def call(argv: Sequence[str], options: Options) -> tuple[float, float]:
     child.returncode = os.waitstatus_to_exitcode(status)
     if child.returncode:
         raise SystemExit(f"coliags {' '.join(argv)} ended with status {child.returncode}")
-    return time.monotonic() - began, usage.ru_maxrss / 1024
+    return {
+        "seconds": time.monotonic() - began,
+        "processor_seconds": usage.ru_utime + usage.ru_stime,
+        "peak_mib": usage.ru_maxrss / 1024,
+    }
 
 
 def spent(name: str, options: Options) -> dict[str, Any]:
-    """The record of a method: steps, seconds, peak_mib."""
+    """The record of a method: steps, seconds, processor_seconds, peak_mib."""
     record: dict[str, Any] = json.loads((options.out / f"{name}.json").read_text(encoding="utf-8"))
     return record
 
@@ -142,6 +146,7 @@ def row(run: EvaluatedRun, options: Options) -> dict[str, Any]:
         "steps": record["steps"],
         "Gaussians drawn": drawn,
         "seconds": round(record["seconds"]),
+        "processor seconds": round(record["processor_seconds"]),
         "peak MiB": round(record["peak_mib"]),
     }
 
