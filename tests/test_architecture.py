@@ -18,7 +18,7 @@ LAYERS = (
     {"contracts"},
     {"poses"},
     {"datamanagers", "fields", "renderers", "modules", "strategies", "losses", "metrics"},
-    {"outputs"},
+    {"outputs", "results"},
     {"engine", "phantom", "reconstruction"},
     {"data_check", "method_check", "reporting"},
     {"api"},

@@ -1,0 +1,155 @@
+"""Record of one evaluated run: the content of a results file.
+
+A results file is one JSON object. It holds the raw value of every metric of every frame, and hashes of what was
+compared, so that tables and statistics can be made from it alone, without the run folder.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict
+
+#: Of the schema below; incremented whenever a reader of the older version would misread a newer file.
+VERSION = 1
+
+Direction = Literal["higher", "lower"]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class ProtocolRecord(_Part):
+    """Evaluation protocol: results whose name or version differ are not comparable."""
+
+    name: str
+    version: int
+    description: str = ""
+
+
+class SceneRecord(_Part):
+    """Data of a run.
+
+    Attributes:
+        name: Of the scene.
+        fingerprint: Hash of its files.
+        split: Name of the split.
+        train: Names of the training frames.
+        size: Width and height of the evaluated images, px.
+    """
+
+    name: str
+    fingerprint: str
+    split: str
+    train: tuple[str, ...]
+    size: tuple[int, int]
+
+
+class MetricRecord(_Part):
+    """What a metric's values mean."""
+
+    unit: str
+    direction: Direction
+
+
+class ProfileRecord(_Part):
+    """Errors of a test set by a property of the pixel: distance to the camera, or angle to the optical axis.
+
+    Attributes:
+        unit: Of the edges: ``mm`` or ``degrees``.
+        edges: Of the bins, ascending. [B + 1]
+        pixels: Pixels with known depth in each bin. [B]
+        rgb_mse: Mean squared colour error of those pixels, colours in [0, 1]; None where there are none. [B]
+        depth_mse: Mean squared depth error of those pixels, mm^2; None where there are none. [B]
+    """
+
+    unit: str
+    edges: tuple[float, ...]
+    pixels: tuple[int, ...]
+    rgb_mse: tuple[float | None, ...]
+    depth_mse: tuple[float | None, ...]
+
+
+class SetRecord(_Part):
+    """Evaluation of one test set.
+
+    Attributes:
+        frames: Names, in video order. [F]
+        values: Raw values by metric, None where a frame has none. [F] each
+        reasons: Why values are missing, by metric.
+        predictions_sha256: Hash of the images and depths as rendered.
+        truth_sha256: Hash of those that they were compared with.
+        profiles: By property: ``distance``, ``angle``; empty without true depth.
+    """
+
+    frames: tuple[str, ...]
+    values: dict[str, tuple[float | None, ...]]
+    reasons: dict[str, str] = {}
+    predictions_sha256: str
+    truth_sha256: str
+    profiles: dict[str, ProfileRecord] = {}
+
+    def mean(self, metric: str) -> float | None:
+        """Mean over the frames that have a metric; None where none has."""
+        known = [value for value in self.values.get(metric, ()) if value is not None]
+        return sum(known) / len(known) if known else None
+
+
+class CostRecord(_Part):
+    """What a run cost; comparable between runs on one device only. None: not measured.
+
+    Attributes:
+        device: Name of the processor or GPU.
+        threads: CPU threads it was given.
+        train_seconds: Time of training, all resumptions together, without reading data and evaluation.
+        processor_seconds: CPU time of the same.
+        peak_memory_mib: Largest resident memory of the training process, or allocated memory of the GPU.
+        render_fps: Views of the test sets rendered in a second, at their size.
+        gaussians: Mean number of Gaussians drawn in a test view; None for radiance fields.
+        checkpoint_bytes: Size of the last checkpoint.
+        seconds_to_psnr: Training seconds after which the logged PSNR, smoothed, first reached a mark in dB.
+    """
+
+    device: str
+    threads: int | None = None
+    train_seconds: float | None = None
+    processor_seconds: float | None = None
+    peak_memory_mib: float | None = None
+    render_fps: float | None = None
+    gaussians: float | None = None
+    checkpoint_bytes: int | None = None
+    seconds_to_psnr: dict[str, float | None] = {}
+
+
+class Result(_Part):
+    """One run, evaluated under one protocol.
+
+    Attributes:
+        version: Of the schema.
+        key: Hash of everything that determines the result; see :mod:`coliags_plugin.results.identity`.
+        metrics: Metrics by name, in the protocol's order.
+        metrics_sha256: Hash of the raw values of all test sets.
+        steps: Training steps taken.
+        seed: Of all random generators of the run.
+        config: The resolved method config.
+        sets: Test sets by name; ``test`` is the split's own.
+        cost: What the run cost.
+        software: Versions of package, Python and libraries.
+        provenance: Further provenance of the run.
+    """
+
+    version: int = VERSION
+    key: str
+    method: str
+    scene: SceneRecord
+    protocol: ProtocolRecord
+    seed: int
+    steps: int
+    metrics: dict[str, MetricRecord]
+    sets: dict[str, SetRecord]
+    metrics_sha256: str
+    cost: CostRecord
+    config: dict[str, Any]
+    software: dict[str, Any]
+    provenance: dict[str, Any] = {}
