@@ -41,7 +41,7 @@ class Finding:
 
 
 def examine() -> list[Finding]:
-    """Check everything that training depends on."""
+    """Check everything that training and evaluation depend on."""
     cuda = torch.cuda.is_available()
     findings = [
         Finding("coliags_plugin", __version__),

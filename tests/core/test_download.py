@@ -293,18 +293,19 @@ def test_the_proxy_of_the_environment_is_asked(server, target, monkeypatch):
     assert server.requests == [("CONNECT", "weights.invalid:443", None)]
 
 
-def test_a_full_disk_keeps_what_fitted(server, target, part):
+@pytest.mark.parametrize("room", [100_000, len(DATA) - 1])
+def test_a_full_disk_keeps_what_fitted(server, target, part, room):
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
     try:
         message = refusal(server, target)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert f"cannot write to {part}" in message and "after 100000 bytes" in message and "Make room" in message
-    assert part.read_bytes() == DATA[:100_000]
+    assert f"cannot write to {part}" in message and f"after {room} bytes" in message and "Make room" in message
+    assert part.read_bytes() == DATA[:room]
     fetch(server, target)
     assert target.read_bytes() == DATA
-    assert server.requests[1] == ("GET", PATH, "bytes=100000-")
+    assert server.requests[1] == ("GET", PATH, f"bytes={room}-")
 
 
 @pytest.mark.parametrize("fault", ["file for a folder", "folder for the part", "folder that is locked"])
