@@ -19,6 +19,7 @@ from coliags_plugin.cli.phantom import Phantom
 from coliags_plugin.cli.poses import Poses
 from coliags_plugin.cli.render import Render
 from coliags_plugin.cli.report import Report
+from coliags_plugin.cli.results import Results
 from coliags_plugin.cli.run import run_command
 from coliags_plugin.cli.train import Train
 from coliags_plugin.cli.weights import Weights
@@ -29,6 +30,7 @@ Command = (
     | Annotated[Evaluate, tyro.conf.subcommand("eval")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Report, tyro.conf.subcommand("report")]
+    | Annotated[Results, tyro.conf.subcommand("results")]
     | Annotated[Poses, tyro.conf.subcommand("poses")]
     | Annotated[List, tyro.conf.subcommand("list")]
     | Annotated[Config, tyro.conf.subcommand("config")]

@@ -1,0 +1,75 @@
+"""Summaries of a result: the content of ``metrics.json`` and ``per_frame.csv``."""
+
+from __future__ import annotations
+
+import csv
+import io
+from typing import Any
+
+from coliags_plugin.results.record import SEEN_SUFFIX, Result
+
+
+def means_summary(result: Result) -> dict[str, Any]:
+    """Content of ``metrics.json``: means per test set, those of the main set also at the top, with their reasons."""
+    main = result.sets[result.main_set]
+    protocols_own = [name for name in result.metrics if not _over_seen_pixels(name, result)]
+    reasons: dict[str, str] = {}
+    for part in reversed(result.sets.values()):
+        reasons |= part.reasons
+    return {
+        "protocol": result.protocol.model_dump(),
+        "method": result.method,
+        "scene": result.scene.name,
+        "step": result.steps,
+        "untrained_views": result.provenance.get("untrained_views", {}),
+        **{name: main.mean(name) for name in protocols_own},
+        "reasons": reasons,
+        "directions": {name: metric.direction for name, metric in result.metrics.items()},
+        "units": {name: metric.unit for name, metric in result.metrics.items()},
+        "sets": {
+            name: {"frames": len(part.frames), **{metric: part.mean(metric) for metric in result.metrics}}
+            for name, part in result.sets.items()
+        },
+        "software": result.software,
+    }
+
+
+def _over_seen_pixels(name: str, result: Result) -> bool:
+    return name.endswith(SEEN_SUFFIX) and name.removesuffix(SEEN_SUFFIX) in result.metrics
+
+
+def per_frame_table(result: Result) -> str:
+    """Content of ``per_frame.csv``: one line per frame and one column per metric, empty where a frame has none."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["set", "frame", *result.metrics])
+    for set_name, part in result.sets.items():
+        for index, frame in enumerate(part.frames):
+            values = (part.values[name][index] if name in part.values else None for name in result.metrics)
+            writer.writerow([set_name, frame, *("" if value is None else repr(value) for value in values)])
+    return text.getvalue()
+
+
+def facts(result: Result) -> dict[str, str]:
+    """What was run and what it cost, in words; nothing about what was not measured."""
+    cost = result.cost
+    threads = "" if cost.threads is None else f", {cost.threads} threads"
+    reached = {mark: seconds for mark, seconds in cost.seconds_to_psnr.items() if seconds is not None}
+    found = {
+        "key": result.key,
+        "seed": str(result.seed),
+        "split": f"{result.scene.split or 'unnamed'}, {len(result.scene.train)} training frames",
+        "trained on": f"{cost.device}{threads}",
+        "training": _said(cost.train_seconds, "{:.1f} s"),
+        "psnr reached": ", ".join(f"{mark} dB after {seconds:.1f} s" for mark, seconds in reached.items()),
+        "processor time": _said(cost.processor_seconds, "{:.1f} s"),
+        "peak memory": _said(cost.peak_memory_mib, "{:.0f} MiB"),
+        "rendering": _said(cost.render_fps, "{:.2f} views a second"),
+        "gaussians": _said(cost.gaussians, "{:.0f} in a view"),
+        "checkpoint": _said(None if cost.checkpoint_bytes is None else cost.checkpoint_bytes / 2**20, "{:.1f} MiB"),
+    }
+    return {name: text for name, text in found.items() if text}
+
+
+def _said(value: float | None, form: str) -> str:
+    return "" if value is None else form.format(value)
