@@ -56,7 +56,7 @@ class Options:
     """Folder of the runs, of their table as Markdown and JSON, and of the contact sheet."""
     methods: str = PAPER
     """Methods by name, comma separated."""
-    timed: str = "reim-nerf"
+    timed: str = "reim-nerf-small"
     """Methods to train for as long as the slowest of the others (processor time), comma separated; empty for none."""
     steps: int = 3000
     """Steps of the others."""
