@@ -21,6 +21,7 @@ from coliags_plugin.config.components import (
     StrategyNode,
 )
 from coliags_plugin.config.method_files import method_files
+from coliags_plugin.config.origins import errors_with_origins
 from coliags_plugin.config.yaml_tree import Node, dump, merge, override_all, read_tree
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.settings import Settings, refuse_zero_ends
@@ -130,7 +131,7 @@ def load_method(method: str, overrides: Iterable[str] = ()) -> LoadedMethod:
     try:
         config = MethodConfig.model_validate(tree.plain())
     except ValidationError as error:
-        raise InputError("\n".join(_describe(error, tree))) from error
+        raise InputError("\n".join(errors_with_origins(error, tree))) from error
     return LoadedMethod(method_name(method), config, tree)
 
 
@@ -182,23 +183,6 @@ def _resolve(path: Path, seen: tuple[Path, ...]) -> Node:
     inherited = {key: node for key, node in parent.value.items() if key != "description"}
     own = {key: node for key, node in tree.value.items() if key != "base"}
     return merge(Node(inherited, parent.origin), Node(own, tree.origin))
-
-
-#: Errors of this package, with messages of their own.
-_TELLING = frozenset({"no_name", "unknown_key", "unknown_component", "no_settings", "value_error", "zero_end"})
-
-
-def _describe(error: ValidationError, tree: Node) -> list[str]:
-    lines = []
-    for item in error.errors():
-        path = [key for key in item["loc"] if isinstance(key, str)]
-        message = item["msg"].removeprefix("Value error, ")
-        if item["type"] == "missing":
-            message = "is missing"
-        elif item["type"] not in _TELLING:
-            message = f"{message}, got {item['input']!r}"
-        lines.append(f"{tree.find(path).origin}: {'.'.join(path) or 'config'}: {message.strip()}")
-    return lines
 
 
 def _annotated(plain: Any, tree: Node, depth: int) -> Sequence[str]:
