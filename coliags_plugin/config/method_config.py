@@ -117,22 +117,33 @@ class LoadedMethod:
         return "\n".join(_annotated(self.config.model_dump(), self.tree, 0)) + "\n"
 
 
-def load_method(method: str, overrides: Iterable[str] = ()) -> LoadedMethod:
+def load_method(method: str, overrides: Iterable[str] = (), data_format: str | None = None) -> LoadedMethod:
     """Resolve a method config.
 
     Args:
         method: A name (``coliags``, ``ablations/imia``), or the path of a YAML file.
         overrides: ``key.path=value`` assignments, applied last.
+        data_format: Name of a data manager that takes the place of the method's, with all its options; None: none does.
 
     Raises:
         InputError: No such method, or it is not valid; names file, line and key.
     """
     tree = method_tree(method, overrides)
+    if data_format is not None:
+        tree = _with_data_format(tree, data_format)
     try:
         config = MethodConfig.model_validate(tree.plain())
     except ValidationError as error:
         raise InputError("\n".join(errors_with_origins(error, tree))) from error
     return LoadedMethod(method_name(method), config, tree)
+
+
+def _with_data_format(tree: Node, data_format: str) -> Node:
+    """The tree with another name of the data manager, whose options stay."""
+    manager = tree.find(["datamanager"])
+    options = manager.value if manager.is_mapping else {}
+    name = Node(data_format, "recognised from the data, or --format")
+    return Node({**tree.value, "datamanager": Node({**options, "name": name}, manager.origin)}, tree.origin)
 
 
 def method_name(method: str) -> str:
