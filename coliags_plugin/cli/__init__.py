@@ -10,6 +10,7 @@ from typing import Annotated
 import tyro
 
 from coliags_plugin.cli.check import Check
+from coliags_plugin.cli.compare import Compare
 from coliags_plugin.cli.config import Config
 from coliags_plugin.cli.data import Data
 from coliags_plugin.cli.doctor import Doctor
@@ -27,6 +28,7 @@ Command = (
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("eval")]
     | Annotated[Render, tyro.conf.subcommand("render")]
+    | Annotated[Compare, tyro.conf.subcommand("compare")]
     | Annotated[Report, tyro.conf.subcommand("report")]
     | Annotated[Poses, tyro.conf.subcommand("poses")]
     | Annotated[List, tyro.conf.subcommand("list")]

@@ -68,7 +68,7 @@ class How:
     jobs: int | None = None
     threads: int | None = None
     device: str = "auto"
-    executor: ExecutorName = "local"
+    executor: str = "local"
     retries: int = 2
     save_seconds: float = 60.0
 
@@ -169,7 +169,9 @@ def _executor(how: How) -> Executor:
         raise InputError(f"--retries {how.retries}", "0 or more")
     if how.executor not in get_args(ExecutorName):
         known = get_args(ExecutorName)
-        raise InputError(f"no executor '{how.executor}'", f"one of {', '.join(known)}", did_you_mean(how.executor, known))
+        raise InputError(
+            f"no executor '{how.executor}'", f"one of {', '.join(known)}", did_you_mean(how.executor, known)
+        )
     cpus = len(os.sched_getaffinity(0))
     gpus = _gpus(how.device)
     jobs = how.jobs or len(gpus) or cpus

@@ -120,8 +120,8 @@ class Failure(_Part):
 class ComparisonFolder:
     """A folder that comparisons accumulate in.
 
-    ``plan.json``; ``runs/`` with ordinary run folders; ``results/`` with one results file per finished cell, which alone
-    make it count as done; ``failures/``; ``logs/``.
+    ``plan.json``; ``runs/`` with ordinary run folders; ``results/`` with a results file per finished cell, which alone
+    make cells count as done; ``failures/``; ``logs/``.
     """
 
     def __init__(self, path: Path) -> None:
@@ -326,6 +326,11 @@ class Finished:
         self._folder = folder
         self._by_path = dict(results)
         self._by_key = {result.key: result for result in results.values()}
+
+    @property
+    def results(self) -> list[Result]:
+        """All of them."""
+        return list(self._by_path.values())
 
     def of(self, cell: Cell) -> Result | None:
         """The result of a cell; under another name where another method is the same; None where it is not done."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -62,7 +61,7 @@ def make_cells(request: Request, recorded: RecordedFingerprint | None = None) ->
     """
     protocol = registry.protocols.get(request.protocol)
     fingerprints = _Fingerprints(recorded or (lambda scene: None))
-    cells = []
+    cells: list[Cell] = []
     with _warnings_only():
         for scene in request.scenes:
             for split in request.splits or (None,):
@@ -86,7 +85,7 @@ def _seeds(
     own, used = (_split(each) for each in (_config(scene, variant.method, scene.overrides), config))
     label = scene.name if used in (None, own) else f"{scene.name}-{used}"
     fingerprint = fingerprints.of(scene, config.datamanager)
-    plain = json.loads(config.model_dump_json())
+    plain = config.model_dump()
     for seed in request.seeds:
         keys = None
         if fingerprint is not None:

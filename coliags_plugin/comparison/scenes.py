@@ -118,8 +118,9 @@ def _benchmark(name: str) -> tuple[Benchmark | None, str | None]:
 def _scenes_of(benchmark: Benchmark, only: str | None, data: Path) -> list[SceneSource]:
     scenes = benchmark.settings.scenes
     if only is not None and only not in scenes:
+        known = ", ".join(scenes)
         raise InputError(
-            f"benchmark '{benchmark.name}' has no scene '{only}'", f"one of {', '.join(scenes)}", did_you_mean(only, scenes)
+            f"benchmark '{benchmark.name}' has no scene '{only}'", f"one of {known}", did_you_mean(only, scenes)
         )
     return [
         SceneSource(
@@ -178,4 +179,3 @@ def _check_same_phantom(source: SceneSource) -> None:
             "the benchmark's phantom, or no folder",
             "Remove it, or choose another --data",
         )
-
