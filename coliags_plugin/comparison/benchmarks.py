@@ -24,7 +24,9 @@ _NAME = re.compile(r"[\w.-]*\w")
 class SceneEntry(Settings):
     """One scene of a benchmark: a folder of a dataset, or a phantom that is made when it is missing."""
 
-    folder: str | None = Field(None, description="Folder, relative to that of the benchmark's data; default: its name.")
+    folder: str | tuple[str, ...] = Field(
+        (), description="Folder in that of the benchmark's data, or names of which one is there; default: its name."
+    )
     phantom: dict[str, Any] | None = Field(None, description="Settings of the phantom to make (docs/phantom.md 6).")
     format: str | None = Field(None, description="Data manager; default: the benchmark's.")
     options: dict[str, Any] = Field(default_factory=dict, description="Options of the data manager.")
@@ -38,6 +40,10 @@ class SceneEntry(Settings):
             except InputError as error:
                 raise ValueError(str(error)) from error
         return options
+
+    def folders(self, name: str) -> tuple[str, ...]:
+        """Names that the scene's folder may have, the first being the usual one."""
+        return ((self.folder,) if isinstance(self.folder, str) else self.folder) or (name,)
 
     @property
     def phantom_settings(self) -> PhantomSettings | None:

@@ -107,23 +107,48 @@ def compare(
     """
     how = how or How()
     request = make_request(methods, scenes, data, seeds, protocol, splits, steps, overrides)
-    executor = _executor(how)
-    folder = ComparisonFolder(Path(output))
-    folder.check_extends(request)
+    return carry_out(request, ComparisonFolder(Path(output)), make_executor(how), how)
+
+
+def carry_out(request: Request, folder: ComparisonFolder, executor: Executor, how: How) -> Comparison:
+    """Run what is missing.
+
+    Args:
+        request: What is asked for.
+        folder: Where.
+        executor: Where workers run.
+        how: The other options.
+
+    Raises:
+        InputError: See :func:`compare`.
+        InterruptedRunError: See :func:`compare`.
+    """
+    cells = plan_cells(request, folder)
     with folder.held():
         executor.check(folder.path)
-        cells = make_cells(request, folder.recorded_fingerprint)
         finished = folder.finished()
         missing = {cell.scene.name: cell.scene for cell in cells if finished.of(cell) is None}
-        with progress_callback() as progress:
-            make_phantoms(list(missing.values()), progress)
-        cells = make_cells(request, folder.recorded_fingerprint)
+        if any(not scene.is_there for scene in missing.values()):
+            with progress_callback() as progress:
+                make_phantoms(list(missing.values()), progress)
+            cells = make_cells(request, folder.recorded_fingerprint)
         folder.record(request, cells)
         sweep = Sweep(folder, executor, how.device, how.retries, how.save_seconds)
         with live_table(folder) as show:
             failures = run_cells(sweep, cells, finished, Estimates(finished.results), show)
         results = [result for cell in cells if (result := finished.of(cell)) is not None]
     return Comparison(folder.path, cells, results, failures)
+
+
+def plan_cells(request: Request, folder: ComparisonFolder) -> list[Cell]:
+    """The cells that are asked for, after what can be checked without writing anything.
+
+    Raises:
+        InputError: A method, split or change is not valid, or the folder is of something else.
+    """
+    folder.check()
+    folder.check_extends(request)
+    return make_cells(request, folder.recorded_fingerprint)
 
 
 def make_request(
@@ -161,7 +186,12 @@ def make_request(
     return Request(variants, found, range(seeds), protocol, tuple(dict.fromkeys(splits)), steps, tuple(overrides))
 
 
-def _executor(how: How) -> Executor:
+def make_executor(how: How) -> Executor:
+    """The executor of a comparison.
+
+    Raises:
+        InputError: An option is not valid, or the executor cannot be used.
+    """
     for name, number in (("jobs", how.jobs), ("threads", how.threads)):
         if number is not None and number < 1:
             raise InputError(f"--{name} {number}", "at least 1")

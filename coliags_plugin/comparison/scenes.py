@@ -109,8 +109,8 @@ def _benchmark(name: str) -> tuple[Benchmark | None, str | None]:
     files = benchmark_files()
     if name in files or name.endswith((".yaml", ".yml")):
         return load_benchmark(name), None
-    first, _, scene = name.partition("/")
-    if first in files and scene and not Path(name).is_dir():
+    first, _, scene = name.rpartition("/")
+    if (first in files or first.endswith((".yaml", ".yml"))) and scene and not Path(name).is_dir():
         return load_benchmark(first), scene
     return None, None
 
@@ -125,7 +125,7 @@ def _scenes_of(benchmark: Benchmark, only: str | None, data: Path) -> list[Scene
     return [
         SceneSource(
             name,
-            (data / (entry.folder or name)).resolve(),
+            _first_there([(data / folder).resolve() for folder in entry.folders(name)]),
             benchmark.overrides(name),
             entry.format or benchmark.settings.format,
             entry.phantom_settings,
@@ -133,6 +133,10 @@ def _scenes_of(benchmark: Benchmark, only: str | None, data: Path) -> list[Scene
         for name, entry in scenes.items()
         if only in (None, name)
     ]
+
+
+def _first_there(paths: Sequence[Path]) -> Path:
+    return next((path for path in paths if path.is_dir()), paths[0])
 
 
 def _folder(name: str) -> SceneSource:

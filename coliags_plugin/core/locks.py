@@ -40,8 +40,8 @@ def locked(file: Path, wait: float = 0.0, waiting: Callable[[str], None] | None 
         raise not_writable(file.parent, error) from error
     try:
         _acquire(handle, wait, waiting)
-        os.ftruncate(handle, 0)
-        os.pwrite(handle, f"process {os.getpid()} on {socket.gethostname()}".encode(), 0)
+        holder = f"process {os.getpid()} on {socket.gethostname()}".encode()
+        os.ftruncate(handle, os.pwrite(handle, holder, 0))
         yield
     finally:
         os.close(handle)
