@@ -4,14 +4,24 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from coliags_plugin.api import evaluate, load_run, load_scene, relight, train
+    from coliags_plugin.api.runs import Run, load_run
+    from coliags_plugin.api.scenes import load_scene, make_phantom
+    from coliags_plugin.api.training import train
 
 __version__ = "0.1.0"
-__all__ = ["evaluate", "load_run", "load_scene", "relight", "train"]
+__all__ = ["Run", "load_run", "load_scene", "make_phantom", "train"]
+
+#: Module of the API that has each name.
+_HOMES = {"Run": "runs", "load_run": "runs", "load_scene": "scenes", "make_phantom": "scenes", "train": "training"}
 
 
 def __getattr__(name: str) -> Any:
-    """A function of :mod:`coliags_plugin.api`, imported on first use, as torch takes a second to load."""
-    if name in __all__:
-        return getattr(import_module("coliags_plugin.api"), name)
+    """A name of :mod:`coliags_plugin.api`, imported on first use, so that importing the package takes no time."""
+    if name in _HOMES:
+        return getattr(import_module(f"coliags_plugin.api.{_HOMES[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """The names of the API too, for completion."""
+    return sorted({*globals(), *__all__})

@@ -22,7 +22,7 @@ from coliags_plugin.config.components import (
 )
 from coliags_plugin.config.method_files import method_files
 from coliags_plugin.config.origins import errors_with_origins
-from coliags_plugin.config.yaml_tree import Node, dump, merge, override_all, read_tree
+from coliags_plugin.config.yaml_tree import Node, dump, dump_inline, merge, override_all, read_tree
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.settings import Settings, refuse_zero_ends
 
@@ -206,6 +206,6 @@ def _annotated(plain: Any, tree: Node, depth: int) -> Sequence[str]:
             lines.extend(_annotated(value, node or Node({}, ""), depth + 1))
         else:
             origin = node.origin if node is not None else "default"
-            text = dump([value]).strip()[1:-1] if not isinstance(value, (list, tuple, dict)) else dump(value).strip()
+            text = dump_inline(value)
             lines.append(f"{indent}{key}: {text}  # {origin}")
     return lines

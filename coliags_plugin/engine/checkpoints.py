@@ -23,6 +23,7 @@ from coliags_plugin.core.files import atomic_folder
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.model import Model, make_view_modules
 from coliags_plugin.engine.optimizers import Optimizers
+from coliags_plugin.engine.run_folder import checkpoints_in_order
 
 logger = logging.getLogger(__name__)
 
@@ -100,13 +101,13 @@ def _check_finite(tensors: Mapping[str, Tensor], step: int) -> None:
 
 def newest_checkpoint(folder: Path) -> Path | None:
     """The checkpoint of the highest step; None where there is none."""
-    found = _in_order(folder)
+    found = checkpoints_in_order(folder)
     return found[-1] if found else None
 
 
 def keep_newest(folder: Path, count: int) -> None:
     """Remove all checkpoints but so many of the highest steps."""
-    for path in _in_order(folder)[:-count]:
+    for path in checkpoints_in_order(folder)[:-count]:
         shutil.rmtree(path)
 
 
@@ -127,12 +128,6 @@ def set_damaged_aside(folder: Path, method: str) -> int:
             logger.warning("%s", error)
             newest.rename(newest.with_name(f"damaged-{newest.name}-{time.time_ns()}"))
     return 0
-
-
-def _in_order(folder: Path) -> list[Path]:
-    """The folder's checkpoints, by their steps."""
-    found = [path.parent for path in folder.glob("step-*/state.json")]
-    return sorted(found, key=lambda path: int(path.name.split("-")[1]))
 
 
 def latest_checkpoint(folder: Path) -> Path:

@@ -16,6 +16,27 @@ FORMAT = 1
 
 
 @dataclass(frozen=True)
+class RunIdentity:
+    """What a run is, from its provenance.
+
+    Attributes:
+        method: Name of its method.
+        scene_name: Name of its scene.
+        scene_path: Where that was read from.
+        fingerprint: Hash of its files.
+        seed: Of all random generators.
+        steps: Length of its training.
+    """
+
+    method: str
+    scene_name: str
+    scene_path: Path
+    fingerprint: str | None
+    seed: int
+    steps: int
+
+
+@dataclass(frozen=True)
 class RunFolder:
     """``config.yaml``, ``provenance.json``, ``metrics.jsonl``, ``checkpoints/`` and ``eval/`` of one run."""
 
@@ -41,9 +62,20 @@ class RunFolder:
         """One folder per checkpoint."""
         return self.path / "checkpoints"
 
+    @property
+    def evaluations(self) -> Path:
+        """One folder per protocol."""
+        return self.path / "eval"
+
     def evaluation(self, protocol: str) -> Path:
         """Folder of the results of a protocol."""
-        return self.path / "eval" / protocol
+        return self.evaluations / protocol
+
+    @property
+    def step(self) -> int:
+        """Steps taken until the newest checkpoint; 0 without one."""
+        found = checkpoints_in_order(self.checkpoints)
+        return checkpoint_step(found[-1]) if found else 0
 
     @classmethod
     def default(cls, scene: str, method: str) -> RunFolder:
@@ -126,3 +158,33 @@ class RunFolder:
         except (OSError, ValueError) as error:
             raise InputError(f"cannot read {self.provenance_file}: {error}", "what `coliags train` wrote") from error
         return found
+
+    def identity(self) -> RunIdentity:
+        """What the run is.
+
+        Raises:
+            InputError: The provenance file is damaged or lacks some of it.
+        """
+        found = self.provenance()
+        try:
+            scene = found["scene"]
+            return RunIdentity(
+                method=found["method"],
+                scene_name=scene["name"],
+                scene_path=Path(scene["path"]),
+                fingerprint=scene["provenance"].get("fingerprint"),
+                seed=int(found["seed"]),
+                steps=int(found["steps"]),
+            )
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise InputError(f"{self.provenance_file} lacks {error}", "what `coliags train` wrote") from error
+
+
+def checkpoints_in_order(folder: Path) -> list[Path]:
+    """The checkpoints of a folder, by their steps."""
+    return sorted((path.parent for path in folder.glob("step-*/state.json")), key=checkpoint_step)
+
+
+def checkpoint_step(checkpoint: Path) -> int:
+    """The step that a checkpoint's folder is named for."""
+    return int(checkpoint.name.split("-")[1])

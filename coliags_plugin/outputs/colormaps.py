@@ -6,7 +6,7 @@ Depth is drawn with viridis and errors with inferno, both perceptually uniform a
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Literal
 
@@ -63,6 +63,17 @@ def colorize_depth(
     image = _colored((np.where(known, depth, low) - low) / (high - low), "depth")
     image[~known] = UNKNOWN_GREY
     return image
+
+
+def depth_limits(depths: Iterable[Float[np.ndarray, "H W"] | Tensor]) -> tuple[float, float]:
+    """From 0 to the largest known depth, rounded up to 10 mm.
+
+    Args:
+        depths: Depth maps, mm; what is not finite is unknown. [H, W] each
+    """
+    known = [array[np.isfinite(array)] for array in map(as_array, depths)]
+    largest = max((float(values.max()) for values in known if values.size), default=0.0)
+    return 0.0, max(10.0, 10.0 * math.ceil(largest / 10.0))
 
 
 def colorize_depth_error(
