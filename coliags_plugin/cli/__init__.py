@@ -9,6 +9,7 @@ from typing import Annotated
 
 import tyro
 
+from coliags_plugin.cli.ablate import Ablate
 from coliags_plugin.cli.check import Check
 from coliags_plugin.cli.compare import Compare
 from coliags_plugin.cli.config import Config
@@ -29,6 +30,7 @@ Command = (
     | Annotated[Evaluate, tyro.conf.subcommand("eval")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Compare, tyro.conf.subcommand("compare")]
+    | Annotated[Ablate, tyro.conf.subcommand("ablate")]
     | Annotated[Report, tyro.conf.subcommand("report")]
     | Annotated[Poses, tyro.conf.subcommand("poses")]
     | Annotated[List, tyro.conf.subcommand("list")]
