@@ -21,6 +21,7 @@ from coliags_plugin.cli.phantom import Phantom
 from coliags_plugin.cli.poses import Poses
 from coliags_plugin.cli.render import Render
 from coliags_plugin.cli.report import Report
+from coliags_plugin.cli.results import Results
 from coliags_plugin.cli.run import run_command
 from coliags_plugin.cli.train import Train
 
@@ -32,6 +33,7 @@ Command = (
     | Annotated[Compare, tyro.conf.subcommand("compare")]
     | Annotated[Ablate, tyro.conf.subcommand("ablate")]
     | Annotated[Report, tyro.conf.subcommand("report")]
+    | Annotated[Results, tyro.conf.subcommand("results")]
     | Annotated[Poses, tyro.conf.subcommand("poses")]
     | Annotated[List, tyro.conf.subcommand("list")]
     | Annotated[Config, tyro.conf.subcommand("config")]
