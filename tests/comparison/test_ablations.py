@@ -78,5 +78,5 @@ def test_faults_are_named(written, text, told):
 
 
 def test_an_unknown_name_says_which_was_meant():
-    with pytest.raises(InputError, match="no ablation 'paper-row'.*Did you mean 'paper-rows'"):
+    with pytest.raises(InputError, match=r"no ablation 'paper-row'.*Did you mean 'paper-rows'"):
         load_ablation("paper-row")

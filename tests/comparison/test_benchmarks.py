@@ -90,7 +90,7 @@ def test_faults_are_named_by_line_and_key(written, text, told):
 
 
 def test_an_unknown_name_says_which_was_meant():
-    with pytest.raises(InputError, match="no benchmark 'c3dv'.*Did you mean 'c3vd'"):
+    with pytest.raises(InputError, match=r"no benchmark 'c3dv'.*Did you mean 'c3vd'"):
         load_benchmark("c3dv")
 
 
