@@ -12,7 +12,6 @@ from coliags_plugin.comparison.benchmarks import load_benchmark
 from coliags_plugin.comparison.named_files import descriptions, shipped
 from coliags_plugin.comparison.scenes import find_scenes
 from coliags_plugin.config.method_config import load_method
-from coliags_plugin.config.method_files import method_names
 from coliags_plugin.core.errors import InputError
 
 
@@ -24,10 +23,6 @@ def test_every_shipped_benchmark_is_valid_and_described(name):
         name_of_format = entry.format or benchmark.settings.format
         config = load_method("coliags", benchmark.overrides(scene), name_of_format).config
         assert config.datamanager.settings.split == (benchmark.settings.split or "every-8th")
-
-
-def test_benchmarks_are_no_methods():
-    assert not [name for name in method_names() if "benchmarks" in name or name in shipped()]
 
 
 def test_c3vd_is_the_official_list(shared_data):
