@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from coliags_plugin.config.method_config import load_method
-from coliags_plugin.config.method_files import method_folder
+from coliags_plugin.config.method_files import method_files, method_folder
 from coliags_plugin.method_check.check import CHECKS, check_method
 
 FOLDER = method_folder()
-METHODS = sorted(path.relative_to(FOLDER).with_suffix("").as_posix() for path in FOLDER.rglob("*.yaml"))
+METHODS = sorted(name for name, path in method_files().items() if path.is_relative_to(FOLDER))
 
 #: Networks so small that a CPU trains them in seconds, by the field's name.
 SMALL_NETWORKS = {

@@ -80,10 +80,13 @@ class Run:
         """The training log: ``step``, ``loss``, ``psnr``, ``seconds``, ``terms.NAME`` and so on over T logged steps.
 
         NaN where a step has no such number. [T] each
-        """
-        from coliags_plugin.engine.history import read_history
 
-        return read_history(self.folder.log_file)
+        Raises:
+            InputError: The log cannot be read.
+        """
+        from coliags_plugin.engine.history import columns
+
+        return columns(self.folder.log_rows())
 
     @property
     def results(self) -> dict[str, Result]:

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import tyro
 
+from coliags_plugin.cli.ablate import Ablate
 from coliags_plugin.cli.check import Check
 from coliags_plugin.cli.compare import Compare
 from coliags_plugin.cli.config import Config
@@ -20,6 +21,7 @@ from coliags_plugin.cli.phantom import Phantom
 from coliags_plugin.cli.poses import Poses
 from coliags_plugin.cli.render import Render
 from coliags_plugin.cli.report import Report
+from coliags_plugin.cli.results import Results
 from coliags_plugin.cli.run import run_command
 from coliags_plugin.cli.train import Train
 
@@ -29,7 +31,9 @@ Command = (
     | Annotated[Evaluate, tyro.conf.subcommand("eval")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Compare, tyro.conf.subcommand("compare")]
+    | Annotated[Ablate, tyro.conf.subcommand("ablate")]
     | Annotated[Report, tyro.conf.subcommand("report")]
+    | Annotated[Results, tyro.conf.subcommand("results")]
     | Annotated[Poses, tyro.conf.subcommand("poses")]
     | Annotated[List, tyro.conf.subcommand("list")]
     | Annotated[Config, tyro.conf.subcommand("config")]

@@ -21,8 +21,8 @@ class Phantom:
     """Random seed of the whole phantom."""
     layout: Annotated[str, tyro.conf.arg(metavar="NAME")] = "c3vd"
     """Files and folders to write (`coliags list phantom_layouts`)."""
-    trajectory: Literal["pullback", "rotation"] = "pullback"
-    """Withdrawal along the lumen, or mostly rotation in place."""
+    trajectory: Literal["pullback", "rotation", "inspection"] = "pullback"
+    """Withdrawal along the lumen, mostly rotation in place, or a withdrawal that approaches spots of the wall."""
     frames: int = 120
     """Frames of the sequence; every 8th is a test frame."""
     size: OptionalText = None

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, field_validator
 
+from coliags_plugin.comparison.named_files import find_file, read_settings, shipped
 from coliags_plugin.config import registry
-from coliags_plugin.config.method_files import BENCHMARKS, method_folder
-from coliags_plugin.config.origins import errors_with_origins
-from coliags_plugin.config.yaml_tree import dump, read_tree
-from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.config.yaml_tree import dump
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.phantom.settings import PhantomSettings, phantom_settings
 
@@ -96,11 +94,6 @@ class Benchmark:
         return tuple(f"datamanager.{key}={_as_text(value)}" for key, value in options.items())
 
 
-def benchmark_files() -> dict[str, Path]:
-    """Files of the shipped benchmarks by name."""
-    return {path.stem: path for path in sorted((method_folder() / BENCHMARKS).glob("*.yaml"))}
-
-
 def load_benchmark(name: str) -> Benchmark:
     """Read a benchmark.
 
@@ -110,19 +103,8 @@ def load_benchmark(name: str) -> Benchmark:
     Raises:
         InputError: There is none, or it is not valid; names file, line and key.
     """
-    if name.endswith((".yaml", ".yml")):
-        path = Path(name)
-    else:
-        files = benchmark_files()
-        if name not in files:
-            known = ", ".join(files)
-            raise InputError(f"no benchmark '{name}'", f"one of {known}, or a YAML file", did_you_mean(name, files))
-        path = files[name]
-    tree = read_tree(path)
-    try:
-        return Benchmark(path.stem, BenchmarkSettings.model_validate(tree.plain()))
-    except ValidationError as error:
-        raise InputError("\n".join(errors_with_origins(error, tree, "benchmark"))) from error
+    path = find_file(name, shipped(), "benchmark")
+    return Benchmark(path.stem, read_settings(path, BenchmarkSettings, "benchmark"))
 
 
 def _as_text(value: Any) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
+from coliags_plugin.comparison.named_files import is_path
 from coliags_plugin.comparison.scenes import SceneSource
 from coliags_plugin.config.method_config import MethodConfig
 
@@ -107,4 +108,4 @@ def file_name(variant: str) -> str:
 
 def absolute_method(method: str) -> str:
     """A method by a name or path that holds in every working folder."""
-    return str(Path(method).resolve()) if method.endswith((".yaml", ".yml")) else method
+    return str(Path(method).resolve()) if is_path(method) else method

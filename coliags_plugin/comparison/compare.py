@@ -15,8 +15,9 @@ from coliags_plugin.comparison.driver import Sweep, run_cells
 from coliags_plugin.comparison.estimates import Estimates
 from coliags_plugin.comparison.executors import Executor, LocalExecutor
 from coliags_plugin.comparison.folder import ComparisonFolder, Failure
-from coliags_plugin.comparison.live import live_table
+from coliags_plugin.comparison.live import live_report
 from coliags_plugin.comparison.plan import Request, make_cells
+from coliags_plugin.comparison.preview import Preview, preview
 from coliags_plugin.comparison.scenes import SceneSource, find_scenes, make_phantoms
 from coliags_plugin.comparison.summary import summary_table
 from coliags_plugin.config.method_config import method_name
@@ -132,12 +133,27 @@ def carry_out(request: Request, folder: ComparisonFolder, executor: Executor, ho
             with progress_callback() as progress:
                 make_phantoms(list(missing.values()), progress)
             cells = make_cells(request, folder.recorded_fingerprint)
+        estimates = Estimates(folder, finished.results)
+        ahead = preview(cells, folder, finished, estimates, executor.slots)
+        log.info("%s", ahead.line())
+        ahead.check_disk()
         folder.record(request, cells)
         sweep = Sweep(folder, executor, how.device, how.retries, how.save_seconds)
-        with live_table(folder) as show:
-            failures = run_cells(sweep, cells, finished, Estimates(finished.results), show)
+        with live_report() as show:
+            failures = run_cells(sweep, cells, finished, estimates, show)
         results = [result for cell in cells if (result := finished.of(cell)) is not None]
     return Comparison(folder.path, cells, results, failures)
+
+
+def dry_run(request: Request, folder: ComparisonFolder, executor: Executor) -> Preview:
+    """What :func:`carry_out` would do; writes nothing.
+
+    Raises:
+        InputError: See :func:`compare`.
+    """
+    cells = plan_cells(request, folder)
+    finished = folder.finished()
+    return preview(cells, folder, finished, Estimates(folder, finished.results), executor.slots)
 
 
 def plan_cells(request: Request, folder: ComparisonFolder) -> list[Cell]:

@@ -16,6 +16,7 @@ from coliags_plugin.comparison.executors import Executor
 from coliags_plugin.comparison.folder import ComparisonFolder, Failure, Finished
 from coliags_plugin.comparison.states import CellState, Watch
 from coliags_plugin.comparison.tasks import Outcome, Task
+from coliags_plugin.comparison.text import megabytes
 from coliags_plugin.core.errors import InputError, InterruptedRunError
 from coliags_plugin.results.reading import read_result
 
@@ -156,10 +157,10 @@ class _Work:
     def _start(self, cell: Cell) -> None:
         key = cell.known_keys.result
         self._attempts[key] = self._attempts.get(key, 0) + 1
-        needed = self._estimates.of(cell).bytes_to_write
+        needed = self._estimates.of(cell).at_times
         free = shutil.disk_usage(self._sweep.folder.path).free
         if free < needed:
-            self._fail(cell, f"the disk is full: {free / 1e6:.0f} MB left, about {needed / 1e6:.0f} MB needed")
+            self._fail(cell, f"the disk is full: {megabytes(free)} left, about {megabytes(needed)} needed")
             return
         try:
             self._sweep.executor.start(self._sweep.task(cell))

@@ -2,55 +2,94 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from statistics import median
 
-from coliags_plugin.comparison.cells import Cell
+from coliags_plugin.comparison.cells import Cell, file_name
+from coliags_plugin.comparison.folder import ComparisonFolder
 from coliags_plugin.results.record import Result
 
-#: Seconds of a step on one thread of a current CPU by kind of field, for images of 338 x 270: what is used where no
-#: result of the method tells. Measured on two cores (docs/comparing.md 4).
+#: Seconds of a step on one thread, for images of 338 x 270, by kind of field (docs/comparing.md 4).
 _ROUGH_STEP = {"anchors": 0.16, "gaussians": 0.10, "surfels": 0.14, "lit-gaussians": 0.20, "reim-nerf": 4.0}
-_OTHER_STEP = 0.15
-_ROUGH_PIXELS = 338 * 270
-#: Of starting a process, reading a scene and evaluating, seconds.
+_ROUGH_STEP_OF_OTHERS = 0.15
+#: Starting a process, reading a scene and evaluating, seconds.
 _ROUGH_OVERHEAD = 30.0
-#: Of a run's checkpoints, three at times, and of the images of its evaluation, bytes.
-_ROUGH_BYTES = 200_000_000
+#: A run folder: a checkpoint, and the images of its evaluation, bytes.
+_ROUGH_CHECKPOINT, _ROUGH_IMAGES = 60e6, 40e6
+#: Checkpoints that are there at times besides the one that stays: the one before, and one being written.
+_CHECKPOINTS_AT_TIMES = 2
+#: Making a phantom, seconds and bytes.
+_ROUGH_PHANTOM = (90.0, 40e6)
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a cell will take from the beginning.
+    """What a cell will take.
 
     Attributes:
         seconds: Time.
-        bytes_to_write: Disk.
-        measured: Whether results of the method tell the time.
+        kept: Disk when it is done, bytes.
+        at_times: Disk while it is running, bytes.
+        measured: Whether the time comes from results of the method, and not from a table.
     """
 
     seconds: float
-    bytes_to_write: float
+    kept: float
+    at_times: float
     measured: bool
 
 
 class Estimates:
-    """Estimates by method, from results where there are any.
+    """Estimates by method, from what its finished cells took, if there are any.
 
     Args:
-        results: Results whose costs are known.
+        folder: Of the comparison, whose finished runs are measured.
+        results: Finished cells by results file.
     """
 
-    def __init__(self, results: Iterable[Result]) -> None:
+    def __init__(self, folder: ComparisonFolder, results: Mapping[Path, Result]) -> None:
         self._steps: dict[str, list[float]] = {}
-        for result in results:
+        self._checkpoints: dict[str, list[float]] = {}
+        for result in results.values():
             if result.cost.train_seconds and result.steps:
-                seconds = result.cost.train_seconds / result.steps
-                self._steps.setdefault(result.method, []).append(seconds)
+                self._steps.setdefault(result.method, []).append(result.cost.train_seconds / result.steps)
+            if result.cost.checkpoint_bytes:
+                self._checkpoints.setdefault(result.method, []).append(float(result.cost.checkpoint_bytes))
+        self._runs = folder.path / "runs"
+        self._sizes: dict[str, list[float]] = {}
 
-    def of(self, cell: Cell) -> Estimate:
-        """The estimate of a cell."""
-        known = self._steps.get(cell.variant.name)
-        step = median(known) if known else _ROUGH_STEP.get(cell.config.field.name, _OTHER_STEP)
-        return Estimate(step * cell.steps + _ROUGH_OVERHEAD, _ROUGH_BYTES, bool(known))
+    def of(self, cell: Cell, steps_done: int = 0) -> Estimate:
+        """The estimate of a cell.
+
+        Args:
+            cell: The cell.
+            steps_done: Steps that need not be repeated.
+        """
+        steps = self._steps.get(cell.variant.name)
+        step = median(steps) if steps else _ROUGH_STEP.get(cell.config.field.name, _ROUGH_STEP_OF_OTHERS)
+        checkpoint = median(self._checkpoints.get(cell.variant.name, [_ROUGH_CHECKPOINT]))
+        kept = median(self._sizes_of(cell) or [checkpoint + _ROUGH_IMAGES])
+        return Estimate(
+            step * (cell.steps - steps_done) + _ROUGH_OVERHEAD,
+            kept,
+            kept + _CHECKPOINTS_AT_TIMES * checkpoint,
+            steps is not None,
+        )
+
+    def phantom(self) -> tuple[float, float]:
+        """Seconds and bytes of making a phantom."""
+        return _ROUGH_PHANTOM
+
+    def _sizes_of(self, cell: Cell) -> list[float]:
+        """Sizes of the method's finished runs, bytes."""
+        name = file_name(cell.variant.name)
+        if name not in self._sizes:
+            runs = [path.parent for path in self._runs.glob(f"*/{name}/*/eval")]
+            self._sizes[name] = [float(_size(run)) for run in runs]
+        return self._sizes[name]
+
+
+def _size(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())

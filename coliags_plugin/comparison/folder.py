@@ -328,9 +328,9 @@ class Finished:
         self._by_key = {result.key: result for result in results.values()}
 
     @property
-    def results(self) -> list[Result]:
-        """All of them."""
-        return list(self._by_path.values())
+    def results(self) -> dict[Path, Result]:
+        """All of them, by path."""
+        return dict(self._by_path)
 
     def of(self, cell: Cell) -> Result | None:
         """The result of a cell; under another name where another method is the same; None where it is not done."""

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from coliags_plugin.comparison.benchmarks import Benchmark, benchmark_files, load_benchmark
+from coliags_plugin.comparison.benchmarks import Benchmark, load_benchmark
+from coliags_plugin.comparison.named_files import is_path, shipped
 from coliags_plugin.config.registry import phantom_layouts
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.locks import locked
@@ -106,11 +107,11 @@ def make_phantoms(sources: Sequence[SceneSource], progress: Progress | None = No
 
 def _benchmark(name: str) -> tuple[Benchmark | None, str | None]:
     """The benchmark that a name stands for, and the one scene of it; None and None for a folder."""
-    files = benchmark_files()
-    if name in files or name.endswith((".yaml", ".yml")):
+    files = shipped()
+    if name in files or is_path(name):
         return load_benchmark(name), None
     first, _, scene = name.rpartition("/")
-    if (first in files or first.endswith((".yaml", ".yml"))) and scene and not Path(name).is_dir():
+    if (first in files or is_path(first)) and scene and not Path(name).is_dir():
         return load_benchmark(first), scene
     return None, None
 
@@ -142,7 +143,7 @@ def _first_there(paths: Sequence[Path]) -> Path:
 def _folder(name: str) -> SceneSource:
     path = Path(name)
     if not path.is_dir():
-        files = benchmark_files()
+        files = shipped()
         raise InputError(
             f"no scene '{name}'",
             f"the folder of a scene, or a benchmark: {', '.join(files)}",

@@ -41,6 +41,11 @@ class CellState:
     reason: str = ""
 
     @property
+    def evaluating(self) -> bool:
+        """Whether training is over and the result is not there yet."""
+        return self.phase == "running" and self.step >= self.cell.steps
+
+    @property
     def seconds_left(self) -> float | None:
         """Of training; None where it cannot be told."""
         if self.phase != "running" or self.seconds_per_step is None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from coliags_plugin.comparison.cells import Cell
+from coliags_plugin.comparison.text import aligned
 from coliags_plugin.results.record import Result
 
 #: Column titles and metrics.
@@ -24,16 +25,6 @@ def summary_table(cells: Sequence[Cell], results: Sequence[Result]) -> str:
         own = [result for result in results if result.method == name]
         rows.append([name, f"{len(own)} of {asked}", *(_mean(own, metric) for metric in _COLUMNS.values())])
     return aligned(rows)
-
-
-def aligned(rows: Sequence[Sequence[str]]) -> str:
-    """Rows of cells as text: the first column to the left, the others to the right."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = []
-    for first, *others in rows:
-        parts = [first.ljust(widths[0]), *(text.rjust(width) for text, width in zip(others, widths[1:], strict=True))]
-        lines.append("  ".join(parts).rstrip())
-    return "\n".join(lines)
 
 
 def _mean(results: Sequence[Result], metric: str) -> str:

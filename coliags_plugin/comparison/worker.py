@@ -113,7 +113,9 @@ def _train(task: Task, run: RunFolder, device: torch.device) -> None:
 
     from coliags_plugin.engine.checkpoints import keep_newest, set_damaged_aside
     from coliags_plugin.engine.data_formats import load_method_for, load_scene
+    from coliags_plugin.engine.evaluator import check_evaluable
     from coliags_plugin.engine.resuming import resumed_method
+    from coliags_plugin.engine.scoring import Scorer
     from coliags_plugin.engine.trainer import Trainer
 
     data, begun = Path(task.data), run.config_file.is_file()
@@ -131,6 +133,7 @@ def _train(task: Task, run: RunFolder, device: torch.device) -> None:
         method, step = replace(loaded, name=task.name), 0
     scene = replace(load_scene(method.config, data), name=task.scene)
     trainer = Trainer(method, scene, task.data, run, task.seed, device)
+    check_evaluable(trainer.model, scene, Scorer(task.protocol))
     if begun:
         trainer.resume()
     else:

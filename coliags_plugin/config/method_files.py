@@ -11,7 +11,7 @@ from coliags_plugin.core.errors import InputError
 
 #: Entry points whose name is a method's, and whose value is the package that holds ``<name>.yaml``.
 ENTRY_POINTS = "coliags_plugin.methods"
-#: Folder of lists of scenes and of variants, beside the methods.
+#: Folder among the shipped method configs that holds benchmarks and ablations instead.
 BENCHMARKS = "benchmarks"
 
 
@@ -27,8 +27,8 @@ def method_files() -> dict[str, Path]:
         InputError: Another package's file is missing, or its name is taken.
     """
     root = method_folder()
-    paths = {path.relative_to(root).with_suffix(""): path for path in root.rglob("*.yaml")}
-    files = {name.as_posix(): path for name, path in paths.items() if name.parts[0] != BENCHMARKS}
+    paths = [path.relative_to(root) for path in root.rglob("*.yaml")]
+    files = {path.with_suffix("").as_posix(): root / path for path in paths if path.parts[0] != BENCHMARKS}
     for entry in entry_points(group=ENTRY_POINTS):
         if entry.name in files:
             raise InputError(

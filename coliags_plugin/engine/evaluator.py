@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -9,8 +10,10 @@ import torch
 from coliags_plugin.contracts import Comparison
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, atomic_write, write_json
-from coliags_plugin.core.scenes import Frame
+from coliags_plugin.core.scenes import Frame, Scene
+from coliags_plugin.engine.costs import RenderMeter
 from coliags_plugin.engine.evaluated_set import EvaluatedSet
+from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.run_result import run_result
 from coliags_plugin.engine.scoring import Scorer
@@ -41,26 +44,38 @@ def evaluate(trained: TrainedRun, protocol_name: str) -> Path:
             "evaluation of a relit run", "the lamp that the data were recorded with", "Evaluate the run as loaded"
         )
     scorer = Scorer(protocol_name)
-    trained.model.check_outputs(scorer.wants, f"protocol '{protocol_name}'")
+    check_evaluable(trained.model, trained.scene, scorer)
     sets = {name: frames for name, frames in trained.scene.test_sets.items() if frames}
-    if not sets:
-        raise InputError(f"scene '{trained.scene.name}' has no test frames", "a split that holds some out")
     total, done = sum(map(len, sets.values())), 0
     target = trained.run.evaluation(scorer.protocol.name)
     evaluated = {name: EvaluatedSet() for name in sets}
+    meter = RenderMeter(trained.device)
     with atomic_folder(target, overwrite=True) as scratch, ProgressReport("evaluate", total) as progress:
         for set_name, frames in sets.items():
             for frame in frames:
-                comparison = scorer.compare(trained.model, frame, trained.device)
-                evaluated[set_name].add(frame, comparison, scorer)
+                placed = frame.to(trained.device)
+                output = meter.render(partial(scorer.render, trained.model, placed))
+                comparison = scorer.protocol.compare(output, placed)
+                evaluated[set_name].add(placed, comparison, scorer)
                 _write_images(scratch, set_name, frame, comparison)
                 done += 1
                 progress.update(done)
-        result = run_result(trained, scorer, evaluated)
+        result = run_result(trained, scorer, evaluated, meter)
         write_result(scratch / RESULT_FILE, result)
         write_json(scratch / "metrics.json", means_summary(result))
         atomic_write(scratch / "per_frame.csv", per_frame_table(result))
     return target
+
+
+def check_evaluable(model: Model, scene: Scene, scorer: Scorer) -> None:
+    """Refuse what cannot be evaluated; worth knowing before training.
+
+    Raises:
+        InputError: The protocol wants what the renderer cannot deliver, or there is no test frame.
+    """
+    model.check_outputs(scorer.wants, f"protocol '{scorer.protocol.name}'")
+    if not any(scene.test_sets.values()):
+        raise InputError(f"scene '{scene.name}' has no test frames", "a split that holds some out")
 
 
 def _write_images(folder: Path, set_name: str, frame: Frame, comparison: Comparison) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -179,6 +180,20 @@ class RunFolder:
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise InputError(f"{self.provenance_file} lacks {error}", "what `coliags train` wrote") from error
 
+    def log_rows(self, until: float = math.inf) -> list[dict[str, Any]]:
+        """Rows of the training log up to a step, without lines that a kill cut short; none without a log.
+
+        Raises:
+            InputError: The log cannot be read.
+        """
+        try:
+            lines = self.log_file.read_text(encoding="utf-8").splitlines()
+        except FileNotFoundError:
+            return []
+        except (OSError, ValueError) as error:
+            raise InputError(f"cannot read {self.log_file}: {error}", "what `coliags train` wrote") from error
+        return [row for row in map(_log_row, lines) if row and row["step"] <= until]
+
 
 def checkpoints_in_order(folder: Path) -> list[Path]:
     """The checkpoints of a folder, by their steps."""
@@ -188,3 +203,15 @@ def checkpoints_in_order(folder: Path) -> list[Path]:
 def checkpoint_step(checkpoint: Path) -> int:
     """The step that a checkpoint's folder is named for."""
     return int(checkpoint.name.split("-")[1])
+
+
+def _log_row(line: str) -> dict[str, Any] | None:
+    """A row of the training log; None where the line is damaged."""
+    try:
+        row = json.loads(line)
+    except ValueError:
+        return None
+    whole = isinstance(row, dict) and all(
+        isinstance(row.get(name), (int, float)) for name in ("step", "psnr", "seconds")
+    )
+    return row if whole else None

@@ -102,8 +102,10 @@ class PhantomSettings(Settings):
 
     seed: int = Field(0, ge=0, description="Seed of all random numbers of the phantom.")
     layout: str = Field("c3vd", description="Files and folders to write; docs/phantom.md 5 lists the layouts.")
-    trajectory: Literal["pullback", "rotation"] = Field(
-        "pullback", description="pullback: withdrawal along the lumen. rotation: the camera mostly rotates in place."
+    trajectory: Literal["pullback", "rotation", "inspection"] = Field(
+        "pullback",
+        description="pullback: withdrawal along the lumen. rotation: the camera mostly rotates in place. inspection: a "
+        "withdrawal that approaches three spots of the wall.",
     )
     frames: int = Field(120, ge=9, le=2000, description="Frames of the sequence; every 8th is a test frame.")
     width: int | None = Field(None, ge=16, le=4096, description="Image width, pixels. None: the layout's own.")

@@ -1,4 +1,4 @@
-"""Camera paths of phantoms: withdrawal along the lumen, rotation in place, and rotated test views."""
+"""Camera paths of phantoms: withdrawal, inspection, rotation in place, and rotated test views."""
 
 from __future__ import annotations
 
@@ -10,15 +10,14 @@ from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.phantom.centreline import CentreLine
+from coliags_plugin.phantom.inspection import inspecting_path
+from coliags_plugin.phantom.motion import NEAREST, SHALLOW_END, draw_sway, rotation, rotation_about
 from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.phantom.streams import Purpose, stream
+from coliags_plugin.phantom.tracing import Tracer
 
-#: No closer to the wall than this, mm; C3VD's nearest surface of any sequence is 5.9 mm away.
-NEAREST = 6.0
 #: Interval of held-out test frames.
 TEST_EVERY = 8
-#: Arc length of the pullback's shallow end, mm. Far enough in that a view turned sideways still ends on the wall.
-_SHALLOW_END = 26.0
 #: Travel of the ``rotation`` trajectory, mm.
 _ROTATION_TRAVEL = 6.0
 #: How far ahead on the centre line the camera looks, mm.
@@ -45,56 +44,29 @@ class RotationView:
     camera_to_world: Float[np.ndarray, "4 4"]
 
 
-def camera_path(centre_line: CentreLine, settings: PhantomSettings, clearance: Clearance) -> Float[np.ndarray, "T 4 4"]:
+def camera_path(centre_line: CentreLine, settings: PhantomSettings, tracer: Tracer) -> Float[np.ndarray, "T 4 4"]:
     """Camera-to-world pose of every frame, OpenCV axes, mm.
 
     Args:
         centre_line: Centre line of the colon.
         settings: Frames, trajectory, preset.
-        clearance: Distance of points to the wall, mm.
+        tracer: Ray tracer of the wall.
 
     Raises:
         InputError: The colon leaves no path that keeps 6 mm from the wall.
     """
-    generator = stream(settings.seed, Purpose.TRAJECTORY)
-    preset = settings.preset
-    time = np.linspace(0.0, 1.0, settings.frames)
-    if settings.trajectory == "pullback":
-        arc = _SHALLOW_END + settings.path_length * (1.0 - time)
-    else:
-        arc = _SHALLOW_END + 0.5 * settings.path_length + _ROTATION_TRAVEL * (0.5 - time)
-    points, frames = centre_line.at(arc)
-
-    waver = np.stack([_sway(time, generator) for _ in range(5)], axis=1)
-    on_the_spot = settings.trajectory == "rotation"
-    low, high = (0.3 * excursion if on_the_spot else excursion for excursion in preset.wobble)
-    clock = generator.uniform(0.0, 2.0 * np.pi) + 2.2 * waver[:, 0] + 4.0 * time
-    amount = 0.5 * (low + high) + 0.5 * (high - low) * waver[:, 1]
-    sideways = amount[:, None] * np.stack([np.cos(clock), np.sin(clock)], axis=1)
-    sideways = _limit_excursion(sideways, points, frames, clearance, NEAREST + 0.5)
-    for approach in range(0 if on_the_spot else preset.approaches):
-        sideways = _add_approach(sideways, points, frames, clearance, preset.closest, approach, time, generator)
-    centers = points + np.einsum("nck,nk->nc", frames[:, :, :2], sideways)
-    nearest = float(clearance(centers).min())
+    poses = (
+        inspecting_path(centre_line, settings, tracer)
+        if settings.trajectory == "inspection"
+        else _withdrawing_path(centre_line, settings, tracer.clearance)
+    )
+    nearest = float(tracer.clearance(poses[:, :3, 3]).min())
     if nearest < NEAREST:
         raise InputError(
             f"the colon of seed {settings.seed} leaves only {nearest:.1f} mm between the camera's path and the wall",
             f"at least {NEAREST:g} mm",
             "Choose another seed",
         )
-
-    ahead, _ = centre_line.at(arc + _LOOK_AHEAD)
-    poses = _looking(centers, ahead, frames)
-    if not on_the_spot:
-        yaw, pitch, roll = (np.radians(limit) * waver[:, 2 + axis] for axis, limit in enumerate(preset.turn))
-    else:
-        # An outward spiral, so that the viewing direction covers a disc.
-        clock = 2.0 * np.pi * 2.5 * time + generator.uniform(0.0, 2.0 * np.pi)
-        away = np.radians(preset.scan) * np.sqrt(time)
-        yaw, pitch = away * np.cos(clock), away * np.sin(clock)
-        roll = np.radians(preset.turn[2]) * waver[:, 4]
-    for pose, turn in zip(poses, np.stack([yaw, pitch, roll], axis=1), strict=True):
-        pose[:3, :3] = pose[:3, :3] @ rotation(*turn)
     return poses
 
 
@@ -131,20 +103,42 @@ def turn_away(
     return views
 
 
-def rotation(yaw: float, pitch: float, roll: float) -> Float[np.ndarray, "3 3"]:
-    """Rotation right by yaw, then up by pitch, then clockwise by roll; radians, camera axes."""
-    return np.asarray(
-        rotation_about(np.array([0.0, 1.0, 0.0]), yaw)
-        @ rotation_about(np.array([1.0, 0.0, 0.0]), pitch)
-        @ rotation_about(np.array([0.0, 0.0, 1.0]), roll)
-    )
+def _withdrawing_path(
+    centre_line: CentreLine, settings: PhantomSettings, clearance: Clearance
+) -> Float[np.ndarray, "T 4 4"]:
+    """Poses of the trajectories ``pullback`` and ``rotation``: along the centre line, and almost in place."""
+    generator = stream(settings.seed, Purpose.TRAJECTORY)
+    preset = settings.preset
+    time = np.linspace(0.0, 1.0, settings.frames)
+    if settings.trajectory == "pullback":
+        arc = SHALLOW_END + settings.path_length * (1.0 - time)
+    else:
+        arc = SHALLOW_END + 0.5 * settings.path_length + _ROTATION_TRAVEL * (0.5 - time)
+    points, frames = centre_line.at(arc)
 
-
-def rotation_about(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarray, "3 3"]:
-    """Rotation about a unit axis, radians, right-handed (Rodrigues)."""
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross)
+    waver = np.stack([draw_sway(generator)(time) for _ in range(5)], axis=1)
+    on_the_spot = settings.trajectory == "rotation"
+    low, high = (0.3 * excursion if on_the_spot else excursion for excursion in preset.wobble)
+    clock = generator.uniform(0.0, 2.0 * np.pi) + 2.2 * waver[:, 0] + 4.0 * time
+    amount = 0.5 * (low + high) + 0.5 * (high - low) * waver[:, 1]
+    sideways = amount[:, None] * np.stack([np.cos(clock), np.sin(clock)], axis=1)
+    sideways = _limit_excursion(sideways, points, frames, clearance, NEAREST + 0.5)
+    for approach in range(0 if on_the_spot else preset.approaches):
+        sideways = _add_approach(sideways, points, frames, clearance, preset.closest, approach, time, generator)
+    centers = points + np.einsum("nck,nk->nc", frames[:, :, :2], sideways)
+    ahead, _ = centre_line.at(arc + _LOOK_AHEAD)
+    poses = _looking(centers, ahead, frames)
+    if not on_the_spot:
+        yaw, pitch, roll = (np.radians(limit) * waver[:, 2 + axis] for axis, limit in enumerate(preset.turn))
+    else:
+        # An outward spiral, so that the viewing direction covers a disc.
+        clock = 2.0 * np.pi * 2.5 * time + generator.uniform(0.0, 2.0 * np.pi)
+        away = np.radians(preset.scan) * np.sqrt(time)
+        yaw, pitch = away * np.cos(clock), away * np.sin(clock)
+        roll = np.radians(preset.turn[2]) * waver[:, 4]
+    for pose, turn in zip(poses, np.stack([yaw, pitch, roll], axis=1), strict=True):
+        pose[:3, :3] = pose[:3, :3] @ rotation(*turn)
+    return poses
 
 
 def _looking(
@@ -159,18 +153,6 @@ def _looking(
     poses[:, :3, :3] = np.stack([right, np.cross(forward, right), forward], axis=2)
     poses[:, :3, 3] = centers
     return poses
-
-
-def _sway(time: Float[np.ndarray, "T"], generator: np.random.Generator) -> Float[np.ndarray, "T"]:
-    """A smooth random curve with amplitude 1, independent of its sampling."""
-    cycles = np.array([0.6, 1.3, 2.4])
-    phase = generator.uniform(0.0, 2.0 * np.pi, 3)
-    weight = np.array([1.0, 0.7, 0.35]) * generator.uniform(0.7, 1.3, 3)
-
-    def curve(at: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T"]:
-        return np.asarray((weight * np.sin(2.0 * np.pi * cycles * at[:, None] + phase)).sum(axis=1))
-
-    return np.asarray(curve(time) / np.abs(curve(np.linspace(0.0, 1.0, 512))).max())
 
 
 def _limit_excursion(

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, model_validator
 from typing_extensions import Self
 
 from coliags_plugin.core.errors import InputError, did_you_mean
-from coliags_plugin.results.table import Table, Value, value_text
+from coliags_plugin.results.display import Table, Value, value_text
 
 #: Of the schema below; incremented whenever a reader of the older version would misread a newer file.
 VERSION = 1

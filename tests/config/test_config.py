@@ -7,7 +7,7 @@ import yaml
 
 from coliags_plugin.config import registry
 from coliags_plugin.config.method_config import load_method
-from coliags_plugin.config.method_files import method_descriptions, method_names
+from coliags_plugin.config.method_files import method_descriptions, method_folder, method_names
 from coliags_plugin.config.yaml_tree import parse_tree, parse_value
 from coliags_plugin.core.errors import InputError
 
@@ -25,6 +25,12 @@ def method_file(tmp_path):
 @pytest.mark.parametrize("name", method_names())
 def test_every_shipped_method_is_described(name):
     assert method_descriptions()[name]
+
+
+def test_benchmarks_are_no_methods():
+    assert list((method_folder() / "benchmarks").glob("*.yaml"))
+    assert "ablations/none" in method_names()
+    assert not [name for name in method_names() if "benchmarks" in name]
 
 
 def test_scaffold_and_coliags_differ_in_heads_only():

@@ -13,12 +13,13 @@ from coliags_plugin.phantom.colon import ColonSurface, build_surface, grow_anato
 from coliags_plugin.phantom.imaging import Sensor, World, expose
 from coliags_plugin.phantom.interreflection import form_factors, make_patches, solve
 from coliags_plugin.phantom.light import UNIT_DISTANCE, Lamp
+from coliags_plugin.phantom.motion import NEAREST, rotation, rotation_about
 from coliags_plugin.phantom.mucosa import Mucosa, paint_mucosa
 from coliags_plugin.phantom.response import develop, encode, exposure_for, exposures, white_balances
 from coliags_plugin.phantom.settings import PRESETS, PhantomSettings, phantom_settings
 from coliags_plugin.phantom.streams import Purpose, SolidNoise, stream
 from coliags_plugin.phantom.tracing import Tracer
-from coliags_plugin.phantom.trajectory import NEAREST, camera_path, rotation, rotation_about, turn_away
+from coliags_plugin.phantom.trajectory import camera_path, turn_away
 from coliags_plugin.phantom.visibility import nearest_poses_first, seen_from
 
 ALBEDO = (0.7, 0.3, 0.2)
@@ -303,7 +304,7 @@ def test_mucosa_has_the_albedo_asked_for_and_no_seam(colon):
 def test_the_camera_keeps_off_the_wall_and_poses_are_rigid(colon, light, trajectory):
     anatomy, _, tracer = colon
     chosen = PhantomSettings(light=light, trajectory=trajectory, frames=60, **COARSE)
-    poses = camera_path(anatomy.centre_line, chosen, tracer.clearance)
+    poses = camera_path(anatomy.centre_line, chosen, tracer)
     rotations = poses[:, :3, :3]
     np.testing.assert_allclose(
         rotations.transpose(0, 2, 1) @ rotations, np.broadcast_to(np.eye(3), (60, 3, 3)), atol=1e-9
@@ -325,7 +326,7 @@ def test_the_camera_keeps_off_the_wall_and_poses_are_rigid(colon, light, traject
 def test_rotation_views_share_a_training_frames_place_and_turn_15_to_30_degrees(colon):
     anatomy, _, tracer = colon
     chosen = PhantomSettings(frames=41, rotation_views=12, **COARSE)
-    poses = camera_path(anatomy.centre_line, chosen, tracer.clearance)
+    poses = camera_path(anatomy.centre_line, chosen, tracer)
     views = turn_away(poses, chosen)
     assert len(views) == 12
     clocks = []
@@ -342,7 +343,7 @@ def test_rotation_views_share_a_training_frames_place_and_turn_15_to_30_degrees(
 def test_where_the_camera_scans_rotation_views_go_on_outwards(colon):
     anatomy, _, tracer = colon
     chosen = PhantomSettings(frames=41, trajectory="rotation", **COARSE)
-    poses = camera_path(anatomy.centre_line, chosen, tracer.clearance)
+    poses = camera_path(anatomy.centre_line, chosen, tracer)
     middle = poses[:, :3, 2].mean(axis=0)
     middle /= np.linalg.norm(middle)
     for view in turn_away(poses, chosen):

@@ -1,4 +1,4 @@
-"""Table of plain values: text when printed, HTML in a notebook."""
+"""Tables for people: text when printed, HTML in a notebook."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _NONE = "-"
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of values.
+    """Rows of values under columns.
 
     ``print`` shows it as text and a notebook as HTML; ``pandas.DataFrame(table.rows)`` is a data frame.
 

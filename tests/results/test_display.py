@@ -7,7 +7,7 @@ import xml.etree.ElementTree as ET
 import pytest
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.results.table import Table
+from coliags_plugin.results.display import Table
 from tests.results.made import made_result, made_set
 
 TABLE = Table(

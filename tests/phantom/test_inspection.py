@@ -1,0 +1,185 @@
+"""The path that inspects: how near it comes to the wall, what it looks at, how smooth it is, and the gain it causes."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import pytest
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.phantom import inspection
+from coliags_plugin.phantom.centreline import CentreLine
+from coliags_plugin.phantom.colon import build_surface, grow_anatomy
+from coliags_plugin.phantom.generate import generate
+from coliags_plugin.phantom.inspection import APPROACHES, nearness, resting
+from coliags_plugin.phantom.motion import NEAREST
+from coliags_plugin.phantom.settings import PRESETS, PhantomSettings
+from coliags_plugin.phantom.tracing import Tracer
+from coliags_plugin.phantom.trajectory import camera_path
+
+#: The far stops fall on frames 0, 40, 80, 120, and the near ones on 20, 60, 100.
+FRAMES = 121
+COARSE = {"trajectory": "inspection", "mesh_spacing": 1.6, "frames": FRAMES}
+FAR, NEAR = [0, 40, 80, 120], [20, 60, 100]
+
+
+@dataclass(frozen=True)
+class Colon:
+    """A colon, and the paths through it by preset."""
+
+    settings: PhantomSettings
+    centre_line: CentreLine
+    tracer: Tracer
+    paths: dict[str, np.ndarray]
+
+
+def colon_of(seed: int, **settings) -> Colon:
+    chosen = PhantomSettings(**{**COARSE, "seed": seed, **settings})
+    anatomy = grow_anatomy(chosen)
+    colon = Colon(chosen, anatomy.centre_line, Tracer(build_surface(anatomy, chosen)), {})
+    colon.paths.update({light: path_of(colon, light=light) for light in PRESETS})
+    return colon
+
+
+def path_of(colon: Colon, **changes) -> np.ndarray:
+    return camera_path(colon.centre_line, colon.settings.model_copy(update=changes), colon.tracer)
+
+
+@pytest.fixture(scope="module", params=[1, 4, 9])
+def colon(request):
+    return colon_of(request.param)
+
+
+def distances_in_the_middle(tracer: Tracer, pose: np.ndarray) -> np.ndarray:
+    """Distances of the wall along rays up to 4 degrees from the centre of the image, mm."""
+    clock = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
+    ring = np.stack([np.cos(clock), np.sin(clock)], axis=1) * np.tan(np.radians(4.0))
+    rays = np.concatenate([[[0.0, 0.0]], ring, 0.5 * ring])
+    directions = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
+    return tracer.cast(pose, directions.astype(np.float32)).z_depth * np.linalg.norm(directions, axis=1)
+
+
+def angles_between(rotations: np.ndarray) -> np.ndarray:
+    """Angle of the rotation from each frame to the next, degrees."""
+    traces = np.einsum("tij,tij->t", rotations[1:], rotations[:-1])
+    return np.degrees(np.arccos(np.clip(0.5 * (traces - 1.0), -1.0, 1.0)))
+
+
+@pytest.mark.parametrize("light", PRESETS)
+def test_it_comes_close_to_the_wall_again_and_again_and_looks_at_what_is_close(colon, light):
+    poses, tracer = colon.paths[light], colon.tracer
+    clearance = tracer.clearance(poses[:, :3, 3])
+    _, frames = colon.centre_line.at(np.linspace(76.0, 26.0, 2 * APPROACHES + 1)[1::2])
+    for stop, frame in zip(NEAR, frames, strict=True):
+        # Within the approach only a fold that is passed may be nearer than the spot.
+        assert NEAREST <= clearance[stop - 20 : stop + 21].min() <= clearance[stop] <= 7.0
+        assert 6.0 < distances_in_the_middle(tracer, poses[stop])[0] < 10.0
+        # The view has turned from the lumen to its wall, as the camera itself has moved towards it.
+        away = np.degrees(np.arccos(poses[stop, :3, 2] @ frame[:, 2]))
+        assert 45.0 - 1e-6 <= away <= 75.0 + 1e-6
+    for stop in FAR:
+        assert clearance[stop] > 9.0
+        assert np.median(distances_in_the_middle(tracer, poses[stop])) == pytest.approx(60.0, abs=15.0)
+
+
+def test_it_is_smooth(colon):
+    for light, poses in colon.paths.items():
+        centers, rotations = poses[:, :3, 3], poses[:, :3, :3]
+        np.testing.assert_allclose(
+            rotations @ rotations.transpose(0, 2, 1), np.tile(np.eye(3), (FRAMES, 1, 1)), atol=1e-9
+        )
+        assert np.linalg.norm(np.diff(centers, axis=0), axis=1).max() < 3.0
+        assert np.linalg.norm(np.diff(centers, n=2, axis=0), axis=1).max() < 0.5
+        assert angles_between(rotations).max() < 11.0
+        assert np.degrees(np.linalg.norm(np.diff(rotations[:, :, 2], n=2, axis=0), axis=1)).max() < 1.8
+        # Frames are samples of one curve without jumps: with twice as many, steps are half as long.
+        finer = path_of(colon, light=light, frames=2 * FRAMES - 1)
+        np.testing.assert_allclose(finer[::2], poses, atol=1e-9)
+        for halves, wholes in (
+            (
+                np.linalg.norm(np.diff(finer[:, :3, 3], axis=0), axis=1),
+                np.linalg.norm(np.diff(centers, axis=0), axis=1),
+            ),
+            (angles_between(finer[:, :3, :3]), angles_between(rotations)),
+        ):
+            assert halves.max() == pytest.approx(0.5 * wholes.max(), rel=0.03)
+
+
+def test_the_same_seed_has_the_same_path_and_another_one_another(colon):
+    path = colon.paths["c3vd"]
+    np.testing.assert_array_equal(path_of(colon), path)
+    assert np.abs(path_of(colon, seed=colon.settings.seed + 1) - path).max() > 1.0
+
+
+def test_a_curve_that_rests_goes_through_its_values_and_stands_still_there():
+    values = np.array([[0.0, 3.0], [2.0, -1.0], [2.0, 5.0]])
+    np.testing.assert_array_equal(resting(values, np.array([0.0, 0.5, 1.0])), values)
+    np.testing.assert_allclose(resting(values, np.array([0.25, 0.75])), 0.5 * (values[:-1] + values[1:]))
+    step = 1e-3
+    before, at, after = resting(values, np.array([0.5 - step, 0.5, 0.5 + step]))
+    # Third order: 10 x^3 of the difference, x being twice the time.
+    assert np.abs(np.stack([before - at, after - at])).max() < 6.1 * 10.0 * (2.0 * step) ** 3
+    np.testing.assert_array_equal(nearness(np.arange(7) / 6.0), [0, 1, 0, 1, 0, 1, 0])
+
+
+def test_a_colon_without_such_a_path_is_an_error(colon, monkeypatch):
+    monkeypatch.setattr(inspection, "_SPOT_WITHIN", 1.0)
+    monkeypatch.setattr(inspection, "_DRAWS", 3)
+    with pytest.raises(InputError, match=f"seed {colon.settings.seed} .*no path") as refused:
+        path_of(colon)
+    assert "another seed" in str(refused.value)
+
+
+def test_automatic_gain_swings_up_to_its_span_and_most_of_the_rotated_views_is_seen(tmp_path):
+    small = {"width": 48, "height": 38, "rotation_views": 6, "texture_spacing": 0.4, "supersampling": 1}
+    options = {**COARSE, **small, "seed": 3, "frames": 60, "interreflection": 0.0}
+    generate(PhantomSettings(**options, gain="auto"), tmp_path / "phantom")
+    truth = tmp_path / "phantom" / "truth"
+    gain = np.array([float(row["gain_g"]) for row in csv.DictReader((truth / "gain.csv").open())])
+    assert 2.5 <= gain.max() / gain.min() <= 3.0 + 1e-5
+    # Low at near stops, frames 10, 30 and 50, and high at far ones.
+    assert gain[[10, 30, 50]].max() < 0.5 * gain[[0, 20, 39, 59]].min()
+    seen = [cv2.imread(str(path), 0) > 0 for path in sorted((tmp_path / "phantom/rotation/seen").iterdir())]
+    assert len(seen) == 6 and np.mean(seen) > 0.75
+    assert json.loads((tmp_path / "phantom/phantom.json").read_text())["settings"]["trajectory"] == "inspection"
+
+
+#: Positions, mm, and viewing directions of frames 0 and 30 of 60, written down before the path that inspects was there.
+EARLIER = {
+    ("c3vd", "pullback"): [
+        [-14.9409, -8.2985, 73.6044],
+        [-0.2705, -0.3989, 0.8762],
+        [-8.2516, -1.1216, 49.8624],
+        [-0.3037, -0.2893, 0.9078],
+    ],
+    ("c3vd", "rotation"): [
+        [-8.0643, -3.7285, 53.0131],
+        [-0.3087, -0.3089, 0.8996],
+        [-7.5433, -2.979, 50.0678],
+        [-0.6002, -0.285, 0.7474],
+    ],
+    ("strong", "pullback"): [
+        [-14.9536, -8.0554, 73.6861],
+        [-0.2344, -0.4027, 0.8848],
+        [-7.9796, 0.231, 50.2319],
+        [-0.3863, -0.1824, 0.9042],
+    ],
+    ("strong", "rotation"): [
+        [-8.0658, -3.6535, 53.0305],
+        [-0.3086, -0.3115, 0.8988],
+        [-7.5973, -2.8606, 50.0777],
+        [-0.656, -0.2812, 0.7004],
+    ],
+}
+
+
+def test_other_paths_are_those_of_earlier_versions():
+    colon = colon_of(3, mesh_spacing=1.2)
+    for (light, trajectory), told in EARLIER.items():
+        poses = path_of(colon, light=light, trajectory=trajectory, frames=60)
+        found = [column for frame in (0, 30) for column in (poses[frame, :3, 3], poses[frame, :3, 2])]
+        np.testing.assert_allclose(found, told, atol=2e-3)
