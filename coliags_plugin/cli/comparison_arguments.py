@@ -57,9 +57,11 @@ class ComparisonArguments:
         """Compare, print a summary and the folder; exit with status 1 if a cell failed."""
         from coliags_plugin.comparison.compare import How, carry_out, dry_run, make_executor, make_request
         from coliags_plugin.comparison.folder import ComparisonFolder
+        from coliags_plugin.config.assignments import assignments, parse_assignments
 
+        overrides = assignments(parse_assignments(self.set))  # written alike, as they are compared with those before
         request = make_request(
-            methods, self.scenes, self.data, self.seeds, self.protocol, self.splits, self.steps, self.set
+            methods, self.scenes, self.data, self.seeds, self.protocol, self.splits, self.steps, overrides
         )
         how = How(self.jobs, self.threads, self.device, self.executor, self.retries)
         folder, executor = ComparisonFolder(self.output), make_executor(how)
@@ -70,8 +72,6 @@ class ComparisonArguments:
             return
         done = carry_out(request, folder, executor, how)
         print(done.table())
-        for failure in done.failures:
-            print(f"failed: {failure.scene} {failure.method} seed {failure.seed}: {failure.reason}")
         print(done.folder)
         if done.failures:
             sys.exit(1)

@@ -19,12 +19,13 @@ from coliags_plugin.comparison.live import live_report
 from coliags_plugin.comparison.plan import Request, make_cells
 from coliags_plugin.comparison.preview import Preview, preview
 from coliags_plugin.comparison.scenes import SceneSource, find_scenes, make_phantoms
-from coliags_plugin.comparison.summary import summary_table
+from coliags_plugin.comparison.summary import COLUMNS, summary_table
 from coliags_plugin.config.method_config import method_name
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.datamanagers.splits import Split
 from coliags_plugin.engine.devices import choose_device
 from coliags_plugin.engine.progress import progress_callback
+from coliags_plugin.results.display import Table
 from coliags_plugin.results.record import Result
 
 log = logging.getLogger(__name__)
@@ -48,9 +49,25 @@ class Comparison:
     results: Sequence[Result]
     failures: Sequence[Failure]
 
-    def table(self) -> str:
-        """Mean PSNR and depth error of every method over its finished cells, as plain text."""
-        return summary_table(self.cells, self.results)
+    def table(self, columns: Sequence[str] = COLUMNS) -> Table:
+        """Mean of every method over its finished cells, with the reasons of failures.
+
+        Args:
+            columns: Names of metrics.
+
+        Raises:
+            InputError: No result has one of the metrics.
+        """
+        return summary_table(self.cells, self.results, self.failures, columns)
+
+    def __repr__(self) -> str:
+        """How much is done, in one line."""
+        failed = f", {len(self.failures)} failed" if self.failures else ""
+        return f"{len(self.results)} of {len(self.cells)} cells done{failed}: {self.folder}"
+
+    def _repr_html_(self) -> str:
+        """The table, for notebooks."""
+        return self.table()._repr_html_()
 
 
 @dataclass(frozen=True)

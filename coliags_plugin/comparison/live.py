@@ -1,4 +1,4 @@
-"""Report of a running comparison: a table on a terminal, a line per event elsewhere."""
+"""Report of a running comparison: a table on a terminal, a line in a notebook, a line per event elsewhere."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from rich.table import Table
 
 from coliags_plugin.comparison.states import CellState
 from coliags_plugin.comparison.text import duration
+from coliags_plugin.engine.progress_displays import NotebookText
 
 log = logging.getLogger(__name__)
 
@@ -27,8 +28,12 @@ _STYLES = {"running": "bold", "failed": "red", "done": "green", "waiting": "dim"
 
 @contextmanager
 def live_report() -> Iterator[Show]:
-    """A function that reports the states of all cells: as a table that is redrawn, or a line for each change."""
+    """A function that reports the states of all cells: as what is redrawn, or a line for each change."""
     console = _log_console() or Console(file=sys.stderr)
+    if console.is_jupyter:
+        text = NotebookText()
+        yield lambda states: text.show(states_line(states))
+        return
     if not console.is_terminal:
         yield _Events().show
         return
@@ -44,9 +49,7 @@ def live_report() -> Iterator[Show]:
 
 def states_table(states: Sequence[CellState]) -> Table:
     """Running and failed cells, then some of those that wait and are done; counts in the title."""
-    counts = Counter(state.phase for state in states)
-    title = ", ".join(f"{count} {phase}" for phase, count in counts.items())
-    table = Table("cell", "state", "step", "PSNR dB", "time left", title=title, title_justify="left")
+    table = Table("cell", "state", "step", "PSNR dB", "time left", title=_counts(states), title_justify="left")
     for state in _shown(states):
         left = state.seconds_left
         table.add_row(
@@ -58,6 +61,17 @@ def states_table(states: Sequence[CellState]) -> Table:
             style=_STYLES[state.phase],
         )
     return table
+
+
+def states_line(states: Sequence[CellState]) -> str:
+    """Counts, and how far running cells are."""
+    running = [f"{each.cell.title} {each.step}/{each.cell.steps}" for each in states if each.phase == "running"]
+    return "; ".join([_counts(states), *running])
+
+
+def _counts(states: Sequence[CellState]) -> str:
+    counts = Counter(state.phase for state in states)
+    return ", ".join(f"{count} {phase}" for phase, count in counts.items())
 
 
 class _Events:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from typing import Any, Protocol
 
@@ -108,20 +109,28 @@ class NotebookLine:
 
     def __init__(self, counted: Counted) -> None:
         self._counted = counted
-        self._last = counted.began
-        self._shown: Any = None
+        self._last = -math.inf
+        self._text = NotebookText()
 
     def update(self, done: int, facts: str) -> None:
         """See :class:`Display`."""
         now = time.monotonic()
-        if self._shown is None or now - self._last >= NOTEBOOK_LINE_EVERY or done == self._counted.total:
+        if now - self._last >= NOTEBOOK_LINE_EVERY or done == self._counted.total:
             self._last = now
-            self._show(self._counted.text(done, facts))
+            self._text.show(self._counted.text(done, facts))
 
     def close(self) -> None:
         """See :class:`Display`."""
 
-    def _show(self, text: str) -> None:
+
+class NotebookText:
+    """Text in the output of a notebook's cell that can be replaced."""
+
+    def __init__(self) -> None:
+        self._shown: Any = None
+
+    def show(self, text: str) -> None:
+        """Show a text instead of the one before."""
         if self._shown is None:
             from IPython import display
 

@@ -175,7 +175,7 @@ def test_a_scene_without_depth_fails_the_methods_that_need_it_alone(wall, bare, 
     assert len(done.results) == 3
     (file,) = (tmp_path / "new" / "failures").rglob("*.json")
     assert json.loads(file.read_text())["reason"] == done.failures[0].reason
-    assert re.search(r"coliags +1 of 2 .*\nscaffold-gs +2 of 2", done.table())
+    assert re.search(r"coliags +1 of 2 .*\nscaffold-gs +2 of 2", str(done.table()))
 
 
 def test_a_split_without_test_frames_fails_before_training(wall, tmp_path, monkeypatch):
