@@ -4,21 +4,28 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from coliags_plugin.api.comparing import ablate, compare, variant
     from coliags_plugin.api.runs import Run, load_run
     from coliags_plugin.api.scenes import load_scene, make_phantom
     from coliags_plugin.api.training import train
 
 __version__ = "0.1.0"
-__all__ = ["Run", "load_run", "load_scene", "make_phantom", "train"]
+__all__ = ["Run", "ablate", "compare", "load_run", "load_scene", "make_phantom", "train", "variant"]
 
-#: Module of the API that has each name.
-_HOMES = {"Run": "runs", "load_run": "runs", "load_scene": "scenes", "make_phantom": "scenes", "train": "training"}
+#: Names of the API by its modules.
+_MODULES = {
+    "comparing": ("ablate", "compare", "variant"),
+    "runs": ("Run", "load_run"),
+    "scenes": ("load_scene", "make_phantom"),
+    "training": ("train",),
+}
 
 
 def __getattr__(name: str) -> Any:
     """A name of :mod:`coliags_plugin.api`, imported on first use, so that importing the package takes no time."""
-    if name in _HOMES:
-        return getattr(import_module(f"coliags_plugin.api.{_HOMES[name]}"), name)
+    for module, names in _MODULES.items():
+        if name in names:
+            return getattr(import_module(f"coliags_plugin.api.{module}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
