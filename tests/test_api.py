@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,8 +19,10 @@ from coliags_plugin.config.assignments import parse_assignments
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.outputs.image_files import read_depth_tiff, read_rgb
 from tests.commands import run
+from tests.comparison.small import InlineExecutor
 from tests.scenes import SMALL, write_wall
 
+ROOT = Path(__file__).parents[1]
 SETTINGS = parse_assignments(SMALL)
 
 
@@ -139,6 +144,28 @@ def test_a_notebook_shows_an_error_as_one_message():
     shell.run_cell("import coliags_plugin as cp\ncp.load_run('gone')")
     (line,) = shown
     assert line.startswith("InputError: gone is not a run folder. Expected")
+
+
+def test_examples_of_the_pages_run(tmp_path, monkeypatch):
+    """In the order of the page, each with a few steps of a small model."""
+    write_wall(tmp_path / "SCENE", frames=17)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("coliags_plugin.comparison.compare.make_executor", lambda how: InlineExecutor())
+
+    def quick(function):
+        def call(*args, settings=None, **options):
+            return function(*args, **{**options, "steps": 2, "settings": {**SETTINGS, **(settings or {})}})
+
+        return call
+
+    monkeypatch.setattr(cp, "train", quick(cp.train), raising=False)
+    monkeypatch.setattr(cp, "compare", quick(cp.compare), raising=False)
+    for page in ("README.md", "docs/api.md"):
+        names = {}
+        for block in re.findall(r"^```python\n(.*?)^```$", (ROOT / page).read_text(), re.DOTALL | re.MULTILINE):
+            exec(block, names)
+        assert isinstance(names["run"], cp.Run)
+        shutil.rmtree("comparison")
 
 
 def test_importing_the_package_imports_no_torch():

@@ -77,7 +77,8 @@ def test_what_fails_is_in_the_table(wall, tmp_path, inline):
 
 
 def test_an_ablation_is_a_comparison_of_a_files_variants(wall, tmp_path, inline):
-    (tmp_path / "mine.yaml").write_text("description: d\nbase: coliags\nvariants: {full: null, plain: [losses.depth=null]}\n")
+    text = "description: d\nbase: coliags\nvariants: {full: null, plain: [losses.depth=null]}\n"
+    (tmp_path / "mine.yaml").write_text(text)
     done = cp.ablate(tmp_path / "mine.yaml", wall, tmp_path / "new", steps=3, settings=SETTINGS)
     assert [result.method for result in done.results] == ["full", "plain"]
     with pytest.raises(InputError, match="paper-rows"):
