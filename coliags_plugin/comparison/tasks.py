@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
+from pathlib import Path
 from typing import Any, Literal
 
 #: How a worker ended. ``died``: without a word, killed or crashed; ``stopped``: asked to, with its state saved.
@@ -75,11 +77,13 @@ class Task:
         return [sys.executable, "-m", "coliags_plugin.comparison.worker", self.to_json()]
 
     def environment(self, inherited: Mapping[str, str]) -> dict[str, str]:
-        """Environment of the worker process: the number of threads of every library that asks for one."""
+        """Environment of the worker process: this package, and the number of threads of every library that asks."""
         count = str(self.threads)
+        package = str(Path(__file__).resolve().parents[2])
+        found = os.pathsep.join(filter(None, [package, inherited.get("PYTHONPATH")]))
         names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
         # A short spin of waiting threads, as on the command line (coliags_plugin.cli.main).
-        return {"GOMP_SPINCOUNT": "10000", **inherited, **dict.fromkeys(names, count)}
+        return {"GOMP_SPINCOUNT": "10000", **inherited, **dict.fromkeys(names, count), "PYTHONPATH": found}
 
 
 @dataclass(frozen=True)
