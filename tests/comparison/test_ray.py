@@ -24,10 +24,10 @@ from tests.commands import refused
 from tests.comparison.small import TINY, compare_inline, hashes, trainings
 from tests.scenes import write_wall
 
-STEPS = 120
-METHODS = ("coliags", "scaffold-gs-depth", "scaffold-gs")
+STEPS = 300
+METHODS = ("coliags", "scaffold-gs-depth", "scaffold-gs", "scaffold-gs-distance")
 OFTEN = (*TINY, "schedule.checkpoint_every=10")
-DEADLINE = 240.0
+DEADLINE = 300.0
 
 
 def test_ray_that_is_not_installed_is_told_how_to_get(tmp_path, capsys, monkeypatch):
@@ -46,6 +46,16 @@ def test_a_cluster_that_cannot_be_reached(tmp_path, capsys, address):
     assert f"no Ray cluster at {address}" in told and "ray start --head" in told
 
 
+def patiently(start):
+    """What a function starts; on a busy machine a node may miss the 30 seconds that Ray gives it."""
+    for _ in range(4):
+        try:
+            return start()
+        except Exception as error:
+            found = error
+    raise found
+
+
 @pytest.fixture
 def cluster():
     """A head, which this process belongs to and which runs nothing, and two nodes of one CPU each."""
@@ -53,9 +63,10 @@ def cluster():
     import ray
     from ray.cluster_utils import Cluster
 
-    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
-    nodes = [made.add_node(num_cpus=1) for _ in range(2)]
-    made.wait_for_nodes()
+    head = {"num_cpus": 0, "include_dashboard": False}
+    made = patiently(lambda: Cluster(initialize_head=True, head_node_args=head))
+    nodes = [patiently(lambda: made.add_node(num_cpus=1)) for _ in range(2)]
+    made.wait_for_nodes(timeout=120)
     yield made, nodes
     ray.shutdown()
     made.shutdown()
@@ -75,12 +86,21 @@ def undisturbed(wall, tmp_path):
 
 
 def driver(wall, folder, address):
-    """``coliags compare --executor ray`` as a process, alone in its group."""
+    """``coliags compare --executor ray`` as a process, alone in its group; its messages go to a file beside."""
     words = ["compare", *METHODS, "--scenes", wall, "--output", folder, "--steps", STEPS, "--threads", 1]
     words += ["--executor", "ray", "--ray-address", address, "--device", "cpu"]
     sets = [word for each in OFTEN for word in ("--set", each)]
     command = [sys.executable, "-c", "from coliags_plugin.cli import main; main()", *map(str, words), *sets]
-    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    with messages_of(folder).open("w") as messages:
+        return subprocess.Popen(command, stderr=messages, start_new_session=True)
+
+
+def messages_of(folder):
+    return folder.with_suffix(".txt")
+
+
+def told_by(folder):
+    return messages_of(folder).read_text()
 
 
 def until(what, value):
@@ -98,14 +118,20 @@ def steps_of(run):
 
 
 def under_way(folder):
-    """Processes of the runs that have some steps and no result yet."""
-    found = {}
+    """A process that has taken some steps of a run and has not ended; None where there is none."""
     for lock in folder.glob("runs/wall/*/.s0-*.lock"):
         run = lock.with_name(lock.name[1:].removesuffix(".lock"))
         text = lock.read_text(encoding="utf-8").split()
-        if len(text) > 1 and 20 < steps_of(run) < STEPS:
-            found[run.parent.name] = int(text[1])
-    return found
+        if len(text) > 1 and 20 < steps_of(run) < STEPS and is_running(int(text[1])):
+            return int(text[1])
+    return None
+
+
+def is_running(process):
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
 
 
 def parent_of(process):
@@ -135,32 +161,24 @@ def test_a_worker_a_node_and_the_driver_are_killed(cluster, wall, undisturbed, t
     made, nodes = cluster
     folder = tmp_path / "killed"
     first = driver(wall, folder, made.address)
-    struck = until("run", lambda: under_way(folder))
-    os.kill(next(iter(struck.values())), signal.SIGKILL)
-
-    again = until(
-        "other run", lambda: {name: pid for name, pid in under_way(folder).items() if pid not in struck.values()}
-    )
-    lost = node_of(next(iter(again.values())), nodes)
+    os.kill(until("run", lambda: under_way(folder)), signal.SIGKILL)
+    until("retry of the worker", lambda: told_by(folder).count("trying again") == 1)
+    lost = node_of(until("second run", lambda: under_way(folder)), nodes)
     made.remove_node(lost, allow_graceful=False)
     nodes.remove(lost)
-
-    until("further run", lambda: [pid for pid in under_way(folder).values() if pid not in again.values()])
+    until("retry on the other node", lambda: told_by(folder).count("trying again") == 2)
+    assert "SIGKILL" in told_by(folder) and "Node" in told_by(folder)
+    until("third run", lambda: under_way(folder))
     first.kill()
-    _, told = first.communicate()
-    assert "SIGKILL" in told and told.count("trying again") == 2, told
-    nodes.append(made.add_node(num_cpus=1))
-    made.wait_for_nodes()
+    first.wait()
+    nodes.append(patiently(lambda: made.add_node(num_cpus=1)))
 
-    last = driver(wall, folder, made.address)
-    _, told = last.communicate()
-    assert last.returncode == 0, told
+    assert driver(wall, folder, made.address).wait() == 0, told_by(folder)
     check(folder, undisturbed)
     before = trainings(folder)
-    assert sum(map(len, before.values())) >= len(METHODS) + 2
-    last = driver(wall, folder, made.address)
-    last.communicate()
-    assert last.returncode == 0 and trainings(folder) == before, "what is done is not run again"
+    assert sum(map(len, before.values())) >= len(METHODS) + 2, "what was struck went on"
+    assert driver(wall, folder, made.address).wait() == 0
+    assert trainings(folder) == before, "what is done is not run again"
 
 
 @pytest.mark.slow
@@ -170,8 +188,7 @@ def test_a_sweep_that_nobody_disturbs_and_one_that_is_asked_to_stop(cluster, wal
     first = driver(wall, folder, made.address)
     until("run", lambda: under_way(folder))
     os.kill(first.pid, signal.SIGINT)
-    _, told = first.communicate()
-    assert first.returncode == 130 and "the same command goes on" in told
+    assert first.wait() == 130 and "the same command goes on" in told_by(folder)
     how = How(threads=1, device="cpu", executor="ray", ray_address=made.address)
     done = compare(METHODS, [wall], folder, steps=STEPS, overrides=OFTEN, how=how)
     assert not done.failures
