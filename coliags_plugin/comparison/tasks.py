@@ -6,7 +6,7 @@ import json
 import os
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -38,6 +38,7 @@ class Task:
         result_key: Key that the result must have.
         log: File of the worker's messages.
         threads: CPU threads for a run that begins; one that goes on keeps its number.
+        variables: Environment variables of this package, for machines that may not have them.
         save_seconds: Largest time between two checkpoints.
         lock_seconds: How long to wait for another process that has the run.
     """
@@ -58,6 +59,7 @@ class Task:
     result_key: str
     log: str
     threads: int
+    variables: Mapping[str, str] = field(default_factory=dict)
     save_seconds: float = 60.0
     lock_seconds: float = 120.0
 
@@ -70,7 +72,7 @@ class Task:
         """What :meth:`to_json` wrote."""
         values = json.loads(text)
         values["overrides"] = tuple(values["overrides"])
-        return cls(**{field.name: values[field.name] for field in fields(cls)})
+        return cls(**{each.name: values[each.name] for each in fields(cls)})
 
     def command(self) -> list[str]:
         """Command line of the worker process."""
@@ -83,7 +85,8 @@ class Task:
         found = os.pathsep.join(filter(None, [package, inherited.get("PYTHONPATH")]))
         names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
         # A short spin of waiting threads, as on the command line (coliags_plugin.cli.main).
-        return {"GOMP_SPINCOUNT": "10000", **inherited, **dict.fromkeys(names, count), "PYTHONPATH": found}
+        own = {**self.variables, **dict.fromkeys(names, count), "PYTHONPATH": found}
+        return {"GOMP_SPINCOUNT": "10000", **inherited, **own}
 
 
 @dataclass(frozen=True)

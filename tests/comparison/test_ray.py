@@ -171,7 +171,6 @@ def test_a_worker_a_node_and_the_driver_are_killed(cluster, wall, undisturbed, t
     until("third run", lambda: under_way(folder))
     first.kill()
     first.wait()
-    nodes.append(patiently(lambda: made.add_node(num_cpus=1)))
 
     assert driver(wall, folder, made.address).wait() == 0, told_by(folder)
     check(folder, undisturbed)
