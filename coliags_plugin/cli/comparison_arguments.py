@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from coliags_plugin.cli.arguments import Assignments, OptionalInt, OptionalPath
+from coliags_plugin.cli.arguments import Assignments, OptionalInt, OptionalPath, OptionalText
 
 if TYPE_CHECKING:
     from coliags_plugin.comparison.cells import Variant
@@ -48,6 +48,8 @@ class ComparisonArguments:
     """Device to compute on."""
     executor: Executors = "local"
     """Where the runs are: processes on this machine, or on a Ray cluster (`pip install "coliags_plugin[sweep]"`)."""
+    ray_address: OptionalText = None
+    """HOST:PORT of the Ray cluster's head; default: RAY_ADDRESS, or the cluster of this machine."""
     retries: int = 2
     """How often a run is resumed whose process was killed or crashed."""
     dry_run: bool = False
@@ -63,7 +65,7 @@ class ComparisonArguments:
         request = make_request(
             methods, self.scenes, self.data, self.seeds, self.protocol, self.splits, self.steps, overrides
         )
-        how = How(self.jobs, self.threads, self.device, self.executor, self.retries)
+        how = How(self.jobs, self.threads, self.device, self.executor, self.ray_address, self.retries)
         folder, executor = ComparisonFolder(self.output), make_executor(how)
         if self.dry_run:
             ahead = dry_run(request, folder, executor)

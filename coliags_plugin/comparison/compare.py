@@ -18,6 +18,7 @@ from coliags_plugin.comparison.folder import ComparisonFolder, Failure
 from coliags_plugin.comparison.live import live_report
 from coliags_plugin.comparison.plan import Request, make_cells
 from coliags_plugin.comparison.preview import Preview, preview
+from coliags_plugin.comparison.ray_executor import RayExecutor
 from coliags_plugin.comparison.scenes import SceneSource, find_scenes, make_phantoms
 from coliags_plugin.comparison.summary import COLUMNS, summary_table
 from coliags_plugin.config.method_config import method_name
@@ -79,6 +80,7 @@ class How:
         threads: CPU threads of each; None: the CPUs divided by the runs at a time.
         device: ``auto``, ``cpu`` or ``cuda``.
         executor: ``local`` or ``ray``.
+        ray_address: ``HOST:PORT`` of the cluster's head; None: ``RAY_ADDRESS``, or the cluster of this machine.
         retries: How often a cell whose process died is tried again.
         save_seconds: Largest time between two checkpoints of a run.
     """
@@ -87,6 +89,7 @@ class How:
     threads: int | None = None
     device: str = "auto"
     executor: str = "local"
+    ray_address: str | None = None
     retries: int = 2
     save_seconds: float = 60.0
 
@@ -143,7 +146,6 @@ def carry_out(request: Request, folder: ComparisonFolder, executor: Executor, ho
     """
     cells = plan_cells(request, folder)
     with folder.held():
-        executor.check(folder.path)
         finished = folder.finished()
         missing = {cell.scene.name: cell.scene for cell in cells if finished.of(cell) is None}
         if any(not scene.is_there for scene in missing.values()):
@@ -154,6 +156,9 @@ def carry_out(request: Request, folder: ComparisonFolder, executor: Executor, ho
         ahead = preview(cells, folder, finished, estimates, executor.slots)
         log.info("%s", ahead.line())
         ahead.check_disk()
+        left = {cell.scene.path for cell in cells if finished.of(cell) is None}
+        if left:
+            executor.check(folder.path, sorted(left))
         folder.record(request, cells)
         sweep = Sweep(folder, executor, how.device, how.retries, how.save_seconds)
         with live_report() as show:
@@ -235,6 +240,8 @@ def make_executor(how: How) -> Executor:
         raise InputError(
             f"no executor '{how.executor}'", f"one of {', '.join(known)}", did_you_mean(how.executor, known)
         )
+    if how.executor == "ray":
+        return RayExecutor(how.ray_address, how.jobs, how.threads or 1, how.device)
     cpus = len(os.sched_getaffinity(0))
     gpus = _gpus(how.device)
     jobs = how.jobs or len(gpus) or cpus

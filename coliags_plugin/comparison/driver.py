@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import shutil
 import signal
 from collections import deque
@@ -63,6 +64,7 @@ class Sweep:
             result_key=cell.known_keys.result,
             log=str(self.folder.log(cell)),
             threads=self.executor.threads,
+            variables={name: value for name, value in os.environ.items() if name.startswith("COLIAGS_")},
             save_seconds=self.save_seconds,
         )
 

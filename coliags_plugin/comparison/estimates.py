@@ -12,10 +12,13 @@ from coliags_plugin.comparison.folder import ComparisonFolder
 from coliags_plugin.results.record import Result
 
 #: Seconds of a step on one thread, for images of 338 x 270, by kind of field (docs/comparing.md 4).
-_ROUGH_STEP = {"anchors": 0.16, "gaussians": 0.10, "surfels": 0.14, "lit-gaussians": 0.20, "reim-nerf": 4.0}
+_ROUGH_STEP = {"anchors": 0.16, "gaussians": 0.10, "surfels": 0.14, "lit-gaussians": 0.20, "reim-nerf": 7.5}
 _ROUGH_STEP_OF_OTHERS = 0.15
-#: Starting a process, reading a scene and evaluating, seconds.
-_ROUGH_OVERHEAD = 30.0
+#: Likewise of rendering the views of the test sets, where that is long.
+_ROUGH_EVALUATION = {"reim-nerf": 5000.0}
+_ROUGH_EVALUATION_OF_OTHERS = 10.0
+#: Starting a process and reading a scene, seconds.
+_ROUGH_START = 20.0
 #: A run folder: a checkpoint, and the images of its evaluation, bytes.
 _ROUGH_CHECKPOINT, _ROUGH_IMAGES = 60e6, 40e6
 #: Checkpoints that are there at times besides the one that stays: the one before, and one being written.
@@ -51,10 +54,14 @@ class Estimates:
 
     def __init__(self, folder: ComparisonFolder, results: Mapping[Path, Result]) -> None:
         self._steps: dict[str, list[float]] = {}
+        self._evaluations: dict[str, list[float]] = {}
         self._checkpoints: dict[str, list[float]] = {}
         for result in results.values():
             if result.cost.train_seconds and result.steps:
                 self._steps.setdefault(result.method, []).append(result.cost.train_seconds / result.steps)
+            if result.cost.render_fps:
+                views = sum(len(part.frames) for part in result.sets.values())
+                self._evaluations.setdefault(result.method, []).append(views / result.cost.render_fps)
             if result.cost.checkpoint_bytes:
                 self._checkpoints.setdefault(result.method, []).append(float(result.cost.checkpoint_bytes))
         self._runs = folder.path / "runs"
@@ -67,15 +74,16 @@ class Estimates:
             cell: The cell.
             steps_done: Steps that need not be repeated.
         """
-        steps = self._steps.get(cell.variant.name)
-        step = median(steps) if steps else _ROUGH_STEP.get(cell.config.field.name, _ROUGH_STEP_OF_OTHERS)
-        checkpoint = median(self._checkpoints.get(cell.variant.name, [_ROUGH_CHECKPOINT]))
+        name, field = cell.variant.name, cell.config.field.name
+        step = median(self._steps.get(name, [_ROUGH_STEP.get(field, _ROUGH_STEP_OF_OTHERS)]))
+        views = median(self._evaluations.get(name, [_ROUGH_EVALUATION.get(field, _ROUGH_EVALUATION_OF_OTHERS)]))
+        checkpoint = median(self._checkpoints.get(name, [_ROUGH_CHECKPOINT]))
         kept = median(self._sizes_of(cell) or [checkpoint + _ROUGH_IMAGES])
         return Estimate(
-            step * (cell.steps - steps_done) + _ROUGH_OVERHEAD,
+            step * (cell.steps - steps_done) + views + _ROUGH_START,
             kept,
             kept + _CHECKPOINTS_AT_TIMES * checkpoint,
-            steps is not None,
+            name in self._steps,
         )
 
     def phantom(self) -> tuple[float, float]:

@@ -14,7 +14,7 @@ from typing import IO
 from coliags_plugin.comparison.tasks import Outcome, Task, read_outcome
 
 #: For workers to save and end once they were asked to, seconds; then they are killed.
-_STOPPING = 45.0
+STOPPING = 45.0
 _PAUSE = 0.1
 
 
@@ -30,8 +30,8 @@ class Executor(ABC):
     threads: int
 
     @abstractmethod
-    def check(self, folder: Path) -> None:
-        """Find out whether tasks can run and write into a folder.
+    def check(self, folder: Path, scenes: Sequence[Path]) -> None:
+        """Find out whether tasks will see and can write a folder, and will see scenes.
 
         Raises:
             InputError: They cannot.
@@ -68,8 +68,8 @@ class LocalExecutor(Executor):
         self._gpus = tuple(gpus)
         self._workers: dict[int, LocalWorker] = {}  # by slot
 
-    def check(self, folder: Path) -> None:
-        """See :class:`Executor`; this machine always can."""
+    def check(self, folder: Path, scenes: Sequence[Path]) -> None:
+        """See :class:`Executor`; this machine always does."""
 
     def start(self, task: Task) -> None:
         """See :class:`Executor`."""
@@ -93,7 +93,7 @@ class LocalExecutor(Executor):
         """See :class:`Executor`."""
         for worker in self._workers.values():
             worker.ask_to_stop()
-        until = time.monotonic() + _STOPPING
+        until = time.monotonic() + STOPPING
         try:
             for worker in self._workers.values():
                 worker.wait_or_kill(until - time.monotonic())

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
 from typing import Any, Literal
 
 #: How a worker ended. ``died``: without a word, killed or crashed; ``stopped``: asked to, with its state saved.
@@ -36,6 +38,7 @@ class Task:
         result_key: Key that the result must have.
         log: File of the worker's messages.
         threads: CPU threads for a run that begins; one that goes on keeps its number.
+        variables: Environment variables of this package, for machines that may not have them.
         save_seconds: Largest time between two checkpoints.
         lock_seconds: How long to wait for another process that has the run.
     """
@@ -56,6 +59,7 @@ class Task:
     result_key: str
     log: str
     threads: int
+    variables: Mapping[str, str] = field(default_factory=dict)
     save_seconds: float = 60.0
     lock_seconds: float = 120.0
 
@@ -68,18 +72,21 @@ class Task:
         """What :meth:`to_json` wrote."""
         values = json.loads(text)
         values["overrides"] = tuple(values["overrides"])
-        return cls(**{field.name: values[field.name] for field in fields(cls)})
+        return cls(**{each.name: values[each.name] for each in fields(cls)})
 
     def command(self) -> list[str]:
         """Command line of the worker process."""
         return [sys.executable, "-m", "coliags_plugin.comparison.worker", self.to_json()]
 
     def environment(self, inherited: Mapping[str, str]) -> dict[str, str]:
-        """Environment of the worker process: the number of threads of every library that asks for one."""
+        """Environment of the worker process: this package, and the number of threads of every library that asks."""
         count = str(self.threads)
+        package = str(Path(__file__).resolve().parents[2])
+        found = os.pathsep.join(filter(None, [package, inherited.get("PYTHONPATH")]))
         names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
         # A short spin of waiting threads, as on the command line (coliags_plugin.cli.main).
-        return {"GOMP_SPINCOUNT": "10000", **inherited, **dict.fromkeys(names, count)}
+        own = {**self.variables, **dict.fromkeys(names, count), "PYTHONPATH": found}
+        return {"GOMP_SPINCOUNT": "10000", **inherited, **own}
 
 
 @dataclass(frozen=True)

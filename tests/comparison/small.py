@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 from coliags_plugin.comparison.compare import How, carry_out, make_request
@@ -28,7 +29,7 @@ class InlineExecutor(Executor):
         self.tasks: list[Task] = []
         self._next: list[Task] = []
 
-    def check(self, folder: Path) -> None:
+    def check(self, folder: Path, scenes: Sequence[Path]) -> None:
         pass
 
     def start(self, task: Task) -> None:

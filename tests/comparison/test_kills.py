@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from coliags_plugin.comparison.compare import How, compare
+from coliags_plugin.comparison.states import steps_saved
 from tests.comparison.small import TINY, compare_inline, hashes, trainings
 from tests.scenes import write_wall
 
@@ -77,6 +78,25 @@ def alive(process):
     except ProcessLookupError:
         return False
     return True
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_comparison_that_is_asked_to_stop_saves_its_runs(wall, undisturbed, tmp_path, number):
+    folder = tmp_path / "stopped"
+    first = driver(wall, folder)
+    until("step", lambda: run_of(folder, "coliags") and run_of(folder, "scaffold-gs-depth"))
+    os.kill(first.pid, number)
+    _, told = first.communicate()
+    assert first.returncode == 130
+    assert "stopped with 0 of 2 cells done; the same command goes on where it stopped" in told
+    runs = sorted(folder.glob("runs/wall/*/s0-*"))
+    saved = {run.relative_to(folder / "runs").as_posix(): steps_saved(run) for run in runs}
+    assert list(saved.values()) == list(map(step_of, runs)), "the last step that was taken is saved"
+    last = driver(wall, folder)
+    last.communicate()
+    assert last.returncode == 0 and hashes(folder) == undisturbed
+    assert trainings(folder) == {run: [0, step] for run, step in saved.items()}
 
 
 def test_killed_worker_and_killed_driver(wall, undisturbed, tmp_path):
