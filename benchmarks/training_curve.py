@@ -27,10 +27,10 @@ from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.data_formats import load_method_for, load_scene
 from coliags_plugin.engine.devices import choose_device
-from coliags_plugin.engine.evaluator import MAIN_SET
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.scoring import Scorer, within_seen
 from coliags_plugin.engine.trainer import Trainer
+from coliags_plugin.results.record import MAIN_SET
 
 #: Figures of protocol `paper` that a curve holds; LPIPS would cost more than the training between two looks.
 METRICS = ("psnr", "ssim", "depth_mse", "depth_mse_inner", "depth_median_error")

@@ -2,69 +2,39 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import torch
 
-from coliags_plugin.contracts import Comparison, Metric, Protocol
+from coliags_plugin.contracts import Comparison
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, atomic_write, write_json
 from coliags_plugin.core.scenes import Frame
+from coliags_plugin.engine.evaluated_set import EvaluatedSet
 from coliags_plugin.engine.progress import ProgressReport
-from coliags_plugin.engine.provenance import software
-from coliags_plugin.engine.scoring import Scorer, Scores, within_seen
+from coliags_plugin.engine.run_result import run_result
+from coliags_plugin.engine.scoring import Scorer
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.outputs.colormaps import DEPTH_ERROR_LIMIT_MM, colorize_depth_error
 from coliags_plugin.outputs.image_files import eight_bit, write_depth_tiff, write_png
-
-#: The main test set, whose means are at the top of metrics.json.
-MAIN_SET = "test"
-#: Metrics that are also computed over pixels seen by a training frame, where frames have a seen mask.
-SEEN_METRICS = ("psnr", "ssim", "depth_mse", "depth_median_error")
-SEEN_SUFFIX = "_seen"
-
-
-@dataclass
-class _SetScores:
-    """Per-frame metrics of one test set, and reasons for missing ones."""
-
-    rows: dict[str, dict[str, float]] = field(default_factory=dict)
-    reasons: dict[str, str] = field(default_factory=dict)
-
-    def add(self, frame: str, scores: Scores, suffix: str = "") -> None:
-        """Add the metrics of one frame, and reasons for missing ones."""
-        row = self.rows.setdefault(frame, {})
-        row.update({name + suffix: value for name, value in scores.values.items()})
-        for name, reason in scores.reasons.items():
-            self.reasons.setdefault(name + suffix, reason)
-
-    def means(self, names: list[str]) -> dict[str, float | None]:
-        """Mean over the frames that have a metric; None where none has."""
-        found: dict[str, float | None] = {}
-        for name in names:
-            values = [row[name] for row in self.rows.values() if name in row]
-            found[name] = sum(values) / len(values) if values else None
-        return found
+from coliags_plugin.results.reading import RESULT_FILE, write_result
+from coliags_plugin.results.summaries import means_summary, per_frame_table
 
 
 def evaluate(trained: TrainedRun, protocol_name: str) -> Path:
     """Render every held-out view, compute the protocol's metrics, and write them with the images.
 
-    Writes ``eval/<protocol>/metrics.json`` (means per test set; the main set's also at the top; null where a metric
-    is not available, with the reason), ``per_frame.csv`` and the images. An earlier evaluation under the same protocol
-    is replaced once the new one is complete.
+    Writes into ``eval/<protocol>/``: ``result.json``, the whole :class:`~coliags_plugin.results.record.Result`; and of
+    it ``metrics.json`` (means per test set; the main set's also at the top; null where a metric is not available, with
+    the reason) and ``per_frame.csv``; and the images. An earlier evaluation under the same protocol is replaced once
+    the new one is complete.
 
     Returns:
         The evaluation's folder.
 
     Raises:
-        InputError: The protocol is unknown or wants what the renderer cannot deliver, there is no test frame, or the
-            run was relit.
+        InputError: The protocol is unknown or wants what the renderer cannot deliver, there is no test frame, the
+            folder cannot be written, or the run was relit.
     """
     if trained.lamp is not None:
         raise InputError(
@@ -77,24 +47,20 @@ def evaluate(trained: TrainedRun, protocol_name: str) -> Path:
         raise InputError(f"scene '{trained.scene.name}' has no test frames", "a split that holds some out")
     total, done = sum(map(len, sets.values())), 0
     target = trained.run.evaluation(scorer.protocol.name)
-    scores = {name: _SetScores() for name in sets}
+    evaluated = {name: EvaluatedSet() for name in sets}
     with atomic_folder(target, overwrite=True) as scratch, ProgressReport("evaluate", total) as progress:
         for set_name, frames in sets.items():
             for frame in frames:
                 comparison = scorer.compare(trained.model, frame, trained.device)
-                _add_scores(scores[set_name], frame, scorer, comparison)
+                evaluated[set_name].add(frame, comparison, scorer)
                 _write_images(scratch, set_name, frame, comparison)
                 done += 1
                 progress.update(done)
-        write_json(scratch / "metrics.json", _summary(trained, scorer.protocol, scorer.metrics, scores))
-        atomic_write(scratch / "per_frame.csv", _table(scores, _columns(scorer.metrics, scores)))
+        result = run_result(trained, scorer, evaluated)
+        write_result(scratch / RESULT_FILE, result)
+        write_json(scratch / "metrics.json", means_summary(result))
+        atomic_write(scratch / "per_frame.csv", per_frame_table(result))
     return target
-
-
-def _add_scores(scores: _SetScores, frame: Frame, scorer: Scorer, comparison: Comparison) -> None:
-    scores.add(frame.name, scorer.score(comparison))
-    if frame.seen is not None:
-        scores.add(frame.name, scorer.score(within_seen(comparison, frame), SEEN_METRICS), SEEN_SUFFIX)
 
 
 def _write_images(folder: Path, set_name: str, frame: Frame, comparison: Comparison) -> None:
@@ -108,40 +74,3 @@ def _write_images(folder: Path, set_name: str, frame: Frame, comparison: Compari
     write_depth_tiff(folder / "true_depth" / f"{name}.tiff", known)
     errors = colorize_depth_error(comparison.depth, known, comparison.depth_valid, DEPTH_ERROR_LIMIT_MM)
     write_png(folder / "errors" / f"{name}.png", errors)
-
-
-def _columns(metrics: Mapping[str, Metric], scores: Mapping[str, _SetScores]) -> list[str]:
-    seen = {name for part in scores.values() for row in part.rows.values() for name in row if name not in metrics}
-    return [*metrics, *(name + SEEN_SUFFIX for name in SEEN_METRICS if name + SEEN_SUFFIX in seen)]
-
-
-def _summary(
-    trained: TrainedRun, protocol: Protocol, metrics: Mapping[str, Metric], scores: Mapping[str, _SetScores]
-) -> dict[str, Any]:
-    columns = _columns(metrics, scores)
-    base = {name: name.removesuffix(SEEN_SUFFIX) for name in columns}
-    main = scores.get(MAIN_SET) or next(iter(scores.values()))
-    reasons = {name: text for part in [*scores.values()][::-1] for name, text in part.reasons.items()}
-    return {
-        "protocol": {"name": protocol.name, "version": protocol.version, "description": protocol.description},
-        "method": trained.method,
-        "scene": trained.scene.name,
-        "step": trained.step,
-        "untrained_views": {name: module.untrained_views for name, module in trained.model.view_modules.items()},
-        **main.means(list(metrics)),
-        "reasons": reasons,
-        "directions": {name: "higher" if metrics[base[name]].higher_is_better else "lower" for name in columns},
-        "units": {name: metrics[base[name]].unit for name in columns},
-        "sets": {name: {"frames": len(part.rows), **part.means(columns)} for name, part in scores.items()},
-        "software": software(),
-    }
-
-
-def _table(scores: Mapping[str, _SetScores], columns: list[str]) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["set", "frame", *columns])
-    for set_name, part in scores.items():
-        for frame, row in part.rows.items():
-            writer.writerow([set_name, frame, *(repr(row[name]) if name in row else "" for name in columns)])
-    return text.getvalue()

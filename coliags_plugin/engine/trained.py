@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -32,6 +33,8 @@ class TrainedRun:
         model: The trained model.
         step: Of the checkpoint.
         device: Where it computes.
+        seed: Of the run.
+        provenance: As recorded by training.
         lamp: What it was relit with; None under the lamp that the data were recorded with.
     """
 
@@ -42,6 +45,8 @@ class TrainedRun:
     model: Model
     step: int
     device: torch.device
+    seed: int
+    provenance: Mapping[str, Any]
     lamp: Lamp | None = None
 
     @cached_property
@@ -67,14 +72,15 @@ def load_trained(path: Path, device: torch.device, data: Path | None = None) -> 
     try:
         method, recorded = provenance["method"], provenance["scene"]
         scene_path, fingerprint = recorded["path"], recorded["provenance"].get("fingerprint")
-    except (KeyError, TypeError, AttributeError) as error:
+        seed = int(provenance["seed"])
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{run.provenance_file} lacks {error}", "what `coliags train` wrote") from error
     saved = read_checkpoint(latest_checkpoint(run.checkpoints), method, device)
     scene = load_scene(config, data or Path(scene_path))
     _check_same_data(scene, fingerprint, data or Path(scene_path))
     renderer = choose_renderer(config.renderer, config.field.target.primitive, device).renderer
     model = restore_model(saved, config, scene, renderer).to(device).eval()
-    return TrainedRun(run, config, method, scene, model, saved.step, device)
+    return TrainedRun(run, config, method, scene, model, saved.step, device, seed, provenance)
 
 
 def _check_same_data(scene: Scene, fingerprint: Any, path: Path) -> None:

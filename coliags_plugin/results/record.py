@@ -8,16 +8,25 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, model_validator
+from typing_extensions import Self
 
 #: Of the schema below; incremented whenever a reader of the older version would misread a newer file.
 VERSION = 1
+#: The split's own test set.
+MAIN_SET = "test"
+#: Of metrics over the pixels that a training frame sees.
+SEEN_SUFFIX = "_seen"
 
+Format = Literal["coliags-result"]
 Direction = Literal["higher", "lower"]
+
+#: Marks a results file.
+FORMAT: Format = "coliags-result"
 
 
 class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class ProtocolRecord(_Part):
@@ -60,8 +69,9 @@ class ProfileRecord(_Part):
         unit: Of the edges: ``mm`` or ``degrees``.
         edges: Of the bins, ascending. [B + 1]
         pixels: Pixels with known depth in each bin. [B]
-        rgb_mse: Mean squared colour error of those pixels, colours in [0, 1]; None where there are none. [B]
-        depth_mse: Mean squared depth error of those pixels, mm^2; None where there are none. [B]
+        rgb_mse: Mean squared colour error of those pixels, colours in [0, 1]; None where there are none, or where a
+            rendered one is not finite. [B]
+        depth_mse: Mean squared depth error of those pixels, mm^2; None likewise. [B]
     """
 
     unit: str
@@ -69,6 +79,14 @@ class ProfileRecord(_Part):
     pixels: tuple[int, ...]
     rgb_mse: tuple[float | None, ...]
     depth_mse: tuple[float | None, ...]
+
+    @model_validator(mode="after")
+    def _one_number_per_bin(self) -> Self:
+        for name in ("pixels", "rgb_mse", "depth_mse"):
+            found, bins = len(getattr(self, name)), len(self.edges) - 1
+            if found != bins:
+                raise ValueError(f"{name} has {found} numbers for {bins} bins")
+        return self
 
 
 class SetRecord(_Part):
@@ -90,6 +108,15 @@ class SetRecord(_Part):
     truth_sha256: str
     profiles: dict[str, ProfileRecord] = {}
 
+    @model_validator(mode="after")
+    def _one_value_per_frame(self) -> Self:
+        if len(set(self.frames)) != len(self.frames):
+            raise ValueError("a frame is listed twice")
+        for name, values in self.values.items():
+            if len(values) != len(self.frames):
+                raise ValueError(f"metric '{name}' has {len(values)} values for {len(self.frames)} frames")
+        return self
+
     def mean(self, metric: str) -> float | None:
         """Mean over the frames that have a metric; None where none has."""
         known = [value for value in self.values.get(metric, ()) if value is not None]
@@ -100,12 +127,16 @@ class CostRecord(_Part):
     """What a run cost; comparable between runs on one device only. None: not measured.
 
     Attributes:
-        device: Name of the processor or GPU.
+        device: Name of the processor or GPU it was trained on.
         threads: CPU threads it was given.
-        train_seconds: Time of training, all resumptions together, without reading data and evaluation.
-        processor_seconds: CPU time of the same.
+        train_seconds: Time of training, all resumptions together, without reading data and evaluation. Steps that a
+            kill made necessary twice count once.
+        processor_seconds: CPU time of the same, all threads together.
         peak_memory_mib: Largest resident memory of the training process, or allocated memory of the GPU.
-        render_fps: Views of the test sets rendered in a second, at their size.
+        render_fps: Views of the test sets rendered in a second, at their size: 1 / the median time of a view, the
+            first one apart.
+        render_device: Name of the processor or GPU that rendered them.
+        render_threads: CPU threads that rendering was given.
         gaussians: Mean number of Gaussians drawn in a test view; None for radiance fields.
         checkpoint_bytes: Size of the last checkpoint.
         seconds_to_psnr: Training seconds after which the logged PSNR, smoothed, first reached a mark in dB.
@@ -117,6 +148,8 @@ class CostRecord(_Part):
     processor_seconds: float | None = None
     peak_memory_mib: float | None = None
     render_fps: float | None = None
+    render_device: str | None = None
+    render_threads: int | None = None
     gaussians: float | None = None
     checkpoint_bytes: int | None = None
     seconds_to_psnr: dict[str, float | None] = {}
@@ -126,9 +159,10 @@ class Result(_Part):
     """One run, evaluated under one protocol.
 
     Attributes:
+        format: Marks the file.
         version: Of the schema.
         key: Hash of everything that determines the result; see :mod:`coliags_plugin.results.identity`.
-        metrics: Metrics by name, in the protocol's order.
+        metrics: Metrics by name, in the protocol's order; then those over seen pixels, ``<name>_seen``.
         metrics_sha256: Hash of the raw values of all test sets.
         steps: Training steps taken.
         seed: Of all random generators of the run.
@@ -139,6 +173,7 @@ class Result(_Part):
         provenance: Further provenance of the run.
     """
 
+    format: Format = FORMAT
     version: int = VERSION
     key: str
     method: str
@@ -153,3 +188,18 @@ class Result(_Part):
     config: dict[str, Any]
     software: dict[str, Any]
     provenance: dict[str, Any] = {}
+
+    @model_validator(mode="after")
+    def _known_metrics(self) -> Self:
+        if not self.sets:
+            raise ValueError("there is no test set")
+        for name, part in self.sets.items():
+            unknown = sorted(part.values.keys() - self.metrics.keys())
+            if unknown:
+                raise ValueError(f"set '{name}' has values of {unknown[0]}, which `metrics` does not describe")
+        return self
+
+    @property
+    def main_set(self) -> str:
+        """Name of the split's own test set; of the first one where it has none."""
+        return MAIN_SET if MAIN_SET in self.sets else next(iter(self.sets))

@@ -1,0 +1,74 @@
+"""What the evaluation of one test set collects, frame by frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+
+from coliags_plugin.contracts import Comparison
+from coliags_plugin.core.scenes import Frame
+from coliags_plugin.engine.scoring import Scorer, Scores, within_seen
+from coliags_plugin.results.hashing import ArraysHash
+from coliags_plugin.results.record import SEEN_SUFFIX, SetRecord
+
+#: Metrics that are also computed over pixels seen by a training frame, where frames have a seen mask.
+SEEN_METRICS = ("psnr", "ssim", "depth_mse", "depth_median_error")
+
+
+class EvaluatedSet:
+    """Scores of one test set, and hashes of what was compared."""
+
+    def __init__(self) -> None:
+        self._rows: dict[str, dict[str, float]] = {}
+        self._reasons: dict[str, str] = {}
+        self._predictions, self._truth = ArraysHash(), ArraysHash()
+
+    def add(self, frame: Frame, comparison: Comparison, scorer: Scorer) -> None:
+        """Score a frame and take it up."""
+        self._add_scores(frame.name, scorer.score(comparison))
+        if frame.seen is not None:
+            self._add_scores(frame.name, scorer.score(within_seen(comparison, frame), SEEN_METRICS), SEEN_SUFFIX)
+        predicted = {"rgb": comparison.rgb, "depth": comparison.depth}
+        true = {
+            "rgb": comparison.true_rgb,
+            "valid": comparison.valid,
+            "depth": comparison.true_depth,
+            "depth_valid": comparison.depth_valid,
+            "seen": frame.seen,
+        }
+        _hash(self._predictions, frame.name, predicted)
+        _hash(self._truth, frame.name, true)
+
+    def _add_scores(self, frame: str, scores: Scores, suffix: str = "") -> None:
+        row = self._rows.setdefault(frame, {})
+        row.update({name + suffix: value for name, value in scores.values.items()})
+        for name, reason in scores.reasons.items():
+            self._reasons.setdefault(name + suffix, reason)
+
+    @property
+    def seen_metrics(self) -> list[str]:
+        """Names of the metrics over seen pixels that some frame has."""
+        scored = {name for row in self._rows.values() for name in row}
+        return [name + SEEN_SUFFIX for name in SEEN_METRICS if name + SEEN_SUFFIX in scored]
+
+    def record(self, metrics: Iterable[str]) -> SetRecord:
+        """The set's record.
+
+        Args:
+            metrics: Names of the protocol's metrics, which are listed even where no frame has one.
+        """
+        rows = self._rows.values()
+        return SetRecord(
+            frames=tuple(self._rows),
+            values={name: tuple(row.get(name) for row in rows) for name in [*metrics, *self.seen_metrics]},
+            reasons=self._reasons,
+            predictions_sha256=self._predictions.hexdigest(),
+            truth_sha256=self._truth.hexdigest(),
+        )
+
+
+def _hash(target: ArraysHash, frame: str, parts: dict[str, torch.Tensor | None]) -> None:
+    for name, values in parts.items():
+        if values is not None:
+            target.add(frame, name, values.detach().cpu().numpy())

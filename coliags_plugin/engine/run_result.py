@@ -1,0 +1,96 @@
+"""The result of an evaluated run, composed of the run's folder, its scene and its scores."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from coliags_plugin import __version__
+from coliags_plugin.contracts import Metric
+from coliags_plugin.core.scenes import Scene
+from coliags_plugin.engine.evaluated_set import SEEN_METRICS, EvaluatedSet
+from coliags_plugin.engine.provenance import software
+from coliags_plugin.engine.scoring import Scorer
+from coliags_plugin.engine.trained import TrainedRun
+from coliags_plugin.results.hashing import metrics_sha256
+from coliags_plugin.results.identity import plain_config, result_key
+from coliags_plugin.results.record import SEEN_SUFFIX, CostRecord, MetricRecord, ProtocolRecord, Result, SceneRecord
+
+#: Keys of the provenance of a run and of its scene that a result has in another place, or that name a local path.
+_LEFT_OUT = ("method", "seed", "steps", "scene", "untrained_views", "path", "fingerprint")
+
+
+def run_result(trained: TrainedRun, scorer: Scorer, evaluated: Mapping[str, EvaluatedSet]) -> Result:
+    """Compose the result of a run.
+
+    Args:
+        trained: The run.
+        scorer: What it was scored with.
+        evaluated: Its test sets, at least one.
+    """
+    protocol, provenance = scorer.protocol, trained.provenance
+    config = plain_config(trained.config.model_dump())
+    scene = scene_record(trained.scene)
+    sets = {name: part.record(scorer.metrics) for name, part in evaluated.items()}
+    return Result(
+        key=result_key(
+            config,
+            scene.fingerprint,
+            trained.seed,
+            __version__,
+            protocol.name,
+            protocol.version,
+            _deviations(trained.step, config["schedule"]["steps"], provenance),
+        ),
+        method=trained.method,
+        scene=scene,
+        protocol=ProtocolRecord(name=protocol.name, version=protocol.version, description=protocol.description),
+        seed=trained.seed,
+        steps=trained.step,
+        metrics=_metrics(scorer.metrics, evaluated),
+        sets=sets,
+        metrics_sha256=metrics_sha256(sets),
+        cost=CostRecord(device=str(provenance.get("device", "unknown"))),
+        config=config,
+        software=software(),
+        provenance={
+            "untrained_views": {name: part.untrained_views for name, part in trained.model.view_modules.items()},
+            "training": {name: value for name, value in provenance.items() if name not in _LEFT_OUT},
+            "scene": {name: value for name, value in trained.scene.provenance.items() if name not in _LEFT_OUT},
+        },
+    )
+
+
+def scene_record(scene: Scene) -> SceneRecord:
+    """The record of a scene that has a test frame."""
+    split = scene.provenance.get("split", "")
+    camera = next(frame for frames in scene.test_sets.values() for frame in frames).camera
+    return SceneRecord(
+        name=scene.name,
+        fingerprint=str(scene.provenance.get("fingerprint", "")),
+        split=str(split.get("name", "") if isinstance(split, Mapping) else split),
+        train=tuple(frame.name for frame in scene.train),
+        size=(camera.width, camera.height),
+    )
+
+
+def _metrics(metrics: Mapping[str, Metric], evaluated: Mapping[str, EvaluatedSet]) -> dict[str, MetricRecord]:
+    seen = {name for part in evaluated.values() for name in part.seen_metrics}
+    records = {name: _metric(metric) for name, metric in metrics.items()}
+    over_seen = {name + SEEN_SUFFIX: records[name] for name in SEEN_METRICS if name + SEEN_SUFFIX in seen}
+    return records | over_seen
+
+
+def _metric(metric: Metric) -> MetricRecord:
+    return MetricRecord(unit=metric.unit, direction="higher" if metric.higher_is_better else "lower")
+
+
+def _deviations(step: int, configured: int, provenance: Mapping[str, Any]) -> dict[str, Any]:
+    """How a run differs from one that goes through as configured; empty where it does not."""
+    lengths = ("steps", "written_for")
+    jumps = [
+        change
+        for change in provenance.get("schedule_changes", [])
+        if any(change["from"][name] != change["to"][name] for name in lengths)
+    ]
+    return {**({} if step == configured else {"step": step}), **({"schedule_changes": jumps} if jumps else {})}

@@ -1,0 +1,84 @@
+"""Reading and writing of results files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import write_json
+from coliags_plugin.core.settings import first_error
+from coliags_plugin.results.hashing import metrics_sha256
+from coliags_plugin.results.record import FORMAT, VERSION, Result
+
+#: Name of the results file in the folder of an evaluation.
+RESULT_FILE = "result.json"
+
+_EXPECTED = "a results file, as `coliags eval` writes it"
+_AGAIN = "Restore it, or run `coliags eval` again"
+
+
+def write_result(path: Path, result: Result) -> None:
+    """Write a results file atomically.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    write_json(path, result.model_dump(mode="json"))
+
+
+def read_result(path: Path) -> Result:
+    """Read a results file.
+
+    Raises:
+        InputError: There is none, it is cut off or otherwise not JSON, no results file, of another version of the
+            schema, lacks a field or has one of a wrong type, or its values are not those that were written.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise InputError(f"there is no file {path}", _EXPECTED) from error
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be read: {error}", _EXPECTED) from error
+    _check_version(_parsed(text, path), path)
+    try:
+        result = Result.model_validate_json(text, strict=True)
+    except ValidationError as error:
+        key, message, _ = first_error(error)
+        raise InputError(f"{path}: {key or 'the file'}: {message}", _EXPECTED, _AGAIN) from error
+    if metrics_sha256(result.sets) != result.metrics_sha256:
+        raise InputError(
+            f"{path}: the values do not have the hash metrics_sha256; the file was changed or damaged",
+            "the values as `coliags eval` wrote them",
+            _AGAIN,
+        )
+    return result
+
+
+def _parsed(text: str, path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        whole = text.rstrip()
+        cut = whole.startswith("{") and not whole.endswith("}")
+        cut |= isinstance(error, json.JSONDecodeError) and error.pos >= len(whole)
+        what = "is empty" if not whole else "is cut off" if cut else "is not JSON"
+        raise InputError(f"{path} {what}: {error}", _EXPECTED, _AGAIN) from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise InputError(f'{path} is not a results file: it lacks "format": "{FORMAT}"', _EXPECTED)
+    return content
+
+
+def _check_version(content: dict[str, Any], path: Path) -> None:
+    version = content.get("version")
+    if type(version) is not int or version < 1:
+        raise InputError(f"{path}: version is {json.dumps(version)}", f"a number from 1 to {VERSION}", _AGAIN)
+    if version > VERSION:
+        raise InputError(
+            f"{path} is from a newer version of coliags_plugin: version {version} of the schema",
+            f"version {VERSION} or older",
+            "Update the package",
+        )

@@ -1,0 +1,329 @@
+"""Results files: what is read is what was written, and nothing else is read."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.results.hashing import ArraysHash, metrics_sha256
+from coliags_plugin.results.identity import result_key
+from coliags_plugin.results.reading import read_result, write_result
+from coliags_plugin.results.record import VERSION, MetricRecord, ProfileRecord, Result
+from coliags_plugin.results.summaries import means_summary, per_frame_table
+from tests.results.made import METRICS, made_result, made_set, numbers, results
+
+quick = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "result.json"
+    write_result(path, made_result())
+    return path
+
+
+def refusal(path) -> str:
+    with pytest.raises(InputError) as found:
+        read_result(path)
+    return str(found.value)
+
+
+def change(path, edit):
+    """Edit the content of a results file."""
+    content = json.loads(path.read_text())
+    edit(content)
+    path.write_text(json.dumps(content))
+
+
+# Round trip
+
+
+@quick
+@given(result=results())
+def test_what_is_read_is_what_was_written(result, tmp_path):
+    path = tmp_path / "result.json"
+    write_result(path, result)
+    assert read_result(path) == result
+
+
+def test_order_of_metrics_sets_and_frames_is_kept(tmp_path):
+    sets = {"test": made_set(), "rotation": made_set(("b", "a"))}
+    write_result(tmp_path / "r.json", made_result(sets))
+    found = read_result(tmp_path / "r.json")
+    assert list(found.sets) == ["test", "rotation"] and found.sets["rotation"].frames == ("b", "a")
+    assert list(found.metrics) == list(METRICS)
+
+
+# Hash of the values
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a value lies in a result."""
+
+    set: str
+    metric: str
+    frame: int
+
+
+def places(result: Result) -> list[Place]:
+    return [
+        Place(name, metric, frame)
+        for name, part in result.sets.items()
+        for metric, values in part.values.items()
+        for frame in range(len(values))
+    ]
+
+
+@quick
+@given(data=st.data(), result=results())
+def test_any_change_of_one_value_is_found_out(data, result, tmp_path):
+    assume(places(result))
+    place = data.draw(st.sampled_from(places(result)))
+    old = result.sets[place.set].values[place.metric][place.frame]
+    new = data.draw(st.none() | numbers | st.just(None if old is None else math.nextafter(old, 0.0)))
+    # 0.0 and -0.0 are equal and not the same.
+    assume(repr(new) != repr(old))
+    path = tmp_path / "result.json"
+    write_result(path, result)
+
+    def edit(content):
+        content["sets"][place.set]["values"][place.metric][place.frame] = new
+
+    change(path, edit)
+    assert "changed or damaged" in refusal(path)
+
+
+def test_the_hash_knows_sets_frames_and_metrics():
+    part = made_set()
+    renamed = made_set(("0000", "0009"))
+    swapped = part.model_copy(update={"values": {**part.values, "psnr": part.values["psnr"][::-1]}})
+    hashes = [metrics_sha256(sets) for sets in ({"test": part}, {"other": part}, {"test": renamed}, {"test": swapped})]
+    assert len(set(hashes)) == 4
+
+
+def test_the_hash_does_not_know_the_order_of_names():
+    part = made_set()
+    turned = part.model_copy(update={"values": dict(reversed(part.values.items()))})
+    assert metrics_sha256({"a": part, "b": part}) == metrics_sha256({"b": turned, "a": part})
+
+
+def test_the_hash_is_of_the_documented_text():
+    import hashlib
+
+    part = made_set(("f",), (30.1,), (None,))
+    text = '{"test":{"frames":["f"],"values":{"depth_mse":[null],"lpips":[null],"psnr":[30.1]}}}'
+    assert metrics_sha256({"test": part}) == hashlib.sha256(text.encode()).hexdigest()
+
+
+# Hash of images
+
+
+def arrays_hash(*arrays) -> str:
+    found = ArraysHash()
+    for frame, part, values in arrays:
+        found.add(frame, part, values)
+    return found.hexdigest()
+
+
+def test_images_have_a_hash_of_names_shapes_and_numbers():
+    image = np.arange(6, dtype=np.float32).reshape(2, 3)
+    other = image.copy()
+    other[1, 2] = np.nextafter(other[1, 2], np.float32(0))
+    variants = [
+        [("a", "rgb", image)],
+        [("b", "rgb", image)],
+        [("a", "depth", image)],
+        [("a", "rgb", image.reshape(3, 2))],
+        [("a", "rgb", other)],
+        [("a", "rgb", image), ("b", "rgb", image)],
+        [("b", "rgb", image), ("a", "rgb", image)],
+    ]
+    assert len({arrays_hash(*arrays) for arrays in variants}) == len(variants)
+
+
+def test_the_hash_of_images_does_not_depend_on_their_memory():
+    image = np.random.default_rng(0).random((4, 5)).astype(np.float32)
+    image[0, 0] = np.nan
+    odd_nan = image.copy()
+    odd_nan.view(np.uint32)[0, 0] = 0xFFC00123
+    assert np.isnan(odd_nan[0, 0])
+    same = [image, np.asfortranarray(image), image.astype(np.float64), image.astype(">f4"), odd_nan]
+    assert len({arrays_hash(("a", "rgb", values)) for values in same}) == 1
+
+
+# Refusals
+
+
+def test_a_missing_file(tmp_path):
+    assert "there is no file" in refusal(tmp_path / "gone.json")
+    assert "cannot be read" in refusal(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "part"),
+    [
+        (b"", "is empty"),
+        (b"psnr,30", "is not JSON"),
+        (b'{"format": "coliags-result",,}', "is not JSON"),
+        (b"\xff\xfe\x00", "cannot be read"),
+        (b"[" * 100_000, "result.json is"),
+        (b"[]", "is not a results file"),
+        (b'{"psnr": 30}', "is not a results file"),
+        (b'{"format": "coliags-result"}', "version is null"),
+        (b'{"format": "coliags-result", "version": "1"}', 'version is "1"'),
+        (b'{"format": "coliags-result", "version": true}', "version is true"),
+        (b'{"format": "coliags-result", "version": 0}', "version is 0"),
+        (b'{"format": "coliags-result", "version": 1}', "key: Field required"),
+    ],
+)
+def test_other_content_is_refused(content, part, tmp_path):
+    path = tmp_path / "result.json"
+    path.write_bytes(content)
+    assert part in refusal(path)
+
+
+@quick
+@given(share=st.floats(0.0, 0.999))
+def test_a_file_that_is_cut_off_says_so(share, tmp_path):
+    path = tmp_path / "result.json"
+    write_result(path, made_result())
+    whole = path.read_bytes().rstrip()
+    path.write_bytes(whole[: int(share * len(whole))])
+    message = refusal(path)
+    assert "is cut off" in message or "is empty" in message
+
+
+def test_a_newer_version_is_refused_whatever_else_it_has(file):
+    change(file, lambda content: content.update(version=VERSION + 1, unheard_of={}))
+    assert "newer version of coliags_plugin" in refusal(file) and "Update the package" in refusal(file)
+
+
+@pytest.mark.parametrize("name", [name for name, field in Result.model_fields.items() if field.is_required()])
+def test_a_missing_field_is_named(name, file):
+    change(file, lambda content: content.pop(name))
+    assert f"{name}: Field required" in refusal(file)
+
+
+@pytest.mark.parametrize(
+    ("keys", "value", "part"),
+    [
+        (("seed",), "0", "seed: "),
+        (("seed",), 0.5, "seed: "),
+        (("steps",), None, "steps: "),
+        (("scene", "size"), [32], "scene.size"),
+        (("scene", "fingerprint"), 3, "scene.fingerprint: "),
+        (("protocol", "version"), "one", "protocol.version: "),
+        (("metrics", "psnr", "direction"), "up", "metrics.psnr.direction: "),
+        (("sets", "test", "values", "psnr"), [30.0, "31.5"], "sets.test.values.psnr.1: "),
+        (("sets", "test", "values", "psnr"), [30.0], "metric 'psnr' has 1 values for 2 frames"),
+        (("sets", "test", "values", "sharpness"), [1.0, 2.0], "values of sharpness, which `metrics`"),
+        (("sets", "test", "frames"), ["0000", "0000"], "a frame is listed twice"),
+        (("sets",), {}, "there is no test set"),
+        (("cost", "train_seconds"), "12 s", "cost.train_seconds: "),
+        (("cost", "colour"), "red", "cost.colour: "),
+        (("unheard_of",), 1, "unheard_of: "),
+    ],
+)
+def test_a_field_of_the_wrong_type_is_named(keys, value, part, file):
+    def edit(content):
+        for key in keys[:-1]:
+            content = content[key]
+        content[keys[-1]] = value
+
+    change(file, edit)
+    assert part in refusal(file)
+
+
+def test_numbers_that_are_not_finite_are_refused(file):
+    text = file.read_text().replace("31.5", "NaN")
+    file.write_text(text)
+    assert "sets.test.values.psnr.1" in refusal(file)
+    with pytest.raises(ValidationError, match="finite"):
+        made_set(psnr=(30.0, math.inf))
+
+
+def test_a_profile_has_one_number_per_bin():
+    with pytest.raises(ValidationError, match="rgb_mse has 1 numbers for 2 bins"):
+        ProfileRecord(unit="mm", edges=(0, 1, 2), pixels=(1, 2), rgb_mse=(1.0,), depth_mse=(1.0, 2.0))
+
+
+# Summaries
+
+
+def test_means_are_over_the_frames_that_have_a_value():
+    summary = means_summary(made_result())
+    assert summary["psnr"] == 30.75 and summary["depth_mse"] == 0.25 and summary["lpips"] is None
+    assert summary["reasons"] == {"lpips": "no weights"}
+    assert "psnr_seen" not in summary and summary["sets"]["test"]["psnr_seen"] is None
+
+
+def test_the_top_shows_the_set_called_test_else_the_first():
+    own, other = made_set(), made_set(psnr=(20.0, 20.0))
+    assert means_summary(made_result({"rotation": other, "test": own}))["psnr"] == 30.75
+    assert means_summary(made_result({"rotation": other, "up": own}))["psnr"] == 20.0
+
+
+def test_the_table_has_every_frame_and_metric():
+    rotation = made_set(("r",), (20.0,), (1.0,))
+    rotation = rotation.model_copy(update={"values": {**rotation.values, "psnr_seen": (25.5,)}})
+    assert per_frame_table(made_result({"test": made_set(), "rotation": rotation})).splitlines() == [
+        "set,frame,psnr,lpips,depth_mse,psnr_seen",
+        "test,0000,30.0,,0.25,",
+        "test,0008,31.5,,,",
+        "rotation,r,20.0,,1.0,25.5",
+    ]
+
+
+def test_a_protocols_own_metric_may_end_like_one_over_seen_pixels():
+    metrics = {"psnr": METRICS["psnr"], "lpips": METRICS["lpips"], "depth_mse": METRICS["depth_mse"]}
+    metrics["foreseen_seen"] = MetricRecord(unit="", direction="lower")
+    assert "foreseen_seen" in means_summary(made_result(metrics=metrics))
+
+
+# Key
+
+KEY = {
+    "config": {"field": {"name": "anchors"}, "schedule": {"steps": 60}},
+    "fingerprint": "f",
+    "seed": 0,
+    "package_version": "1.0",
+    "protocol": "paper",
+    "protocol_version": 1,
+}
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"config": {"field": {"name": "anchors"}, "schedule": {"steps": 61}}},
+        {"fingerprint": "g"},
+        {"seed": 1},
+        {"package_version": "1.1"},
+        {"protocol": "authors-code"},
+        {"protocol_version": 2},
+        {"deviations": {"step": 30}},
+    ],
+)
+def test_everything_that_determines_a_result_changes_its_key(changes):
+    assert result_key(**{**KEY, **changes}) != result_key(**KEY)
+
+
+def test_what_does_not_determine_a_result_leaves_its_key():
+    other = copy.deepcopy(KEY["config"]) | {"description": "another", "protocol": "authors-code"}
+    assert result_key(**{**KEY, "config": other, "deviations": {}}) == result_key(**KEY)
+
+
+def test_a_config_and_its_json_have_the_same_key():
+    config = {"size": (1, 2), "far": math.inf}
+    read = json.loads(json.dumps({"size": [1, 2], "far": "Infinity"}))
+    assert result_key(**{**KEY, "config": config}) == result_key(**{**KEY, "config": read})
