@@ -11,11 +11,13 @@ from typing import Any
 
 import torch
 
+from coliags_plugin.engine.devices import device_name
+
 
 def describe_machine() -> dict[str, Any]:
     """Processor, threads, library versions."""
     found = {
-        "cpu": _cpu_name(),
+        "cpu": device_name(torch.device("cpu")),
         "cpus": os.cpu_count(),
         "threads": torch.get_num_threads(),
         "python": platform.python_version(),
@@ -24,14 +26,6 @@ def describe_machine() -> dict[str, Any]:
     if torch.cuda.is_available():
         found["gpu"] = torch.cuda.get_device_name(0)
     return found
-
-
-def _cpu_name() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor()
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
 def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:

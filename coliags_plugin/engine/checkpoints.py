@@ -18,6 +18,7 @@ from coliags_plugin.contracts import Renderer, Sampler, Strategy
 from coliags_plugin.core.errors import InputError, NotFiniteError
 from coliags_plugin.core.files import atomic_folder
 from coliags_plugin.core.scenes import Scene
+from coliags_plugin.engine.costs import TrainingCost
 from coliags_plugin.engine.model import Model, make_view_modules
 from coliags_plugin.engine.optimizers import Optimizers
 
@@ -35,12 +36,14 @@ class Checkpoint:
         method: Name of the method it belongs to.
         tensors: By ``<part>/<name>``, the parts being field, modules, optimizer, strategy and generator.
         queue: Frames that the sampler has planned, the last being next.
+        cost: What the run had cost; None where it was not measured.
     """
 
     step: int
     method: str
     tensors: Mapping[str, Tensor]
     queue: list[int]
+    cost: TrainingCost | None = None
 
     def part(self, name: str) -> dict[str, Tensor]:
         """The tensors of one part."""
@@ -57,6 +60,7 @@ def save_checkpoint(
     strategy: Strategy,
     generators: Mapping[str, torch.Generator],
     sampler: Sampler,
+    cost: TrainingCost | None = None,
 ) -> Path:
     """Write ``step-<step>`` into ``folder``, for bitwise identical continuation of training.
 
@@ -76,8 +80,10 @@ def save_checkpoint(
     tensors |= {f"strategy/{name}": value for name, value in strategy.state_dict().items()}
     tensors |= {f"generator/{name}": generator.get_state() for name, generator in generators.items()}
     _check_finite(tensors, step)
-    target = folder / f"step-{step:06d}"
+    target = checkpoint_folder(folder, step)
     state: dict[str, Any] = {"format": FORMAT, "step": step, "method": method, "frame_queue": sampler.queue}
+    if cost is not None:
+        state["cost"] = cost.model_dump()
     with atomic_folder(target, overwrite=True) as scratch:
         save_file({key: value.detach().contiguous() for key, value in tensors.items()}, scratch / "state.safetensors")
         (scratch / "state.json").write_text(json.dumps(state, indent=2) + "\n", encoding="utf-8")
@@ -91,6 +97,11 @@ def _check_finite(tensors: Mapping[str, Tensor], step: int) -> None:
             f"after step {step} these are not finite: {', '.join(spoiled)}. No checkpoint was written; "
             "the last one is whole. Look for too large a learning rate."
         )
+
+
+def checkpoint_folder(folder: Path, step: int) -> Path:
+    """Where the checkpoint of a step lies."""
+    return folder / f"step-{step:06d}"
 
 
 def newest_checkpoint(folder: Path) -> Path | None:
@@ -121,6 +132,7 @@ def read_checkpoint(path: Path, method: str, device: torch.device) -> Checkpoint
         state = json.loads((path / "state.json").read_text(encoding="utf-8"))
         tensors = load_file(path / "state.safetensors")
         step, owner, queue, version = (state[key] for key in ("step", "method", "frame_queue", "format"))
+        cost = None if state.get("cost") is None else TrainingCost.model_validate(state["cost"])
     except (OSError, ValueError, KeyError, SafetensorError) as error:
         raise InputError(f"checkpoint {path} cannot be read: {error}", "an intact checkpoint") from error
     if version not in READABLE:
@@ -131,7 +143,7 @@ def read_checkpoint(path: Path, method: str, device: torch.device) -> Checkpoint
             f"checkpoint {path} is of method '{owner}'", f"one of method '{method}'", "Name its own method"
         )
     placed = {key: value if key.startswith("generator/") else value.to(device) for key, value in tensors.items()}
-    return Checkpoint(step, owner, placed, queue)
+    return Checkpoint(step, owner, placed, queue, cost)
 
 
 def restore_model(checkpoint: Checkpoint, config: MethodConfig, scene: Scene, renderer: Renderer) -> Model:

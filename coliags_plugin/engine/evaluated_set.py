@@ -10,6 +10,7 @@ from coliags_plugin.contracts import Comparison
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.scoring import Scorer, Scores, within_seen
 from coliags_plugin.results.hashing import ArraysHash
+from coliags_plugin.results.profiles import ErrorProfiles
 from coliags_plugin.results.record import SEEN_SUFFIX, SetRecord
 
 #: Metrics that are also computed over pixels seen by a training frame, where frames have a seen mask.
@@ -17,12 +18,13 @@ SEEN_METRICS = ("psnr", "ssim", "depth_mse", "depth_median_error")
 
 
 class EvaluatedSet:
-    """Scores of one test set, and hashes of what was compared."""
+    """Scores, error profiles and hashes of one test set."""
 
     def __init__(self) -> None:
         self._rows: dict[str, dict[str, float]] = {}
         self._reasons: dict[str, str] = {}
         self._predictions, self._truth = ArraysHash(), ArraysHash()
+        self._profiles = ErrorProfiles()
 
     def add(self, frame: Frame, comparison: Comparison, scorer: Scorer) -> None:
         """Score a frame and take it up."""
@@ -39,6 +41,7 @@ class EvaluatedSet:
         }
         _hash(self._predictions, frame.name, predicted)
         _hash(self._truth, frame.name, true)
+        self._profiles.add(comparison, frame)
 
     def _add_scores(self, frame: str, scores: Scores, suffix: str = "") -> None:
         row = self._rows.setdefault(frame, {})
@@ -65,6 +68,7 @@ class EvaluatedSet:
             reasons=self._reasons,
             predictions_sha256=self._predictions.hexdigest(),
             truth_sha256=self._truth.hexdigest(),
+            profiles=self._profiles.records(),
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -10,6 +11,7 @@ from coliags_plugin.contracts import Comparison
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, atomic_write, write_json
 from coliags_plugin.core.scenes import Frame
+from coliags_plugin.engine.costs import RenderMeter
 from coliags_plugin.engine.evaluated_set import EvaluatedSet
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.run_result import run_result
@@ -48,15 +50,18 @@ def evaluate(trained: TrainedRun, protocol_name: str) -> Path:
     total, done = sum(map(len, sets.values())), 0
     target = trained.run.evaluation(scorer.protocol.name)
     evaluated = {name: EvaluatedSet() for name in sets}
+    meter = RenderMeter(trained.device)
     with atomic_folder(target, overwrite=True) as scratch, ProgressReport("evaluate", total) as progress:
         for set_name, frames in sets.items():
             for frame in frames:
-                comparison = scorer.compare(trained.model, frame, trained.device)
-                evaluated[set_name].add(frame, comparison, scorer)
+                placed = frame.to(trained.device)
+                output = meter.render(partial(scorer.render, trained.model, placed))
+                comparison = scorer.protocol.compare(output, placed)
+                evaluated[set_name].add(placed, comparison, scorer)
                 _write_images(scratch, set_name, frame, comparison)
                 done += 1
                 progress.update(done)
-        result = run_result(trained, scorer, evaluated)
+        result = run_result(trained, scorer, evaluated, meter)
         write_result(scratch / RESULT_FILE, result)
         write_json(scratch / "metrics.json", means_summary(result))
         atomic_write(scratch / "per_frame.csv", per_frame_table(result))

@@ -126,3 +126,29 @@ class RunFolder:
         except (OSError, ValueError) as error:
             raise InputError(f"cannot read {self.provenance_file}: {error}", "what `coliags train` wrote") from error
         return found
+
+    def log_rows(self, until: int) -> list[dict[str, Any]]:
+        """Rows of the training log up to a step, without lines that a kill cut short; none without a log.
+
+        Raises:
+            InputError: The log cannot be read.
+        """
+        try:
+            lines = self.log_file.read_text(encoding="utf-8").splitlines()
+        except FileNotFoundError:
+            return []
+        except (OSError, ValueError) as error:
+            raise InputError(f"cannot read {self.log_file}: {error}", "what `coliags train` wrote") from error
+        return [row for row in map(_log_row, lines) if row and row["step"] <= until]
+
+
+def _log_row(line: str) -> dict[str, Any] | None:
+    """A row of the training log; None where the line is damaged."""
+    try:
+        row = json.loads(line)
+    except ValueError:
+        return None
+    whole = isinstance(row, dict) and all(
+        isinstance(row.get(name), (int, float)) for name in ("step", "psnr", "seconds")
+    )
+    return row if whole else None

@@ -5,9 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import torch
+
 from coliags_plugin import __version__
 from coliags_plugin.contracts import Metric
 from coliags_plugin.core.scenes import Scene
+from coliags_plugin.engine.checkpoints import checkpoint_folder
+from coliags_plugin.engine.costs import RenderMeter, TrainingCost, seconds_to_psnr
+from coliags_plugin.engine.devices import device_name
 from coliags_plugin.engine.evaluated_set import SEEN_METRICS, EvaluatedSet
 from coliags_plugin.engine.provenance import software
 from coliags_plugin.engine.scoring import Scorer
@@ -20,13 +25,19 @@ from coliags_plugin.results.record import SEEN_SUFFIX, CostRecord, MetricRecord,
 _LEFT_OUT = ("method", "seed", "steps", "scene", "untrained_views", "path", "fingerprint")
 
 
-def run_result(trained: TrainedRun, scorer: Scorer, evaluated: Mapping[str, EvaluatedSet]) -> Result:
+def run_result(
+    trained: TrainedRun, scorer: Scorer, evaluated: Mapping[str, EvaluatedSet], meter: RenderMeter
+) -> Result:
     """Compose the result of a run.
 
     Args:
         trained: The run.
         scorer: What it was scored with.
         evaluated: Its test sets, at least one.
+        meter: What rendering them cost.
+
+    Raises:
+        InputError: The training log cannot be read.
     """
     protocol, provenance = scorer.protocol, trained.provenance
     config = plain_config(trained.config.model_dump())
@@ -50,7 +61,7 @@ def run_result(trained: TrainedRun, scorer: Scorer, evaluated: Mapping[str, Eval
         metrics=_metrics(scorer.metrics, evaluated),
         sets=sets,
         metrics_sha256=metrics_sha256(sets),
-        cost=CostRecord(device=str(provenance.get("device", "unknown"))),
+        cost=_cost(trained, meter),
         config=config,
         software=software(),
         provenance={
@@ -83,6 +94,28 @@ def _metrics(metrics: Mapping[str, Metric], evaluated: Mapping[str, EvaluatedSet
 
 def _metric(metric: Metric) -> MetricRecord:
     return MetricRecord(unit=metric.unit, direction="higher" if metric.higher_is_better else "lower")
+
+
+def _cost(trained: TrainedRun, meter: RenderMeter) -> CostRecord:
+    rows = trained.run.log_rows(trained.step)
+    training = trained.cost
+    if training is None:  # of a version that measured seconds alone
+        device, seconds = str(trained.provenance.get("device")), rows[-1]["seconds"] if rows else None
+        training = TrainingCost(device=device, seconds=seconds)
+    checkpoint = checkpoint_folder(trained.run.checkpoints, trained.step)
+    return CostRecord(
+        device=training.device,
+        threads=training.threads,
+        train_seconds=training.seconds,
+        processor_seconds=training.processor_seconds,
+        peak_memory_mib=training.peak_memory_mib,
+        render_fps=meter.fps,
+        render_device=device_name(trained.device),
+        render_threads=torch.get_num_threads(),
+        gaussians=meter.gaussians,
+        checkpoint_bytes=sum(file.stat().st_size for file in checkpoint.glob("*")) or None,
+        seconds_to_psnr=seconds_to_psnr(rows, len(trained.scene.train)),
+    )
 
 
 def _deviations(step: int, configured: int, provenance: Mapping[str, Any]) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from coliags_plugin.config import registry
 from coliags_plugin.config.components import named_component
 from coliags_plugin.contracts import Comparison, Metric, Protocol
 from coliags_plugin.core.errors import InputError, UnavailableError
+from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.model import Model
 
@@ -56,11 +57,14 @@ class Scorer:
         }
 
     @torch.no_grad()
+    def render(self, model: Model, frame: Frame) -> RenderOutput:
+        """Render a held-out frame, which is on the model's device, with the outputs that the protocol compares."""
+        return model.render(frame.camera, self.wants, frame.view(trained=False))
+
     def compare(self, model: Model, frame: Frame, device: torch.device) -> Comparison:
         """Render a held-out frame for comparison with its ground truth."""
         placed = frame.to(device)
-        output = model.render(placed.camera, self.wants, frame.view(trained=False))
-        return self.protocol.compare(output, placed)
+        return self.protocol.compare(self.render(model, placed), placed)
 
     def score(self, comparison: Comparison, names: Sequence[str] | None = None) -> Scores:
         """Every metric of a view, or those named among them."""

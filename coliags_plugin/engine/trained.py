@@ -15,6 +15,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.lamps import Lamp
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.checkpoints import latest_checkpoint, read_checkpoint, restore_model
+from coliags_plugin.engine.costs import TrainingCost
 from coliags_plugin.engine.data_formats import load_scene
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.run_folder import RunFolder
@@ -35,6 +36,7 @@ class TrainedRun:
         device: Where it computes.
         seed: Of the run.
         provenance: As recorded by training.
+        cost: What training cost up to the checkpoint; None where it was not measured.
         lamp: What it was relit with; None under the lamp that the data were recorded with.
     """
 
@@ -47,6 +49,7 @@ class TrainedRun:
     device: torch.device
     seed: int
     provenance: Mapping[str, Any]
+    cost: TrainingCost | None = None
     lamp: Lamp | None = None
 
     @cached_property
@@ -80,7 +83,7 @@ def load_trained(path: Path, device: torch.device, data: Path | None = None) -> 
     _check_same_data(scene, fingerprint, data or Path(scene_path))
     renderer = choose_renderer(config.renderer, config.field.target.primitive, device).renderer
     model = restore_model(saved, config, scene, renderer).to(device).eval()
-    return TrainedRun(run, config, method, scene, model, saved.step, device, seed, provenance)
+    return TrainedRun(run, config, method, scene, model, saved.step, device, seed, provenance, saved.cost)
 
 
 def _check_same_data(scene: Scene, fingerprint: Any, path: Path) -> None:

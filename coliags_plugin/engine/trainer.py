@@ -6,7 +6,6 @@ import json
 import logging
 import math
 import signal
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,6 +23,8 @@ from coliags_plugin.core.render_output import RenderOutput, Splats, concatenate_
 from coliags_plugin.core.scenes import Frame, Scene, Target, concatenate_targets
 from coliags_plugin.engine import checkpoints
 from coliags_plugin.engine.compatibility import check_components
+from coliags_plugin.engine.costs import CostMeter, TrainingCost
+from coliags_plugin.engine.devices import device_name
 from coliags_plugin.engine.model import Model, make_view_modules
 from coliags_plugin.engine.optimizers import Optimizers
 from coliags_plugin.engine.progress import ProgressReport
@@ -82,7 +83,7 @@ class Trainer:
         self.chosen.renderer.check_field(field)
         self.optimizers = self._optimizers()
         self.step = 0
-        self.seconds = 0.0
+        self.costs = CostMeter(device)
 
     def start(self, overwrite: bool = False) -> None:
         """Make the run folder.
@@ -103,14 +104,16 @@ class Trainer:
         """
         check_same_run(self.run, self.method, self.scene, self.scene_path)
         path = checkpoints.newest_checkpoint(self.run.checkpoints)
-        if path is not None:
-            self._restore(path)
+        cost = None if path is None else self._restore(path)
         record_schedule(self.run, self.method.config, self.step)
-        self._cut_log()
+        rows = self._cut_log()
+        if cost is None and path is not None:  # of a version that measured seconds alone
+            cost = TrainingCost(device=device_name(self.device), seconds=rows[-1]["seconds"] if rows else None)
+        self.costs = CostMeter(self.device, cost)
         logger.info("resuming %s at step %d of %d", self.run.path, self.step, self.steps)
 
-    def _restore(self, path: Path) -> None:
-        """Load model, optimizers, strategy, sampler and random generators from a checkpoint."""
+    def _restore(self, path: Path) -> TrainingCost | None:
+        """Load model, optimizers, strategy, sampler and random generators from a checkpoint; what it had cost."""
         saved = checkpoints.read_checkpoint(path, self.method.name, self.device)
         self.model = checkpoints.restore_model(saved, self.method.config, self.scene, self.chosen.renderer)
         self.model.to(self.device)
@@ -120,6 +123,12 @@ class Trainer:
         checkpoints.restore_strategy(saved, self.strategy, self.method.config.strategy.name)
         self.sampler.queue = list(saved.queue)
         self.step = saved.step
+        return saved.cost
+
+    @property
+    def seconds(self) -> float:
+        """Time spent in training, all resumptions together."""
+        return self.costs.seconds
 
     def train(self) -> None:
         """Train to the last step, logging and saving on the way.
@@ -132,15 +141,14 @@ class Trainer:
         logger.info("%s", self.strategy.plan())
         for name, module in self.model.view_modules.items():
             logger.info("module %s: %s", name, module.untrained_views)
-        began = time.monotonic() - self.seconds
         with (
+            self.costs.running(),
             _deferred_interrupt() as interrupted,
             ProgressReport(f"train {self.method.name}", self.steps, self.step) as progress,
             self.run.log_file.open("a", encoding="utf-8") as log,
         ):
             while self.step < self.steps:
                 row = self.take_step()
-                self.seconds = time.monotonic() - began
                 if self.step % schedule.log_every == 0 or self.step == self.steps:
                     log.write(json.dumps({**row, "seconds": round(self.seconds, 3)}, allow_nan=False) + "\n")
                     log.flush()
@@ -218,6 +226,7 @@ class Trainer:
             self.strategy,
             self.generators,
             self.sampler,
+            self.costs.cost(),
         )
 
     def provenance(self) -> dict[str, Any]:
@@ -261,22 +270,13 @@ class Trainer:
     def _optimizers(self) -> Optimizers:
         return Optimizers(self.model, self.method.config.optimizers, self.steps, self.scene.extent)
 
-    def _cut_log(self) -> None:
-        """Remove log rows of steps after the checkpoint, which will be repeated."""
+    def _cut_log(self) -> list[dict[str, Any]]:
+        """Remove log rows of steps after the checkpoint, which will be repeated; those that stay."""
         if not self.run.log_file.is_file():
-            return
-        rows = self.run.log_file.read_text(encoding="utf-8").splitlines()
-        kept = [row for row in rows if _logged_step(row) <= self.step]
-        if kept:
-            self.seconds = json.loads(kept[-1])["seconds"]
-        atomic_write(self.run.log_file, "".join(f"{row}\n" for row in kept))
-
-
-def _logged_step(row: str) -> float:
-    try:
-        return float(json.loads(row)["step"])
-    except (ValueError, KeyError):
-        return math.inf  # a line cut short by a kill
+            return []
+        rows = self.run.log_rows(self.step)
+        atomic_write(self.run.log_file, "".join(f"{json.dumps(row)}\n" for row in rows))
+        return rows
 
 
 @torch.no_grad()

@@ -26,6 +26,7 @@ import torch
 
 from coliags_plugin.engine.checkpoints import latest_checkpoint, newest_checkpoint, read_checkpoint
 from coliags_plugin.engine.run_folder import RunFolder
+from coliags_plugin.results.reading import RESULT_FILE, read_result
 
 METHOD = "coliags"
 STEPS = 24
@@ -114,17 +115,20 @@ def check_whole(run: Path) -> None:
         read_checkpoint(newest, METHOD, torch.device("cpu"))
     for file in run.glob("eval/*/metrics.json"):
         json.loads(file.read_text(encoding="utf-8"))
+        read_result(file.with_name(RESULT_FILE))
 
 
 def results(run: Path) -> dict[str, object]:
     """What must not depend on kills: tensors, log without its clock, figures."""
     saved = read_checkpoint(latest_checkpoint(run / "checkpoints"), METHOD, torch.device("cpu"))
+    result = read_result(run / "eval" / "paper" / RESULT_FILE)
     log = [json.loads(line) for line in (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()]
     return {
         **{name: tensor.numpy().tobytes() for name, tensor in saved.tensors.items()},
         "step": saved.step,
         "log": [{key: value for key, value in row.items() if key != "seconds"} for row in log],
         "figures": (run / "eval" / "paper" / "per_frame.csv").read_text(encoding="utf-8"),
+        "result": result.model_dump(include={"key", "sets", "metrics_sha256"}),
         "config": (run / "config.yaml").read_text(encoding="utf-8"),
     }
 

@@ -1,0 +1,181 @@
+"""Measurement of what training and rendering cost."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from statistics import fmean, median
+from typing import Any
+
+import numpy as np
+import torch
+from pydantic import BaseModel, ConfigDict
+
+from coliags_plugin.core.render_output import RenderOutput
+from coliags_plugin.engine.devices import device_name
+
+#: PSNR of training views whose first reaching is timed, dB.
+PSNR_MARKS = (25, 30, 32, 34, 36, 38, 40)
+
+
+class TrainingCost(BaseModel):
+    """What training cost up to a checkpoint, all resumptions together; kept in the checkpoint. None: not measured.
+
+    Attributes:
+        device: Name of the processor or GPU.
+        threads: CPU threads of torch.
+        seconds: Time in the training loop: steps, logging and earlier checkpoints. What a kill threw away is not in it.
+        processor_seconds: CPU time of the process in the same, all threads together.
+        peak_memory_mib: Largest resident memory of the process; on a GPU, largest memory allocated there in the loop.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    device: str
+    threads: int | None = None
+    seconds: float | None = None
+    processor_seconds: float | None = None
+    peak_memory_mib: float | None = None
+
+
+class CostMeter:
+    """Measures the cost of a training loop on top of what earlier parts of the run cost.
+
+    Reading a clock and the memory takes microseconds.
+
+    Args:
+        device: Where the loop computes.
+        earlier: Cost of the run before; None where it begins.
+    """
+
+    def __init__(self, device: torch.device, earlier: TrainingCost | None = None) -> None:
+        self._device = device
+        self._earlier = earlier or TrainingCost(device="", seconds=0.0, processor_seconds=0.0, peak_memory_mib=0.0)
+        self._measured = earlier is not None
+        self._began: tuple[float, float] | None = None
+        self._spent = (0.0, 0.0)
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """Count what is spent in the block."""
+        if self._device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(self._device)
+        self._measured, self._began = True, _clocks()
+        try:
+            yield
+        finally:
+            self._spent, self._began = self._so_far(), None
+
+    @property
+    def seconds(self) -> float:
+        """Time of the run so far, of which nothing is missing that was measured."""
+        return (self._earlier.seconds or 0.0) + self._so_far()[0]
+
+    def cost(self) -> TrainingCost | None:
+        """Cost of the run so far; None where nothing was measured."""
+        if not self._measured:
+            return None
+        earlier, (seconds, processor_seconds) = self._earlier, self._so_far()
+        peak = earlier.peak_memory_mib
+        return TrainingCost(
+            device=device_name(self._device),
+            threads=torch.get_num_threads(),
+            seconds=_sum(earlier.seconds, seconds),
+            processor_seconds=_sum(earlier.processor_seconds, processor_seconds),
+            peak_memory_mib=None if peak is None else max(peak, peak_memory_mib(self._device)),
+        )
+
+    def _so_far(self) -> tuple[float, float]:
+        if self._began is None:
+            return self._spent
+        now = _clocks()
+        return self._spent[0] + now[0] - self._began[0], self._spent[1] + now[1] - self._began[1]
+
+
+def _clocks() -> tuple[float, float]:
+    return time.monotonic(), time.process_time()
+
+
+def _sum(earlier: float | None, now: float) -> float | None:
+    return None if earlier is None else earlier + now
+
+
+def peak_memory_mib(device: torch.device) -> float:
+    """Largest resident memory of this process so far; on a GPU, largest memory allocated since its statistics began."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / 2**20
+    try:  # of this process alone: the other source counts what its parent had when it was started
+        lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
+        return next(float(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 2**10
+    except (OSError, StopIteration):
+        import resource
+
+        unit = 1 if sys.platform == "darwin" else 2**10
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
+
+
+class RenderMeter:
+    """Measures the rendering of single views, waiting for the device before and after each."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        self._seconds: list[float] = []
+        self._drawn: list[int] = []
+
+    def render(self, view: Callable[[], RenderOutput]) -> RenderOutput:
+        """Render a view, and measure it.
+
+        Args:
+            view: Renders it, and does nothing else.
+        """
+        self._wait()
+        began = time.perf_counter()
+        output = view()
+        self._wait()
+        self._seconds.append(time.perf_counter() - began)
+        if output.splats is not None:
+            self._drawn.append(int((output.splats.radii > 0).sum()))
+        return output
+
+    def _wait(self) -> None:
+        if self._device.type == "cuda":
+            torch.cuda.synchronize(self._device)
+
+    @property
+    def fps(self) -> float | None:
+        """1 / the median time of a view; the first, which may compile and allocate, only counts where it is alone."""
+        return 1.0 / median(self._seconds[1:] or self._seconds) if self._seconds else None
+
+    @property
+    def gaussians(self) -> float | None:
+        """Mean number of Gaussians drawn in a view; None where none are rendered."""
+        return fmean(self._drawn) if self._drawn else None
+
+
+def seconds_to_psnr(rows: Sequence[Mapping[str, Any]], frames: int) -> dict[str, float | None]:
+    """Training seconds at which the smoothed PSNR first reached each of :data:`PSNR_MARKS`; None where it never did.
+
+    Empty without rows.
+
+    Smoothed is the mean over the logged rows of the last ``frames`` steps, one pass over the frames where a step draws
+    one, from the end of the first pass on.
+
+    Args:
+        rows: Of the training log, ascending, with ``step``, ``psnr`` and ``seconds``.
+        frames: Number of training frames.
+    """
+    if not rows:
+        return {}
+    steps, psnr, seconds = (np.array([row[name] for row in rows], dtype=float) for name in ("step", "psnr", "seconds"))
+    sums = np.concatenate([[0.0], np.cumsum(psnr)])
+    first = np.searchsorted(steps, steps - frames, side="right")
+    index = np.arange(len(steps))
+    smoothed = (sums[index + 1] - sums[first]) / (index + 1 - first)
+    found: dict[str, float | None] = {}
+    for mark in PSNR_MARKS:
+        reached = seconds[(steps >= frames) & (smoothed >= mark)]
+        found[str(mark)] = float(reached[0]) if len(reached) else None
+    return found

@@ -1,0 +1,273 @@
+"""What training and rendering cost: sums over resumptions, marks of quality, and no change of the result."""
+
+from __future__ import annotations
+
+import json
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.engine import costs
+from coliags_plugin.engine.checkpoints import checkpoint_folder
+from coliags_plugin.engine.costs import PSNR_MARKS, CostMeter, RenderMeter, TrainingCost, seconds_to_psnr
+from coliags_plugin.engine.devices import device_name
+from tests.engine.test_trainer import final_state, log_rows, make_trainer, train
+
+CPU = torch.device("cpu")
+
+
+class Clocks:
+    """Clocks that are set by hand."""
+
+    wall = processor = 0.0
+
+    def __call__(self):
+        return self.wall, self.processor
+
+    def go_on(self, wall, processor):
+        self.wall += wall
+        self.processor += processor
+
+
+@pytest.fixture
+def clocks(monkeypatch):
+    found = Clocks()
+    monkeypatch.setattr(costs, "_clocks", found)
+    return found
+
+
+# The meter
+
+
+def test_only_what_runs_is_counted(clocks):
+    meter = CostMeter(CPU)
+    assert meter.cost() is None and meter.seconds == 0.0
+    clocks.go_on(100, 100)
+    with meter.running():
+        clocks.go_on(3, 5)
+        assert meter.seconds == 3.0 and meter.cost().processor_seconds == 5.0
+        clocks.go_on(1, 1)
+    clocks.go_on(100, 100)
+    with meter.running():
+        clocks.go_on(2, 2)
+    assert (meter.cost().seconds, meter.cost().processor_seconds) == (6.0, 8.0)
+
+
+def test_the_clock_stops_when_the_loop_fails(clocks):
+    meter = CostMeter(CPU)
+    with pytest.raises(InputError), meter.running():
+        clocks.go_on(3, 3)
+        raise InputError("a failure")
+    clocks.go_on(100, 100)
+    assert meter.seconds == 3.0
+
+
+def test_earlier_parts_of_the_run_are_added(clocks):
+    earlier = TrainingCost(device="old", threads=1, seconds=10.0, processor_seconds=20.0, peak_memory_mib=1e9)
+    meter = CostMeter(CPU, earlier)
+    with meter.running():
+        clocks.go_on(3, 5)
+    found = meter.cost()
+    assert (found.seconds, found.processor_seconds, found.peak_memory_mib) == (13.0, 25.0, 1e9)
+    assert found.device == device_name(CPU) and found.threads == torch.get_num_threads()
+
+
+def test_what_was_not_measured_before_stays_unmeasured(clocks):
+    meter = CostMeter(CPU, TrainingCost(device="old", seconds=10.0))
+    with meter.running():
+        clocks.go_on(3, 5)
+    found = meter.cost()
+    assert (found.seconds, found.processor_seconds, found.peak_memory_mib) == (13.0, None, None)
+
+
+def test_processor_time_counts_work_and_not_waiting():
+    meter = CostMeter(CPU)
+    with meter.running():
+        time.sleep(0.2)
+    assert meter.cost().seconds >= 0.2 and meter.cost().processor_seconds < 0.15
+
+
+def test_the_peak_holds_what_is_allocated():
+    before = costs.peak_memory_mib(CPU)
+    held = np.ones(64 * 2**20 + int(before - _resident_mib()) * 2**20, dtype=np.uint8)
+    after = costs.peak_memory_mib(CPU)
+    assert 55 < after - before < 120
+    del held
+    assert costs.peak_memory_mib(CPU) == pytest.approx(after, abs=1.0), "a peak does not fall"
+
+
+def _resident_mib():
+    with open("/proc/self/status", encoding="utf-8") as file:
+        return next(float(line.split()[1]) for line in file if line.startswith("VmRSS")) / 2**10
+
+
+def test_the_processor_has_a_name():
+    assert device_name(CPU).strip()
+
+
+# In a run
+
+
+def test_the_cost_of_a_resumed_run_goes_on_from_its_checkpoint(tmp_path, clocks):
+    """Stopped at 4 of 8 steps; two more steps were taken and lost."""
+    first = make_trainer(tmp_path / "run", steps=8, overrides=["schedule.checkpoint_every=4"])
+    first.start()
+    _tick(first, clocks, until=6)
+    with pytest.raises(RuntimeError, match="killed"):
+        first.train()
+    assert first.seconds == 6.0
+    assert final_state(first).cost.seconds == 4.0 and final_state(first).step == 4
+    second = make_trainer(tmp_path / "run", steps=8, overrides=["schedule.checkpoint_every=4"])
+    second.resume()
+    assert second.seconds == 4.0, "lost steps are not counted"
+    clocks.go_on(1000, 1000)
+    _tick(second, clocks)
+    second.train()
+    found = final_state(second).cost
+    assert (found.seconds, found.processor_seconds) == (8.0, 16.0)
+    assert [row["seconds"] for row in log_rows(second)] == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0]
+
+
+def _tick(trainer, clocks, until=None):
+    """Each step takes one second, and two of the processor; killed after a step."""
+    take = trainer.take_step
+
+    def step():
+        if trainer.step == until:
+            raise RuntimeError("killed")
+        clocks.go_on(1, 2)
+        return take()
+
+    trainer.take_step = step
+
+
+def test_seconds_between_the_last_logged_row_and_the_checkpoint_are_not_lost(tmp_path, clocks):
+    rare = ["schedule.log_every=4", "schedule.checkpoint_every=3"]
+    first = make_trainer(tmp_path / "run", steps=8, overrides=rare)
+    first.start()
+    _tick(first, clocks, until=3)
+    with pytest.raises(RuntimeError, match="killed"):
+        first.train()
+    second = make_trainer(tmp_path / "run", steps=8, overrides=rare)
+    second.resume()
+    assert second.seconds == 3.0 and second.run.log_rows(3) == []
+
+
+def test_a_checkpoint_without_cost_goes_on_from_the_log(tmp_path, clocks):
+    trainer = make_trainer(tmp_path / "run", steps=3)
+    trainer.start()
+    _tick(trainer, clocks)
+    trainer.train()
+    state = checkpoint_folder(trainer.run.checkpoints, 3) / "state.json"
+    content = json.loads(state.read_text())
+    del content["cost"]
+    state.write_text(json.dumps(content))
+    longer = make_trainer(tmp_path / "run", steps=5)
+    longer.resume()
+    _tick(longer, clocks)
+    longer.train()
+    found = final_state(longer).cost
+    assert found.seconds == 5.0 and found.processor_seconds is None and found.peak_memory_mib is None
+
+
+def test_steps_taken_outside_the_loop_have_no_cost(tmp_path):
+    trainer = make_trainer(tmp_path / "run")
+    trainer.start()
+    trainer.take_step()
+    trainer.save()
+    assert final_state(trainer).cost is None
+
+
+def test_a_damaged_cost_is_refused(tmp_path):
+    trainer = train(tmp_path / "run", steps=1)
+    state = checkpoint_folder(trainer.run.checkpoints, 1) / "state.json"
+    state.write_text(state.read_text().replace('"seconds": ', '"hours": '))
+    with pytest.raises(InputError, match="cannot be read"):
+        final_state(trainer)
+
+
+def test_log_rows_end_at_the_step_and_leave_damaged_lines_out(tmp_path):
+    trainer = train(tmp_path / "run", steps=4)
+    whole = log_rows(trainer)
+    with trainer.run.log_file.open("a") as log:
+        log.write('{"step": 5}\n[]\n3\n{"step": 6, "psn')
+    assert trainer.run.log_rows(3) == whole[:3] and trainer.run.log_rows(99) == whole
+    trainer.run.log_file.unlink()
+    assert trainer.run.log_rows(3) == []
+
+
+# Rendering
+
+
+def test_the_first_view_counts_only_where_it_is_alone(monkeypatch):
+    now = iter([0.0, 10.0, 20.0, 20.5, 30.0, 30.1, 40.0, 40.4])
+    monkeypatch.setattr(costs.time, "perf_counter", lambda: next(now))
+    meter, output = RenderMeter(CPU), SimpleNamespace(splats=None)
+    assert meter.fps is None and meter.gaussians is None
+    assert meter.render(lambda: output) is output
+    assert meter.fps == 0.1
+    for _ in range(3):
+        meter.render(lambda: output)
+    assert meter.fps == pytest.approx(1 / 0.4) and meter.gaussians is None
+
+
+def test_gaussians_that_were_not_drawn_do_not_count():
+    meter = RenderMeter(CPU)
+    for radii in ([1.0, 0.0, 3.0], [0.0, 0.0, 2.0]):
+        meter.render(lambda radii=radii: SimpleNamespace(splats=SimpleNamespace(radii=torch.tensor(radii))))
+    assert meter.gaussians == 1.5
+
+
+# Marks of quality
+
+
+def rows_of(psnr, every=1):
+    """A log with a row every so many steps, each step taking 2 seconds."""
+    return [
+        {"step": every * index, "psnr": value, "seconds": 2.0 * every * index}
+        for index, value in enumerate(psnr, start=1)
+    ]
+
+
+def test_a_mark_is_reached_when_the_mean_over_one_pass_is():
+    """40 dB from step 5 on: over 4 steps the mean of 20 and 40 reaches 25, 30 and 40 after 1, 2 and 4 such rows."""
+    found = seconds_to_psnr(rows_of([20.0] * 4 + [40.0] * 6), frames=4)
+    assert found["25"] == 2.0 * 5 and found["30"] == 2.0 * 6 and found["32"] == 2.0 * 7 and found["40"] == 2.0 * 8
+
+
+def test_a_single_good_view_reaches_nothing():
+    found = seconds_to_psnr(rows_of([60.0] + [20.0] * 20), frames=4)
+    assert found["30"] == 8.0 and found["32"] is None, "the first whole pass has a mean of 30"
+    assert seconds_to_psnr(rows_of([60.0] * 3), frames=4) == dict.fromkeys(map(str, PSNR_MARKS))
+    assert seconds_to_psnr([], frames=4) == {}
+
+
+@settings(max_examples=50, deadline=None)
+@given(psnr=st.lists(st.floats(10, 50), min_size=1, max_size=60), frames=st.integers(1, 25), every=st.integers(1, 12))
+def test_marks_agree_with_means_taken_one_by_one(psnr, frames, every):
+    rows = rows_of(psnr, every)
+    expected = dict.fromkeys(map(str, PSNR_MARKS))
+    for row in rows:
+        window = [other["psnr"] for other in rows if row["step"] - frames < other["step"] <= row["step"]]
+        for mark in PSNR_MARKS:
+            if row["step"] >= frames and expected[str(mark)] is None and sum(window) / len(window) >= mark:
+                expected[str(mark)] = row["seconds"]
+    found = seconds_to_psnr(rows, frames)
+    assert found == expected
+
+
+def test_measuring_leaves_the_trained_bits(tmp_path, monkeypatch):
+    """Tensors of the same run with a meter that measures nothing."""
+    measured = final_state(train(tmp_path / "a", steps=4))
+    monkeypatch.setattr(CostMeter, "cost", lambda self: None)
+    unmeasured = final_state(train(tmp_path / "b", steps=4))
+    assert unmeasured.cost is None and measured.cost is not None
+    assert all(torch.equal(value, unmeasured.tensors[name]) for name, value in measured.tensors.items())
+    files = [tmp_path / name / "checkpoints/step-000004/state.safetensors" for name in "ab"]
+    assert files[0].read_bytes() == files[1].read_bytes()

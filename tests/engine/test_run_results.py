@@ -1,0 +1,217 @@
+"""The result of an evaluated run: everything it says is what the run was, and does not depend on interruptions."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from coliags_plugin import __version__
+from coliags_plugin.config.method_config import load_method
+from coliags_plugin.core import files
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.engine import trained as trained_module
+from coliags_plugin.engine.checkpoints import checkpoint_folder
+from coliags_plugin.engine.devices import device_name
+from coliags_plugin.engine.evaluator import evaluate
+from coliags_plugin.engine.scoring import Scorer
+from coliags_plugin.engine.trained import load_trained
+from coliags_plugin.results.identity import result_key
+from coliags_plugin.results.reading import RESULT_FILE, read_result
+from coliags_plugin.results.summaries import means_summary, per_frame_table
+from tests.engine.test_trainer import make_trainer
+from tests.scenes import SMALL, wall_scene
+
+CPU = torch.device("cpu")
+STEPS = 6
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """With a second test set, whose frames have seen masks."""
+    made = wall_scene()
+    left = torch.zeros(24, 32, dtype=torch.bool)
+    left[:, :16] = True
+    turned = [replace(frame, name=f"turned-{frame.name}", seen=left) for frame in made.test_sets["test"]]
+    return replace(made, test_sets={**made.test_sets, "rotation": turned})
+
+
+@pytest.fixture(scope="module")
+def loaded(scene, tmp_path_factory):
+    """Trains and loads a run of the scene."""
+    torch.set_num_threads(2)  # as for every test; the fixture that says so comes later
+    patch = pytest.MonkeyPatch()
+    patch.setattr(trained_module, "load_scene", lambda config, path: scene)
+    folder, count = tmp_path_factory.mktemp("runs"), iter(range(99))
+
+    def make(stop=None, resume_to=None, **options):
+        path = folder / str(next(count))
+        trainer = make_trainer(path, scene=scene, **{"steps": STEPS, **options})
+        trainer.start()
+        if stop is not None:
+            _stop(trainer, stop)
+            with pytest.raises(RuntimeError):
+                trainer.train()
+        else:
+            trainer.train()
+        if resume_to is not None:
+            again = make_trainer(path, scene=scene, **{**options, "steps": resume_to})
+            again.resume()
+            again.train()
+        return load_trained(path, CPU)
+
+    yield make
+    patch.undo()
+
+
+def _stop(trainer, step):
+    take = trainer.take_step
+
+    def stopping():
+        if trainer.step == step:
+            raise RuntimeError("killed")
+        return take()
+
+    trainer.take_step = stopping
+
+
+@pytest.fixture(scope="module")
+def whole(loaded):
+    return loaded()
+
+
+@pytest.fixture(scope="module")
+def result(whole):
+    return read_result(evaluate(whole, "paper") / RESULT_FILE)
+
+
+def test_it_says_what_the_run_was(result, whole, scene):
+    config = load_method("coliags", [*SMALL, f"schedule.steps={STEPS}"]).config.model_dump()
+    assert (result.method, result.seed, result.steps) == ("coliags", 0, STEPS)
+    assert result.key == result_key(config, "wall-9-True", 0, __version__, "paper", 1)
+    assert result.config["schedule"]["steps"] == STEPS and result.config["field"]["voxel_size"] == 2.0
+    assert result.scene.train == tuple(frame.name for frame in scene.train)
+    assert (result.scene.name, result.scene.size) == ("wall", (32, 24))
+    assert result.software["package_version"] == __version__
+    assert result.provenance["training"]["renderer"] == "cpu"
+
+
+def test_its_values_are_those_of_the_metrics(result, whole, scene):
+    scorer = Scorer("paper")
+    for name, frames in scene.test_sets.items():
+        part = result.sets[name]
+        assert part.frames == tuple(frame.name for frame in frames)
+        for index, frame in enumerate(frames):
+            scores = scorer.score(scorer.compare(whole.model, frame, CPU))
+            assert scores.values == {
+                metric: part.values[metric][index]
+                for metric in scorer.metrics
+                if part.values[metric][index] is not None
+            }
+        assert list(part.values)[: len(scorer.metrics)] == list(scorer.metrics)
+
+
+def test_metrics_over_seen_pixels_belong_to_frames_with_a_mask(result):
+    assert "psnr_seen" not in result.sets["test"].values
+    seen, everywhere = (result.sets["rotation"].values[name] for name in ("psnr_seen", "psnr"))
+    assert all(value is not None for value in seen) and seen != everywhere
+    assert list(result.metrics)[-4:] == ["psnr_seen", "ssim_seen", "depth_mse_seen", "depth_median_error_seen"]
+    assert result.metrics["depth_mse_seen"] == result.metrics["depth_mse"]
+
+
+def test_the_other_files_are_made_of_it(result, whole):
+    folder = whole.run.evaluation("paper")
+    assert json.loads((folder / "metrics.json").read_text()) == json.loads(json.dumps(means_summary(result)))
+    assert (folder / "per_frame.csv").read_text() == per_frame_table(result)
+
+
+def test_profiles_and_metrics_agree(result):
+    """The pixels of all bins together have the mean squared errors of the metrics, all frames having as many."""
+    for part in result.sets.values():
+        for profile in part.profiles.values():
+            pixels = np.array(profile.pixels)
+            assert pixels.sum() == 24 * 32 * len(part.frames)
+            depth = sum(count * (mse or 0.0) for count, mse in zip(pixels, profile.depth_mse, strict=True))
+            assert depth / pixels.sum() == pytest.approx(part.mean("depth_mse"), rel=1e-6)
+            colour = sum(count * (mse or 0.0) for count, mse in zip(pixels, profile.rgb_mse, strict=True))
+            means = [10 ** (-psnr / 10) for psnr in part.values["psnr"]]
+            assert colour / pixels.sum() == pytest.approx(np.mean(means), rel=1e-6)
+
+
+def test_a_killed_and_resumed_run_has_the_same_result(loaded, result):
+    resumed = loaded(stop=4, resume_to=STEPS, overrides=["schedule.checkpoint_every=3"])
+    found = read_result(evaluate(resumed, "paper") / RESULT_FILE)
+    assert found.sets == result.sets
+    assert found.metrics_sha256 == result.metrics_sha256
+
+
+def test_another_model_has_other_predictions_and_the_same_truth(loaded, result):
+    found = read_result(evaluate(loaded(seed=1), "paper") / RESULT_FILE)
+    assert found.key != result.key and found.metrics_sha256 != result.metrics_sha256
+    for name, part in result.sets.items():
+        assert found.sets[name].predictions_sha256 != part.predictions_sha256
+        assert found.sets[name].truth_sha256 == part.truth_sha256
+
+
+def test_other_truth_has_another_hash(loaded, result, whole, scene):
+    frames = scene.test_sets["rotation"]
+    everything = [replace(frame, seen=torch.ones(24, 32, dtype=torch.bool)) for frame in frames]
+    other = replace(whole, scene=replace(scene, test_sets={"rotation": everything}))
+    found = read_result(evaluate(other, "paper") / RESULT_FILE).sets["rotation"]
+    assert found.predictions_sha256 == result.sets["rotation"].predictions_sha256
+    assert found.truth_sha256 != result.sets["rotation"].truth_sha256
+
+
+def test_runs_that_did_not_go_as_configured_have_keys_of_their_own(loaded, result):
+    """Stopped half-way, or with a schedule that was changed on the way: neither is a run of so many steps."""
+    half = loaded(stop=4, overrides=["schedule.checkpoint_every=3"])
+    straight = loaded(overrides=["schedule.checkpoint_every=3"])
+    jumped = loaded(steps=3, resume_to=STEPS, overrides=["schedule.checkpoint_every=3"])
+    logged = loaded(stop=4, resume_to=STEPS, overrides=["schedule.checkpoint_every=3"])
+    keys = [read_result(evaluate(run, "paper") / RESULT_FILE).key for run in (half, straight, jumped, logged)]
+    assert half.step == 3
+    assert len(set(keys[:3])) == 3 and keys[3] == keys[1]
+
+
+def test_it_says_what_the_run_cost(result, whole):
+    cost, last = result.cost, whole.run.log_rows(STEPS)[-1]
+    assert cost.device == cost.render_device == device_name(CPU)
+    assert cost.threads == cost.render_threads == torch.get_num_threads()
+    assert cost.train_seconds == pytest.approx(last["seconds"], abs=0.5) and cost.processor_seconds > 0
+    assert cost.peak_memory_mib > 50 and cost.render_fps > 0
+    assert 0 < cost.gaussians <= 2 * last["gaussians"]
+    folder = checkpoint_folder(whole.run.checkpoints, STEPS)
+    assert cost.checkpoint_bytes == sum(path.stat().st_size for path in folder.iterdir())
+    assert set(cost.seconds_to_psnr) == {"25", "30", "32", "34", "36", "38", "40"}
+
+
+def test_a_run_of_an_earlier_version_has_the_seconds_of_its_log(whole, result):
+    found = read_result(evaluate(replace(whole, cost=None), "paper") / RESULT_FILE).cost
+    assert found.train_seconds == whole.run.log_rows(STEPS)[-1]["seconds"]
+    assert found.processor_seconds is None and found.peak_memory_mib is None
+
+
+def test_a_run_without_a_seed_is_refused(whole):
+    text = whole.run.provenance_file.read_text()
+    whole.run.provenance_file.write_text(text.replace('"seed"', '"sead"'))
+    with pytest.raises(InputError, match="lacks 'seed'"):
+        load_trained(whole.run.path, CPU)
+    whole.run.provenance_file.write_text(text)
+
+
+def test_a_disk_that_is_full_leaves_the_earlier_evaluation(whole, result, monkeypatch):
+    before = (whole.run.evaluation("paper") / RESULT_FILE).read_bytes()
+    replace_file = files.os.replace
+
+    def full(source, target):
+        if str(target).endswith(RESULT_FILE):
+            raise OSError(28, "No space left on device")
+        replace_file(source, target)
+
+    monkeypatch.setattr(files.os, "replace", full)
+    with pytest.raises(InputError, match="No space left on device"):
+        evaluate(whole, "paper")
+    assert (whole.run.evaluation("paper") / RESULT_FILE).read_bytes() == before

@@ -1,0 +1,136 @@
+"""Profiles of errors over distance and angle, against closed forms."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+
+from coliags_plugin.contracts import Comparison
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.scenes import Frame
+from coliags_plugin.results.profiles import ANGLE_EDGES, DISTANCE_EDGES, ErrorProfiles
+from tests.scenes import camera_at
+
+
+def pose(yaw=0.3):
+    return camera_at(1.0, 2.0, 3.0, yaw=yaw).camera_to_world
+
+
+def view(camera, depth, rgb_error=0.1, depth_error=2.0, mask=None, depth_valid=None):
+    """A frame of this true depth and its rendering with these errors."""
+    image = torch.full((camera.height, camera.width, 3), 100, dtype=torch.uint8)
+    frame = Frame("f", 0, image, camera, depth, mask)
+    known = torch.isfinite(depth) if depth_valid is None else depth_valid
+    compared = Comparison(
+        frame.rgb + rgb_error, frame.rgb, frame.valid, depth + depth_error, depth, known & frame.valid
+    )
+    return compared, frame
+
+
+def profiles(*views):
+    found = ErrorProfiles()
+    for compared, frame in views:
+        found.add(compared, frame)
+    return found.records()
+
+
+def pixel(column, row, camera):
+    """The bin indices of one pixel's distance per z-depth and angle, by trigonometry."""
+    x, y = (column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy
+    return math.sqrt(1 + x * x + y * y), math.degrees(math.acos(1 / math.sqrt(1 + x * x + y * y)))
+
+
+def test_a_pixel_on_the_axis_lies_at_its_depth_and_at_angle_zero():
+    camera = Camera(10.0, 10.0, 0.5, 0.5, 1, 1, pose())
+    found = profiles(view(camera, torch.tensor([[12.0]]), rgb_error=0.1, depth_error=3.0))
+    distance, angle = found["distance"], found["angle"]
+    assert distance.edges == DISTANCE_EDGES and distance.unit == "mm"
+    assert distance.pixels.index(1) == DISTANCE_EDGES.index(10.0) and sum(distance.pixels) == 1
+    assert distance.rgb_mse[2] == pytest.approx(0.01, rel=1e-5) and distance.depth_mse[2] == 9.0
+    assert angle.pixels[0] == 1 and angle.depth_mse[0] == 9.0 and angle.unit == "degrees"
+    assert [value for index, value in enumerate(distance.rgb_mse) if index != 2] == [None] * (len(distance.pixels) - 1)
+
+
+def test_a_pixel_at_45_degrees_is_further_than_its_depth():
+    """x / z = 1: distance sqrt(2) z = 33.9 mm for z = 24 mm, where z itself lies in the bin before."""
+    camera = Camera(1.0, 1.0, -0.5, 0.5, 1, 1, pose())
+    found = profiles(view(camera, torch.tensor([[24.0]])))
+    assert found["distance"].pixels[DISTANCE_EDGES.index(30.0)] == 1
+    # 45 degrees lies on an edge, so one of two bins by rounding.
+    assert found["angle"].pixels[ANGLE_EDGES.index(45.0)] + found["angle"].pixels[ANGLE_EDGES.index(40.0)] == 1
+    steeper = Camera(1.0, 1.0, -0.51, 0.5, 1, 1, pose())
+    assert profiles(view(steeper, torch.tensor([[24.0]])))["angle"].pixels[ANGLE_EDGES.index(45.0)] == 1
+
+
+def test_a_distance_on_an_edge_belongs_to_the_bin_above():
+    camera = Camera(10.0, 10.0, 0.5, 0.5, 1, 1, pose())
+    for edge, z in enumerate(DISTANCE_EDGES[1:-1], start=1):
+        assert profiles(view(camera, torch.tensor([[z]])))["distance"].pixels[edge] == 1
+
+
+def test_every_pixel_is_counted_where_trigonometry_puts_it():
+    camera = Camera(20.0, 17.0, 15.0, 12.5, 32, 24, pose())
+    depth = torch.rand(24, 32, generator=torch.Generator().manual_seed(0)) * 90 + 1
+    found = profiles(view(camera, depth))
+    distances, angles = [], []
+    for row in range(24):
+        for column in range(32):
+            scale, angle = pixel(column, row, camera)
+            distances.append(scale * float(depth[row, column]))
+            angles.append(angle)
+    np.testing.assert_array_equal(found["distance"].pixels, np.histogram(distances, DISTANCE_EDGES)[0])
+    np.testing.assert_array_equal(found["angle"].pixels, np.histogram(angles, ANGLE_EDGES)[0])
+    assert sum(found["angle"].pixels) == 24 * 32
+
+
+def test_errors_are_those_of_the_bin():
+    """Colour error grows with the angle and depth error with the distance: each bin has the mean over its pixels."""
+    camera = Camera(20.0, 17.0, 15.0, 12.5, 32, 24, pose())
+    rays = np.array([[pixel(column, row, camera) for column in range(32)] for row in range(24)])
+    depth = torch.full((24, 32), 25.0)
+    rgb_error, depth_error = rays[..., 1] / 1000, rays[..., 0]
+    made = view(camera, depth, torch.from_numpy(rgb_error)[..., None], torch.from_numpy(depth_error))
+    angle = profiles(made)["angle"]
+    for index, (low, high) in enumerate(pairwise(ANGLE_EDGES)):
+        inside = (rays[..., 1] >= low) & (rays[..., 1] < high)
+        assert angle.pixels[index] == inside.sum()
+        if inside.any():
+            assert angle.rgb_mse[index] == pytest.approx((rgb_error[inside] ** 2).mean(), rel=1e-4)
+            assert angle.depth_mse[index] == pytest.approx((depth_error[inside] ** 2).mean(), rel=1e-4)
+
+
+def test_the_mean_is_over_the_pixels_of_all_frames_and_channels():
+    camera, wide = Camera(10.0, 10.0, 0.5, 0.5, 1, 1, pose()), Camera(1e3, 1e3, 1.0, 0.5, 2, 1, pose(1.0))
+    one = view(camera, torch.tensor([[12.0]]), rgb_error=torch.tensor([0.3, 0.0, 0.0]), depth_error=3.0)
+    two = view(wide, torch.tensor([[12.0, 13.0]]), rgb_error=0.0, depth_error=0.0)
+    found = profiles(one, two)["distance"]
+    assert found.pixels[2] == 3
+    assert found.depth_mse[2] == 3.0
+    assert found.rgb_mse[2] == pytest.approx(0.09 / 3 / 3, rel=1e-5)
+
+
+def test_only_pixels_of_known_depth_that_are_compared_count():
+    camera = Camera(1e3, 1e3, 2.0, 0.5, 4, 1, pose())
+    depth = torch.tensor([[12.0, torch.nan, 12.0, 400.0]])
+    made = view(camera, depth, mask=torch.tensor([[True, True, False, True]]))
+    assert sum(profiles(made)["distance"].pixels) == 1, "one is masked, one unknown, and one beyond the last edge"
+    everywhere = view(camera, depth, depth_valid=torch.ones(1, 4, dtype=torch.bool))
+    assert sum(profiles(everywhere)["distance"].pixels) == 2, "a protocol that compares unknown depth has no distance"
+
+
+def test_a_depth_that_is_not_finite_leaves_its_bin_without_a_value():
+    camera = Camera(1e3, 1e3, 1.0, 0.5, 2, 1, pose())
+    made = view(camera, torch.tensor([[12.0, 12.0]]), depth_error=torch.tensor([[torch.inf, 1.0]]))
+    found = profiles(made)["distance"]
+    assert found.pixels[2] == 2 and found.depth_mse[2] is None and found.rgb_mse[2] is not None
+
+
+def test_without_true_depth_there_is_no_profile():
+    camera = Camera(10.0, 10.0, 0.5, 0.5, 1, 1, pose())
+    frame = Frame("f", 0, torch.zeros(1, 1, 3, dtype=torch.uint8), camera)
+    assert profiles((Comparison(frame.rgb, frame.rgb, frame.valid), frame)) == {}
+    assert profiles() == {}
