@@ -13,6 +13,9 @@ from coliags_plugin.reporting.tables import Column, Entry, Row, Table, counted, 
 from coliags_plugin.results.record import CostRecord
 
 _KIB = 1024.0
+_STEPS = Column("steps", "Steps")
+#: Of the PSNR marks.
+_MARKS_SHOWN = 3
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,7 @@ def _kinds(marks: Sequence[str]) -> list[_Kind]:
 
 def _mark_kind(mark: str) -> _Kind:
     return _Kind(
-        Column(f"seconds_to_{mark}", f"To {mark} dB", "", "lower"),
+        Column(_mark_key(mark), f"To {mark} dB", "", "lower"),
         lambda cost: cost.seconds_to_psnr.get(mark),
         duration,
         "training",
@@ -81,10 +84,12 @@ def cost_table(study: Study) -> Table:
         "rendering": {rendering_device(cost) for cost in costs},
     }
     columns, entries = [_STEPS], [[_steps(study, method) for method in study.methods]]
-    for kind in _kinds(sorted({mark for cost in costs for mark in cost.seconds_to_psnr}, key=float)):
+    marks = sorted({mark for cost in costs for mark in cost.seconds_to_psnr}, key=float)
+    telling = _telling_marks(study, shared, marks)
+    for kind in _kinds(marks):
         comparable = kind.device is None or len(devices[kind.device]) == 1
         column = kind.column if comparable else replace(kind.column, direction=None)
-        columns.append(column)
+        columns.append(replace(column, shown=column.key not in map(_mark_key, marks) or column.key in telling))
         entries.append(_ranked(column, [_entry(study, shared, kind, method) for method in study.methods]))
     columns.append(Column("device", "Device", words=True))
     entries.append([_device(study, method) for method in study.methods])
@@ -100,7 +105,19 @@ def cost_table(study: Study) -> Table:
     )
 
 
-_STEPS = Column("steps", "Steps")
+def _telling_marks(study: Study, shared: Sequence[str], marks: Sequence[str]) -> set[str]:
+    """Keys of the marks to show: the highest that all methods reached, then the lowest that some did."""
+    reached = {
+        mark: [_entry(study, shared, _mark_kind(mark), method).value is not None for method in study.methods]
+        for mark in marks
+    }
+    by_all = [mark for mark in reversed(marks) if all(reached[mark])]
+    by_some = [mark for mark in marks if any(reached[mark]) and not all(reached[mark])]
+    return {_mark_key(mark) for mark in (*by_all, *by_some)[:_MARKS_SHOWN]}
+
+
+def _mark_key(mark: str) -> str:
+    return f"seconds_to_{mark}"
 
 
 def _steps(study: Study, method: str) -> Entry:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.reporting.metric_columns import metric_columns, part_name, part_title
 from coliags_plugin.reporting.missing_values import shared_scenes
-from coliags_plugin.reporting.statistics_text import p_text
+from coliags_plugin.reporting.statistics_text import p_text, smallest_p_text
 from coliags_plugin.reporting.study import Part, Study
 from coliags_plugin.reporting.tables import Column, Entry, Row, Table, column_decimals, number_text, unit_text
 from coliags_plugin.statistics.comparison import RivalComparison, compare_with_rivals
@@ -106,7 +106,7 @@ def _entries(row: RivalComparison, decimals: int, tested: bool) -> tuple[Entry, 
     return (
         *entries,
         Entry(f"{_signed(low, decimals)} to {_signed(high, decimals)}", low),
-        Entry(p_text(smallest_p(scenes)), smallest_p(scenes)),
+        Entry(smallest_p_text(scenes), smallest_p(scenes)),
         _p_entry(tests.wilcoxon) or undefined,
         Entry(p_text(tests.wilcoxon_holm), tests.wilcoxon_holm, stars=row.stars),
         _p_entry(tests.t_test) or undefined,

@@ -35,15 +35,15 @@ def statistics_text(compared: Sequence[RivalComparison], reference: str, chosen:
         return [
             f"No test is run: {counted(most, 'scene')} cannot tell methods apart. The unit is the scene, not the "
             f"frame, and of {counted(most, 'difference')} the two-sided Wilcoxon test cannot give less than p = "
-            f"{p_text(smallest_p(most))}; tests are run from {FEWEST_SCENES} scenes on "
-            f"(p = {p_text(smallest_p(FEWEST_SCENES))})."
+            f"{smallest_p_text(most)}; tests are run from {FEWEST_SCENES} scenes on "
+            f"(p = {smallest_p_text(FEWEST_SCENES)})."
         ]
     rivals = sum(row.tests is not None for row in compared)
     smallest = min(1.0, rivals * smallest_p(most))
     text = [
         f"Paired over {counted(most, 'scene')}: the unit is the scene, not the frame. The smallest p that the "
-        f"two-sided Wilcoxon signed-rank test can give is {p_text(smallest_p(most))}, or {p_text(smallest)} after "
-        f"Holm's adjustment for {counted(rivals, 'rival')}."
+        f"two-sided Wilcoxon signed-rank test can give is {smallest_p_text(most)}, or "
+        f"{smallest_p_text(most, rivals)} after Holm's adjustment for {counted(rivals, 'rival')}."
     ]
     if smallest >= LEVELS[0]:
         needed = next(count for count in range(most, 100) if rivals * smallest_p(count) < LEVELS[0])
@@ -58,6 +58,10 @@ def statistics_text(compared: Sequence[RivalComparison], reference: str, chosen:
 
 def p_text(p: float) -> str:
     """A p-value: two significant digits, without a leading zero; ``1`` and ``< .0001`` at the ends."""
-    if p < _SMALLEST_PRINTED:
-        return "< .0001"
-    return f"{p:.2g}".removeprefix("0")
+    return "< .0001" if p < _SMALLEST_PRINTED else f"{p:.2g}".removeprefix("0")
+
+
+def smallest_p_text(scenes: int, rivals: int = 1) -> str:
+    """The smallest p that so many scenes can give, adjusted for so many rivals: three significant digits."""
+    p = min(1.0, rivals * smallest_p(scenes))
+    return "< .0001" if p < _SMALLEST_PRINTED else f"{p:.3g}".removeprefix("0")

@@ -11,7 +11,7 @@ from coliags_plugin.reporting import html_blocks, latex, markdown
 from coliags_plugin.reporting.blocks import Folded
 from coliags_plugin.reporting.content import Choices, make_content
 from coliags_plugin.reporting.sources import read_study
-from coliags_plugin.reporting.tables import Column, Entry, Row, Table
+from coliags_plugin.reporting.tables import DASH, Column, Entry, Row, Table
 from tests.reporting.made import eight_scenes, write_comparison
 
 NASTY = r"a_b & 50 % <of> {x} $y$ #1 ~ ^ \z | *c* `d`"
@@ -44,7 +44,7 @@ def model_cells(table):
     shown = table.only_shown()
     marks = shown.footnotes()
     return [
-        [row.label, *((e.text or "–", e.spread, e.stars, _place(e), marks.get(e.note, "")) for e in row.entries)]
+        [row.label, *((e.text or DASH, e.spread, e.stars, _place(e), marks.get(e.note, "")) for e in row.entries)]
         for row in shown.rows
     ]
 
@@ -97,7 +97,7 @@ def _latex_cell(cell):
     value, _, spread = cell.partition(r" $\pm$ ")
     place = "best" if value.startswith(r"\textbf") else "second" if value.startswith(r"\underline") else ""
     value = re.sub(r"^\\(?:textbf|underline)\{(.*)\}$", r"\1", value)
-    for code, character in (("$-$", "-"), ("$<$", "<"), ("--", "–")):
+    for code, character in (("$-$", "-"), ("$<$", "<"), ("--", DASH)):
         value = value.replace(code, character)
     return plain(value), spread, stars.group(1) if stars else "", place, mark.group(1) if mark else ""
 
@@ -188,7 +188,9 @@ def test_latex_lines_are_commands_tables_or_comments(content):
 
 
 def test_nasty_names_survive():
-    table = Table(NASTY, "Method", (Column("x", NASTY, "mm^2", "lower"),), (Row(NASTY, (Entry("1", 1.0, note=NASTY),)),))
+    table = Table(
+        NASTY, "Method", (Column("x", NASTY, "mm^2", "lower"),), (Row(NASTY, (Entry("1", 1.0, note=NASTY),)),)
+    )
     assert markdown_cells(markdown.markdown_table(table))[0][0] == NASTY
     tex = latex.latex_table(table)
     assert r"a\_b \& 50 \% $<$of$>$ \{x\} \$y\$ \#1 \textasciitilde{} \textasciicircum{} \textbackslash{}z $|$" in tex
