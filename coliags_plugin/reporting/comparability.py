@@ -154,9 +154,7 @@ def _unpaired_seeds(study: Study) -> list[str]:
 
 
 def _steps(study: Study) -> list[str]:
-    steps = {
-        method: sorted({cell.result.steps for cell in study.cells if cell.method == method}) for method in study.methods
-    }
+    steps = {method: sorted({cell.result.steps for cell in own}) for method, own in study.by_method.items()}
     if len({tuple(own) for own in steps.values()}) == 1 and all(len(own) == 1 for own in steps.values()):
         return []
     each = ", ".join(f"{method} {' or '.join(f'{count:,}' for count in own)}" for method, own in steps.items())

@@ -121,13 +121,13 @@ def _mark_key(mark: str) -> str:
 
 
 def _steps(study: Study, method: str) -> Entry:
-    steps = sorted({cell.result.steps for cell in study.cells if cell.method == method})
+    steps = sorted({cell.result.steps for cell in study.by_method[method]})
     text = f"{steps[0]:,}" if len(steps) == 1 else f"{steps[0]:,} to {steps[-1]:,}"
     return Entry(text, steps[-1])
 
 
 def _device(study: Study, method: str) -> Entry:
-    own = [training_device(cell.result.cost) for cell in study.cells if cell.method == method]
+    own = [training_device(cell.result.cost) for cell in study.by_method[method]]
     return Entry("; ".join(dict.fromkeys(own)))
 
 
@@ -185,7 +185,7 @@ def _with_threads(device: str, threads: int | None) -> str:
 
 
 def _costs(study: Study, method: str, scene: str) -> list[CostRecord]:
-    return [cell.result.cost for cell in study.cells if cell.method == method and cell.scene == scene]
+    return [cell.result.cost for cell in study.by_method[method] if cell.scene == scene]
 
 
 def duration(seconds: float) -> str:

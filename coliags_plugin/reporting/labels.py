@@ -16,18 +16,16 @@ def told_apart(cells: Sequence[Cell]) -> list[Cell]:
     Runs of one config that differ in seed share a label. Where a method has several configs or several runs of one
     seed, its label is followed by what tells them apart: steps, the stamp of the run, or a hash of the config.
     """
-    ambiguous = {name for name in dict.fromkeys(cell.method for cell in cells) if not _clear(_of(cells, name))}
+    groups: dict[str, list[int]] = {}
+    for index, cell in enumerate(cells):
+        groups.setdefault(cell.method, []).append(index)
     labelled = list(cells)
-    for method in ambiguous:
-        own = [index for index, cell in enumerate(labelled) if cell.method == method]
-        labels = _distinct([labelled[index] for index in own])
-        for index, label in zip(own, labels, strict=True):
-            labelled[index] = replace(labelled[index], method=label)
+    for own in groups.values():
+        group = [cells[index] for index in own]
+        if not _clear(group):
+            for index, label in zip(own, _distinct(group), strict=True):
+                labelled[index] = replace(labelled[index], method=label)
     return labelled
-
-
-def _of(cells: Sequence[Cell], method: str) -> list[Cell]:
-    return [cell for cell in cells if cell.method == method]
 
 
 def _clear(cells: Sequence[Cell]) -> bool:
@@ -48,8 +46,8 @@ def _distinct(cells: Sequence[Cell]) -> list[str]:
     ways: list[Callable[[Cell], str]] = [_steps, _stamp, _config] if one_scene else [_steps, _config, _stamp]
     for way in ways:
         labels = [f"{cell.method} · {way(cell)}" for cell in cells]
-        labelled = [replace(cell, method=label) for cell, label in zip(cells, labels, strict=True)]
-        if all(_clear(_of(labelled, label)) for label in labels):
+        groups = ([cell for cell, own in zip(cells, labels, strict=True) if own == label] for label in set(labels))
+        if all(map(_clear, groups)):
             return labels
     labels = [f"{cell.method} · {cell.stamp}" for cell in cells]
     return [

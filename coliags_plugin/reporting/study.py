@@ -72,9 +72,17 @@ class Study:
     failures: tuple[Failure, ...] = ()
 
     @cached_property
+    def by_method(self) -> dict[str, list[Cell]]:
+        """Results of every method, in the order given."""
+        found: dict[str, list[Cell]] = {}
+        for cell in self.cells:
+            found.setdefault(cell.method, []).append(cell)
+        return found
+
+    @property
     def methods(self) -> list[str]:
         """Methods with a result, in the order given."""
-        return list(dict.fromkeys(cell.method for cell in self.cells))
+        return [*self.by_method]
 
     @cached_property
     def parts(self) -> list[Part]:
@@ -108,11 +116,8 @@ class Study:
 
     def runs(self, part: Part, scene: str, method: str) -> list[Cell]:
         """Results of a method on a scene, by seed."""
-        found = [
-            cell
-            for cell in self.cells
-            if cell.method == method and cell.scene == scene and self.record(cell, part) is not None
-        ]
+        own = self.by_method.get(method, [])
+        found = [cell for cell in own if cell.scene == scene and self.record(cell, part) is not None]
         return sorted(found, key=lambda cell: cell.result.seed)
 
     def frames(self, part: Part, scene: str) -> Sequence[str]:
@@ -141,8 +146,8 @@ class Study:
         """Why a metric is unavailable, as the first result without it says."""
         records = [
             record
-            for cell in self.cells
-            if cell.method == method and scene in (None, cell.scene) and (record := self.record(cell, part)) is not None
+            for cell in self.by_method.get(method, [])
+            if scene in (None, cell.scene) and (record := self.record(cell, part)) is not None
         ]
         if not records:
             return "no result"

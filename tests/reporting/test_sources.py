@@ -70,6 +70,42 @@ def test_failures_are_kept_unless_there_is_a_result(tmp_path):
     assert (failure.scene, failure.method, failure.seed, failure.reason) == failed
 
 
+def plan(folder, results, *more):
+    """The plan of results, and of cells (scene, method, seed) without one."""
+    cells = []
+    for result in results:
+        place = f"{result.scene.name}/{result.method.replace('/', '-')}/s{result.seed}-"
+        cells.append((result.scene.name, result.method, result.seed, f"{place}{result.key[:8]}"))
+    cells += [(scene, method, seed, f"{scene}/{method}/s{seed}-00000000") for scene, method, seed in more]
+    entries = [
+        {"scene": scene, "method": method, "seed": seed, "protocol": "paper", "key": "", "run": f"runs/{place}",
+         "result": f"results/{place}.json"}
+        for scene, method, seed, place in cells
+    ]  # fmt: skip
+    (folder / "plan.json").write_text(json.dumps({"format": "coliags-comparison", "cells": entries}))
+
+
+def test_the_plan_gives_order_runs_and_what_is_not_finished(tmp_path):
+    results = [result_of("scaffold-gs"), result_of("coliags"), result_of("coliags", steps=4000)]
+    folder = write_comparison(tmp_path, results, [("cecum", "2dgs", 0, "no memory")])
+    plan(folder, results[:2], ("cecum", "2dgs", 0), ("cecum", "3dgs", 1))
+    write_run(folder / f"runs/cecum/coliags/s0-{results[1].key[:8]}", results[1])
+    (failed,) = (folder / "failures/cecum/2dgs").iterdir()
+    failed.rename(failed.with_name("s0-00000000.json"))
+    study = read_study([folder])
+    assert study.methods == ["scaffold-gs", "coliags"]  # without the result that the plan no longer has
+    assert [cell.run is None for cell in study.cells] == [True, False]
+    assert [(f.method, f.seed, f.reason) for f in study.failures] == [
+        ("2dgs", 0, "no memory"),
+        ("3dgs", 1, "not finished"),
+    ]
+    refuses([folder], "results of protocol paper only", protocol="authors-code")
+    damaged = {"{": "cannot be read", "[]": "holds a list", '{"cells": [{}]}': "a cell lacks 'scene'"}
+    for content, match in damaged.items():
+        (folder / "plan.json").write_text(content)
+        refuses([folder], f"plan.json.*{match}")
+
+
 def test_nothing_is_refused(tmp_path):
     refuses([], "no results")
     refuses([tmp_path / "none"], "none.json|none")
@@ -78,7 +114,7 @@ def test_nothing_is_refused(tmp_path):
     refuses([tmp_path], "holds no results. Expected at least one finished cell")
     failed = write_comparison(tmp_path / "f", [], [("cecum", "3dgs", 0, "no <memory>")])
     (failed / "results").mkdir()
-    refuses([failed], "all 1 cells of .* failed; 3dgs on cecum: no <memory>")
+    refuses([failed], "none of the 1 cells of .* has a result; 3dgs on cecum: no <memory>")
 
 
 def test_what_was_not_evaluated_is_refused(tmp_path):
