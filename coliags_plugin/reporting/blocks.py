@@ -41,6 +41,7 @@ class Content:
     Attributes:
         title: Heading.
         note: Remark under it; may be empty.
+        reference: Method that the others are compared with.
         facts: Names and values: scenes, methods, protocol.
         description: How the protocol computes its metrics.
         cautions: What limits the comparison.
@@ -52,6 +53,7 @@ class Content:
 
     title: str
     note: str
+    reference: str
     facts: Sequence[tuple[str, str]]
     description: str
     cautions: Sequence[str]

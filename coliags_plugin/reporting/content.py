@@ -50,6 +50,7 @@ def make_content(study: Study, choices: Choices) -> Content:
     return Content(
         title=choices.title if choices.title is not None else _title(study),
         note=choices.note or "",
+        reference=reference,
         facts=[(name, value) for name, value in _facts(study) if value],
         description=study.protocol.description,
         cautions=cautions(study),
@@ -96,7 +97,8 @@ def _metrics(study: Study, choices: Choices, reference: str) -> Section:
         how += " Best in bold, second underlined, by the printed digits; equal values share a rank."
     blocks: list[Block] = [Paragraph(how)]
     for part in study.parts:
-        blocks += _part(study, part, choices, reference)
+        # What holds for several parts is said once.
+        blocks += [block for block in _part(study, part, choices, reference) if block not in blocks]
     return Section("Metrics", blocks)
 
 

@@ -91,8 +91,9 @@ def cost_table(study: Study) -> Table:
         column = kind.column if comparable else replace(kind.column, direction=None)
         columns.append(replace(column, shown=column.key not in map(_mark_key, marks) or column.key in telling))
         entries.append(_ranked(column, [_entry(study, shared, kind, method) for method in study.methods]))
-    columns.append(Column("device", "Device", words=True))
-    entries.append([_device(study, method) for method in study.methods])
+    if len(devices["training"]) > 1:
+        columns.append(Column("device", "Device", words=True))
+        entries.append([_device(study, method) for method in study.methods])
     rows = [Row(method, tuple(own[index] for own in entries), index) for index, method in enumerate(study.methods)]
     return Table(
         title="Costs",
@@ -145,7 +146,12 @@ def _entry(study: Study, shared: Sequence[str], kind: _Kind, method: str) -> Ent
 
 
 def _ranked(column: Column, entries: Sequence[Entry]) -> list[Entry]:
-    keys = [None if entry.value is None else repr(entry.value) for entry in entries]
+    first: dict[str, float] = {}
+    for entry in entries:
+        if entry.value is not None:
+            first.setdefault(entry.text, entry.value)
+    # By the printed text: values that look alike share a rank.
+    keys = [repr(first[entry.text]) if entry.text in first else None for entry in entries]
     return [
         replace(entry, rank=rank) for entry, rank in zip(entries, printed_ranks(keys, column.direction), strict=True)
     ]
@@ -162,6 +168,7 @@ def _notes(study: Study, shared: Sequence[str], devices: dict[str, set[str]]) ->
         notes.append(
             f"Not ranked: {' and '.join(mixed)} ran on different devices, whose costs are not comparable ({each})"
         )
+    notes += [f"All {what} on {next(iter(found))}" for what, found in devices.items() if len(found) == 1]
     if any(cell.result.cost.seconds_to_psnr for cell in study.cells):
         notes.append("To N dB: training time until the logged PSNR, smoothed, first reached N dB")
     notes.append("Rendering: views of the test sets a second. Gaussians: drawn in a test view, mean")

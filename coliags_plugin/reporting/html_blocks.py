@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from html import escape
 
 from coliags_plugin.outputs.charts import style_classes
 from coliags_plugin.reporting.blocks import Block, Content, Folded, Paragraph, Section
-from coliags_plugin.reporting.tables import DASH, Column, Entry, Row, Table, unit_text
+from coliags_plugin.reporting.tables import DASH, Column, Entry, Footnote, Row, Table, unit_text
 
 
 def html_header(content: Content, extra_facts: str = "") -> str:
@@ -41,9 +41,10 @@ def html_block(block: Block) -> str:
     return html_table(block)
 
 
-def folded(title: str, parts: Sequence[str] | map[str]) -> str:
+def folded(title: str, parts: Iterable[str], is_open: bool = False) -> str:
     """HTML behind a title that unfolds."""
-    return f'<details><summary>{escape(title)}</summary><div class="inside">{"".join(parts)}</div></details>'
+    state = " open" if is_open else ""
+    return f'<details{state}><summary>{escape(title)}</summary><div class="inside">{"".join(parts)}</div></details>'
 
 
 def html_table(table: Table) -> str:
@@ -51,31 +52,42 @@ def html_table(table: Table) -> str:
 
     ``data-key`` names a column, and ``data-value`` is the number of a cell; the script sorts by it.
     """
-    marks = table.footnotes()
+    footnotes = table.footnotes()
+    marks = {text: note.mark for text, note in footnotes.items()}
     count = f' <span class="count">{escape(table.count)}</span>' if table.count else ""
-    head = f'<th scope="col" class="text">{escape(table.head)}</th>{"".join(map(_heading, table.columns))}'
+    heads = "".join(_heading(table, column) for column in table.columns)
     rows = "".join(_row(table, row, marks) for row in table.rows)
     parts = [
         f'<div class="scroll"><table class="results" data-name="{escape(table.name, quote=True)}">',
         f"<caption>{escape(table.title)}{count}</caption>",
-        f"<thead><tr>{head}</tr></thead>",
+        f'<thead><tr><th scope="col" class="text">{escape(table.head)}</th>{heads}</tr></thead>',
         f"<tbody>{rows}</tbody></table></div>",
     ]
-    below = [f"<li><sup>{mark}</sup> {escape(text)}</li>" for text, mark in marks.items()]
+    below = [_footnote(table, text, note) for text, note in footnotes.items()]
     below += [f"<li>{escape(note)}.</li>" for note in table.notes]
     if below:
         parts.append(f'<ul class="footnotes">{"".join(below)}</ul>')
     return "\n".join(parts)
 
 
-def _heading(column: Column) -> str:
+def _footnote(table: Table, text: str, note: Footnote) -> str:
+    """A footnote, hidden with the columns that it is for."""
+    shown = {column.key for column in table.columns if column.shown}
+    hidden = "" if shown & set(note.columns) else " hidden"
+    keys = escape(" ".join(note.columns), quote=True)
+    return f'<li data-columns="{keys}"{hidden}><sup>{note.mark}</sup> {escape(text)}</li>'
+
+
+def _heading(table: Table, column: Column) -> str:
     title = f' title="{column.direction} is better"' if column.direction else ""
-    # Arrow and unit share the second line, so that all headings have two lines.
-    under = f"{column.arrow} {escape(unit_text(column.unit))}".strip() or "&nbsp;"
+    # Arrow and unit share the second line, so that all headings have two lines; or one, where no column has any.
+    under = f"{column.arrow} {escape(unit_text(column.unit))}".strip()
+    if any(each.arrow or unit_text(each.unit) for each in table.columns):
+        under = f'<span class="unit"{title}>{under or "&nbsp;"}</span>'
     direction = f' data-better="{column.direction}"' if column.direction else ""
     return (
         f'<th scope="col"{_class(column)}{_hidden(column)} data-key="{escape(column.key, quote=True)}"{direction}>'
-        f'{escape(column.title)}<span class="unit"{title}>{under}</span></th>'
+        f"{escape(column.title)}{under}</th>"
     )
 
 
@@ -110,3 +122,9 @@ def _hidden(column: Column) -> str:
 def swatch(style: int | None) -> str:
     """Coloured dot of a method; nothing for no style."""
     return "" if style is None else f'<i class="swatch {style_classes(style)}"></i>'
+
+
+def legend(methods: Sequence[str]) -> str:
+    """Names and colours of the methods, for charts."""
+    items = "".join(f"<li>{swatch(index)}{escape(method)}</li>" for index, method in enumerate(methods))
+    return f'<ul class="legend">{items}</ul>'

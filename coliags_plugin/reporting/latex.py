@@ -63,7 +63,7 @@ def _blocks(blocks: Sequence[Block]) -> Iterator[str]:
 def latex_table(table: Table) -> str:
     """A ``table`` environment with caption, label, footnotes and notes: the columns that are shown."""
     table = table.only_shown()
-    marks = table.footnotes()
+    marks = {text: note.mark for text, note in table.footnotes().items()}
     count = f" ({table.count})" if table.count else ""
     below = [f"$^{{{mark}}}$ {escaped(text)}." for text, mark in marks.items()]
     below += [f"{escaped(note)}." for note in table.notes]

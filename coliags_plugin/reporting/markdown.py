@@ -41,7 +41,7 @@ def _blocks(blocks: Sequence[Block], level: int) -> list[str]:
 def markdown_table(table: Table) -> str:
     """A table with its title, footnotes and notes: the columns that are shown."""
     table = table.only_shown()
-    marks = table.footnotes()
+    marks = {text: note.mark for text, note in table.footnotes().items()}
     title = f"**{escaped(table.title)}**" + (f" ({escaped(table.count)})" if table.count else "")
     lines = [
         _line([table.head, *map(_heading, table.columns)]),

@@ -78,6 +78,14 @@ class Row:
 
 
 @dataclass(frozen=True)
+class Footnote:
+    """A footnote's mark, and the keys of the columns that refer to it."""
+
+    mark: str
+    columns: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class Table:
     """A table.
 
@@ -105,10 +113,15 @@ class Table:
         rows = tuple(replace(row, entries=tuple(row.entries[index] for index in kept)) for row in self.rows)
         return replace(self, columns=tuple(self.columns[index] for index in kept), rows=rows)
 
-    def footnotes(self) -> dict[str, str]:
-        """Mark of each footnote by its text: a, b, ...; equal texts share one."""
-        texts = dict.fromkeys(entry.note for row in self.rows for entry in row.entries if entry.note)
-        return {text: _mark(index) for index, text in enumerate(texts)}
+    def footnotes(self) -> dict[str, Footnote]:
+        """Footnotes by their texts; equal texts share one. Those of columns that are not shown come last."""
+        keys: dict[str, dict[str, None]] = {}
+        for shown in (True, False):
+            for row in self.rows:
+                for column, entry in zip(self.columns, row.entries, strict=True):
+                    if entry.note and column.shown is shown:
+                        keys.setdefault(entry.note, {})[column.key] = None
+        return {text: Footnote(_mark(index), tuple(own)) for index, (text, own) in enumerate(keys.items())}
 
 
 def numeric_entries(

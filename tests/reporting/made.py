@@ -179,7 +179,7 @@ def write_comparison(
     return folder
 
 
-def eight_scenes(methods: Mapping[str, float], scenes: int = 8, seeds: int = 1, **options) -> list[Result]:
+def made_scenes(methods: Mapping[str, float], scenes: int = 8, seeds: int = 1, **options) -> list[Result]:
     """Methods on several scenes: each scene has its level, each method its lead of about so many dB."""
     rng = np.random.default_rng(4)
     levels = {f"scene-{index + 1}": float(rng.normal(30, 2)) for index in range(scenes)}

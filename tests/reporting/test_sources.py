@@ -10,7 +10,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.reporting.sources import read_study
 from coliags_plugin.reporting.study import Part
 from coliags_plugin.results.reading import write_result
-from tests.reporting.made import FRAMES, eight_scenes, result_of, write_comparison, write_run
+from tests.reporting.made import FRAMES, made_scenes, result_of, write_comparison, write_run
 
 TEST, ROTATION = Part("every-8th", "test"), Part("every-8th", "rotation")
 
@@ -205,7 +205,7 @@ def labels(study):
 
 def test_seeds_of_one_config_are_one_method(study_of):
     assert labels(study_of([result_of("a"), result_of("a", seed=1)])) == ["a", "a"]
-    assert labels(study_of(eight_scenes({"a": 0, "b": 0}, scenes=2, seeds=2))) == ["a"] * 4 + ["b"] * 4
+    assert labels(study_of(made_scenes({"a": 0, "b": 0}, scenes=2, seeds=2))) == ["a"] * 4 + ["b"] * 4
 
 
 def test_runs_of_one_method_are_told_apart(tmp_path, study_of):

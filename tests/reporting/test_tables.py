@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coliags_plugin.reporting.tables import Column, Entry, Row, Table, counted, number_text, numeric_entries
+from coliags_plugin.reporting.tables import Column, Entry, Footnote, Row, Table, counted, number_text, numeric_entries
 
 
 @pytest.mark.parametrize(
@@ -73,10 +73,14 @@ def test_equal_footnotes_share_a_mark_and_hidden_columns_have_none():
         Row("two", (Entry(note="y"), Entry("1", 1.0), Entry(note="x"))),
     )
     table = Table("T", "Method", columns, rows)
-    assert table.footnotes() == {"x": "a", "hidden": "b", "y": "c"}
+    assert table.footnotes() == {
+        "x": Footnote("a", ("a", "c")),
+        "y": Footnote("b", ("c", "a")),
+        "hidden": Footnote("c", ("b",)),
+    }
     shown = table.only_shown()
     assert [column.key for column in shown.columns] == ["a", "c"]
-    assert shown.footnotes() == {"x": "a", "y": "b"}
+    assert [note.mark for note in shown.footnotes().values()] == ["a", "b"]
 
 
 def test_counted():

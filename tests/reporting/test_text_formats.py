@@ -12,7 +12,7 @@ from coliags_plugin.reporting.blocks import Folded
 from coliags_plugin.reporting.content import Choices, make_content
 from coliags_plugin.reporting.sources import read_study
 from coliags_plugin.reporting.tables import DASH, Column, Entry, Row, Table
-from tests.reporting.made import eight_scenes, write_comparison
+from tests.reporting.made import made_scenes, write_comparison
 
 NASTY = r"a_b & 50 % <of> {x} $y$ #1 ~ ^ \z | *c* `d`"
 
@@ -20,7 +20,7 @@ NASTY = r"a_b & 50 % <of> {x} $y$ #1 ~ ^ \z | *c* `d`"
 @pytest.fixture(scope="module")
 def content(tmp_path_factory):
     methods = {"coliags": 2.0, "scaffold-gs": 0.5, "ablations/none": 0.0}
-    folder = write_comparison(tmp_path_factory.mktemp("comparison"), eight_scenes(methods, seeds=2)[:-2])
+    folder = write_comparison(tmp_path_factory.mktemp("comparison"), made_scenes(methods, seeds=2)[:-2])
     return make_content(read_study([folder]), Choices(note=NASTY))
 
 
@@ -42,7 +42,7 @@ def tables_of(content):
 def model_cells(table):
     """What every rendering must say: label, and value, spread, stars, rank and footnote of every entry."""
     shown = table.only_shown()
-    marks = shown.footnotes()
+    marks = {text: note.mark for text, note in shown.footnotes().items()}
     return [
         [row.label, *((e.text or DASH, e.spread, e.stars, _place(e), marks.get(e.note, "")) for e in row.entries)]
         for row in shown.rows
@@ -157,11 +157,7 @@ def test_all_formats_have_the_same_numbers(content):
         expected = model_cells(table)
         assert markdown_cells(markdown.markdown_table(table)) == expected
         assert latex_cells(latex.latex_table(table)) == expected
-        # The page numbers its footnotes over the hidden columns too.
-        html = Cells(html_blocks.html_table(table)).cells
-        assert [[row[0], *(cell[:4] for cell in row[1:])] for row in html] == [
-            [row[0], *(cell[:4] for cell in row[1:])] for row in expected
-        ]
+        assert Cells(html_blocks.html_table(table)).cells == expected
 
 
 def test_whole_reports_hold_every_table(content):
