@@ -335,16 +335,18 @@ def test_the_page_holds_the_values_of_all_frames(tmp_path, two_runs):
 
 def test_formats(tmp_path, two_runs):
     files = write_report(two_runs, tmp_path / "out/tables.html", ("markdown", "html", "latex", "csv"))
-    assert [file.name for file in files] == ["tables.md", "tables.html", "tables.tex", "tables.csv"]
-    assert (tmp_path / "out/tables.md").read_text().startswith("# 2 methods compared on cecum")
-    assert r"\toprule" in (tmp_path / "out/tables.tex").read_text()
-    assert (tmp_path / "out/tables.csv").read_text().startswith("scene,split,set,frame,method,seed,psnr")
+    assert {file.stem for file in files} == {"tables"}
+    text = {file.suffix: file.read_text() for file in files}
+    assert list(text) == [".md", ".html", ".tex", ".csv"]
+    assert text[".md"].startswith("# 2 methods compared on cecum")
+    assert r"\toprule" in text[".tex"]
+    assert text[".csv"].startswith("scene,split,set,frame,method,seed,psnr")
     assert write_report(two_runs, tmp_path / "table.txt", ("markdown",)) == [tmp_path / "table.txt"]
 
 
 def test_tables_alone_need_no_images(tmp_path, two_runs):
     (two_runs[0] / "eval/paper/renders/test/0004.png").unlink()
-    write_report(two_runs, tmp_path / "table.md", ("markdown",))
+    write_report(two_runs, tmp_path / "table.txt", ("markdown",))
 
 
 # Refusals
