@@ -26,7 +26,7 @@ LAYERS = (
 )
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
 #: Loaded when a command or component runs, never when a module is imported.
-LAZY = {"open3d", "pycolmap", "numba", "gsplat", "viser", "nerfstudio"}
+LAZY = {"open3d", "pycolmap", "numba", "gsplat", "viser", "nerfstudio", "pyarrow"}
 
 SOURCES = {
     ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"): path

@@ -19,8 +19,10 @@ from coliags_plugin.cli.phantom import Phantom
 from coliags_plugin.cli.poses import Poses
 from coliags_plugin.cli.render import Render
 from coliags_plugin.cli.report import Report
+from coliags_plugin.cli.results import Results
 from coliags_plugin.cli.run import run_command
 from coliags_plugin.cli.train import Train
+from coliags_plugin.cli.weights import Weights
 
 Command = (
     Annotated[Phantom, tyro.conf.subcommand("phantom")]
@@ -28,11 +30,13 @@ Command = (
     | Annotated[Evaluate, tyro.conf.subcommand("eval")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Report, tyro.conf.subcommand("report")]
+    | Annotated[Results, tyro.conf.subcommand("results")]
     | Annotated[Poses, tyro.conf.subcommand("poses")]
     | Annotated[List, tyro.conf.subcommand("list")]
     | Annotated[Config, tyro.conf.subcommand("config")]
     | Annotated[Data, tyro.conf.subcommand("data")]
     | Annotated[Check, tyro.conf.subcommand("check")]
+    | Annotated[Weights, tyro.conf.subcommand("weights")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
 )
 

@@ -1,4 +1,4 @@
-"""Key of a result: a hash of everything that determines it."""
+"""Keys of runs and results: hashes of everything that determines them."""
 
 from __future__ import annotations
 
@@ -9,14 +9,32 @@ from typing import Any
 
 from pydantic_core import to_json
 
-#: Keys of a method config that do not change a result; the protocol counts as what it was evaluated under.
+#: Keys of a method config that do not change a trained model; the protocol has a place of its own in a result's key.
 _IGNORED = ("description", "protocol")
+#: Likewise of its schedule.
+_IGNORED_OF_SCHEDULE = ("log_every", "checkpoint_every")
 
 
 def plain_config(config: Mapping[str, Any]) -> dict[str, Any]:
     """A method config as data of standard JSON: tuples become lists, infinity the string ``Infinity``."""
     plain: dict[str, Any] = json.loads(to_json(config, inf_nan_mode="strings"))
     return plain
+
+
+def training_key(config: Mapping[str, Any], fingerprint: str, seed: int, package_version: str) -> str:
+    """Key of a trained model, 16 hexadecimal digits; how often is logged and saved does not count.
+
+    Args:
+        config: The resolved method config as plain data.
+        fingerprint: Of the scene's files.
+        seed: Of the run.
+        package_version: Of this package.
+    """
+    relevant = {name: value for name, value in plain_config(config).items() if name not in _IGNORED}
+    schedule = relevant.get("schedule")
+    if isinstance(schedule, Mapping):
+        relevant["schedule"] = {name: value for name, value in schedule.items() if name not in _IGNORED_OF_SCHEDULE}
+    return _digest([relevant, fingerprint, seed, package_version])
 
 
 def result_key(
@@ -31,17 +49,20 @@ def result_key(
     """Key of a result, 16 hexadecimal digits.
 
     Args:
-        config: The resolved method config as plain data.
-        fingerprint: Of the scene's files.
-        seed: Of the run.
-        package_version: Of this package.
+        config: See :func:`training_key`.
+        fingerprint: See :func:`training_key`.
+        seed: See :func:`training_key`.
+        package_version: See :func:`training_key`.
         protocol: Name of the evaluation protocol.
         protocol_version: Its version.
-        deviations: How the run differs from one that goes through as configured: taken to another step, or with
-            another schedule on the way. None where it does not.
+        deviations: How the run differs from one that goes through as configured: taken to another step, with another
+            schedule on the way, or trained by another version. None where it does not.
     """
-    relevant = {name: value for name, value in plain_config(config).items() if name not in _IGNORED}
-    parts: list[Any] = [relevant, fingerprint, seed, package_version, protocol, protocol_version]
+    parts: list[Any] = [training_key(config, fingerprint, seed, package_version), protocol, protocol_version]
     if deviations:
         parts.append(plain_config(deviations))
+    return _digest(parts)
+
+
+def _digest(parts: list[Any]) -> str:
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]

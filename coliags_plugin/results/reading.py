@@ -21,6 +21,10 @@ _EXPECTED = "a results file, as `coliags eval` writes it"
 _AGAIN = "Restore it, or run `coliags eval` again"
 
 
+class NewerResultError(InputError):
+    """A results file is from a newer version of the package."""
+
+
 def write_result(path: Path, result: Result) -> None:
     """Write a results file atomically.
 
@@ -34,8 +38,9 @@ def read_result(path: Path) -> Result:
     """Read a results file.
 
     Raises:
-        InputError: There is none, it is cut off or otherwise not JSON, no results file, of another version of the
-            schema, lacks a field or has one of a wrong type, or its values are not those that were written.
+        NewerResultError: It is of a newer version of the schema.
+        InputError: There is none, it is cut off or otherwise not JSON, no results file, lacks a field or has one of a
+            wrong type, or its values are not those that were written.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -77,7 +82,7 @@ def _check_version(content: dict[str, Any], path: Path) -> None:
     if type(version) is not int or version < 1:
         raise InputError(f"{path}: version is {json.dumps(version)}", f"a number from 1 to {VERSION}", _AGAIN)
     if version > VERSION:
-        raise InputError(
+        raise NewerResultError(
             f"{path} is from a newer version of coliags_plugin: version {version} of the schema",
             f"version {VERSION} or older",
             "Update the package",

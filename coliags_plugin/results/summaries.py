@@ -48,3 +48,28 @@ def per_frame_table(result: Result) -> str:
             values = (part.values[name][index] if name in part.values else None for name in result.metrics)
             writer.writerow([set_name, frame, *("" if value is None else repr(value) for value in values)])
     return text.getvalue()
+
+
+def facts(result: Result) -> dict[str, str]:
+    """What was run and what it cost, in words; nothing about what was not measured."""
+    cost = result.cost
+    threads = "" if cost.threads is None else f", {cost.threads} threads"
+    reached = {mark: seconds for mark, seconds in cost.seconds_to_psnr.items() if seconds is not None}
+    found = {
+        "key": result.key,
+        "seed": str(result.seed),
+        "split": f"{result.scene.split or 'unnamed'}, {len(result.scene.train)} training frames",
+        "trained on": f"{cost.device}{threads}",
+        "training": _said(cost.train_seconds, "{:.1f} s"),
+        "psnr reached": ", ".join(f"{mark} dB after {seconds:.1f} s" for mark, seconds in reached.items()),
+        "processor time": _said(cost.processor_seconds, "{:.1f} s"),
+        "peak memory": _said(cost.peak_memory_mib, "{:.0f} MiB"),
+        "rendering": _said(cost.render_fps, "{:.2f} views a second"),
+        "gaussians": _said(cost.gaussians, "{:.0f} in a view"),
+        "checkpoint": _said(None if cost.checkpoint_bytes is None else cost.checkpoint_bytes / 2**20, "{:.1f} MiB"),
+    }
+    return {name: text for name, text in found.items() if text}
+
+
+def _said(value: float | None, form: str) -> str:
+    return "" if value is None else form.format(value)
