@@ -85,6 +85,18 @@ def test_an_ablation_is_a_comparison_of_a_files_variants(wall, tmp_path, inline)
         cp.ablate("paper-row", wall, tmp_path / "new")
 
 
+def test_a_report_of_a_comparison_is_the_commands(compared, tmp_path):
+    files = cp.report(compared, tmp_path / "ours.html", formats=["markdown", "csv"], title="Depth")
+    assert files == [tmp_path / "ours.md", tmp_path / "ours.csv"]
+    names = ("--format", "markdown", "--format", "csv", "--title", "Depth")
+    assert run("report", compared.folder, "--output", tmp_path / "theirs.html", *names) == 0
+    for suffix in ("md", "csv"):
+        assert (tmp_path / f"ours.{suffix}").read_text() == (tmp_path / f"theirs.{suffix}").read_text()
+    assert "without depth" in (tmp_path / "ours.md").read_text()
+    with pytest.raises(InputError, match=r"no format 'latx'.*Did you mean 'latex'"):
+        cp.report(compared, formats="latx")
+
+
 def test_a_notebook_shows_one_line(wall, tmp_path, inline, monkeypatch):
     shown = Shown()
     monkeypatch.setattr("IPython.display.display", shown)

@@ -18,7 +18,7 @@ LAYERS = (
     {"contracts"},
     {"poses"},
     {"datamanagers", "fields", "renderers", "modules", "strategies", "losses", "metrics"},
-    {"outputs", "results"},
+    {"outputs", "results", "statistics"},
     {"engine", "phantom", "reconstruction"},
     {"comparison", "data_check", "method_check", "reporting"},
     {"api"},

@@ -28,6 +28,7 @@ def compare(
     threads: int | None = None,
     device: str = "auto",
     executor: str = "local",
+    ray_address: str | None = None,
     retries: int = 2,
 ) -> Comparison:
     """Train and evaluate methods on scenes: what is missing is run, what is done is kept.
@@ -46,6 +47,7 @@ def compare(
         threads: CPU threads of each run; None: the CPUs divided by the runs at a time.
         device: ``auto``, ``cpu`` or ``cuda``.
         executor: Where runs are processes: ``local``, or ``ray`` for a Ray cluster.
+        ray_address: ``HOST:PORT`` of the cluster's head; None: ``RAY_ADDRESS``, or the cluster of this machine.
         retries: How often a run is resumed whose process was killed or crashed.
 
     Raises:
@@ -67,7 +69,7 @@ def compare(
         splits=splits,
         steps=steps,
         overrides=assignments(settings),
-        how=How(jobs, threads, device, executor, retries),
+        how=How(jobs, threads, device, executor, ray_address, retries),
     )
 
 

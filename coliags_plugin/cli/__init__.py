@@ -24,6 +24,7 @@ from coliags_plugin.cli.report import Report
 from coliags_plugin.cli.results import Results
 from coliags_plugin.cli.run import run_command
 from coliags_plugin.cli.train import Train
+from coliags_plugin.cli.weights import Weights
 
 Command = (
     Annotated[Phantom, tyro.conf.subcommand("phantom")]
@@ -39,6 +40,7 @@ Command = (
     | Annotated[Config, tyro.conf.subcommand("config")]
     | Annotated[Data, tyro.conf.subcommand("data")]
     | Annotated[Check, tyro.conf.subcommand("check")]
+    | Annotated[Weights, tyro.conf.subcommand("weights")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
 )
 

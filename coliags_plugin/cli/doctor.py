@@ -1,4 +1,4 @@
-"""``coliags doctor``: report versions, devices and the renderer in use."""
+"""``coliags doctor``: report versions, devices, the renderer in use and the weights of LPIPS."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Doctor:
-    """Report versions and devices, and which renderer would be used and why."""
+    """Report versions and devices, which renderer would be used and why, and where the weights of LPIPS are."""
 
     def run(self) -> None:
         """Print the findings; exit with status 1 where a requirement is missing."""

@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from coliags_plugin.core.errors import InputError
 
@@ -53,15 +53,36 @@ def atomic_write(target: Path, data: bytes | str) -> None:
     Raises:
         InputError: The folder cannot be written.
     """
+    with _renamed_at_the_end(target) as file:
+        file.write(data.encode() if isinstance(data, str) else data)
+
+
+def atomic_copy(source: Path, target: Path) -> None:
+    """Copy a file under a temporary name, then rename that to ``target``.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    with source.open("rb") as original, _renamed_at_the_end(target) as file:
+        shutil.copyfileobj(original, file)
+
+
+@contextmanager
+def _renamed_at_the_end(target: Path) -> Iterator[IO[bytes]]:
     make_folder(target.parent)
+    scratch = None
     try:
         handle, scratch = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
         with os.fdopen(handle, "wb") as file:
-            file.write(data.encode() if isinstance(data, str) else data)
+            yield file
         os.chmod(scratch, 0o644)
         os.replace(scratch, target)
+        scratch = None
     except OSError as error:
         raise not_writable(target.parent, error) from error
+    finally:
+        if scratch is not None:
+            Path(scratch).unlink(missing_ok=True)
 
 
 def write_json(target: Path, data: Any) -> None:

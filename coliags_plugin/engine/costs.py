@@ -79,13 +79,13 @@ class CostMeter:
         if not self._measured:
             return None
         earlier, (seconds, processor_seconds) = self._earlier, self._so_far()
-        peak = earlier.peak_memory_mib
+        peak, before = peak_memory_mib(self._device), earlier.peak_memory_mib
         return TrainingCost(
             device=device_name(self._device),
             threads=torch.get_num_threads(),
             seconds=_sum(earlier.seconds, seconds),
             processor_seconds=_sum(earlier.processor_seconds, processor_seconds),
-            peak_memory_mib=None if peak is None else max(peak, peak_memory_mib(self._device)),
+            peak_memory_mib=None if peak is None or before is None else max(peak, before),
         )
 
     def _so_far(self) -> tuple[float, float]:
@@ -103,18 +103,24 @@ def _sum(earlier: float | None, now: float) -> float | None:
     return None if earlier is None else earlier + now
 
 
-def peak_memory_mib(device: torch.device) -> float:
-    """Largest resident memory of this process so far; on a GPU, largest memory allocated since its statistics began."""
+def peak_memory_mib(device: torch.device) -> float | None:
+    """Largest resident memory of this process so far; on a GPU, largest memory allocated since its statistics began.
+
+    None where the system does not tell.
+    """
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / 2**20
-    try:  # of this process alone: the other source counts what its parent had when it was started
+    try:  # of this process alone: getrusage counts what its parent had when it was started
         lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
         return next(float(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 2**10
     except (OSError, StopIteration):
+        pass
+    try:
         import resource
-
-        unit = 1 if sys.platform == "darwin" else 2**10
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
+    except ImportError:  # on Windows
+        return None
+    unit = 1 if sys.platform == "darwin" else 2**10
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
 
 
 class RenderMeter:

@@ -13,8 +13,9 @@ import torch
 from coliags_plugin import __version__
 from coliags_plugin.config import registry
 from coliags_plugin.config.components import make_component
-from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.errors import InputError, UnavailableError
 from coliags_plugin.engine.devices import choose_device
+from coliags_plugin.metrics.lpips_weights import DEFAULT_NETS, find_weights
 from coliags_plugin.renderers.choice import choose_renderer
 
 #: Distribution -> module. Imported for real: a library that is installed may still fail to load.
@@ -40,7 +41,7 @@ class Finding:
 
 
 def examine() -> list[Finding]:
-    """Check everything that training depends on."""
+    """Check everything that training and evaluation depend on."""
     cuda = torch.cuda.is_available()
     findings = [
         Finding("coliags_plugin", __version__),
@@ -50,6 +51,7 @@ def examine() -> list[Finding]:
     ]
     findings += [_library(name, module) for name, module in LIBRARIES.items()]
     findings += [_renderer(name) for name in registry.renderers]
+    findings += [_lpips(net) for net in DEFAULT_NETS]
     return findings
 
 
@@ -75,3 +77,12 @@ def _renderer(name: str) -> Finding:
         return Finding(f"renderer {name}", f"would use {chosen.name} ({chosen.reason})")
     available = component.target.availability()
     return Finding(f"renderer {name}", f"{'can' if available.ok else 'cannot'} run here: {available.reason}")
+
+
+def _lpips(net: str) -> Finding:
+    """Weights are no requirement: without them LPIPS is left out, and nothing else."""
+    try:
+        backbone, heads = find_weights(net)
+    except UnavailableError as error:
+        return Finding(f"weights of LPIPS {net}", str(error))
+    return Finding(f"weights of LPIPS {net}", f"{backbone} and {heads}")

@@ -119,11 +119,16 @@ def _cost(trained: TrainedRun, meter: RenderMeter) -> CostRecord:
 
 
 def _deviations(step: int, configured: int, provenance: Mapping[str, Any]) -> dict[str, Any]:
-    """How a run differs from one that goes through as configured; empty where it does not."""
+    """How a run differs from one that goes through as configured, with this version; empty where it does not."""
     lengths = ("steps", "written_for")
     jumps = [
         change
         for change in provenance.get("schedule_changes", [])
         if any(change["from"][name] != change["to"][name] for name in lengths)
     ]
-    return {**({} if step == configured else {"step": step}), **({"schedule_changes": jumps} if jumps else {})}
+    version = provenance.get("package_version", __version__)
+    return {
+        **({} if step == configured else {"step": step}),
+        **({"schedule_changes": jumps} if jumps else {}),
+        **({} if version == __version__ else {"trained_with": version}),
+    }

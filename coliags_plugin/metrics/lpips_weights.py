@@ -1,10 +1,10 @@
-"""Search for and loading of LPIPS weights on this machine. Nothing is ever downloaded."""
+"""Search for and loading of LPIPS weights on this machine; only ``coliags weights lpips`` downloads them."""
 
 from __future__ import annotations
 
 import os
 import pickle
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -16,6 +16,9 @@ from coliags_plugin.metrics.lpips_network import TAPS, LPIPSNetwork
 
 WEIGHTS_VARIABLE = "COLIAGS_LPIPS_WEIGHTS"
 
+#: The nets of the protocols' metrics.
+DEFAULT_NETS = ("vgg", "squeeze")
+
 #: File names of torchvision's weights in torch's download folder; the second names are older copies of the same.
 BACKBONE_FILES: dict[str, tuple[str, ...]] = {
     "vgg": ("vgg16-397923af.pth",),
@@ -24,7 +27,7 @@ BACKBONE_FILES: dict[str, tuple[str, ...]] = {
 }
 
 
-def find_weights(net: str, folder: str | None = None) -> tuple[Path, Path]:
+def find_weights(net: str, folder: str | Path | None = None) -> tuple[Path, Path]:
     """Paths of the backbone and linear head weights.
 
     Searched in ``folder``, then in the folder that ``COLIAGS_LPIPS_WEIGHTS`` names, then where ``torch.hub`` keeps
@@ -35,9 +38,7 @@ def find_weights(net: str, folder: str | None = None) -> tuple[Path, Path]:
     Raises:
         UnavailableError: One is missing; names the file and the folders searched.
     """
-    folders = list(_folders(folder))
-    backbone = next((file for place in folders for file in _backbones(net, place)), None)
-    heads = next((file for place in [*folders, *_package_folders()] for file in _heads(net, place)), None)
+    backbone, heads = search(net, folder)
     if backbone is None or heads is None:
         missing = [
             f"{what} ({name})"
@@ -47,11 +48,30 @@ def find_weights(net: str, folder: str | None = None) -> tuple[Path, Path]:
             )
             if found is None
         ]
+        command = "coliags weights lpips" + ("" if net in DEFAULT_NETS else f" --net {net}")
         raise UnavailableError(
-            f"LPIPS {net} weights not found: {' and '.join(missing)}. Looked in {', '.join(map(str, folders))}; "
-            f"{WEIGHTS_VARIABLE} can name a folder that has them"
+            f"LPIPS {net} weights not found: {' and '.join(missing)}. To download them, run `{command}`. "
+            f"Looked in {', '.join(map(str, _folders(folder)))}; {WEIGHTS_VARIABLE} can name a folder that has them"
         )
     return backbone, heads
+
+
+def search(net: str, folder: str | Path | None = None) -> tuple[Path | None, Path | None]:
+    """Backbone and linear heads where :func:`find_weights` looks; None for what is missing."""
+    backbone, heads = weights_in(net, _folders(folder))
+    return backbone, heads or weights_in(net, _package_folders())[1]
+
+
+def weights_in(net: str, folders: Iterable[Path]) -> tuple[Path | None, Path | None]:
+    """Backbone and linear heads in the first of some folders that has them; None for what is missing."""
+    folders = list(folders)
+    backbone = next((file for place in folders for file in _backbones(net, place)), None)
+    return backbone, next((file for place in folders for file in _heads(net, place)), None)
+
+
+def default_folder() -> Path:
+    """Where ``torch.hub`` keeps downloads."""
+    return Path(torch.hub.get_dir()) / "checkpoints"
 
 
 def load_network(net: str, backbone: Path, heads: Path) -> LPIPSNetwork:
@@ -78,11 +98,11 @@ def load_network(net: str, backbone: Path, heads: Path) -> LPIPSNetwork:
         raise UnavailableError(f"{backbone} does not hold the backbone of LPIPS {net}") from error
 
 
-def _folders(folder: str | None) -> Iterator[Path]:
+def _folders(folder: str | Path | None) -> Iterator[Path]:
     for named in (folder, os.environ.get(WEIGHTS_VARIABLE)):
         if named:
             yield Path(named).expanduser()
-    yield Path(torch.hub.get_dir()) / "checkpoints"
+    yield default_folder()
 
 
 def _package_folders() -> Iterator[Path]:

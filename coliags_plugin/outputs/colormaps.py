@@ -96,7 +96,7 @@ def colorize_depth_error(
         InputError: The shapes differ, or the limit is not positive.
     """
     error, known = depth_error(rendered_mm, true_mm, valid)
-    return _error_colors(error, known, limit_mm)
+    return colorize_error(error, known, limit_mm)
 
 
 def depth_error(
@@ -146,7 +146,27 @@ def colorize_rgb_error(
     error = rgb_error(rendered, true)
     known = np.ones(error.shape, dtype=bool) if valid is None else as_array(valid).astype(bool)
     _same_shape(known, error, "valid")
-    return _error_colors(error, known, limit)
+    return colorize_error(error, known, limit)
+
+
+def colorize_error(
+    error: Float[np.ndarray, "H W"], known: Bool[np.ndarray, "H W"], limit: float
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Colour-mapped error on a fixed scale; pixels without ground truth are hatched in grey.
+
+    Args:
+        error: Not negative; of any value where not known. [H, W]
+        known: Where there is ground truth. [H, W]
+        limit: The error of the last colour; larger errors take it too.
+
+    Raises:
+        InputError: The limit is not positive.
+    """
+    if not (math.isfinite(limit) and limit > 0.0):
+        raise InputError(f"an error scale that ends at {limit}", "a positive number")
+    image = _colored(np.where(known, error, 0.0) / limit, "error")
+    image[~known] = hatch(*known.shape)[~known]
+    return image
 
 
 def rgb_error(rendered: np.ndarray | Tensor, true: np.ndarray | Tensor) -> Float[np.ndarray, "H W"]:
@@ -239,14 +259,6 @@ def hatch(height: int, width: int) -> UInt8[np.ndarray, "H W 3"]:
     stripe = (rows + columns) % _HATCH_PERIOD < _HATCH_WIDTH
     grey = np.where(stripe, HATCH_GREYS[1], HATCH_GREYS[0]).astype(np.uint8)
     return np.repeat(grey[:, :, None], 3, axis=2)
-
-
-def _error_colors(error: np.ndarray, known: np.ndarray, limit: float) -> np.ndarray:
-    if not (math.isfinite(limit) and limit > 0.0):
-        raise InputError(f"an error scale that ends at {limit}", "a positive number")
-    image = _colored(error / limit, "error")
-    image[~known] = hatch(*known.shape)[~known]
-    return image
 
 
 def _colored(fraction: np.ndarray, color_map: ColorMap) -> np.ndarray:

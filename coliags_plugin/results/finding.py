@@ -13,7 +13,7 @@ _MARK = f'"{FORMAT}"'.encode()
 
 
 def find_results(paths: Sequence[Path]) -> list[Result]:
-    """Read the results at some paths, each once.
+    """Read the results at some paths, each once: of files with one key and the same values the first counts.
 
     Args:
         paths: Results files, and folders that are searched for them: run folders, folders of runs, or folders of
@@ -21,16 +21,16 @@ def find_results(paths: Sequence[Path]) -> list[Result]:
             looked into, nor are JSON files of other content.
 
     Raises:
-        InputError: A path is missing, a folder holds no results, a results file is damaged, or two of them have the
-            same key and differ.
+        InputError: A path is missing, a folder holds no results, a results file is damaged, or two of them have one
+            key and other values.
     """
     found: dict[str, tuple[Path, Result]] = {}
     for path in dict.fromkeys(file.resolve() for given in paths for file in _files(given)):
         result = read_result(path)
         other, known = found.setdefault(result.key, (path, result))
-        if known != result:
+        if known.metrics_sha256 != result.metrics_sha256:
             raise InputError(
-                f"{other} and {path} are results of the same run, and differ",
+                f"{other} and {path} are results of the same run, and their values differ",
                 "each run once",
                 "Name the paths of those that count",
             )

@@ -55,8 +55,8 @@ def result_key(
         package_version: See :func:`training_key`.
         protocol: Name of the evaluation protocol.
         protocol_version: Its version.
-        deviations: How the run differs from one that goes through as configured: taken to another step, or with
-            another schedule on the way. None where it does not.
+        deviations: How the run differs from one that goes through as configured: taken to another step, with another
+            schedule on the way, or trained by another version. None where it does not.
     """
     parts: list[Any] = [training_key(config, fingerprint, seed, package_version), protocol, protocol_version]
     if deviations:

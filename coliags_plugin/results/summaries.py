@@ -54,12 +54,14 @@ def facts(result: Result) -> dict[str, str]:
     """What was run and what it cost, in words; nothing about what was not measured."""
     cost = result.cost
     threads = "" if cost.threads is None else f", {cost.threads} threads"
+    reached = {mark: seconds for mark, seconds in cost.seconds_to_psnr.items() if seconds is not None}
     found = {
         "key": result.key,
         "seed": str(result.seed),
         "split": f"{result.scene.split or 'unnamed'}, {len(result.scene.train)} training frames",
         "trained on": f"{cost.device}{threads}",
         "training": _said(cost.train_seconds, "{:.1f} s"),
+        "psnr reached": ", ".join(f"{mark} dB after {seconds:.1f} s" for mark, seconds in reached.items()),
         "processor time": _said(cost.processor_seconds, "{:.1f} s"),
         "peak memory": _said(cost.peak_memory_mib, "{:.0f} MiB"),
         "rendering": _said(cost.render_fps, "{:.2f} views a second"),

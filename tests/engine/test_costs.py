@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -105,6 +107,22 @@ def test_the_peak_holds_what_is_allocated():
 def _resident_mib():
     with open("/proc/self/status", encoding="utf-8") as file:
         return next(float(line.split()[1]) for line in file if line.startswith("VmRSS")) / 2**10
+
+
+def test_a_system_that_tells_no_peak_leaves_it_unmeasured(monkeypatch, clocks):
+    monkeypatch.setattr(costs, "peak_memory_mib", lambda device: None)
+    meter = CostMeter(CPU)
+    with meter.running():
+        clocks.go_on(3, 5)
+    assert meter.cost().peak_memory_mib is None and meter.cost().seconds == 3.0
+
+
+def test_without_proc_the_peak_is_that_of_getrusage(monkeypatch):
+    told = costs.peak_memory_mib(CPU)
+    monkeypatch.setattr(costs, "Path", lambda path: Path("no such file"))
+    assert costs.peak_memory_mib(CPU) >= told * 0.99
+    monkeypatch.setitem(sys.modules, "resource", None)
+    assert costs.peak_memory_mib(CPU) is None
 
 
 def test_the_processor_has_a_name():

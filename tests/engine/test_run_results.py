@@ -176,6 +176,11 @@ def test_runs_that_did_not_go_as_configured_have_keys_of_their_own(loaded, resul
     assert len(set(keys[:3])) == 3 and keys[3] == keys[1]
 
 
+def test_a_run_that_another_version_trained_has_a_key_of_its_own(whole, result):
+    older = replace(whole, provenance={**whole.provenance, "package_version": "0.0.1"})
+    assert read_result(evaluate(older, "paper") / RESULT_FILE).key != result.key
+
+
 def test_it_says_what_the_run_cost(result, whole):
     cost, last = result.cost, whole.run.log_rows(STEPS)[-1]
     assert cost.device == cost.render_device == device_name(CPU)

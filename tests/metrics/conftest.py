@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import pytest
 import torch
 
@@ -10,6 +11,7 @@ from coliags_plugin.contracts import Comparison
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Frame
+from coliags_plugin.metrics import lpips_weights
 
 
 def _make(name, **options):
@@ -66,3 +68,30 @@ def make_output():
 def make_frame():
     """A Frame of this image, depth and mask."""
     return _frame
+
+
+@pytest.fixture
+def nowhere(monkeypatch, tmp_path):
+    """A machine without any LPIPS weights."""
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    monkeypatch.delenv(lpips_weights.WEIGHTS_VARIABLE, raising=False)
+    monkeypatch.setattr(lpips_weights, "find_spec", lambda name: None)
+    return tmp_path
+
+
+@pytest.fixture
+def pair():
+    """A Comparison of a random image and a noisy copy."""
+    generator = torch.Generator().manual_seed(3)
+    truth = torch.rand(48, 40, 3, generator=generator)
+    return _images((truth + 0.1 * torch.randn(48, 40, 3, generator=generator)).clamp(0, 1), truth)
+
+
+def _read(path):
+    return torch.from_numpy(cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)).float() / 255
+
+
+@pytest.fixture
+def examples(shared_data):
+    """The example images of LPIPS."""
+    return {name: _read(shared_data / "lpips" / "test_images" / f"ex_{name}.png") for name in ("ref", "p0", "p1")}

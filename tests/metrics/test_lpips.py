@@ -1,4 +1,3 @@
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -6,76 +5,9 @@ import torch
 from coliags_plugin.core.errors import InputError, UnavailableError
 from coliags_plugin.metrics import lpips_weights
 from coliags_plugin.metrics.lpips_network import TAPS, LPIPSNetwork, features
+from tests.metrics.weight_files import TORCHVISION, lay_out, random_backbone, random_heads
 
 NETS = ["vgg", "alex", "squeeze"]
-
-# Keys and shapes of the convolutions in torchvision's models, from its documentation of the architectures.
-TORCHVISION = {
-    "vgg": {
-        "0": (64, 3, 3), "2": (64, 64, 3), "5": (128, 64, 3), "7": (128, 128, 3), "10": (256, 128, 3),
-        "12": (256, 256, 3), "14": (256, 256, 3), "17": (512, 256, 3), "19": (512, 512, 3), "21": (512, 512, 3),
-        "24": (512, 512, 3), "26": (512, 512, 3), "28": (512, 512, 3),
-    },
-    "alex": {"0": (64, 3, 11), "3": (192, 64, 5), "6": (384, 192, 3), "8": (256, 384, 3), "10": (256, 256, 3)},
-    "squeeze": {
-        "0": (64, 3, 3),
-        **{
-            f"{layer}.{part}": shape
-            for layer, inputs, squeezed, expanded in (
-                (3, 64, 16, 64), (4, 128, 16, 64), (6, 128, 32, 128), (7, 256, 32, 128), (9, 256, 48, 192),
-                (10, 384, 48, 192), (11, 384, 64, 256), (12, 512, 64, 256),
-            )
-            for part, shape in (
-                ("squeeze", (squeezed, inputs, 1)), ("expand1x1", (expanded, squeezed, 1)),
-                ("expand3x3", (expanded, squeezed, 3)),
-            )
-        },
-    },
-}  # fmt: skip
-
-
-def random_backbone(net, prefix=""):
-    generator = torch.Generator().manual_seed(0)
-    state = {}
-    for key, (outputs, inputs, size) in TORCHVISION[net].items():
-        spread = (2 / (inputs * size * size)) ** 0.5
-        state[f"{prefix}{key}.weight"] = spread * torch.randn(outputs, inputs, size, size, generator=generator)
-        state[f"{prefix}{key}.bias"] = torch.zeros(outputs)
-    return state
-
-
-def random_heads(net):
-    generator = torch.Generator().manual_seed(1)
-    return {
-        f"lin{index}.model.1.weight": torch.rand(1, channels, 1, 1, generator=generator)
-        for index, channels in enumerate(TAPS[net].values())
-    }
-
-
-@pytest.fixture
-def nowhere(monkeypatch, tmp_path):
-    """A machine without any LPIPS weights."""
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
-    monkeypatch.delenv(lpips_weights.WEIGHTS_VARIABLE, raising=False)
-    monkeypatch.setattr(lpips_weights, "find_spec", lambda name: None)
-    return tmp_path
-
-
-@pytest.fixture
-def pair(images):
-    generator = torch.Generator().manual_seed(3)
-    truth = torch.rand(48, 40, 3, generator=generator)
-    return images((truth + 0.1 * torch.randn(48, 40, 3, generator=generator)).clamp(0, 1), truth)
-
-
-def read(path):
-    return torch.from_numpy(cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)).float() / 255
-
-
-@pytest.fixture
-def examples(shared_data):
-    return {name: read(shared_data / "lpips" / "test_images" / f"ex_{name}.png") for name in ("ref", "p0", "p1")}
-
 
 # --------------------------------------------------------------------------------------------------- the real weights
 
@@ -195,14 +127,6 @@ def test_building_a_network_draws_no_random_numbers():
 # ------------------------------------------------------------------------------------------------- finding the weights
 
 
-def lay_out(folder, net, heads="v0.1/{}.pth"):
-    """As torchvision's downloads lie: the classifier too, under its published name."""
-    (folder / heads.format(net)).parent.mkdir(parents=True, exist_ok=True)
-    state = random_backbone(net, "features.") | {"classifier.0.weight": torch.zeros(2, 2)}
-    torch.save(state, folder / lpips_weights.BACKBONE_FILES[net][0])
-    torch.save(random_heads(net), folder / heads.format(net))
-
-
 @pytest.mark.parametrize("net", NETS)
 def test_torch_hub_s_folder_is_found(net, nowhere, make, pair):
     checkpoints = nowhere / "torch" / "hub" / "checkpoints"
@@ -246,6 +170,7 @@ def test_missing_weights_say_what_and_where(nowhere, make, pair):
     text = str(caught.value)
     for part in ("vgg16-397923af.pth", "v0.1/vgg.pth", str(nowhere / "torch" / "hub"), "COLIAGS_LPIPS_WEIGHTS"):
         assert part in text
+    assert "run `coliags weights lpips`" in text
     torch.save(random_heads("vgg"), nowhere / "vgg.pth")
     with pytest.raises(UnavailableError, match="backbone") as caught:
         make("lpips", net="vgg", weights=str(nowhere))(pair)

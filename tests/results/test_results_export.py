@@ -57,14 +57,14 @@ def test_results_are_found_in_files_and_folders(runs):
 
 
 def test_what_is_named_twice_counts_once(runs, monkeypatch):
-    write_result(runs / "copy.json", made_result())
+    write_result(runs / "copy.json", made_result(cost=CostRecord(device="the same", render_fps=3.0)))
     monkeypatch.chdir(runs)
     assert len(find_results([runs, runs / "one", runs.parent / "runs" / ".." / "runs" / "copy.json"])) == 2
 
 
 def test_two_different_results_of_one_run_are_refused(runs):
     write_result(runs / "copy.json", made_result({"test": made_set(psnr=(1.0, 2.0))}))
-    with pytest.raises(InputError, match=r"copy\.json.*results of the same run, and differ"):
+    with pytest.raises(InputError, match=r"copy\.json.*results of the same run, and their values differ"):
         find_results([runs])
 
 

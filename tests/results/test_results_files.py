@@ -21,7 +21,7 @@ from coliags_plugin.results.record import VERSION, MetricRecord, ProfileRecord, 
 from coliags_plugin.results.summaries import means_summary, per_frame_table
 from tests.results.made import METRICS, made_result, made_set, numbers, results
 
-quick = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+quick = settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @pytest.fixture

@@ -1,0 +1,42 @@
+"""``coliags weights lpips``: install the weights that LPIPS needs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import tyro
+
+from coliags_plugin.cli.arguments import OptionalPath
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Download the weights that LPIPS needs, or copy them; nothing else in this package downloads."""
+
+    metric: tyro.conf.Positional[Literal["lpips"]]
+    """Whose weights."""
+    net: Literal["vgg", "alex", "squeeze", "all"] | None = None
+    """Backbone: VGG's has 528 MiB, AlexNet's 233, SqueezeNet's 5; default: vgg and squeeze, for the protocol paper."""
+    folder: OptionalPath = None
+    """Where to install them; default: torch's download cache, where LPIPS finds them."""
+    from_folder: Annotated[OptionalPath, tyro.conf.arg(name="from")] = None
+    """Copy the files from this folder instead of downloading them."""
+
+    def run(self) -> None:
+        """Install what is missing, and print where the weights of each net are."""
+        from coliags_plugin.engine.progress import progress_callback
+        from coliags_plugin.metrics.lpips_install import SOURCES, install
+        from coliags_plugin.metrics.lpips_weights import DEFAULT_NETS, WEIGHTS_VARIABLE, find_weights, search
+
+        nets = DEFAULT_NETS if self.net is None else tuple(SOURCES) if self.net == "all" else (self.net,)
+        folder = None if self.folder is None else self.folder.expanduser().resolve()
+        with progress_callback(after=1.0) as progress:
+            written = install(nets, folder, self.from_folder, progress)
+        for net in nets:
+            backbone, heads = find_weights(net, folder)
+            print(f"LPIPS {net}: backbone {backbone}, linear heads {heads}")
+        if not written:
+            print("Everything was there already.")
+        if folder is not None and any(search(net) != find_weights(net, folder) for net in nets):
+            print(f"Set {WEIGHTS_VARIABLE}={folder} for LPIPS to find them.")

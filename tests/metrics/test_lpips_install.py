@@ -1,0 +1,296 @@
+"""LPIPS weights are installed where LPIPS finds them, or not at all."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import re
+
+import pytest
+import torch
+
+from coliags_plugin.config.registry import REGISTRIES
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.metrics import lpips_install
+from coliags_plugin.metrics.lpips_install import SOURCES, Published, install
+from coliags_plugin.metrics.lpips_network import LPIPSNetwork
+from coliags_plugin.metrics.lpips_weights import BACKBONE_FILES, DEFAULT_NETS, find_weights, load_network, weights_in
+from tests.file_server import file_server
+from tests.metrics.weight_files import lay_out, random_backbone, random_heads
+
+NETS = ("alex", "squeeze")
+
+
+def sha256(path):
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def quiet(*_):
+    pass
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A folder with random weights of two nets, as published."""
+    folder = tmp_path_factory.mktemp("published")
+    for net in NETS:
+        lay_out(folder, net)
+    return folder
+
+
+@pytest.fixture
+def server(made, nowhere, monkeypatch):
+    """A server that has them, which the table of sources names."""
+    for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    with file_server() as server:
+        for net in NETS:
+            pair = []
+            for file, path in zip(weights_in(net, [made]), (BACKBONE_FILES[net][0], f"v0.1/{net}.pth"), strict=True):
+                server.files[f"/{path}"] = file.read_bytes()
+                pair.append(Published(f"{server.url}/{path}", {sha256(file): path}))
+            monkeypatch.setitem(SOURCES, net, tuple(pair))
+        yield server
+
+
+@pytest.fixture
+def cache(nowhere):
+    """torch's download cache."""
+    return nowhere / "torch" / "hub" / "checkpoints"
+
+
+def asked(server):
+    return [path for _, path, _ in server.requests]
+
+
+def files(folder):
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+
+
+EVERYTHING = ["alexnet-owt-7be5be79.pth", "squeezenet1_1-b8a52dc0.pth", "v0.1/alex.pth", "v0.1/squeeze.pth"]
+
+
+def direct(net, pair):
+    """LPIPS of the weights themselves, past all files."""
+    network = LPIPSNetwork(net, random_backbone(net), list(random_heads(net).values()))
+    image, truth = (x.permute(2, 0, 1)[None] for x in (pair.rgb, pair.true_rgb))
+    return network(image, truth, pair.valid).item()
+
+
+# Downloading
+
+
+def test_what_is_downloaded_is_found_and_gives_the_same_values(server, cache, make, pair):
+    written = install(NETS, None, None, quiet)
+    assert sorted(path.relative_to(cache).as_posix() for path in written) == files(cache) == EVERYTHING
+    for net in NETS:
+        assert find_weights(net) == (cache / BACKBONE_FILES[net][0], cache / "v0.1" / f"{net}.pth")
+        assert make("lpips", net=net)(pair) == pytest.approx(direct(net, pair), rel=1e-6)
+
+
+def test_small_files_come_first(server):
+    install(NETS, None, None, quiet)
+    assert asked(server)[:2] == ["/v0.1/alex.pth", "/v0.1/squeeze.pth"]
+
+
+def test_nothing_is_asked_for_where_nothing_is_missing(server, cache):
+    install(NETS, None, None, quiet)
+    server.requests.clear()
+    assert install(NETS, None, None, quiet) == []
+    assert server.requests == []
+
+
+def test_only_what_is_missing_is_fetched(server, cache, made, monkeypatch):
+    other = cache.parent / "other"
+    (other / "v0.1").mkdir(parents=True)
+    (other / "v0.1" / "alex.pth").write_bytes((made / "v0.1" / "alex.pth").read_bytes())
+    monkeypatch.setenv("COLIAGS_LPIPS_WEIGHTS", str(other))
+    assert install(["alex"], None, None, quiet) == [cache / BACKBONE_FILES["alex"][0]]
+    assert find_weights("alex") == (cache / BACKBONE_FILES["alex"][0], other / "v0.1" / "alex.pth")
+
+
+def test_a_folder_of_one_s_own_gets_everything(server, cache, tmp_path):
+    install(NETS, None, None, quiet)
+    folder = tmp_path / "mine"
+    assert len(install(NETS, folder, None, quiet)) == 4
+    assert files(folder) == EVERYTHING
+    assert find_weights("alex", folder)[0].parent == folder
+
+
+def test_a_broken_transfer_goes_on_and_ends_with_the_same_values(server, cache, make, pair):
+    server.cuts = [3000, len(server.files["/v0.1/squeeze.pth"]), 1_000_000]
+    for left in (3000, 1_000_000):
+        with pytest.raises(InputError, match=f"broke after {left} bytes"):
+            install(["squeeze"], None, None, quiet)
+        (part,) = cache.rglob("*.part")
+        assert part.stat().st_size == left
+    install(["squeeze"], None, None, quiet)
+    assert server.sent == sum(len(data) for path, data in server.files.items() if "squeeze" in path)
+    assert make("lpips", net="squeeze")(pair) == pytest.approx(direct("squeeze", pair), rel=1e-6)
+
+
+def test_without_a_connection_all_that_is_missing_is_named(server, cache):
+    server.statuses = {"/v0.1/squeeze.pth": 503}
+    with pytest.raises(InputError) as caught:
+        install(NETS, None, None, quiet)
+    advice = re.search(r"On a machine with a connection download (.*), and pass --from FOLDER", str(caught.value))
+    left = [path for path in EVERYTHING if path != "v0.1/alex.pth"]  # which has come
+    assert sorted(advice[1].split(", ")) == sorted(f"{server.url}/{path}" for path in left)
+    assert files(cache) == ["v0.1/alex.pth"]
+
+
+def test_something_else_in_a_file_s_place_is_never_installed(server, cache):
+    server.files["/v0.1/alex.pth"] = b"<html>Please log in to the hospital's network</html>"
+    with pytest.raises(InputError, match="SHA-256"):
+        install(["alex"], None, None, quiet)
+    assert files(cache) == []
+
+
+# Copying
+
+
+def test_files_of_a_folder_are_copied(server, cache, made, make, pair):
+    assert len(install(NETS, None, made, quiet)) == 4
+    assert files(cache) == EVERYTHING
+    assert server.requests == []
+    for net in NETS:
+        assert make("lpips", net=net)(pair) == pytest.approx(direct(net, pair), rel=1e-6)
+    assert install(NETS, None, made, quiet) == []
+
+
+def test_heads_beside_the_backbone_are_taken_too(server, cache, made, tmp_path):
+    for name in (BACKBONE_FILES["alex"][0], "v0.1/alex.pth"):
+        (tmp_path / name.rpartition("/")[2]).write_bytes((made / name).read_bytes())
+    install(["alex"], None, tmp_path, quiet)
+    assert files(cache) == ["alexnet-owt-7be5be79.pth", "v0.1/alex.pth"]
+
+
+def test_a_copy_under_another_name_gets_that_of_its_checksum(server, cache, made, tmp_path, monkeypatch):
+    """Features alone must not pass for torchvision's file, wherever they lie."""
+    lay_out(tmp_path, "squeeze")
+    file = tmp_path / BACKBONE_FILES["squeeze"][0]
+    torch.save(random_backbone("squeeze"), file)
+    backbone, heads = SOURCES["squeeze"]
+    known = {**backbone.known, sha256(file): "squeeze.backbone.pth"}
+    monkeypatch.setitem(
+        SOURCES,
+        "squeeze",
+        (Published(backbone.url, known), Published(heads.url, {sha256(tmp_path / "v0.1/squeeze.pth"): heads.path})),
+    )
+    install(["squeeze"], None, tmp_path, quiet)
+    assert files(cache) == ["squeeze.backbone.pth", "v0.1/squeeze.pth"]
+    assert find_weights("squeeze")[0] == cache / "squeeze.backbone.pth"
+
+
+@pytest.mark.parametrize("which", ["backbone", "heads"])
+def test_nothing_is_copied_if_one_file_is_another(server, cache, made, tmp_path, which):
+    lay_out(tmp_path, "alex")
+    name = BACKBONE_FILES["alex"][0] if which == "backbone" else "v0.1/alex.pth"
+    spoiled = bytearray((made / name).read_bytes())
+    spoiled[len(spoiled) // 2] ^= 1
+    (tmp_path / name).write_bytes(spoiled)
+    for other in {BACKBONE_FILES["alex"][0], "v0.1/alex.pth"} - {name}:
+        (tmp_path / other).write_bytes((made / other).read_bytes())
+    with pytest.raises(InputError) as caught:
+        install(["alex"], None, tmp_path, quiet)
+    text = str(caught.value)
+    assert str(tmp_path / name) in text and hashlib.sha256(spoiled).hexdigest() in text and sha256(made / name) in text
+    assert not cache.exists()
+
+
+def test_a_folder_that_lacks_files_says_which(server, cache, made, tmp_path):
+    (tmp_path / "alex.pth").write_bytes((made / "v0.1/alex.pth").read_bytes())
+    with pytest.raises(InputError) as caught:
+        install(NETS, None, tmp_path, quiet)
+    for name in ("alexnet-owt-7be5be79.pth", "v0.1/squeeze.pth", "squeezenet1_1-b8a52dc0.pth"):
+        assert f"{server.url}/{name}" in str(caught.value)
+    assert "v0.1/alex.pth" not in str(caught.value)
+    assert not cache.exists()
+
+
+def test_no_folder_to_copy_from(server, tmp_path):
+    with pytest.raises(InputError, match="is not a folder"):
+        install(NETS, None, tmp_path / "nothing", quiet)
+
+
+def test_a_copy_that_fails_leaves_nothing(server, cache, made, monkeypatch):
+    def full(source, target):
+        target.write(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("coliags_plugin.core.files.shutil.copyfileobj", full)
+    with pytest.raises(InputError, match="No space left"):
+        install(["alex"], None, made, quiet)
+    assert files(cache) == []
+
+
+# What is there already
+
+
+@pytest.mark.parametrize("damage", ["half", "other"])
+def test_damaged_weights_are_named_and_not_touched(server, cache, made, damage):
+    install(["alex"], None, made, quiet)
+    file = cache / BACKBONE_FILES["alex"][0]
+    if damage == "half":
+        file.write_bytes(file.read_bytes()[:1000])
+    else:
+        torch.save(random_backbone("squeeze"), file)
+    before = file.read_bytes()
+    with pytest.raises(InputError) as caught:
+        install(["alex"], None, None, quiet)
+    assert str(file) in str(caught.value) and "Remove that file" in str(caught.value)
+    assert file.read_bytes() == before
+
+
+def test_weights_of_one_s_own_are_used_with_a_warning(server, cache, made, caplog):
+    install(["squeeze"], None, made, quiet)
+    file = cache / BACKBONE_FILES["squeeze"][0]
+    torch.save({key: 2 * value for key, value in random_backbone("squeeze").items()}, file)
+    with caplog.at_level(logging.WARNING, logger=lpips_install.__name__):
+        assert install(["squeeze"], None, None, quiet) == []
+    assert [f"{file} is not the published file: its SHA-256 is {sha256(file)}"] == caplog.messages
+
+
+# The table
+
+
+def test_default_nets_are_those_of_the_protocols():
+    protocols = (REGISTRIES["protocols"].get(name) for name in REGISTRIES["protocols"])
+    metrics = [metric for protocol in protocols for metric in protocol.metrics.values()]
+    assert {options["net"] for name, options in metrics if name == "lpips"} == set(DEFAULT_NETS)
+
+
+def test_checksums_of_backbones_are_those_in_their_names():
+    for net in BACKBONE_FILES:
+        backbone, heads = SOURCES[net]
+        assert re.fullmatch(rf"https://download\.pytorch\.org/models/[\w-]+-{backbone.sha256}\.pth", backbone.url)
+        assert backbone.path == backbone.url.rpartition("/")[2] == BACKBONE_FILES[net][0]
+        assert re.fullmatch("[0-9a-f]{8}", backbone.sha256) and re.fullmatch("[0-9a-f]{64}", heads.sha256)
+        assert heads.url.endswith(f"/richzhang/PerceptualSimilarity/master/lpips/weights/{heads.path}")
+    assert set(SOURCES["alex"][0].known) == {"7be5be79", "4df8aa71"}
+
+
+# The real files
+
+
+def test_the_published_heads_have_the_checksums_of_the_table(shared_data):
+    for _, heads in SOURCES.values():
+        assert sha256(shared_data / "lpips" / heads.path) == heads.sha256
+
+
+def test_the_real_squeezenet_is_installed_and_scores_as_before(shared_data, nowhere, cache, make, images, examples):
+    """0.7110476: lpips 0.1.4 (net="squeeze") on the same weights and images, run once."""
+    written = install(["squeeze"], None, shared_data / "lpips", quiet)
+    assert sorted(written) == sorted(cache / name for name in files(cache)) == sorted(find_weights("squeeze"))
+    comparison = images(examples["p0"], examples["ref"])
+    value = make("lpips", net="squeeze", input_range="minus-one-one")(comparison)
+    assert value == pytest.approx(0.7110476, abs=2e-6)
+    network = load_network("squeeze", *weights_in("squeeze", [shared_data / "lpips"]))
+    first, second = (2 * x.permute(2, 0, 1)[None] - 1 for x in (examples["p0"], examples["ref"]))
+    assert value == network(first, second, comparison.valid).item()
+
+
+def test_the_real_folder_has_no_vgg(shared_data, nowhere, cache):
+    with pytest.raises(InputError, match=r"has no vgg16-397923af\.pth.*https://download\.pytorch\.org/models/vgg16"):
+        install(DEFAULT_NETS, None, shared_data / "lpips", quiet)
+    assert not cache.exists()
