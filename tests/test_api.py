@@ -160,9 +160,10 @@ def test_examples_of_the_pages_run(tmp_path, monkeypatch):
 
     monkeypatch.setattr(cp, "train", quick(cp.train), raising=False)
     monkeypatch.setattr(cp, "compare", quick(cp.compare), raising=False)
-    for page in ("README.md", "docs/api.md"):
+    for page in (ROOT / "README", ROOT / "docs" / "api"):
         names = {}
-        for block in re.findall(r"^```python\n(.*?)^```$", (ROOT / page).read_text(), re.DOTALL | re.MULTILINE):
+        text = page.with_suffix(".md").read_text(encoding="utf-8")
+        for block in re.findall(r"^```python\n(.*?)^```$", text, re.DOTALL | re.MULTILINE):
             exec(block, names)
         assert isinstance(names["run"], cp.Run)
         shutil.rmtree("comparison")

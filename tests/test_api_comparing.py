@@ -86,13 +86,14 @@ def test_an_ablation_is_a_comparison_of_a_files_variants(wall, tmp_path, inline)
 
 
 def test_a_report_of_a_comparison_is_the_commands(compared, tmp_path):
-    files = cp.report(compared, tmp_path / "ours.html", formats=["markdown", "csv"], title="Depth")
-    assert files == [tmp_path / "ours.md", tmp_path / "ours.csv"]
+    ours, theirs = tmp_path / "ours.html", tmp_path / "theirs.html"
+    files = cp.report(compared, ours, formats=["markdown", "csv"], title="Depth")
     names = ("--format", "markdown", "--format", "csv", "--title", "Depth")
-    assert run("report", compared.folder, "--output", tmp_path / "theirs.html", *names) == 0
-    for suffix in ("md", "csv"):
-        assert (tmp_path / f"ours.{suffix}").read_text() == (tmp_path / f"theirs.{suffix}").read_text()
-    assert "without depth" in (tmp_path / "ours.md").read_text()
+    assert run("report", compared.folder, "--output", theirs, *names) == 0
+    assert [file.suffix for file in files] == [".md", ".csv"]
+    for file in files:
+        assert file.read_text() == theirs.with_suffix(file.suffix).read_text()
+        assert "without depth" in file.read_text()
     with pytest.raises(InputError, match=r"no format 'latx'.*Did you mean 'latex'"):
         cp.report(compared, formats="latx")
 

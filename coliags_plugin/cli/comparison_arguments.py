@@ -59,11 +59,9 @@ class ComparisonArguments:
         """Compare, print a summary and the folder; exit with status 1 if a cell failed."""
         from coliags_plugin.comparison.compare import How, carry_out, dry_run, make_executor, make_request
         from coliags_plugin.comparison.folder import ComparisonFolder
-        from coliags_plugin.config.assignments import assignments, parse_assignments
 
-        overrides = assignments(parse_assignments(self.set))  # written alike, as they are compared with those before
         request = make_request(
-            methods, self.scenes, self.data, self.seeds, self.protocol, self.splits, self.steps, overrides
+            methods, self.scenes, self.data, self.seeds, self.protocol, self.splits, self.steps, self.set
         )
         how = How(self.jobs, self.threads, self.device, self.executor, self.ray_address, self.retries)
         folder, executor = ComparisonFolder(self.output), make_executor(how)

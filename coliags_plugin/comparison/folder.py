@@ -15,6 +15,7 @@ from coliags_plugin import __version__
 from coliags_plugin.comparison.cells import Cell
 from coliags_plugin.comparison.plan import Request
 from coliags_plugin.comparison.scenes import SceneSource
+from coliags_plugin.config.assignments import parse_assignments
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import make_folder, write_json
 from coliags_plugin.core.locks import LockedError, locked
@@ -232,7 +233,8 @@ class ComparisonFolder:
             seen = "each method's own steps" if before.steps is None else f"--steps {before.steps}"
             asked = "each method's own" if request.steps is None else request.steps
             raise InputError(f"{self.path} compares runs of {seen}, not {asked}", "the same, or another --output")
-        if before.overrides != tuple(request.overrides):
+        values = [list(parse_assignments(each).items()) for each in (before.overrides, request.overrides)]
+        if values[0] != values[1]:  # 1e-3 is 0.001
             seen = " ".join(f"--set {each}" for each in before.overrides) or "no --set"
             asked = " ".join(f"--set {each}" for each in request.overrides) or "no --set"
             raise InputError(f"{self.path} compares runs with {seen}, not {asked}", "the same, or another --output")
