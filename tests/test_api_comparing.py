@@ -59,6 +59,14 @@ def test_variants_are_methods_with_settings(compared):
     assert losses["coliags"] - losses["without depth"] == {"depth"}
 
 
+def test_its_runs_can_be_loaded(compared):
+    assert list(compared.runs) == [("wall", "coliags", 0), ("wall", "without depth", 0)]
+    loaded = cp.load_run(compared.runs["wall", "without depth", 0])
+    assert (loaded.method, loaded.step) == ("without depth", 3)
+    assert loaded.results["paper"] == compared.results[1]
+    assert loaded.render(loaded.frame_names()[0]).rgb.shape == (24, 32, 3)
+
+
 def test_the_command_goes_on_with_what_a_notebook_began(wall, compared, inline, capsys):
     sets = [part for text in TINY for part in ("--set", text)]
     argv = ("compare", "coliags", "--scenes", wall, "--output", compared.folder, "--steps", 3, *sets)

@@ -61,6 +61,13 @@ class Comparison:
         """
         return summary_table(self.cells, self.results, self.failures, columns)
 
+    @property
+    def runs(self) -> dict[tuple[str, str, int], Path]:
+        """Folders of the runs that were begun, by scene, method and seed."""
+        folder = ComparisonFolder(self.folder)
+        places = {(cell.scene_label, cell.variant.name, cell.seed): folder.run(cell) for cell in self.cells}
+        return {name: place for name, place in places.items() if place.is_dir()}
+
     def __repr__(self) -> str:
         """How much is done, in one line."""
         failed = f", {len(self.failures)} failed" if self.failures else ""
