@@ -12,8 +12,9 @@ from coliags_plugin.comparison.cells import Cell
 from coliags_plugin.comparison.estimates import Estimate, Estimates
 from coliags_plugin.comparison.folder import ComparisonFolder, Finished
 from coliags_plugin.comparison.states import steps_saved
-from coliags_plugin.comparison.text import aligned, duration, megabytes
+from coliags_plugin.comparison.text import duration, megabytes
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.results.display import aligned
 
 
 @dataclass(frozen=True)

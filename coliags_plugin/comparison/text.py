@@ -1,18 +1,6 @@
-"""Plain text: aligned tables, durations and sizes."""
+"""Plain text: durations and sizes."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
-
-
-def aligned(rows: Sequence[Sequence[str]]) -> str:
-    """Rows of cells as text: the first column to the left, the others to the right."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = []
-    for first, *others in rows:
-        parts = [first.ljust(widths[0]), *(text.rjust(width) for text, width in zip(others, widths[1:], strict=True))]
-        lines.append("  ".join(parts).rstrip())
-    return "\n".join(lines)
 
 
 def duration(seconds: float) -> str:

@@ -33,14 +33,8 @@ class Table:
     notes: Sequence[str] = ()
 
     def __str__(self) -> str:
-        """The table as text: the first column to the left, the others to the right."""
-        cells = [self._head, *self._cells]
-        widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-        lines = []
-        for first, *others in cells:
-            right = (text.rjust(width) for text, width in zip(others, widths[1:], strict=True))
-            lines.append("  ".join([first.ljust(widths[0]), *right]).rstrip())
-        return "\n".join([self.title, *lines, *self.notes])
+        """The table as text."""
+        return "\n".join([self.title, aligned([self._head, *self._cells]), *self.notes])
 
     __repr__ = __str__
 
@@ -58,6 +52,16 @@ class Table:
     @property
     def _cells(self) -> list[list[str]]:
         return [[value_text(row.get(key)) for key in self.columns] for row in self.rows]
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> str:
+    """Rows of cells as text: the first column to the left, the others to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for first, *others in rows:
+        right = (text.rjust(width) for text, width in zip(others, widths[1:], strict=True))
+        lines.append("  ".join([first.ljust(widths[0]), *right]).rstrip())
+    return "\n".join(lines)
 
 
 def value_text(value: Value) -> str:

@@ -15,8 +15,9 @@ from coliags_plugin.comparison.live import live_report, states_table
 from coliags_plugin.comparison.plan import make_cells
 from coliags_plugin.comparison.preview import preview
 from coliags_plugin.comparison.states import Watch
-from coliags_plugin.comparison.text import aligned, duration, megabytes
+from coliags_plugin.comparison.text import duration, megabytes
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.results.display import aligned
 from tests.results.made import made_result
 from tests.scenes import write_wall
 
