@@ -32,6 +32,12 @@ _VANISHING = 60.0
 #: For a connection to the cluster's address, seconds.
 _CONNECT = 10.0
 _PAUSE = 0.1
+#: Ray's errors of tasks that ended without a word, whose own texts are long.
+_DEATHS = {
+    "NodeDiedError": "the node died",
+    "OutOfMemoryError": "the node's memory ran out",
+    "WorkerCrashedError": "the task's process was ended",
+}
 
 
 class RayExecutor(Executor):
@@ -162,7 +168,8 @@ class RayExecutor(Executor):
         except self._ray.exceptions.TaskCancelledError:
             return Outcome("stopped")
         except self._ray.exceptions.RayError as error:
-            return Outcome("died", f"{type(error).__name__}: {_last_line(error)}")
+            told = _DEATHS.get(type(error).__name__)
+            return Outcome("died", told or f"{type(error).__name__}: {_last_line(error)}")
 
 
 def _check_node(node: Mapping[str, Any], seen: Mapping[str, Any], file: Path, token: str) -> None:
