@@ -20,11 +20,11 @@ _ROUGH_EVALUATION_OF_OTHERS = 10.0
 #: Starting a process and reading a scene, seconds.
 _ROUGH_START = 20.0
 #: A run folder: a checkpoint, and the images of its evaluation, bytes.
-_ROUGH_CHECKPOINT, _ROUGH_IMAGES = 60e6, 40e6
+_ROUGH_CHECKPOINT, _ROUGH_IMAGES = 40e6, 30e6
 #: Checkpoints that are there at times besides the one that stays: the one before, and one being written.
 _CHECKPOINTS_AT_TIMES = 2
 #: Making a phantom, seconds and bytes.
-_ROUGH_PHANTOM = (90.0, 40e6)
+_ROUGH_PHANTOM = (90.0, 70e6)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ a worker. What a task has done is in its run folder, which all nodes must see.
 
 from __future__ import annotations
 
+import logging
 import os
 import socket
 import time
@@ -22,11 +23,21 @@ from coliags_plugin.comparison.tasks import Outcome, Task
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
 
+log = logging.getLogger(__name__)
+
 #: For an answer of a node to the question what it sees, seconds.
 _ANSWER = 120.0
+#: For a node that has vanished to be counted as dead by Ray, seconds.
+_VANISHING = 60.0
 #: For a connection to the cluster's address, seconds.
 _CONNECT = 10.0
 _PAUSE = 0.1
+#: Ray's errors of tasks that ended without a word, whose own texts are long.
+_DEATHS = {
+    "NodeDiedError": "the node died",
+    "OutOfMemoryError": "the node's memory ran out",
+    "WorkerCrashedError": "the task's process was ended",
+}
 
 
 class RayExecutor(Executor):
@@ -70,7 +81,9 @@ class RayExecutor(Executor):
         atomic_write(file, token)
         try:
             for node in self._nodes():
-                _check_node(node, self._seen_by(node, file, scenes), file, token)
+                seen = self._seen_by(node, file, scenes)
+                if seen is not None:
+                    _check_node(node, seen, file, token)
         finally:
             for path in folder.glob(f".storage-{token}*"):
                 path.unlink(missing_ok=True)
@@ -119,8 +132,8 @@ class RayExecutor(Executor):
     def _nodes(self) -> list[Mapping[str, Any]]:
         return [node for node in self._ray.nodes() if node["Alive"]]
 
-    def _seen_by(self, node: Mapping[str, Any], file: Path, scenes: Sequence[Path]) -> Mapping[str, Any]:
-        """What a node sees of a file and of scenes."""
+    def _seen_by(self, node: Mapping[str, Any], file: Path, scenes: Sequence[Path]) -> Mapping[str, Any] | None:
+        """What a node sees of a file and of scenes; None where it is gone meanwhile."""
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
         there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
@@ -129,6 +142,10 @@ class RayExecutor(Executor):
         try:
             seen: Mapping[str, Any] = self._ray.get(question, timeout=_ANSWER)
         except self._ray.exceptions.RayError as error:
+            lost = (self._ray.exceptions.TaskUnschedulableError, self._ray.exceptions.NodeDiedError)
+            if isinstance(error, lost) and self._is_gone(node):
+                log.warning("node %s is gone", node["NodeManagerAddress"])
+                return None
             raise InputError(
                 f"node {node['NodeManagerAddress']} cannot run tasks: {_last_line(error)}",
                 f"coliags_plugin {__version__} on every node",
@@ -136,13 +153,23 @@ class RayExecutor(Executor):
             ) from error
         return seen
 
+    def _is_gone(self, node: Mapping[str, Any]) -> bool:
+        """Whether a node that runs no tasks is dead, as Ray finds out after a while."""
+        until = time.monotonic() + _VANISHING
+        while any(other["NodeID"] == node["NodeID"] for other in self._nodes()):
+            if time.monotonic() > until:
+                return False
+            time.sleep(_PAUSE)
+        return True
+
     def _outcome(self, reference: Any) -> Outcome:
         try:
             return Outcome(**self._ray.get(reference))
         except self._ray.exceptions.TaskCancelledError:
             return Outcome("stopped")
         except self._ray.exceptions.RayError as error:
-            return Outcome("died", f"{type(error).__name__}: {_last_line(error)}")
+            told = _DEATHS.get(type(error).__name__)
+            return Outcome("died", told or f"{type(error).__name__}: {_last_line(error)}")
 
 
 def _check_node(node: Mapping[str, Any], seen: Mapping[str, Any], file: Path, token: str) -> None:

@@ -167,7 +167,7 @@ def test_a_worker_a_node_and_the_driver_are_killed(cluster, wall, undisturbed, t
     made.remove_node(lost, allow_graceful=False)
     nodes.remove(lost)
     until("retry on the other node", lambda: told_by(folder).count("trying again") == 2)
-    assert "SIGKILL" in told_by(folder) and "Node" in told_by(folder)
+    assert "SIGKILL" in told_by(folder) and "the node died" in told_by(folder)
     until("third run", lambda: under_way(folder))
     first.kill()
     first.wait()
@@ -192,6 +192,19 @@ def test_a_sweep_that_nobody_disturbs_and_one_that_is_asked_to_stop(cluster, wal
     done = compare(METHODS, [wall], folder, steps=STEPS, overrides=OFTEN, how=how)
     assert not done.failures
     check(folder, undisturbed)
+
+
+@pytest.mark.slow
+def test_tries_are_counted_when_memory_runs_out(monkeypatch, request, wall, tmp_path):
+    """Ray's own retries then have no end."""
+    monkeypatch.setenv("RAY_memory_usage_threshold", "0.001")  # less than is in use
+    monkeypatch.setenv("RAY_memory_monitor_refresh_ms", "100")
+    monkeypatch.setattr(RayExecutor, "check", lambda *_: None)  # whose tasks would end likewise
+    made, _ = request.getfixturevalue("cluster")
+    how = How(threads=1, device="cpu", executor="ray", ray_address=made.address, retries=1)
+    done = compare(["coliags"], [wall], tmp_path / "full", steps=100_000, overrides=TINY, how=how)
+    (failure,) = done.failures
+    assert (failure.reason, failure.attempts) == ("the node's memory ran out, 2 times", 2)
 
 
 @pytest.mark.slow

@@ -65,6 +65,7 @@ def test_auto_passes_on_what_was_set(wall):
     auto = make_component("datamanagers", {"name": "auto", "points_count": 77})
     scene = auto.target(auto.settings).load(wall)
     assert scene.provenance["dataset"] == "c3vd" and len(scene.points) == 77
+    assert auto.target(auto.settings).fingerprint(wall) == scene.provenance["fingerprint"]
 
 
 def test_options_of_the_folders_own_format_may_be_set(wall):
