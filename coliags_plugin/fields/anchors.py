@@ -36,8 +36,8 @@ class AnchorFieldSettings(Settings):
     children: int = Option(default=10, ge=1)  # Gaussians per anchor
     # Edge of a voxel in scene units (mm); null: voxel_pixels times the size of a training pixel on the surface.
     voxel_size: float | None = Option(default=None, gt=0)
-    # Four pixels with ten children per anchor, about half of them transparent, put a Gaussian about every two pixels.
-    voxel_pixels: float = Option(default=4.0, gt=0)
+    # Two pixels with ten children per anchor, about half of them transparent, put a Gaussian about every pixel.
+    voxel_pixels: float = Option(default=2.0, gt=0)
     near_plane: float = Option(default=0.2, ge=0)  # scene units; anchors entirely nearer are not decoded
 
 
