@@ -7,7 +7,7 @@ DEMO ?= demo
 DEMO_STEPS ?= 1200
 DEMO_FLAGS := --data $(DEMO)/phantom --steps $(DEMO_STEPS) --overwrite
 
-.PHONY: demo test test-slow lint docs options method-table matrix install system clean
+.PHONY: demo test test-slow lint docs options method-table notebooks matrix install system clean
 
 demo: install
 	$(BIN)/coliags phantom $(DEMO)/phantom --seed 0 --overwrite
@@ -42,6 +42,10 @@ options: install
 # docs/method_table.md, from the method configs.
 method-table: install
 	$(BIN)/python docs/tools/methods.py
+
+# The outputs stored in docs/notebooks.
+notebooks: install
+	$(BIN)/python docs/tools/notebooks.py
 
 # The test suite on every Python that is here.
 matrix:

@@ -28,7 +28,8 @@ from machine import describe_machine, markdown_table, write_results
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.outputs.colormaps import colorize_depth
 from coliags_plugin.outputs.image_files import encode_jpeg, read_depth_tiff, read_rgb
-from coliags_plugin.reporting.run_data import EvaluatedRun, read_runs
+from coliags_plugin.reporting.sources import read_study
+from coliags_plugin.results.record import Result
 
 PAPER = "3dgs,2dgs,scaffold-gs,gaussian-pancakes,pr-endo,coliags,3dgs-depth,scaffold-gs-depth"
 #: Column title -> test set and metric.
@@ -79,8 +80,9 @@ def main(options: Options) -> None:
     for name in timed:
         if not (options.out / f"{name}.json").is_file():
             complete(name, max(1, round(slowest / seconds_per_step(name, options))), options)
-    runs = read_runs([options.out / name for name in (*methods, *timed)], "paper")
-    rows = [row(run, options) for run in runs]
+    runs = [options.out / name for name in (*methods, *timed)]
+    cells = read_study(runs).cells
+    rows = [row(run, cell.result, options) for run, cell in zip(runs, cells, strict=True)]
     header = ", ".join(f"{key}: {value}" for key, value in describe_machine().items())
     text = f"{header}; {options.jobs} runs at a time\n\n{markdown_table(rows)}\n"
     (options.out / "table.txt").write_text(text, encoding="utf-8")
@@ -138,13 +140,16 @@ def spent(name: str, options: Options) -> dict[str, Any]:
     return record
 
 
-def row(run: EvaluatedRun, options: Options) -> dict[str, Any]:
+def row(run: Path, result: Result, options: Options) -> dict[str, Any]:
     """A run's row of the table."""
-    means = {title: run.mean(*column) for title, column in COLUMNS.items()}
-    log = (run.folder / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
-    record, drawn = spent(run.folder.name, options), json.loads(log[-1]).get("gaussians", "none")
+    means = {
+        title: result.sets[set_name].mean(metric) if set_name in result.sets else None
+        for title, (set_name, metric) in COLUMNS.items()
+    }
+    log = (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
+    record, drawn = spent(run.name, options), json.loads(log[-1]).get("gaussians", "none")
     return {
-        "method": run.folder.name,
+        "method": run.name,
         **{title: "" if value is None else f"{value:.4f}" for title, value in means.items()},
         "steps": record["steps"],
         "Gaussians drawn": drawn,
@@ -154,12 +159,12 @@ def row(run: EvaluatedRun, options: Options) -> dict[str, Any]:
     }
 
 
-def contact_sheet(runs: Sequence[EvaluatedRun], options: Options) -> np.ndarray:
+def contact_sheet(runs: Sequence[Path], options: Options) -> np.ndarray:
     """The truth and every run, one row each: a held-out and a rotated view, each beside its depth; half size."""
-    chosen = [(name, frames) for name in ("test", "rotation") if (frames := _frames(runs[0].folder, name))]
+    chosen = [(name, frames) for name in ("test", "rotation") if (frames := _frames(runs[0], name))]
     views = [(name, frames[len(frames) // 2]) for name, frames in chosen]
-    rows = [_strip("truth", runs[0].folder, views, ("truth", "true_depth"), options)]
-    rows += [_strip(run.folder.name, run.folder, views, ("renders", "depth"), options) for run in runs]
+    rows = [_strip("truth", runs[0], views, ("truth", "true_depth"), options)]
+    rows += [_strip(run.name, run, views, ("renders", "depth"), options) for run in runs]
     return np.concatenate(rows)
 
 

@@ -4,14 +4,33 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from coliags_plugin.api import evaluate, load_run, load_scene, relight, train
+    from coliags_plugin.api.comparing import ablate, compare, variant
+    from coliags_plugin.api.reports import report
+    from coliags_plugin.api.runs import Run, load_run
+    from coliags_plugin.api.scenes import load_scene, make_phantom
+    from coliags_plugin.api.training import train
 
 __version__ = "0.1.0"
-__all__ = ["evaluate", "load_run", "load_scene", "relight", "train"]
+__all__ = ["Run", "ablate", "compare", "load_run", "load_scene", "make_phantom", "report", "train", "variant"]
+
+#: Names of the API by its modules.
+_MODULES = {
+    "comparing": ("ablate", "compare", "variant"),
+    "reports": ("report",),
+    "runs": ("Run", "load_run"),
+    "scenes": ("load_scene", "make_phantom"),
+    "training": ("train",),
+}
 
 
 def __getattr__(name: str) -> Any:
-    """A function of :mod:`coliags_plugin.api`, imported on first use, as torch takes a second to load."""
-    if name in __all__:
-        return getattr(import_module("coliags_plugin.api"), name)
+    """A name of :mod:`coliags_plugin.api`, imported on first use, so that importing the package takes no time."""
+    for module, names in _MODULES.items():
+        if name in names:
+            return getattr(import_module(f"coliags_plugin.api.{module}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """The names of the API too, for completion."""
+    return sorted({*globals(), *__all__})

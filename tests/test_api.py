@@ -1,19 +1,29 @@
-"""The Python API: the same results as the command line, errors instead of exit statuses, lazy import."""
+"""The Python API: the same results as the command line, light handles, errors as messages, lazy import."""
 
 from __future__ import annotations
 
 import json
+import re
+import shutil
 import subprocess
 import sys
+from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
-import coliags_plugin
+import coliags_plugin as cp
+from coliags_plugin.config.assignments import parse_assignments
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.engine.trained import TrainedRun
+from coliags_plugin.outputs.image_files import read_depth_tiff, read_rgb
 from tests.commands import run
+from tests.comparison.small import InlineExecutor
 from tests.scenes import SMALL, write_wall
+
+ROOT = Path(__file__).parents[1]
+SETTINGS = parse_assignments(SMALL)
 
 
 @pytest.fixture(scope="module")
@@ -23,48 +33,160 @@ def scene(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def trained(scene, tmp_path_factory):
-    output = tmp_path_factory.mktemp("runs") / "run"
-    assert coliags_plugin.train("coliags", scene, output, overrides=[*SMALL, "schedule.steps=8"], seed=3) == output
-    return output
+    return cp.train("coliags", scene, tmp_path_factory.mktemp("runs") / "run", steps=8, seed=3, settings=SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def result(trained):
+    return trained.evaluate()
 
 
 def test_train_is_the_command(scene, trained, tmp_path):
     sets = [part for override in SMALL for part in ("--set", override)]
     assert run("train", "coliags", "--data", scene, "--output", tmp_path / "run", "--steps", 8, "--seed", 3, *sets) == 0
-    ours, theirs = (coliags_plugin.load_run(path) for path in (trained, tmp_path / "run"))
-    assert isinstance(ours, TrainedRun) and ours.step == theirs.step == 8
-    states = ours.model.state_dict(), theirs.model.state_dict()
+    states = [handle.load().model.state_dict() for handle in (trained, cp.load_run(tmp_path / "run"))]
     assert states[0].keys() == states[1].keys()
     assert all(torch.equal(states[0][name], states[1][name]) for name in states[0])
 
 
-def test_a_loaded_run_renders_and_is_evaluated(scene, trained):
-    loaded = coliags_plugin.load_run(trained)
-    frame = coliags_plugin.load_scene(scene, options=["frame_step=4"]).train[0]
-    image = loaded.model.render(frame.camera).rgb
-    assert image.shape == frame.rgb.shape and image.max() > 0.1
-    summary = coliags_plugin.evaluate(loaded)
-    assert summary == coliags_plugin.evaluate(trained, "paper")
-    assert summary == json.loads((trained / "eval/paper/metrics.json").read_text(encoding="utf-8"))
+def test_a_run_says_what_it_is(trained):
+    assert (trained.method, trained.scene_name, trained.seed, trained.step) == ("coliags", "wall", 3, 8)
+    assert repr(trained) == f"coliags on wall, seed 3, step 8 of 8: {trained.path}"
+    assert trained.config.field.settings.voxel_size == 2.0
+    assert repr(trained.load().scene) == "Scene wall: frames 14 train, 3 test; 2000 points"
+    assert len(repr(trained.load())) < 500
 
 
-def test_training_resumes(scene, trained):
-    overrides = ["schedule.steps=10"]
-    assert coliags_plugin.train("coliags", scene, trained, overrides=overrides, resume=True) == trained
-    assert coliags_plugin.load_run(trained).step == 10
+def test_its_log_is_arrays(trained):
+    history = trained.history
+    np.testing.assert_array_equal(history["step"], np.arange(1, 9))
+    assert {"loss", "psnr", "seconds", "terms.l1"} <= history.keys()
+    assert np.isfinite(history["psnr"]).all()
+
+
+def test_an_evaluation_is_a_result(trained, result):
+    summary = json.loads((trained.path / "eval/paper/metrics.json").read_text(encoding="utf-8"))
+    assert result.mean("psnr") == summary["psnr"] > 10.0
+    assert cp.load_run(trained.path).results == {"paper": result}
+
+
+def test_a_held_out_frame_is_rendered_as_evaluated(trained, result):
+    names = trained.frame_names()
+    assert names == list(result.sets["test"].frames)
+    view = trained.render(names[1])
+    evaluation = trained.path / "eval/paper"
+    np.testing.assert_array_equal(view.rgb, read_rgb(evaluation / f"renders/test/{names[1]}.png"))
+    np.testing.assert_array_equal(view.true_rgb, read_rgb(evaluation / f"truth/test/{names[1]}.png"))
+    np.testing.assert_array_equal(view.depth, read_depth_tiff(evaluation / f"depth/test/{names[1]}.tiff"))
+    np.testing.assert_array_equal(view.true_depth, read_depth_tiff(evaluation / f"true_depth/test/{names[1]}.tiff"))
+    assert view.rgb.dtype == np.uint8 and view.alpha.shape == view.depth.shape == (24, 32)
+
+
+def test_a_view_shows_truth_and_rendering(trained):
+    view = trained.render("0000_color", depth="depth_expected", outputs=["normals"])
+    assert view.outputs["normals"].shape == (24, 32, 3)
+    captions = ["truth", "rendered", "true depth, 0 to 30 mm", "depth, 0 to 30 mm", "depth error, 0 to 2 mm"]
+    assert list(view.images()) == captions
+    assert view._repr_html_().count("data:image/png;base64,") == 5
+    camera = replace(view.camera, width=16)
+    free = trained.render(camera)
+    assert free.name == "" and free.rgb.shape == (24, 16, 3)
+    assert free.true_rgb is None and len(free.images()) == 2
+
+
+def test_training_resumes(scene, trained, tmp_path):
+    before = trained.load().step
+    cut = cp.train("coliags", scene, tmp_path / "run", steps=4, settings=SETTINGS)
+    assert cut.load().step == 4
+    on = cp.train("coliags", scene, tmp_path / "run", steps=6, resume=True)
+    assert (before, on.step, cut.load().step) == (8, 6, 6)
+
+
+def test_scenes_are_made_and_read(tmp_path):
+    tiny = {"mesh_spacing": 1.2, "texture_spacing": 0.4, "interreflection": 0.0}
+    made = cp.make_phantom(tmp_path / "p", seed=1, frames=9, width=32, height=26, rotation_views=0, **tiny)
+    assert made == tmp_path / "p"
+    scene = cp.load_scene(made, settings={"frame_step": 2})
+    assert [frame.index for frame in scene.train] == [2, 4, 6, 8]
+    with pytest.raises(InputError, match="unknown key 'frame_stpe'"):
+        cp.load_scene(made, settings={"frame_stpe": 2})
+    with pytest.raises(InputError, match=r"unknown key 'sede'.*Did you mean 'seed'"):
+        cp.make_phantom(tmp_path / "q", sede=1)
 
 
 def test_errors_say_what_to_do(scene, trained, tmp_path):
     with pytest.raises(InputError, match="already exists"):
-        coliags_plugin.train("coliags", scene, trained)
+        cp.train("coliags", scene, trained.path)
+    with pytest.raises(InputError, match="one of them"):
+        cp.train("coliags", scene, trained.path, resume=True, overwrite=True)
+    with pytest.raises(InputError, match="values by key path"):
+        cp.train("coliags", scene, tmp_path / "r", settings=["schedule.steps=3"])
     with pytest.raises(InputError, match="not a run folder"):
-        coliags_plugin.load_run(tmp_path)
+        cp.load_run(tmp_path)
     with pytest.raises(InputError, match="no folder"):
-        coliags_plugin.load_scene(tmp_path / "gone")
+        cp.load_scene(tmp_path / "gone")
+    with pytest.raises(InputError, match=r"no frame '0000_colro'.*Did you mean '0000_color'"):
+        trained.render("0000_colro")
+    with pytest.raises(InputError, match="no kind of depth 'depth'"):
+        trained.render("0000_color", depth="depth")
+    with pytest.raises(InputError, match="albedo"):
+        trained.render("0000_color", outputs=["albedo"])
     with pytest.raises(AttributeError, match="no attribute 'trian'"):
-        _ = coliags_plugin.trian
+        _ = cp.trian
+
+
+def test_a_notebook_shows_an_error_as_one_message():
+    from IPython.core.interactiveshell import InteractiveShell
+
+    shell = InteractiveShell()
+    shown = []
+    shell._showtraceback = lambda kind, error, lines: shown.extend(lines)
+    shell.run_cell("import coliags_plugin as cp\ncp.load_run('gone')")
+    (line,) = shown
+    assert line.startswith("InputError: gone is not a run folder. Expected")
+
+
+def test_examples_of_the_pages_run(tmp_path, monkeypatch):
+    """In the order of the page, each with a few steps of a small model."""
+    write_wall(tmp_path / "SCENE", frames=17)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("coliags_plugin.comparison.compare.make_executor", lambda how: InlineExecutor())
+
+    def quick(function):
+        def call(*args, settings=None, **options):
+            return function(*args, **{**options, "steps": 2, "settings": {**SETTINGS, **(settings or {})}})
+
+        return call
+
+    monkeypatch.setattr(cp, "train", quick(cp.train), raising=False)
+    monkeypatch.setattr(cp, "compare", quick(cp.compare), raising=False)
+    for page in (ROOT / "README", ROOT / "docs" / "api"):
+        names = {}
+        text = page.with_suffix(".md").read_text(encoding="utf-8")
+        for block in re.findall(r"^```python\n(.*?)^```$", text, re.DOTALL | re.MULTILINE):
+            exec(block, names)
+        assert isinstance(names["run"], cp.Run)
+        shutil.rmtree("comparison")
 
 
 def test_importing_the_package_imports_no_torch():
-    code = "import sys, coliags_plugin; sys.exit('torch' in sys.modules or 'numpy' in sys.modules)"
+    code = (
+        "import sys, coliags_plugin as cp; heavy = {'torch', 'numpy', 'cv2', 'pydantic', 'rich'}\n"
+        "assert not heavy & set(sys.modules), heavy & set(sys.modules)\n"
+        "assert set(cp.__all__) <= set(dir(cp))\n"
+        "from coliags_plugin import *\n"
+        "assert not {'torch', 'cv2', 'numba'} & set(sys.modules)"
+    )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_handle_needs_no_torch(trained, result):
+    code = (
+        "import sys, coliags_plugin as cp\n"
+        f"run = cp.load_run({str(trained.path)!r})\n"
+        "print(run, run.history['psnr'][-1], run.results['paper'])\n"
+        "assert 'torch' not in sys.modules"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(repr(trained)) and str(result) in done.stdout

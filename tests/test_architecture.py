@@ -18,15 +18,15 @@ LAYERS = (
     {"contracts"},
     {"poses"},
     {"datamanagers", "fields", "renderers", "modules", "strategies", "losses", "metrics"},
-    {"outputs", "results"},
+    {"outputs", "results", "statistics"},
     {"engine", "phantom", "reconstruction"},
-    {"data_check", "method_check", "reporting"},
+    {"comparison", "data_check", "method_check", "reporting"},
     {"api"},
     {"cli"},
 )
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
 #: Loaded when a command or component runs, never when a module is imported.
-LAZY = {"open3d", "pycolmap", "numba", "gsplat", "viser", "nerfstudio", "pyarrow"}
+LAZY = {"open3d", "pycolmap", "numba", "gsplat", "viser", "nerfstudio", "pyarrow", "ray"}
 
 SOURCES = {
     ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"): path

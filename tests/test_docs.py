@@ -169,6 +169,8 @@ def parsed(argv: list[str], monkeypatch: pytest.MonkeyPatch) -> Any:
     return caught[0] if caught else None
 
 
+#: Subcommands that running text names alone.
+ALONE = ("train", "eval", "render", "report", "compare", "ablate", "phantom", "config", "check", "poses")
 #: Methods that docs/example_package adds; tests/test_third_party_package.py trains them.
 OF_THE_EXAMPLE = {path.stem for path in (DOCS / "example_package").rglob("*.yaml")}
 
@@ -177,7 +179,7 @@ OF_THE_EXAMPLE = {path.stem for path in (DOCS / "example_package").rglob("*.yaml
 def test_commands_parse(page, command, monkeypatch, capsys):
     words = shlex.split(command, comments=True)
     argv = words[words.index("coliags") + 1 :]
-    if len(argv) == 1 and argv[0] in ("train", "eval", "render", "report", "phantom", "config", "check", "poses"):
+    if len(argv) == 1 and argv[0] in ALONE:
         argv.append("--help")  # the subcommand's name alone, in running text
     found = parsed(argv, monkeypatch)
     if (

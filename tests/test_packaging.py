@@ -32,7 +32,8 @@ def test_wheel_contents(wheel):
     configs = {
         f"coliags_plugin/{path.relative_to(ROOT).as_posix()}" for path in (ROOT / "method_configs").rglob("*.yaml")
     }
-    assert sources | configs | {"coliags_plugin/py.typed", "coliags_plugin/outputs/page_template.html"} <= names
+    others = {"py.typed", "outputs/page_template.html", "reporting/report.css", "reporting/report.js"}
+    assert sources | configs | {f"coliags_plugin/{name}" for name in others} <= names
     assert {name.split("/")[0] for name in names} == {"coliags_plugin", f"coliags_plugin-{__version__}.dist-info"}
     assert "License-Expression: Apache-2.0" in metadata
     assert f"Version: {__version__}" in metadata

@@ -9,7 +9,9 @@ from typing import Annotated
 
 import tyro
 
+from coliags_plugin.cli.ablate import Ablate
 from coliags_plugin.cli.check import Check
+from coliags_plugin.cli.compare import Compare
 from coliags_plugin.cli.config import Config
 from coliags_plugin.cli.data import Data
 from coliags_plugin.cli.doctor import Doctor
@@ -29,6 +31,8 @@ Command = (
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("eval")]
     | Annotated[Render, tyro.conf.subcommand("render")]
+    | Annotated[Compare, tyro.conf.subcommand("compare")]
+    | Annotated[Ablate, tyro.conf.subcommand("ablate")]
     | Annotated[Report, tyro.conf.subcommand("report")]
     | Annotated[Results, tyro.conf.subcommand("results")]
     | Annotated[Poses, tyro.conf.subcommand("poses")]

@@ -26,16 +26,9 @@ class Evaluate:
 
     def run(self) -> None:
         """Evaluate, print a table, and print the path of the metrics."""
-        from rich.console import Console
+        from coliags_plugin.api.runs import load_run
 
-        from coliags_plugin.api import evaluate, load_run
-        from coliags_plugin.reporting.metrics_table import metrics_table
-
-        trained = load_run(self.path, data=self.data, device=self.device)
-        protocol = self.protocol or trained.config.protocol
-        summary = evaluate(trained, protocol)
-        Console().print(metrics_table(summary))
-        for reason in dict.fromkeys(summary["reasons"].values()):
-            names = [name for name, text in summary["reasons"].items() if text == reason]
-            print(f"{', '.join(names)}: {reason}")
-        print(trained.run.evaluation(protocol) / "metrics.json")
+        run = load_run(self.path, data=self.data, device=self.device)
+        result = run.evaluate(self.protocol)
+        print(result)
+        print(run.folder.evaluation(result.protocol.name) / "metrics.json")

@@ -44,11 +44,8 @@ class Phantom:
 
     def run(self) -> None:
         """Generate the dataset and print its path."""
-        from coliags_plugin.config.yaml_tree import parse_value
-        from coliags_plugin.core.errors import InputError
-        from coliags_plugin.engine.progress import progress_callback
-        from coliags_plugin.phantom.generate import generate
-        from coliags_plugin.phantom.settings import phantom_settings
+        from coliags_plugin.api.scenes import make_phantom
+        from coliags_plugin.config.assignments import parse_assignments
 
         options: dict[str, Any] = {
             "seed": self.seed,
@@ -59,17 +56,11 @@ class Phantom:
             "gain": self.gain,
             "polyps": self.polyps,
             "rotation_views": self.rotation_views,
+            "overwrite": self.overwrite,
         }
         if self.size is not None:
             options["width"], options["height"] = parse_size(self.size)
         if self.light_offset is not None:
             options["light_offset"] = parse_vector("--light-offset", self.light_offset)
-        for assignment in self.set:
-            key, equals, value = assignment.partition("=")
-            if not equals:
-                raise InputError(f"--set {assignment}", "KEY=VALUE")
-            options[key] = parse_value(value)
-        settings = phantom_settings(options)
-        with progress_callback() as progress:
-            generate(settings, self.output, overwrite=self.overwrite, progress=progress)
-        print(self.output)
+        options |= parse_assignments(self.set, expected="KEY=VALUE")
+        print(make_phantom(self.output, **options))

@@ -40,14 +40,20 @@ class Render:
 
     def run(self) -> None:
         """Render and print the output folder."""
-        from coliags_plugin.api import load_run
-        from coliags_plugin.engine.relighting import read_lamp, relight
-        from coliags_plugin.engine.rendering import render_run
+        from coliags_plugin.api.runs import load_run
+        from coliags_plugin.config.assignments import parse_assignments
 
-        output = self.output or self.path / ("relit" if self.light else "renders")
-        lamp = read_lamp(self.light)
-        trained = load_run(self.path, data=self.data, device=self.device)
-        if self.light:
-            trained = relight(trained, lamp)
-        render_run(trained, output, self.frames, self.video, self.fps, self.overwrite, self.channel)
-        print(output)
+        lamp = parse_assignments(self.light, "--light", "KEY=VALUE, for instance power=10")
+        run = load_run(self.path, data=self.data, device=self.device)
+        if lamp:
+            run = run.relight(**lamp)
+        print(
+            run.write_renders(
+                self.output,
+                self.frames,
+                video=self.video,
+                fps=self.fps,
+                channels=self.channel,
+                overwrite=self.overwrite,
+            )
+        )

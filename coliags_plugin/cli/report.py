@@ -1,35 +1,63 @@
-"""``coliags report``: compare runs in one HTML file."""
+"""``coliags report``: compare methods in an HTML page, and in tables for a paper."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
 
 import tyro
 
-from coliags_plugin.cli.arguments import OptionalText
+from coliags_plugin.cli.arguments import OptionalPath, OptionalText
+
+#: ``--format NAME``, repeatable.
+Formats = Annotated[
+    tuple[Literal["html", "markdown", "latex", "csv", "all"], ...],
+    tyro.conf.arg(name="format"),
+    tyro.conf.UseAppendAction,
+]
 
 
 @dataclass(frozen=True)
 class Report:
-    """Compare evaluated runs of one scene in one self-contained HTML file."""
+    """Compare evaluated methods: tables with statistics, held-out views, errors, curves and costs."""
 
-    runs: tyro.conf.Positional[tuple[Path, ...]]
-    """Run folders, each evaluated with `coliags eval`."""
-    output: Path = Path("report.html")
-    """File to write."""
+    paths: tyro.conf.Positional[tuple[Path, ...]]
+    """Evaluated run folders, results files (`eval/PROTOCOL/result.json`), or the folder of a `coliags compare`."""
+    output: OptionalPath = None
+    """File to write; with several formats, its suffix is replaced by that of each; default: report.html, .md, ..."""
+    format: Formats = ()
+    """What to write, repeatable: html (default), markdown, latex (booktabs), csv (every frame), or all."""
+    columns: OptionalText = None
+    """Metrics to show, separated by commas, or `all`; default: psnr,ssim,lpips,depth_mse,depth_mse_inner,
+    depth_median_error."""
+    reference: OptionalText = None
+    """Method that the others are compared with; default: coliags, or the best where it is not there."""
     protocol: str = "paper"
-    """Evaluation protocol to show."""
+    """Evaluation protocol to read."""
     frames: int = 4
-    """Held-out frames to show per test set."""
+    """Held-out frames to show per scene and test set; the worst ones are added."""
     title: OptionalText = None
-    """Heading; default: the scene."""
+    """Heading; default: methods and scenes."""
     note: OptionalText = None
     """A remark shown at the top."""
 
     def run(self) -> None:
-        """Write the report and print its path."""
-        from coliags_plugin.reporting.html_report import write_report
+        """Write the report and print the paths."""
+        from coliags_plugin.api.reports import report
+        from coliags_plugin.reporting.report import FORMATS
 
-        write_report(self.runs, self.output, self.protocol, self.frames, self.title, self.note)
-        print(self.output.resolve())
+        named = tuple(name for name in self.format if name != "all") or FORMATS[:1]
+        files = report(
+            self.paths,
+            self.output,
+            formats=FORMATS if "all" in self.format else named,
+            columns=tuple(filter(None, (self.columns or "").replace(" ", "").split(","))),
+            reference=self.reference,
+            protocol=self.protocol,
+            frames=self.frames,
+            title=self.title,
+            note=self.note,
+        )
+        for file in files:
+            print(file.resolve())

@@ -18,14 +18,11 @@ class Show:
 
     def run(self) -> None:
         """Print a table for each."""
-        from rich.console import Console
-
-        from coliags_plugin.reporting.metrics_table import metrics_table
         from coliags_plugin.results.finding import find_results
-        from coliags_plugin.results.summaries import facts, means_summary
+        from coliags_plugin.results.summaries import facts
 
         for result in find_results([self.path]):
-            Console().print(metrics_table(means_summary(result)))
+            print(result)
             for name, text in facts(result).items():
                 print(f"{name:<16}{text}")
 

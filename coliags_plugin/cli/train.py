@@ -40,22 +40,20 @@ class Train:
 
     def run(self) -> None:
         """Train and print the run folder."""
-        from coliags_plugin.api import train
+        from coliags_plugin.api.training import train
+        from coliags_plugin.config.assignments import parse_assignments
 
-        overrides = list(self.set)
-        if self.steps is not None:
-            overrides.append(f"schedule.steps={self.steps}")
-        if self.renderer is not None:
-            overrides.append(f"renderer.name={self.renderer}")
         run = train(
             self.method,
             self.data,
             self.output,
-            overrides=overrides,
-            data_format=self.format,
+            steps=self.steps,
             seed=self.seed,
+            settings=parse_assignments(self.set),
+            renderer=self.renderer,
+            data_format=self.format,
             device=self.device,
             resume=self.resume,
             overwrite=self.overwrite,
         )
-        print(run)
+        print(run.path)

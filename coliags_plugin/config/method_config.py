@@ -21,7 +21,8 @@ from coliags_plugin.config.components import (
     StrategyNode,
 )
 from coliags_plugin.config.method_files import method_files
-from coliags_plugin.config.yaml_tree import Node, dump, merge, override_all, read_tree
+from coliags_plugin.config.origins import errors_with_origins
+from coliags_plugin.config.yaml_tree import Node, dump, dump_inline, merge, override_all, read_tree
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.settings import Settings, refuse_zero_ends
 
@@ -116,22 +117,33 @@ class LoadedMethod:
         return "\n".join(_annotated(self.config.model_dump(), self.tree, 0)) + "\n"
 
 
-def load_method(method: str, overrides: Iterable[str] = ()) -> LoadedMethod:
+def load_method(method: str, overrides: Iterable[str] = (), data_format: str | None = None) -> LoadedMethod:
     """Resolve a method config.
 
     Args:
         method: A name (``coliags``, ``ablations/imia``), or the path of a YAML file.
         overrides: ``key.path=value`` assignments, applied last.
+        data_format: Name of a data manager that takes the place of the method's, with all its options; None: none does.
 
     Raises:
         InputError: No such method, or it is not valid; names file, line and key.
     """
     tree = method_tree(method, overrides)
+    if data_format is not None:
+        tree = _with_data_format(tree, data_format)
     try:
         config = MethodConfig.model_validate(tree.plain())
     except ValidationError as error:
-        raise InputError("\n".join(_describe(error, tree))) from error
+        raise InputError("\n".join(errors_with_origins(error, tree))) from error
     return LoadedMethod(method_name(method), config, tree)
+
+
+def _with_data_format(tree: Node, data_format: str) -> Node:
+    """The tree with another name of the data manager, whose options stay."""
+    manager = tree.find(["datamanager"])
+    options = manager.value if manager.is_mapping else {}
+    name = Node(data_format, "recognised from the data, or --format")
+    return Node({**tree.value, "datamanager": Node({**options, "name": name}, manager.origin)}, tree.origin)
 
 
 def method_name(method: str) -> str:
@@ -184,23 +196,6 @@ def _resolve(path: Path, seen: tuple[Path, ...]) -> Node:
     return merge(Node(inherited, parent.origin), Node(own, tree.origin))
 
 
-#: Errors of this package, with messages of their own.
-_TELLING = frozenset({"no_name", "unknown_key", "unknown_component", "no_settings", "value_error", "zero_end"})
-
-
-def _describe(error: ValidationError, tree: Node) -> list[str]:
-    lines = []
-    for item in error.errors():
-        path = [key for key in item["loc"] if isinstance(key, str)]
-        message = item["msg"].removeprefix("Value error, ")
-        if item["type"] == "missing":
-            message = "is missing"
-        elif item["type"] not in _TELLING:
-            message = f"{message}, got {item['input']!r}"
-        lines.append(f"{tree.find(path).origin}: {'.'.join(path) or 'config'}: {message.strip()}")
-    return lines
-
-
 def _annotated(plain: Any, tree: Node, depth: int) -> Sequence[str]:
     lines: list[str] = []
     for key, value in plain.items():
@@ -211,6 +206,6 @@ def _annotated(plain: Any, tree: Node, depth: int) -> Sequence[str]:
             lines.extend(_annotated(value, node or Node({}, ""), depth + 1))
         else:
             origin = node.origin if node is not None else "default"
-            text = dump([value]).strip()[1:-1] if not isinstance(value, (list, tuple, dict)) else dump(value).strip()
+            text = dump_inline(value)
             lines.append(f"{indent}{key}: {text}  # {origin}")
     return lines

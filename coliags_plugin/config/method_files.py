@@ -11,7 +11,7 @@ from coliags_plugin.core.errors import InputError
 
 #: Entry points whose name is a method's, and whose value is the package that holds ``<name>.yaml``.
 ENTRY_POINTS = "coliags_plugin.methods"
-#: Folder among the shipped method configs that holds descriptions of benchmarks instead.
+#: Folder among the shipped method configs that holds benchmarks and ablations instead.
 BENCHMARKS = "benchmarks"
 
 

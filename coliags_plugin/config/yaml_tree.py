@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -55,14 +56,27 @@ _Loader.yaml_implicit_resolvers = {
     for _FLOAT, _BOOL in [("tag:yaml.org,2002:float", "tag:yaml.org,2002:bool")]
     for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
 }
-_Loader.add_implicit_resolver(
+#: Tag, pattern and first characters of numbers as YAML 1.2 has them.
+_NUMBERS = (
     "tag:yaml.org,2002:float",
     re.compile(r"^[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?$|^[-+]?\.(inf|Inf|INF)$|^\.(nan|NaN|NAN)$"),
     list("-+0123456789."),
 )
+_Loader.add_implicit_resolver(*_NUMBERS)
 _Loader.add_implicit_resolver(
     "tag:yaml.org,2002:bool", re.compile(r"^(true|True|TRUE|false|False|FALSE)$"), list("tTfF")
 )
+
+
+class _Dumper(yaml.SafeDumper):
+    """Safe dumper that quotes text which either version of YAML would take for something else."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        """Write what is there twice twice."""
+        return True
+
+
+_Dumper.add_implicit_resolver(*_NUMBERS)
 
 
 def read_tree(path: Path) -> Node:
@@ -188,7 +202,19 @@ def override_all(tree: Node, assignments: Iterable[str]) -> Node:
 
 def dump(plain: Any) -> str:
     """YAML text of plain data, keys in their own order, the innermost collections on one line."""
-    return yaml.safe_dump(_lists(plain), sort_keys=False, allow_unicode=True, default_flow_style=None, width=1000)
+    return _dumped(plain, flow=None, width=1000)
+
+
+def dump_inline(plain: Any) -> str:
+    """YAML text of plain data as it stands behind ``key=``, which :func:`parse_value` reads."""
+    return _dumped([plain], flow=True, width=math.inf).strip()[1:-1]  # a list, so that no end of document is written
+
+
+def _dumped(plain: Any, flow: bool | None, width: float) -> str:
+    text: str = yaml.dump(
+        _lists(plain), Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=flow, width=width
+    )
+    return text
 
 
 def _lists(value: Any) -> Any:

@@ -7,9 +7,13 @@ from difflib import get_close_matches
 
 
 class ReportedError(Exception):
-    """Error that the command line prints as one line, without a traceback; it exits with ``exit_status``."""
+    """Error that the command line and notebooks print without a traceback; the former exits with ``exit_status``."""
 
     exit_status = 1
+
+    def _render_traceback_(self) -> list[str]:
+        """What IPython shows instead of a traceback."""
+        return [f"{type(self).__name__}: {self}"]
 
 
 class InputError(ReportedError):

@@ -192,6 +192,12 @@ class Scene:
     points: PointCloud
     provenance: dict[str, Any] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        """Counts, not pixels."""
+        sets = {"train": self.train, **self.test_sets}
+        counts = ", ".join(f"{len(frames)} {name}" for name, frames in sets.items())
+        return f"Scene {self.name}: frames {counts}; {len(self.points)} points"
+
     @property
     def extent(self) -> float:
         """1.1 times the largest distance of a training camera from their mean, scene units (docs/methods.md 2.1)."""

@@ -26,7 +26,14 @@ class AutoDataManager(DataManager):
         Raises:
             InputError: No format, or several, recognise the folder; or it cannot be read.
         """
+        return self._manager(path).load(path, progress)
+
+    def fingerprint(self, path: Path) -> str:
+        """See :meth:`DataManager.fingerprint`."""
+        return self._manager(path).fingerprint(path)
+
+    def _manager(self, path: Path) -> DataManager:
         given = self.settings.model_dump(include=self.settings.model_fields_set)
         component = make_component("datamanagers", {**given, "name": find_format(path)})
         manager: DataManager = component.target(component.settings)
-        return manager.load(path, progress)
+        return manager

@@ -54,6 +54,10 @@ class RecordedDataManager(DataManager):
             InputError: The folder is missing, or files are missing or invalid.
         """
 
+    def fingerprint(self, path: Path) -> str:
+        """See :meth:`DataManager.fingerprint`; reads no pixels."""
+        return self.open(Path(path)).fingerprint
+
     def working_size(self, width: int, height: int) -> tuple[int, int]:
         """Working size for a stored size, pixels: the configured size, or the largest within :attr:`fits`."""
         return self.settings.size or fitted(width, height, self.fits)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import logging
+import shutil
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +24,9 @@ from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.costs import TrainingCost
 from coliags_plugin.engine.model import Model, make_view_modules
 from coliags_plugin.engine.optimizers import Optimizers
+from coliags_plugin.engine.run_folder import checkpoints_in_order
+
+logger = logging.getLogger(__name__)
 
 #: Written. Format 2 lacks view modules and is otherwise the same.
 FORMAT = 3
@@ -106,8 +112,33 @@ def checkpoint_folder(folder: Path, step: int) -> Path:
 
 def newest_checkpoint(folder: Path) -> Path | None:
     """The checkpoint of the highest step; None where there is none."""
-    found = sorted(folder.glob("step-*/state.json"), key=lambda path: int(path.parent.name.split("-")[1]))
-    return found[-1].parent if found else None
+    found = checkpoints_in_order(folder)
+    return found[-1] if found else None
+
+
+def keep_newest(folder: Path, count: int) -> None:
+    """Remove all checkpoints but so many of the highest steps."""
+    for path in checkpoints_in_order(folder)[:-count]:
+        shutil.rmtree(path)
+
+
+def set_damaged_aside(folder: Path, method: str) -> int:
+    """Rename checkpoints that cannot be read, newest first, until one can be: so that a run goes on from that one.
+
+    Args:
+        folder: The run's checkpoints.
+        method: Name of its method.
+
+    Returns:
+        The step of the newest whole checkpoint; 0 where there is none.
+    """
+    while (newest := newest_checkpoint(folder)) is not None:
+        try:
+            return read_checkpoint(newest, method, torch.device("cpu")).step
+        except InputError as error:
+            logger.warning("%s", error)
+            newest.rename(newest.with_name(f"damaged-{newest.name}-{time.time_ns()}"))
+    return 0
 
 
 def latest_checkpoint(folder: Path) -> Path:

@@ -34,6 +34,8 @@ def load_method_for(
 ) -> LoadedMethod:
     """A method config whose data manager is the one that reads ``path``.
 
+    Options that the method gives to ``auto`` are those of the folder's format; options for another format are dropped.
+
     Args:
         path: The scene's folder.
         method: Name or path of a method config.
@@ -43,10 +45,9 @@ def load_method_for(
     Raises:
         InputError: No such method or format, or the config is not valid, or see :func:`find_format`.
     """
-    if data_format is None:
-        named = method_tree(method, overrides).find(["datamanager", "name"]).value
-        if named in registry.datamanagers and not registry.datamanagers.get(named).has_format:
-            data_format = find_format(path)
+    named = method_tree(method, overrides).find(["datamanager", "name"]).value
+    if named in registry.datamanagers and not registry.datamanagers.get(named).has_format:
+        return load_method(method, overrides, data_format or find_format(path))
     chosen = [] if data_format is None else [f"datamanager.name={data_format}"]
     return load_method(method, [*chosen, *overrides])
 

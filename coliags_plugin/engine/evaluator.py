@@ -10,9 +10,10 @@ import torch
 from coliags_plugin.contracts import Comparison
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, atomic_write, write_json
-from coliags_plugin.core.scenes import Frame
+from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.engine.costs import RenderMeter
 from coliags_plugin.engine.evaluated_set import EvaluatedSet
+from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.run_result import run_result
 from coliags_plugin.engine.scoring import Scorer
@@ -43,10 +44,8 @@ def evaluate(trained: TrainedRun, protocol_name: str) -> Path:
             "evaluation of a relit run", "the lamp that the data were recorded with", "Evaluate the run as loaded"
         )
     scorer = Scorer(protocol_name)
-    trained.model.check_outputs(scorer.wants, f"protocol '{protocol_name}'")
+    check_evaluable(trained.model, trained.scene, scorer)
     sets = {name: frames for name, frames in trained.scene.test_sets.items() if frames}
-    if not sets:
-        raise InputError(f"scene '{trained.scene.name}' has no test frames", "a split that holds some out")
     total, done = sum(map(len, sets.values())), 0
     target = trained.run.evaluation(scorer.protocol.name)
     evaluated = {name: EvaluatedSet() for name in sets}
@@ -66,6 +65,17 @@ def evaluate(trained: TrainedRun, protocol_name: str) -> Path:
         write_json(scratch / "metrics.json", means_summary(result))
         atomic_write(scratch / "per_frame.csv", per_frame_table(result))
     return target
+
+
+def check_evaluable(model: Model, scene: Scene, scorer: Scorer) -> None:
+    """Refuse what cannot be evaluated; worth knowing before training.
+
+    Raises:
+        InputError: The protocol wants what the renderer cannot deliver, or there is no test frame.
+    """
+    model.check_outputs(scorer.wants, f"protocol '{scorer.protocol.name}'")
+    if not any(scene.test_sets.values()):
+        raise InputError(f"scene '{scene.name}' has no test frames", "a split that holds some out")
 
 
 def _write_images(folder: Path, set_name: str, frame: Frame, comparison: Comparison) -> None:

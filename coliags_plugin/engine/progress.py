@@ -1,4 +1,4 @@
-"""Progress reports: a bar on a terminal, plain lines elsewhere."""
+"""Progress reports of long jobs."""
 
 from __future__ import annotations
 
@@ -7,13 +7,10 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from types import TracebackType
-from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-#: Between plain lines, seconds.
-PLAIN_LINE_EVERY = 10.0
+from coliags_plugin.engine.progress_displays import Display, open_display
 
 
 class ProgressReport:
@@ -29,45 +26,23 @@ class ProgressReport:
 
     def __init__(self, title: str, total: int, start: int = 0) -> None:
         self.title = title
-        self.total = total
-        self.first = start
-        self.console = Console(file=sys.stderr)
-        self.bar: Progress | None = None
-        self.task: Any = None
-        self.began = self.last_line = time.monotonic()
+        self._total, self._start = total, start
+        self._display: Display | None = None
 
     def __enter__(self) -> ProgressReport:
-        self.began = self.last_line = time.monotonic()
-        if self.console.is_terminal:
-            columns = [
-                TextColumn("{task.description}"),
-                BarColumn(),
-                MofNCompleteColumn(),
-                TimeElapsedColumn(),
-                TimeRemainingColumn(),
-                TextColumn("{task.fields[facts]}"),
-            ]
-            self.bar = Progress(*columns, console=self.console)
-            self.bar.start()
-            self.task = self.bar.add_task(self.title, total=self.total, completed=self.first, facts="")
+        self._display = open_display(Console(file=sys.stderr), self.title, self._total, self._start)
         return self
 
     def update(self, done: int, facts: str = "") -> None:
-        """Report ``done`` of the total, with ``facts`` behind the bar."""
-        if self.bar is not None:
-            self.bar.update(self.task, completed=done, facts=facts)
-            return
-        now = time.monotonic()
-        if now - self.last_line >= PLAIN_LINE_EVERY or done == self.total:
-            self.last_line = now
-            left = (now - self.began) / max(1, done - self.first) * (self.total - done)
-            self.console.print(f"{self.title} {done}/{self.total}, {left:.0f} s to go  {facts}", highlight=False)
+        """Report ``done`` of the total, with ``facts`` behind it."""
+        if self._display is not None:
+            self._display.update(done, facts)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self.bar is not None:
-            self.bar.stop()
+        if self._display is not None:
+            self._display.close()
 
 
 @contextmanager

@@ -2,35 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 from pydantic import ValidationError
 
 from coliags_plugin.config.registry import fields
-from coliags_plugin.config.yaml_tree import parse_value
 from coliags_plugin.contracts import LitField
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.lamps import Lamp
 from coliags_plugin.core.settings import first_error
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.trained import TrainedRun
-
-
-def read_lamp(options: Sequence[str]) -> Lamp:
-    """The lamp of ``key=value`` options, values read as YAML, the last one of a key last.
-
-    Raises:
-        InputError: An option is no ``key=value``, is unknown, or has an invalid value.
-    """
-    values: dict[str, Any] = {}
-    for option in options:
-        key, equals, text = option.partition("=")
-        if not equals:
-            raise InputError(f"--light {option}", "KEY=VALUE, for instance power=10")
-        values[key.strip()] = parse_value(text)
-    return make_lamp(values)
 
 
 def make_lamp(values: Mapping[str, Any]) -> Lamp:

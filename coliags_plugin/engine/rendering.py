@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from coliags_plugin.config.yaml_tree import dump
+from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.files import atomic_folder, atomic_write
 from coliags_plugin.core.render_output import RenderOutput
-from coliags_plugin.core.scenes import Frame
+from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.outputs.colormaps import (
@@ -22,12 +23,15 @@ from coliags_plugin.outputs.colormaps import (
     colorize_depth,
     colorize_depth_error,
     colorize_rgb_error,
+    depth_limits,
 )
 from coliags_plugin.outputs.image_files import eight_bit, write_png
 from coliags_plugin.outputs.video import write_video
 
 #: Upper limit of the colour error images, as a share of the colour range.
 RGB_ERROR_LIMIT = 0.2
+#: Outputs that the images are made of.
+_WANTS = ("rgb", "alpha", "depth_accumulated")
 
 
 def render_run(
@@ -55,16 +59,17 @@ def render_run(
     Raises:
         InputError: No such frames or channel, or the folder exists or cannot be written.
     """
-    chosen = _choose(trained, frames)
+    chosen = choose_frames(trained.scene, frames)
     _check_channels(trained, channels)
-    path = _choose(trained, "all")
-    limits = _depth_limits(trained, chosen)
+    path = choose_frames(trained.scene, "all")
+    sample = chosen[:: max(1, len(chosen) // 4)][:4]
+    limits = depth_limits(render_view(trained, frame)["depth_accumulated"] for frame in sample)
     with (
         atomic_folder(output, overwrite) as folder,
         ProgressReport("render", len(chosen) + len(path) * video) as progress,
     ):
         for count, frame in enumerate(chosen, start=1):
-            view = _render(trained, frame, channels)
+            view = render_view(trained, frame, (*_WANTS, *channels))
             _write_frame(folder, frame, view, limits, relit=trained.lamp is not None)
             for channel in channels:
                 write_png(folder / channel / f"{frame.name}.png", eight_bit(_as_rgb(view[channel])))
@@ -79,8 +84,12 @@ def render_run(
             write_video(_film(trained, path, limits, progress, len(chosen)), folder / "trajectory.mp4", fps)
 
 
-def _choose(trained: TrainedRun, frames: str) -> list[Frame]:
-    scene = trained.scene
+def choose_frames(scene: Scene, frames: str) -> list[Frame]:
+    """Frames of a scene: ``train``, ``all`` (train and test in video order), or those of a test set by its name.
+
+    Raises:
+        InputError: There are none.
+    """
     groups = {"train": scene.train, **scene.test_sets}
     groups["all"] = sorted([*scene.train, *scene.test_sets.get("test", [])], key=lambda frame: frame.index)
     if not groups.get(frames):
@@ -101,22 +110,23 @@ def _check_channels(trained: TrainedRun, channels: Sequence[str]) -> None:
 
 
 @torch.no_grad()
-def _render(trained: TrainedRun, frame: Frame, channels: Sequence[str] = ()) -> RenderOutput:
-    view = frame.view(trained=frame.name in trained.training_frames)
-    wants = ("rgb", "alpha", "depth_accumulated", *channels)
-    return trained.model.render(frame.camera.to(trained.device), wants, view)
+def render_view(trained: TrainedRun, of: Frame | Camera, wants: Sequence[str] = _WANTS) -> RenderOutput:
+    """What the model of a run renders.
+
+    Args:
+        trained: The run.
+        of: A frame of its scene, or a free camera.
+        wants: Names of outputs.
+    """
+    if isinstance(of, Camera):
+        return trained.model.render(of.to(trained.device), wants)
+    view = of.view(trained=of.name in trained.training_frames)
+    return trained.model.render(of.camera.to(trained.device), wants, view)
 
 
 def _as_rgb(channel: Tensor) -> Tensor:
     """Three equal numbers per pixel where the channel has one. [H, W, 3]"""
     return channel.reshape(*channel.shape[:2], -1).expand(-1, -1, 3)
-
-
-def _depth_limits(trained: TrainedRun, frames: list[Frame]) -> tuple[float, float]:
-    """From 0 to the largest rendered depth in a few of the frames, rounded up to 10 mm."""
-    sample = frames[:: max(1, len(frames) // 4)][:4]
-    largest = max(float(_render(trained, frame)["depth_accumulated"].max()) for frame in sample)
-    return 0.0, max(10.0, 10.0 * float(np.ceil(largest / 10.0)))
 
 
 def _write_frame(folder: Path, frame: Frame, output: RenderOutput, limits: tuple[float, float], relit: bool) -> None:
@@ -137,7 +147,7 @@ def _film(
     trained: TrainedRun, path: list[Frame], limits: tuple[float, float], progress: ProgressReport, done: int
 ) -> Iterator[np.ndarray]:
     for count, frame in enumerate(path, start=1):
-        output = _render(trained, frame)
+        output = render_view(trained, frame)
         rgb = eight_bit(output.rgb).cpu().numpy()
         yield np.concatenate([rgb, colorize_depth(output["depth_accumulated"], limits)], axis=1)
         progress.update(done + count)

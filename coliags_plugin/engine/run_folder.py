@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -13,6 +14,27 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, atomic_write, write_json
 
 FORMAT = 1
+
+
+@dataclass(frozen=True)
+class RunIdentity:
+    """What a run is, from its provenance.
+
+    Attributes:
+        method: Name of its method.
+        scene_name: Name of its scene.
+        scene_path: Where that was read from.
+        fingerprint: Hash of its files.
+        seed: Of all random generators.
+        steps: Length of its training.
+    """
+
+    method: str
+    scene_name: str
+    scene_path: Path
+    fingerprint: str | None
+    seed: int
+    steps: int
 
 
 @dataclass(frozen=True)
@@ -41,9 +63,20 @@ class RunFolder:
         """One folder per checkpoint."""
         return self.path / "checkpoints"
 
+    @property
+    def evaluations(self) -> Path:
+        """One folder per protocol."""
+        return self.path / "eval"
+
     def evaluation(self, protocol: str) -> Path:
         """Folder of the results of a protocol."""
-        return self.path / "eval" / protocol
+        return self.evaluations / protocol
+
+    @property
+    def step(self) -> int:
+        """Steps taken until the newest checkpoint; 0 without one."""
+        found = checkpoints_in_order(self.checkpoints)
+        return checkpoint_step(found[-1]) if found else 0
 
     @classmethod
     def default(cls, scene: str, method: str) -> RunFolder:
@@ -127,7 +160,27 @@ class RunFolder:
             raise InputError(f"cannot read {self.provenance_file}: {error}", "what `coliags train` wrote") from error
         return found
 
-    def log_rows(self, until: int) -> list[dict[str, Any]]:
+    def identity(self) -> RunIdentity:
+        """What the run is.
+
+        Raises:
+            InputError: The provenance file is damaged or lacks some of it.
+        """
+        found = self.provenance()
+        try:
+            scene = found["scene"]
+            return RunIdentity(
+                method=found["method"],
+                scene_name=scene["name"],
+                scene_path=Path(scene["path"]),
+                fingerprint=scene["provenance"].get("fingerprint"),
+                seed=int(found["seed"]),
+                steps=int(found["steps"]),
+            )
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise InputError(f"{self.provenance_file} lacks {error}", "what `coliags train` wrote") from error
+
+    def log_rows(self, until: float = math.inf) -> list[dict[str, Any]]:
         """Rows of the training log up to a step, without lines that a kill cut short; none without a log.
 
         Raises:
@@ -140,6 +193,16 @@ class RunFolder:
         except (OSError, ValueError) as error:
             raise InputError(f"cannot read {self.log_file}: {error}", "what `coliags train` wrote") from error
         return [row for row in map(_log_row, lines) if row and row["step"] <= until]
+
+
+def checkpoints_in_order(folder: Path) -> list[Path]:
+    """The checkpoints of a folder, by their steps."""
+    return sorted((path.parent for path in folder.glob("step-*/state.json")), key=checkpoint_step)
+
+
+def checkpoint_step(checkpoint: Path) -> int:
+    """The step that a checkpoint's folder is named for."""
+    return int(checkpoint.name.split("-")[1])
 
 
 def _log_row(line: str) -> dict[str, Any] | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -41,14 +41,14 @@ class TrainedRun:
     """
 
     run: RunFolder
-    config: MethodConfig
+    config: MethodConfig = field(repr=False)
     method: str
     scene: Scene
-    model: Model
+    model: Model = field(repr=False)
     step: int
     device: torch.device
     seed: int
-    provenance: Mapping[str, Any]
+    provenance: Mapping[str, Any] = field(repr=False)
     cost: TrainingCost | None = None
     lamp: Lamp | None = None
 
@@ -71,22 +71,17 @@ def load_trained(path: Path, device: torch.device, data: Path | None = None) -> 
     """
     run = RunFolder.existing(path)
     config = run.method().config
-    provenance = run.provenance()
-    try:
-        method, recorded = provenance["method"], provenance["scene"]
-        scene_path, fingerprint = recorded["path"], recorded["provenance"].get("fingerprint")
-        seed = int(provenance["seed"])
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{run.provenance_file} lacks {error}", "what `coliags train` wrote") from error
+    identity, provenance = run.identity(), run.provenance()
+    method, folder = identity.method, data or identity.scene_path
     saved = read_checkpoint(latest_checkpoint(run.checkpoints), method, device)
-    scene = load_scene(config, data or Path(scene_path))
-    _check_same_data(scene, fingerprint, data or Path(scene_path))
+    scene = load_scene(config, folder)
+    _check_same_data(scene, identity.fingerprint, folder)
     renderer = choose_renderer(config.renderer, config.field.target.primitive, device).renderer
     model = restore_model(saved, config, scene, renderer).to(device).eval()
-    return TrainedRun(run, config, method, scene, model, saved.step, device, seed, provenance, saved.cost)
+    return TrainedRun(run, config, method, scene, model, saved.step, device, identity.seed, provenance, saved.cost)
 
 
-def _check_same_data(scene: Scene, fingerprint: Any, path: Path) -> None:
+def _check_same_data(scene: Scene, fingerprint: str | None, path: Path) -> None:
     if scene.provenance.get("fingerprint") != fingerprint:
         raise InputError(
             f"{path} is not the data the run was trained on", "the same, unchanged data", "Pass --data SCENE"

@@ -6,6 +6,7 @@ import json
 import logging
 import math
 import signal
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -130,8 +131,12 @@ class Trainer:
         """Time spent in training, all resumptions together."""
         return self.costs.seconds
 
-    def train(self) -> None:
+    def train(self, save_seconds: float = math.inf, keep: int | None = None) -> None:
         """Train to the last step, logging and saving on the way.
+
+        Args:
+            save_seconds: Largest time between two checkpoints, besides those of the schedule.
+            keep: How many checkpoints to keep, the newest; None: all.
 
         Raises:
             InterruptedRunError: Ctrl-C; what was done is saved.
@@ -141,6 +146,7 @@ class Trainer:
         logger.info("%s", self.strategy.plan())
         for name, module in self.model.view_modules.items():
             logger.info("module %s: %s", name, module.untrained_views)
+        saved = time.monotonic()
         with (
             self.costs.running(),
             _deferred_interrupt() as interrupted,
@@ -153,9 +159,13 @@ class Trainer:
                     log.write(json.dumps({**row, "seconds": round(self.seconds, 3)}, allow_nan=False) + "\n")
                     log.flush()
                 progress.update(self.step, f"loss {row['loss']:.4f}, {row['psnr']:.2f} dB")
-                stop = interrupted()
-                if self.step % schedule.checkpoint_every == 0 or self.step == self.steps or stop:
+                stop = interrupted() or self.step == self.steps
+                late = time.monotonic() - saved >= save_seconds
+                if self.step % schedule.checkpoint_every == 0 or stop or late:
                     self.save()
+                    saved = time.monotonic()
+                    if keep is not None:
+                        checkpoints.keep_newest(self.run.checkpoints, keep)
                 if stop and self.step < self.steps:
                     raise InterruptedRunError(
                         f"stopped after step {self.step} of {self.steps}, which is saved; go on with "

@@ -6,7 +6,7 @@ Depth is drawn with viridis and errors with inferno, both perceptually uniform a
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Literal
 
@@ -65,6 +65,17 @@ def colorize_depth(
     return image
 
 
+def depth_limits(depths: Iterable[Float[np.ndarray, "H W"] | Tensor]) -> tuple[float, float]:
+    """From 0 to the largest known depth, rounded up to 10 mm.
+
+    Args:
+        depths: Depth maps, mm; what is not finite is unknown. [H, W] each
+    """
+    known = [array[np.isfinite(array)] for array in map(as_array, depths)]
+    largest = max((float(values.max()) for values in known if values.size), default=0.0)
+    return 0.0, max(10.0, 10.0 * math.ceil(largest / 10.0))
+
+
 def colorize_depth_error(
     rendered_mm: Float[np.ndarray, "H W"] | Tensor,
     true_mm: Float[np.ndarray, "H W"] | Tensor,
@@ -85,7 +96,7 @@ def colorize_depth_error(
         InputError: The shapes differ, or the limit is not positive.
     """
     error, known = depth_error(rendered_mm, true_mm, valid)
-    return _error_colors(error, known, limit_mm)
+    return colorize_error(error, known, limit_mm)
 
 
 def depth_error(
@@ -135,7 +146,27 @@ def colorize_rgb_error(
     error = rgb_error(rendered, true)
     known = np.ones(error.shape, dtype=bool) if valid is None else as_array(valid).astype(bool)
     _same_shape(known, error, "valid")
-    return _error_colors(error, known, limit)
+    return colorize_error(error, known, limit)
+
+
+def colorize_error(
+    error: Float[np.ndarray, "H W"], known: Bool[np.ndarray, "H W"], limit: float
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Colour-mapped error on a fixed scale; pixels without ground truth are hatched in grey.
+
+    Args:
+        error: Not negative; of any value where not known. [H, W]
+        known: Where there is ground truth. [H, W]
+        limit: The error of the last colour; larger errors take it too.
+
+    Raises:
+        InputError: The limit is not positive.
+    """
+    if not (math.isfinite(limit) and limit > 0.0):
+        raise InputError(f"an error scale that ends at {limit}", "a positive number")
+    image = _colored(np.where(known, error, 0.0) / limit, "error")
+    image[~known] = hatch(*known.shape)[~known]
+    return image
 
 
 def rgb_error(rendered: np.ndarray | Tensor, true: np.ndarray | Tensor) -> Float[np.ndarray, "H W"]:
@@ -228,14 +259,6 @@ def hatch(height: int, width: int) -> UInt8[np.ndarray, "H W 3"]:
     stripe = (rows + columns) % _HATCH_PERIOD < _HATCH_WIDTH
     grey = np.where(stripe, HATCH_GREYS[1], HATCH_GREYS[0]).astype(np.uint8)
     return np.repeat(grey[:, :, None], 3, axis=2)
-
-
-def _error_colors(error: np.ndarray, known: np.ndarray, limit: float) -> np.ndarray:
-    if not (math.isfinite(limit) and limit > 0.0):
-        raise InputError(f"an error scale that ends at {limit}", "a positive number")
-    image = _colored(error / limit, "error")
-    image[~known] = hatch(*known.shape)[~known]
-    return image
 
 
 def _colored(fraction: np.ndarray, color_map: ColorMap) -> np.ndarray:

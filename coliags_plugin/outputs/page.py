@@ -21,7 +21,9 @@ _LARGEST_MAPPING = 12
 _ABSOLUTE_PATH = re.compile(r"^(/|~|[A-Za-z]:[\\/]|\\\\|file:)")
 
 
-def write_page(output: Path, title: str, header: str, sections: Iterable[str]) -> None:
+def write_page(
+    output: Path, title: str, header: str, sections: Iterable[str], style: str = "", script: str = ""
+) -> None:
     """Write an HTML page.
 
     Args:
@@ -29,6 +31,8 @@ def write_page(output: Path, title: str, header: str, sections: Iterable[str]) -
         title: Page title, plain text.
         header: HTML of the heading.
         sections: HTML; empty ones are left out.
+        style: CSS, after that of all pages.
+        script: JavaScript, run once the page is there.
 
     Raises:
         InputError: ``output`` is a folder, or cannot be written.
@@ -36,7 +40,9 @@ def write_page(output: Path, title: str, header: str, sections: Iterable[str]) -
     refuse_folder(output)
     page = Template(_TEMPLATE.read_text(encoding="utf-8")).substitute(
         title=escape(title),
+        style=style,
         header=header,
+        script=f"<script>\n{script}</script>" if script else "",
         sections="\n".join(filter(None, sections)),
         footer=f"Written by coliags_plugin {escape(__version__)}.",
     )

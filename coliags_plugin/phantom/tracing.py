@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.open3d_library import import_open3d
 from coliags_plugin.phantom.colon import ColonSurface
 
 
@@ -47,18 +46,9 @@ class Tracer:
     """
 
     def __init__(self, surface: ColonSurface) -> None:
-        try:
-            import open3d
-        except (ImportError, OSError) as error:
-            raise InputError(
-                f"open3d cannot be imported ({error})",
-                "open3d, which traces a phantom's rays",
-                "Install it with `pip install open3d`; on Debian and Ubuntu it also needs the package libusb-1.0-0",
-            ) from error
-        # open3d's type stubs lack some constructors.
-        self._open3d: Any = open3d
+        self._open3d = import_open3d("traces a phantom's rays")
         self._surface = surface
-        self._scene = open3d.t.geometry.RaycastingScene()
+        self._scene = self._open3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(
             self._open3d.core.Tensor(np.ascontiguousarray(surface.vertices, np.float32)),
             self._open3d.core.Tensor(np.ascontiguousarray(surface.triangles, np.uint32)),

@@ -1,33 +1,33 @@
-"""Held-out views of a report: selection, reading, and error maps on a common colour scale."""
+"""The views that a report shows, drawn: images, and errors on one scale for the whole report."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
 
-from coliags_plugin.core.errors import InputError
 from coliags_plugin.outputs.axis_ticks import linear_ticks, round_up
 from coliags_plugin.outputs.colormaps import (
     colorize_depth,
-    colorize_depth_error,
-    colorize_rgb_error,
+    colorize_error,
     depth_error,
     rgb_error,
 )
-from coliags_plugin.outputs.image_files import encode_jpeg, encode_png, read_depth_tiff, read_rgb
-from coliags_plugin.reporting.run_data import EvaluatedRun, FrameMetrics
+from coliags_plugin.outputs.image_files import encode_jpeg, encode_webp
+from coliags_plugin.reporting.study import Cell, Study
+from coliags_plugin.reporting.view_pixels import ViewPixels, read_pixels, reduction
+from coliags_plugin.reporting.view_selection import ChosenFrame, choose_frames
 
-#: Wider images are reduced by an integer factor, to limit the size of the report, px.
-_WIDEST = 640
 #: Percentile of the errors shown at which the common scale ends, before rounding up.
 SCALE_PERCENTILE = 95.0
 _SMALLEST_SCALE = 1e-6
+#: Errors of an image that enter the percentile.
+_SAMPLED = 20_000
+
+ErrorKind = Literal["depth", "rgb"]
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class EncodedImage:
     """An encoded image.
 
     Attributes:
-        mime: ``image/png`` or ``image/jpeg``.
+        mime: For instance ``image/jpeg``.
         data: The file's bytes.
         width: px.
         height: px.
@@ -48,206 +48,157 @@ class EncodedImage:
 
 
 @dataclass(frozen=True)
-class RunView:
-    """Rendering, error map and metrics of one run; ``error`` is None if the run has no depth of the frame."""
+class MethodView:
+    """Rendering and error map of one method; ``error`` is None where there is no depth to compare."""
 
+    cell: Cell
     render: EncodedImage
     error: EncodedImage | None
-    metrics: FrameMetrics
 
 
 @dataclass(frozen=True)
 class View:
-    """One held-out frame: ground truth and every run's rendering; ``depth`` is None if the data have none."""
+    """One frame: truth, its depth where it has one, and the methods' renderings."""
 
-    set_name: str
-    frame: str
-    position: int
-    frames_in_set: int
+    frame: ChosenFrame
+    error_kind: ErrorKind
     truth: EncodedImage
     depth: EncodedImage | None
-    runs: Sequence[RunView]
+    methods: Sequence[MethodView]
 
 
 @dataclass(frozen=True)
-class Views:
-    """The views of a report and the scales they share.
+class Scales:
+    """Colour scales that all views share.
 
     Attributes:
-        views: In the order of the sets and the video.
-        size: Width and height of the evaluated images, px.
-        reduction: Integer factor by which the images are reduced.
-        error_kind: Whether the error maps show depth or colour errors.
-        error_limit: Upper end of the common error scale: mm for depth, levels of 255 for colour.
-        depth_limits: Range of the common scale of the true depth, mm; None without depth.
+        depth_error: Upper end, mm; None where no depth is compared.
+        rgb_error: Upper end, levels of 255; None where depth is compared everywhere.
+        depth: Range of the true depth, mm; None without depth.
+        reduction: Largest integer factor by which images are reduced.
     """
 
-    views: Sequence[View]
-    size: tuple[int, int]
+    depth_error: float | None
+    rgb_error: float | None
+    depth: tuple[float, float] | None
     reduction: int
-    error_kind: Literal["depth", "rgb"]
-    error_limit: float
-    depth_limits: tuple[float, float] | None
 
 
 @dataclass(frozen=True)
-class _Pixels:
-    """Pixels of a selected frame, reduced. Depths are in mm."""
+class _ReadView:
+    """A frame as read, its errors not coloured yet: NaN where the truth is unknown."""
 
-    set_name: str
-    position: int
-    truth: np.ndarray
+    frame: ChosenFrame
+    error_kind: ErrorKind
+    truth: EncodedImage
     true_depth: np.ndarray | None
-    renders: list[np.ndarray]
-    depths: list[np.ndarray | None]
+    cells: Sequence[Cell]
+    renders: Sequence[EncodedImage]
+    errors: Sequence[np.ndarray | None]
 
 
-def read_views(runs: Sequence[EvaluatedRun], count: int) -> Views:
-    """Select frames evenly over every test set, first and last included, and draw them.
+class Views:
+    """Views of a study: read at once, for the common scales; drawn one by one.
 
     Args:
-        runs: Runs evaluated on the same frames.
-        count: Frames per set; all of a smaller set.
+        study: The results; those without run folders are left out.
+        reference: Method whose worst frames are shown.
+        count: Evenly spread frames per scene and set.
 
     Raises:
-        InputError: ``count`` is not positive; or an image is missing, damaged, or not of the ground truth's size.
+        InputError: ``count`` is not positive, or an image is missing, damaged or of another size.
     """
-    if count < 1:
-        raise InputError(f"{count} frames to show", "at least one")
-    first = runs[0]
-    chosen = [
-        (set_name, position) for set_name, frames in first.per_frame.items() for position in evenly(len(frames), count)
-    ]
-    pixels: list[_Pixels] = []
-    size = (0, 0)
-    reduction = 1
-    for set_name, position in chosen:
-        truth = _read(read_rgb, first, "truth", set_name, position, ".png")
-        if not pixels:
-            size = (truth.shape[1], truth.shape[0])
-            reduction = math.ceil(truth.shape[1] / _WIDEST)
-        pixels.append(_read_pixels(runs, set_name, position, truth, reduction))
-    with_depth = [frame for frame in pixels if frame.true_depth is not None]
-    kind: Literal["depth", "rgb"] = "depth" if any(d is not None for f in with_depth for d in f.depths) else "rgb"
-    limit = error_limit(_errors(pixels, kind))
-    depth_limits = _depth_limits(with_depth)
-    return Views(
-        views=[_draw(frame, runs, kind, limit, depth_limits) for frame in pixels],
-        size=size,
-        reduction=reduction,
+
+    def __init__(self, study: Study, reference: str, count: int) -> None:
+        chosen = [(frame, _runs_with_images(study, frame)) for frame in choose_frames(study, reference, count)]
+        self._read = [_read_view(frame, runs) for frame, runs in chosen if runs]
+        self.scales = Scales(
+            depth_error=self._limit("depth"),
+            rgb_error=self._limit("rgb"),
+            depth=_depth_limits(view.true_depth for view in self._read if view.true_depth is not None),
+            reduction=max((reduction(view.cells[0].result.scene.size[0]) for view in self._read), default=1),
+        )
+
+    @property
+    def figures(self) -> int:
+        """Number of figures: the truth and every method of each view."""
+        return sum(1 + len(view.cells) for view in self._read)
+
+    def drawn(self) -> Iterable[View]:
+        """The views in the order of scenes, sets and video."""
+        return map(self._draw, self._read)
+
+    def _limit(self, kind: ErrorKind) -> float | None:
+        views = [view for view in self._read if view.error_kind == kind]
+        return error_limit([error for view in views for error in view.errors if error is not None]) if views else None
+
+    def _draw(self, view: _ReadView) -> View:
+        limit = self.scales.depth_error if view.error_kind == "depth" else self.scales.rgb_error
+        errors = [
+            None if error is None else _webp(colorize_error(error, ~np.isnan(error), limit or 1.0))
+            for error in view.errors
+        ]
+        methods = [MethodView(*each) for each in zip(view.cells, view.renders, errors, strict=True)]
+        depth = None
+        if view.true_depth is not None and self.scales.depth is not None:
+            depth = _webp(colorize_depth(view.true_depth, self.scales.depth))
+        return View(view.frame, view.error_kind, view.truth, depth, methods)
+
+
+def _read_view(frame: ChosenFrame, runs: Sequence[Cell]) -> _ReadView:
+    pixels = read_pixels(frame, runs)
+    kind: ErrorKind = "depth" if any(depth is not None for depth in pixels.depths) else "rgb"
+    return _ReadView(
+        frame=frame,
         error_kind=kind,
-        error_limit=limit,
-        depth_limits=depth_limits,
+        truth=_jpeg(pixels.truth),
+        true_depth=pixels.true_depth,
+        cells=runs,
+        renders=[_jpeg(render) for render in pixels.renders],
+        errors=_depth_errors(pixels) if kind == "depth" else _rgb_errors(pixels),
     )
 
 
-def evenly(length: int, count: int) -> list[int]:
-    """``count`` evenly spaced indices below ``length``, first and last included; the middle one if ``count`` is 1."""
-    if count >= length:
-        return list(range(length))
-    if count == 1:
-        return [length // 2]
-    return [round(index * (length - 1) / (count - 1)) for index in range(count)]
+def _depth_errors(pixels: ViewPixels) -> list[np.ndarray | None]:
+    """Absolute errors, mm."""
+    errors: list[np.ndarray | None] = []
+    for depth in pixels.depths:
+        if depth is None or pixels.true_depth is None:
+            errors.append(None)
+            continue
+        error, known = depth_error(depth, pixels.true_depth)
+        errors.append(np.where(known, error, np.nan).astype(np.float32))
+    return errors
+
+
+def _rgb_errors(pixels: ViewPixels) -> list[np.ndarray | None]:
+    """Absolute errors, levels of 255."""
+    return [(rgb_error(render, pixels.truth) * 255.0).astype(np.float32) for render in pixels.renders]
+
+
+def _runs_with_images(study: Study, frame: ChosenFrame) -> list[Cell]:
+    """One run of every method: that of the first seed with images."""
+    by_method = ([cell for cell in study.runs(frame.part, frame.scene, m) if cell.run] for m in study.methods)
+    return [runs[0] for runs in by_method if runs]
 
 
 def error_limit(errors: Sequence[np.ndarray]) -> float:
     """The 95th percentile of all finite errors together, rounded up to 1, 2 or 5 times a power of ten."""
-    pooled = np.concatenate([values.ravel() for values in errors]) if errors else np.zeros(0)
+    pooled = np.concatenate([_sampled(values.ravel()) for values in errors]) if errors else np.zeros(0)
     finite = pooled[np.isfinite(pooled)]
     return round_up(max(float(np.percentile(finite, SCALE_PERCENTILE)), _SMALLEST_SCALE)) if finite.size else 1.0
 
 
-def _read_pixels(
-    runs: Sequence[EvaluatedRun], set_name: str, position: int, truth: np.ndarray, reduction: int
-) -> _Pixels:
-    shape = truth.shape[:2]
-    renders = [_read(read_rgb, run, "renders", set_name, position, ".png", shape) for run in runs]
-    truths = (_read_if_there(run, "true_depth", set_name, position, shape) for run in runs)
-    true_depth = next((depth for depth in truths if depth is not None), None)
-    depths: list[np.ndarray | None] = [None] * len(runs)
-    if true_depth is not None:
-        depths = [_read_if_there(run, "depth", set_name, position, shape) for run in runs]
-    return _Pixels(
-        set_name,
-        position,
-        _reduced_rgb(truth, reduction),
-        None if true_depth is None else _reduced_map(true_depth, reduction),
-        [_reduced_rgb(render, reduction) for render in renders],
-        [None if depth is None else _reduced_map(depth, reduction) for depth in depths],
-    )
+def _sampled(values: np.ndarray) -> np.ndarray:
+    return values[:: math.ceil(values.size / _SAMPLED) or 1]
 
 
-def _path(run: EvaluatedRun, kind: str, set_name: str, position: int, suffix: str) -> Path:
-    return run.evaluation / kind / set_name / f"{run.per_frame[set_name][position].name}{suffix}"
-
-
-def _read(
-    reader: Callable[[Path], np.ndarray],
-    run: EvaluatedRun,
-    kind: str,
-    set_name: str,
-    position: int,
-    suffix: str,
-    shape: tuple[int, ...] | None = None,
-) -> np.ndarray:
-    path = _path(run, kind, set_name, position, suffix)
-    if not path.is_file():
-        raise InputError(
-            f"{path} is missing, though per_frame.csv lists its frame",
-            "a complete evaluation",
-            f"Run `coliags eval {run.folder} --protocol {run.evaluation.name} --overwrite` again",
-        )
-    pixels = reader(path)
-    if shape is not None and pixels.shape[:2] != shape:
-        raise InputError(
-            f"{path} is {pixels.shape[1]} x {pixels.shape[0]} px", f"{shape[1]} x {shape[0]} px, as the true image"
-        )
-    return pixels
-
-
-def _read_if_there(
-    run: EvaluatedRun, kind: str, set_name: str, position: int, shape: tuple[int, ...]
-) -> np.ndarray | None:
-    if not _path(run, kind, set_name, position, ".tiff").is_file():
+def _depth_limits(depths: Iterable[np.ndarray]) -> tuple[float, float] | None:
+    """Range of the depths shown, widened to the next ticks."""
+    finite = [own for depth in depths if (own := depth[np.isfinite(depth)]).size]
+    if not finite:
         return None
-    return _read(read_depth_tiff, run, kind, set_name, position, ".tiff", shape)
-
-
-def _reduced_rgb(rgb: np.ndarray, reduction: int) -> np.ndarray:
-    if reduction == 1:
-        return rgb
-    height, width = rgb.shape[0] // reduction, rgb.shape[1] // reduction
-    whole = np.ascontiguousarray(rgb[: height * reduction, : width * reduction])
-    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA))
-
-
-def _reduced_map(values: np.ndarray, reduction: int) -> np.ndarray:
-    """Subsampled map: averaging across an edge would mix depths of different surfaces."""
-    height, width = values.shape[0] // reduction, values.shape[1] // reduction
-    middle = reduction // 2
-    return values[middle::reduction, middle::reduction][:height, :width]
-
-
-def _errors(pixels: Iterable[_Pixels], kind: Literal["depth", "rgb"]) -> list[np.ndarray]:
-    errors = []
-    for frame in pixels:
-        if kind == "rgb":
-            errors += [rgb_error(render, frame.truth) * 255.0 for render in frame.renders]
-        elif frame.true_depth is not None:
-            for depth in frame.depths:
-                if depth is not None:
-                    error, known = depth_error(depth, frame.true_depth)
-                    errors.append(error[known])
-    return errors
-
-
-def _depth_limits(frames: Sequence[_Pixels]) -> tuple[float, float] | None:
-    """Range of the true depths shown, widened to the next ticks."""
-    finite = [depth[np.isfinite(depth)] for frame in frames if (depth := frame.true_depth) is not None]
-    values = np.concatenate(finite) if finite else np.zeros(0)
-    if not values.size:
-        return None
-    low, high = float(values.min()), float(values.max())
+    low, high = min(float(own.min()) for own in finite), max(float(own.max()) for own in finite)
     if low == high:
         low, high = low - 0.5, high + 0.5
     ticks = linear_ticks(low, high)
@@ -255,33 +206,9 @@ def _depth_limits(frames: Sequence[_Pixels]) -> tuple[float, float] | None:
     return math.floor(low / step) * step, math.ceil(high / step) * step
 
 
-def _draw(
-    frame: _Pixels,
-    runs: Sequence[EvaluatedRun],
-    kind: Literal["depth", "rgb"],
-    limit: float,
-    depth_limits: tuple[float, float] | None,
-) -> View:
-    drawn = []
-    for run, render, depth in zip(runs, frame.renders, frame.depths, strict=True):
-        error = None
-        if kind == "rgb":
-            error = _png(colorize_rgb_error(render, frame.truth, limit=limit / 255.0))
-        elif depth is not None and frame.true_depth is not None:
-            error = _png(colorize_depth_error(depth, frame.true_depth, None, limit))
-        drawn.append(RunView(_jpeg(render), error, run.per_frame[frame.set_name][frame.position]))
-    in_set = runs[0].per_frame[frame.set_name]
-    true_depth = None
-    if frame.true_depth is not None and depth_limits is not None:
-        true_depth = _png(colorize_depth(frame.true_depth, depth_limits))
-    return View(
-        frame.set_name, in_set[frame.position].name, frame.position, len(in_set), _jpeg(frame.truth), true_depth, drawn
-    )
-
-
-def _png(rgb: np.ndarray) -> EncodedImage:
-    return EncodedImage("image/png", encode_png(rgb), rgb.shape[1], rgb.shape[0])
-
-
 def _jpeg(rgb: np.ndarray) -> EncodedImage:
     return EncodedImage("image/jpeg", encode_jpeg(rgb), rgb.shape[1], rgb.shape[0])
+
+
+def _webp(rgb: np.ndarray) -> EncodedImage:
+    return EncodedImage("image/webp", encode_webp(rgb), rgb.shape[1], rgb.shape[0])

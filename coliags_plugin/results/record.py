@@ -11,6 +11,9 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, model_validator
 from typing_extensions import Self
 
+from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.results.display import Table, Value, value_text
+
 #: Of the schema below; incremented whenever a reader of the older version would misread a newer file.
 VERSION = 1
 #: The split's own test set.
@@ -203,3 +206,61 @@ class Result(_Part):
     def main_set(self) -> str:
         """Name of the split's own test set; of the first one where it has none."""
         return MAIN_SET if MAIN_SET in self.sets else next(iter(self.sets))
+
+    def mean(self, metric: str, set_name: str | None = None) -> float | None:
+        """Mean of a metric over the frames of a test set that have it; None where none has.
+
+        Args:
+            metric: Its name.
+            set_name: Name of the test set; None: the main one.
+
+        Raises:
+            InputError: There is no such metric or test set.
+        """
+        chosen = self.main_set if set_name is None else set_name
+        for kind, name, known in (("metric", metric, self.metrics), ("test set", chosen, self.sets)):
+            if name not in known:
+                raise InputError(
+                    f"no {kind} '{name}' in a result of protocol {self.protocol.name}",
+                    f"one of {', '.join(known)}",
+                    did_you_mean(name, known),
+                )
+        return self.sets[chosen].mean(metric)
+
+    @property
+    def title(self) -> str:
+        """What was evaluated and how, in one line."""
+        return (
+            f"{self.method} on {self.scene.name}, seed {self.seed}, {self.steps} steps, "
+            f"protocol {self.protocol.name} v{self.protocol.version}"
+        )
+
+    def table(self) -> Table:
+        """Means of every metric over every test set, with the reasons of those that are missing."""
+        rows: list[dict[str, Value]] = [
+            {"metric": name, "unit": metric.unit, **{key: part.mean(name) for key, part in self.sets.items()}}
+            for name, metric in self.metrics.items()
+        ]
+        reasons = {name: reason for part in self.sets.values() for name, reason in part.reasons.items()}
+        without = {each: [name for name in reasons if reasons[name] == each] for each in reasons.values()}
+        return Table(
+            self.title,
+            ("metric", "unit", *self.sets),
+            rows,
+            {key: f"{key} ({len(part.frames)} frames)" for key, part in self.sets.items()},
+            [f"{', '.join(names)}: {reason}" for reason, names in without.items()],
+        )
+
+    def __repr__(self) -> str:
+        """The title with the means of the main test set."""
+        own = {name: metric.unit for name, metric in self.metrics.items() if not name.endswith(SEEN_SUFFIX)}
+        known = [f"{name} {value_text(mean)} {own[name]}" for name in own if (mean := self.mean(name)) is not None]
+        return f"{self.title}: {', '.join(text.strip() for text in known) or 'no values'}"
+
+    def __str__(self) -> str:
+        """The table."""
+        return str(self.table())
+
+    def _repr_html_(self) -> str:
+        """The table, for notebooks."""
+        return self.table()._repr_html_()

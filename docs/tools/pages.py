@@ -1,4 +1,4 @@
-"""Pages of the site that are not in docs/: README, CONTRIBUTING, CHANGELOG, and a reference page for every module."""
+"""Pages of the site that are not Markdown in docs/: those of the root, notebooks, and a reference of every module."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import notebooks  # of this folder
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parents[2]
@@ -30,9 +31,17 @@ def on_files(files: Files, config: Any, **_: Any) -> Files:
     for page, name in FROM_ROOT.items():
         files.append(File.generated(config, page, content=for_site((ROOT / name).read_text(encoding="utf-8"))))
     files.append(File.generated(config, "site.css", content=STYLE))
+    for path in sorted(notebooks.NOTEBOOKS.glob("*.ipynb")):
+        page = f"notebooks/{path.stem}.md"
+        files.append(File.generated(config, page, content=notebooks.as_markdown(path)))
     for page, content in reference():
         files.append(File.generated(config, page, content=content))
     return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Called by mkdocs for each page: links to notebooks lead to their pages."""
+    return re.sub(r"\.ipynb\)", ".md)", markdown)
 
 
 def for_site(text: str) -> str:

@@ -65,6 +65,7 @@ def test_auto_passes_on_what_was_set(wall):
     auto = make_component("datamanagers", {"name": "auto", "points_count": 77})
     scene = auto.target(auto.settings).load(wall)
     assert scene.provenance["dataset"] == "c3vd" and len(scene.points) == 77
+    assert auto.target(auto.settings).fingerprint(wall) == scene.provenance["fingerprint"]
 
 
 def test_options_of_the_folders_own_format_may_be_set(wall):
@@ -76,6 +77,22 @@ def test_options_of_the_folders_own_format_may_be_set(wall):
     assert named.config.datamanager.name == "c3vd"
     with pytest.raises(InputError, match="Did you mean 'c3vd'"):
         load_method_for(wall, "coliags", [], "c3dv")
+
+
+@pytest.mark.parametrize("data_format", [None, "c3vd"])
+def test_options_of_the_method_are_kept_when_the_format_is_recognised(wall, data_format):
+    method = load_method_for(wall, "3dgs", [], data_format)
+    assert method.config.datamanager.name == "c3vd"
+    assert method.config.datamanager.settings.points_count == 50_000
+    assert "points_count: 50000  # 3dgs.yaml:7" in method.with_origins()
+
+
+def test_options_for_another_format_are_dropped(wall, tmp_path):
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("base: 3dgs\ndatamanager: {name: rotatecolon, points_count: 9}\n")
+    kept, dropped = (load_method_for(wall, str(mine), [], name) for name in (None, "c3vd"))
+    assert (kept.config.datamanager.name, kept.config.datamanager.settings.points_count) == ("rotatecolon", 9)
+    assert (dropped.config.datamanager.name, dropped.config.datamanager.settings.points_count) == ("c3vd", 200_000)
 
 
 def test_options_without_a_method(wall):

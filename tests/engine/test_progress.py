@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import pytest
+from rich.console import Console
 
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.engine import progress as module
 from coliags_plugin.engine.data_formats import load_scene
 from coliags_plugin.engine.progress import progress_callback
+from coliags_plugin.engine.progress_displays import open_display
 from tests.scenes import write_wall
 
 
@@ -53,3 +55,33 @@ def test_reading_a_small_scene_says_nothing(tmp_path, capsys):
     config = load_method("coliags", ["datamanager.name=c3vd"]).config
     assert load_scene(config, write_wall(tmp_path / "wall")).train
     assert capsys.readouterr().err == ""
+
+
+class Shown:
+    """In place of a notebook: what it shows at last, and how often it changed."""
+
+    def __init__(self):
+        self.text, self.changes = "", 0
+
+    def __call__(self, data, raw, display_id):
+        assert raw and display_id
+        return self.update(data, raw)
+
+    def update(self, data, raw):
+        assert raw and data.keys() == {"text/plain"}
+        self.text, self.changes = data["text/plain"], self.changes + 1
+        return self
+
+
+def test_a_notebook_shows_one_line_that_changes(clock, monkeypatch, capsys):
+    shown = Shown()
+    monkeypatch.setattr("IPython.display.display", shown)
+    console = Console(force_jupyter=True)
+    display = open_display(console, "train", 1000, 0)
+    for done in range(1, 1001):
+        clock[0] += 0.01
+        display.update(done, f"loss {done}")
+    display.close()
+    assert shown.text == "train 1000/1000, took 10 s  loss 1000"
+    assert 15 <= shown.changes <= 22  # two a second
+    assert capsys.readouterr() == ("", "")

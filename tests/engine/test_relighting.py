@@ -15,7 +15,6 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.lamps import Lamp
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.engine.checkpoints import latest_checkpoint, read_checkpoint
-from coliags_plugin.engine.relighting import read_lamp
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer
 from coliags_plugin.outputs.image_files import read_rgb
@@ -135,25 +134,26 @@ def test_resume_is_bit_exact_with_noise_and_growth(tmp_path):
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     scene = write_wall(tmp_path_factory.mktemp("data") / "wall")
-    overrides = ["datamanager.points_count=2000", "schedule.steps=5", "schedule.written_for=5"]
+    settings = {"datamanager.points_count": 2000, "schedule.written_for": 5, "losses.diffuse-factor": None}
     output = tmp_path_factory.mktemp("runs") / "run"
-    return coliags_plugin.train("pr-endo", scene, output, overrides=[*overrides, "losses.diffuse-factor=null"])
+    return coliags_plugin.train("pr-endo", scene, output, steps=5, settings=settings).path
 
 
 def test_a_relit_run_renders_the_field_under_that_lamp(trained):
-    loaded = coliags_plugin.load_run(trained)
+    run = coliags_plugin.load_run(trained)
+    loaded = run.load()
     camera = loaded.scene.train[0].camera
     before = loaded.model.render(camera).rgb
-    relit = coliags_plugin.relight(loaded, offset=(4.0, 0.0, 0.0), power=8.0)
-    assert relit.lamp == Lamp(offset=(4.0, 0.0, 0.0), power=8.0)
-    after = relit.model.render(camera).rgb
+    relit = run.relight(offset=(4.0, 0.0, 0.0), power=8.0)
+    assert relit.load().lamp == Lamp(offset=(4.0, 0.0, 0.0), power=8.0)
+    after = relit.load().model.render(camera).rgb
     assert not torch.allclose(before, after, atol=0.02)
     assert after.mean() < before.mean()
     assert torch.equal(loaded.model.render(camera).rgb, before)
-    dark = coliags_plugin.relight(loaded, intensity=0.0).model.render(camera).rgb
+    dark = run.relight(intensity=0.0).load().model.render(camera).rgb
     assert dark.max() < 0.01
     with pytest.raises(InputError, match="relit run"):
-        coliags_plugin.evaluate(relit)
+        relit.evaluate()
 
 
 def test_render_under_another_lamp_says_which(trained, tmp_path):
@@ -190,12 +190,11 @@ def test_bad_options_are_one_message(trained, capsys, options, words):
 
 def test_a_method_without_a_lamp_is_refused_and_the_fields_with_one_are_listed(tmp_path):
     scene = write_wall(tmp_path / "wall")
-    overrides = ["datamanager.points_count=500", "schedule.steps=2"]
-    plain = coliags_plugin.load_run(coliags_plugin.train("3dgs", scene, tmp_path / "run", overrides=overrides))
+    settings = {"datamanager.points_count": 500}
+    plain = coliags_plugin.train("3dgs", scene, tmp_path / "run", steps=2, settings=settings)
     with pytest.raises(InputError, match=r"'3dgs', whose field 'gaussians'.*fields: lit-gaussians"):
-        coliags_plugin.relight(plain, power=3.0)
+        plain.relight(power=3.0)
 
 
-def test_options_of_a_lamp_are_read_in_order():
-    assert read_lamp(["power=3", "power=4", "offset=[1,2,3]"]) == Lamp(power=4.0, offset=(1.0, 2.0, 3.0))
-    assert read_lamp([]) == Lamp() and Lamp().at_camera
+def test_a_lamp_is_at_the_camera_unless_told_otherwise():
+    assert Lamp().at_camera and not Lamp(offset=(1.0, 0.0, 0.0)).at_camera

@@ -12,7 +12,7 @@ import torch
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.errors import InputError, InterruptedRunError, NotFiniteError
 from coliags_plugin.engine import trainer as trainer_module
-from coliags_plugin.engine.checkpoints import latest_checkpoint, read_checkpoint
+from coliags_plugin.engine.checkpoints import latest_checkpoint, newest_checkpoint, read_checkpoint, set_damaged_aside
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer
 from tests.scenes import SMALL, wall_scene
@@ -262,6 +262,34 @@ def test_nan_parameters_are_found_in_the_next_step_and_never_saved(tmp_path):
         trainer.save()
     assert [path.name for path in trainer.run.checkpoints.iterdir()] == ["step-000001"]
     assert latest_checkpoint(trainer.run.checkpoints).name == "step-000001"
+
+
+def test_checkpoints_by_the_clock_and_how_many_are_kept(tmp_path):
+    trainer = make_trainer(tmp_path / "run", steps=6, overrides=["schedule.checkpoint_every=100"])
+    trainer.start()
+    trainer.train(save_seconds=0.0, keep=2)
+    assert sorted(path.name for path in trainer.run.checkpoints.iterdir()) == ["step-000005", "step-000006"]
+    other = make_trainer(tmp_path / "other", steps=6, overrides=["schedule.checkpoint_every=2"])
+    other.start()
+    other.train(save_seconds=3600.0)
+    assert len(list(other.run.checkpoints.iterdir())) == 3
+
+
+def test_damaged_checkpoints_are_set_aside_for_the_one_before(tmp_path):
+    trainer = make_trainer(tmp_path / "run", steps=6, overrides=["schedule.checkpoint_every=2"])
+    trainer.start()
+    trainer.train()
+    folder = trainer.run.checkpoints
+    assert set_damaged_aside(folder, "coliags") == 6
+    (folder / "step-000006" / "state.safetensors").write_bytes(b"")
+    (folder / "step-000004" / "state.json").write_text("{")
+    assert set_damaged_aside(folder, "coliags") == 2
+    assert newest_checkpoint(folder).name == "step-000002"
+    assert sorted(path.name.rsplit("-", 1)[0] for path in folder.glob("damaged-*")) == [
+        "damaged-step-000004",
+        "damaged-step-000006",
+    ]
+    assert set_damaged_aside(tmp_path / "none", "coliags") == 0
 
 
 def test_optimizer_groups_must_be_the_fields(tmp_path):

@@ -11,6 +11,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.outputs.image_files import (
     encode_jpeg,
     encode_png,
+    encode_webp,
     read_depth_tiff,
     read_rgb,
     write_depth_tiff,
@@ -94,3 +95,12 @@ def test_nothing_is_converted_on_reading(tmp_path, rgb):
 def test_png_is_eight_bit_rgb(rgb):
     width, height, bits, kind = struct.unpack(">IIBB", encode_png(rgb)[16:26])
     assert (width, height, bits, kind) == (5, 7, 8, 2)
+
+
+def test_webp_loses_nothing():
+    rgb = np.random.default_rng(0).integers(0, 256, (13, 17, 3), dtype=np.uint8)
+    data = encode_webp(rgb)
+    assert data[:4] == b"RIFF" and data[8:12] == b"WEBP"
+    assert (cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1] == rgb).all()
+    with pytest.raises(InputError, match="8-bit RGB"):
+        encode_webp(rgb[..., 0])

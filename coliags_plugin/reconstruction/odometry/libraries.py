@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.open3d_library import import_open3d
 
 
 @contextmanager
@@ -18,15 +18,7 @@ def deterministic_open3d() -> Iterator[Any]:
     Raises:
         InputError: open3d cannot be imported.
     """
-    try:
-        import open3d
-    except (ImportError, OSError) as error:
-        raise InputError(
-            f"open3d cannot be imported ({error})",
-            "open3d, which registers frames and optimises the pose graph",
-            "Install it with `pip install open3d`; on Debian and Ubuntu it also needs the package libusb-1.0-0",
-        ) from error
-    library: Any = open3d
+    library = import_open3d("registers frames and optimises the pose graph")
     can_limit = hasattr(library.utility, "set_max_threads")
     threads = library.utility.get_max_threads() if can_limit else 0
     if can_limit:

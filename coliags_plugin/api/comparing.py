@@ -1,0 +1,109 @@
+"""Comparison of methods over scenes in one call."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from coliags_plugin.config.assignments import assignments
+
+if TYPE_CHECKING:
+    from coliags_plugin.comparison.cells import Variant
+    from coliags_plugin.comparison.compare import Comparison
+
+
+def compare(
+    methods: str | Variant | Sequence[str | Variant],
+    scenes: str | Path | Sequence[str | Path],
+    output: str | Path = "comparison",
+    *,
+    data: str | Path | None = None,
+    seeds: int = 1,
+    protocol: str = "paper",
+    splits: Sequence[str] = (),
+    steps: int | None = None,
+    settings: Mapping[str, Any] | None = None,
+    jobs: int | None = None,
+    threads: int | None = None,
+    device: str = "auto",
+    executor: str = "local",
+    ray_address: str | None = None,
+    retries: int = 2,
+) -> Comparison:
+    """Train and evaluate methods on scenes: what is missing is run, what is done is kept.
+
+    Args:
+        methods: Names of methods, paths of method configs, or variants (:func:`variant`).
+        scenes: Benchmarks, ``BENCHMARK/SCENE``, paths of benchmark files, or folders of scenes.
+        output: Folder of the comparison; one that is there is extended.
+        data: Folder of the benchmark's scenes; None: ``scenes/BENCHMARK``.
+        seeds: Runs of every method on every scene, with the seeds 0, 1, ...
+        protocol: Name of the evaluation protocol.
+        splits: Splits, each trained apart; empty: each scene's own.
+        steps: Training steps of all runs; None: each method's own.
+        settings: Changes of all method configs, see :func:`~coliags_plugin.api.training.train`.
+        jobs: Runs at a time; None: one per CPU, or per GPU.
+        threads: CPU threads of each run; None: the CPUs divided by the runs at a time.
+        device: ``auto``, ``cpu`` or ``cuda``.
+        executor: Where runs are processes: ``local``, or ``ray`` for a Ray cluster.
+        ray_address: ``HOST:PORT`` of the cluster's head; None: ``RAY_ADDRESS``, or the cluster of this machine.
+        retries: How often a run is resumed whose process was killed or crashed.
+
+    Raises:
+        InputError: Methods, scenes or options are not valid or not there, the folder cannot be used, or the disk is
+            too small; nothing was run.
+        InterruptedRunError: Ctrl-C; all runs are saved, and the same call goes on with them.
+    """
+    from coliags_plugin.comparison.cells import Variant
+    from coliags_plugin.comparison.compare import How
+    from coliags_plugin.comparison.compare import compare as compare_methods
+
+    return compare_methods(
+        [methods] if isinstance(methods, (str, Variant)) else methods,
+        [scenes] if isinstance(scenes, (str, Path)) else scenes,
+        output,
+        data=data,
+        seeds=seeds,
+        protocol=protocol,
+        splits=splits,
+        steps=steps,
+        overrides=assignments(settings),
+        how=How(jobs, threads, device, executor, ray_address, retries),
+    )
+
+
+def ablate(
+    file: str | Path, scenes: str | Path | Sequence[str | Path], output: str | Path = "ablation", **options: Any
+) -> Comparison:
+    """Compare the variants of methods that a file names.
+
+    Args:
+        file: Name of an ablation, or path of a YAML file.
+        scenes: See :func:`compare`.
+        output: See :func:`compare`.
+        options: See :func:`compare`.
+
+    Raises:
+        InputError: See :func:`compare`; or there is no such file, or it is not valid.
+        InterruptedRunError: See :func:`compare`.
+    """
+    from coliags_plugin.comparison.ablations import load_ablation
+
+    return compare(load_ablation(str(file)), scenes, output, **options)
+
+
+def variant(name: str, method: str, settings: Mapping[str, Any]) -> Variant:
+    """A method with changes, under a name of its own.
+
+    Args:
+        name: In tables and file names.
+        method: Name of a method or path of a method config.
+        settings: Changes of the method config, see :func:`~coliags_plugin.api.training.train`.
+
+    Raises:
+        InputError: These are no settings.
+    """
+    from coliags_plugin.comparison.cells import Variant
+
+    return Variant(name, method, assignments(settings))

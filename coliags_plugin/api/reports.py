@@ -1,0 +1,65 @@
+"""Reports in one call."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from coliags_plugin.api.runs import Run
+from coliags_plugin.core.errors import InputError, did_you_mean
+
+if TYPE_CHECKING:
+    from coliags_plugin.comparison.compare import Comparison
+
+#: What a report can be written as.
+Format = Literal["html", "markdown", "latex", "csv"]
+
+
+def report(
+    of: Run | Comparison | str | Path | Sequence[Run | Comparison | str | Path],
+    output: str | Path | None = None,
+    *,
+    formats: Format | Sequence[Format] = "html",
+    columns: Sequence[str] = (),
+    reference: str | None = None,
+    protocol: str = "paper",
+    frames: int = 4,
+    title: str | None = None,
+    note: str | None = None,
+) -> list[Path]:
+    """Write a report of evaluated methods: tables with statistics, held-out views, errors, curves and costs.
+
+    Args:
+        of: Runs, comparisons, or paths of run folders, results files and folders of comparisons.
+        output: File to write; with several formats, its suffix is that of each. None: ``report.html``, ``.md``, ...
+        formats: What to write; CSV has every metric of every frame.
+        columns: Metrics to show; empty: the default ones.
+        reference: Method that the others are compared with; None: ``coliags``, or the best where it is not there.
+        protocol: Evaluation protocol to read.
+        frames: Held-out frames to show per scene and test set; the worst ones are added.
+        title: Heading; None: methods and scenes.
+        note: A remark shown at the top.
+
+    Returns:
+        The files.
+
+    Raises:
+        InputError: A result is missing, damaged or not comparable with the others, a choice is not possible, or a file
+            cannot be written.
+    """
+    from coliags_plugin.comparison.compare import Comparison
+    from coliags_plugin.reporting.content import Choices
+    from coliags_plugin.reporting.report import SUFFIXES, write_report
+
+    parts = [of] if isinstance(of, (Run, Comparison, str, Path)) else of
+    paths = [
+        part.path if isinstance(part, Run) else part.folder if isinstance(part, Comparison) else Path(part)
+        for part in parts
+    ]
+    wanted: Sequence[Format] = (formats,) if isinstance(formats, str) else formats
+    for each in wanted:
+        if each not in SUFFIXES:
+            raise InputError(f"no format '{each}'", f"one of {', '.join(SUFFIXES)}", did_you_mean(each, SUFFIXES))
+    file = Path(f"report{SUFFIXES[wanted[0]]}") if output is None else Path(output)
+    return write_report(paths, file, wanted, Choices(columns, reference, title, note), protocol, frames)

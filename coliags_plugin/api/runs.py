@@ -1,0 +1,216 @@
+"""Handles of runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from coliags_plugin.engine.run_folder import RunFolder
+
+if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import Float
+
+    from coliags_plugin.api.views import View
+    from coliags_plugin.config.method_config import MethodConfig
+    from coliags_plugin.core.cameras import Camera
+    from coliags_plugin.engine.trained import TrainedRun
+    from coliags_plugin.results.record import Result
+
+
+class Run:
+    """A run folder. Scene and model are loaded when something is computed, everything else is read when asked for.
+
+    Args:
+        path: The run folder.
+        data: The scene's folder, where it has moved since training.
+        device: ``auto``, ``cpu`` or ``cuda``.
+
+    Raises:
+        InputError: This is no run folder, or a file of it is damaged.
+    """
+
+    def __init__(self, path: str | Path, *, data: str | Path | None = None, device: str = "auto") -> None:
+        self.folder = RunFolder.existing(Path(path))
+        self.data = None if data is None else Path(data)
+        self.device = device
+        self._identity = self.folder.identity()
+        self._loaded: TrainedRun | None = None
+
+    def __repr__(self) -> str:
+        """What it is, in one line."""
+        relit = ", relit" if self._loaded is not None and self._loaded.lamp is not None else ""
+        steps = f"step {self.step} of {self._identity.steps}"
+        return f"{self.method} on {self.scene_name}, seed {self.seed}, {steps}{relit}: {self.path}"
+
+    @property
+    def path(self) -> Path:
+        """The run folder."""
+        return self.folder.path
+
+    @property
+    def method(self) -> str:
+        """Name of its method."""
+        return self._identity.method
+
+    @property
+    def scene_name(self) -> str:
+        """Name of its scene."""
+        return self._identity.scene_name
+
+    @property
+    def seed(self) -> int:
+        """Of all its random generators."""
+        return self._identity.seed
+
+    @property
+    def step(self) -> int:
+        """Steps taken until the newest checkpoint."""
+        return self.folder.step
+
+    @cached_property
+    def config(self) -> MethodConfig:
+        """The resolved method config."""
+        return self.folder.method().config
+
+    @property
+    def history(self) -> dict[str, Float[np.ndarray, "T"]]:
+        """The training log: ``step``, ``loss``, ``psnr``, ``seconds``, ``terms.NAME`` and so on over T logged steps.
+
+        NaN where a step has no such number. [T] each
+
+        Raises:
+            InputError: The log cannot be read.
+        """
+        from coliags_plugin.engine.history import columns
+
+        return columns(self.folder.log_rows())
+
+    @property
+    def results(self) -> dict[str, Result]:
+        """Results of its evaluations by protocol.
+
+        Raises:
+            InputError: A results file is damaged or of a newer version.
+        """
+        from coliags_plugin.results.reading import RESULT_FILE, read_result
+
+        files = sorted(self.folder.evaluations.glob(f"*/{RESULT_FILE}"))
+        return {file.parent.name: read_result(file) for file in files}
+
+    def load(self) -> TrainedRun:
+        """Scene and model at the newest checkpoint, kept for the next call.
+
+        Raises:
+            InputError: There is no checkpoint, or the data are missing or have changed.
+        """
+        from coliags_plugin.engine.devices import choose_device
+        from coliags_plugin.engine.trained import load_trained
+
+        kept = self._loaded
+        if kept is None or (kept.lamp is None and kept.step != self.step):
+            self._loaded = kept = load_trained(self.path, choose_device(self.device), self.data)
+        return kept
+
+    def evaluate(self, protocol: str | None = None) -> Result:
+        """Evaluate the run on its held-out frames, writing ``eval/PROTOCOL/`` in its folder.
+
+        Args:
+            protocol: Name of a protocol; None: the method config's.
+
+        Raises:
+            InputError: See :meth:`load`; the protocol is unknown, no frame is held out, or the run was relit.
+        """
+        from coliags_plugin.engine import evaluator
+        from coliags_plugin.results.reading import RESULT_FILE, read_result
+
+        trained = self.load()
+        return read_result(evaluator.evaluate(trained, protocol or trained.config.protocol) / RESULT_FILE)
+
+    def frame_names(self, frames: str = "test") -> list[str]:
+        """Names of frames that can be rendered.
+
+        Args:
+            frames: ``train``, ``all``, or the name of a test set.
+
+        Raises:
+            InputError: See :meth:`load`; or there are no such frames.
+        """
+        from coliags_plugin.engine.rendering import choose_frames
+
+        return [frame.name for frame in choose_frames(self.load().scene, frames)]
+
+    def render(self, frame: str | Camera, *, depth: str = "depth_accumulated", outputs: Sequence[str] = ()) -> View:
+        """Render one view.
+
+        Args:
+            frame: Name of a frame of the scene, held out or not; or a free camera.
+            depth: Kind of depth (docs/conventions.md 3).
+            outputs: Names of further outputs, and of feature channels of the method's Gaussians.
+
+        Raises:
+            InputError: See :meth:`load`; or there is no such frame or output.
+        """
+        from coliags_plugin.api.views import view_of
+
+        return view_of(self.load(), frame, depth, outputs)
+
+    def write_renders(
+        self,
+        output: str | Path | None = None,
+        frames: str = "test",
+        *,
+        video: bool = True,
+        fps: float = 15.0,
+        channels: Sequence[str] = (),
+        overwrite: bool = False,
+    ) -> Path:
+        """Write colour, depth and error images of a set of frames, and a video along the trajectory.
+
+        Args:
+            output: Folder to make; None: ``renders`` in the run folder, ``relit`` for a relit run.
+            frames: See :meth:`frame_names`.
+            video: Also write ``trajectory.mp4``, rgb beside depth.
+            fps: Frames per second of the video.
+            channels: Feature channels to write as images too.
+            overwrite: Replace the folder where it exists.
+
+        Returns:
+            The folder.
+
+        Raises:
+            InputError: See :meth:`load`; no such frames or channel; or the folder exists or cannot be written.
+        """
+        from coliags_plugin.engine.rendering import render_run
+
+        trained = self.load()
+        folder = Path(output) if output is not None else self.path / ("renders" if trained.lamp is None else "relit")
+        render_run(trained, folder, frames, video, fps, overwrite, channels)
+        return folder
+
+    def relight(self, /, **lamp: Any) -> Run:
+        """The run under another lamp, for rendering; it shares the parameters.
+
+        Args:
+            lamp: Options of :class:`~coliags_plugin.core.lamps.Lamp`, for instance ``offset=(5.0, 0.0, 0.0)`` (mm).
+
+        Raises:
+            InputError: See :meth:`load`; an option is unknown or invalid, or the field does not model the lamp.
+        """
+        from coliags_plugin.engine.relighting import make_lamp, relight
+
+        made = make_lamp(lamp)
+        relit = Run(self.path, data=self.data, device=self.device)
+        relit._loaded = relight(self.load(), made)
+        return relit
+
+
+def load_run(path: str | Path, *, data: str | Path | None = None, device: str = "auto") -> Run:
+    """Handle of a run that is there; see :class:`Run` for the arguments.
+
+    Raises:
+        InputError: This is no run folder.
+    """
+    return Run(path, data=data, device=device)

@@ -1,0 +1,122 @@
+"""Rendered views as arrays, shown as images in a notebook."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from html import escape
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.render_output import DEPTH_KINDS
+from coliags_plugin.core.scenes import Frame, Scene
+from coliags_plugin.engine import rendering
+from coliags_plugin.engine.trained import TrainedRun
+from coliags_plugin.outputs.colormaps import DEPTH_ERROR_LIMIT_MM, colorize_depth, colorize_depth_error, depth_limits
+from coliags_plugin.outputs.image_files import as_array, eight_bit, encode_png
+
+#: Smallest width of an image in a notebook, px on the screen.
+_SHOWN_WIDTH = 200
+
+
+@dataclass(frozen=True)
+class View:
+    """A rendered view, with the recorded one where it is of a frame.
+
+    Attributes:
+        name: Of the frame; empty for a free camera.
+        camera: What it was rendered from.
+        rgb: Rendered colours. [H, W, 3]
+        alpha: Accumulated opacity. [H, W]
+        depth: Rendered z-depth of the kind asked for, mm. [H, W]
+        outputs: The other outputs asked for. [H, W] or [H, W, C] each
+        true_rgb: Recorded colours; None for a free camera, and under another lamp. [H, W, 3]
+        true_depth: True z-depth, mm; NaN where unknown or not to be looked at. None where there is none. [H, W]
+    """
+
+    name: str
+    camera: Camera = field(repr=False)
+    rgb: UInt8[np.ndarray, "H W 3"] = field(repr=False)
+    alpha: Float32[np.ndarray, "H W"] = field(repr=False)
+    depth: Float32[np.ndarray, "H W"] = field(repr=False)
+    outputs: Mapping[str, np.ndarray] = field(repr=False)
+    true_rgb: UInt8[np.ndarray, "H W 3"] | None = field(default=None, repr=False)
+    true_depth: Float32[np.ndarray, "H W"] | None = field(default=None, repr=False)
+
+    def images(self) -> dict[str, UInt8[np.ndarray, "H W 3"]]:
+        """Truth, rendering, depths on one scale, and depth error as images, by captions. [H, W, 3] each"""
+        limits = depth_limits([self.depth] if self.true_depth is None else [self.depth, self.true_depth])
+        scale = f"0 to {limits[1]:.0f} mm"
+        shown = {} if self.true_rgb is None else {"truth": self.true_rgb}
+        shown["rendered"] = self.rgb
+        if self.true_depth is not None:
+            shown[f"true depth, {scale}"] = colorize_depth(self.true_depth, limits)
+        shown[f"depth, {scale}"] = colorize_depth(self.depth, limits)
+        if self.true_depth is not None:
+            known, limit = np.isfinite(self.true_depth), DEPTH_ERROR_LIMIT_MM
+            errors = colorize_depth_error(self.depth, self.true_depth, known, limit)
+            shown[f"depth error, 0 to {limit:g} mm"] = errors
+        return shown
+
+    def _repr_html_(self) -> str:
+        """The images in a row with their captions; notebooks ask for it."""
+        width = max(_SHOWN_WIDTH, self.camera.width)
+        return (
+            '<div style="display:flex;flex-wrap:wrap;gap:8px">'
+            + "".join(
+                f'<figure style="margin:0"><img alt="{escape(caption)}" width="{width}" '
+                f'src="data:image/png;base64,{base64.b64encode(encode_png(image)).decode()}">'
+                f"<figcaption>{escape(caption)}</figcaption></figure>"
+                for caption, image in self.images().items()
+            )
+            + "</div>"
+        )
+
+
+def view_of(trained: TrainedRun, of: str | Camera, depth: str, outputs: Sequence[str]) -> View:
+    """Render a view of a run; see :meth:`coliags_plugin.api.runs.Run.render`.
+
+    Raises:
+        InputError: There is no such frame or output.
+    """
+    if depth not in DEPTH_KINDS:
+        raise InputError(
+            f"no kind of depth '{depth}'", f"one of {', '.join(DEPTH_KINDS)}", did_you_mean(depth, DEPTH_KINDS)
+        )
+    wants = ("rgb", "alpha", depth, *outputs)
+    trained.model.check_outputs(wants, "this view")
+    frame, camera = (None, of) if isinstance(of, Camera) else _frame(trained.scene, of)
+    found = rendering.render_view(trained, frame or camera, wants)
+    return View(
+        name="" if frame is None else frame.name,
+        camera=camera,
+        rgb=as_array(eight_bit(found.rgb)),
+        alpha=as_array(found.alpha),
+        depth=as_array(found[depth]),
+        outputs={name: as_array(found[name]) for name in outputs},
+        true_rgb=None if frame is None or trained.lamp is not None else as_array(frame.image),
+        true_depth=None if frame is None else _true_depth(frame),
+    )
+
+
+def _frame(scene: Scene, name: str) -> tuple[Frame, Camera]:
+    """The frame of a name, with its camera."""
+    frames = {frame.name: frame for part in (scene.train, *scene.test_sets.values()) for frame in part}
+    if name not in frames:
+        raise InputError(
+            f"scene '{scene.name}' has no frame '{name}'",
+            "the name of a frame, see Run.frame_names(), or a camera",
+            did_you_mean(name, frames),
+        )
+    return frames[name], frames[name].camera
+
+
+def _true_depth(frame: Frame) -> Float32[np.ndarray, "H W"] | None:
+    if frame.depth is None:
+        return None
+    return as_array(frame.depth.masked_fill(~frame.valid, math.nan).float())

@@ -1,0 +1,77 @@
+"""Arguments of ``coliags compare`` and ``coliags ablate``, and what both do with them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from coliags_plugin.cli.arguments import Assignments, OptionalInt, OptionalPath, OptionalText
+
+if TYPE_CHECKING:
+    from coliags_plugin.comparison.cells import Variant
+
+Scenes = Annotated[tuple[str, ...], tyro.conf.arg(metavar="SCENE...")]
+Splits = Annotated[tuple[str, ...], tyro.conf.arg(metavar="SPLIT...")]
+Executors = Annotated[str, tyro.conf.arg(metavar="local|ray")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparisonArguments:
+    """Scenes, options of the runs, and how they are carried out."""
+
+    scenes: Scenes
+    """Benchmarks (`coliags list benchmarks`), BENCHMARK/SCENE, paths of benchmark files, or folders of scenes."""
+    output: Path
+    """Folder of the comparison; one that is there is extended."""
+    data: OptionalPath = None
+    """Folder of the benchmark's scenes; default scenes/BENCHMARK. Phantoms that are missing are made there."""
+    seeds: int = 1
+    """Runs of every method on every scene, with the seeds 0, 1, ..."""
+    protocol: str = "paper"
+    """Evaluation protocol (`coliags list protocols`)."""
+    steps: OptionalInt = None
+    """Training steps of all runs; default: each method's own."""
+    splits: Splits = ()
+    """Splits, each trained apart, for instance every-8th block; default: the scene's own."""
+    set: Assignments = ()
+    """Change a value of every method config, as for train."""
+    jobs: OptionalInt = None
+    """Runs at a time; default: one per CPU, or per GPU."""
+    threads: OptionalInt = None
+    """CPU threads of each run; default: the CPUs divided by the runs at a time."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Device to compute on."""
+    executor: Executors = "local"
+    """Where the runs are: processes on this machine, or on a Ray cluster (`pip install "coliags_plugin[sweep]"`)."""
+    ray_address: OptionalText = None
+    """HOST:PORT of the Ray cluster's head; default: RAY_ADDRESS, or the cluster of this machine."""
+    retries: int = 2
+    """How often a run is resumed whose process was killed or crashed."""
+    dry_run: bool = False
+    """Only print what would be done, with estimates of time and disk."""
+
+    def carry_out(self, methods: Sequence[str | Variant]) -> None:
+        """Compare, print a summary and the folder; exit with status 1 if a cell failed."""
+        from coliags_plugin.comparison.compare import How, carry_out, dry_run, make_executor, make_request
+        from coliags_plugin.comparison.folder import ComparisonFolder
+
+        request = make_request(
+            methods, self.scenes, self.data, self.seeds, self.protocol, self.splits, self.steps, self.set
+        )
+        how = How(self.jobs, self.threads, self.device, self.executor, self.ray_address, self.retries)
+        folder, executor = ComparisonFolder(self.output), make_executor(how)
+        if self.dry_run:
+            ahead = dry_run(request, folder, executor)
+            print(ahead.table())
+            print(ahead.line())
+            return
+        done = carry_out(request, folder, executor, how)
+        print(done.table())
+        print(done.folder)
+        if done.failures:
+            sys.exit(1)

@@ -1,0 +1,1 @@
+"""Comparison of methods over scenes: plan, execution on one machine or several, and resuming."""

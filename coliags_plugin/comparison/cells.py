@@ -1,0 +1,111 @@
+"""Cells of a comparison: one method on one scene, with one split and one seed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from coliags_plugin.comparison.named_files import is_path
+from coliags_plugin.comparison.scenes import SceneSource
+from coliags_plugin.config.method_config import MethodConfig
+
+#: Digits of a key in names of files.
+_SHORT = 8
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A column of the comparison: a method with changes, under a name.
+
+    Attributes:
+        name: In tables and file names.
+        method: Name of a method, or path of a method config.
+        overrides: ``key.path=value`` changes of it.
+    """
+
+    name: str
+    method: str
+    overrides: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class CellKeys:
+    """Hashes that identify a cell's scene, run and result; see :mod:`coliags_plugin.results.identity`."""
+
+    fingerprint: str
+    training: str
+    result: str
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One run of the comparison and its evaluation.
+
+    Attributes:
+        variant: Method.
+        scene: Scene.
+        scene_label: Name of the scene; with that of the split where it is not the scene's own.
+        seed: Of all random generators.
+        protocol: Name of the evaluation protocol.
+        overrides: All changes of the method config: of the scene, the split, the variant and the comparison.
+        config: The resolved method config.
+        keys: None while the scene, a phantom, is not there.
+    """
+
+    variant: Variant
+    scene: SceneSource
+    scene_label: str
+    seed: int
+    protocol: str
+    overrides: tuple[str, ...]
+    config: MethodConfig
+    keys: CellKeys | None
+
+    @property
+    def identity(self) -> tuple[str, str, int, str]:
+        """What it is called: scene, method, seed, protocol."""
+        return self.scene_label, self.variant.name, self.seed, self.protocol
+
+    @property
+    def steps(self) -> int:
+        """Length of its training."""
+        return self.config.schedule.steps
+
+    @property
+    def title(self) -> str:
+        """For messages: scene, method and seed."""
+        return f"{self.scene_label} {self.variant.name} seed {self.seed}"
+
+    @property
+    def known_keys(self) -> CellKeys:
+        """Its keys.
+
+        Raises:
+            ValueError: The scene is not there yet.
+        """
+        if self.keys is None:
+            raise ValueError(f"{self.title}: the scene is not there, so that it has no key")
+        return self.keys
+
+    @property
+    def run_place(self) -> PurePosixPath:
+        """Of the run, among runs: ``SCENE/METHOD/sSEED-KEY``; protocols share a run."""
+        return self._place(self.known_keys.training)
+
+    @property
+    def result_place(self) -> PurePosixPath:
+        """Of the result, among results, without suffix: ``SCENE/METHOD/sSEED-KEY``."""
+        return self._place(self.known_keys.result)
+
+    def _place(self, key: str) -> PurePosixPath:
+        return PurePosixPath(self.scene_label, file_name(self.variant.name), f"s{self.seed}-{key[:_SHORT]}")
+
+
+def file_name(variant: str) -> str:
+    """A variant's name as part of a path: ``ablations/depth`` is ``ablations-depth``."""
+    return variant.replace("/", "-")
+
+
+def absolute_method(method: str) -> str:
+    """A method by a name or path that holds in every working folder."""
+    return str(Path(method).resolve()) if is_path(method) else method

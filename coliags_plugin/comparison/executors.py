@@ -1,0 +1,166 @@
+"""Executors: where the worker processes of a comparison run."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import IO
+
+from coliags_plugin.comparison.tasks import Outcome, Task, read_outcome
+
+#: For workers to save and end once they were asked to, seconds; then they are killed.
+STOPPING = 45.0
+_PAUSE = 0.1
+
+
+class Executor(ABC):
+    """Runs tasks, each in a worker process of its own.
+
+    Attributes:
+        slots: How many run at once.
+        threads: CPU threads of each.
+    """
+
+    slots: int
+    threads: int
+
+    @abstractmethod
+    def check(self, folder: Path, scenes: Sequence[Path]) -> None:
+        """Find out whether tasks will see and can write a folder, and will see scenes.
+
+        Raises:
+            InputError: They cannot.
+        """
+
+    @abstractmethod
+    def start(self, task: Task) -> None:
+        """Start a task.
+
+        Raises:
+            OSError: It cannot be started.
+        """
+
+    @abstractmethod
+    def wait(self, seconds: float) -> list[tuple[Task, Outcome]]:
+        """Tasks that have ended, after so many seconds at most."""
+
+    @abstractmethod
+    def stop(self) -> None:
+        """Have all tasks save their state and end."""
+
+
+class LocalExecutor(Executor):
+    """Processes on this machine.
+
+    Args:
+        slots: How many at once.
+        threads: CPU threads of each.
+        gpus: Identifiers of GPUs, as in ``CUDA_VISIBLE_DEVICES``, over which they are spread; empty: none.
+    """
+
+    def __init__(self, slots: int, threads: int, gpus: Sequence[str] = ()) -> None:
+        self.slots, self.threads = slots, threads
+        self._gpus = tuple(gpus)
+        self._workers: dict[int, LocalWorker] = {}  # by slot
+
+    def check(self, folder: Path, scenes: Sequence[Path]) -> None:
+        """See :class:`Executor`; this machine always does."""
+
+    def start(self, task: Task) -> None:
+        """See :class:`Executor`."""
+        slot = min(set(range(self.slots)) - self._workers.keys())
+        gpu = self._gpus[slot % len(self._gpus)] if self._gpus else None
+        self._workers[slot] = LocalWorker(task, gpu)
+
+    def wait(self, seconds: float) -> list[tuple[Task, Outcome]]:
+        """See :class:`Executor`."""
+        until = time.monotonic() + seconds
+        while True:
+            ended = {slot: worker for slot, worker in self._workers.items() if worker.ended}
+            if ended or time.monotonic() >= until:
+                break
+            time.sleep(_PAUSE)
+        for slot in ended:
+            del self._workers[slot]
+        return [(worker.task, worker.outcome()) for worker in ended.values()]
+
+    def stop(self) -> None:
+        """See :class:`Executor`."""
+        for worker in self._workers.values():
+            worker.ask_to_stop()
+        until = time.monotonic() + STOPPING
+        try:
+            for worker in self._workers.values():
+                worker.wait_or_kill(until - time.monotonic())
+        except KeyboardInterrupt:
+            for worker in self._workers.values():
+                worker.wait_or_kill(0.0)
+            raise
+        finally:
+            self._workers.clear()
+
+
+class LocalWorker:
+    """A worker process on this machine, which ends when this object's process does.
+
+    Args:
+        task: What it works on.
+        gpu: The GPU that it sees; None: all.
+    """
+
+    def __init__(self, task: Task, gpu: str | None = None) -> None:
+        self.task = task
+        environment = task.environment(os.environ)
+        if gpu is not None:
+            environment["CUDA_VISIBLE_DEVICES"] = gpu
+        Path(task.log).parent.mkdir(parents=True, exist_ok=True)
+        with Path(task.log).open("a", encoding="utf-8") as messages:
+            self._process = subprocess.Popen(
+                task.command(),
+                stdin=subprocess.PIPE,  # never written: the worker stops when it is closed
+                stdout=subprocess.PIPE,
+                stderr=messages,
+                env=environment,
+                start_new_session=True,  # Ctrl-C reaches the comparison alone, which then asks its workers to stop
+            )
+
+    @property
+    def ended(self) -> bool:
+        """Whether the process has."""
+        return self._process.poll() is not None
+
+    def outcome(self) -> Outcome:
+        """How it ended; waits until it has."""
+        printed = _pipe(self._process.stdout).read()
+        returncode = self._process.wait()
+        self._close()
+        return read_outcome(returncode, printed.decode(errors="replace"))
+
+    def ask_to_stop(self) -> None:
+        """Have it save its state and end."""
+        with suppress(BrokenPipeError):
+            _pipe(self._process.stdin).close()
+
+    def wait_or_kill(self, seconds: float) -> None:
+        """Wait until it has ended, or kill it."""
+        try:
+            self._process.wait(max(0.0, seconds))
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._close()
+
+    def _close(self) -> None:
+        for pipe in (self._process.stdin, self._process.stdout):
+            _pipe(pipe).close()
+
+
+def _pipe(pipe: IO[bytes] | None) -> IO[bytes]:
+    if pipe is None:
+        raise ValueError("the process has no such pipe")
+    return pipe

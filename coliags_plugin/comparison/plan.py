@@ -1,0 +1,145 @@
+"""Planning of a comparison: which cells it has, and what each of them is."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from coliags_plugin import __version__
+from coliags_plugin.comparison.cells import Cell, CellKeys, Variant
+from coliags_plugin.comparison.scenes import SceneSource
+from coliags_plugin.config import registry
+from coliags_plugin.config.components import Component
+from coliags_plugin.config.method_config import MethodConfig, load_method
+from coliags_plugin.engine.data_formats import load_method_for
+from coliags_plugin.results.identity import result_key, training_key
+
+#: The fingerprint of a scene that is not there, as recorded when it was; None where it never was.
+RecordedFingerprint = Callable[[SceneSource], str | None]
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is to be compared.
+
+    Attributes:
+        variants: Methods.
+        scenes: Scenes.
+        seeds: One run for each.
+        protocol: Name of the evaluation protocol.
+        splits: Names of splits, one run for each; empty: each scene's own.
+        steps: Length of all runs; None: each method's own.
+        overrides: ``key.path=value`` changes of all methods.
+    """
+
+    variants: Sequence[Variant]
+    scenes: Sequence[SceneSource]
+    seeds: Sequence[int] = (0,)
+    protocol: str = "paper"
+    splits: Sequence[str] = ()
+    steps: int | None = None
+    overrides: Sequence[str] = ()
+
+    @property
+    def changes(self) -> tuple[str, ...]:
+        """The changes of all methods, with the length of the runs."""
+        return (*(() if self.steps is None else (f"schedule.steps={self.steps}",)), *self.overrides)
+
+
+def make_cells(request: Request, recorded: RecordedFingerprint | None = None) -> list[Cell]:
+    """All cells, those of one seed together, and within it those of one scene.
+
+    Args:
+        request: What is asked for.
+        recorded: Fingerprints of scenes that are not there.
+
+    Raises:
+        InputError: A method, split, protocol or change is not valid, or the folder of a scene is damaged.
+    """
+    protocol = registry.protocols.get(request.protocol)
+    fingerprints = _Fingerprints(recorded or (lambda scene: None))
+    cells: list[Cell] = []
+    with _warnings_only():
+        for scene in request.scenes:
+            for split in request.splits or (None,):
+                for variant in request.variants:
+                    cells += _seeds(request, scene, split, variant, fingerprints, protocol.version)
+    order = {seed: number for number, seed in enumerate(request.seeds)}
+    return sorted(cells, key=lambda cell: order[cell.seed])
+
+
+def _seeds(
+    request: Request,
+    scene: SceneSource,
+    split: str | None,
+    variant: Variant,
+    fingerprints: _Fingerprints,
+    protocol_version: int,
+) -> Iterator[Cell]:
+    chosen = () if split is None else (f"datamanager.split={split}",)
+    overrides = (*scene.overrides, *chosen, *variant.overrides, *request.changes)
+    config = _config(scene, variant.method, overrides)
+    own, used = (_split(each) for each in (_config(scene, variant.method, scene.overrides), config))
+    label = scene.name if used in (None, own) else f"{scene.name}-{used}"
+    fingerprint = fingerprints.of(scene, config.datamanager)
+    plain = config.model_dump()
+    for seed in request.seeds:
+        keys = None
+        if fingerprint is not None:
+            keys = CellKeys(
+                fingerprint,
+                training_key(plain, fingerprint, seed, __version__),
+                result_key(plain, fingerprint, seed, __version__, request.protocol, protocol_version),
+            )
+        yield Cell(variant, scene, label, seed, request.protocol, overrides, config, keys)
+
+
+def _config(scene: SceneSource, method: str, overrides: Sequence[str]) -> MethodConfig:
+    """The method as it would read the scene; of a phantom that is not there, as far as that can be told."""
+    data_format = scene.data_format if scene.is_there else _layout_format(scene)
+    if data_format is None and not scene.is_there:
+        return load_method(method, overrides).config
+    return load_method_for(scene.path, method, overrides, data_format).config
+
+
+def _layout_format(scene: SceneSource) -> str | None:
+    """The data manager that reads a phantom, where it has the name of the phantom's layout."""
+    layout = None if scene.phantom is None else scene.phantom.layout
+    return scene.data_format or (layout if layout in registry.datamanagers.names() else None)
+
+
+def _split(config: MethodConfig) -> str | None:
+    """The split that a config's data manager makes; None where it knows none."""
+    return getattr(config.datamanager.settings, "split", None)
+
+
+class _Fingerprints:
+    """Fingerprints of scenes, each computed once for each way of reading it."""
+
+    def __init__(self, recorded: RecordedFingerprint) -> None:
+        self._recorded = recorded
+        self._known: dict[tuple[str, str, str], str] = {}
+
+    def of(self, scene: SceneSource, component: Component) -> str | None:
+        if not scene.is_there:
+            return self._recorded(scene)
+        key = (str(scene.path), component.name, component.settings.model_dump_json())
+        if key not in self._known:
+            manager: Any = component.target(component.settings)
+            self._known[key] = manager.fingerprint(scene.path)
+        return self._known[key]
+
+
+@contextmanager
+def _warnings_only() -> Iterator[None]:
+    """Leave out what the data managers log of every folder."""
+    logger = logging.getLogger("coliags_plugin")
+    level = logger.level
+    logger.setLevel(logging.WARNING)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)

@@ -1,0 +1,239 @@
+"""Executor on a Ray cluster: plain Ray tasks, each of which starts the same worker process as on one machine.
+
+Ray's own retries are off: its retries when memory runs out have no end, and a comparison counts its own, whatever ends
+a worker. What a task has done is in its run folder, which all nodes must see.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import time
+import uuid
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from coliags_plugin import __version__
+from coliags_plugin.comparison.executors import STOPPING, Executor, LocalWorker
+from coliags_plugin.comparison.tasks import Outcome, Task
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import atomic_write
+
+log = logging.getLogger(__name__)
+
+#: For an answer of a node to the question what it sees, seconds.
+_ANSWER = 120.0
+#: For a node that has vanished to be counted as dead by Ray, seconds.
+_VANISHING = 60.0
+#: For a connection to the cluster's address, seconds.
+_CONNECT = 10.0
+_PAUSE = 0.1
+#: Ray's errors of tasks that ended without a word, whose own texts are long.
+_DEATHS = {
+    "NodeDiedError": "the node died",
+    "OutOfMemoryError": "the node's memory ran out",
+    "WorkerCrashedError": "the task's process was ended",
+}
+
+
+class RayExecutor(Executor):
+    """Tasks on the nodes of a cluster.
+
+    Args:
+        address: ``HOST:PORT`` of the cluster's head; None: ``RAY_ADDRESS``, or the cluster of this machine.
+        slots: How many at once; None: as many as the cluster has CPUs or GPUs for.
+        threads: CPU threads of each, which it takes from the node's CPUs.
+        device: ``auto``, ``cpu`` or ``cuda``; each task takes a GPU for itself unless it is ``cpu`` or there is none.
+
+    Raises:
+        InputError: Ray is not installed, or there is no such cluster.
+    """
+
+    def __init__(self, address: str | None, slots: int | None, threads: int, device: str) -> None:
+        self._ray = _library()
+        self._connect(address)
+        self.threads, self._slots = threads, slots
+        self._gpus = 0 if device == "cpu" or not self._resource("GPU") else 1
+        if device == "cuda" and not self._gpus:
+            raise InputError("device cuda was requested, but the cluster has no GPU", "cpu, or auto")
+        self._tasks: dict[Any, Task] = {}  # by reference of the answer
+        self._work = self._ray.remote(_work).options(num_cpus=threads, num_gpus=self._gpus, max_retries=0)
+
+    @property
+    def slots(self) -> int:  # type: ignore[override]
+        """As many as the cluster has room for now, or fewer where that was asked for."""
+        of_cpus = int(self._resource("CPU") // self.threads)
+        room = min(of_cpus, int(self._resource("GPU"))) if self._gpus else of_cpus
+        return max(1, room if self._slots is None else min(room, self._slots))
+
+    def check(self, folder: Path, scenes: Sequence[Path]) -> None:
+        """Have every node read and write in the folder, and see the scenes.
+
+        Raises:
+            InputError: One cannot, lacks this package, or has another version of it.
+        """
+        token = uuid.uuid4().hex
+        file = folder / f".storage-{token}"
+        atomic_write(file, token)
+        try:
+            for node in self._nodes():
+                seen = self._seen_by(node, file, scenes)
+                if seen is not None:
+                    _check_node(node, seen, file, token)
+        finally:
+            for path in folder.glob(f".storage-{token}*"):
+                path.unlink(missing_ok=True)
+
+    def start(self, task: Task) -> None:
+        """See :class:`Executor`."""
+        self._tasks[self._work.remote(task.to_json())] = task
+
+    def wait(self, seconds: float) -> list[tuple[Task, Outcome]]:
+        """See :class:`Executor`."""
+        if not self._tasks:
+            return []
+        ready, _ = self._ray.wait(list(self._tasks), num_returns=1, timeout=seconds)
+        return [(self._tasks.pop(reference), self._outcome(reference)) for reference in ready]
+
+    def stop(self) -> None:
+        """See :class:`Executor`."""
+        for reference in self._tasks:
+            self._ray.cancel(reference)
+        if self._tasks:
+            _, left = self._ray.wait(list(self._tasks), num_returns=len(self._tasks), timeout=STOPPING + 10.0)
+            for reference in left:
+                self._ray.cancel(reference, force=True)
+        self._tasks.clear()
+
+    def _connect(self, address: str | None) -> None:
+        if self._ray.is_initialized():
+            return
+        address = address or os.environ.get("RAY_ADDRESS") or "auto"
+        start = "Start one: `ray start --head`, and `ray start --address HOST:PORT` on every other machine"
+        if address != "auto" and "://" not in address:
+            host, _, port = address.rpartition(":")
+            try:
+                socket.create_connection((host, int(port)), _CONNECT).close()
+            except (OSError, ValueError) as error:
+                raise InputError(f"no Ray cluster at {address}: {error}", "HOST:PORT of its head", start) from error
+        try:
+            self._ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+        except (ConnectionError, RuntimeError, ValueError) as error:
+            told = str(error).strip().partition("\n")[0]
+            raise InputError(f"no Ray cluster at '{address}': {told}", "one that is running", start) from error
+
+    def _resource(self, name: str) -> float:
+        return float(self._ray.cluster_resources().get(name, 0.0))
+
+    def _nodes(self) -> list[Mapping[str, Any]]:
+        return [node for node in self._ray.nodes() if node["Alive"]]
+
+    def _seen_by(self, node: Mapping[str, Any], file: Path, scenes: Sequence[Path]) -> Mapping[str, Any] | None:
+        """What a node sees of a file and of scenes; None where it is gone meanwhile."""
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+        there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
+        look = self._ray.remote(_look).options(num_cpus=0, max_retries=0, scheduling_strategy=there)
+        question = look.remote(str(file), [str(path) for path in scenes])
+        try:
+            seen: Mapping[str, Any] = self._ray.get(question, timeout=_ANSWER)
+        except self._ray.exceptions.RayError as error:
+            lost = (self._ray.exceptions.TaskUnschedulableError, self._ray.exceptions.NodeDiedError)
+            if isinstance(error, lost) and self._is_gone(node):
+                log.warning("node %s is gone", node["NodeManagerAddress"])
+                return None
+            raise InputError(
+                f"node {node['NodeManagerAddress']} cannot run tasks: {_last_line(error)}",
+                f"coliags_plugin {__version__} on every node",
+                "Install it there in the Python that runs `ray start`",
+            ) from error
+        return seen
+
+    def _is_gone(self, node: Mapping[str, Any]) -> bool:
+        """Whether a node that runs no tasks is dead, as Ray finds out after a while."""
+        until = time.monotonic() + _VANISHING
+        while any(other["NodeID"] == node["NodeID"] for other in self._nodes()):
+            if time.monotonic() > until:
+                return False
+            time.sleep(_PAUSE)
+        return True
+
+    def _outcome(self, reference: Any) -> Outcome:
+        try:
+            return Outcome(**self._ray.get(reference))
+        except self._ray.exceptions.TaskCancelledError:
+            return Outcome("stopped")
+        except self._ray.exceptions.RayError as error:
+            told = _DEATHS.get(type(error).__name__)
+            return Outcome("died", told or f"{type(error).__name__}: {_last_line(error)}")
+
+
+def _check_node(node: Mapping[str, Any], seen: Mapping[str, Any], file: Path, token: str) -> None:
+    """Raise InputError where a node does not see what it should."""
+    name = f"node {node['NodeManagerAddress']}"
+    if seen["version"] != __version__:
+        raise InputError(f"{name} has coliags_plugin {seen['version']}", f"{__version__}, as here", "Install it there")
+    answer = file.with_name(f"{file.name}-{node['NodeID']}")
+    read = answer.read_text(encoding="utf-8") if answer.is_file() else None
+    if seen["token"] != token or read != token:
+        raise InputError(
+            f"{name} does not see {file.parent}: {seen['error'] or 'it is another folder there'}",
+            "an --output on storage that all machines share, under the same path",
+            "Choose a folder on a network file system",
+        )
+    if seen["missing"]:
+        raise InputError(
+            f"{name} does not see the scenes {', '.join(seen['missing'])}",
+            "scenes on storage that all machines share, under the same paths",
+            "Copy them there, or name their folder with --data",
+        )
+
+
+def _look(file: str, scenes: Sequence[str]) -> dict[str, Any]:
+    """On a node: read a token, write it into a file beside it, and look for scenes."""
+    import ray
+
+    path, node = Path(file), ray.get_runtime_context().get_node_id()
+    token, error = None, ""
+    try:
+        token = path.read_text(encoding="utf-8")
+        path.with_name(f"{path.name}-{node}").write_text(token, encoding="utf-8")
+    except OSError as found:
+        error = found.strerror or str(found)
+    missing = [scene for scene in scenes if not Path(scene).is_dir()]
+    return {"version": __version__, "token": token, "error": error, "missing": missing}
+
+
+def _work(text: str) -> dict[str, Any]:
+    """On a node: run a worker process to its end, or until the task is cancelled."""
+    worker = LocalWorker(Task.from_json(text))
+    try:
+        while not worker.ended:
+            time.sleep(_PAUSE)
+        return asdict(worker.outcome())
+    except KeyboardInterrupt:
+        worker.ask_to_stop()
+        with suppress(KeyboardInterrupt):
+            worker.wait_or_kill(STOPPING)
+        return asdict(Outcome("stopped"))
+
+
+def _library() -> Any:
+    try:
+        import ray
+    except ImportError as error:
+        raise InputError(
+            "--executor ray, but Ray is not installed",
+            "the package with its extra 'sweep'",
+            'pip install "coliags_plugin[sweep]"',
+        ) from error
+    return ray
+
+
+def _last_line(error: Exception) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[-1] if lines else type(error).__name__

@@ -1,0 +1,186 @@
+"""Scenes of a comparison: folders, and those of benchmarks; phantoms are made when they are missing."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from coliags_plugin.comparison.benchmarks import Benchmark, load_benchmark
+from coliags_plugin.comparison.named_files import is_path, shipped
+from coliags_plugin.config.registry import phantom_layouts
+from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.locks import locked
+from coliags_plugin.core.progress import Progress
+from coliags_plugin.phantom.generate import generate, resolve
+from coliags_plugin.phantom.settings import PhantomSettings
+
+log = logging.getLogger(__name__)
+
+#: Where the scenes of benchmarks are, under the working directory, in a folder of the benchmark's name.
+SCENES = Path("scenes")
+
+
+@dataclass(frozen=True)
+class SceneSource:
+    """A scene on disk, or a phantom to make there.
+
+    Attributes:
+        name: Unique within a comparison.
+        path: Its folder, absolute.
+        overrides: ``key.path=value`` changes of a method config with which it is read.
+        data_format: Name of a data manager; None: recognised from the files.
+        phantom: Settings to make it with; None for a dataset.
+    """
+
+    name: str
+    path: Path
+    overrides: tuple[str, ...] = ()
+    data_format: str | None = None
+    phantom: PhantomSettings | None = None
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the folder is."""
+        return self.path.is_dir()
+
+    @property
+    def phantom_record(self) -> dict[str, Any] | None:
+        """All settings of the phantom as plain data, defaults of its layout and light included."""
+        if self.phantom is None:
+            return None
+        settings = resolve(self.phantom, phantom_layouts.get(self.phantom.layout)())
+        record: dict[str, Any] = json.loads(settings.model_dump_json())
+        return record
+
+
+def find_scenes(names: Sequence[str], data: Path | None = None) -> list[SceneSource]:
+    """The scenes that names stand for.
+
+    Args:
+        names: Each a benchmark, ``BENCHMARK/SCENE`` for one scene of it, the path of a benchmark's YAML file, or the
+            folder of a scene.
+        data: Folder of the benchmark's scenes; None: ``scenes/BENCHMARK``.
+
+    Raises:
+        InputError: A name is unknown, scenes are missing that cannot be made, a folder holds another phantom, or two
+            scenes have one name.
+    """
+    found: list[SceneSource] = []
+    benchmarks: set[str] = set()
+    for name in names:
+        benchmark, scene = _benchmark(name)
+        if benchmark is not None:
+            benchmarks.add(benchmark.name)
+            found += _scenes_of(benchmark, scene, data or SCENES / benchmark.name)
+        else:
+            found.append(_folder(name))
+    if data is not None and len(benchmarks) != 1:
+        many = ", ".join(sorted(benchmarks)) or "none"
+        raise InputError(f"--data {data} with these benchmarks: {many}", "one benchmark, whose scenes are there")
+    twice = [name for name, count in Counter(source.name for source in found).items() if count > 1]
+    if twice:
+        raise InputError(f"more than one scene is named {', '.join(twice)}", "scenes of different names")
+    _check_there(found)
+    return found
+
+
+def make_phantoms(sources: Sequence[SceneSource], progress: Progress | None = None) -> None:
+    """Make every phantom that is missing.
+
+    Raises:
+        InputError: One cannot be made or written.
+    """
+    for source in sources:
+        if source.phantom is None or source.is_there:
+            continue
+        with locked(source.path.parent / f".{source.path.name}.lock", wait=math.inf):
+            if not source.is_there:  # another comparison may have made it meanwhile
+                log.info("making phantom %s", source.path)
+                generate(source.phantom, source.path, progress=progress)
+
+
+def _benchmark(name: str) -> tuple[Benchmark | None, str | None]:
+    """The benchmark that a name stands for, and the one scene of it; None and None for a folder."""
+    files = shipped()
+    if name in files or is_path(name):
+        return load_benchmark(name), None
+    first, _, scene = name.rpartition("/")
+    if (first in files or is_path(first)) and scene and not Path(name).is_dir():
+        return load_benchmark(first), scene
+    return None, None
+
+
+def _scenes_of(benchmark: Benchmark, only: str | None, data: Path) -> list[SceneSource]:
+    scenes = benchmark.settings.scenes
+    if only is not None and only not in scenes:
+        known = ", ".join(scenes)
+        raise InputError(
+            f"benchmark '{benchmark.name}' has no scene '{only}'", f"one of {known}", did_you_mean(only, scenes)
+        )
+    return [
+        SceneSource(
+            name,
+            _first_there([(data / folder).resolve() for folder in entry.folders(name)]),
+            benchmark.overrides(name),
+            entry.format or benchmark.settings.format,
+            entry.phantom_settings,
+        )
+        for name, entry in scenes.items()
+        if only in (None, name)
+    ]
+
+
+def _first_there(paths: Sequence[Path]) -> Path:
+    return next((path for path in paths if path.is_dir()), paths[0])
+
+
+def _folder(name: str) -> SceneSource:
+    path = Path(name)
+    if not path.is_dir():
+        files = shipped()
+        raise InputError(
+            f"no scene '{name}'",
+            f"the folder of a scene, or a benchmark: {', '.join(files)}",
+            did_you_mean(name, files) or "`coliags list benchmarks` describes them",
+        )
+    return SceneSource(path.resolve().name, path.resolve())
+
+
+def _check_there(sources: Sequence[SceneSource]) -> None:
+    missing = [source for source in sources if not source.is_there and source.phantom is None]
+    if missing:
+        folders = ", ".join(dict.fromkeys(str(source.path.parent) for source in missing))
+        raise InputError(
+            f"{len(missing)} of {len(sources)} scenes are not there: {', '.join(source.name for source in missing)}",
+            f"a folder for each in {folders}",
+            "Get the dataset (docs/data.md), or name its folder with --data",
+        )
+    for source in sources:
+        if source.is_there and source.phantom is not None:
+            _check_same_phantom(source)
+
+
+def _check_same_phantom(source: SceneSource) -> None:
+    """Refuse a folder with another phantom than the benchmark's."""
+    file = source.path / "phantom.json"
+    try:
+        settings = json.loads(file.read_text(encoding="utf-8"))["settings"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{source.path} is not a phantom: {file.name} cannot be read", "the benchmark's phantom, or no folder"
+        ) from error
+    wanted = source.phantom_record or {}
+    differing = [key for key in wanted if settings.get(key) != wanted[key]]
+    if differing:
+        seen = ", ".join(f"{key} {settings.get(key)!r} instead of {wanted[key]!r}" for key in differing)
+        raise InputError(
+            f"{source.path} is another phantom than the benchmark's: {seen}",
+            "the benchmark's phantom, or no folder",
+            "Remove it, or choose another --data",
+        )

@@ -1,0 +1,67 @@
+"""Settings as values by key path, and as the ``key.path=value`` texts of the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from coliags_plugin.config.yaml_tree import dump_inline, parse_value
+from coliags_plugin.core.errors import InputError
+
+#: An assignment as messages explain it.
+EXAMPLE = "key.path=value, for instance field.geometry_head.frequencies=8"
+
+
+def parse_assignments(texts: Iterable[str], option: str = "--set", expected: str = EXAMPLE) -> dict[str, Any]:
+    """Values by key path, read as YAML; of a key that is there twice the last one counts, in its place.
+
+    Args:
+        texts: ``key.path=value`` each.
+        option: Name of the option, for messages.
+        expected: What would have been valid, for messages.
+
+    Raises:
+        InputError: A text has no ``=``.
+    """
+    values: dict[str, Any] = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not equals:
+            raise InputError(f"{option} {text}", expected)
+        values.pop(key.strip(), None)
+        values[key.strip()] = parse_value(value)
+    return values
+
+
+def assignments(settings: Mapping[str, Any] | None) -> tuple[str, ...]:
+    """``key.path=value`` texts, in the settings' order; what :func:`parse_assignments` reads as the same settings.
+
+    Args:
+        settings: Plain values by key path; a key with a dot in it is put in double quotes. None: no settings.
+
+    Raises:
+        InputError: This is no mapping from text, or a value is not plain data.
+    """
+    if settings is None:
+        return ()
+    if not isinstance(settings, Mapping) or not all(isinstance(key, str) for key in settings):
+        raise InputError(f"settings {settings!r}", 'values by key path, for instance {"schedule.steps": 5000}')
+    return tuple(f"{key}={dump_inline(_plain(value, key))}" for key, value in settings.items())
+
+
+def _plain(value: Any, key: str) -> Any:
+    """The value as YAML has it."""
+    if getattr(value, "ndim", None) == 0:
+        value = value.item()  # a number of NumPy
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Mapping):
+        return {str(name): _plain(child, f"{key}.{name}") for name, child in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(child, key) for child in value]
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    raise InputError(
+        f"setting {key} is a {type(value).__name__}: {value!r}", "a number, text, None, or a list or mapping of them"
+    )

@@ -1,0 +1,54 @@
+"""Reading of a run's training log."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from coliags_plugin.core.errors import InputError
+
+_COLUMNS = ("step", "loss", "psnr", "seconds")
+
+
+def read_training_log(run: Path) -> dict[str, Float[np.ndarray, "L"]]:
+    """The logged steps of a run by column: step, loss, psnr, and seconds since training began.
+
+    NaN where a line lacks the column; without the columns that no line has; empty where there is no log.
+
+    Args:
+        run: Run folder.
+
+    Raises:
+        InputError: The log cannot be read, or a line is not a JSON object.
+    """
+    path = run / "metrics.jsonl"
+    if not path.is_file():
+        return {}
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be read: {error}", "the training log") from error
+    lines = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        if not line.strip():
+            continue
+        try:
+            values = json.loads(line)
+        except ValueError as error:
+            raise InputError(f"{path}, line {number} is not JSON: {error}", "one JSON object per line") from error
+        if not isinstance(values, dict):
+            raise InputError(f"{path}, line {number} holds a {type(values).__name__}", "one JSON object per line")
+        lines.append(values)
+    table = {name: np.array([_number(values.get(name)) for values in lines], dtype=np.float64) for name in _COLUMNS}
+    return {name: values for name, values in table.items() if np.isfinite(values).any()}
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return math.nan
+    return float(value) if math.isfinite(value) else math.nan

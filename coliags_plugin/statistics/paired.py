@@ -1,0 +1,125 @@
+"""Paired tests, effect sizes and bootstrap interval of differences over scenes."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import stats
+
+#: Scenes from which on a test is run: with 5, the two-sided Wilcoxon test cannot give less than .0625.
+FEWEST_SCENES = 6
+#: Resamples of the bootstrap.
+RESAMPLES = 10_000
+#: Largest sample whose p is exact, scipy's limit as well.
+_MOST_EXACT = 50
+
+Differences = Float[np.ndarray, "n"]
+
+
+def smallest_p(scenes: int) -> float:
+    """The smallest p that the two-sided Wilcoxon test of ``scenes`` differences can give: 2 / 2^n."""
+    return min(1.0, 2.0 * 0.5**scenes)
+
+
+def wilcoxon_p(differences: Differences) -> float:
+    """Two-sided p of the Wilcoxon signed-rank test.
+
+    Zeros are dropped. Exact for up to 50 differences, of which scipy takes those without ties; the normal approximation
+    beyond. Never below :func:`smallest_p`. Without a difference that is not zero it is 1.
+
+    Args:
+        differences: One per scene. [n]
+    """
+    kept = differences[differences != 0.0]
+    if not kept.size:
+        return 1.0
+    tied = len(np.unique(np.abs(kept))) < len(kept)
+    if tied and len(kept) <= _MOST_EXACT:
+        return _exact_p(stats.rankdata(np.abs(kept)), kept > 0.0)
+    return max(float(stats.wilcoxon(kept).pvalue), smallest_p(len(kept)))
+
+
+def _exact_p(ranks: Float[np.ndarray, "n"], positive: Bool[np.ndarray, "n"]) -> float:
+    """Two-sided p of the sum of positive ranks, under all sign changes alike; tied ranks are halves."""
+    doubled = np.rint(2.0 * ranks).astype(np.int64)
+    # ways[s]: of choosing the positive ranks so that twice their sum is s. Exact: below 2^53.
+    ways = np.zeros(int(doubled.sum()) + 1)
+    ways[0] = 1.0
+    for rank in doubled:
+        ways[rank:] += ways[:-rank].copy()
+    found = int(doubled[positive].sum())
+    tail = min(ways[: found + 1].sum(), ways[found:].sum())
+    return float(min(1.0, 2.0 * tail / ways.sum()))
+
+
+def t_test_p(differences: Differences) -> float | None:
+    """Two-sided p of the paired t-test; None where all differences are equal, so that it is undefined.
+
+    Args:
+        differences: One per scene, at least two. [n]
+    """
+    if _constant(differences):
+        return None
+    return float(stats.ttest_1samp(differences, 0.0).pvalue)
+
+
+def cohen_dz(differences: Differences) -> float | None:
+    """Cohen's d of paired samples: mean over standard deviation (n - 1); None where all differences are equal.
+
+    Args:
+        differences: One per scene, at least two. [n]
+    """
+    if _constant(differences):
+        return None
+    return float(np.mean(differences) / np.std(differences, ddof=1))
+
+
+def rank_biserial(differences: Differences) -> float:
+    """Matched-pairs rank-biserial correlation: (R+ - R-) / (R+ + R-), of the ranks of the non-zero differences.
+
+    1 where all differences are positive, -1 where all are negative, 0 where none is other than zero. Source: Kerby,
+    The simple difference formula, 2014.
+
+    Args:
+        differences: One per scene. [n]
+    """
+    kept = differences[differences != 0.0]
+    if not kept.size:
+        return 0.0
+    ranks = stats.rankdata(np.abs(kept))
+    return float(np.sum(np.sign(kept) * ranks) / np.sum(ranks))
+
+
+def bootstrap_interval(differences: Differences, seed: int = 0, confidence: float = 0.95) -> tuple[float, float]:
+    """Percentile bootstrap interval of the mean difference; scenes are resampled, never frames.
+
+    Args:
+        differences: One per scene. [n]
+        seed: Of the resampling.
+        confidence: Share of the resampled means inside.
+    """
+    count = len(differences)
+    chosen = np.random.default_rng(seed).integers(0, count, (RESAMPLES, count))
+    tail = 50.0 * (1.0 - confidence)
+    low, high = np.percentile(differences[chosen].mean(axis=1), [tail, 100.0 - tail])
+    return float(low), float(high)
+
+
+def holm(p_values: list[float]) -> list[float]:
+    """p-values adjusted for their number by Holm's step-down procedure, in the given order.
+
+    Source: Holm, A simple sequentially rejective multiple test procedure, 1979.
+    """
+    count = len(p_values)
+    adjusted = [0.0] * count
+    largest = 0.0
+    for rank, index in enumerate(sorted(range(count), key=lambda index: p_values[index])):
+        largest = max(largest, min(1.0, (count - rank) * p_values[index]))
+        adjusted[index] = largest
+    return adjusted
+
+
+def _constant(differences: Differences) -> bool:
+    """Whether all differences are equal up to rounding, so that their standard deviation is none."""
+    size = float(np.max(np.abs(differences), initial=0.0))
+    return float(np.ptp(differences)) <= 1e-12 * size

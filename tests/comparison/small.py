@@ -1,0 +1,74 @@
+"""Comparisons small enough for tests."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from coliags_plugin.comparison.compare import How, carry_out, make_request
+from coliags_plugin.comparison.executors import Executor
+from coliags_plugin.comparison.folder import ComparisonFolder
+from coliags_plugin.comparison.tasks import Outcome, Task
+from coliags_plugin.comparison.worker import work
+
+#: Overrides that make the anchor methods small, whose steps then take some milliseconds.
+TINY = (
+    *("datamanager.points_count=500", "field.features=8", "field.children=4", "field.voxel_size=4"),
+    *("schedule.log_every=1", "strategy.statistics_from=0", "strategy.growth_from=2", "strategy.every=3"),
+    *("strategy.gradient_threshold=1e-6", "strategy.pixels_per_birth=100"),
+)
+
+
+class InlineExecutor(Executor):
+    """Works on tasks in this process, one after the other; remembers which."""
+
+    slots, threads = 1, 1
+
+    def __init__(self) -> None:
+        self.tasks: list[Task] = []
+        self._next: list[Task] = []
+
+    def check(self, folder: Path, scenes: Sequence[Path]) -> None:
+        pass
+
+    def start(self, task: Task) -> None:
+        self.tasks.append(task)
+        self._next.append(task)
+
+    def wait(self, seconds: float) -> list[tuple[Task, Outcome]]:
+        ended = [(task, self.outcome(task)) for task in self._next]
+        self._next.clear()
+        return ended
+
+    def outcome(self, task: Task) -> Outcome:
+        return work(task)
+
+    def stop(self) -> None:
+        self._next.clear()
+
+
+def compare_inline(methods, scenes, output, executor=None, *, steps=3, overrides=TINY, seeds=1, splits=(), **how):
+    """``compare`` in this process."""
+    request = make_request(methods, scenes, how.pop("data", None), seeds, "paper", splits, steps, overrides)
+    executor = executor or InlineExecutor()
+    return carry_out(request, ComparisonFolder(Path(output)), executor, How(device="cpu", **how))
+
+
+def hashes(folder: Path) -> dict[str, str]:
+    """``metrics_sha256`` of every results file, by its place."""
+    found = {}
+    for path in sorted((folder / "results").rglob("*.json")):
+        (value,) = re.findall(r'"metrics_sha256": "(\w+)"', path.read_text(encoding="utf-8"))
+        found[path.relative_to(folder).as_posix()] = value
+    return found
+
+
+def trainings(folder: Path) -> dict[str, list[int]]:
+    """Steps from which training was started or resumed, by run."""
+    return {
+        path.relative_to(folder / "logs").with_suffix("").as_posix(): [
+            int(step) for step in re.findall(r"training from step (\d+)", path.read_text(encoding="utf-8"))
+        ]
+        for path in sorted((folder / "logs").rglob("*.log"))
+    }

@@ -1,0 +1,146 @@
+"""Benchmarks: the shipped ones are those of the publications, and a file with a fault is refused by line and key."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from coliags_plugin.comparison.benchmarks import load_benchmark
+from coliags_plugin.comparison.named_files import descriptions, shipped
+from coliags_plugin.comparison.scenes import find_scenes
+from coliags_plugin.config.method_config import load_method
+from coliags_plugin.core.errors import InputError
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_every_shipped_benchmark_is_valid_and_described(name):
+    benchmark = load_benchmark(name)
+    assert descriptions()[name] == benchmark.settings.description != ""
+    for scene, entry in benchmark.settings.scenes.items():
+        name_of_format = entry.format or benchmark.settings.format
+        config = load_method("coliags", benchmark.overrides(scene), name_of_format).config
+        assert config.datamanager.settings.split == (benchmark.settings.split or "every-8th")
+
+
+def test_c3vd_is_the_official_list(shared_data):
+    path = shared_data / "c3vd_summary_csv" / "C3VD_data_summary_registered.csv"
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        official = {row["Old Name"]: row["Video Name"] for row in csv.DictReader(file) if row["Video Name"]}
+    scenes = load_benchmark("c3vd").settings.scenes
+    assert {name: entry.folders(name) for name, entry in scenes.items()} == {
+        old: (old, new) for old, new in official.items()
+    }
+
+
+def test_the_ten_of_endogslam_are_of_c3vd():
+    ten = load_benchmark("c3vd-endogslam").settings
+    assert len(ten.scenes) == 10 and ten.scenes.keys() < load_benchmark("c3vd").settings.scenes.keys()
+    assert (ten.split, ten.format) == ("endogslam", "c3vd-endogslam")
+
+
+@pytest.fixture
+def written(tmp_path):
+    def write(text, name="mine.yaml"):
+        (tmp_path / name).write_text(text)
+        return str(tmp_path / name)
+
+    return write
+
+
+def test_options_become_changes_of_the_data_manager(written):
+    name = written(
+        "description: mine\nsplit: block\noptions: {block: [0.2, 0.4], width: 84, height: 67}\n"
+        "scenes: {a: {}, b: {options: {split: own, points_file: a b.ply}}}\n"
+    )
+    benchmark = load_benchmark(name)
+    assert benchmark.name == "mine"
+    settings = {
+        scene: load_method("coliags", benchmark.overrides(scene)).config.datamanager.settings for scene in ("a", "b")
+    }
+    assert (settings["a"].split, settings["a"].block, settings["a"].width) == ("block", (0.2, 0.4), 84)
+    assert (settings["b"].split, settings["b"].height, settings["b"].points_file) == ("own", 67, "a b.ply")
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("scenes: {a: {}}", "mine.yaml:1: description: is missing"),
+        ("description: x", "mine.yaml:1: scenes: is missing"),
+        ("description: x\nscenes: {}", "mine.yaml:2: scenes"),
+        ("description: x\nscenes:\n  a: {phantm: {seed: 0}}", r"mine.yaml:3: scenes.a.phantm: unknown key 'phantm'"),
+        ("description: x\nscenes:\n  a:\n    phantom: {seeds: 0}", "mine.yaml:4: scenes.a.phantom: .*'seeds'"),
+        ("description: x\nscenes:\n  a: {phantom: {light: sun}}", "scenes.a.phantom: phantom setting light"),
+        ("description: x\nscenes: {../a: {}}", r"scene name '\.\./a'"),
+        ("description: x\nformat: c3dv\nscenes: {a: {}}", "mine.yaml:2: format: .*Did you mean 'c3vd'"),
+        ("description: x\nscenes: [a]", "mine.yaml:2: scenes"),
+        ("description: x\nscenes: {a: {}}\nscenes: {a: {}}", "key 'scenes' is there twice"),
+    ],
+)
+def test_faults_are_named_by_line_and_key(written, text, told):
+    with pytest.raises(InputError, match=told):
+        load_benchmark(written(text))
+
+
+def test_an_unknown_name_says_which_was_meant():
+    with pytest.raises(InputError, match=r"no benchmark 'c3dv'.*Did you mean 'c3vd'"):
+        load_benchmark("c3dv")
+
+
+# Scenes
+
+
+def test_scenes_that_are_missing_are_all_named_with_the_place(tmp_path):
+    (tmp_path / "cecum_t1_a").mkdir()
+    with pytest.raises(InputError, match=r"21 of 22 scenes are not there: cecum_t1_b, cecum_t2_a") as refused:
+        find_scenes(["c3vd"], tmp_path)
+    assert "trans_t4_b" in str(refused.value) and str(tmp_path) in str(refused.value)
+    assert "cecum_t1_a," not in str(refused.value)
+
+
+def test_folders_by_the_present_names_of_c3vd(tmp_path):
+    (tmp_path / "c0_cecum_t1_v2").mkdir()
+    (scene,) = find_scenes(["c3vd/cecum_t1_b"], tmp_path)
+    assert (scene.name, scene.path, scene.data_format) == ("cecum_t1_b", tmp_path / "c0_cecum_t1_v2", "c3vd")
+
+
+def test_folders_and_scenes_of_a_file(tmp_path, written):
+    (tmp_path / "wall").mkdir()
+    name = written("description: x\nscenes: {one: {phantom: {seed: 3}}, two: {phantom: {seed: 4}}}")
+    scenes = find_scenes([str(tmp_path / "wall"), f"{name}/two"], tmp_path / "made")
+    assert [scene.name for scene in scenes] == ["wall", "two"]
+    assert scenes[0].is_there and not scenes[1].is_there
+    assert scenes[1].phantom.seed == 4 and scenes[1].path == tmp_path / "made" / "two"
+
+
+@pytest.mark.parametrize(
+    ("names", "data", "told"),
+    [
+        (["nowhere"], None, "no scene 'nowhere'.*a benchmark: c3vd, c3vd-endogslam"),
+        (["c3vd/cecum"], None, "benchmark 'c3vd' has no scene 'cecum'.*Did you mean"),
+        (["{tmp}/wall", "{tmp}/other/wall"], None, "more than one scene is named wall"),
+        (["{tmp}/wall"], "x", "--data x with these benchmarks: none"),
+        (["c3vd", "rotatecolon"], "x", "--data x with these benchmarks: c3vd, rotatecolon"),
+    ],
+)
+def test_scenes_that_cannot_be_meant(tmp_path, names, data, told):
+    for folder in ("wall", "other/wall"):
+        (tmp_path / folder).mkdir(parents=True)
+    with pytest.raises(InputError, match=told):
+        find_scenes([name.format(tmp=tmp_path) for name in names], None if data is None else Path(data))
+
+
+def test_another_phantom_in_the_place_of_the_benchmarks(tmp_path, written):
+    name = written("description: x\nscenes: {one: {phantom: {seed: 3, frames: 9}}}")
+    (scene,) = find_scenes([name], tmp_path / "made")
+    (tmp_path / "made" / "one").mkdir(parents=True)
+    with pytest.raises(InputError, match="is not a phantom"):
+        find_scenes([name], tmp_path / "made")
+    file = tmp_path / "made" / "one" / "phantom.json"
+    file.write_text(json.dumps({"settings": scene.phantom_record}))
+    assert find_scenes([name], tmp_path / "made")[0].is_there
+    file.write_text(json.dumps({"settings": {**scene.phantom_record, "seed": 4}}))
+    with pytest.raises(InputError, match="another phantom than the benchmark's: seed 4 instead of 3"):
+        find_scenes([name], tmp_path / "made")

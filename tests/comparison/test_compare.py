@@ -1,0 +1,365 @@
+"""Comparisons, carried out in this process: what is done is kept, what fails is told, and nothing else suffers."""
+
+from __future__ import annotations
+
+import errno
+import json
+import re
+import shutil
+from collections import namedtuple
+
+import pytest
+
+from coliags_plugin.comparison.cells import Variant
+from coliags_plugin.comparison.folder import ComparisonFolder
+from coliags_plugin.comparison.tasks import Outcome
+from coliags_plugin.core.errors import InputError, InterruptedRunError
+from coliags_plugin.engine.evaluator import evaluate
+from coliags_plugin.engine.trainer import Trainer
+from coliags_plugin.results.reading import NewerResultError, read_result
+from tests.commands import run
+from tests.comparison.small import TINY, InlineExecutor, compare_inline, hashes
+from tests.scenes import write_wall
+
+
+@pytest.fixture(scope="module")
+def wall(tmp_path_factory):
+    return write_wall(tmp_path_factory.mktemp("data") / "wall")
+
+
+@pytest.fixture(scope="module")
+def bare(tmp_path_factory):
+    """A scene without depth."""
+    return write_wall(tmp_path_factory.mktemp("data") / "bare", depth=False)
+
+
+@pytest.fixture(scope="module")
+def compared(wall, tmp_path_factory):
+    """A comparison that is done; copied by tests that change it."""
+    folder = tmp_path_factory.mktemp("compared") / "comparison"
+    done = compare_inline(["coliags", "scaffold-gs"], [wall], folder)
+    assert not done.failures
+    return folder
+
+
+@pytest.fixture
+def folder(compared, tmp_path):
+    shutil.copytree(compared, tmp_path / "comparison")
+    return tmp_path / "comparison"
+
+
+def again(wall, folder, methods=("coliags", "scaffold-gs"), **options):
+    """Compare in the same folder; the comparison, and the titles of what was run."""
+    executor = InlineExecutor()
+    done = compare_inline(list(methods), [wall], folder, executor, **options)
+    return done, [task.title for task in executor.tasks]
+
+
+# What is done
+
+
+def test_a_comparison_leaves_runs_results_and_a_plan(compared):
+    plan = json.loads((compared / "plan.json").read_text())
+    assert (plan["steps"], plan["overrides"]) == (3, list(TINY))
+    assert [(cell["scene"], cell["method"]) for cell in plan["cells"]] == [("wall", "coliags"), ("wall", "scaffold-gs")]
+    for cell in plan["cells"]:
+        result = read_result(compared / cell["result"])
+        assert (result.method, result.key, result.steps) == (cell["method"], cell["key"], 3)
+        assert (compared / cell["run"] / "eval" / "paper" / "result.json").is_file()
+        assert len(list((compared / cell["run"] / "checkpoints").iterdir())) == 1
+    assert not (compared / "failures").exists()
+    assert str(compared) not in (compared / "plan.json").read_text()
+
+
+def test_what_is_done_is_not_run_again(wall, folder):
+    before = hashes(folder)
+    done, ran = again(wall, folder)
+    assert ran == [] and hashes(folder) == before
+    assert [result.method for result in done.results] == ["coliags", "scaffold-gs"]
+
+
+def test_results_alone_count_as_done(wall, folder):
+    for path in folder.iterdir():
+        if path.name != "results":
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+    done, ran = again(wall, folder)
+    assert ran == [] and len(done.results) == 2
+
+
+def test_a_lost_result_of_a_finished_run_is_not_trained_again(wall, folder, monkeypatch):
+    before = hashes(folder)
+    shutil.rmtree(folder / "results")
+    monkeypatch.setattr(Trainer, "train", None)
+    done, ran = again(wall, folder)
+    assert not done.failures and len(ran) == 2 and hashes(folder) == before
+
+
+def test_a_comparison_is_extended(wall, folder):
+    _, ran = again(wall, folder, ["scaffold-gs", "coliags"], seeds=2)
+    assert ran == ["wall scaffold-gs seed 1", "wall coliags seed 1"]
+    _, ran = again(wall, folder, ["scaffold-gs"], splits=["block"])
+    assert ran == ["wall-block scaffold-gs seed 0"]
+    cells = ComparisonFolder(folder).plan().cells
+    assert len(cells) == len({cell.key for cell in cells}) == 5
+    assert read_result(folder / cells[-1].result).scene.split == "block"
+
+
+def test_a_method_that_has_changed_is_another_run(wall, folder, tmp_path, caplog):
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("base: scaffold-gs\n")
+    done, ran = again(wall, folder, [str(mine)])
+    assert ran == [] and done.results[0].provenance["same_as"] == "scaffold-gs"
+    mine.write_text("base: scaffold-gs\nlosses: {l1: {weight: 0.7}}\n")
+    _, ran = again(wall, folder, [str(mine)])
+    assert ran == ["wall mine seed 0"] and "not those of the former plan" in caplog.text
+    assert len(list((folder / "results" / "wall" / "mine").iterdir())) == 2
+    assert sum(cell.method == "mine" for cell in ComparisonFolder(folder).plan().cells) == 1
+
+
+def test_methods_that_are_the_same_are_run_once(wall, tmp_path):
+    names = ["coliags", Variant("whole", "ablations/depth-imve-imia"), "ablations/embedding-10-5"]
+    done, ran = again(wall, tmp_path / "new", names)
+    assert ran == ["wall coliags seed 0"]
+    assert [result.method for result in done.results] == ["coliags", "whole", "ablations/embedding-10-5"]
+    assert len({result.metrics_sha256 for result in done.results}) == 1
+    assert (tmp_path / "new/results/wall/ablations-embedding-10-5").is_dir()
+
+
+def test_a_run_goes_on_from_its_checkpoint(wall, tmp_path, monkeypatch):
+    whole = tmp_path / "whole"
+    compare_inline(["coliags"], [wall], whole, steps=6)
+    steps = Trainer.take_step
+
+    def interrupted(self):
+        row = steps(self)
+        if self.step == 4:
+            self.save()
+            raise KeyboardInterrupt
+        return row
+
+    monkeypatch.setattr(Trainer, "take_step", interrupted)
+    part = tmp_path / "part"
+    executor = InlineExecutor()
+    done = compare_inline(["coliags"], [wall], part, executor, steps=6)
+    assert not done.failures and len(executor.tasks) == 2
+    assert hashes(part) == hashes(whole)
+
+
+def test_a_damaged_checkpoint_is_set_aside(wall, tmp_path, monkeypatch):
+    whole, part = tmp_path / "whole", tmp_path / "part"
+    overrides = [*TINY, "schedule.checkpoint_every=2"]
+    compare_inline(["coliags"], [wall], whole, steps=6, overrides=overrides)
+    steps = Trainer.take_step
+    lives = []
+
+    def struck(self):
+        if self.step == 4 and not lives:
+            lives.append(4)
+            (self.run.checkpoints / "step-000004" / "state.safetensors").write_bytes(b"")
+            raise KeyboardInterrupt
+        return steps(self)
+
+    monkeypatch.setattr(Trainer, "take_step", struck)
+    done = compare_inline(["coliags"], [wall], part, steps=6, overrides=overrides)
+    assert not done.failures and lives and hashes(part) == hashes(whole)
+    assert next(part.glob("runs/wall/coliags/s0-*/checkpoints/damaged-step-000004-*"))
+
+
+# What fails
+
+
+def test_a_scene_without_depth_fails_the_methods_that_need_it_alone(wall, bare, tmp_path):
+    done = compare_inline(["coliags", "scaffold-gs"], [wall, bare], tmp_path / "new")
+    assert [(failure.scene, failure.method) for failure in done.failures] == [("bare", "coliags")]
+    assert "depth" in done.failures[0].reason
+    assert len(done.results) == 3
+    (file,) = (tmp_path / "new" / "failures").rglob("*.json")
+    assert json.loads(file.read_text())["reason"] == done.failures[0].reason
+    assert re.search(r"coliags +1 of 2 .*\nscaffold-gs +2 of 2", str(done.table()))
+
+
+def test_a_split_without_test_frames_fails_before_training(wall, tmp_path, monkeypatch):
+    monkeypatch.setattr(Trainer, "train", None)
+    done = compare_inline(["coliags"], [wall], tmp_path / "new", splits=["all-train"])
+    assert "has no test frames" in done.failures[0].reason
+
+
+def test_a_failure_is_forgotten_when_the_cell_is_done(wall, tmp_path, monkeypatch):
+    monkeypatch.setattr(Trainer, "take_step", lambda self: 1 / 0)
+    done = compare_inline(["coliags"], [wall], tmp_path / "new")
+    assert done.failures[0].reason == "ZeroDivisionError: division by zero"
+    monkeypatch.undo()
+    done = compare_inline(["coliags"], [wall], tmp_path / "new")
+    assert not done.failures and not list((tmp_path / "new" / "failures").rglob("*.json"))
+
+
+def test_a_run_that_becomes_nan_fails_alone(wall, tmp_path):
+    wild = ("optimizers.opacity_mlp.lr=1e39", "optimizers.opacity_mlp.final_lr=1e39")
+    methods = [Variant("wild", "coliags", wild), "coliags"]
+    done = compare_inline(methods, [wall], tmp_path / "new", steps=6)
+    assert [failure.method for failure in done.failures] == ["wild"] and "not finite" in done.failures[0].reason
+    assert [result.method for result in done.results] == ["coliags"]
+
+
+def test_a_full_disk_in_the_middle(wall, tmp_path, monkeypatch):
+    def full(trained, protocol):
+        if trained.method == "coliags":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return evaluate(trained, protocol)
+
+    monkeypatch.setattr("coliags_plugin.engine.evaluator.evaluate", full)
+    done = compare_inline(["coliags", "scaffold-gs"], [wall], tmp_path / "new")
+    assert [failure.method for failure in done.failures] == ["coliags"]
+    assert done.failures[0].reason.startswith("no space left for")
+    assert [result.method for result in done.results] == ["scaffold-gs"]
+
+
+Usage = namedtuple("Usage", "total used free")
+
+
+def test_a_disk_that_is_too_small_is_told_before_anything_runs(wall, tmp_path, monkeypatch):
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: Usage(2e9, 1.9e9, 1e8))
+    executor = InlineExecutor()
+    with pytest.raises(InputError, match=r"the runs need about .* MB, and the disk has 100 MB left"):
+        compare_inline(["coliags", "scaffold-gs"], [wall], tmp_path / "new", executor)
+    assert not executor.tasks
+
+
+def test_a_disk_that_fills_up_keeps_further_cells_from_starting(wall, tmp_path, monkeypatch):
+    free = iter([1e12, 1e12, 1e6])
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: Usage(1e12, 0, next(free)))
+    done = compare_inline(["coliags", "scaffold-gs"], [wall], tmp_path / "new")
+    assert "the disk is full: 1 MB left" in done.failures[0].reason and len(done.results) == 1
+
+
+class Dying(InlineExecutor):
+    """Whose workers die so many times."""
+
+    def __init__(self, times, ending="died"):
+        super().__init__()
+        self.left, self.ending = times, ending
+
+    def outcome(self, task):
+        self.left -= 1
+        return Outcome(self.ending, "the process was ended by SIGKILL") if self.left >= 0 else super().outcome(task)
+
+
+@pytest.mark.parametrize(("times", "fails"), [(2, False), (3, True)])
+def test_workers_that_die_are_tried_again_so_often(wall, tmp_path, times, fails):
+    done = compare_inline(["coliags"], [wall], tmp_path / "new", Dying(times))
+    assert bool(done.failures) == fails
+    if fails:
+        assert done.failures[0].reason == "the process was ended by SIGKILL, 3 times"
+        assert done.failures[0].attempts == 3
+
+
+def test_a_stop_names_what_is_done(wall, tmp_path):
+    class Interrupted(InlineExecutor):
+        def outcome(self, task):
+            if task.name == "scaffold-gs":
+                raise KeyboardInterrupt
+            return super().outcome(task)
+
+    with pytest.raises(InterruptedRunError, match="stopped with 1 of 2 cells done; the same command goes on"):
+        compare_inline(["coliags", "scaffold-gs"], [wall], tmp_path / "new", Interrupted())
+    done, ran = again(wall, tmp_path / "new")
+    assert ran == ["wall scaffold-gs seed 0"] and not done.failures
+
+
+# Damaged and foreign folders
+
+
+def test_a_half_written_result_is_reported_and_written_again(wall, folder, caplog):
+    (path,) = (folder / "results" / "wall" / "coliags").iterdir()
+    whole = path.read_bytes()
+    path.write_bytes(whole[:300])
+    _, ran = again(wall, folder)
+    assert ran == ["wall coliags seed 0"] and "not counted as done" in caplog.text and path.name in caplog.text
+    assert read_result(path).metrics_sha256 == json.loads(whole)["metrics_sha256"]
+
+
+def test_a_result_of_a_newer_version_is_refused_by_name(wall, folder):
+    (path,) = (folder / "results" / "wall" / "coliags").iterdir()
+    path.write_text(path.read_text().replace('"version": 1', '"version": 99', 1))
+    with pytest.raises(NewerResultError, match=re.escape(str(path))):
+        again(wall, folder)
+    assert '"version": 99' in path.read_text()
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ('{"format": "coliags-comparison", "version": 99}', "plan.json is from a newer version"),
+        ("{", "plan.json cannot be read"),
+        ('{"cells": 3}', "plan.json: cells"),
+    ],
+)
+def test_a_plan_that_cannot_be_read(wall, folder, content, told):
+    (folder / "plan.json").write_text(content)
+    with pytest.raises(InputError, match=told):
+        again(wall, folder)
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"steps": 4}, "compares runs of --steps 3, not 4"),
+        ({"steps": None}, "compares runs of --steps 3, not each method's own"),
+        ({"overrides": ["field.features=4"]}, "compares runs with .*--set field.features=8 .*, not --set field.feat"),
+    ],
+)
+def test_runs_of_another_kind_are_not_mixed(wall, folder, options, told):
+    with pytest.raises(InputError, match=told):
+        again(wall, folder, **options)
+
+
+def test_a_folder_of_something_else(wall, tmp_path):
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "chapter.txt").write_text("")
+    (tmp_path / "file").write_text("")
+    for path, told in [
+        (tmp_path / "thesis", "not the folder of a comparison: it holds chapter.txt"),
+        (tmp_path / "file", "is a file"),
+        (tmp_path / "file" / "x", "cannot write to"),
+    ]:
+        with pytest.raises(InputError, match=told):
+            again(wall, path)
+
+
+def test_invalid_input_leaves_no_files(wall, tmp_path):
+    for options in ({"methods": ["colias"]}, {"overrides": ["field.x=1"]}, {"splits": ["blok"]}):
+        with pytest.raises(InputError):
+            again(wall, tmp_path / "new", **options)
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_second_comparison_in_the_same_folder_is_refused(wall, folder):
+    with (
+        ComparisonFolder(folder).held(),
+        pytest.raises(InputError, match=r"another comparison is running in .*: process \d+"),
+    ):
+        again(wall, folder)
+
+
+# Preview
+
+
+def test_a_dry_run_tells_states_and_writes_nothing(wall, folder, tmp_path, capsys):
+    sets = [word for each in TINY for word in ("--set", each)]
+    shutil.rmtree(folder / "results" / "wall" / "scaffold-gs")
+    words = ["compare", "coliags", "scaffold-gs", "ablations/depth-imve-imia", "--scenes", wall]
+    benchmark = tmp_path / "mine.yaml"
+    benchmark.write_text("description: x\nscenes: {made: {phantom: {seed: 1}}}")
+    before = sorted(folder.rglob("*"))
+    command = [*words, benchmark, "--data", tmp_path / "made", "--output", folder, "--steps", 3, *sets]
+    assert run(*command, "--dry-run") == 0
+    table = capsys.readouterr().out
+    for line in (
+        r"wall coliags seed 0 +done +3 +-",
+        r"wall scaffold-gs seed 0 +resume +3 of 3 .* a rough table",
+        r"wall ablations/depth-imve-imia seed 0 +done",
+        r"made coliags seed 0 +scene to make +3 .* results",
+        r"6 cells: 2 done, 1 resume, 3 scene to make; about .* of free disk",
+    ):
+        assert re.search(line, table), line
+    assert sorted(folder.rglob("*")) == before and not (tmp_path / "made").exists()

@@ -1,0 +1,107 @@
+"""Plans: which cells there are, what they are called, and what their keys depend on."""
+
+from __future__ import annotations
+
+import pytest
+
+from coliags_plugin.comparison.cells import Variant, file_name
+from coliags_plugin.comparison.compare import make_request
+from coliags_plugin.comparison.plan import make_cells
+from coliags_plugin.comparison.scenes import SceneSource
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.datamanagers.c3vd.reader import C3VDDataManager
+from coliags_plugin.phantom.settings import PhantomSettings
+from tests.scenes import write_wall
+
+
+@pytest.fixture(scope="module")
+def wall(tmp_path_factory):
+    return write_wall(tmp_path_factory.mktemp("data") / "wall")
+
+
+def cells(wall, methods=("coliags",), *, seeds=1, protocol="paper", splits=(), steps=5, overrides=()):
+    return make_cells(make_request(methods, [wall], None, seeds, protocol, splits, steps, overrides))
+
+
+def keys(wall, **options):
+    (cell,) = cells(wall, **options)
+    return cell.keys
+
+
+def test_one_cell_for_each_method_split_and_seed_the_seeds_together(wall):
+    made = cells(wall, ["coliags", "3dgs"], seeds=2, splits=["every-8th", "block"])
+    assert [(cell.seed, cell.scene_label, cell.variant.name) for cell in made] == [
+        (seed, label, method) for seed in (0, 1) for label in ("wall", "wall-block") for method in ("coliags", "3dgs")
+    ]
+    assert {cell.config.datamanager.settings.split for cell in made if cell.scene_label == "wall"} == {"every-8th"}
+    assert len({cell.keys.result for cell in made}) == len(made)
+    assert {cell.config.schedule.steps for cell in made} == {5}
+
+
+def test_the_split_of_a_change_is_in_the_label_too(wall):
+    (cell,) = cells(wall, overrides=["datamanager.split=block"])
+    assert cell.scene_label == "wall-block"
+
+
+def test_a_key_depends_on_what_changes_a_result_and_on_nothing_else(wall, tmp_path):
+    plain = keys(wall)
+    assert keys(wall) == plain
+    assert keys(wall, overrides=["schedule.log_every=1", "schedule.checkpoint_every=2"]) == plain
+    others = [
+        keys(wall, steps=6),
+        keys(wall, methods=["scaffold-gs-depth"]),
+        keys(wall, overrides=["field.features=8"]),
+        keys(write_wall(tmp_path / "wall", frames=10)),
+    ]
+    assert len({each.training for each in [plain, *others]}) == 5
+    authors = keys(wall, protocol="authors-code")
+    assert authors.training == plain.training and authors.result != plain.result
+
+
+def test_a_method_under_another_name_has_the_same_key(wall):
+    ours, same, other = cells(
+        wall, ["coliags", Variant("whole", "ablations/depth-imve-imia"), Variant("no-lamp", "ablations/depth-imve")]
+    )
+    assert ours.keys == same.keys and ours.keys != other.keys
+    assert ours.run_place != same.run_place
+
+
+def test_places_are_made_of_scene_method_seed_and_key(wall):
+    (cell,) = cells(wall, ["ablations/depth"])
+    assert str(cell.run_place) == f"wall/ablations-depth/s0-{cell.keys.training[:8]}"
+    assert str(cell.result_place) == f"wall/ablations-depth/s0-{cell.keys.result[:8]}"
+    assert file_name("ablations/depth") == "ablations-depth"
+
+
+def test_the_fingerprint_is_that_of_the_loaded_scene(wall):
+    manager = C3VDDataManager(C3VDDataManager.Settings())
+    assert keys(wall).fingerprint == manager.fingerprint(wall) == manager.load(wall).provenance["fingerprint"]
+
+
+@pytest.mark.parametrize("layout", ["c3vd", "pr-endo"])
+def test_a_phantom_to_be_made_has_keys_where_its_fingerprint_is_known(tmp_path, layout):
+    phantom = PhantomSettings(layout=layout, frames=9)
+    request = make_request(["coliags"], [tmp_path], None, 1, "paper", (), 5, ())
+    request = type(request)(request.variants, [SceneSource("made", tmp_path / "made", phantom=phantom)], steps=5)
+    (unknown,) = make_cells(request)
+    assert unknown.keys is None and unknown.config.schedule.steps == 5
+    (known,) = make_cells(request, lambda scene: "abc")
+    assert known.keys is not None and known.keys.fingerprint == "abc"
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"methods": []}, "no method"),
+        ({"methods": ["colias"]}, "no method 'colias'.*Did you mean 'coliags'"),
+        ({"methods": ["coliags", "coliags"]}, "more than one method is named coliags"),
+        ({"seeds": 0}, "--seeds 0"),
+        ({"steps": 0}, "--steps 0"),
+        ({"splits": ["blok"]}, "no split 'blok'.*Did you mean 'block'"),
+        ({"protocol": "papre"}, "no protocol 'papre'.*Did you mean 'paper'"),
+        ({"overrides": ["field.featurs=8"]}, "--set field.featurs=8.*Did you mean 'features'"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(wall, options, told):
+    with pytest.raises(InputError, match=told):
+        cells(wall, **options)

@@ -1,0 +1,226 @@
+"""Sweeps on a real Ray cluster of two nodes on this machine: whatever is killed, the results are those of one that
+nobody disturbed, nothing is run twice and nothing is lost.
+
+All nodes share one disk, so that these tests do not show that run folders travel between machines.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from coliags_plugin.comparison.compare import How, compare
+from coliags_plugin.comparison.ray_executor import RayExecutor
+from coliags_plugin.core.errors import InputError
+from tests.commands import refused
+from tests.comparison.small import TINY, compare_inline, hashes, trainings
+from tests.scenes import write_wall
+
+STEPS = 300
+METHODS = ("coliags", "scaffold-gs-depth", "scaffold-gs", "scaffold-gs-distance")
+OFTEN = (*TINY, "schedule.checkpoint_every=10")
+DEADLINE = 300.0
+
+
+def test_ray_that_is_not_installed_is_told_how_to_get(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    wall = write_wall(tmp_path / "wall")
+    told = refused(capsys, "compare", "coliags", "--scenes", wall, "--output", tmp_path / "x", "--executor", "ray")
+    assert 'pip install "coliags_plugin[sweep]"' in told and not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:1", "nowhere"])
+def test_a_cluster_that_cannot_be_reached(tmp_path, capsys, address):
+    pytest.importorskip("ray")
+    wall = write_wall(tmp_path / "wall")
+    words = ("compare", "coliags", "--scenes", wall, "--output", tmp_path / "x", "--executor", "ray")
+    told = refused(capsys, *words, "--ray-address", address)
+    assert f"no Ray cluster at {address}" in told and "ray start --head" in told
+
+
+def patiently(start):
+    """What a function starts; on a busy machine a node may miss the 30 seconds that Ray gives it."""
+    for _ in range(4):
+        try:
+            return start()
+        except Exception as error:
+            found = error
+    raise found
+
+
+@pytest.fixture
+def cluster():
+    """A head, which this process belongs to and which runs nothing, and two nodes of one CPU each."""
+    pytest.importorskip("ray")
+    import ray
+    from ray.cluster_utils import Cluster
+
+    head = {"num_cpus": 0, "include_dashboard": False}
+    made = patiently(lambda: Cluster(initialize_head=True, head_node_args=head))
+    nodes = [patiently(lambda: made.add_node(num_cpus=1)) for _ in range(2)]
+    made.wait_for_nodes(timeout=120)
+    yield made, nodes
+    ray.shutdown()
+    made.shutdown()
+
+
+@pytest.fixture
+def wall(tmp_path):
+    return write_wall(tmp_path / "wall")
+
+
+@pytest.fixture
+def undisturbed(wall, tmp_path):
+    torch.set_num_threads(1)
+    done = compare_inline(METHODS, [wall], tmp_path / "undisturbed", steps=STEPS, overrides=OFTEN)
+    assert not done.failures
+    return hashes(tmp_path / "undisturbed")
+
+
+def driver(wall, folder, address):
+    """``coliags compare --executor ray`` as a process, alone in its group; its messages go to a file beside."""
+    words = ["compare", *METHODS, "--scenes", wall, "--output", folder, "--steps", STEPS, "--threads", 1]
+    words += ["--executor", "ray", "--ray-address", address, "--device", "cpu"]
+    sets = [word for each in OFTEN for word in ("--set", each)]
+    command = [sys.executable, "-c", "from coliags_plugin.cli import main; main()", *map(str, words), *sets]
+    with messages_of(folder).open("w") as messages:
+        return subprocess.Popen(command, stderr=messages, start_new_session=True)
+
+
+def messages_of(folder):
+    return folder.with_suffix(".txt")
+
+
+def told_by(folder):
+    return messages_of(folder).read_text()
+
+
+def until(what, value):
+    """Wait until a function of no argument returns something true, and return that."""
+    end = time.monotonic() + DEADLINE
+    while not (found := value()):
+        assert time.monotonic() < end, f"no {what}"
+        time.sleep(0.01)
+    return found
+
+
+def steps_of(run):
+    log = run / "metrics.jsonl"
+    return len(log.read_text(encoding="utf-8").splitlines()) if log.is_file() else 0
+
+
+def under_way(folder):
+    """A process that has taken some steps of a run and has not ended; None where there is none."""
+    for lock in folder.glob("runs/wall/*/.s0-*.lock"):
+        run = lock.with_name(lock.name[1:].removesuffix(".lock"))
+        text = lock.read_text(encoding="utf-8").split()
+        if len(text) > 1 and 20 < steps_of(run) < STEPS and is_running(int(text[1])):
+            return int(text[1])
+    return None
+
+
+def is_running(process):
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def parent_of(process):
+    return int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1])
+
+
+def node_of(process, nodes):
+    """The node that a worker's Ray process belongs to: its raylet is the parent of that."""
+    raylet = parent_of(parent_of(process))
+    return next(
+        node for node in nodes if any(info.process.pid == raylet for info in node.all_processes.get("raylet", []))
+    )
+
+
+def check(folder, undisturbed):
+    """Every result is that of the undisturbed comparison, and no step was kept twice or lost."""
+    assert hashes(folder) == undisturbed
+    for run, begun in trainings(folder).items():
+        log = [json.loads(line)["step"] for line in (folder / "runs" / run / "metrics.jsonl").read_text().splitlines()]
+        assert log == list(range(1, STEPS + 1))
+        assert begun[0] == 0 and begun == sorted(set(begun)), f"{run} was begun at {begun}"
+    assert not list(folder.rglob(".storage-*")) and not list((folder / "failures").rglob("*.json"))
+
+
+@pytest.mark.slow
+def test_a_worker_a_node_and_the_driver_are_killed(cluster, wall, undisturbed, tmp_path):
+    made, nodes = cluster
+    folder = tmp_path / "killed"
+    first = driver(wall, folder, made.address)
+    os.kill(until("run", lambda: under_way(folder)), signal.SIGKILL)
+    until("retry of the worker", lambda: told_by(folder).count("trying again") == 1)
+    lost = node_of(until("second run", lambda: under_way(folder)), nodes)
+    made.remove_node(lost, allow_graceful=False)
+    nodes.remove(lost)
+    until("retry on the other node", lambda: told_by(folder).count("trying again") == 2)
+    assert "SIGKILL" in told_by(folder) and "the node died" in told_by(folder)
+    until("third run", lambda: under_way(folder))
+    first.kill()
+    first.wait()
+
+    assert driver(wall, folder, made.address).wait() == 0, told_by(folder)
+    check(folder, undisturbed)
+    before = trainings(folder)
+    assert sum(map(len, before.values())) >= len(METHODS) + 2, "what was struck went on"
+    assert driver(wall, folder, made.address).wait() == 0
+    assert trainings(folder) == before, "what is done is not run again"
+
+
+@pytest.mark.slow
+def test_a_sweep_that_nobody_disturbs_and_one_that_is_asked_to_stop(cluster, wall, undisturbed, tmp_path):
+    made, _ = cluster
+    folder = tmp_path / "stopped"
+    first = driver(wall, folder, made.address)
+    until("run", lambda: under_way(folder))
+    os.kill(first.pid, signal.SIGINT)
+    assert first.wait() == 130 and "the same command goes on" in told_by(folder)
+    how = How(threads=1, device="cpu", executor="ray", ray_address=made.address)
+    done = compare(METHODS, [wall], folder, steps=STEPS, overrides=OFTEN, how=how)
+    assert not done.failures
+    check(folder, undisturbed)
+
+
+@pytest.mark.slow
+def test_tries_are_counted_when_memory_runs_out(monkeypatch, request, wall, tmp_path):
+    """Ray's own retries then have no end."""
+    monkeypatch.setenv("RAY_memory_usage_threshold", "0.001")  # less than is in use
+    monkeypatch.setenv("RAY_memory_monitor_refresh_ms", "100")
+    monkeypatch.setattr(RayExecutor, "check", lambda *_: None)  # whose tasks would end likewise
+    made, _ = request.getfixturevalue("cluster")
+    how = How(threads=1, device="cpu", executor="ray", ray_address=made.address, retries=1)
+    done = compare(["coliags"], [wall], tmp_path / "full", steps=100_000, overrides=TINY, how=how)
+    (failure,) = done.failures
+    assert (failure.reason, failure.attempts) == ("the node's memory ran out, 2 times", 2)
+
+
+@pytest.mark.slow
+def test_a_folder_that_a_node_does_not_see(cluster, wall, tmp_path, monkeypatch):
+    made, _ = cluster
+    executor = RayExecutor(made.address, None, 1, "cpu")
+    assert executor.slots == 2
+    executor.check(tmp_path, [wall])
+    assert not list(tmp_path.glob(".storage-*"))
+    with pytest.raises(InputError, match=r"node .* does not see the scenes .*/gone\. Expected scenes on storage"):
+        executor.check(tmp_path, [wall, tmp_path / "gone"])
+    seen = RayExecutor._seen_by
+
+    def elsewhere(self, node, file, scenes):
+        return seen(self, node, Path("/proc/1/nowhere") / file.name, scenes)
+
+    monkeypatch.setattr(RayExecutor, "_seen_by", elsewhere)
+    with pytest.raises(InputError, match=r"node .* does not see .*No such file.*storage that all machines share"):
+        executor.check(tmp_path, [wall])

@@ -1,0 +1,126 @@
+"""What workers are told and tell: tasks, their environment, and how a process ended."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from coliags_plugin.comparison.executors import LocalExecutor
+from coliags_plugin.comparison.tasks import Outcome, Task, outcome_line, read_outcome
+from coliags_plugin.comparison.worker import work
+from coliags_plugin.core.locks import LockedError, locked
+
+
+@pytest.fixture
+def task(tmp_path):
+    places = {name: str(tmp_path / name) for name in ("data", "run", "lock", "result", "log")}
+    return Task(
+        title="wall coliags seed 0",
+        name="coliags",
+        method="coliags",
+        overrides=("field.features=8",),
+        scene="wall",
+        data_format=None,
+        seed=0,
+        device="cpu",
+        protocol="paper",
+        result_key="0" * 16,
+        threads=3,
+        variables={"COLIAGS_LPIPS_WEIGHTS": "here"},
+        **places,
+    )
+
+
+def test_a_task_travels_as_json(task):
+    assert Task.from_json(task.to_json()) == task
+
+
+def test_the_environment_names_threads_package_and_variables(task):
+    environment = task.environment({"HOME": "/home", "PYTHONPATH": "mine", "OMP_NUM_THREADS": "64"})
+    assert environment["OMP_NUM_THREADS"] == environment["OPENBLAS_NUM_THREADS"] == "3"
+    assert environment["COLIAGS_LPIPS_WEIGHTS"] == "here" and environment["HOME"] == "/home"
+    first, second = environment["PYTHONPATH"].split(os.pathsep)
+    assert second == "mine" and os.path.isdir(os.path.join(first, "coliags_plugin"))
+
+
+@pytest.mark.parametrize("outcome", [Outcome("done"), Outcome("failed", 'no "depth"\nat all'), Outcome("stopped", "x")])
+def test_an_outcome_is_read_from_the_last_line(outcome):
+    assert read_outcome(1, f"noise\n{outcome_line(outcome)}\n") == outcome
+
+
+@pytest.mark.parametrize(
+    ("returncode", "printed", "reason"),
+    [
+        (-signal.SIGKILL, "", "the process was ended by SIGKILL; the system does so when memory runs out"),
+        (-signal.SIGSEGV, "half a li", "the process was ended by SIGSEGV"),
+        (1, "", "the process ended with status 1 without a message"),
+        (0, "[1]", "the process ended with status 0 without a message"),
+    ],
+)
+def test_a_process_that_says_nothing_has_died(returncode, printed, reason):
+    assert read_outcome(returncode, printed) == Outcome("died", reason)
+
+
+def test_a_scene_that_is_gone_is_the_reason(task):
+    outcome = work(task)
+    assert outcome.ending == "failed" and f"no folder {task.data}" in outcome.reason
+
+
+def test_a_run_that_another_process_has_is_left_alone(task):
+    with locked(Path(task.lock)):
+        outcome = work(replace(task, lock_seconds=0.3))
+    assert outcome == Outcome("failed", f"{task.run} is still in use by process {os.getpid()} on {os.uname().nodename}")
+
+
+def test_locks_end_with_their_process(tmp_path):
+    file = tmp_path / "deep" / "lock"
+    code = "import sys, time\nfrom pathlib import Path\nfrom coliags_plugin.core.locks import locked\n"
+    code += "with locked(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)\n"
+    with subprocess.Popen([sys.executable, "-c", code, str(file)], stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout.readline() == "held\n"
+        told = []
+        with pytest.raises(LockedError, match=f"process {holder.pid} on"), locked(file, 0.3, told.append):
+            pass
+        assert told == [f"process {holder.pid} on {os.uname().nodename}"]
+        holder.kill()
+    with locked(file, wait=5.0):
+        assert str(os.getpid()) in file.read_text()
+
+
+class Sleeper(Task):
+    """Whose process sleeps until its input is closed, then needs a moment."""
+
+    def command(self):
+        code = "import sys, time\nprint('up', file=sys.stderr, flush=True)\nsys.stdin.read()\ntime.sleep(0.2)\n"
+        code += 'print(\'{"ending": "stopped", "reason": "asked"}\')'
+        return [sys.executable, "-c", code]
+
+
+def test_the_local_executor_runs_as_many_as_it_has_slots_for_and_stops_them(task):
+    executor = LocalExecutor(2, threads=1, gpus=("4", "7"))
+    sleeper = Sleeper.from_json(task.to_json())
+    executor.start(sleeper)
+    executor.start(sleeper)
+    assert executor.wait(0.2) == []
+    environments = [
+        Path(f"/proc/{worker._process.pid}/environ").read_bytes().split(b"\0") for worker in executor._workers.values()
+    ]
+    assert [b"CUDA_VISIBLE_DEVICES=%d" % gpu in each for gpu, each in zip((4, 7), environments, strict=True)] == [
+        True
+    ] * 2
+    while Path(task.log).read_text().count("up") < 2:
+        time.sleep(0.01)
+    processes = [worker._process for worker in executor._workers.values()]
+    executor.stop()
+    assert [process.returncode for process in processes] == [0, 0]
+    executor.start(sleeper)
+    executor._workers[0]._process.kill()
+    ((_, outcome),) = executor.wait(30.0)
+    assert outcome.ending == "died" and "SIGKILL" in outcome.reason
