@@ -11,11 +11,18 @@ from coliags_plugin.comparison.cells import Cell, file_name
 from coliags_plugin.comparison.folder import ComparisonFolder
 from coliags_plugin.results.record import Result
 
-#: Seconds of a step on one thread, for images of 338 x 270, by kind of field (docs/comparing.md 4).
-_ROUGH_STEP = {"anchors": 0.16, "gaussians": 0.10, "surfels": 0.14, "lit-gaussians": 0.20, "reim-nerf": 7.5}
+#: Seconds of a step on one thread, for images of 338 x 270, by method or else kind of field (docs/comparing.md 4).
+_ROUGH_STEP = {
+    "anchors": 0.16,
+    "gaussians": 0.10,
+    "surfels": 0.14,
+    "lit-gaussians": 0.20,
+    "reim-nerf": 7.5,
+    "reim-nerf-small": 0.14,
+}
 _ROUGH_STEP_OF_OTHERS = 0.15
 #: Likewise of rendering the views of the test sets, where that is long.
-_ROUGH_EVALUATION = {"reim-nerf": 5000.0}
+_ROUGH_EVALUATION = {"reim-nerf": 5000.0, "reim-nerf-small": 100.0}
 _ROUGH_EVALUATION_OF_OTHERS = 10.0
 #: Starting a process and reading a scene, seconds.
 _ROUGH_START = 20.0
@@ -74,9 +81,9 @@ class Estimates:
             cell: The cell.
             steps_done: Steps that need not be repeated.
         """
-        name, field = cell.variant.name, cell.config.field.name
-        step = median(self._steps.get(name, [_ROUGH_STEP.get(field, _ROUGH_STEP_OF_OTHERS)]))
-        views = median(self._evaluations.get(name, [_ROUGH_EVALUATION.get(field, _ROUGH_EVALUATION_OF_OTHERS)]))
+        name = cell.variant.name
+        step = median(self._steps.get(name, [_rough(_ROUGH_STEP, cell, _ROUGH_STEP_OF_OTHERS)]))
+        views = median(self._evaluations.get(name, [_rough(_ROUGH_EVALUATION, cell, _ROUGH_EVALUATION_OF_OTHERS)]))
         checkpoint = median(self._checkpoints.get(name, [_ROUGH_CHECKPOINT]))
         kept = median(self._sizes_of(cell) or [checkpoint + _ROUGH_IMAGES])
         return Estimate(
@@ -97,6 +104,10 @@ class Estimates:
             runs = [path.parent for path in self._runs.glob(f"*/{name}/*/eval")]
             self._sizes[name] = [float(_size(run)) for run in runs]
         return self._sizes[name]
+
+
+def _rough(table: Mapping[str, float], cell: Cell, other: float) -> float:
+    return table.get(cell.variant.method, table.get(cell.config.field.name, other))
 
 
 def _size(folder: Path) -> int:
