@@ -21,6 +21,7 @@ def report(
     output: str | Path | None = None,
     *,
     formats: Format | Sequence[Format] = "html",
+    methods: Sequence[str] = (),
     columns: Sequence[str] = (),
     reference: str | None = None,
     protocol: str = "paper",
@@ -34,6 +35,7 @@ def report(
         of: Runs, comparisons, or paths of run folders, results files and folders of comparisons.
         output: File to write; with several formats, its suffix is that of each. None: ``report.html``, ``.md``, ...
         formats: What to write; CSV has every metric of every frame.
+        methods: Names of methods to show, in this order; empty: all.
         columns: Metrics to show; empty: the default ones.
         reference: Method that the others are compared with; None: ``coliags``, or the best where it is not there.
         protocol: Evaluation protocol to read.
@@ -62,4 +64,4 @@ def report(
         if each not in SUFFIXES:
             raise InputError(f"no format '{each}'", f"one of {', '.join(SUFFIXES)}", did_you_mean(each, SUFFIXES))
     file = Path(f"report{SUFFIXES[wanted[0]]}") if output is None else Path(output)
-    return write_report(paths, file, wanted, Choices(columns, reference, title, note), protocol, frames)
+    return write_report(paths, file, wanted, Choices(columns, reference, title, note), protocol, frames, methods)

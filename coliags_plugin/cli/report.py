@@ -28,6 +28,8 @@ class Report:
     """File to write; with several formats, its suffix is replaced by that of each; default: report.html, .md, ..."""
     format: Formats = ()
     """What to write, repeatable: html (default), markdown, latex (booktabs), csv (every frame), or all."""
+    methods: OptionalText = None
+    """Names of methods to show, in this order, separated by commas; default: all."""
     columns: OptionalText = None
     """Metrics to show, separated by commas, or `all`; default: psnr,ssim,lpips,depth_mse,depth_mse_inner,
     depth_median_error."""
@@ -52,7 +54,8 @@ class Report:
             self.paths,
             self.output,
             formats=FORMATS if "all" in self.format else named,
-            columns=tuple(filter(None, (self.columns or "").replace(" ", "").split(","))),
+            methods=_listed(self.methods),
+            columns=_listed(self.columns),
             reference=self.reference,
             protocol=self.protocol,
             frames=self.frames,
@@ -61,3 +64,7 @@ class Report:
         )
         for file in files:
             print(file.resolve())
+
+
+def _listed(text: str | None) -> tuple[str, ...]:
+    return tuple(filter(None, (part.strip() for part in (text or "").split(","))))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
-import socket
+import platform
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -40,7 +40,7 @@ def locked(file: Path, wait: float = 0.0, waiting: Callable[[str], None] | None 
         raise not_writable(file.parent, error) from error
     try:
         _acquire(handle, wait, waiting)
-        holder = f"process {os.getpid()} on {socket.gethostname()}".encode()
+        holder = f"process {os.getpid()} on {platform.node()}".encode()
         os.ftruncate(handle, os.pwrite(handle, holder, 0))
         yield
     finally:

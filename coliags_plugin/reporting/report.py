@@ -31,6 +31,7 @@ def write_report(
     choices: Choices | None = None,
     protocol: str = "paper",
     frames: int = 4,
+    methods: Sequence[str] = (),
 ) -> list[Path]:
     """Write a report of methods on scenes: metrics and statistics, views, errors, curves, costs and provenance.
 
@@ -41,6 +42,7 @@ def write_report(
         choices: Columns, reference, title and note.
         protocol: Name of the evaluation to read from folders.
         frames: Held-out views to show per scene and test set, beside the worst ones.
+        methods: Names of methods to show, in this order; empty: all.
 
     Returns:
         The files.
@@ -55,7 +57,7 @@ def write_report(
     }
     for file in files.values():
         refuse_folder(file)
-    study = read_study(paths, protocol)
+    study = read_study(paths, protocol, methods)
     content = make_content(study, choices)
     views = Views(study, content.reference, frames) if "html" in files else None
     for each, file in files.items():

@@ -5,24 +5,25 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.reporting.comparability import refuse_incomparable
 from coliags_plugin.reporting.comparison_folders import FoundResult, is_comparison, read_comparison, read_file
 from coliags_plugin.reporting.labels import told_apart
-from coliags_plugin.reporting.study import Failure, Study
+from coliags_plugin.reporting.study import Cell, Failure, Study
 from coliags_plugin.results.reading import RESULT_FILE
 
 
-def read_study(paths: Sequence[Path], protocol: str = "paper") -> Study:
+def read_study(paths: Sequence[Path], protocol: str = "paper", methods: Sequence[str] = ()) -> Study:
     """Read results and check that they are comparable.
 
     Args:
         paths: Run folders, results files, and folders of a comparison, in any mixture.
         protocol: Name of the evaluation to read from folders.
+        methods: Names of methods to keep, in this order; empty: all.
 
     Raises:
-        InputError: Nothing is there, a path is neither, a file is damaged or given twice, or the results are not
-            comparable.
+        InputError: Nothing is there, a path is neither, a file is damaged or given twice, a method is not there, or the
+            results are not comparable.
     """
     if not paths:
         raise InputError("no results", "run folders, results files or the folder of a comparison", "Name at least one")
@@ -42,8 +43,22 @@ def read_study(paths: Sequence[Path], protocol: str = "paper") -> Study:
     if not cells:
         raise _nothing_yet(paths, failures)
     labelled = told_apart(cells)
+    if methods:
+        labelled, failures = _only(methods, labelled, failures)
     refuse_incomparable(labelled)
     return Study(tuple(labelled), tuple(failures))
+
+
+def _only(
+    methods: Sequence[str], cells: Sequence[Cell], failures: Sequence[Failure]
+) -> tuple[list[Cell], list[Failure]]:
+    """Results and failures of some methods, in their order."""
+    known = list(dict.fromkeys(one.method for one in (*cells, *failures)))
+    for name in methods:
+        if name not in known:
+            raise InputError(f"no method '{name}' among the results", f"one of {', '.join(known)}", did_you_mean(name, known))
+    kept = [cell for name in dict.fromkeys(methods) for cell in cells if name == cell.method]
+    return kept, [failure for failure in failures if failure.method in methods]
 
 
 def _read_run(folder: Path, protocol: str) -> FoundResult:

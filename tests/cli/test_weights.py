@@ -106,6 +106,8 @@ def test_bad_input(capsys, cache, tmp_path):
 def test_ctrl_c_keeps_what_arrived(server, cache):
     server.cuts, server.go_on = [20_000_000, 1_000_000], threading.Event()
     code = f"""
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored by processes that a shell starts in the background
 from coliags_plugin.cli import main
 from coliags_plugin.metrics.lpips_install import SOURCES, Published
 SOURCES["squeeze"] = {SOURCES["squeeze"]!r}

@@ -147,11 +147,11 @@ def test_few_points_get_finite_scales(count):
     assert torch.isfinite(neighbour_log_scales(points)).all()
 
 
-def test_default_voxel_is_four_pixels_on_the_surface():
+def test_default_voxel_is_two_pixels_on_the_surface():
     scene = wall_scene()
     component = make_component("fields", COLIAGS)
     field = component.target.from_scene(scene, component.settings, torch.Generator().manual_seed(0))
-    assert float(field.voxel_size) == pytest.approx(4 * scene.pixel_footprint)
+    assert float(field.voxel_size) == pytest.approx(2 * scene.pixel_footprint)
     camera = scene.train[0].camera
     size = 20.0 / math.sqrt(camera.fx * camera.fy)
     assert scene.pixel_footprint == pytest.approx(size, rel=0.15)  # the camera comes up to 4 mm nearer

@@ -53,6 +53,15 @@ def test_a_comparison_finds_its_runs_by_the_results_key(tmp_path):
     assert read_study([folder]).cells[0].run is None
 
 
+def test_some_methods_alone_in_the_order_asked_for(tmp_path):
+    results = [result_of(name) for name in ("coliags", "2dgs", "3dgs")]
+    folder = write_comparison(tmp_path, results, [("cecum", "3dgs", 2, "no memory"), ("cecum", "2dgs", 2, "no memory")])
+    study = read_study([folder], methods=["3dgs", "coliags"])
+    assert study.methods == ["3dgs", "coliags"]
+    assert [failure.method for failure in study.failures] == ["3dgs"]
+    refuses([folder], "no method '3dg' .* Did you mean '3dgs'", methods=["3dg"])
+
+
 def test_variants_of_a_comparison_have_the_names_of_their_folders(tmp_path):
     folder = write_comparison(tmp_path, [result_of("ablations/none"), result_of("coliags")])
     (folder / "results/cecum/coliags").rename(folder / "results/cecum/coliags-steady")
