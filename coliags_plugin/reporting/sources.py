@@ -56,7 +56,8 @@ def _only(
     known = list(dict.fromkeys(one.method for one in (*cells, *failures)))
     for name in methods:
         if name not in known:
-            raise InputError(f"no method '{name}' among the results", f"one of {', '.join(known)}", did_you_mean(name, known))
+            those = ", ".join(known)
+            raise InputError(f"no method '{name}' among the results", f"one of {those}", did_you_mean(name, known))
     kept = [cell for name in dict.fromkeys(methods) for cell in cells if name == cell.method]
     return kept, [failure for failure in failures if failure.method in methods]
 
