@@ -15,7 +15,7 @@ from coliags_plugin.config import registry
 from coliags_plugin.config.components import make_component
 from coliags_plugin.core.errors import InputError, UnavailableError
 from coliags_plugin.engine.devices import choose_device
-from coliags_plugin.metrics.lpips_weights import DEFAULT_NETS, find_weights
+from coliags_plugin.metrics.lpips_weights import DEFAULT_NETS, WEIGHTS_VARIABLE, find_weights, searched_folders
 from coliags_plugin.renderers.choice import choose_renderer
 
 #: Distribution -> module. Imported for real: a library that is installed may still fail to load.
@@ -84,5 +84,7 @@ def _lpips(net: str) -> Finding:
     try:
         backbone, heads = find_weights(net)
     except UnavailableError as error:
-        return Finding(f"weights of LPIPS {net}", str(error))
+        folders = ", ".join(map(str, searched_folders()))
+        told = f"{error}. Looked in {folders}; {WEIGHTS_VARIABLE} can name a folder that has them"
+        return Finding(f"weights of LPIPS {net}", told)
     return Finding(f"weights of LPIPS {net}", f"{backbone} and {heads}")

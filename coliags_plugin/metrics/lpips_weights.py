@@ -36,7 +36,7 @@ def find_weights(net: str, folder: str | Path | None = None) -> tuple[Path, Path
     or in ``v0.1/``.
 
     Raises:
-        UnavailableError: One is missing; names the file and the folders searched.
+        UnavailableError: One is missing; names the file and the command that installs it.
     """
     backbone, heads = search(net, folder)
     if backbone is None or heads is None:
@@ -49,16 +49,16 @@ def find_weights(net: str, folder: str | Path | None = None) -> tuple[Path, Path
             if found is None
         ]
         command = "coliags weights lpips" + ("" if net in DEFAULT_NETS else f" --net {net}")
+        # Recorded with results, which are to be the same on every machine: no folders here.
         raise UnavailableError(
-            f"LPIPS {net} weights not found: {' and '.join(missing)}. To download them, run `{command}`. "
-            f"Looked in {', '.join(map(str, _folders(folder)))}; {WEIGHTS_VARIABLE} can name a folder that has them"
+            f"LPIPS {net} weights not found: {' and '.join(missing)}. To download them, run `{command}`"
         )
     return backbone, heads
 
 
 def search(net: str, folder: str | Path | None = None) -> tuple[Path | None, Path | None]:
     """Backbone and linear heads where :func:`find_weights` looks; None for what is missing."""
-    backbone, heads = weights_in(net, _folders(folder))
+    backbone, heads = weights_in(net, searched_folders(folder))
     return backbone, heads or weights_in(net, _package_folders())[1]
 
 
@@ -98,7 +98,8 @@ def load_network(net: str, backbone: Path, heads: Path) -> LPIPSNetwork:
         raise UnavailableError(f"{backbone} does not hold the backbone of LPIPS {net}") from error
 
 
-def _folders(folder: str | Path | None) -> Iterator[Path]:
+def searched_folders(folder: str | Path | None = None) -> Iterator[Path]:
+    """Where weights are searched for, in this order; heads also in an installed ``lpips`` package."""
     for named in (folder, os.environ.get(WEIGHTS_VARIABLE)):
         if named:
             yield Path(named).expanduser()

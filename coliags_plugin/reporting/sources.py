@@ -53,7 +53,7 @@ def _only(
     methods: Sequence[str], cells: Sequence[Cell], failures: Sequence[Failure]
 ) -> tuple[list[Cell], list[Failure]]:
     """Results and failures of some methods, in their order."""
-    known = list(dict.fromkeys(one.method for one in (*cells, *failures)))
+    known = list(dict.fromkeys([cell.method for cell in cells] + [failure.method for failure in failures]))
     for name in methods:
         if name not in known:
             those = ", ".join(known)
