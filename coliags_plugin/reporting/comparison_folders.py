@@ -70,7 +70,7 @@ def _planned(folder: Path, protocol: str) -> tuple[list[FoundResult], list[Failu
             found.append(replace(one, cell=replace(one.cell, method=method, run=_with_images(folder / run, protocol))))
         else:
             failure = folder / _FAILURES / Path(place).relative_to(_RESULTS)
-            failures.append(Failure(scene, method, seed, _reason(failure) if failure.is_file() else "not finished"))
+            failures.append(Failure(scene, method, seed, _reason(failure) if failure.is_file() else None))
     _refuse_other_protocols(folder, protocol, protocols)
     return found, failures
 

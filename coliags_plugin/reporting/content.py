@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -135,10 +136,17 @@ def _scenes(study: Study, choices: Choices) -> Section | None:
 def _failures(failures: Sequence[Failure]) -> Section | None:
     if not failures:
         return None
+    blocks: list[Block] = [Paragraph("Means and tests leave these out.")]
+    unfinished = Counter(failure.method for failure in failures if failure.reason is None)
+    if unfinished:
+        each = ", ".join(f"{method} ({count})" for method, count in unfinished.items())
+        blocks.append(Paragraph(f"{counted(unfinished.total(), 'cell')} not finished: {each}."))
     rows = tuple(
         Row(failure.method, (Entry(failure.scene), Entry(str(failure.seed), failure.seed), Entry(failure.reason)))
         for failure in failures
+        if failure.reason is not None
     )
-    columns = (Column("scene", "Scene", words=True), Column("seed", "Seed"), Column("reason", "Reason", words=True))
-    table = Table("Failed", "Method", columns, rows, counted(len(failures), "cell"), name="failed")
-    return Section("Failed cells", [Paragraph("These have no result; means and tests leave them out."), table])
+    if rows:
+        columns = (Column("scene", "Scene", words=True), Column("seed", "Seed"), Column("reason", "Reason", words=True))
+        blocks.append(Table("Failed", "Method", columns, rows, counted(len(rows), "cell"), name="failed"))
+    return Section("Cells without a result", blocks)

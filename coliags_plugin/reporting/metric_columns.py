@@ -13,6 +13,8 @@ from coliags_plugin.results.record import MAIN_SET, SEEN_SUFFIX
 DEFAULT_COLUMNS = ("psnr", "ssim", "lpips", "depth_mse", "depth_mse_inner", "depth_median_error")
 #: The same for other sets, whose views leave the path, so that much of what they see was never filmed.
 _BEYOND_THE_PATH = ("psnr", "psnr_seen", *DEFAULT_COLUMNS[1:])
+#: Of the default columns, what is shown where no result has the first.
+_INSTEAD = {"lpips": "lpips_squeeze"}
 #: Chooses all.
 ALL_COLUMNS = "all"
 
@@ -78,13 +80,19 @@ def metric_columns(study: Study, part: Part, chosen: Sequence[str] = ()) -> list
     """
     own = [name for name in study.metrics if not _belongs_elsewhere(study, part, name)]
     default = DEFAULT_COLUMNS if part.set_name == MAIN_SET else _BEYOND_THE_PATH
-    wanted = own if ALL_COLUMNS in chosen else chosen or default
+    wanted = own if ALL_COLUMNS in chosen else chosen or [_available(study, part, name) for name in default]
     shown = [name for name in wanted if name in own]
     ordered = dict.fromkeys([*shown, *own])
     return [
         Column(name, metric_title(name), study.metrics[name].unit, study.metrics[name].direction, name in shown)
         for name in ordered
     ]
+
+
+def _available(study: Study, part: Part, metric: str) -> str:
+    """A default column, or what stands for it where it is empty."""
+    other = _INSTEAD.get(metric, metric)
+    return metric if any(study.values(part, metric).values()) or not any(study.values(part, other).values()) else other
 
 
 def _belongs_elsewhere(study: Study, part: Part, metric: str) -> bool:

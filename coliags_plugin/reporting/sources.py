@@ -100,7 +100,7 @@ def _nothing_yet(paths: Sequence[Path], failures: Sequence[Failure]) -> InputErr
         first = failures[0]
         return InputError(
             f"none of the {len(failures)} cells of {where} has a result; {first.method} on {first.scene}: "
-            f"{first.reason}",
+            f"{first.reason or 'not finished'}",
             "at least one",
         )
     return InputError(f"{where} holds no results", "at least one finished cell", "Wait, or run `coliags compare` again")

@@ -39,12 +39,12 @@ class Cell:
 
 @dataclass(frozen=True)
 class Failure:
-    """A cell of a comparison that has no result, and why."""
+    """A cell of a comparison that has no result, and why; None where it has not been finished yet."""
 
     scene: str
     method: str
     seed: int
-    reason: str
+    reason: str | None
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +17,9 @@ from coliags_plugin.reporting.frame_values import per_frame_csv
 from coliags_plugin.reporting.published import _C3VD_FRAMES
 from coliags_plugin.reporting.sources import read_study
 from coliags_plugin.reporting.statistics_text import p_text
+from coliags_plugin.reporting.study import Failure
 from coliags_plugin.reporting.tables import Table
+from coliags_plugin.results.hashing import metrics_sha256
 from tests.reporting.made import FRAMES, NO_LPIPS, made_scenes, result_of, write_comparison
 
 
@@ -59,6 +62,20 @@ def test_facts_and_title(study_of):
 
 
 # Summary
+
+
+def test_lpips_of_another_net_where_there_is_no_vgg(study_of):
+    ours = result_of("coliags")
+    part = ours.sets["test"]
+    values = {**part.values, "lpips_squeeze": (0.1,) * len(part.frames)}
+    sets = {**ours.sets, "test": part.model_copy(update={"values": values})}
+    metrics = {**ours.metrics, "lpips_squeeze": ours.metrics["lpips"]}
+    squeezed = ours.model_copy(update={"metrics": metrics, "sets": sets, "metrics_sha256": metrics_sha256(sets)})
+    both = tables(of(study_of, [squeezed]))
+    assert [column.key for column in both["summary-test"].columns if column.shown][2] == "lpips_squeeze"
+    assert "lpips" in [column.key for column in both["summary-rotation"].columns if column.shown]
+    chosen = tables(of(study_of, [squeezed], columns=["lpips"]))["summary-test"]
+    assert [column.key for column in chosen.columns if column.shown] == ["lpips"]
 
 
 def test_the_summary_of_one_scene_is_the_mean_of_its_frames(study_of):
@@ -257,6 +274,14 @@ def test_failed_cells_are_listed(tmp_path):
         ["3dgs", "cecum", "0", "ran out of memory"],
         ["3dgs", "sigmoid", "1", "no reason was recorded"],
     ]
+
+
+def test_unfinished_cells_are_counted(study_of):
+    failures = tuple(Failure(scene, "3dgs", 0, None) for scene in "pq")
+    study = replace(study_of([result_of("coliags")]), failures=failures)
+    content = make_content(study, Choices())
+    assert "failed" not in tables(content)
+    assert Paragraph("2 cells not finished: 3dgs (2).") in content.failures.blocks
 
 
 # Published numbers

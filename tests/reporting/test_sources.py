@@ -106,7 +106,7 @@ def test_the_plan_gives_order_runs_and_what_is_not_finished(tmp_path):
     assert [cell.run is None for cell in study.cells] == [True, False]
     assert [(f.method, f.seed, f.reason) for f in study.failures] == [
         ("2dgs", 0, "no memory"),
-        ("3dgs", 1, "not finished"),
+        ("3dgs", 1, None),
     ]
     refuses([folder], "results of protocol paper only", protocol="authors-code")
     damaged = {"{": "cannot be read", "[]": "holds a list", '{"cells": [{}]}': "a cell lacks 'scene'"}
