@@ -19,8 +19,9 @@ demo: install
 	  --title "ColIAGS and Scaffold-GS on a synthetic colon" \
 	  --note "A demonstration: $(DEMO_STEPS) steps on a CPU, where the paper trains 30,000."
 
+# In a process per CPU, up to four; each would take all CPUs otherwise.
 test: install
-	$(BIN)/python -m pytest -q
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --maxprocesses 4
 
 test-slow: install
 	$(BIN)/python -m pytest -q -m slow
