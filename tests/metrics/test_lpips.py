@@ -164,7 +164,7 @@ def test_an_installed_lpips_package_lends_its_heads_without_being_imported(nowhe
     assert heads == package / "weights" / "v0.1" / "alex.pth"
 
 
-def test_missing_weights_say_what_and_where(nowhere, make, pair):
+def test_missing_weights_say_what_and_how_to_get_it(nowhere, make, pair):
     with pytest.raises(UnavailableError) as caught:
         make("lpips", net="vgg")(pair)
     text = str(caught.value)
