@@ -168,9 +168,9 @@ def test_missing_weights_say_what_and_how_to_get_it(nowhere, make, pair):
     with pytest.raises(UnavailableError) as caught:
         make("lpips", net="vgg")(pair)
     text = str(caught.value)
-    for part in ("vgg16-397923af.pth", "v0.1/vgg.pth", str(nowhere / "torch" / "hub"), "COLIAGS_LPIPS_WEIGHTS"):
+    for part in ("vgg16-397923af.pth", "v0.1/vgg.pth", "run `coliags weights lpips`"):
         assert part in text
-    assert "run `coliags weights lpips`" in text
+    assert str(nowhere) not in text, "results are to be the same on every machine"
     torch.save(random_heads("vgg"), nowhere / "vgg.pth")
     with pytest.raises(UnavailableError, match="backbone") as caught:
         make("lpips", net="vgg", weights=str(nowhere))(pair)
