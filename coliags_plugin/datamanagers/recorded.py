@@ -24,6 +24,7 @@ from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSetting
 from coliags_plugin.datamanagers.seen import with_valid_seen_masks
 from coliags_plugin.datamanagers.splits import Split, divide
 from coliags_plugin.datamanagers.stored_frames import StoredFrame, read_in_parallel
+from coliags_plugin.datamanagers.units import read_unit
 
 log = logging.getLogger(__name__)
 
@@ -104,6 +105,7 @@ class RecordedDataManager(DataManager):
         provenance = {
             "dataset": self.name,
             "path": str(path.resolve()),
+            "unit": read_unit(path),
             **recording.facts,
             "fingerprint": recording.fingerprint,
             "split": split,

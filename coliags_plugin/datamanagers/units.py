@@ -1,0 +1,43 @@
+"""Unit of length of a scene: millimetres, or unknown where poses came from images alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal, cast, get_args
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import atomic_write
+from coliags_plugin.poses.text import read_text, shortened
+
+Unit = Literal["mm", "unknown"]
+
+#: The file that states the unit, in the scene's folder; without it the unit is the millimetre.
+UNIT_FILE = "unit.txt"
+
+
+def read_unit(folder: Path) -> Unit:
+    """The unit of a scene's poses and depth.
+
+    Args:
+        folder: The scene's folder.
+
+    Raises:
+        InputError: The file holds something else than one of the units.
+    """
+    path = folder / UNIT_FILE
+    if not path.is_file():
+        return "mm"
+    word = read_text(path, "the unit of length").strip()
+    if word not in get_args(Unit):
+        raise InputError(f"{path}: '{shortened(word)}'", " or ".join(get_args(Unit)), "Correct or remove the file")
+    return cast(Unit, word)
+
+
+def write_unit(folder: Path, unit: Unit) -> None:
+    """State the unit of a scene.
+
+    Args:
+        folder: The scene's folder.
+        unit: Of its poses and depth.
+    """
+    atomic_write(folder / UNIT_FILE, unit + "\n")
