@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -55,6 +55,7 @@ def _planned(folder: Path, protocol: str) -> tuple[list[FoundResult], list[Failu
     plan = _read_json(folder / _PLAN, "what `coliags compare` wrote")
     found, failures = [], []
     protocols: set[str] = set()
+    runs: dict[str, Path] = {}  # by key: what is the same as another method under a second name has no run of its own
     for entry in plan.get("cells", []):
         try:
             scene, method, seed = entry["scene"], entry["method"], int(entry["seed"])
@@ -67,12 +68,19 @@ def _planned(folder: Path, protocol: str) -> tuple[list[FoundResult], list[Failu
         file = folder / place
         if file.is_file():
             one = read_file(file, file.stem)
-            found.append(replace(one, cell=replace(one.cell, method=method, run=_with_images(folder / run, protocol))))
+            own = _with_images(folder / run, protocol)
+            if own is not None:
+                runs[one.cell.result.key] = own
+            found.append(replace(one, cell=replace(one.cell, method=method, run=own)))
         else:
             failure = folder / _FAILURES / Path(place).relative_to(_RESULTS)
             failures.append(Failure(scene, method, seed, _reason(failure) if failure.is_file() else None))
     _refuse_other_protocols(folder, protocol, protocols)
-    return found, failures
+    return [one if one.cell.run else _with_run(one, runs) for one in found], failures
+
+
+def _with_run(found: FoundResult, runs: Mapping[str, Path]) -> FoundResult:
+    return replace(found, cell=replace(found.cell, run=runs.get(found.cell.result.key)))
 
 
 def _unplanned(folder: Path, runs: Path | None, protocol: str) -> list[FoundResult]:

@@ -115,6 +115,15 @@ def test_the_plan_gives_order_runs_and_what_is_not_finished(tmp_path):
         refuses([folder], f"plan.json.*{match}")
 
 
+def test_a_method_under_a_second_name_shows_the_run_of_the_first(tmp_path):
+    first, other = result_of("coliags"), result_of("3dgs")
+    second = first.model_copy(update={"method": "depth-imve-imia"})
+    folder = write_comparison(tmp_path, [second, first, other])
+    plan(folder, [second, first, other])
+    run = write_run(folder / f"runs/cecum/coliags/s0-{first.key[:8]}", first)
+    assert [cell.run for cell in read_study([folder]).cells] == [run, run, None]
+
+
 def test_nothing_is_refused(tmp_path):
     refuses([], "no results")
     refuses([tmp_path / "none"], "none.json|none")
