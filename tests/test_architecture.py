@@ -20,7 +20,7 @@ LAYERS = (
     {"datamanagers", "fields", "renderers", "modules", "strategies", "losses", "metrics"},
     {"outputs", "results", "statistics"},
     {"engine", "phantom", "reconstruction"},
-    {"comparison", "data_check", "method_check", "reporting"},
+    {"comparison", "data_check", "depth_check", "method_check", "reporting"},
     {"api"},
     {"cli"},
 )

@@ -14,6 +14,7 @@ from coliags_plugin.cli.check import Check
 from coliags_plugin.cli.compare import Compare
 from coliags_plugin.cli.config import Config
 from coliags_plugin.cli.data import Data
+from coliags_plugin.cli.depth import Depth
 from coliags_plugin.cli.doctor import Doctor
 from coliags_plugin.cli.evaluate import Evaluate
 from coliags_plugin.cli.list import List
@@ -39,6 +40,7 @@ Command = (
     | Annotated[List, tyro.conf.subcommand("list")]
     | Annotated[Config, tyro.conf.subcommand("config")]
     | Annotated[Data, tyro.conf.subcommand("data")]
+    | Annotated[Depth, tyro.conf.subcommand("depth")]
     | Annotated[Check, tyro.conf.subcommand("check")]
     | Annotated[Weights, tyro.conf.subcommand("weights")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]

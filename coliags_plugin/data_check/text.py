@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from coliags_plugin.data_check.check import SceneCheck
+from coliags_plugin.outputs.text_table import aligned
 
 #: Cell of an unavailable value.
 _NONE = "-"
@@ -102,13 +103,6 @@ def lines(check: SceneCheck) -> Iterator[str]:
         yield f"SUSPECT {finding.what}: {finding.evidence}. {finding.do}."
     if not check.findings:
         yield "nothing suspect"
-
-
-def aligned(rows: list[list[str]]) -> Iterator[str]:
-    """Rows as lines with aligned columns."""
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    for row in rows:
-        yield "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
 
 
 def _number(value: float | None, factor: float = 1.0) -> str:

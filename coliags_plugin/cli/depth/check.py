@@ -1,0 +1,61 @@
+"""``coliags depth check``: compare estimated with true depth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from coliags_plugin.cli.arguments import Assignments, OptionalPath
+
+_Format = Annotated[str | None, tyro.conf.arg(metavar="NAME")]
+
+
+@dataclass(frozen=True)
+class CheckDepth:
+    """Compare estimated with true depth: error, bias, coverage, and whether the stated confidence is right."""
+
+    estimate: tyro.conf.Positional[Path]
+    """The scene whose depth to judge, or a folder of float32 TIFF or .npy files of z-depth in mm."""
+    truth: tyro.conf.Positional[Path]
+    """The same with true depth, dense or at single points."""
+    align_scale: bool = False
+    """Multiply the estimate by the median of true / estimated depth."""
+    estimate_format: _Format = None
+    """Dataset format of the estimate (`coliags list datamanagers`); default: recognised from the files."""
+    truth_format: _Format = None
+    """Dataset format of the truth; default: recognised from the files."""
+    html: OptionalPath = None
+    """Also write an HTML page with images."""
+    json: OptionalPath = None
+    """Also write the results as JSON."""
+    maps: OptionalPath = None
+    """Also write maps of the error, PNG, to this folder, which must be new or empty."""
+    set: Assignments = ()
+    """An option of both data managers, for instance max_frames=20."""
+
+    def run(self) -> None:
+        """Compare, and print the results."""
+        from coliags_plugin.core.files import write_json
+        from coliags_plugin.depth_check.check import check_depth
+        from coliags_plugin.depth_check.error_maps import write_error_maps
+        from coliags_plugin.depth_check.page import write_depth_page
+        from coliags_plugin.depth_check.sources import open_depth
+        from coliags_plugin.depth_check.text import lines
+        from coliags_plugin.engine.progress import progress_callback
+
+        with progress_callback() as progress:
+            estimate = open_depth(self.estimate, self.estimate_format, self.set, progress)
+            truth = open_depth(self.truth, self.truth_format, self.set, progress)
+            check = check_depth(estimate, truth, self.align_scale, progress)
+        print("\n".join(lines(check)))
+        if self.html is not None:
+            write_depth_page(check, self.html)
+            print(self.html.resolve())
+        if self.json is not None:
+            write_json(self.json, check.as_json())
+        if self.maps is not None:
+            write_error_maps(check, self.maps)
+            print(self.maps.resolve())

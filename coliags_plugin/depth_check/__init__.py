@@ -1,0 +1,1 @@
+"""Comparison of estimated with true depth: ``coliags depth check``."""

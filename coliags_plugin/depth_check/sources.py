@@ -1,0 +1,142 @@
+"""Depth maps of a scene of any format, or of a folder of files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.scenes import Frame, Scene, SparseDepth
+from coliags_plugin.datamanagers.reading.depth_arrays import DepthArray
+from coliags_plugin.datamanagers.reading.images import read_gray
+from coliags_plugin.datamanagers.recognition import recognised
+from coliags_plugin.engine.data_formats import open_scene
+from coliags_plugin.outputs.image_files import read_depth_tiff
+
+#: Files of a folder of depth maps.
+_TIFF, _ARRAY = (".tiff", ".tif"), ".npy"
+_EXPECTED_FOLDER = "float32 TIFF or .npy files of z-depth in mm"
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """Depth of one frame.
+
+    Attributes:
+        depth: z-depth, scene units; NaN where unknown or masked. None where there are only single points. [H, W]
+        confidence: Estimated probability of an error below 5 %; 0 where unknown. None where there is none. [H, W]
+        sparse: Depth at single points.
+        size: Width and height of the image, px.
+        intrinsics: Of the image; None for a folder of depth maps.
+        image: RGB; None for a folder of depth maps. [H, W, 3]
+    """
+
+    depth: Float[np.ndarray, "H W"] | None
+    confidence: Float[np.ndarray, "H W"] | None
+    sparse: SparseDepth | None
+    size: tuple[int, int]
+    intrinsics: Intrinsics | None = None
+    image: UInt8[np.ndarray, "H W 3"] | None = None
+
+
+@dataclass(frozen=True)
+class DepthSource:
+    """Depth maps by the names of their frames.
+
+    Attributes:
+        path: The scene or folder.
+        metric: Whether lengths are in mm; False where the unit is unknown.
+        names: Of the frames, in order.
+        read: Reads the depth map of a frame by its place.
+    """
+
+    path: Path
+    metric: bool
+    names: Sequence[str]
+    read: Callable[[int], DepthMap]
+
+
+def open_depth(
+    path: Path, data_format: str | None = None, options: Sequence[str] = (), progress: Progress | None = None
+) -> DepthSource:
+    """The depth maps of a scene, or of a folder of TIFF or NPY files.
+
+    Args:
+        path: A scene's folder; or one of float32 TIFF or ``.npy`` files, mm. 8-bit PNGs of the same stems in a folder
+            ``confidence`` beside the latter are the confidence, 255 = 1.
+        data_format: See :func:`open_scene`.
+        options: Options of the scene's data manager.
+        progress: Called while images are read.
+
+    Raises:
+        InputError: Neither a scene nor such a folder, or it holds no depth.
+    """
+    files = _depth_files(path) if data_format is None and path.is_dir() and not recognised(path) else []
+    if files:
+        return _of_folder(path, files)
+    scene = open_scene(path, data_format, (*options, "initial_points=none"), progress)
+    return _of_scene(path, scene)
+
+
+def _of_scene(path: Path, scene: Scene) -> DepthSource:
+    frames = [*scene.train, *(frame for frames in scene.test_sets.values() for frame in frames)]
+    frames.sort(key=lambda frame: frame.index)
+    kept = [frame for frame in frames if frame.depth is not None or frame.sparse_depth is not None]
+    if not kept:
+        raise InputError(
+            f"{path} has no depth", "a scene with depth files or sparse depth", "Name a scene with depth"
+        )
+    metric = scene.provenance.get("unit", "mm") == "mm"
+    return DepthSource(path, metric, [frame.name for frame in kept], lambda place: _of_frame(kept[place]))
+
+
+def _of_frame(frame: Frame) -> DepthMap:
+    valid = frame.valid.numpy()
+    depth = None if frame.depth is None else np.where(valid, frame.depth.numpy(), np.float32(np.nan))
+    stated = getattr(frame, "depth_confidence", None)
+    confidence = None if stated is None else stated.numpy()
+    camera = frame.camera
+    return DepthMap(
+        depth, confidence, frame.sparse_depth, (camera.width, camera.height), camera.intrinsics, frame.image.numpy()
+    )
+
+
+def _depth_files(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in (*_TIFF, _ARRAY))
+
+
+def _of_folder(folder: Path, files: Sequence[Path]) -> DepthSource:
+    stems = [path.stem for path in files]
+    double = next((stem for place, stem in enumerate(stems) if stem in stems[:place]), None)
+    if double is not None:
+        raise InputError(f"{folder} holds several files {double}.*", "one depth map per frame", "Move the others away")
+    return DepthSource(folder, True, stems, lambda place: _of_file(files[place]))
+
+
+def _of_file(path: Path) -> DepthMap:
+    reader = DepthArray(1.0)
+    stored = read_depth_tiff(path) if path.suffix.lower() in _TIFF else reader.read(path)
+    depth = reader.z_depth(stored)
+    height, width = depth.shape
+    return DepthMap(depth, _confidence_beside(path, depth.shape), None, (width, height))
+
+
+def _confidence_beside(path: Path, shape: tuple[int, ...]) -> Float[np.ndarray, "H W"] | None:
+    beside = path.parent.parent / "confidence" / f"{path.stem}.png"
+    if not beside.is_file():
+        return None
+    stored = read_gray(beside, 8, "an 8-bit grey image of the confidence")
+    if stored.shape != shape:
+        raise InputError(f"{beside} is {stored.shape[1]} x {stored.shape[0]}", f"the size of {path.name}")
+    return np.asarray(stored.astype(np.float32) / np.float32(255.0))
+
+
+def known_depth(depth: Float[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """Where depth is finite and positive. [H, W]"""
+    return np.asarray(np.isfinite(depth) & (np.nan_to_num(depth) > 0.0))
