@@ -80,6 +80,7 @@ class Target(_MaskedImage):
         sparse_depth: Depth at single points of a whole frame; None where there is none.
         index: Of a whole frame in the video.
         chosen: Identifiers of the pixels, if they are not those of a whole frame. [H, W]
+        depth_confidence: How far ``depth`` can be trusted, see :class:`Frame`; None where it is true. [H, W]
     """
 
     name: str
@@ -89,6 +90,7 @@ class Target(_MaskedImage):
     sparse_depth: SparseDepth | None = None
     index: int = 0
     chosen: Int[Tensor, "H W"] | None = None
+    depth_confidence: Float[Tensor, "H W"] | None = None
 
     @property
     def ids(self) -> Int[Tensor, "H W"]:
@@ -114,6 +116,8 @@ class Frame(_MaskedImage):
         depth_at_least: Where the depth sensor clipped, the z-depth it clipped at, mm: the surface lies there or beyond
             and ``depth`` is NaN. NaN elsewhere; None where nothing is clipped. [H, W]
         sparse_depth: Depth at single points; None where the dataset has none.
+        depth_confidence: Of estimated depth, the estimated probability in [0, 1] that its relative error is below 5 %;
+            0 where it follows a prior only. None where ``depth`` is true: measured or rendered. [H, W]
     """
 
     name: str
@@ -125,11 +129,20 @@ class Frame(_MaskedImage):
     seen: Bool[Tensor, "H W"] | None = None
     depth_at_least: Float[Tensor, "H W"] | None = None
     sparse_depth: SparseDepth | None = None
+    depth_confidence: Float[Tensor, "H W"] | None = None
 
     @property
     def target(self) -> Target:
         """The whole frame as a target."""
-        return Target(self.name, self.image, self.mask, self.depth, self.sparse_depth, self.index)
+        return Target(
+            self.name,
+            self.image,
+            self.mask,
+            self.depth,
+            self.sparse_depth,
+            self.index,
+            depth_confidence=self.depth_confidence,
+        )
 
     def target_at(self, pixels: Int[Tensor, "P 2"]) -> Target:
         """Some pixels as a target.
@@ -143,7 +156,14 @@ class Frame(_MaskedImage):
             return None if values is None else values[row, column][:, None]
 
         image, chosen = self.image[row, column][:, None], pixel_ids(self.index, row * self.image.shape[1] + column)
-        return Target(self.name, image, taken(self.mask), taken(self.depth), chosen=chosen[:, None])
+        return Target(
+            self.name,
+            image,
+            taken(self.mask),
+            taken(self.depth),
+            chosen=chosen[:, None],
+            depth_confidence=taken(self.depth_confidence),
+        )
 
     def view(self, trained: bool) -> View:
         """This frame, for the modules of a model."""
@@ -151,7 +171,7 @@ class Frame(_MaskedImage):
 
     def to(self, device: torch.device | str) -> Frame:
         """The same frame on another device."""
-        names = ("image", "camera", "depth", "mask", "seen", "depth_at_least", "sparse_depth")
+        names = ("image", "camera", "depth", "mask", "seen", "depth_at_least", "sparse_depth", "depth_confidence")
         values = {name: getattr(self, name) for name in names}
         moved: dict[str, Any] = {name: value if value is None else value.to(device) for name, value in values.items()}
         return Frame(self.name, self.index, **moved)
@@ -224,7 +244,9 @@ class Scene:
 
 
 def concatenate_targets(parts: Sequence[Target]) -> Target:
-    """Pixel batches of several frames as one: a missing mask is all True, missing depth beside other depth all NaN.
+    """Pixel batches of several frames as one.
+
+    A missing mask is all True; beside others, missing depth is all NaN and missing confidence all 1.
 
     Args:
         parts: Of P_i rows and one column each.
@@ -232,11 +254,20 @@ def concatenate_targets(parts: Sequence[Target]) -> Target:
     if len(parts) == 1:
         return parts[0]
     masks = None if all(part.mask is None for part in parts) else torch.cat([part.valid for part in parts])
-    depths = None
-    if any(part.depth is not None for part in parts):
-        unknown = [torch.full(part.image.shape[:2], torch.nan, device=part.image.device) for part in parts]
-        depths = torch.cat(
-            [nothing if part.depth is None else part.depth for part, nothing in zip(parts, unknown, strict=True)]
-        )
+    depths = _joined(parts, [part.depth for part in parts], torch.nan)
+    confidences = _joined(parts, [part.depth_confidence for part in parts], 1.0)
     images, chosen = torch.cat([part.image for part in parts]), torch.cat([part.ids for part in parts])
-    return Target(", ".join(part.name for part in parts), images, masks, depths, chosen=chosen)
+    name = ", ".join(part.name for part in parts)
+    return Target(name, images, masks, depths, chosen=chosen, depth_confidence=confidences)
+
+
+def _joined(parts: Sequence[Target], maps: Sequence[Tensor | None], instead: float) -> Tensor | None:
+    """Maps of several targets as one, with one value in those of targets without; None where no target has one."""
+    if all(own is None for own in maps):
+        return None
+    return torch.cat(
+        [
+            torch.full(part.image.shape[:2], instead, device=part.image.device) if own is None else own
+            for part, own in zip(parts, maps, strict=True)
+        ]
+    )

@@ -31,6 +31,7 @@ class Shot:
         mask: Mask file of the image's size; black pixels are ignored.
         seen: Mask file of the image's size; not black where training frames see the same surface.
         sparse_depth: Depth at single points of the working image.
+        confidence: 8-bit grey image of the depth file's size: how far estimated depth can be trusted, 255 = 1.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Shot:
     mask: Path | None = None
     seen: Path | None = None
     sparse_depth: SparseDepth | None = None
+    confidence: Path | None = None
 
 
 @dataclass(frozen=True)

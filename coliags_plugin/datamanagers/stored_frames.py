@@ -12,19 +12,20 @@ from torch import Tensor
 
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.datamanagers.reading.images import read_mask, read_rgb
+from coliags_plugin.datamanagers.reading.images import read_gray, read_mask, read_rgb
 from coliags_plugin.datamanagers.reading.parallel import parallel_map
 from coliags_plugin.datamanagers.recording import Shot
 
 
 @dataclass(frozen=True)
 class _Pixels:
-    """Image, depth and masks of the working size, in the stored data types."""
+    """Image, depth, masks and confidence of the working size, in the stored data types."""
 
     image: UInt8[np.ndarray, "H W 3"]
     depth: Shaped[np.ndarray, "H W"] | None
     mask: Bool[np.ndarray, "H W"] | None
     seen: Bool[np.ndarray, "H W"] | None
+    confidence: UInt8[np.ndarray, "H W"] | None
 
 
 class StoredFrame(Frame):
@@ -83,6 +84,11 @@ class StoredFrame(Frame):
         """See :class:`Frame`."""
         return _tensor(self._read().seen if self._keep else _seen(self._shot))
 
+    @property
+    def depth_confidence(self) -> Float[Tensor, "H W"] | None:
+        """See :class:`Frame`; decoded each time."""
+        return _share(self._read().confidence if self._keep else _confidence(self._shot))
+
     def to(self, device: torch.device | str) -> Frame:
         """Decoded frame on a device; files are read once."""
         pixels = self._read()
@@ -91,6 +97,7 @@ class StoredFrame(Frame):
             "mask": _tensor(pixels.mask),
             "seen": _tensor(pixels.seen),
             "depth_at_least": self._bound(pixels.depth),
+            "depth_confidence": _share(pixels.confidence),
         }
         return Frame(
             self.name,
@@ -140,7 +147,7 @@ def read_in_parallel(frames: Sequence[Frame], progress: Progress | None = None) 
 
 def _read_pixels(shot: Shot) -> _Pixels:
     mask = _mask(shot)
-    return _Pixels(_image(shot), _depth(shot, mask), mask, _seen(shot))
+    return _Pixels(_image(shot), _depth(shot, mask), mask, _seen(shot), _confidence(shot))
 
 
 def _image(shot: Shot) -> UInt8[np.ndarray, "H W 3"]:
@@ -168,6 +175,18 @@ def _seen(shot: Shot) -> Bool[np.ndarray, "H W"] | None:
         if shot.seen is None
         else shot.rectification.nearest(shot.rectification.checked(shot.seen, read_mask(shot.seen)))
     )
+
+
+def _confidence(shot: Shot) -> UInt8[np.ndarray, "H W"] | None:
+    if shot.confidence is None:
+        return None
+    stored = read_gray(shot.confidence, 8, "a one-channel 8-bit image of the confidence in depth, 255 = 1")
+    return shot.rectification.nearest(shot.rectification.checked(shot.confidence, stored))
+
+
+def _share(stored: UInt8[np.ndarray, "H W"] | None) -> Float[Tensor, "H W"] | None:
+    """8-bit values in [0, 1], float32."""
+    return None if stored is None else torch.from_numpy(stored.astype(np.float32) / np.float32(255.0))
 
 
 def _tensor(array: np.ndarray | None) -> Tensor | None:

@@ -6,12 +6,14 @@ file, what was seen in it, and what would have been right.
 
 from __future__ import annotations
 
+import json
 import logging
 import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -721,6 +723,23 @@ def test_both_reading_orders_of_c3vds_poses_give_the_true_ones(made):
 PAGES = Path(__file__).parents[2] / "docs/layouts"
 _MODEL_OF_NOTHING = change_json("transforms.json", lambda content: content.update(camera_model="PANORAMA"))
 
+def _with_confidence(spoil: Callable[[dict], object] = lambda content: None, dtype: str = "uint8") -> Spoil:
+    """Every frame gets a confidence, then the content is spoilt."""
+
+    def change(folder: Path) -> None:
+        content = json.loads((folder / "transforms.json").read_text())
+        for frame in content["frames"]:
+            frame["confidence_file_path"] = frame["depth_file_path"].replace("depth/", "confidence/")
+            file = folder / frame["confidence_file_path"]
+            file.parent.mkdir(exist_ok=True)
+            depth = cv2.imread(str(folder / frame["depth_file_path"]), cv2.IMREAD_UNCHANGED)
+            cv2.imwrite(str(file), np.zeros(depth.shape, dtype if "00003" in file.name else "uint8"))
+        spoil(content)
+        (folder / "transforms.json").write_text(json.dumps(content))
+
+    return change
+
+
 #: By page, in the order of its table: the kind, and how to spoil it, or the fault above that does.
 TOLD: dict[str, list[tuple[str, str | Spoil]]] = {
     "colmap": [
@@ -741,6 +760,9 @@ TOLD: dict[str, list[tuple[str, str | Spoil]]] = {
         ("nerfstudio", "an image that is gone"),
         ("nerfstudio", "depth that is missing for a frame"),
         ("nerfstudio", change_json("transforms.json", lambda content: content["frames"][3].pop("depth_file_path"))),
+        ("nerfstudio", _with_confidence(lambda content: content["frames"][3].pop("confidence_file_path"))),
+        ("nerfstudio", _with_confidence(lambda content: [frame.pop("depth_file_path") for frame in content["frames"]])),
+        ("nerfstudio", _with_confidence(dtype="uint16")),
         ("nerfstudio", _MODEL_OF_NOTHING),
         ("nerfstudio", change_json("transforms.json", lambda content: content.update(k4=0.1))),
         ("nerfstudio", "a rotation that is none"),

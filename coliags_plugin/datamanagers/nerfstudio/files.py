@@ -31,6 +31,7 @@ class Entry:
     camera: Lens
     depth: Path | None
     mask: Path | None
+    confidence: Path | None
 
 
 class Transforms:
@@ -55,16 +56,17 @@ class Transforms:
         """Frame entries by name.
 
         Raises:
-            InputError: Files are missing, only some frames have depth, or a camera is unsupported or incomplete.
+            InputError: Files are missing, only some frames have depth or confidence, there is confidence without depth,
+                or a camera is unsupported or incomplete.
         """
         images = self._images(names)
-        depths = [self._file(name, "depth_file_path") for name in names]
-        if None in depths and any(depths):
-            lone = names[depths.index(None)]
+        depths = self._for_all_or_none(names, "depth_file_path", "depth")
+        confidences = self._for_all_or_none(names, "confidence_file_path", "confidence")
+        if any(confidences) and not any(depths):
             raise InputError(
-                f"{self.path}: {sum(map(bool, depths))} of {len(depths)} frames have a depth_file_path; {lone} has not",
-                "depth for every frame, or for none",
-                "Add the missing ones",
+                f"{self.path}: the frames have a confidence_file_path, but no depth_file_path",
+                "confidence beside the depth that it is about",
+                "Add depth_file_path, or remove confidence_file_path",
             )
         # Without a size in the file, all images must have the size of the first.
         first_size = cache(lambda: size_of(images[0]))
@@ -77,8 +79,9 @@ class Transforms:
                 ),
                 depth,
                 self._file(name, "mask_path"),
+                confidence,
             )
-            for name, image, depth in zip(names, images, depths, strict=True)
+            for name, image, depth, confidence in zip(names, images, depths, confidences, strict=True)
         ]
 
     def points_file(self) -> Path | None:
@@ -155,6 +158,17 @@ class Transforms:
                 "Restore them, or remove their frames",
             )
         return cast(list[Path], found)
+
+    def _for_all_or_none(self, names: Sequence[str], key: str, what: str) -> list[Path | None]:
+        files = [self._file(name, key) for name in names]
+        if None in files and any(files):
+            lone = names[files.index(None)]
+            raise InputError(
+                f"{self.path}: {sum(map(bool, files))} of {len(files)} frames have a {key}; {lone} has not",
+                f"{what} for every frame, or for none",
+                "Add the missing ones",
+            )
+        return files
 
     def _file(self, name: str, key: str) -> Path | None:
         value = self.frames[name].get(key)

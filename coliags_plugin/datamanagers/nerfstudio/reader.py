@@ -79,7 +79,7 @@ class NerfstudioDataManager(RecordedDataManager):
         depth_unit = self._depth_unit(transforms)
         rectifications = self._rectifications(entries, file)
         images = [entry.image for entry in entries]
-        others = [found for entry in entries for found in (entry.depth, entry.mask)]
+        others = [found for entry in entries for found in (entry.depth, entry.mask, entry.confidence)]
         unposed = unposed_images(images, others)
         warn_of_unposed(file, unposed)
         seen = find_seen_masks(path / "truth", len(images), complete=not unposed)
@@ -93,6 +93,7 @@ class NerfstudioDataManager(RecordedDataManager):
                 None if entry.depth is None else depth_format(entry.depth, depth_unit),
                 entry.mask,
                 seen.get(index),
+                confidence=entry.confidence,
             )
             for index, (short, entry, pose) in enumerate(zip(short_names(names), entries, camera_to_world, strict=True))
         ]
@@ -106,6 +107,7 @@ class NerfstudioDataManager(RecordedDataManager):
             **next(iter(rectifications.values())).facts(),
             "scale": settings.scale,
             "depth_unit": depth_unit if shots[0].depth is not None else None,
+            "depth_is_estimated": shots[0].confidence is not None,
             "pixel_centers_in_file": settings.pixel_centers,
             "pose_convention": {
                 "stored_as": trajectory.stored_as,

@@ -24,6 +24,7 @@ from coliags_plugin.poses.text import read_text, shortened
 IMAGE_FOLDERS = ("rgb", "color", "images")
 DEPTH_FOLDERS = ("depth", "depths")
 MASK_FOLDERS = ("mask", "masks")
+CONFIDENCE_FOLDERS = ("confidence",)
 TRAJECTORIES = ("groundtruth.txt", "poses.txt", "traj.txt", "trajectory.txt", "*_poses.txt")
 CAMERA_FILES = ("camera.json", "intrinsics.txt", "cameras.txt")
 EXPECTED = (
@@ -91,18 +92,44 @@ def find_masks(folder: Path, images: Sequence[Path]) -> dict[str, Path]:
     Raises:
         InputError: There is more than one such folder, or an image has no mask.
     """
-    found = _only(folder, MASK_FOLDERS)
-    if found is None:
+    return _of_every_image(folder, MASK_FOLDERS, images, "mask")
+
+
+def find_confidences(folder: Path, images: Sequence[Path], with_depth: bool) -> dict[str, Path]:
+    """Files of the confidence in estimated depth by the stem of their image; empty without a folder of them.
+
+    Args:
+        folder: Folder of the scene.
+        images: The images.
+        with_depth: Whether they have depth.
+
+    Raises:
+        InputError: An image has none, or there is no depth.
+    """
+    found = _of_every_image(folder, CONFIDENCE_FOLDERS, images, "confidence")
+    if found and not with_depth:
+        raise InputError(
+            f"{folder} holds confidence/, but no depth",
+            "confidence beside the depth that it is about",
+            "Add the depth, or move confidence/ away",
+        )
+    return found
+
+
+def _of_every_image(folder: Path, places: tuple[str, ...], images: Sequence[Path], what: str) -> dict[str, Path]:
+    """Files by the stem of their image, which must all be there if their folder is."""
+    place = _only(folder, places)
+    if place is None:
         return {}
-    masks = {path.stem: path for path in found.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES}
-    lone = next((image for image in images if image.stem not in masks), None)
+    found = {path.stem: path for path in place.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES}
+    lone = next((image for image in images if image.stem not in found), None)
     if lone is not None:
         raise InputError(
-            f"{found} has no mask for {lone.name}",
-            "a mask of the same name for every image, or no such folder",
+            f"{place} has no {what} for {lone.name}",
+            f"a {what} of the same name for every image, or no such folder",
             "Restore the missing ones, or move the folder away",
         )
-    return {image.stem: masks[image.stem] for image in images}
+    return {image.stem: found[image.stem] for image in images}
 
 
 def lacks_trajectory(folder: Path) -> bool:

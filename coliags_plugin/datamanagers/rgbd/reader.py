@@ -23,6 +23,7 @@ from coliags_plugin.datamanagers.rgbd.association import by_number, is_time, nea
 from coliags_plugin.datamanagers.rgbd.files import (
     CameraFile,
     find_camera,
+    find_confidences,
     find_depths,
     find_images,
     find_masks,
@@ -116,6 +117,8 @@ class RGBDDataManager(RecordedDataManager):
         complete = len(frames.images) == len(images) == len(trajectory)
         seen = find_seen_masks(path / "truth", len(images), complete)
         masks = find_masks(path, frames.images)
+        metric = settings.depth == "metric"
+        confidences = find_confidences(path, frames.images, with_depth=bool(depths)) if metric else {}
         shots = [
             Shot(
                 image.stem,
@@ -126,6 +129,7 @@ class RGBDDataManager(RecordedDataManager):
                 form,
                 mask=masks.get(image.stem),
                 seen=seen.get(index),
+                confidence=confidences.get(image.stem),
             )
             for index, (image, depth, pose) in enumerate(zip(frames.images, frames.depths, frames.poses, strict=True))
         ]
@@ -136,6 +140,7 @@ class RGBDDataManager(RecordedDataManager):
             "depth_scale": scale,
             "association": frames.facts,
             "masks": len(masks),
+            "depth_is_estimated": bool(confidences),
             **rectification.facts(),
             "pose_convention": None
             if file is None
@@ -150,7 +155,9 @@ class RGBDDataManager(RecordedDataManager):
             kind=f"TUM RGB-D, associated by {frames.facts['by']}",
             shots=shots,
             facts=facts,
-            fingerprint=fingerprint(path, (*frames.images, *frames.depths, *masks.values()), (file, camera.path)),
+            fingerprint=fingerprint(
+                path, (*frames.images, *frames.depths, *masks.values(), *confidences.values()), (file, camera.path)
+            ),
             own_points=(lambda: _points(points)) if points is not None else None,
             points_source=points,
         )
