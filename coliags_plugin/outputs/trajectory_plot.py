@@ -60,11 +60,10 @@ def plot_trajectory(alignment: Alignment, unit: str) -> UInt8[np.ndarray, "900 1
     _text(image, title, (70, 30), 0.55)
     _legend(image)
     _views(image, paths, unit)
-    charts = [(alignment.position_errors, f"position error [{unit}]")]
-    if alignment.rotation_errors_deg is not None:
-        charts.append((alignment.rotation_errors_deg, "rotation error [deg]"))
-    else:
-        _text(image, f"rotation error: none, {alignment.transform.undetermined}", (70, 800), _TEXT)
+    charts = [
+        (alignment.position_errors, f"position error [{unit}]"),
+        (alignment.rotation_errors_deg, "rotation error [deg]"),
+    ]
     for index, (errors, label) in enumerate(charts):
         last = index == len(charts) - 1
         _errors(image, (70, 590 + 160 * index, 1110, 100), errors, label, "matched frame" if last else "")

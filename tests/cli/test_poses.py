@@ -135,12 +135,19 @@ def test_align_prints_errors_and_writes_them(estimate, truth, tmp_path, capsys):
     assert json.loads(figures.read_text())["ate"]["rmse"] > told["ate"]["rmse"]
 
 
-def test_align_says_where_rotation_is_undetermined(tmp_path, capsys):
+def test_align_warns_where_positions_determine_no_rotation(tmp_path, capsys, caplog):
     poses = np.tile(np.eye(4), (5, 1, 1))
     poses[:, 2, 3] = np.arange(5.0)
     write_trajectory(tmp_path / "line", Trajectory(poses), "c3vd")
-    assert run("poses", "align", tmp_path / "line", tmp_path / "line") == 0
-    assert "rotation error: none, the positions lie on a line" in capsys.readouterr().out
+    turned = poses.copy()
+    turned[:, :3, :3] = Rotation.from_euler("z", 178, degrees=True).as_matrix()
+    write_trajectory(tmp_path / "turned", Trajectory(turned), "c3vd")
+    figures = tmp_path / "figures.json"
+    assert run("poses", "align", tmp_path / "turned", tmp_path / "line", "--json", figures) == 0
+    assert "the positions lie on a line" in caplog.text
+    assert "the rotation is that by orientations about the path" in caplog.text
+    assert "ATE rmse: 0 % of the path, 4 mm" in capsys.readouterr().out
+    assert json.loads(figures.read_text())["rotation_deg"]["max"] < 1e-9
 
 
 @pytest.mark.parametrize(

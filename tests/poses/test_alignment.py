@@ -13,9 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.poses import c3vd, nerfstudio
-from coliags_plugin.poses.alignment import ErrorStatistics, Matches, align, associate, umeyama
+from coliags_plugin.poses.alignment import ErrorStatistics, align
+from coliags_plugin.poses.association import Matches, associate
 from coliags_plugin.poses.rigid import rigid
+from coliags_plugin.poses.similarity import Similarity, umeyama
 from coliags_plugin.poses.trajectory import Trajectory
+from coliags_plugin.poses.world_rotation import world_rotation
 from tests.poses.winding import some_transform, trajectories, winding
 
 SEEDS = st.integers(0, 10_000)
@@ -113,17 +116,67 @@ def line(count=10, direction=(1.0, 2.0, -0.5), off_line=0.0):
 
 
 @pytest.mark.parametrize("with_scale", [False, True])
-def test_on_a_line_positions_are_aligned_and_the_rotation_is_said_to_be_undetermined(with_scale):
-    reference = line()
-    estimate = moved(line(), some_transform(3), 2.5 if with_scale else 1.0)
-    result = aligned(estimate, reference, with_scale=with_scale)
-    assert "lie on a line" in result.transform.undetermined
+@pytest.mark.parametrize("off_line", [0.0, 0.1])
+def test_on_a_nearly_straight_path_orientations_determine_the_rotation_about_it(with_scale, off_line):
+    reference = line(off_line=off_line)
+    transform = some_transform(3)
+    result = aligned(moved(reference, transform, 2.5 if with_scale else 1.0), reference, with_scale=with_scale)
+    assert result.world_rotation.by == "orientations about the path"
+    assert ("lie on a line" if off_line < 0.1 else "nearly straight") in result.world_rotation.reason
     assert result.ate.max < 1e-10
-    assert result.rotation_deg is None
+    assert result.rotation_deg.max < 1e-4
+    np.testing.assert_allclose(result.world_rotation.rotation, transform[:3, :3].T, atol=1e-6)
     assert result.transform.scale == pytest.approx(0.4 if with_scale else 1.0)
-    told = result.to_json("mm")
-    assert told["rotation_deg"] is None
-    assert told["reasons"] == {"rotation_deg": result.transform.undetermined}
+    assert json.loads(json.dumps(result.to_json("mm")))["world_rotation"]["by"] == "orientations about the path"
+
+
+def test_errors_of_positions_do_not_turn_a_nearly_straight_path():
+    """Positions alone give tens of degrees about the path, orientations agree exactly."""
+    reference = line(20, off_line=0.05)
+    poses = reference.camera_to_world.copy()
+    poses[:, :3, 3] += np.random.default_rng(3).normal(0.0, 0.1, (20, 3))
+    result = aligned(moved(Trajectory(poses), some_transform(4)), reference)
+    turned = result.transform.rotation @ some_transform(4)[:3, :3]
+    assert np.rad2deg(Rotation.from_matrix(turned).magnitude()) > 10.0
+    assert result.rotation_deg.rmse < 0.5
+    # The ATE is the usual one, by positions alone.
+    expected = umeyama(moved(Trajectory(poses), some_transform(4)).centers, reference.centers)
+    centers = moved(Trajectory(poses), some_transform(4)).centers
+    np.testing.assert_allclose(
+        result.position_errors, np.linalg.norm(expected.points(centers) - reference.centers, axis=1)
+    )
+
+
+@given(seed=SEEDS)
+@settings(max_examples=20, deadline=None)
+def test_the_rotation_about_the_path_is_that_of_least_chordal_distance(seed):
+    rng = np.random.default_rng(seed)
+    axis = some_transform(seed)[:3, 0]
+    estimated, true = Rotation.random(2 * 7, rng=rng).as_matrix().reshape(2, 7, 3, 3)
+    transform = Similarity(1.0, some_transform(seed + 1)[:3, :3], np.zeros(3), "", axis, 0.01)
+
+    def distance(angle):
+        about = Rotation.from_rotvec(angle * axis).as_matrix() @ transform.rotation
+        return ((about @ estimated - true) ** 2).sum()
+
+    found = world_rotation(estimated, true, transform).rotation
+    assert ((found @ estimated - true) ** 2).sum() <= min(map(distance, np.linspace(0, 2 * np.pi, 400))) + 1e-9
+    np.testing.assert_allclose(found @ transform.rotation.T @ axis, axis, atol=1e-12)
+
+
+@given(seed=SEEDS)
+@settings(max_examples=20, deadline=None)
+def test_without_a_path_the_rotation_is_scipys_mean_of_the_relative_ones(seed):
+    reference = winding(6, seed)
+    poses = shaken(reference, seed, 0.0).camera_to_world
+    poses[:, :3, 3] = 0.0
+    result = aligned(Trajectory(poses), reference)
+    relative = reference.rotations @ poses[:, :3, :3].transpose(0, 2, 1)
+    assert result.world_rotation.by == "orientations"
+    np.testing.assert_allclose(
+        result.world_rotation.rotation, Rotation.from_matrix(relative).mean().as_matrix(), atol=1e-6
+    )
+    assert result.ate_share is not None
 
 
 def test_on_a_line_the_smallest_rotation_is_taken():
@@ -150,9 +203,20 @@ def test_the_smallest_rotation_at_any_angle(seed, angle):
     assert Rotation.from_matrix(found.rotation).magnitude() == pytest.approx(angle, abs=1e-4)
 
 
-def test_how_far_off_a_line_is_enough():
-    assert aligned(line(off_line=0.001), line(off_line=0.001)).transform.undetermined
-    assert not aligned(line(off_line=0.1), line(off_line=0.1)).transform.undetermined
+@pytest.mark.parametrize(
+    ("off_line", "undetermined", "by"),
+    [
+        (0.001, True, "orientations about the path"),
+        (0.1, False, "orientations about the path"),
+        (3.0, False, "positions"),
+    ],
+)
+def test_how_far_off_a_line_is_enough(off_line, undetermined, by):
+    result = aligned(line(off_line=off_line), line(off_line=off_line))
+    assert bool(result.transform.undetermined) == undetermined
+    assert result.world_rotation.by == by
+    values = np.linalg.svd(line(off_line=off_line).centers - line(off_line=off_line).centers.mean(axis=0))[1]
+    assert result.transform.spread == pytest.approx(np.hypot(values[1], values[2]) / values[0], abs=1e-9)
 
 
 def test_a_line_run_backwards_is_turned_round():
@@ -194,8 +258,7 @@ def test_a_moved_copy_has_no_error(trajectory, seed, scale):
     assert result.ate.max < 1e-8 * size
     assert result.rpe_translation.max < 1e-8 * size
     assert result.rpe_rotation_deg.max < 1e-5
-    if result.rotation_deg is not None:
-        assert result.rotation_deg.max < 1e-4
+    assert result.rotation_deg.max < 1e-4
 
 
 @given(seed=SEEDS, delta=st.integers(1, 5))
@@ -268,7 +331,8 @@ def test_figures_are_json():
     assert told["ate"]["rmse"] == result.ate.rmse
     assert told["alignment"] == "Sim(3)"
     assert told["frames"]["position_error"] == result.position_errors.tolist()
-    assert told["reasons"] == {}
+    assert told["world_rotation"]["by"] == "positions"
+    assert told["ate_share_of_path"] == pytest.approx(told["ate"]["rmse"] / winding().steps.sum())
 
 
 # Association

@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.data_formats import open_video
-from coliags_plugin.poses.alignment import align, associate
+from coliags_plugin.poses.alignment import align
+from coliags_plugin.poses.association import associate
 from coliags_plugin.poses.rigid import inverse, rotation_angles_deg
 from coliags_plugin.poses.trajectory import Trajectory
 from coliags_plugin.reconstruction.odometry.chain import Bridge, chain, fill_gaps, power

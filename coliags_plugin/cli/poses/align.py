@@ -54,7 +54,8 @@ class Align:
 
         from coliags_plugin.core.errors import InputError
         from coliags_plugin.core.files import write_json
-        from coliags_plugin.poses.alignment import align, associate
+        from coliags_plugin.poses.alignment import align
+        from coliags_plugin.poses.association import associate
 
         log = logging.getLogger(__name__)
         if self.plot is not None and self.plot.suffix.lower() != ".png":
@@ -76,8 +77,11 @@ class Align:
             f"reference ones\n{_described(result, unit)}"
         )
         Console().print(_table(result, unit))
-        if result.transform.undetermined:
-            print(f"rotation error: none, {result.transform.undetermined}")
+        if result.ate_share is not None:
+            print(f"ATE rmse: {100.0 * result.ate_share:.3g} % of the path, {result.path_length:.4g} {unit}")
+        worlds = result.world_rotation
+        if worlds.reason:
+            log.warning("%s: for the rotation error, the rotation is that by %s", worlds.reason, worlds.by)
         if self.json is not None:
             write_json(self.json, result.to_json(unit))
             print(self.json)
@@ -115,6 +119,5 @@ def _table(result: Alignment, unit: str) -> Table:
         (f"RPE over {step}", unit, result.rpe_translation),
         (f"RPE over {step}", "deg", result.rpe_rotation_deg),
     ):
-        values = ["-"] * 4 if spread is None else [f"{value:.4g}" for value in vars(spread).values()]
-        table.add_row(name, kind, *values)
+        table.add_row(name, kind, *(f"{value:.4g}" for value in vars(spread).values()))
     return table

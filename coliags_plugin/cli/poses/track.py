@@ -97,7 +97,8 @@ def _errors(found: Tracking, scene: Scene) -> str:
     """Trajectory errors against the scene's own poses, which the tracking did not use."""
     import numpy as np
 
-    from coliags_plugin.poses.alignment import FEWEST_MATCHES, align, associate
+    from coliags_plugin.poses.alignment import align
+    from coliags_plugin.poses.association import FEWEST_MATCHES, associate
     from coliags_plugin.poses.trajectory import Trajectory
 
     if len(scene.train) < FEWEST_MATCHES:
@@ -105,10 +106,10 @@ def _errors(found: Tracking, scene: Scene) -> str:
     given = Trajectory(np.stack([frame.camera.camera_to_world.double().numpy() for frame in scene.train]))
     estimate = Trajectory(found.camera_to_world)
     result = align(estimate, given, associate(estimate, given, "index"))
-    path = float(given.steps.sum())
-    share = f" ({100.0 * result.ate.rmse / path:.3g} % of the path, {path:.4g})" if path > 0.0 else ""
+    share = result.ate_share
+    of_path = "" if share is None else f" ({100.0 * share:.3g} % of the path, {result.path_length:.4g})"
     rpe, turn = result.rpe_translation, result.rpe_rotation_deg
     return (
-        f"against the scene's own poses: ATE rmse {result.ate.rmse:.4g}{share}, max {result.ate.max:.4g}; "
+        f"against the scene's own poses: ATE rmse {result.ate.rmse:.4g}{of_path}, max {result.ate.max:.4g}; "
         f"RPE over 1 frame rmse {rpe.rmse:.4g} and {turn.rmse:.4g} deg"
     )

@@ -1,0 +1,117 @@
+"""Least-squares transforms between the positions, and rotations between the orientations, of matched cameras.
+
+S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", IEEE TPAMI 13(4), 1991.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from coliags_plugin.core.errors import InputError
+
+#: Least ratio of the paths' extents (standard deviations) across and along their main direction for which the rotation
+#: about that direction is determined.
+OFF_LINE_SHARE = 1e-3
+#: Extents below this share of the coordinates are rounding errors.
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """x -> scale * rotation @ x + translation.
+
+    Attributes:
+        scale: 1 for a rigid transform.
+        rotation: Rotation matrix, det 1. [3, 3]
+        translation: Units of the target. [3]
+        undetermined: Why the points do not determine the rotation, or an empty string. The rotation is then the
+            smallest among those that fit equally well.
+        axis: Main direction of the target's points, unit length; zero where they do not determine one. [3]
+        spread: Extent of the points across that direction relative to that along it (standard deviations), 0 to 1.
+    """
+
+    scale: float
+    rotation: Float[np.ndarray, "3 3"]
+    translation: Float[np.ndarray, "3"]
+    undetermined: str = ""
+    axis: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    spread: float = 1.0
+
+    def points(self, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
+        """Transformed points. [N, 3]"""
+        return self.scale * points @ self.rotation.T + self.translation
+
+
+def umeyama(source: Float[np.ndarray, "N 3"], target: Float[np.ndarray, "N 3"], with_scale: bool = False) -> Similarity:
+    """Least-squares rigid or similarity transform between corresponding points (Umeyama's method).
+
+    The rotation is unique only if d2 + s d3 > 0, with d1 >= d2 >= d3 the singular values of the covariance and s the
+    sign of its determinant (Umeyama 1991, section III). Otherwise, as for points on a line, the smallest rotation that
+    fits is returned, and :attr:`Similarity.undetermined` gives the reason.
+
+    Args:
+        source: Points to transform. [N, 3]
+        target: Corresponding target points. [N, 3]
+        with_scale: Also estimate a scale.
+
+    Raises:
+        InputError: A scale is requested, and the points of one side coincide or the two are uncorrelated.
+    """
+    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
+    centered, wanted = source - source_mean, target - target_mean
+    covariance = wanted.T @ centered / len(source)
+    left, values, right = np.linalg.svd(covariance)
+    sign = 1.0 if np.linalg.det(left) * np.linalg.det(right) > 0.0 else -1.0
+    still = _still(source, centered) or _still(target, wanted)
+    rotation = left @ np.diag([1.0, 1.0, sign]) @ right
+    undetermined, axis = "", left[:, 0]
+    if still or values[0] <= _ROUNDING * np.sqrt((centered**2).sum() * (wanted**2).sum()) / len(source):
+        rotation, axis = np.eye(3), np.zeros(3)
+        undetermined = (
+            "the camera does not move, so that positions determine no rotation"
+            if still
+            else "the two paths are uncorrelated, so that positions determine no rotation"
+        )
+    elif values[1] + sign * values[2] <= OFF_LINE_SHARE**2 * values[0]:
+        rotation = _shortest_rotation(right[0], left[:, 0], right[1])
+        undetermined = (
+            "the positions lie on a line, about which the rotation is undetermined"
+            if values[1] <= 2.0 * OFF_LINE_SHARE**2 * values[0]
+            else "one path is the mirror image of the other, so that several rotations fit equally well"
+        )
+    scale = 1.0
+    if with_scale:
+        if still or not values[0] > 0.0:
+            raise InputError(
+                "a scale cannot be estimated: the camera of one trajectory does not move",
+                "two cameras that move",
+                "Align without --scale",
+            )
+        scale = float((values * (1.0, 1.0, sign)).sum() / (centered**2).sum(axis=1).mean())
+    spread = float(np.sqrt(max(values[1] + sign * values[2], 0.0) / values[0])) if axis.any() else 0.0
+    translation = target_mean - scale * rotation @ source_mean
+    return Similarity(scale, rotation, translation, undetermined, axis, spread)
+
+
+def _shortest_rotation(start: np.ndarray, end: np.ndarray, beside: np.ndarray) -> np.ndarray:
+    """The smallest rotation from one unit vector to another; ``beside`` is perpendicular to the first.
+
+    The product of two half turns, about the first vector and about the bisector of both. (scipy 1.17's
+    ``align_vectors`` of one vector is off by degrees if the two are nearly opposite.)
+    """
+    if start @ end < -0.9999:
+        about = _half_turn(beside)
+        return np.asarray(_shortest_rotation(-start, end, beside) @ about)
+    middle = (start + end) / np.linalg.norm(start + end)
+    return np.asarray(_half_turn(middle) @ _half_turn(start))
+
+
+def _half_turn(axis: np.ndarray) -> np.ndarray:
+    return 2.0 * np.outer(axis, axis) - np.eye(3)
+
+
+def _still(points: np.ndarray, centered: np.ndarray) -> bool:
+    return bool(np.abs(centered).max() <= _ROUNDING * np.abs(points).max())
