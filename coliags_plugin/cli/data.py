@@ -39,7 +39,14 @@ class Data:
         from coliags_plugin.engine.progress import progress_callback
 
         with progress_callback() as progress:
-            check = check_scene(open_scene(self.scene, self.format, self.set, progress), progress)
+            scene = open_scene(self.scene, self.format, self.set, progress)
+            data = scene.provenance
+            shrunk = data.get("stored_size") != data.get("size")
+            check = check_scene(
+                scene,
+                progress,
+                (lambda: open_scene(self.scene, self.format, self.set, stored_size=True)) if shrunk else None,
+            )
         print("\n".join(lines(check)))
         if self.html is not None:
             write_check_page(check, self.html)

@@ -176,9 +176,9 @@ def _check_same_phantom(source: SceneSource) -> None:
             f"{source.path} is not a phantom: {file.name} cannot be read", "the benchmark's phantom, or no folder"
         ) from error
     wanted = source.phantom_record or {}
-    differing = [key for key in wanted if settings.get(key) != wanted[key]]
+    differing = [key for key in PhantomSettings.model_fields if settings.get(key) != wanted.get(key)]
     if differing:
-        seen = ", ".join(f"{key} {settings.get(key)!r} instead of {wanted[key]!r}" for key in differing)
+        seen = ", ".join(f"{key} {settings.get(key)!r} instead of {wanted.get(key)!r}" for key in differing)
         raise InputError(
             f"{source.path} is another phantom than the benchmark's: {seen}",
             "the benchmark's phantom, or no folder",

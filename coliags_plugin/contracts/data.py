@@ -38,6 +38,13 @@ class DataManager(ABC):
         """
         return self
 
+    def at_stored_size(self) -> DataManager:
+        """The data manager, with the same options, that reads images at their stored size, each when it is used.
+
+        It makes no initial points. Itself where there is no such choice.
+        """
+        return self
+
     @abstractmethod
     def load(self, path: Path, progress: Progress | None = None) -> Scene:
         """Read the scene.

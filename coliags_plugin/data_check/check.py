@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -21,8 +22,10 @@ from coliags_plugin.data_check.facts import (
 )
 from coliags_plugin.data_check.findings import Finding
 from coliags_plugin.data_check.hypotheses import CHANGES
+from coliags_plugin.data_check.lamp import LampFacts, lamp_facts
 from coliags_plugin.data_check.matches import EpipolarAgreement, epipolar_agreement, match
-from coliags_plugin.data_check.reprojection import Agreement, Pair, agreement, best_scale, video_pairs
+from coliags_plugin.data_check.pairs import video_pairs
+from coliags_plugin.data_check.reprojection import Agreement, BestScale, Pair, agreement, best_scale
 
 
 @dataclass(frozen=True)
@@ -32,11 +35,12 @@ class SceneCheck:
     Attributes:
         scene: The scene checked.
         pairs: Source and target frames of the reprojection or matching.
-        depth, path, images: Statistics; None where there is nothing to measure.
+        depth, path, images, lamp: Statistics; None where there is nothing to measure.
         agreement: Reprojection errors of frames with depth, by pose hypothesis.
-        scale: The factor on depth with the smallest reprojection error, and the relative depth error with it.
+        scale: The factor on depth with the smallest reprojection error, and the errors with it.
         matches: Epipolar errors of matched features, by pose hypothesis; empty where there is depth.
         findings: Suspected problems.
+        undecided: What the data are not enough to check.
     """
 
     scene: Scene
@@ -44,10 +48,12 @@ class SceneCheck:
     depth: DepthFacts | None
     path: PathFacts | None
     images: ImageFacts
+    lamp: LampFacts | None
     agreement: dict[str, Agreement]
-    scale: tuple[float, float] | None
+    scale: BestScale | None
     matches: dict[str, EpipolarAgreement]
     findings: list[Finding]
+    undecided: list[Finding]
 
     def as_json(self) -> dict[str, Any]:
         """The same as JSON values; unavailable ones are null."""
@@ -55,26 +61,32 @@ class SceneCheck:
             "scene": self.scene.name,
             "suspect": bool(self.findings),
             "findings": [asdict(finding) for finding in self.findings],
+            "undecided": [asdict(doubt) for doubt in self.undecided],
             "data": self.scene.provenance,
             "initial_points": len(self.scene.points),
             "depth": None if self.depth is None else asdict(self.depth),
             "path": None if self.path is None else asdict(self.path),
             "images": asdict(self.images),
+            "lamp": None if self.lamp is None else asdict(self.lamp),
             "pairs": [[source.name, target.name] for source, target in self.pairs],
             "agreement": {name: asdict(found) for name, found in self.agreement.items()},
-            "best_depth_scale": None if self.scale is None else {"factor": self.scale[0], "depth_error": self.scale[1]},
+            "best_depth_scale": None if self.scale is None else asdict(self.scale),
             "matches": {name: asdict(found) for name, found in self.matches.items()},
         }
         cleaned: dict[str, Any] = _without_nan(plain)
         return cleaned
 
 
-def check_scene(scene: Scene, progress: Progress | None = None) -> SceneCheck:
+def check_scene(
+    scene: Scene, progress: Progress | None = None, at_stored_size: Callable[[], Scene] | None = None
+) -> SceneCheck:
     """Run all checks on a scene.
 
     Args:
         scene: As loaded by a data manager.
         progress: Called during the comparison of frames.
+        at_stored_size: Loads the same scene with images of the stored size, in which features are matched if there is
+            no depth; None: those of ``scene``.
     """
     video = video_of(scene)
     looked = sampled_frames(video)
@@ -89,22 +101,36 @@ def check_scene(scene: Scene, progress: Progress | None = None) -> SceneCheck:
         scale = best_scale(with_depth)
     else:
         # Epipolar errors grow with the baseline, so frames further apart are compared.
-        pairs = video_pairs(video, farther=3)
+        pairs = video_pairs(video if at_stored_size is None else video_of(at_stored_size()), farther=3)
         matches = match(pairs)
         found = {name: epipolar_agreement(matches, name) for name in CHANGES}
         matched = {name: reading for name, reading in found.items() if reading is not None}
     if progress is not None:
         progress("compare frames", len(CHANGES), len(CHANGES))
     depth, path, images = depth_facts(looked), path_facts(video), image_facts(looked)
+    lamp = lamp_facts(looked)
     found_suspect = [
-        *suspect.agreement_findings(readings, scale, path),
+        *suspect.agreement_findings(readings, scale, path, depth),
         *suspect.match_findings(matched),
         *suspect.depth_findings(depth),
+        *suspect.lamp_findings(lamp),
         *suspect.path_findings(path),
         *suspect.calibration_findings(video),
         *suspect.image_findings(images),
     ]
-    return SceneCheck(scene, pairs, depth, path, images, readings, scale, matched, found_suspect)
+    return SceneCheck(
+        scene,
+        pairs,
+        depth,
+        path,
+        images,
+        lamp,
+        readings,
+        scale,
+        matched,
+        found_suspect,
+        list(suspect.undecided(matched)),
+    )
 
 
 def _without_nan(value: Any) -> Any:

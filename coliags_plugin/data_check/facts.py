@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from coliags_plugin.core.scenes import Frame, Scene
 
@@ -28,11 +29,11 @@ class DepthFacts:
 
 @dataclass(frozen=True)
 class PathFacts:
-    """Camera path: lengths in scene units, rotation in degrees."""
+    """Camera path: lengths in scene units, rotation in degrees; ``moving_step`` as of :func:`moving_step`."""
 
     length: float
     mean_step: float
-    median_step: float
+    moving_step: float
     largest_step: float
     largest_step_at: str
     extent: float
@@ -97,12 +98,26 @@ def path_facts(video: Sequence[Frame]) -> PathFacts | None:
     return PathFacts(
         length=float(lengths.sum()),
         mean_step=float(steps.mean()),
-        median_step=float(np.median(steps)),
+        moving_step=moving_step(steps),
         largest_step=float(steps.max()),
         largest_step_at=video[int(steps.argmax()) + 1].name,
         extent=float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max() * 2.0),
         turn=float(np.degrees(np.arccos(cosines)).sum()),
     )
+
+
+def moving_step(steps: Float[np.ndarray, "N"]) -> float:
+    """Typical step of a camera while it moves: half of the path is made of shorter steps.
+
+    Pauses, which have no length, do not count, nor do jumps: the longest tenth of the steps is left out.
+
+    Args:
+        steps: Distances between successive cameras, at least one.
+    """
+    jumps = max(len(steps) // 10, min(2, len(steps) // 3))
+    ordered = np.sort(steps)[: len(steps) - jumps]
+    walked = np.cumsum(ordered)
+    return float(ordered[np.searchsorted(walked, 0.5 * walked[-1])])
 
 
 def image_facts(frames: Sequence[Frame]) -> ImageFacts:

@@ -9,25 +9,33 @@ from dataclasses import dataclass
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.data_check.facts import DepthFacts, ImageFacts, PathFacts
 from coliags_plugin.data_check.hypotheses import ADVICE, GIVEN, NO_MOTION
+from coliags_plugin.data_check.lamp import LampFacts
 from coliags_plugin.data_check.matches import EpipolarAgreement
-from coliags_plugin.data_check.reprojection import Agreement
+from coliags_plugin.data_check.reprojection import Agreement, BestScale
 
 #: Largest median depth difference of agreeing frames, relative to the depth.
 DEPTH_AGREES = 0.02
+#: The same under another reading of the poses, for it to be named.
+READING_AGREES = 0.04
+#: Depth differences below this share are limited by the sampling of depth, and raise no doubt.
+DEPTH_SURE = 0.005
 #: A pose hypothesis is reported when it reduces the error by this factor.
 CLEARLY_BETTER = 2.0
 #: Factors on depth closer to 1 than this (in the logarithm) are ignored.
 SCALE_TOLERANCE = 0.1
 #: Smallest share of pixels that must project into the other image.
 SHARE_LANDS = 0.3
-#: Largest median epipolar distance of matches that agree with the poses, px.
-EPIPOLAR_AGREES = 2.0
 #: Epipolar distances below this are limited by image sharpness, px.
 EPIPOLAR_SURE = 0.5
 #: Smallest share of good matches in front of both cameras.
 IN_FRONT = 0.6
-#: Steps longer than this many median steps are jumps.
+#: Steps longer than this many typical steps of the moving camera are jumps.
 JUMP = 10.0
+#: Rank correlation of brightness and distance, and share of the frames where it is positive, above which depth is taken
+#: to be reversed.
+REVERSED, REVERSED_SHARE = 0.3, 0.75
+#: Fewest frames to tell.
+REVERSED_FRAMES = 4
 #: The renderers' default near plane, scene units.
 NEAR = 0.2
 
@@ -59,7 +67,7 @@ def depth_findings(depth: DepthFacts | None) -> Iterator[Finding]:
         )
     if math.isnan(depth.median):
         return
-    if depth.farthest - depth.nearest < 1e-3 * depth.median:
+    if _is_flat(depth):
         yield Finding(
             "depth is the same everywhere",
             f"{depth.nearest:.4g} to {depth.farthest:.4g}",
@@ -80,12 +88,25 @@ def depth_findings(depth: DepthFacts | None) -> Iterator[Finding]:
         )
 
 
+def lamp_findings(lamp: LampFacts | None) -> Iterator[Finding]:
+    """Depth under which the lamp would light what is far more than what is near."""
+    if lamp is None or lamp.frames < REVERSED_FRAMES:
+        return
+    if lamp.correlation > REVERSED and lamp.rising_share > REVERSED_SHARE:
+        yield Finding(
+            "the far is brighter than the near",
+            f"brightness rises with distance (rank correlation {lamp.correlation:.2f}, the median of {lamp.frames} "
+            "frames), though the lamp is at the camera",
+            "Check whether the depth is reversed: a disparity, inverse or inverted depth, or one of other images",
+        )
+
+
 def agreement_findings(
-    readings: Mapping[str, Agreement], scale: tuple[float, float] | None, path: PathFacts | None
+    readings: Mapping[str, Agreement], scale: BestScale | None, path: PathFacts | None, depth: DepthFacts | None
 ) -> Iterator[Finding]:
     """Contradictions of poses and depth, and the pose convention or unit that would resolve them."""
     given = readings.get(GIVEN)
-    if given is None or path is None or path.length == 0.0:
+    if given is None or path is None or path.length == 0.0 or depth is None or _is_flat(depth):
         return
     error = math.inf if given.depth_error is None or given.share < SHARE_LANDS else given.depth_error
     errors = (
@@ -99,14 +120,17 @@ def agreement_findings(
     }
     best = min(better, key=lambda name: better[name].depth_error or 0.0, default=None)
     least = math.inf if best is None else better[best].depth_error or 0.0
-    by_scale = math.inf if scale is None or abs(math.log(scale[0])) < SCALE_TOLERANCE else scale[1]
+    by_scale = math.inf
+    if scale is not None and error > DEPTH_SURE and abs(math.log(scale.factor)) >= SCALE_TOLERANCE:
+        # With dummy depth any factor does that makes the motion negligible.
+        by_scale = scale.depth_error if scale.depth_error * CLEARLY_BETTER < scale.beside else math.inf
     if scale is not None and by_scale * CLEARLY_BETTER < min(error, least * CLEARLY_BETTER):
         yield Finding(
             "depth and poses are in different units",
-            f"as given, {errors}; with depth times {scale[0]:.3g}, {_percent(by_scale)}",
-            f"Check the units: depth seems to be {1.0 / scale[0]:.3g} times what the poses expect",
+            f"as given, {errors}; with depth times {scale.factor:.3g}, {_percent(by_scale)}",
+            f"Check the units: depth seems to be {1.0 / scale.factor:.3g} times what the poses expect",
         )
-    elif best is not None and least * CLEARLY_BETTER < error:
+    elif best is not None and error > DEPTH_SURE and least * CLEARLY_BETTER < error and least < READING_AGREES:
         yield Finding(
             f"poses agree with depth when read as: {best}",
             f"as given, {errors}; read this way, {_percent(least)}",
@@ -126,16 +150,17 @@ def match_findings(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Findin
     given = readings.get(GIVEN)
     if given is None:
         return
-    errors = (
-        f"{given.count} matches lie {given.error:.2g} px from their epipolar lines (median), {given.in_front:.0%} in "
-        "front of both cameras"
+    errors = f"{given.count} matches lie {given.error:.2g} px from their epipolar lines (median), " + (
+        f"with a parallax of {given.parallax:.2g} px"
+        if given.in_front is None
+        else f"{given.in_front:.0%} in front of both cameras"
     )
-    in_front = given.in_front >= IN_FRONT
+    in_front = given.in_front is None or given.in_front >= IN_FRONT
     right = [
         name
         for name, reading in readings.items()
         if name in ADVICE
-        and reading.in_front >= IN_FRONT
+        and (reading.in_front or 0.0) >= IN_FRONT
         and (
             (given.error > EPIPOLAR_SURE and reading.error * CLEARLY_BETTER < given.error)
             or (not in_front and reading.error <= max(EPIPOLAR_SURE, given.error))
@@ -146,14 +171,26 @@ def match_findings(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Findin
         reading = readings[best]
         yield Finding(
             f"poses agree with the images when read as: {best}",
-            f"as given, {errors}; read this way, {reading.error:.2g} px, {reading.in_front:.0%} in front",
+            f"as given, {errors}; read this way, {reading.error:.2g} px, {_percent(reading.in_front)} in front",
             ADVICE[best],
         )
-    elif given.error > EPIPOLAR_AGREES or not in_front:
+    elif not given.agrees or not in_front:
         yield Finding(
             "images do not agree with the poses",
             errors,
             "Check that images and poses match frame by frame, and the calibration",
+        )
+
+
+def undecided(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Finding]:
+    """What matched features are not enough to tell."""
+    given = readings.get(GIVEN)
+    if given is not None and given.in_front is None and given.agrees:
+        yield Finding(
+            "poses may be right or wrong",
+            f"{given.count} matches lie {given.error:.2g} px from their epipolar lines, but the camera moves them by "
+            f"{given.parallax:.2g} px only (median), beside its rotation",
+            "Look at frames further apart, --set frame_step=N, or at a part of the video with more motion",
         )
 
 
@@ -163,10 +200,10 @@ def path_findings(path: PathFacts | None) -> Iterator[Finding]:
         return
     if path.length == 0.0:
         yield Finding("the camera does not move", "all poses have one centre", "Check the pose file")
-    elif path.largest_step > JUMP * max(path.median_step, 1e-3 * path.mean_step):
+    elif path.largest_step > JUMP * max(path.moving_step, 1e-3 * path.mean_step):
         yield Finding(
             "the camera jumps",
-            f"{path.largest_step:.4g} to {path.largest_step_at}, {path.median_step:.4g} in the median",
+            f"{path.largest_step:.4g} to {path.largest_step_at}, {path.moving_step:.4g} typically while it moves",
             "Check the poses around that frame: a cut in the video, or lines missing",
         )
 
@@ -227,6 +264,11 @@ def image_findings(images: ImageFacts) -> Iterator[Finding]:
             "Leave repeated images and their poses out: the video was captured at a higher frame rate than the "
             "endoscope's",
         )
+
+
+def _is_flat(depth: DepthFacts) -> bool:
+    """Whether depth is the same everywhere; False where it is unknown."""
+    return depth.farthest - depth.nearest < 1e-3 * depth.median
 
 
 def _percent(value: float | None) -> str:

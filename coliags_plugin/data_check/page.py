@@ -12,6 +12,7 @@ import torch
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.data_check.check import SceneCheck
 from coliags_plugin.data_check.facts import video_of
+from coliags_plugin.data_check.findings import Finding
 from coliags_plugin.data_check.reprojection import warp_image
 from coliags_plugin.data_check.text import fact_rows, reading_rows
 from coliags_plugin.outputs.charts import Series, line_chart
@@ -38,22 +39,26 @@ def write_check_page(check: SceneCheck, output: Path) -> None:
 
 
 def _findings(check: SceneCheck) -> str:
-    if not check.findings:
-        return ""
-    items = "".join(
-        f"<li><strong>{escape(finding.what)}</strong>: {escape(finding.evidence)}. {escape(finding.do)}</li>"
-        for finding in check.findings
-    )
-    return f'<section><h2>Suspect</h2><ul class="cautions">{items}</ul></section>'
+    parts = [
+        f'<h2>{title}</h2><ul class="cautions">{"".join(map(_item, found))}</ul>'
+        for title, found in (("Suspect", check.findings), ("Undecided", check.undecided))
+        if found
+    ]
+    return f"<section>{''.join(parts)}</section>" if parts else ""
+
+
+def _item(finding: Finding) -> str:
+    return f"<li><strong>{escape(finding.what)}</strong>: {escape(finding.evidence)}. {escape(finding.do)}</li>"
 
 
 def _readings(check: SceneCheck) -> str:
     head, rows = reading_rows(check)
     if not rows:
         return ""
-    apart = abs(check.pairs[0][1].index - check.pairs[0][0].index) if check.pairs else 0
+    gaps = [target.index - source.index for source, target in check.pairs] or [0]
+    apart = f"{min(gaps)} to {max(gaps)} frames"
     note = (
-        f"Each of {len(check.pairs)} frames is reprojected {apart} frames ahead by depth, poses and calibration; "
+        f"Each of {len(check.pairs)} frames is reprojected {apart} ahead by depth, poses and calibration; "
         "medians over all pixels. If the given poses are not the best row, they are suspect."
         if check.agreement
         else f"Matched features of {len(check.pairs)} pairs of frames, {apart} apart, as there is no depth."

@@ -16,8 +16,6 @@ from coliags_plugin.data_check.hypotheses import CHANGES, GIVEN, Change
 
 #: Largest number of pixels reprojected per frame.
 _PIXELS = 4000
-#: Number of frame pairs.
-PAIRS = 12
 #: Factors on depth of the coarse search.
 _SCALES = np.logspace(-4.0, 4.0, 65)
 #: Stride of the pixels used in that search.
@@ -108,22 +106,6 @@ class Agreement:
     share: float
 
 
-def video_pairs(frames: Sequence[Frame], farther: int = 1, count: int = PAIRS) -> list[tuple[Frame, Frame]]:
-    """Pairs of frames with a short baseline: long enough to reveal wrong poses, short enough to overlap.
-
-    Args:
-        frames: Frames of the video.
-        farther: Factor on the default distance in frames.
-        count: Largest number of pairs.
-    """
-    video = sorted(frames, key=lambda frame: frame.index)
-    apart = min(farther * min(max(1, round(len(video) / 30)), 10), max(1, len(video) - 1))
-    if len(video) <= apart:
-        return []
-    starts = np.unique(np.linspace(0, len(video) - 1 - apart, count).astype(int))
-    return [(video[start], video[start + apart]) for start in starts]
-
-
 def agreement(pairs: Sequence[Pair], change: str = GIVEN, scale: float = 1.0, every: int = 1) -> Agreement:
     """Reproject the first frame of every pair into the second; arguments as in :meth:`Pair.reproject`."""
     reprojected = [pair.reproject(CHANGES[change], scale, every) for pair in pairs]
@@ -135,8 +117,23 @@ def agreement(pairs: Sequence[Pair], change: str = GIVEN, scale: float = 1.0, ev
     )
 
 
-def best_scale(pairs: Sequence[Pair]) -> tuple[float, float] | None:
-    """Factor on depth with the smallest reprojection error, and the relative depth error with it; None if none fits."""
+@dataclass(frozen=True)
+class BestScale:
+    """The factor on depth with the smallest reprojection error.
+
+    Attributes:
+        factor: On depth.
+        depth_error: Relative error of z-depth with it.
+        beside: The smaller of the errors with half and with twice the factor; infinite where nothing overlaps.
+    """
+
+    factor: float
+    depth_error: float
+    beside: float
+
+
+def best_scale(pairs: Sequence[Pair]) -> BestScale | None:
+    """The factor on depth with the smallest reprojection error; None if none fits."""
 
     def error(scale: float) -> float:
         found = agreement(pairs, scale=float(scale), every=_THINNED)
@@ -149,7 +146,8 @@ def best_scale(pairs: Sequence[Pair]) -> tuple[float, float] | None:
     step = _SCALES[1] / _SCALES[0]
     fine = _SCALES[least] * step ** np.linspace(-1.0, 1.0, 17)
     fine_errors = [error(scale) for scale in fine]
-    return float(fine[int(np.argmin(fine_errors))]), float(min(fine_errors))
+    best = float(fine[int(np.argmin(fine_errors))])
+    return BestScale(best, float(min(fine_errors)), float(min(error(0.5 * best), error(2.0 * best))))
 
 
 def warp_image(source: Frame, target: Frame) -> tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"]]:

@@ -56,6 +56,12 @@ def fact_rows(check: SceneCheck) -> Iterator[tuple[str, str]]:
         f"mean {images.mean:.0f} of 255, frames {images.darkest_frame:.0f} to {images.brightest_frame:.0f}, "
         f"{images.overexposed_share:.1%} white, {images.masked_share:.1%} masked",
     )
+    if check.lamp is not None:
+        lamp = check.lamp
+        yield (
+            "brightness and distance",
+            f"rank correlation {lamp.correlation:.2f} (median of {lamp.frames} frames); below 0, the near is brighter",
+        )
     yield "initial points", f"{len(scene.points)} from {data.get('points', {}).get('source', 'unknown')}"
 
 
@@ -81,12 +87,24 @@ def reading_rows(check: SceneCheck) -> tuple[list[str], list[list[str]]]:
         ]
         if check.scale is not None:
             rows.append(
-                [f"given, depth times {check.scale[0]:.3g}", _number(check.scale[1], 100.0), _NONE, _NONE, _NONE]
+                [
+                    f"given, depth times {check.scale.factor:.3g}",
+                    _number(check.scale.depth_error, 100.0),
+                    _NONE,
+                    _NONE,
+                    _NONE,
+                ]
             )
         return head, rows
-    head = ["poses read as", "distance from the epipolar line, px", "in front of both cameras, %", "matches"]
+    head = [
+        "poses read as",
+        "distance from the epipolar line, px",
+        "in front of both cameras, %",
+        "parallax, px",
+        "matches",
+    ]
     return head, [
-        [name, _number(found.error), _number(found.in_front, 100.0), str(found.count)]
+        [name, _number(found.error), _number(found.in_front, 100.0), _number(found.parallax), str(found.count)]
         for name, found in check.matches.items()
     ]
 
@@ -101,6 +119,8 @@ def lines(check: SceneCheck) -> Iterator[str]:
     yield ""
     for finding in check.findings:
         yield f"SUSPECT {finding.what}: {finding.evidence}. {finding.do}."
+    for doubt in check.undecided:
+        yield f"UNDECIDED {doubt.what}: {doubt.evidence}. {doubt.do}."
     if not check.findings:
         yield "nothing suspect"
 

@@ -47,6 +47,10 @@ class RecordedDataManager(DataManager):
     #: The split whose training frames the dataset's seen masks refer to (docs/layouts/c3vd.md 5).
     seen_split: ClassVar[Split] = "every-8th"
 
+    def __init__(self, settings: Any) -> None:
+        super().__init__(settings)
+        self._bounds = self.fits
+
     @abstractmethod
     def open(self, path: Path) -> Recording:
         """Find the files of a scene and read its poses and cameras, but no pixels.
@@ -61,7 +65,14 @@ class RecordedDataManager(DataManager):
 
     def working_size(self, width: int, height: int) -> tuple[int, int]:
         """Working size for a stored size, pixels: the configured size, or the largest within :attr:`fits`."""
-        return self.settings.size or fitted(width, height, self.fits)
+        return self.settings.size or fitted(width, height, self._bounds)
+
+    def at_stored_size(self) -> DataManager:
+        """See :class:`DataManager`."""
+        changes = {"width": None, "height": None, "keep_pixels": False, "initial_points": "none"}
+        manager = type(self)(self.settings.model_copy(update=changes))
+        manager._bounds = None
+        return manager
 
     def load(self, path: Path, progress: Progress | None = None) -> Scene:
         """Read the scene.

@@ -65,7 +65,11 @@ def load_scene(config: MethodConfig, path: Path) -> Scene:
 
 
 def open_scene(
-    path: Path, data_format: str | None = None, options: Sequence[str] = (), progress: Progress | None = None
+    path: Path,
+    data_format: str | None = None,
+    options: Sequence[str] = (),
+    progress: Progress | None = None,
+    stored_size: bool = False,
 ) -> Scene:
     """Read a scene without a method, also one that has nothing to make initial points from.
 
@@ -74,12 +78,15 @@ def open_scene(
         data_format: A data manager's name; None: the one that recognises the folder.
         options: ``key=value`` options of that data manager.
         progress: Called with ``(what, done, total)`` while images are read.
+        stored_size: Read images at their stored size, each when it is used, and make no initial points.
 
     Raises:
         InputError: See :func:`find_format`; an option is unknown; or the scene cannot be read.
     """
     name = find_format(path) if data_format is None else data_format
     given = override_all(Node({}, "options"), options).plain()
+    if stored_size:
+        return _manager(name, given).at_stored_size().load(path, progress)
     try:
         return _manager(name, given).load(path, progress)
     except NoPointsError as error:

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.phantom.centreline import CentreLine
-from coliags_plugin.phantom.motion import NEAREST, SHALLOW_END, Curve, draw_sway
+from coliags_plugin.phantom.motion import NEAREST, SHALLOW_END, Curve, draw_sway, times
 from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.phantom.streams import Purpose, stream
 from coliags_plugin.phantom.tracing import Tracer
@@ -106,7 +106,7 @@ def inspecting_path(centre_line: CentreLine, settings: PhantomSettings, tracer: 
         for number in range(APPROACHES + 1)
     ]
 
-    time = np.linspace(0.0, 1.0, settings.frames)
+    time = times(settings)
     points, frames = withdrawal.at(time)
     rolls = np.radians(settings.preset.turn[2]) * roll(time)
     poses = np.tile(np.eye(4), (settings.frames, 1, 1))

@@ -7,12 +7,24 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
+from coliags_plugin.phantom.settings import PhantomSettings
+
 #: No closer to the wall than this, mm; C3VD's nearest surface of any sequence is 5.9 mm away.
 NEAREST = 6.0
 #: Arc length of a withdrawal's shallow end, mm. Far enough in that a view turned sideways still ends on the wall.
 SHALLOW_END = 26.0
 
 Curve = Callable[[Float[np.ndarray, "T"]], Float[np.ndarray, "T"]]
+
+
+def times(settings: PhantomSettings) -> Float[np.ndarray, "T"]:
+    """Time of every frame along the path, from 0 to 1: even steps, and none during pauses. [T]"""
+    pauses = settings.pauses
+    moving = settings.frames - pauses * settings.pause_frames
+    frames = np.ones(moving, dtype=np.int64)
+    for pause in range(pauses):
+        frames[round((pause + 1) / (pauses + 1) * (moving - 1))] += settings.pause_frames
+    return np.repeat(np.linspace(0.0, 1.0, moving), frames)
 
 
 def rotation(yaw: float, pitch: float, roll: float) -> Float[np.ndarray, "3 3"]:

@@ -7,11 +7,24 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
-from pydantic import Field, ValidationError, field_validator
+from pydantic import (
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
+from typing_extensions import Self
 
 from coliags_plugin.config.registry import phantom_layouts
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.settings import Settings, first_error
+
+#: Fewest frames in which the camera moves.
+_MOVING = 9
+#: Settings that only count with pauses.
+_OF_PAUSES = ("pauses", "pause_frames")
 
 _T = TypeVar("_T")
 
@@ -175,6 +188,8 @@ class PhantomSettings(Settings):
     )
 
     polyps: int = Field(4, ge=0, le=20, description="Sessile polyps, 3 to 10 mm wide.")
+    pauses: int = Field(0, ge=0, le=50, description="How often the camera stops, at even intervals of its path.")
+    pause_frames: int = Field(10, ge=1, le=500, description="Frames of each pause beyond the one that reaches it.")
     path_length: float = Field(50.0, ge=0.0, le=60.0, description="Length of the pullback, mm; C3VD's median is 47.")
     mesh_spacing: float = Field(0.42, ge=0.2, le=4.0, description="Distance of mesh vertices, mm.")
     texture_spacing: float = Field(0.1, ge=0.05, le=2.0, description="Size of a texel of the mucosa, mm.")
@@ -200,6 +215,22 @@ class PhantomSettings(Settings):
         if not all(0.02 <= value <= 0.9 for value in albedo):
             raise ValueError(f"albedo {albedo} has a channel outside 0.02 to 0.9")
         return albedo
+
+    @model_validator(mode="after")
+    def _pauses_leave_motion(self) -> Self:
+        moving = self.frames - self.pauses * self.pause_frames
+        if moving < _MOVING:
+            raise ValueError(
+                f"{self.pauses} pauses of {self.pause_frames} of {self.frames} frames leave {moving} that move; must "
+                f"be {_MOVING} or more"
+            )
+        return self
+
+    @model_serializer(mode="wrap")
+    def _records_of_earlier_versions(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        # A phantom without pauses is recorded as it was before there were any: it is the same phantom.
+        record: dict[str, Any] = serialize(self)
+        return record if self.pauses else {key: record[key] for key in record if key not in _OF_PAUSES}
 
     @property
     def preset(self) -> Preset:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.phantom.centreline import CentreLine
 from coliags_plugin.phantom.inspection import inspecting_path
-from coliags_plugin.phantom.motion import NEAREST, SHALLOW_END, draw_sway, rotation, rotation_about
+from coliags_plugin.phantom.motion import NEAREST, SHALLOW_END, draw_sway, rotation, rotation_about, times
 from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.phantom.streams import Purpose, stream
 from coliags_plugin.phantom.tracing import Tracer
@@ -109,7 +109,7 @@ def _withdrawing_path(
     """Poses of the trajectories ``pullback`` and ``rotation``: along the centre line, and almost in place."""
     generator = stream(settings.seed, Purpose.TRAJECTORY)
     preset = settings.preset
-    time = np.linspace(0.0, 1.0, settings.frames)
+    time = times(settings)
     if settings.trajectory == "pullback":
         arc = SHALLOW_END + settings.path_length * (1.0 - time)
     else:

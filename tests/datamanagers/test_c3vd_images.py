@@ -50,7 +50,8 @@ def test_colour_order_and_alpha(tmp_path):
         (read_rgb, np.zeros((4, 4, 3), np.uint16), "3 channels of uint16"),
         (C3VD_DEPTH.read, np.zeros((4, 4), np.uint8), "1 channel of uint8.*16-bit"),
         (C3VD_DEPTH.read, np.zeros((4, 4, 3), np.uint16), "3 channels of uint16"),
-        (read_mask, np.zeros((4, 4, 3), np.uint8), "3 channels of uint8"),
+        (read_mask, np.arange(48, dtype=np.uint8).reshape(4, 4, 3), "a colour image.*three equal ones"),
+        (read_mask, np.zeros((4, 4), np.uint16), "1 channel of uint16.*8-bit mask"),
     ],
 )
 def test_the_wrong_kind_of_image(tmp_path, reader, pixels, message):

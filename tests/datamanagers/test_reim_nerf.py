@@ -310,9 +310,9 @@ REFUSED = {
         _image("rgb_mask.png", np.zeros((36, 45), np.uint8)),
         r"rgb_mask.png is 45 x 36.*90 x 72",
     ),
-    "a mask of three channels": (
-        _image("rgb_mask.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8)),
-        r"rgb_mask.png is an image of 3 channels",
+    "a mask in colour": (
+        _image("rgb_mask.png", np.arange(HEIGHT * WIDTH * 3, dtype=np.uint8).reshape(HEIGHT, WIDTH, 3)),
+        r"rgb_mask.png is a colour image.*three equal ones",
     ),
     "intrinsics of another resolution": (
         _json(lambda content: content.update(w=180, h=144), "train", "val", "test", "true_test"),
@@ -360,6 +360,21 @@ class TestRefused:
         (mine / "transforms_train.json").unlink()
         assert ReimNerfDataManager.recognise(mine) is None
         assert ReimNerfDataManager.recognise(mine / "rgb_mask.png") is None
+
+
+def test_files_as_the_preprocessing_writes_them(mine, scene):
+    """Its mask is an RGB image of equal channels; numbers in file names are not padded like those in the JSON files."""
+    mask = cv2.imread(str(mine / "rgb_mask.png"), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(mine / "rgb_mask.png"), np.repeat(mask[..., None], 3, axis=2))
+    for part in ("images", "distmaps"):
+        for index in range(FRAMES):
+            (mine / part / f"{index:04d}_color.png").rename(mine / part / f"{index}_color.png")
+    found = load(mine)
+    assert names(found.train) == [f"{index}_color" for index in (0, 5, 10, 15, 20)]
+    for frame, expected in zip(found.train, scene.train, strict=True):
+        assert torch.equal(frame.image, expected.image)
+        assert torch.equal(frame.valid, expected.valid)
+        assert torch.equal(frame.depth.nan_to_num(), expected.depth.nan_to_num())
 
 
 def test_frames_are_in_the_order_that_people_count_in(mine):

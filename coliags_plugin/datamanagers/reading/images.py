@@ -35,6 +35,11 @@ def read_gray(path: Path, bits: int, expected: str) -> Shaped[np.ndarray, "H W"]
         InputError: The file is damaged or has another format.
     """
     image = _read(path)
+    _check_gray(path, image, bits, expected)
+    return image
+
+
+def _check_gray(path: Path, image: np.ndarray, bits: int, expected: str) -> None:
     if image.dtype != np.dtype(f"uint{bits}") or image.ndim != 2:
         lost = image.dtype == np.uint8 and bits == 16
         raise InputError(
@@ -42,7 +47,6 @@ def read_gray(path: Path, bits: int, expected: str) -> Shaped[np.ndarray, "H W"]
             expected,
             "Use the original file: depth converted to 8 bits has lost 0.4 mm" if lost else "Convert it",
         )
-    return image
 
 
 def bits_of(path: Path) -> int:
@@ -65,12 +69,20 @@ def size_of(path: Path) -> tuple[int, int]:
 
 
 def read_mask(path: Path) -> Shaped[np.ndarray, "H W"]:
-    """Read an 8-bit one-channel image as a mask: True where it is not black. [H, W]
+    """Read an 8-bit mask, of one channel or of three equal ones: True where it is not black. [H, W]
 
     Raises:
         InputError: The file is damaged or has another format.
     """
-    return read_gray(path, 8, "a one-channel 8-bit mask") > 0
+    image = _read(path)
+    if image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8:
+        if not (image == image[..., :1]).all():
+            raise InputError(
+                f"{path} is a colour image", "an 8-bit mask: one channel, or three equal ones", "Convert it"
+            )
+        image = image[..., 0]
+    _check_gray(path, image, 8, "an 8-bit mask: one channel, or three equal ones")
+    return np.asarray(image > 0)
 
 
 def resize_rgb(image: UInt8[np.ndarray, "H W 3"], width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:

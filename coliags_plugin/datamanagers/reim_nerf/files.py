@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,8 @@ PARTS = ("train", "val", "test", "true_test")
 EXPECTED = "images/, distmaps/, rgb_mask.png and transforms_train.json as REIM-NeRF's preprocessing writes them"
 #: z-depth at which C3VD's depth is clipped, mm. The preprocessing treats clipped pixels as valid.
 C3VD_RANGE = 100.0
+#: Digits tried of numbers in file names.
+_DIGITS = 6
 _LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "w", "h")
 _SHARED = (*_LENS, "p1", "p2", "scene_scale", "distmap_scale", "camera_model")
 
@@ -250,12 +253,30 @@ def _frames(
         camera_to_world = matrix @ FLIP_Y_AND_Z
         camera_to_world[:3, 3] = camera_to_world[:3, 3] / scale - shift
         distances = frame.get("distmap_path")
-        paths = [folder / name, *([folder / distances] if isinstance(distances, str) else [])]
-        for path in paths:
-            if not path.is_file():
-                raise InputError(f"{file} names {path}, which does not exist", "every named file", "Restore it")
+        named = [folder / name, *([folder / distances] if isinstance(distances, str) else [])]
+        paths = [_stored(path) for path in named]
+        for path, found in zip(named, paths, strict=True):
+            if not found.is_file():
+                raise InputError(
+                    f"{file} names {path}, which does not exist, nor with its number padded otherwise",
+                    "every named file",
+                    "Restore it",
+                )
         result.append((name, FrameEntry(paths[0], paths[1] if len(paths) > 1 else None, camera_to_world)))
     return result
+
+
+def _stored(named: Path) -> Path:
+    """The file that a JSON file names, or else the one whose number has more or fewer leading zeros.
+
+    C3VD's releases and the preprocessing write both 0_color.png and 0000_color.png.
+    """
+    number = re.match(r"\d+", named.name)
+    if named.is_file() or number is None:
+        return named
+    rest = named.name[number.end() :]
+    others = (named.with_name(f"{int(number.group()):0{digits}d}{rest}") for digits in range(1, _DIGITS + 1))
+    return next((path for path in others if path.is_file()), named)
 
 
 def _array(value: Any) -> np.ndarray:
