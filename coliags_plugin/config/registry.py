@@ -235,6 +235,8 @@ losses = Registry(
         "attribute-variance": "coliags_plugin.losses.attribute_variance:AttributeVarianceLoss",
         "diffuse-factor": "coliags_plugin.losses.diffuse_factor:DiffuseFactorLoss",
         "depth-huber": "coliags_plugin.losses.depth:DepthHuberLoss",
+        "estimated-depth": "coliags_plugin.losses.estimated_depth:EstimatedDepthLoss",
+        "opacity": "coliags_plugin.losses.opacity:OpacityLoss",
         "distance-l1": "coliags_plugin.losses.distance:DistanceL1Loss",
         "sparse-depth": "coliags_plugin.losses.sparse_depth:SparseDepthLoss",
         "scale-volume": "coliags_plugin.losses.scale_volume:ScaleVolumeLoss",
