@@ -45,6 +45,7 @@ class DepthLoss(Loss):
 
     Settings: ClassVar[type[LossSettings]] = DepthL1Settings
     needs: ClassVar[frozenset[str]] = frozenset({"depth"})
+    trusts_depth: ClassVar[bool] = True
 
     @property
     def wants(self) -> frozenset[str]:

@@ -38,6 +38,7 @@ class DistanceL1Loss(Loss):
 
     Settings: ClassVar[type[LossSettings]] = DistanceL1Settings
     needs: ClassVar[frozenset[str]] = frozenset({"depth"})
+    trusts_depth: ClassVar[bool] = True
 
     @property
     def wants(self) -> frozenset[str]:

@@ -23,13 +23,17 @@ class SparseDepthSettings(LossSettings):
     huber: float | None = Field(
         default=None,
         gt=0.0,
-        description="Huber threshold, scene units: smaller differences are squared and divided by twice this; null: "
-        "absolute differences.",
+        description="Huber threshold, of the differences' unit: smaller ones are squared and divided by twice this; "
+        "null: absolute differences.",
+    )
+    relative: bool = Field(
+        default=False,
+        description="Whether differences are divided by the known depth, so that the weight needs no unit of length.",
     )
 
 
 class SparseDepthLoss(Loss):
-    """Mean |D(p) - z| in scene units over the points p of a frame whose z-depth is known (docs/methods.md 4.5).
+    """Mean |D(p) - z|, or |D(p) - z| / z, over the points p of a frame whose z-depth is known (docs/methods.md 4.5).
 
     After DS-NeRF (Deng et al., "Depth-supervised NeRF: Fewer Views and Faster Training for Free", CVPR 2022). D is
     interpolated bilinearly at a point, with border pixels replicated. A point is used if all interpolated pixels are
@@ -46,7 +50,7 @@ class SparseDepthLoss(Loss):
         return frozenset({self.settings.depth})
 
     def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
-        """The unweighted term, scene units; 0, still part of the graph, if no point is used."""
+        """The unweighted term, scene units unless ``relative``; 0, still part of the graph, if no point is used."""
         rendered, points = step.output[self.settings.depth], step.target.sparse_depth
         if points is None or not len(points.depth):
             return rendered.reshape(-1)[:0].sum()
@@ -56,7 +60,11 @@ class SparseDepthLoss(Loss):
             rendered = 1.0 / torch.where(drawn, rendered, 1.0)
         sampled, counts = _interpolated(rendered, drawn, points)
         truth = points.depth.to(rendered.dtype)
+        if self.settings.relative:
+            counts = counts & (truth > 0)
         difference = torch.where(counts, sampled - truth, 0.0).abs()
+        if self.settings.relative:
+            difference = difference / torch.where(counts, truth, 1.0)
         if (near := self.settings.huber) is not None:
             difference = torch.where(difference < near, difference.square() / (2.0 * near), difference - 0.5 * near)
         return difference.sum() / counts.sum().clamp_min(1)
