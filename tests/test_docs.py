@@ -214,9 +214,9 @@ def titled(language: str, name: str) -> str:
 
 def test_the_tutorial_runs_as_written(tmp_path):
     scene = write_wall(tmp_path / "SCENE")
-    for language, name in (("python", "opaque.py"), ("yaml", "coliags-opaque.yaml")):
+    for language, name in (("python", "edges.py"), ("yaml", "coliags-edges.yaml")):
         (tmp_path / name).write_text(titled(language, name))
-    (shell,) = [block for block in fenced(DOCS / "configs.md", "sh") if "coliags-opaque.yaml" in block]
+    (shell,) = [block for block in fenced(DOCS / "configs.md", "sh") if "coliags-edges.yaml" in block]
     environment = dict(os.environ)
     shown = []
     for line in shell.splitlines():
@@ -233,17 +233,17 @@ def test_the_tutorial_runs_as_written(tmp_path):
         )
         assert done.returncode == 0, done.stderr
         shown.append(done.stdout)
-    assert "opaque" in shown[0]
+    assert "edges" in shown[0]
     last = json.loads((tmp_path / "RUN" / "metrics.jsonl").read_text().splitlines()[-1])
     assert last["step"] == 2
-    assert 0.0 < last["terms"]["opaque"] < 0.99
-    assert yaml.safe_load((tmp_path / "RUN" / "config.yaml").read_text())["losses"]["opaque"]["floor"] == 0.99
+    assert 0.0 < last["terms"]["edges"] < 0.5
+    assert yaml.safe_load((tmp_path / "RUN" / "config.yaml").read_text())["losses"]["edges"]["apart"] == 1
     assert (tmp_path / "RUN" / "eval" / "paper" / "metrics.json").is_file()
     assert scene.is_dir()
 
 
 def test_yaml_examples_are_valid_methods(tmp_path):
-    examples = [block for block in fenced(DOCS / "configs.md", "yaml") if "opaque" not in block]
+    examples = [block for block in fenced(DOCS / "configs.md", "yaml") if "name: edges" not in block]
     assert len(examples) == 3
     for number, block in enumerate(examples):
         (tmp_path / f"{number}.yaml").write_text(block)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from coliags_plugin.api.views import View
     from coliags_plugin.config.method_config import MethodConfig
     from coliags_plugin.core.cameras import Camera
+    from coliags_plugin.core.scenes import Scene
     from coliags_plugin.engine.trained import TrainedRun
     from coliags_plugin.results.record import Result
 
@@ -114,20 +115,24 @@ class Run:
             self._loaded = kept = load_trained(self.path, choose_device(self.device), self.data)
         return kept
 
-    def evaluate(self, protocol: str | None = None) -> Result:
+    def evaluate(self, protocol: str | None = None, *, truth: str | Path | None = None) -> Result:
         """Evaluate the run on its held-out frames, writing ``eval/PROTOCOL/`` in its folder.
 
         Args:
             protocol: Name of a protocol; None: the method config's.
+            truth: Folder of a scene of the same frames and poses with true depth, to evaluate a run that was trained on
+                estimated depth; writes ``eval/PROTOCOL-truth/``.
 
         Raises:
-            InputError: See :meth:`load`; the protocol is unknown, no frame is held out, or the run was relit.
+            InputError: See :meth:`load`; the protocol is unknown, no frame is held out, the run was relit, or ``truth``
+                is not of the same video and world.
         """
         from coliags_plugin.engine import evaluator
         from coliags_plugin.results.reading import RESULT_FILE, read_result
 
         trained = self.load()
-        return read_result(evaluator.evaluate(trained, protocol or trained.config.protocol) / RESULT_FILE)
+        other = None if truth is None else _scene_of_size(Path(truth), trained.scene)
+        return read_result(evaluator.evaluate(trained, protocol or trained.config.protocol, other) / RESULT_FILE)
 
     def frame_names(self, frames: str = "test") -> list[str]:
         """Names of frames that can be rendered.
@@ -205,6 +210,14 @@ class Run:
         relit = Run(self.path, data=self.data, device=self.device)
         relit._loaded = relight(self.load(), made)
         return relit
+
+
+def _scene_of_size(path: Path, like: Scene) -> Scene:
+    """A scene, read at the working size of another one."""
+    from coliags_plugin.engine.data_formats import open_scene
+
+    camera = like.train[0].camera
+    return open_scene(path, options=[f"width={camera.width}", f"height={camera.height}"])
 
 
 def load_run(path: str | Path, *, data: str | Path | None = None, device: str = "auto") -> Run:

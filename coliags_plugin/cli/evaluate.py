@@ -21,6 +21,9 @@ class Evaluate:
     """Protocol by name (`coliags list protocols`); default: the method config's."""
     data: OptionalPath = None
     """The scene's folder, where it has moved since training."""
+    truth: OptionalPath = None
+    """A scene of the same frames and poses with true depth, to evaluate against instead of the run's own, for runs
+    trained on estimated depth; results go into eval/PROTOCOL-truth."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Device to compute on."""
 
@@ -29,6 +32,6 @@ class Evaluate:
         from coliags_plugin.api.runs import load_run
 
         run = load_run(self.path, data=self.data, device=self.device)
-        result = run.evaluate(self.protocol)
+        result = run.evaluate(self.protocol, truth=self.truth)
         print(result)
-        print(run.folder.evaluation(result.protocol.name) / "metrics.json")
+        print(run.folder.evaluations / result.evaluation_name / "metrics.json")

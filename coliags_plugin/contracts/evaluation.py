@@ -26,6 +26,10 @@ class Comparison:
         depth: Rendered z-depth of the protocol's kind, mm; None where the frame has no true depth. [H, W]
         true_depth: mm. [H, W]
         depth_valid: Pixels that count for depth metrics. [H, W]
+        estimated: Whether the frame has depth, which is no truth, having been estimated.
+        point_depth: Rendered z-depth at those points of known depth that can be compared, scene units; None where the
+            frame has no points. [K]
+        true_point_depth: Known z-depth there, scene units. [K]
     """
 
     rgb: Float[Tensor, "H W 3"]
@@ -34,6 +38,9 @@ class Comparison:
     depth: Float[Tensor, "H W"] | None = None
     true_depth: Float[Tensor, "H W"] | None = None
     depth_valid: Bool[Tensor, "H W"] | None = None
+    estimated: bool = False
+    point_depth: Float[Tensor, "K"] | None = None
+    true_point_depth: Float[Tensor, "K"] | None = None
 
 
 class Metric(ABC):
@@ -66,6 +73,8 @@ class Protocol(ABC):
     wants: ClassVar[frozenset[str]]
     #: Result name -> (metric name, metric options)
     metrics: ClassVar[Mapping[str, tuple[str, Mapping[str, Any]]]]
+    #: Likewise, of metrics that a result has only if a frame has them.
+    optional_metrics: ClassVar[Mapping[str, tuple[str, Mapping[str, Any]]]] = {}
 
     @abstractmethod
     def compare(self, output: RenderOutput, frame: Frame) -> Comparison:

@@ -24,6 +24,8 @@ class Loss(ABC):
     needs: ClassVar[frozenset[str]] = frozenset()
     #: Whether it depends on neighbouring pixels, so that batches of single pixels cannot be used.
     whole_image: ClassVar[bool] = False
+    #: Whether it draws the rendered depth to ``Target.depth`` as to the truth, by confidence weighted at most.
+    trusts_depth: ClassVar[bool] = False
     #: Whether it reads ``output.splats``, which only splatting renderers deliver.
     needs_splats: ClassVar[bool] = False
 

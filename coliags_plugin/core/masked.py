@@ -1,4 +1,4 @@
-"""Masking of values and means, with exactly zero gradients at ignored pixels."""
+"""Masking of values, and plain and weighted means, with exactly zero gradients at ignored pixels."""
 
 from __future__ import annotations
 
@@ -37,3 +37,22 @@ def masked_mean(values: Float[Tensor, "H W *C"], mask: Bool[Tensor, "H W"] | Non
         return values.sum() / max(values.numel(), 1)
     per_pixel = values.shape[2] if values.dim() > mask.dim() else 1
     return zero_outside(values, mask).sum() / (mask.sum() * per_pixel).clamp_min(1)
+
+
+def weighted_mean(
+    values: Float[Tensor, "H W"], mask: Bool[Tensor, "H W"], weights: Float[Tensor, "H W"] | None
+) -> Float[Tensor, ""]:
+    """Weighted mean over the pixels where the mask is True: sum w v / sum w; 0, still part of the graph, if sum w = 0.
+
+    Without weights it is :func:`masked_mean` to the bit.
+
+    Args:
+        values: A map. [H, W]
+        mask: False where a pixel is ignored. [H, W]
+        weights: Not negative; None: all equal. [H, W]
+    """
+    if weights is None:
+        return masked_mean(values, mask)
+    inside = zero_outside(weights.to(values.dtype), mask)
+    total = inside.sum()
+    return (zero_outside(values, mask) * inside).sum() / torch.where(total > 0, total, torch.ones_like(total))

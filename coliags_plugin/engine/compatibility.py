@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 
 from coliags_plugin.config.method_config import MethodConfig
@@ -9,6 +10,8 @@ from coliags_plugin.contracts import Loss, Schedule
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.renderers.choice import ChosenRenderer
+
+log = logging.getLogger(__name__)
 
 #: Descriptions of target attributes for messages; others are called by their names.
 _DATA = {"sparse_depth": "depth at single points"}
@@ -27,6 +30,7 @@ def check_components(
     _check_sampler(config, chosen, losses)
     _check_splats(config, losses)
     _check_data(scene, losses)
+    _warn_of_trusted_estimates(scene, losses)
     _check_schedule(losses, schedule)
 
 
@@ -82,14 +86,26 @@ def _check_data(scene: Scene, losses: Mapping[str, Loss]) -> None:
     for key, loss in losses.items():
         for missing in sorted(loss.needs - there):
             instead = ""
-            if missing == "depth" and "sparse_depth" in there:
-                instead = f", or train on its points with --set 'losses.{key}={{name: sparse-depth, weight: 0.2}}'"
+            if missing == "depth":
+                of_points = ", train the method coliags-sparse-depth on its points" if "sparse_depth" in there else ""
+                instead = f"{of_points}, or make a scene with depth: coliags depth estimate"
             raise InputError(
                 f"loss term '{key}' needs {_DATA.get(missing, missing)}, and no training frame of scene "
                 f"'{scene.name}' has any",
                 f"frames with {_DATA.get(missing, missing)}, or no such term",
                 f"Remove it with --set losses.{key}=null{instead}",
             )
+
+
+def _warn_of_trusted_estimates(scene: Scene, losses: Mapping[str, Loss]) -> None:
+    trusting = [key for key, loss in losses.items() if loss.trusts_depth]
+    if trusting and any(frame.depth_confidence is not None for frame in scene.train):
+        log.warning(
+            "the depth of scene '%s' is estimated, and loss term '%s' takes it for true, weighted by its confidence; "
+            "the method coliags-estimated-depth is made for such scenes",
+            scene.name,
+            trusting[0],
+        )
 
 
 def _check_schedule(losses: Mapping[str, Loss], schedule: Schedule) -> None:

@@ -25,10 +25,12 @@ class EvaluatedSet:
         self._reasons: dict[str, str] = {}
         self._predictions, self._truth = ArraysHash(), ArraysHash()
         self._profiles = ErrorProfiles()
+        self._optional: tuple[str, ...] = ()
 
     def add(self, frame: Frame, comparison: Comparison, scorer: Scorer) -> None:
         """Score a frame and take it up."""
         self._add_scores(frame.name, scorer.score(comparison))
+        self._optional = tuple(scorer.optional_metrics)
         if frame.seen is not None:
             self._add_scores(frame.name, scorer.score(within_seen(comparison, frame), SEEN_METRICS), SEEN_SUFFIX)
         predicted = {"rgb": comparison.rgb, "depth": comparison.depth}
@@ -52,8 +54,16 @@ class EvaluatedSet:
     @property
     def seen_metrics(self) -> list[str]:
         """Names of the metrics over seen pixels that some frame has."""
-        scored = {name for row in self._rows.values() for name in row}
-        return [name + SEEN_SUFFIX for name in SEEN_METRICS if name + SEEN_SUFFIX in scored]
+        return [name + SEEN_SUFFIX for name in SEEN_METRICS if name + SEEN_SUFFIX in self._scored]
+
+    @property
+    def optional_metrics(self) -> list[str]:
+        """Names of the protocol's optional metrics that some frame has."""
+        return [name for name in self._optional if name in self._scored]
+
+    @property
+    def _scored(self) -> set[str]:
+        return {name for row in self._rows.values() for name in row}
 
     def record(self, metrics: Iterable[str]) -> SetRecord:
         """The set's record.
@@ -62,10 +72,12 @@ class EvaluatedSet:
             metrics: Names of the protocol's metrics, which are listed even where no frame has one.
         """
         rows = self._rows.values()
+        lacking = set(self._optional) - set(self.optional_metrics)
+        names = [*metrics, *self.optional_metrics, *self.seen_metrics]
         return SetRecord(
             frames=tuple(self._rows),
-            values={name: tuple(row.get(name) for row in rows) for name in [*metrics, *self.seen_metrics]},
-            reasons=self._reasons,
+            values={name: tuple(row.get(name) for row in rows) for name in names},
+            reasons={name: reason for name, reason in self._reasons.items() if name not in lacking},
             predictions_sha256=self._predictions.hexdigest(),
             truth_sha256=self._truth.hexdigest(),
             profiles=self._profiles.records(),

@@ -18,13 +18,14 @@ from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.run_result import run_result
 from coliags_plugin.engine.scoring import Scorer
 from coliags_plugin.engine.trained import TrainedRun
+from coliags_plugin.engine.truth import match_truth
 from coliags_plugin.outputs.colormaps import DEPTH_ERROR_LIMIT_MM, colorize_depth_error
 from coliags_plugin.outputs.image_files import eight_bit, write_depth_tiff, write_png
 from coliags_plugin.results.reading import RESULT_FILE, write_result
 from coliags_plugin.results.summaries import means_summary, per_frame_table
 
 
-def evaluate(trained: TrainedRun, protocol_name: str) -> Path:
+def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None) -> Path:
     """Render every held-out view, compute the protocol's metrics, and write them with the images.
 
     Writes into ``eval/<protocol>/``: ``result.json``, the whole :class:`~coliags_plugin.results.record.Result`; and of
@@ -32,22 +33,30 @@ def evaluate(trained: TrainedRun, protocol_name: str) -> Path:
     the reason) and ``per_frame.csv``; and the images. An earlier evaluation under the same protocol is replaced once
     the new one is complete.
 
+    Args:
+        trained: The run.
+        protocol_name: Name of the protocol.
+        other: A scene with the true depth, whose frames take the place of the run's own
+            (:func:`~coliags_plugin.engine.truth.match_truth`); the folder is then ``eval/<protocol>-truth/``.
+
     Returns:
         The evaluation's folder.
 
     Raises:
         InputError: The protocol is unknown or wants what the renderer cannot deliver, there is no test frame, the
-            folder cannot be written, or the run was relit.
+            folder cannot be written, the run was relit, or the other scene is not of the same world.
     """
     if trained.lamp is not None:
         raise InputError(
             "evaluation of a relit run", "the lamp that the data were recorded with", "Evaluate the run as loaded"
         )
     scorer = Scorer(protocol_name)
-    check_evaluable(trained.model, trained.scene, scorer)
-    sets = {name: frames for name, frames in trained.scene.test_sets.items() if frames}
+    truth = None if other is None else match_truth(trained.scene, other)
+    scene = trained.scene if truth is None else truth.scene
+    check_evaluable(trained.model, scene, scorer)
+    sets = {name: frames for name, frames in scene.test_sets.items() if frames}
     total, done = sum(map(len, sets.values())), 0
-    target = trained.run.evaluation(scorer.protocol.name)
+    target = trained.run.evaluation(scorer.protocol.name, against_truth=truth is not None)
     evaluated = {name: EvaluatedSet() for name in sets}
     meter = RenderMeter(trained.device)
     with atomic_folder(target, overwrite=True) as scratch, ProgressReport("evaluate", total) as progress:
@@ -60,7 +69,7 @@ def evaluate(trained: TrainedRun, protocol_name: str) -> Path:
                 _write_images(scratch, set_name, frame, comparison)
                 done += 1
                 progress.update(done)
-        result = run_result(trained, scorer, evaluated, meter)
+        result = run_result(trained, scorer, evaluated, meter, truth)
         write_result(scratch / RESULT_FILE, result)
         write_json(scratch / "metrics.json", means_summary(result))
         atomic_write(scratch / "per_frame.csv", per_frame_table(result))

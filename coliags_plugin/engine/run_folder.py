@@ -12,6 +12,7 @@ from typing import Any
 from coliags_plugin.config.method_config import LoadedMethod, load_method
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, atomic_write, write_json
+from coliags_plugin.results.record import TRUTH_SUFFIX
 
 FORMAT = 1
 
@@ -68,9 +69,9 @@ class RunFolder:
         """One folder per protocol."""
         return self.path / "eval"
 
-    def evaluation(self, protocol: str) -> Path:
-        """Folder of the results of a protocol."""
-        return self.evaluations / protocol
+    def evaluation(self, protocol: str, against_truth: bool = False) -> Path:
+        """Folder of the results of a protocol: on the run's own scene, or against another scene's true depth."""
+        return self.evaluations / (f"{protocol}{TRUTH_SUFFIX}" if against_truth else protocol)
 
     @property
     def step(self) -> int:

@@ -17,6 +17,7 @@ from coliags_plugin.engine.evaluated_set import SEEN_METRICS, EvaluatedSet
 from coliags_plugin.engine.provenance import software
 from coliags_plugin.engine.scoring import Scorer
 from coliags_plugin.engine.trained import TrainedRun
+from coliags_plugin.engine.truth import Truth
 from coliags_plugin.results.hashing import metrics_sha256
 from coliags_plugin.results.identity import plain_config, result_key
 from coliags_plugin.results.record import SEEN_SUFFIX, CostRecord, MetricRecord, ProtocolRecord, Result, SceneRecord
@@ -26,7 +27,11 @@ _LEFT_OUT = ("method", "seed", "steps", "scene", "untrained_views", "path", "fin
 
 
 def run_result(
-    trained: TrainedRun, scorer: Scorer, evaluated: Mapping[str, EvaluatedSet], meter: RenderMeter
+    trained: TrainedRun,
+    scorer: Scorer,
+    evaluated: Mapping[str, EvaluatedSet],
+    meter: RenderMeter,
+    truth: Truth | None = None,
 ) -> Result:
     """Compose the result of a run.
 
@@ -35,30 +40,31 @@ def run_result(
         scorer: What it was scored with.
         evaluated: Its test sets, at least one.
         meter: What rendering them cost.
+        truth: What it was evaluated against, if not its own scene.
 
     Raises:
         InputError: The training log cannot be read.
     """
     protocol, provenance = scorer.protocol, trained.provenance
     config = plain_config(trained.config.model_dump())
-    scene = scene_record(trained.scene)
+    data = trained.scene if truth is None else truth.scene
     sets = {name: part.record(scorer.metrics) for name, part in evaluated.items()}
     return Result(
         key=result_key(
             config,
-            scene.fingerprint,
+            str(trained.scene.provenance.get("fingerprint", "")),
             trained.seed,
             __version__,
             protocol.name,
             protocol.version,
-            _deviations(trained.step, config["schedule"]["steps"], provenance),
+            _deviations(trained.step, config["schedule"]["steps"], provenance) | _fingerprint_of(truth),
         ),
         method=trained.method,
-        scene=scene,
+        scene=scene_record(data),
         protocol=ProtocolRecord(name=protocol.name, version=protocol.version, description=protocol.description),
         seed=trained.seed,
         steps=trained.step,
-        metrics=_metrics(scorer.metrics, evaluated),
+        metrics=_metrics(scorer, evaluated, str(data.provenance.get("unit", "mm"))),
         sets=sets,
         metrics_sha256=metrics_sha256(sets),
         cost=_cost(trained, meter),
@@ -67,9 +73,25 @@ def run_result(
         provenance={
             "untrained_views": {name: part.untrained_views for name, part in trained.model.view_modules.items()},
             "training": {name: value for name, value in provenance.items() if name not in _LEFT_OUT},
-            "scene": {name: value for name, value in trained.scene.provenance.items() if name not in _LEFT_OUT},
+            "scene": {name: value for name, value in data.provenance.items() if name not in _LEFT_OUT},
+            **({} if truth is None else {"truth": _described(truth, trained.scene)}),
         },
     )
+
+
+def _fingerprint_of(truth: Truth | None) -> dict[str, Any]:
+    return {} if truth is None else {"truth": truth.scene.provenance.get("fingerprint")}
+
+
+def _described(truth: Truth, own: Scene) -> dict[str, Any]:
+    return {
+        "scene": truth.scene.name,
+        "matched_by": truth.matched_by,
+        "trained_on": {
+            "name": own.name,
+            **{key: own.provenance.get(key) for key in ("dataset", "unit", "fingerprint")},
+        },
+    }
 
 
 def scene_record(scene: Scene) -> SceneRecord:
@@ -85,15 +107,19 @@ def scene_record(scene: Scene) -> SceneRecord:
     )
 
 
-def _metrics(metrics: Mapping[str, Metric], evaluated: Mapping[str, EvaluatedSet]) -> dict[str, MetricRecord]:
+def _metrics(scorer: Scorer, evaluated: Mapping[str, EvaluatedSet], unit: str) -> dict[str, MetricRecord]:
     seen = {name for part in evaluated.values() for name in part.seen_metrics}
-    records = {name: _metric(metric) for name, metric in metrics.items()}
+    optional = {name for part in evaluated.values() for name in part.optional_metrics}
+    metrics = scorer.metrics | {name: metric for name, metric in scorer.optional_metrics.items() if name in optional}
+    records = {name: _metric(metric, unit) for name, metric in metrics.items()}
     over_seen = {name + SEEN_SUFFIX: records[name] for name in SEEN_METRICS if name + SEEN_SUFFIX in seen}
     return records | over_seen
 
 
-def _metric(metric: Metric) -> MetricRecord:
-    return MetricRecord(unit=metric.unit, direction="higher" if metric.higher_is_better else "lower")
+def _metric(metric: Metric, unit: str) -> MetricRecord:
+    """What a metric's values mean, lengths in the scene's unit."""
+    length = metric.unit if unit == "mm" else metric.unit.replace("mm", "units")
+    return MetricRecord(unit=length, direction="higher" if metric.higher_is_better else "lower")
 
 
 def _cost(trained: TrainedRun, meter: RenderMeter) -> CostRecord:

@@ -50,9 +50,15 @@ class Scorer:
                 "the name that it is registered under",
             )
         self.wants = tuple(sorted({"rgb", "alpha"} | self.protocol.wants))
-        self.metrics: dict[str, Metric] = {
-            key: _metric(name, options, f"protocol '{protocol}', metric '{key}'")
-            for key, (name, options) in self.protocol.metrics.items()
+        self.metrics = self._made(self.protocol.metrics, only)
+        self.optional_metrics = self._made(self.protocol.optional_metrics, only)
+
+    def _made(
+        self, table: Mapping[str, tuple[str, Mapping[str, Any]]], only: Sequence[str] | None
+    ) -> dict[str, Metric]:
+        return {
+            key: _metric(name, options, f"protocol '{self.protocol.name}', metric '{key}'")
+            for key, (name, options) in table.items()
             if only is None or key in only
         }
 
@@ -69,7 +75,7 @@ class Scorer:
     def score(self, comparison: Comparison, names: Sequence[str] | None = None) -> Scores:
         """Every metric of a view, or those named among them."""
         scores = Scores()
-        for name, metric in self.metrics.items():
+        for name, metric in (self.metrics | self.optional_metrics).items():
             if names is not None and name not in names:
                 continue
             try:

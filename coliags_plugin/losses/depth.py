@@ -12,7 +12,7 @@ from torch import Tensor
 
 from coliags_plugin.contracts import Loss, LossSettings, TrainingStep
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.masked import masked_mean, zero_outside
+from coliags_plugin.core.masked import weighted_mean, zero_outside
 from coliags_plugin.core.scenes import Target
 
 #: :data:`coliags_plugin.core.render_output.DEPTH_KINDS` as a literal type; a test compares the two.
@@ -37,7 +37,7 @@ class DepthHuberSettings(DepthL1Settings):
 
 
 class DepthLoss(Loss):
-    """Mean penalty of D - D_true over the valid pixels of known true depth.
+    """Mean penalty of D - D_true over the valid pixels of known depth, weighted by its confidence if it is estimated.
 
     For ``inverse_depth_accumulated`` (E = sum w/z, what the authors' code of the paper trains on) D = 1/E where E > 0.
     Where nothing was drawn (E = 0) D is ``empty_depth``, which enters the value but has no gradient.
@@ -45,6 +45,7 @@ class DepthLoss(Loss):
 
     Settings: ClassVar[type[LossSettings]] = DepthL1Settings
     needs: ClassVar[frozenset[str]] = frozenset({"depth"})
+    trusts_depth: ClassVar[bool] = True
 
     @property
     def wants(self) -> frozenset[str]:
@@ -56,7 +57,7 @@ class DepthLoss(Loss):
         """Penalty of each difference in depth. [H, W]"""
 
     def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
-        """The unweighted term; 0 where no valid pixel has a true depth.
+        """The unweighted term; 0 where no valid pixel has a depth that is trusted at all.
 
         Raises:
             InputError: The target has no depth at all.
@@ -66,7 +67,8 @@ class DepthLoss(Loss):
         if self.settings.depth == "inverse_depth_accumulated":
             rendered = _reciprocal(rendered, self.settings.empty_depth)
         truth = depth.to(rendered.dtype)
-        return masked_mean(self.penalty(zero_outside(rendered, known) - zero_outside(truth, known)), known)
+        penalties = self.penalty(zero_outside(rendered, known) - zero_outside(truth, known))
+        return weighted_mean(penalties, known, step.target.depth_confidence)
 
 
 class DepthL1Loss(DepthLoss):
@@ -97,7 +99,7 @@ class DepthHuberLoss(DepthLoss):
 
 
 def known_depth(target: Target) -> tuple[Float[Tensor, "H W"], Bool[Tensor, "H W"]]:
-    """The true z-depth and where it is known and valid.
+    """The z-depth to compare with, and where it is known and valid.
 
     Args:
         target: What is compared with.
@@ -108,7 +110,7 @@ def known_depth(target: Target) -> tuple[Float[Tensor, "H W"], Bool[Tensor, "H W
     if target.depth is None:
         raise InputError(
             f"frame '{target.name}' has no depth",
-            "ground-truth depth for every training frame, since the losses include one of depth",
+            "depth for every training frame, since the losses include one of depth",
             "Remove that term, for instance with --set losses.depth=null",
         )
     return target.depth, torch.isfinite(target.depth) & target.valid

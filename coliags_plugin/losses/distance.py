@@ -9,7 +9,7 @@ from pydantic import Field
 from torch import Tensor
 
 from coliags_plugin.contracts import Loss, LossSettings, TrainingStep
-from coliags_plugin.core.masked import masked_mean, zero_outside
+from coliags_plugin.core.masked import weighted_mean, zero_outside
 from coliags_plugin.core.pixel_ids import fixed_uniform
 from coliags_plugin.losses.depth import known_depth
 
@@ -30,14 +30,15 @@ class DistanceL1Settings(LossSettings):
 
 
 class DistanceL1Loss(Loss):
-    """Mean |t - t_true| over the drawn valid pixels of known true depth, t = |r| sum w z = sum w t_i (REIM-NeRF).
+    """Mean |t - t_true| over the drawn valid pixels of known depth, t = |r| sum w z = sum w t_i (REIM-NeRF).
 
-    |r| is the length of the pixel's ray per z-depth. Which pixels are drawn depends on ``seed``, frame and pixel only,
-    so it is the same at every step and in a resumed run.
+    Weighted by the confidence of the depth if it is estimated. |r| is the length of the pixel's ray per z-depth. Which
+    pixels are drawn depends on ``seed``, frame and pixel only, so it is the same at every step and in a resumed run.
     """
 
     Settings: ClassVar[type[LossSettings]] = DistanceL1Settings
     needs: ClassVar[frozenset[str]] = frozenset({"depth"})
+    trusts_depth: ClassVar[bool] = True
 
     @property
     def wants(self) -> frozenset[str]:
@@ -55,5 +56,5 @@ class DistanceL1Loss(Loss):
             known = known & (fixed_uniform(step.target.ids, self.settings.seed) < self.settings.share)
         rendered = step.output[self.settings.depth]
         difference = zero_outside(rendered, known) - zero_outside(depth.to(rendered.dtype), known)
-        error = masked_mean(difference.abs() * step.output["ray_lengths"], known)
+        error = weighted_mean(difference.abs() * step.output["ray_lengths"], known, step.target.depth_confidence)
         return error / step.model.field.length_unit if self.settings.unit == "field" else error

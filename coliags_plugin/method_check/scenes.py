@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -12,7 +13,8 @@ from tempfile import TemporaryDirectory
 import torch
 
 from coliags_plugin.config import registry
-from coliags_plugin.config.method_config import method_tree
+from coliags_plugin.config.method_config import load_method, method_tree
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.phantom.generate import generate
 from coliags_plugin.phantom.settings import phantom_settings
@@ -31,10 +33,14 @@ PHANTOM = {
 }
 #: Has depth, from which initial points are fused.
 DEFAULT_LAYOUT = "c3vd"
+#: Layouts that have what losses may need and the default layout lacks.
+_LAYOUTS_WITH = {"sparse_depth": "colmap"}
 
 
 def write_phantom(method: str, overrides: Sequence[str], folder: Path) -> Path:
-    """Make the phantom that a method is checked on, in the layout of its data manager where there is one of that name.
+    """Make the phantom that a method is checked on.
+
+    In the layout of its data manager, where there is one of that name, or in one that has what its losses need.
 
     Args:
         method: Name or path of a method config.
@@ -45,8 +51,16 @@ def write_phantom(method: str, overrides: Sequence[str], folder: Path) -> Path:
         InputError: No such method.
     """
     named = method_tree(method, overrides).find(["datamanager", "name"]).value
-    layout = named if named in registry.phantom_layouts else DEFAULT_LAYOUT
+    layout = named if named in registry.phantom_layouts else _layout_for_losses(method, overrides)
     return shutil.copytree(_phantom(layout).name, folder / "phantom", dirs_exist_ok=True)
+
+
+def _layout_for_losses(method: str, overrides: Sequence[str]) -> str:
+    needed: set[str] = set()
+    with suppress(InputError):  # of an invalid config: the first check tells
+        losses = load_method(method, overrides).config.losses
+        needed = {name for node in losses.values() for name in node.target.needs}
+    return next((layout for name, layout in _LAYOUTS_WITH.items() if name in needed), DEFAULT_LAYOUT)
 
 
 @cache
@@ -105,4 +119,4 @@ def _masked(frame: Frame, spoilt: bool) -> Frame:
 
 
 def _without_depth(frame: Frame) -> Frame:
-    return replace(frame, depth=None, depth_at_least=None, sparse_depth=None)
+    return replace(frame, depth=None, depth_at_least=None, sparse_depth=None, depth_confidence=None)

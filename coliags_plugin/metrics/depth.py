@@ -38,7 +38,9 @@ class DepthMetric(Metric):
         """
         rendered, truth, counts = comparison.depth, comparison.true_depth, comparison.depth_valid
         if rendered is None or truth is None or counts is None:
-            raise UnavailableError("this frame has no ground-truth depth")
+            raise UnavailableError(
+                "estimated depth is no truth" if comparison.estimated else "this frame has no ground-truth depth"
+            )
         if not counts.any():
             raise UnavailableError("no pixel of this frame has a valid ground-truth depth")
         counts = self.select(truth, counts)

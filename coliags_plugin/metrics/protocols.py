@@ -7,14 +7,18 @@ A protocol's name and version are written into every result; results whose name 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, ClassVar
 
 import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
 
 from coliags_plugin.contracts import Comparison, Protocol
+from coliags_plugin.core.interpolation import interpolated
 from coliags_plugin.core.render_output import RenderOutput
-from coliags_plugin.core.scenes import Frame
+from coliags_plugin.core.scenes import Frame, SparseDepth
 from coliags_plugin.metrics.quantization import through_8_bit, through_16_bit
 
 MetricTable = Mapping[str, tuple[str, Mapping[str, Any]]]
@@ -51,20 +55,23 @@ class PaperProtocol(Protocol):
             "depth_abs_rel": ("depth_abs_rel", {}),
         }
     )
+    optional_metrics: ClassVar[MetricTable] = MappingProxyType(
+        {
+            "sparse_depth_median": ("sparse_depth", {"quantile": 0.5}),
+            "sparse_depth_p90": ("sparse_depth", {"quantile": 0.9}),
+        }
+    )
 
     def compare(self, output: RenderOutput, frame: Frame) -> Comparison:
         """Pair the rendered image, clamped to [0, 1], and the unchanged rendered depth with the frame."""
+        depth = output["depth_accumulated"].detach()
         image = Comparison(rgb=output.rgb.detach().clamp(0.0, 1.0), true_rgb=frame.rgb, valid=frame.valid)
-        if frame.depth is None:
-            return image
-        return Comparison(
-            image.rgb,
-            image.true_rgb,
-            image.valid,
-            depth=output["depth_accumulated"].detach(),
-            true_depth=frame.depth,
-            depth_valid=torch.isfinite(frame.depth) & frame.valid,
-        )
+        if frame.sparse_depth is not None:
+            rendered, known = _at_points(depth, output.alpha.detach(), frame.valid, frame.sparse_depth)
+            image = replace(image, point_depth=rendered, true_point_depth=known)
+        if (truth := _true_depth(frame)) is None:
+            return replace(image, estimated=frame.depth_confidence is not None)
+        return replace(image, depth=depth, true_depth=truth, depth_valid=torch.isfinite(truth) & frame.valid)
 
 
 class AuthorsCodeProtocol(Protocol):
@@ -100,10 +107,9 @@ class AuthorsCodeProtocol(Protocol):
         """Rendered and true image and depth as read back from the files; every pixel counts."""
         everywhere = torch.ones_like(frame.valid)
         image = Comparison(rgb=through_8_bit(output.rgb.detach()), true_rgb=through_8_bit(frame.rgb), valid=everywhere)
-        if frame.depth is None:
-            return image
+        if (known := _true_depth(frame)) is None:
+            return replace(image, estimated=frame.depth_confidence is not None)
         rendered = 1.0 / output["inverse_depth_accumulated"].detach()  # infinite where nothing was drawn
-        known = frame.depth
         if frame.depth_at_least is not None:
             known = torch.where(torch.isfinite(frame.depth_at_least), frame.depth_at_least, known)
         known = torch.where(torch.isfinite(known), known, 0.0)
@@ -115,3 +121,17 @@ class AuthorsCodeProtocol(Protocol):
             true_depth=through_16_bit(known, self.true_full_scale),
             depth_valid=everywhere,
         )
+
+
+def _true_depth(frame: Frame) -> Float[Tensor, "H W"] | None:
+    """The frame's depth, if it is true; None where it is estimated or missing. [H, W]"""
+    return frame.depth if frame.depth_confidence is None else None
+
+
+def _at_points(
+    depth: Float[Tensor, "H W"], alpha: Float[Tensor, "H W"], valid: Bool[Tensor, "H W"], points: SparseDepth
+) -> tuple[Float[Tensor, "K"], Float[Tensor, "K"]]:
+    """Rendered and known depth at the points where all interpolated pixels are drawn and valid. [K] each"""
+    sampled, usable = interpolated(depth, (alpha > 0) & torch.isfinite(depth) & valid, points.pixels)
+    usable = usable & (points.depth > 0)
+    return sampled[usable], points.depth[usable]

@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.reporting.published import published_for
 from coliags_plugin.reporting.study import Part, Study
 from coliags_plugin.reporting.tables import Column
 from coliags_plugin.results.record import MAIN_SET, SEEN_SUFFIX
 
 #: Shown unless the reader chooses others.
-DEFAULT_COLUMNS = ("psnr", "ssim", "lpips", "depth_mse", "depth_mse_inner", "depth_median_error")
+DEFAULT_COLUMNS = (
+    *("psnr", "ssim", "lpips", "depth_mse", "depth_mse_inner", "depth_median_error"),
+    *("sparse_depth_median", "sparse_depth_p90"),
+)
 #: The same for other sets, whose views leave the path, so that much of what they see was never filmed.
 _BEYOND_THE_PATH = ("psnr", "psnr_seen", *DEFAULT_COLUMNS[1:])
 #: Of the default columns, what is shown where no result has the first.
@@ -29,6 +33,8 @@ _NAMES = {
     "depth_mae": "Depth MAE",
     "depth_median_error": "Depth median error",
     "depth_abs_rel": "Depth AbsRel",
+    "sparse_depth_median": "Sparse depth, median",
+    "sparse_depth_p90": "Sparse depth, 90th percentile",
 }
 _SET_TITLES = {"test": "held out along the path", "rotation": "beyond the path"}
 
@@ -73,20 +79,34 @@ def check_columns(study: Study, chosen: Sequence[str]) -> None:
 def metric_columns(study: Study, part: Part, chosen: Sequence[str] = ()) -> list[Column]:
     """Columns of a part: every metric that it has, or that no part has; those not chosen are there, but not shown.
 
+    Unless chosen, metrics that have no value in the part, nor a published one, are not shown either.
+
     Args:
         study: The results.
         part: Test set and split.
         chosen: Metrics to show, in this order, before the others; empty: :data:`DEFAULT_COLUMNS`.
     """
     own = [name for name in study.metrics if not _belongs_elsewhere(study, part, name)]
-    default = DEFAULT_COLUMNS if part.set_name == MAIN_SET else _BEYOND_THE_PATH
-    wanted = own if ALL_COLUMNS in chosen else chosen or [_available(study, part, name) for name in default]
+    wanted = own if ALL_COLUMNS in chosen else chosen or _default_columns(study, part)
     shown = [name for name in wanted if name in own]
     ordered = dict.fromkeys([*shown, *own])
     return [
         Column(name, metric_title(name), study.metrics[name].unit, study.metrics[name].direction, name in shown)
         for name in ordered
     ]
+
+
+def _default_columns(study: Study, part: Part) -> list[str]:
+    default = DEFAULT_COLUMNS if part.set_name == MAIN_SET else _BEYOND_THE_PATH
+    published = published_for(study, part)
+    kept = set() if published is None else {name for numbers in published.methods.values() for name in numbers}
+    empty = set(empty_metrics(study, part)) - kept
+    return [name for name in (_available(study, part, name) for name in default) if name not in empty]
+
+
+def empty_metrics(study: Study, part: Part) -> list[str]:
+    """Metrics that no result has a value of in this part."""
+    return [name for name in study.metrics if not any(study.values(part, name).values())]
 
 
 def _available(study: Study, part: Part, metric: str) -> str:

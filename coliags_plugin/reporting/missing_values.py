@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from coliags_plugin.reporting.metric_columns import empty_metrics
 from coliags_plugin.reporting.study import MetricValues, Part, Study
 from coliags_plugin.reporting.tables import Column
 from coliags_plugin.statistics.spread import common_scenes
@@ -61,6 +62,15 @@ def _partial_note(study: Study, part: Part, column: Column, method: str, scenes:
     if having == total:
         return ""
     return f"{column.title}: mean over {having} of {total} frames; {study.reason(part, method, column.key)}"
+
+
+def not_shown_notes(study: Study, part: Part, columns: Sequence[Column]) -> list[str]:
+    """Which metrics are not shown for lack of any value, and why, together where the reason is the same."""
+    empty, by_reason = empty_metrics(study, part), dict[str, list[str]]()
+    for column in columns:
+        if column.key in empty and not column.shown:
+            by_reason.setdefault(study.reason(part, study.methods[0], column.key), []).append(column.title)
+    return [f"Not shown, without values: {'; '.join(titles)}: {reason}" for reason, titles in by_reason.items()]
 
 
 def left_out_notes(study: Study, part: Part, columns: Sequence[Column]) -> list[str]:

@@ -34,7 +34,7 @@ class Cell:
     @property
     def evaluation(self) -> Path | None:
         """Folder of its images."""
-        return None if self.run is None else self.run / "eval" / self.result.protocol.name
+        return None if self.run is None else self.run / "eval" / self.result.evaluation_name
 
 
 @dataclass(frozen=True)

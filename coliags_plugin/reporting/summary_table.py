@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from coliags_plugin.reporting.metric_columns import part_name, part_title
-from coliags_plugin.reporting.missing_values import left_out_notes, shared_scenes, summary_note
+from coliags_plugin.reporting.missing_values import left_out_notes, not_shown_notes, shared_scenes, summary_note
 from coliags_plugin.reporting.published import PublishedBenchmark
 from coliags_plugin.reporting.study import Part, Study
 from coliags_plugin.reporting.tables import Column, Entry, Row, Table, counted, numeric_entries
@@ -42,6 +42,7 @@ def summary_table(
         columns=tuple(columns),
         rows=(*rows, *([] if published is None else _published_rows(published, columns))),
         notes=(
+            *not_shown_notes(study, part, columns),
             *left_out_notes(study, part, columns),
             *_spread_note(study, part, rows),
             *_star_note(comparisons),

@@ -20,6 +20,8 @@ VERSION = 1
 MAIN_SET = "test"
 #: Of metrics over the pixels that a training frame sees.
 SEEN_SUFFIX = "_seen"
+#: Of folders of evaluations against another scene's true depth, behind the name of the protocol.
+TRUTH_SUFFIX = "-truth"
 
 Format = Literal["coliags-result"]
 Direction = Literal["higher", "lower"]
@@ -228,6 +230,11 @@ class Result(_Part):
         return self.sets[chosen].mean(metric)
 
     @property
+    def evaluation_name(self) -> str:
+        """Name of its folder among the evaluations of a run."""
+        return self.protocol.name + (TRUTH_SUFFIX if "truth" in self.provenance else "")
+
+    @property
     def title(self) -> str:
         """What was evaluated and how, in one line."""
         return (
@@ -236,10 +243,11 @@ class Result(_Part):
         )
 
     def table(self) -> Table:
-        """Means of every metric over every test set, with the reasons of those that are missing."""
+        """Means of the metrics that a test set has, over every test set, with the reasons of those that are missing."""
         rows: list[dict[str, Value]] = [
             {"metric": name, "unit": metric.unit, **{key: part.mean(name) for key, part in self.sets.items()}}
             for name, metric in self.metrics.items()
+            if any(part.mean(name) is not None for part in self.sets.values())
         ]
         reasons = {name: reason for part in self.sets.values() for name, reason in part.reasons.items()}
         without = {each: [name for name in reasons if reasons[name] == each] for each in reasons.values()}
@@ -248,8 +256,13 @@ class Result(_Part):
             ("metric", "unit", *self.sets),
             rows,
             {key: f"{key} ({len(part.frames)} frames)" for key, part in self.sets.items()},
-            [f"{', '.join(names)}: {reason}" for reason, names in without.items()],
+            [f"{self._not_shown(names)}: {reason}" for reason, names in without.items()],
         )
+
+    def _not_shown(self, names: list[str]) -> str:
+        """Names of metrics that lack values, saying so if no set has any."""
+        empty = all(part.mean(name) is None for name in names for part in self.sets.values())
+        return f"not shown: {', '.join(names)}" if empty else ", ".join(names)
 
     def __repr__(self) -> str:
         """The title with the means of the main test set."""

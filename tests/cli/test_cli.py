@@ -114,6 +114,20 @@ def test_moved_data_are_found_by_option(trained, scene, tmp_path, capsys):
     assert "not the data" in refused(capsys, "eval", trained, "--data", other)
 
 
+def test_eval_against_another_scene(trained, scene, tmp_path, capsys):
+    copy = Path(shutil.copytree(scene, tmp_path / "true"))
+    assert run("eval", trained, "--truth", copy) == 0
+    assert capsys.readouterr().out.rstrip().endswith("eval/paper-truth/metrics.json")
+    own, against = (
+        json.loads((trained / f"eval/{name}/metrics.json").read_text()) for name in ("paper", "paper-truth")
+    )
+    assert against["psnr"] == own["psnr"] and against["depth_mse"] == own["depth_mse"]
+    assert against["scene"] == "true"
+    assert run("report", trained, "--protocol", "paper-truth", "--output", tmp_path / "report.html") == 0
+    other = write_wall(tmp_path / "other", frames=5)
+    assert "has no frame" in refused(capsys, "eval", trained, "--truth", other)
+
+
 def test_resume_from_the_command_line(scene, tmp_path):
     path = tmp_path / "run"
     assert run("train", "coliags", "--data", scene, "--output", path, "--steps", 2, *SETS) == 0

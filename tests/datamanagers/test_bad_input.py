@@ -723,6 +723,7 @@ def test_both_reading_orders_of_c3vds_poses_give_the_true_ones(made):
 PAGES = Path(__file__).parents[2] / "docs/layouts"
 _MODEL_OF_NOTHING = change_json("transforms.json", lambda content: content.update(camera_model="PANORAMA"))
 
+
 def _with_confidence(spoil: Callable[[dict], object] = lambda content: None, dtype: str = "uint8") -> Spoil:
     """Every frame gets a confidence, then the content is spoilt."""
 

@@ -9,6 +9,7 @@ import torch
 
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scenes import SparseDepth
 from coliags_plugin.engine.compatibility import _check_data, _check_sampler
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer
@@ -108,6 +109,25 @@ def test_a_term_that_would_never_count_is_refused():
 def test_depth_that_no_frame_has(tmp_path):
     with pytest.raises(InputError, match="loss term 'depth' needs depth, and no training frame"):
         start(tmp_path / "run", method="scaffold-gs-depth", scene=wall_scene(depth=False))
+
+
+def test_the_methods_made_for_such_data_are_named(tmp_path, caplog):
+    scene, points = wall_scene(), SparseDepth(torch.tensor([[3.5, 2.5]]), torch.tensor([20.0]))
+    bare = [replace(frame, depth=None) for frame in scene.train]
+    with pytest.raises(InputError, match=r"or make a scene with depth: coliags depth estimate") as caught:
+        start(tmp_path / "run", method="scaffold-gs-depth", scene=replace(scene, train=bare))
+    assert "coliags-sparse-depth" not in str(caught.value)
+    sparse = [replace(frame, sparse_depth=points) for frame in bare]
+    with pytest.raises(InputError, match=r"train the method coliags-sparse-depth on its points, or .* depth estimate"):
+        start(tmp_path / "run", method="scaffold-gs-depth", scene=replace(scene, train=sparse))
+    assert start(tmp_path / "run", method="coliags-sparse-depth", scene=replace(scene, train=sparse))
+    estimated = [replace(frame, depth_confidence=torch.ones_like(frame.depth)) for frame in scene.train]
+    for method, warned in (("coliags", True), ("coliags-estimated-depth", False), ("scaffold-gs", False)):
+        caplog.clear()
+        start(tmp_path / "run", method=method, scene=replace(scene, train=estimated))
+        assert ("coliags-estimated-depth is made for such scenes" in caplog.text) == warned
+    start(tmp_path / "run", method="coliags", scene=scene)
+    assert "estimated" not in caplog.text
 
 
 def test_a_run_with_modules_resumes_to_the_bit(tmp_path):

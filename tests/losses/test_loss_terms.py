@@ -39,7 +39,7 @@ def depth(generator):
 # ---------------------------------------------------------------------------------------------------- all terms alike
 
 
-@pytest.mark.parametrize("name", ["l1", "mse", "d-ssim", "depth-l1", "scale-volume"])
+@pytest.mark.parametrize("name", ["l1", "mse", "d-ssim", "depth-l1", "estimated-depth", "opacity", "scale-volume"])
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0, None])
 def test_a_finite_scalar_with_a_graph_whatever_the_mask(
     name, share, make_output, make_frame, generator, image, rgb, depth
@@ -61,7 +61,7 @@ def test_a_finite_scalar_with_a_graph_whatever_the_mask(
         assert term.item() == 0.0
 
 
-@pytest.mark.parametrize("name", ["l1", "mse", "d-ssim"])
+@pytest.mark.parametrize("name", ["l1", "mse", "d-ssim", "estimated-depth", "opacity"])
 def test_ignored_pixels_get_no_gradient_and_a_full_mask_changes_nothing(
     name, make_output, make_frame, generator, image, rgb, depth
 ):
@@ -78,12 +78,12 @@ def test_ignored_pixels_get_no_gradient_and_a_full_mask_changes_nothing(
 
 def test_double_precision_stays_double(make_output, make_frame, image, rgb, depth):
     output = make_output(rgb.double(), torch.ones(2, 3).double(), depth_accumulated=depth.double())
-    for name in ("l1", "mse", "d-ssim", "depth-l1", "scale-volume"):
+    for name in ("l1", "mse", "d-ssim", "depth-l1", "estimated-depth", "scale-volume"):
         assert make(name)(output, make_frame(image, depth)).dtype == torch.float64
 
 
 def test_only_the_depth_term_needs_depth_and_another_output():
-    for name in ("l1", "mse", "d-ssim", "scale-volume"):
+    for name in ("l1", "mse", "d-ssim", "opacity", "scale-volume"):
         assert make(name).loss.needs == make(name).loss.wants == frozenset()
     assert make("depth-l1").loss.needs == {"depth"}
     assert make("depth-l1").loss.wants == {"depth_accumulated"}

@@ -68,6 +68,19 @@ def test_sampling_is_torchs_with_pixel_centres_at_one_half(case, rendered, gener
     torch.testing.assert_close(rendered.grad, gradient)
 
 
+def test_relative_differences_need_no_unit(case, rendered, generator):
+    pixels, depth = random_points(generator)
+    depth[3] = 0.0  # no point of a surface
+    kept = torch.arange(len(depth)) != 3
+    for huber in (None, 0.05):
+        found = [
+            case(unit * rendered, pixels, unit * depth, relative=True, huber=huber).item() for unit in (1.0, 1e-3, 50.0)
+        ]
+        points = zip(pixels[kept], depth[kept], strict=True)
+        each = [case(rendered / z, [point.tolist()], [1.0], huber=huber).item() for point, z in points]
+        assert found == pytest.approx([sum(each) / len(each)] * 3, rel=1e-6)
+
+
 def test_a_point_on_a_pixel_centre_is_that_pixel(case, rendered):
     term = case(rendered, [[3.5, 2.5]], [0.0])
     term.backward()
@@ -179,5 +192,7 @@ def test_any_method_can_be_given_the_term(tmp_path):
 def test_a_scene_without_such_depth_is_refused_before_training(tmp_path):
     with pytest.raises(InputError, match=r"'sparse_depth' needs depth at single points.*losses\.sparse_depth=null"):
         trainer(tmp_path / "run", wall_scene())
-    with pytest.raises(InputError, match=r"'depth' needs depth, .*losses\.depth=null, or .*name: sparse-depth"):
+    with pytest.raises(
+        InputError, match=r"'depth' needs depth, .*losses\.depth=null, train .*coliags-sparse-depth on its points"
+    ):
         trainer(tmp_path / "run", sparse_scene(), SPARSE[1:])

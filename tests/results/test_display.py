@@ -46,6 +46,6 @@ def test_a_result_in_one_line_and_as_a_table():
     assert repr(result) == "coliags on wall, seed 0, 60 steps, protocol paper v1: psnr 30.75 dB, depth_mse 0.25 mm^2"
     table = result.table()
     assert table.rows[0] == {"metric": "psnr", "unit": "dB", "test": 30.75, "rotation": 20.0}
-    assert table.notes == ["lpips: no weights"]
+    assert table.notes == ["not shown: lpips: no weights"]
     assert "test (2 frames)  rotation (1 frames)" in str(result) == str(table)
     assert result._repr_html_() == table._repr_html_()

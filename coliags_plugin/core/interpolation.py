@@ -1,0 +1,41 @@
+"""Interpolation of maps at points between pixel centres."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+def interpolated(
+    values: Float[Tensor, "H W"], usable: Bool[Tensor, "H W"], pixels: Float[Tensor, "K 2"]
+) -> tuple[Float[Tensor, "K"], Bool[Tensor, "K"]]:
+    """Bilinear samples of a map at points, and whether all interpolated pixels are usable.
+
+    Unusable pixels may be NaN; they affect no value and no gradient. Points outside the map are not usable.
+
+    Args:
+        values: A map. [H, W]
+        usable: Pixels that may be interpolated. [H, W]
+        pixels: Columns and rows of the points, pixel centres at integers + 0.5. [K, 2]
+
+    Returns:
+        Samples [K], of which those of unusable points mean nothing; and which are usable [K].
+    """
+    height, width = values.shape
+    size = pixels.new_tensor([width, height])
+    inside = ((pixels >= 0) & (pixels <= size)).all(dim=1)
+    # Pixel centres at integers from here on; the border is replicated.
+    place = torch.minimum((torch.where(inside[:, None], pixels, 0.5) - 0.5).clamp_min(0.0), size - 1)
+    corner = torch.minimum(place.floor(), (size - 2).clamp_min(0))
+    share = (place - corner).to(values.dtype)
+    column, row = corner.long().unbind(1)
+    total, counts = values.new_zeros(len(place)), inside
+    for down in (0, 1):
+        for across in (0, 1):
+            weight = (share[:, 0] if across else 1 - share[:, 0]) * (share[:, 1] if down else 1 - share[:, 1])
+            index = ((row + down).clamp_max(height - 1), (column + across).clamp_max(width - 1))
+            fine = usable[index]
+            total = total + weight * torch.where(fine, values[index], 0.0)
+            counts = counts & (fine | (weight == 0))
+    return total, counts

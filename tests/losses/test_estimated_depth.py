@@ -1,0 +1,198 @@
+"""Losses against depth of a confidence: weighted means, the robust relative loss, and the opacity."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch.nn.functional import huber_loss
+
+from coliags_plugin.contracts import Schedule, TrainingStep
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.masked import masked_mean, weighted_mean
+from coliags_plugin.core.render_output import RenderOutput
+from coliags_plugin.core.scenes import concatenate_targets
+from tests.losses.terms import make
+
+HEIGHT, WIDTH = 7, 9
+WEIGHTED = ("depth-l1", "depth-huber", "distance-l1")
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture
+def case(make_output, make_frame, generator):
+    """A rendered depth, and a frame with estimated depth, a mask and unknown pixels."""
+    depth, rendered = 20 + 10 * torch.rand(2, HEIGHT, WIDTH, generator=generator, dtype=torch.float64)
+    depth[0, :3] = torch.nan
+    mask = torch.rand(HEIGHT, WIDTH, generator=generator) < 0.7
+    confidence = torch.rand(HEIGHT, WIDTH, generator=generator)
+    lengths = 1 + torch.rand(HEIGHT, WIDTH, generator=generator, dtype=torch.float64)
+    rendered = rendered.requires_grad_()
+    output = make_output(torch.zeros(HEIGHT, WIDTH, 3), depth_accumulated=rendered, ray_lengths=lengths)
+    frame = make_frame(torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8), depth, mask)
+    return output, replace(frame, depth_confidence=confidence), rendered
+
+
+def penalties(name, output, frame):
+    """Per-pixel penalties; 0 where the depth is unknown."""
+    difference = torch.nan_to_num(output["depth_accumulated"] - frame.depth)
+    if name == "distance-l1":
+        return difference.abs() * output["ray_lengths"]
+    if name == "depth-huber":
+        return huber_loss(difference, torch.zeros_like(difference), reduction="none", delta=0.2)
+    return difference.abs()
+
+
+@pytest.mark.parametrize("name", WEIGHTED)
+def test_pixels_are_weighted_by_their_confidence(name, case):
+    output, frame, rendered = case
+    known = frame.mask & frame.depth.isfinite()
+    weights = frame.depth_confidence.double() * known
+    expected = (weights * penalties(name, output, frame)).sum() / weights.sum()
+    term = make(name)(output, frame)
+    assert term.item() == pytest.approx(expected.item(), rel=1e-12)
+    (wanted,) = torch.autograd.grad(expected, rendered, retain_graph=True)
+    (found,) = torch.autograd.grad(term, rendered)
+    torch.testing.assert_close(found, wanted)
+    assert not found[~known].any()
+
+
+@pytest.mark.parametrize("name", WEIGHTED)
+def test_without_confidence_nothing_changes_to_the_bit(name, case):
+    output, frame, rendered = case
+    plain = replace(frame, depth_confidence=None)
+    known = frame.mask & frame.depth.isfinite()
+    term, expected = make(name)(output, plain), masked_mean(penalties(name, output, frame), known)
+    assert term.item() == expected.item()
+    assert torch.equal(*(torch.autograd.grad(each, rendered, retain_graph=True)[0] for each in (term, expected)))
+    certain = replace(frame, depth_confidence=torch.ones(HEIGHT, WIDTH))
+    assert make(name)(output, certain).item() == pytest.approx(term.item(), rel=1e-12)
+
+
+@pytest.mark.parametrize("name", WEIGHTED)
+def test_no_confidence_at_all_costs_nothing(name, case):
+    output, frame, rendered = case
+    term = make(name)(output, replace(frame, depth_confidence=torch.zeros(HEIGHT, WIDTH)))
+    term.backward()
+    assert term.item() == 0.0 and not rendered.grad.any()
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    st.lists(st.tuples(st.floats(-100, 100), st.floats(0, 1), st.booleans()), min_size=1, max_size=12),
+    st.floats(0.1, 10),
+)
+def test_a_weighted_mean_is_between_its_values_and_ignores_the_scale_of_weights(pixels, scale):
+    values, weights = (torch.tensor([[pixel[place] for pixel in pixels]], dtype=torch.float64) for place in (0, 1))
+    mask = torch.tensor([[pixel[2] for pixel in pixels]])
+    found = weighted_mean(values, mask, weights).item()
+    used = values[mask & (weights > 0)]
+    assert found == 0.0 if not len(used) else used.min() - 1e-9 <= found <= used.max() + 1e-9
+    assert weighted_mean(values, mask, scale * weights).item() == pytest.approx(found, abs=1e-9)
+
+
+# The robust relative loss
+
+
+def test_it_is_hubers_loss_of_the_relative_error(case):
+    output, frame, rendered = case
+    known = frame.mask & frame.depth.isfinite()
+    depth = torch.where(known, frame.depth, 1.0)
+    relative = (output["depth_accumulated"] - depth) / depth
+    penalty = huber_loss(relative, torch.zeros_like(relative), reduction="none", delta=0.05) / 0.05
+    expected = (penalty * frame.depth_confidence.double().clamp_min(0.1))[known].mean()
+    term = make("estimated-depth")(output, frame)
+    assert term.item() == pytest.approx(expected.item(), rel=1e-12)
+    (wanted,) = torch.autograd.grad(expected, rendered, retain_graph=True)
+    torch.testing.assert_close(torch.autograd.grad(term, rendered)[0], wanted)
+
+
+@settings(max_examples=30, deadline=None)
+@given(scale=st.floats(1e-3, 1e3), shift=st.floats(-0.6, 0.6), floor=st.floats(0, 1))
+def test_it_does_not_depend_on_the_unit(scale, shift, floor):
+    from tests.losses.conftest import _frame, _output
+
+    image, depth = torch.zeros(2, 3, 3, dtype=torch.uint8), torch.linspace(5, 80, 6, dtype=torch.float64).view(2, 3)
+    confidence = torch.linspace(0, 1, 6).view(2, 3)
+
+    def term(unit):
+        output = _output(torch.zeros(2, 3, 3), depth_accumulated=unit * depth * (1 + shift))
+        frame = replace(_frame(image, unit * depth), depth_confidence=confidence)
+        return make("estimated-depth", floor=floor)(output, frame).item()
+
+    weight = confidence.clamp_min(floor).mean().item()
+    near, x = 0.05, abs(shift)
+    assert term(1.0) == pytest.approx(weight * (x * x / (2 * near) if x < near else x - near / 2), rel=1e-5, abs=1e-9)
+    assert term(scale) == pytest.approx(term(1.0), rel=1e-9, abs=1e-12)
+
+
+def test_a_prior_guides_with_a_tenth_of_the_weight(case):
+    output, frame, _ = case
+    nothing, certain = torch.zeros(HEIGHT, WIDTH), torch.ones(HEIGHT, WIDTH)
+    prior, sure, plain = (
+        make("estimated-depth")(output, replace(frame, depth_confidence=each)).item()
+        for each in (nothing, certain, None)
+    )
+    assert prior == pytest.approx(0.1 * sure, rel=1e-6)
+    assert plain == pytest.approx(sure, rel=1e-12)
+    assert make("estimated-depth", floor=0.0)(output, replace(frame, depth_confidence=nothing)).item() == 0.0
+
+
+def test_ignored_and_unknown_pixels_may_be_nan(make_output, make_frame):
+    depth = torch.tensor([[10.0, torch.nan, 0.0, torch.inf, 20.0]])
+    rendered = torch.tensor([[12.0, 5.0, 5.0, 5.0, torch.nan]], requires_grad=True)
+    mask = torch.tensor([[True, True, True, True, False]])
+    frame = make_frame(torch.zeros(1, 5, 3, dtype=torch.uint8), depth, mask)
+    term = make("estimated-depth")(make_output(torch.zeros(1, 5, 3), depth_accumulated=rendered), frame)
+    term.backward()
+    assert term.item() == pytest.approx(0.2 - 0.025)
+    assert rendered.grad[0].tolist() == pytest.approx([0.1, 0, 0, 0, 0])
+
+
+def test_inverse_depth_counts_where_something_was_drawn(make_output, make_frame):
+    inverse = torch.tensor([[0.05, 0.0]], requires_grad=True)
+    output = make_output(torch.zeros(1, 2, 3), inverse_depth_accumulated=inverse)
+    loss = make("estimated-depth", depth="inverse_depth_accumulated")
+    term = loss(output, make_frame(torch.zeros(1, 2, 3, dtype=torch.uint8), torch.tensor([[10.0, 10.0]])))
+    term.backward()
+    assert term.item() == pytest.approx(1.0 - 0.025)
+    assert inverse.grad[0].tolist() == pytest.approx([-1 / (10 * 0.05**2), 0.0])
+    assert loss.loss.wants == {"inverse_depth_accumulated"} and loss.loss.needs == {"depth"}
+
+
+def test_pixel_batches_of_several_frames(case):
+    output, frame, _ = case
+    pixels = torch.stack(torch.meshgrid(torch.arange(WIDTH), torch.arange(HEIGHT), indexing="xy"), -1).reshape(-1, 2)
+    depth = output["depth_accumulated"].detach().reshape(-1, 1).repeat(2, 1)
+    rgb, alpha = torch.zeros(len(depth), 1, 3), torch.ones(len(depth), 1)
+    seen = RenderOutput(rgb, alpha, None, {"depth_accumulated": depth})
+    target = concatenate_targets([frame.target_at(pixels), frame.target_at(pixels)])
+    loss = make("estimated-depth").loss
+    batch = loss(TrainingStep(seen, target, None, 1, Schedule(1, 1))).item()
+    assert batch == pytest.approx(make("estimated-depth")(output, frame).item(), rel=1e-12)
+
+
+def test_a_frame_without_depth_is_refused(case):
+    output, frame, _ = case
+    with pytest.raises(InputError, match=r"'0007' has no depth"):
+        make("estimated-depth")(output, replace(frame, depth=None, depth_confidence=None))
+
+
+# Opacity
+
+
+def test_opacity_is_the_mean_transparency_of_valid_pixels(make_output, make_frame):
+    alpha = torch.tensor([[1.0, 0.75], [0.25, torch.nan]], requires_grad=True)
+    mask = torch.tensor([[True, True], [True, False]])
+    frame = make_frame(torch.zeros(2, 2, 3, dtype=torch.uint8), mask=mask)
+    term = make("opacity")(make_output(torch.zeros(2, 2, 3), alpha=alpha), frame)
+    term.backward()
+    assert term.item() == pytest.approx((0.0 + 0.25 + 0.75) / 3)
+    assert alpha.grad.flatten().tolist() == pytest.approx([-1 / 3, -1 / 3, -1 / 3, 0.0])
