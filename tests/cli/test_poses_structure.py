@@ -7,6 +7,7 @@ import shlex
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 import torch
 
@@ -14,8 +15,9 @@ from coliags_plugin.cli.poses.arguments import settings_of
 from coliags_plugin.cli.poses.triangulate import _held_out
 from coliags_plugin.core.scenes import PointCloud, Scene
 from coliags_plugin.engine.data_formats import open_scene
+from coliags_plugin.outputs.image_files import read_rgb
 from coliags_plugin.reconstruction.structure.sfm import SfmSettings
-from coliags_plugin.reconstruction.structure.triangulation import TriangulationSettings
+from coliags_plugin.reconstruction.structure.triangulation import TriangulationSettings, triangulate
 from tests import commands
 from tests.commands import run
 from tests.scenes import SMALL
@@ -85,6 +87,27 @@ def test_options_of_reading_and_of_triangulation(tube, tmp_path, capsys, caplog)
     assert "already exists" in refused(capsys, *argv)
     assert run(*argv, "--overwrite", "--set", "split=all-train") == 0
     assert capsys.readouterr().out.splitlines()[-1].endswith("--set datamanager.split=all-train")
+
+
+def test_features_are_detected_at_the_stored_size(tube, tmp_path, capsys, caplog):
+    caplog.set_level("INFO")
+    whole, half = tmp_path / "whole", tmp_path / "half"
+    assert run("poses", "triangulate", tube, "--out", whole) == 0
+    assert "detected at" not in caplog.text
+    assert run("poses", "triangulate", tube, "--out", half, "--set", "width=80", "--set", "height=64") == 0
+    assert "features are detected at the stored size, 160 x 128" in caplog.text
+    models = [pycolmap.Reconstruction(str(folder / "sparse" / "0")) for folder in (whole, half)]
+    # The same points from the same images, in pixels of half the size.
+    assert models[0].num_points3D() == models[1].num_points3D() > 200
+    for number, point in models[0].points3D.items():
+        np.testing.assert_allclose(models[1].points3D[number].xyz, point.xyz)
+        assert models[1].points3D[number].error == pytest.approx(point.error / 2, rel=1e-3)
+    for number, image in models[0].images.items():
+        for one, other in zip(image.points2D, models[1].images[number].points2D, strict=True):
+            np.testing.assert_allclose(other.xy, one.xy / 2)
+    assert read_rgb(half / "images" / "0001_color.png").shape == (64, 80, 3)
+    scene = open_scene(tube, options=["initial_points=none", "width=120", "height=96"])
+    assert len(triangulate(scene.train)) < 0.8 * models[0].num_points3D()
 
 
 @pytest.mark.parametrize(
