@@ -39,7 +39,7 @@ class Triangulate:
         """Triangulate the training frames, write all frames and print a summary."""
         import logging
 
-        from coliags_plugin.cli.poses.arguments import SPARSE_DEPTH, refuse_output, settings_among, train_command
+        from coliags_plugin.cli.poses.arguments import next_commands, refuse_output, settings_among
         from coliags_plugin.engine.data_formats import open_scene
         from coliags_plugin.engine.progress import progress_callback
         from coliags_plugin.reconstruction.structure.colmap_scene import write_colmap_scene
@@ -54,13 +54,14 @@ class Triangulate:
             detected = self._at_stored_size(scene, options)
             found = in_pixels_of(triangulate(detected, settings, progress), detected, scene.train)
         test, split = _held_out(scene)
-        write_colmap_scene(self.out, scene.train, found, test, self.overwrite)
+        unit = scene.provenance.get("unit", "mm")
+        write_colmap_scene(self.out, scene.train, found, test, self.overwrite, unit)
         log = logging.getLogger(__name__)
         if test:
             log.info(
                 "points come from the %d training frames; the %d test frames see none", len(scene.train), len(test)
             )
-        print(f"{found.summary()}\n{self.out}\n{train_command(self.out, SPARSE_DEPTH, *split)}")
+        print(f"{found.summary()}\n{self.out}\n{next_commands(self.out, *split)}")
 
     def _at_stored_size(self, scene: Scene, options: list[str]) -> Sequence[Frame]:
         """The training frames, undistorted at the stored size, where more features are found than at a smaller one."""
