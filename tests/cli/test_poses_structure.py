@@ -7,15 +7,18 @@ import shlex
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 import torch
 
 from coliags_plugin.cli.poses.arguments import settings_of
 from coliags_plugin.cli.poses.triangulate import _held_out
 from coliags_plugin.core.scenes import PointCloud, Scene
+from coliags_plugin.datamanagers.units import read_unit
 from coliags_plugin.engine.data_formats import open_scene
-from coliags_plugin.reconstruction.structure.sfm import SfmSettings
-from coliags_plugin.reconstruction.structure.triangulation import TriangulationSettings
+from coliags_plugin.outputs.image_files import read_rgb
+from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
+from coliags_plugin.reconstruction.structure.triangulation import TriangulationSettings, triangulate
 from tests import commands
 from tests.commands import run
 from tests.scenes import SMALL
@@ -23,6 +26,8 @@ from tests.textured_tube import INTRINSICS, tube_frames, write_tube
 
 CAMERA = ("--camera", "PINHOLE", "--params", ",".join(map(str, INTRINSICS)))
 COUNT = 9
+#: Option that trains on the sparse depth of a scene's points.
+SPARSE_DEPTH = "losses.depth={name: sparse-depth, weight: 0.2, final_weight: 0.01}"
 
 
 def refused(capsys, *argv):
@@ -48,13 +53,17 @@ def test_triangulate_makes_a_scene_that_trains(tube, tmp_path, capsys):
     assert "coliags poses triangulate" in refused(capsys, "train", "scaffold-gs", "--data", tube)
     out = tmp_path / "out"
     assert run("poses", "triangulate", tube, "--out", out) == 0
-    summary, place, command = capsys.readouterr().out.splitlines()
+    summary, place, *commands = capsys.readouterr().out.splitlines()
     assert "points of" in summary
     assert "mean reprojection error 0." in summary
     assert "frames each" in summary
     assert "depth uncertainty" in summary
     assert place == str(out)
-    assert "split" not in command
+    assert commands == [
+        f"coliags depth estimate {out} --out {out}-depth",
+        f"coliags train coliags-estimated-depth --data {out}-depth",
+    ]
+    assert read_unit(out) == "mm"
     scene, source = open_scene(out), open_scene(tube)
     assert summary.startswith(f"{len(scene.points)} points")
     for one, other in zip(
@@ -63,7 +72,7 @@ def test_triangulate_makes_a_scene_that_trains(tube, tmp_path, capsys):
         assert one.name == other.name
         torch.testing.assert_close(one.camera.camera_to_world, other.camera.camera_to_world, atol=1e-5, rtol=0)
         np.testing.assert_array_equal(one.image, other.image)
-    terms = trains(command, tmp_path / "run")
+    terms = trains(f"coliags train coliags --data {out} --set {shlex.quote(SPARSE_DEPTH)}", tmp_path / "run")
     assert 0.0 < terms["depth"] < 50.0
     # Also where no loss asks for depth, and no option is given.
     assert trains(f"coliags train scaffold-gs --data {out}", tmp_path / "run-2")
@@ -85,6 +94,27 @@ def test_options_of_reading_and_of_triangulation(tube, tmp_path, capsys, caplog)
     assert "already exists" in refused(capsys, *argv)
     assert run(*argv, "--overwrite", "--set", "split=all-train") == 0
     assert capsys.readouterr().out.splitlines()[-1].endswith("--set datamanager.split=all-train")
+
+
+def test_features_are_detected_at_the_stored_size(tube, tmp_path, capsys, caplog):
+    caplog.set_level("INFO")
+    whole, half = tmp_path / "whole", tmp_path / "half"
+    assert run("poses", "triangulate", tube, "--out", whole) == 0
+    assert "detected at" not in caplog.text
+    assert run("poses", "triangulate", tube, "--out", half, "--set", "width=80", "--set", "height=64") == 0
+    assert "features are detected at the stored size, 160 x 128" in caplog.text
+    models = [pycolmap.Reconstruction(str(folder / "sparse" / "0")) for folder in (whole, half)]
+    # The same points from the same images, in pixels of half the size.
+    assert models[0].num_points3D() == models[1].num_points3D() > 200
+    for number, point in models[0].points3D.items():
+        np.testing.assert_allclose(models[1].points3D[number].xyz, point.xyz)
+        assert models[1].points3D[number].error == pytest.approx(point.error / 2, rel=1e-3)
+    for number, image in models[0].images.items():
+        for one, other in zip(image.points2D, models[1].images[number].points2D, strict=True):
+            np.testing.assert_allclose(other.xy, one.xy / 2)
+    assert read_rgb(half / "images" / "0001_color.png").shape == (64, 80, 3)
+    scene = open_scene(tube, options=["initial_points=none", "width=120", "height=96"])
+    assert len(triangulate(scene.train)) < 0.8 * models[0].num_points3D()
 
 
 @pytest.mark.parametrize(
@@ -134,11 +164,18 @@ def test_splits_are_kept_where_a_rule_tells_them(caplog):
 def test_sfm_makes_a_scene_that_trains_and_aligns(tube, tmp_path, capsys, caplog):
     out = tmp_path / "out"
     assert run("poses", "sfm", tube / "images", "--out", out, *CAMERA, "--every", 2, "--max-frames", 5) == 0
-    summary, unit, place, command = capsys.readouterr().out.splitlines()
+    summary, unit, place, *commands = capsys.readouterr().out.splitlines()
     assert summary.startswith("5 of 5 images posed")
-    assert "the unit of length is arbitrary" in unit
+    assert unit.startswith("unit: unknown, as images alone do not determine it; the median depth of the points is")
+    assert read_unit(out) == "unknown"
+    assert open_scene(out).provenance["unit"] == "unknown"
     assert place == str(out)
+    assert commands == [
+        f"coliags depth estimate {out} --out {out}-depth",
+        f"coliags train coliags-estimated-depth --data {out}-depth",
+    ]
     assert sorted(path.name for path in (out / "images").iterdir()) == [f"{n:04d}_color.png" for n in range(0, 9, 2)]
+    command = f"coliags train coliags --data {out} --set {shlex.quote(SPARSE_DEPTH)}"
     assert trains(command, tmp_path / "run")["depth"] > 0.0
     capsys.readouterr()
     assert run("poses", "convert", tube / "camera_pose.txt", tmp_path / "true", "--to", "colmap", "--images",
@@ -150,9 +187,38 @@ def test_sfm_makes_a_scene_that_trains_and_aligns(tube, tmp_path, capsys, caplog
     assert told["ate"]["rmse"] < 0.2
 
 
+def test_a_known_distance_or_diameter_fixes_the_scale(tube, tmp_path, capsys, caplog):
+    truth = np.stack([frame.camera.camera_to_world.numpy() for frame in tube_frames(COUNT)])
+    first, last = truth[0, :3, 3], truth[8, :3, 3]
+    argv = ("poses", "sfm", tube / "images", *CAMERA, "--every", 4)
+    known = f"0000_color.png,0008_color,{np.linalg.norm(last - first)}"
+    assert run(*argv, "--out", tmp_path / "by-distance", "--distance", known) == 0
+    assert "unit: mm, " in capsys.readouterr().out
+    assert read_unit(tmp_path / "by-distance") == "mm"
+    scene = open_scene(tmp_path / "by-distance", options=["split=all-train"])
+    centers = np.stack([frame.camera.center.numpy() for frame in scene.train])
+    assert np.linalg.norm(centers[2] - centers[0]) == pytest.approx(np.linalg.norm(last - first), rel=1e-5)
+    assert np.linalg.norm(centers[1] - centers[0]) == pytest.approx(np.linalg.norm(truth[4, :3, 3] - first), rel=0.02)
+    # The wall is ahead of so short a path: the poses are kept, in an unknown unit.
+    assert run(*argv, "--out", tmp_path / "by-diameter", "--diameter", 40) == 0
+    assert "lie beside the camera's path" in caplog.text
+    assert "unit: unknown" in capsys.readouterr().out
+    assert read_unit(tmp_path / "by-diameter") == "unknown"
+    # Points of a scene keep its unit.
+    assert run("poses", "triangulate", tmp_path / "by-diameter", "--out", tmp_path / "points", "--set",
+               "split=all-train", "--set", "triangulation.min_share=0") == 0  # fmt: skip
+    assert read_unit(tmp_path / "points") == "unknown"
+
+
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
+        (("--diameter", "0"), "--diameter 0. Expected a length in mm above 0"),
+        (("--diameter", "40", "--distance", "a,b,1"), "--diameter and --distance. Expected one of them"),
+        (("--distance", "a,b"), "IMAGE,IMAGE,MM"),
+        (("--distance", "a,b,nan"), "a length in mm above 0"),
+        (("--camera", "c3vd", "--params", "1,2"), "--params, and --camera c3vd"),
+        (("--set", "camera.field_of_view=[90, 20]"), "two ascending angles"),
         (("--camera", "PINHOLES"), "camera model PINHOLES"),
         (("--camera", "PINHOLE", "--params", "1,2"), "2 parameters for PINHOLE"),
         (("--params", "1,two"), "--set camera.params"),

@@ -18,14 +18,10 @@ from coliags_plugin.poses.alignment import align
 from coliags_plugin.poses.association import associate
 from coliags_plugin.poses.trajectory import Trajectory
 from coliags_plugin.reconstruction.structure.features import FeatureSettings
-from coliags_plugin.reconstruction.structure.image_files import file_names, list_images
-from coliags_plugin.reconstruction.structure.sfm import (
-    CameraSettings,
-    SfmSettings,
-    masks_for,
-    reconstruct,
-    write_sfm_scene,
-)
+from coliags_plugin.reconstruction.structure.image_files import file_names, list_images, masks_for
+from coliags_plugin.reconstruction.structure.sfm import reconstruct
+from coliags_plugin.reconstruction.structure.sfm_scene import write_sfm_scene
+from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings, SfmSettings
 from tests.textured_tube import INTRINSICS, tube_frames, write_tube
 
 KNOWN = SfmSettings(camera=CameraSettings(model="PINHOLE", params=INTRINSICS))
@@ -56,7 +52,7 @@ def test_a_known_camera_finds_its_path(found):
     assert found.left_out == ()
     error, degrees = share_of_path(found.trajectory, TRUTH)
     assert error < 0.005
-    assert degrees < 3.0  # the path is nearly straight, and only positions are aligned
+    assert degrees < 2.0  # the direction of so short a path
     (camera,) = found.model.cameras.values()
     assert tuple(camera.params) == INTRINSICS
     assert f"{COUNT} of {COUNT} images posed" in found.summary()
@@ -98,12 +94,20 @@ def test_a_phantom_is_found_without_its_camera(phantom, caplog):
     assert share_of_path(found.trajectory, np.load(phantom / "truth" / "camera_to_world.npy"))[0] < 0.005
     (camera,) = found.model.cameras.values()
     assert camera.focal_length == pytest.approx(json.loads((phantom / "camera.json").read_text())["fx"], rel=0.05)
-    assert "focal length went" not in caplog.text
+    assert not [record for record in caplog.records if record.levelname == "WARNING"]
+    # The lamp is at the lens.
+    assert found.correlation < -0.5
 
 
-def test_a_focal_length_that_runs_away_is_doubted(tube, caplog):
-    reconstruct(list_images(tube), SfmSettings(camera=CameraSettings(model="SIMPLE_PINHOLE", focal_factor=2.5)))
-    assert "the focal length went from 400 to" in caplog.text
+def test_an_implausible_focal_length_is_refused(tube):
+    camera = CameraSettings(model="SIMPLE_PINHOLE", refine=False, focal_factors=(2.5,))
+    refusal(
+        r"implausible focal lengths \(focal length 400 px \(23 degrees\).*40 to 150 degrees",
+        tube,
+        SfmSettings(camera=camera),
+    )
+    wide = camera.model_copy(update={"field_of_view": (20.0, 150.0)})
+    assert reconstruct(list_images(tube), SfmSettings(camera=wide)).registered
 
 
 def test_images_of_something_else_are_left_out_and_named(tube, tmp_path, caplog):
@@ -165,6 +169,8 @@ def test_cameras_that_are_none_are_refused(tube, tmp_path):
         tube,
         SfmSettings(camera=CameraSettings(model="PINHOLES")),
     )
+    both = SfmSettings(camera=CameraSettings(model="c3vd", params=(1.0,)))
+    refusal("--params, and --camera c3vd", tube, both)
     one = SfmSettings(camera=CameraSettings(model="PINHOLE", params=(1.0,)))
     refusal("1 parameters for PINHOLE. Expected 4: fx, fy, cx, cy", tube, one)
     write_png(tmp_path / "0.png", read_rgb(list_images(tube)[0]))
@@ -213,9 +219,5 @@ def test_masks_of_a_file_and_of_a_folder(tmp_path):
         masks_for(tmp_path / "masks", [Path("c.jpg")])
 
 
-def test_a_camera_is_refined_unless_it_is_given():
-    assert CameraSettings().is_refined
-    assert not KNOWN.camera.is_refined
-    assert CameraSettings(params=(1.0,), refine=True).is_refined
-    assert not CameraSettings(refine=False).is_refined
+def test_features_of_structure_from_motion_have_their_own_defaults():
     assert SfmSettings().features != FeatureSettings()

@@ -17,6 +17,7 @@ from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.poses.rigid import FLIP_Y_AND_Z, inverse
 from coliags_plugin.reconstruction.structure.colmap_scene import write_colmap_scene
 from coliags_plugin.reconstruction.structure.triangulation import TriangulationSettings, triangulate
+from coliags_plugin.reconstruction.structure.working_size import in_pixels_of
 from tests.textured_tube import texture, tube_frames
 
 FRAMES = tube_frames()
@@ -71,6 +72,19 @@ def test_observations_reproject_and_add_up(found):
     assert found.track_lengths.min() >= SETTINGS.min_track_length
     assert found.depth_uncertainty.max() <= SETTINGS.max_depth_uncertainty
     assert found.summary().startswith(f"{len(found)} points of {found.found} found, seen in")
+
+
+def test_residuals_are_in_pixels_of_the_working_size(found):
+    half = tube_frames(size=(80, 64))
+    converted = in_pixels_of(found, FRAMES, half)
+    np.testing.assert_allclose(converted.errors, found.errors / 2, rtol=1e-3)
+    assert converted.pixel_noise == pytest.approx(found.pixel_noise / 2)
+    for frame, seen in zip(half, converted.observations, strict=True):
+        pixels, depth = frame.camera.project(torch.from_numpy(found.positions[seen.points]))
+        assert np.linalg.norm(pixels.numpy() - seen.pixels, axis=1).max() < SETTINGS.max_reprojection_error / 2 + 0.05
+        np.testing.assert_allclose(depth, seen.depth)
+    with pytest.raises(InputError, match="the same frames at two sizes"):
+        in_pixels_of(found, FRAMES, half[1:])
 
 
 def test_the_same_frames_give_the_same_points():

@@ -20,9 +20,6 @@ if TYPE_CHECKING:
 
 S = TypeVar("S", bound="Settings")
 
-#: Override that trains on the sparse depth of a scene's points.
-SPARSE_DEPTH = "losses.depth={name: sparse-depth, weight: 0.2, final_weight: 0.01}"
-
 OptionalFormat = Annotated[str | None, tyro.conf.arg(metavar="FORMAT")]
 
 
@@ -117,7 +114,20 @@ def refuse_output(out: Path, source: Path, overwrite: bool) -> None:
         raise InputError(f"{out} already exists", "a new or empty folder", "Choose another, or pass --overwrite")
 
 
-def train_command(out: Path, *assignments: str) -> str:
+def train_command(out: Path) -> str:
     """Shell command that trains on a scene."""
-    words = ["coliags", "train", "coliags", "--data", str(out)]
-    return shlex.join([*words, *(word for assignment in assignments for word in ("--set", assignment))])
+    return shlex.join(["coliags", "train", "coliags", "--data", str(out)])
+
+
+def next_commands(out: Path, *assignments: str) -> str:
+    """Shell commands that estimate the depth of a scene with poses and points, and train on it; two lines.
+
+    Args:
+        out: The scene.
+        assignments: Options of training.
+    """
+    with_depth = out.with_name(f"{out.name}-depth")
+    estimate = ["coliags", "depth", "estimate", str(out), "--out", str(with_depth)]
+    train = ["coliags", "train", "coliags-estimated-depth", "--data", str(with_depth)]
+    train += [word for assignment in assignments for word in ("--set", assignment)]
+    return f"{shlex.join(estimate)}\n{shlex.join(train)}"

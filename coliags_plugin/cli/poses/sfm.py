@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from coliags_plugin.cli.arguments import Assignments, OptionalInt, OptionalPath, OptionalText
+
+if TYPE_CHECKING:
+    from coliags_plugin.reconstruction.structure.sfm import Reconstruction
 
 
 @dataclass(frozen=True)
@@ -20,9 +23,14 @@ class Sfm:
     out: Path
     """Folder to create, in COLMAP's layout."""
     camera: OptionalText = None
-    """COLMAP's camera model, for instance PINHOLE or OPENCV_FISHEYE; default SIMPLE_RADIAL."""
+    """A known camera, scaled to the images (c3vd: whole frames of C3VD; c3vd-undistorted), or a camera model of COLMAP,
+    for instance PINHOLE or OPENCV_FISHEYE; default SIMPLE_RADIAL."""
     params: Annotated[OptionalText, tyro.conf.arg(metavar="P1,P2,...")] = None
-    """Its parameters in COLMAP's order, pixel centres at integers + 0.5, kept fixed; default: estimated."""
+    """Parameters of COLMAP's model in its order, pixel centres at integers + 0.5, kept fixed; default: estimated."""
+    diameter: Annotated[float | None, tyro.conf.arg(metavar="MM")] = None
+    """The colon's typical inner diameter, which fixes the scale roughly; default: the scale stays unknown."""
+    distance: Annotated[OptionalText, tyro.conf.arg(metavar="IMAGE,IMAGE,MM")] = None
+    """Known distance between the cameras of two images, which fixes the scale."""
     mask: OptionalPath = None
     """Mask image, black where pixels are ignored, or a folder with one per image."""
     every: int = 1
@@ -30,21 +38,25 @@ class Sfm:
     max_frames: OptionalInt = None
     """Use at most the first n images."""
     set: Assignments = ()
-    """An option of matching or mapping, for instance overlap=12 or features.max_features=2000."""
+    """An option of matching or mapping, for instance exhaustive_up_to=80 or features.max_features=2000."""
     overwrite: bool = False
     """Replace the output folder where it exists."""
 
     def run(self) -> None:
         """Reconstruct, write the scene and print a summary."""
-        from coliags_plugin.cli.poses.arguments import SPARSE_DEPTH, refuse_output, settings_of, train_command
+        from coliags_plugin.cli.poses.arguments import next_commands, refuse_output, settings_of
         from coliags_plugin.core.errors import InputError
         from coliags_plugin.engine.progress import progress_callback
-        from coliags_plugin.reconstruction.structure.image_files import list_images
-        from coliags_plugin.reconstruction.structure.sfm import SfmSettings, masks_for, reconstruct, write_sfm_scene
+        from coliags_plugin.reconstruction.structure.image_files import list_images, masks_for
+        from coliags_plugin.reconstruction.structure.model_scale import scaled
+        from coliags_plugin.reconstruction.structure.sfm import reconstruct
+        from coliags_plugin.reconstruction.structure.sfm_scene import write_sfm_scene
+        from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 
         refuse_output(self.out, self.frames, self.overwrite)
         if self.every < 1 or (self.max_frames is not None and self.max_frames < 2):
             raise InputError(f"--every {self.every}, --max-frames {self.max_frames}", "1 or more, and 2 or more")
+        known_distance = self._known_distance()
         given = [] if self.camera is None else [f"camera.model={self.camera}"]
         given += [] if self.params is None else [f"camera.params=[{self.params}]"]
         settings = settings_of(SfmSettings, [*given, *self.set])
@@ -52,10 +64,52 @@ class Sfm:
         masks = None if self.mask is None else masks_for(self.mask, images)
         with progress_callback() as progress:
             found = reconstruct(images, settings, masks, progress)
-        write_sfm_scene(self.out, found, masks, self.overwrite)
-        print(
-            f"{found.summary()}\n"
-            f"the unit of length is arbitrary: the median depth of the points is {found.median_depth:.4g} units; if it "
-            "is known in mm, divide that by this number and pass --set datamanager.scale=QUOTIENT\n"
-            f"{self.out}\n{train_command(self.out, SPARSE_DEPTH)}"
-        )
+        factor = self._factor(found, known_distance)
+        if factor is not None:
+            found = scaled(found, factor)
+        write_sfm_scene(self.out, found, masks, self.overwrite, "unknown" if factor is None else "mm")
+        print(f"{found.summary()}\n{_unit(found, factor)}\n{self.out}\n{next_commands(self.out)}")
+
+    def _known_distance(self) -> tuple[str, str, float] | None:
+        """The parts of ``--distance``."""
+        import math
+
+        from coliags_plugin.core.errors import InputError
+
+        if self.diameter is not None and self.distance is not None:
+            raise InputError("--diameter and --distance", "one of them")
+        if self.diameter is not None and not (math.isfinite(self.diameter) and self.diameter > 0.0):
+            raise InputError(f"--diameter {self.diameter:g}", "a length in mm above 0")
+        if self.distance is None:
+            return None
+        try:
+            first, second, text = self.distance.split(",")
+            length = float(text)
+        except ValueError as error:
+            raise InputError(f"--distance {self.distance}", "IMAGE,IMAGE,MM: two image names and a length") from error
+        if not (math.isfinite(length) and length > 0.0):
+            raise InputError(f"--distance {self.distance}", "a length in mm above 0")
+        return first, second, length
+
+    def _factor(self, found: Reconstruction, known_distance: tuple[str, str, float] | None) -> float | None:
+        """Millimetres per unit of the model; None where the scale stays unknown."""
+        import logging
+
+        from coliags_plugin.core.errors import InputError
+        from coliags_plugin.reconstruction.structure.model_scale import from_diameter, from_distance
+
+        try:
+            if known_distance is not None:
+                return from_distance(found, *known_distance)
+            return None if self.diameter is None else from_diameter(found, self.diameter)
+        except InputError as error:
+            # The poses took minutes: they are written all the same.
+            logging.getLogger(__name__).warning("%s The scale stays unknown", error)
+            return None
+
+
+def _unit(found: Reconstruction, factor: float | None) -> str:
+    depth = f"the median depth of the points is {found.median_depth:.4g}"
+    if factor is not None:
+        return f"unit: mm, {factor:.4g} per unit of the model; {depth} mm"
+    return f"unit: unknown, as images alone do not determine it; {depth} units (--diameter or --distance fix the scale)"

@@ -11,6 +11,8 @@ import tyro
 from coliags_plugin.cli.arguments import Assignments, DataFormat
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from coliags_plugin.core.scenes import Frame, Scene
     from coliags_plugin.datamanagers.splits import Split
 
@@ -37,26 +39,44 @@ class Triangulate:
         """Triangulate the training frames, write all frames and print a summary."""
         import logging
 
-        from coliags_plugin.cli.poses.arguments import SPARSE_DEPTH, refuse_output, settings_among, train_command
+        from coliags_plugin.cli.poses.arguments import next_commands, refuse_output, settings_among
         from coliags_plugin.engine.data_formats import open_scene
         from coliags_plugin.engine.progress import progress_callback
         from coliags_plugin.reconstruction.structure.colmap_scene import write_colmap_scene
         from coliags_plugin.reconstruction.structure.triangulation import TriangulationSettings, triangulate
+        from coliags_plugin.reconstruction.structure.working_size import in_pixels_of
 
         refuse_output(self.out, self.scene, self.overwrite)
         settings, options = settings_among(TriangulationSettings, self.set, _OWN)
         with progress_callback() as progress:
             # Initial points are not needed here unless requested.
             scene = open_scene(self.scene, self.format, ["initial_points=none", *options], progress)
-            found = triangulate(scene.train, settings, progress)
+            detected = self._at_stored_size(scene, options)
+            found = in_pixels_of(triangulate(detected, settings, progress), detected, scene.train)
         test, split = _held_out(scene)
-        write_colmap_scene(self.out, scene.train, found, test, self.overwrite)
+        unit = scene.provenance.get("unit", "mm")
+        write_colmap_scene(self.out, scene.train, found, test, self.overwrite, unit)
         log = logging.getLogger(__name__)
         if test:
             log.info(
                 "points come from the %d training frames; the %d test frames see none", len(scene.train), len(test)
             )
-        print(f"{found.summary()}\n{self.out}\n{train_command(self.out, SPARSE_DEPTH, *split)}")
+        print(f"{found.summary()}\n{self.out}\n{next_commands(self.out, *split)}")
+
+    def _at_stored_size(self, scene: Scene, options: list[str]) -> Sequence[Frame]:
+        """The training frames, undistorted at the stored size, where more features are found than at a smaller one."""
+        import logging
+
+        from coliags_plugin.engine.data_formats import open_scene
+
+        stored = scene.provenance.get("stored_size")
+        if stored is None or stored == scene.provenance.get("size"):
+            return scene.train
+        logging.getLogger(__name__).info("features are detected at the stored size, %d x %d", *stored)
+        size = [f"width={stored[0]}", f"height={stored[1]}"]
+        # Read again when needed: images of the stored size may not fit into memory.
+        chosen = [*options, *size, "initial_points=none", "keep_pixels=false"]
+        return open_scene(self.scene, self.format, chosen).train
 
 
 def _held_out(scene: Scene) -> tuple[list[Frame], list[str]]:

@@ -11,6 +11,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points, write_image_and_mask, write_model
+from coliags_plugin.datamanagers.units import Unit, write_unit
 from coliags_plugin.reconstruction.structure.colmap_model import frame_model
 from coliags_plugin.reconstruction.structure.image_files import file_names
 from coliags_plugin.reconstruction.structure.triangulation import Triangulation
@@ -22,10 +23,11 @@ def write_colmap_scene(
     triangulation: Triangulation,
     held_out: Sequence[Frame] = (),
     overwrite: bool = False,
+    unit: Unit = "mm",
 ) -> None:
     """Write images, masks and a sparse model: ``images/NAME.png``, ``masks/NAME.png``, ``sparse/0/*.bin``.
 
-    Poses, intrinsics and the unit of length are those of the frames.
+    Poses, intrinsics and the unit of length are those of the frames; ``unit.txt`` states the unit.
 
     Args:
         folder: The folder to create.
@@ -33,6 +35,7 @@ def write_colmap_scene(
         triangulation: Points of these frames.
         held_out: Further frames of the same video, without observations; sorted among the others by ``index``.
         overwrite: Replace the folder if it exists.
+        unit: Of the frames' poses.
 
     Raises:
         InputError: The triangulation has another number of frames, or the folder exists or cannot be written.
@@ -55,3 +58,4 @@ def write_colmap_scene(
             mask = None if frame.mask is None else frame.mask.cpu().numpy()
             write_image_and_mask(scratch, name, frame.image.cpu().numpy(), mask)
         write_model(scratch, model)
+        write_unit(scratch, unit)

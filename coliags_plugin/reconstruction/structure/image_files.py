@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,9 @@ from coliags_plugin.poses.trajectory import natural_order
 
 #: Suffixes of image files, in lower case.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+
+#: False where a pixel is ignored: one for all images, or one per image; None where none is.
+Masks = Mapping[Path, Bool[np.ndarray, "H W"]] | Bool[np.ndarray, "H W"] | None
 
 _FFMPEG = "make images with ffmpeg -i VIDEO -vf fps=10 FOLDER/%05d.png"
 
@@ -64,6 +67,37 @@ def read_mask(path: Path) -> Bool[np.ndarray, "H W"]:
         InputError: It cannot be read.
     """
     return np.asarray(read_image(path).max(axis=2) > 0)
+
+
+def masks_for(path: Path, images: Sequence[Path]) -> Masks:
+    """Read one mask for all images from a file, or a mask per image from a folder.
+
+    Args:
+        path: A mask image, black where pixels are ignored; or a folder of ``NAME.png`` or ``NAME.jpg.png``.
+        images: The images to find masks for.
+
+    Raises:
+        InputError: A mask is missing or cannot be read.
+    """
+    if path.is_file():
+        return read_mask(path)
+    masks = {}
+    for image in images:
+        candidates = (path / f"{image.name}.png", path / f"{image.stem}.png")
+        file = next((candidate for candidate in candidates if candidate.is_file()), None)
+        if file is None:
+            raise InputError(
+                f"{path} has no mask for {image.name}",
+                f"{candidates[0].name} or {candidates[1].name}",
+                "Give one mask for all images, or a folder with a mask for each",
+            )
+        masks[image] = read_mask(file)
+    return masks
+
+
+def mask_of(image: Path, masks: Masks) -> Bool[np.ndarray, "H W"] | None:
+    """The mask of an image."""
+    return masks.get(image) if isinstance(masks, Mapping) else masks
 
 
 def file_names(names: Sequence[str], suffix: str) -> list[str]:

@@ -34,7 +34,7 @@ FEWEST_POINTS = 10
 
 
 class TriangulationSettings(Settings):
-    """Options of matching and point filtering. Pixels are those of the given frames."""
+    """Options of matching and point filtering. Pixels are those of the images in which features are detected."""
 
     features: FeatureSettings = FeatureSettings()
     """Feature extraction."""

@@ -1,0 +1,180 @@
+"""Choice among models of the same images with other focal lengths, or reversed in depth.
+
+Images of distant, shallow surfaces nearly determine structure only up to a reversal of depth (the bas-relief or Necker
+ambiguity: R. Szeliski and S. B. Kang, "Shape ambiguities in structure from motion", IEEE TPAMI 19(5), 1997). The lamp
+at the lens resolves it: nearer points are brighter.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.reconstruction.structure.mapping import bundle_adjust
+from coliags_plugin.reconstruction.structure.observations import brightness_correlation, depths_of
+from coliags_plugin.reconstruction.structure.sfm_cameras import field_of_view
+
+if TYPE_CHECKING:
+    import pycolmap
+
+log = logging.getLogger(__name__)
+
+#: Models with at least these shares of the most images and observations explain the images as well as any.
+_ENOUGH_IMAGES, _ENOUGH_OBSERVATIONS = 0.9, 0.9
+#: A focal length is ambiguous if models whose errors differ by less than this factor have focal lengths that differ by
+#: more than this factor.
+_SAME_ERROR, _OTHER_FOCAL_LENGTH = 1.1, 1.15
+#: A point nearer than this share of the median depth counts as this near when depth is reversed.
+_NEAREST = 0.05
+#: Reflects the z axis.
+_MIRROR = np.diag([1.0, 1.0, -1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A model and what tells it from others.
+
+    Attributes:
+        model: COLMAP's reconstruction, after bundle adjustment.
+        correlation: Of log brightness with log depth; None: unknown.
+        is_reversed: Whether it was made by reversing another one's depth.
+    """
+
+    model: pycolmap.Reconstruction
+    correlation: float | None
+    is_reversed: bool = False
+
+    @classmethod
+    def of(
+        cls, model: pycolmap.Reconstruction, brightness: Sequence[Float[np.ndarray, "K"]], is_reversed: bool = False
+    ) -> Hypothesis:
+        """The hypothesis of a bundle-adjusted model; ``brightness`` at the features of each image."""
+        return cls(model, brightness_correlation(model, brightness), is_reversed)
+
+    @property
+    def images(self) -> int:
+        """Number of registered images."""
+        return int(self.model.num_reg_images())
+
+    @property
+    def observations(self) -> int:
+        """Number of observations of points."""
+        return int(self.model.compute_num_observations())
+
+    @property
+    def error(self) -> float:
+        """Mean reprojection error, pixels."""
+        return float(self.model.compute_mean_reprojection_error())
+
+    @property
+    def focal_length(self) -> float:
+        """Of the first camera, pixels."""
+        return float(next(iter(self.model.cameras.values())).mean_focal_length())
+
+    @property
+    def fields_of_view(self) -> list[float]:
+        """Nominal field of view of each camera, degrees."""
+        return [field_of_view(camera) for camera in self.model.cameras.values()]
+
+    @property
+    def is_lit_from_the_camera(self) -> bool:
+        """Whether nearer points are brighter."""
+        return self.correlation is not None and self.correlation < 0.0
+
+    def is_plausible(self, plausible: tuple[float, float]) -> bool:
+        """Whether the nominal fields of view are in a range, degrees."""
+        return all(plausible[0] <= view <= plausible[1] for view in self.fields_of_view)
+
+    def described(self) -> str:
+        """What tells it from others, in words."""
+        light = "unknown" if self.correlation is None else f"{self.correlation:.2f}"
+        return (
+            f"focal length {self.focal_length:.0f} px ({self.fields_of_view[0]:.0f} degrees)"
+            f"{', depth reversed' if self.is_reversed else ''}: {self.images} images, {self.observations} observations"
+            f", reprojection error {self.error:.2f} px, correlation of brightness with depth {light}"
+        )
+
+
+def choose(hypotheses: Sequence[Hypothesis], plausible: tuple[float, float]) -> Hypothesis:
+    """The best model: of plausible focal length; explaining the images as well as any; lit from the camera; exact.
+
+    Args:
+        hypotheses: At least one.
+        plausible: Least and largest nominal field of view, degrees.
+
+    Raises:
+        InputError: No model has a plausible focal length.
+    """
+    for hypothesis in hypotheses:
+        log.info("%s", hypothesis.described())
+    left = [one for one in hypotheses if one.is_plausible(plausible)]
+    if not left:
+        raise InputError(
+            f"implausible focal lengths ({'; '.join(one.described() for one in hypotheses)})",
+            f"a nominal field of view of {plausible[0]:g} to {plausible[1]:g} degrees",
+            "Give the camera's calibration (--camera and --params, or a known --camera), fix the focal length at a "
+            "multiple of the larger side (--set camera.refine=false --set camera.focal_factors=[0.6]), or state the "
+            "range (--set camera.field_of_view=[20, 150])",
+        )
+    left = _explaining(left)
+    left = [one for one in left if one.is_lit_from_the_camera] or left
+    return min(left, key=lambda one: one.error)
+
+
+def is_ambiguous(hypotheses: Sequence[Hypothesis], chosen: Hypothesis, plausible: tuple[float, float]) -> bool:
+    """Whether another model of plausible focal length, lit from the camera, fits nearly as well with another one."""
+    rivals = _explaining([one for one in hypotheses if one.is_plausible(plausible)])
+    if chosen.is_lit_from_the_camera:
+        rivals = [one for one in rivals if one.is_lit_from_the_camera]
+    factors = [one.focal_length / chosen.focal_length for one in rivals if one.error <= _SAME_ERROR * chosen.error]
+    return any(max(factor, 1.0 / factor) > _OTHER_FOCAL_LENGTH for factor in factors)
+
+
+def _explaining(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Those that explain the images as well as any."""
+    images = max((one.images for one in hypotheses), default=0)
+    left = [one for one in hypotheses if one.images >= _ENOUGH_IMAGES * images]
+    observations = max((one.observations for one in left), default=0)
+    return [one for one in left if one.observations >= _ENOUGH_OBSERVATIONS * observations]
+
+
+def reversed_in_depth(model: pycolmap.Reconstruction, refine_camera: bool) -> pycolmap.Reconstruction:
+    """The model with near and far exchanged, bundle-adjusted.
+
+    In the frame of the middle registered camera, every point is moved along its ray to the median depth squared divided
+    by its depth, and the rotations of the others to it are mirrored; the images change least this way.
+
+    Args:
+        model: Stays as it is.
+        refine_camera: Whether focal length and distortion are adjusted too.
+    """
+    import pycolmap
+
+    made = pycolmap.Reconstruction(model)
+    numbers = sorted(made.reg_image_ids())
+    middle = made.images[numbers[len(numbers) // 2]]
+    frame = middle.cam_from_world().matrix()
+    depths = depths_of(made)[middle.image_id][1]
+    median = float(np.median(depths[depths > 0.0])) if (depths > 0.0).any() else 1.0
+    for point in made.points3D.values():
+        local = frame[:, :3] @ point.xyz + frame[:, 3]
+        local[2] = max(local[2], _NEAREST * median)
+        point.xyz = frame[:, :3].T @ (local * (median / local[2]) ** 2 - frame[:, 3])
+    center = np.array([0.0, 0.0, median])
+    for number in numbers:
+        pose = made.images[number].cam_from_world().matrix()
+        rotation = pose[:, :3] @ frame[:, :3].T
+        translation = pose[:, 3] - rotation @ frame[:, 3]
+        mirrored = _MIRROR @ rotation @ _MIRROR
+        # The centre of the scene keeps its place in every image.
+        translation = rotation @ center + translation - mirrored @ center
+        matrix = np.concatenate([mirrored @ frame[:, :3], (mirrored @ frame[:, 3] + translation)[:, None]], axis=1)
+        made.frames[made.images[number].frame_id].rig_from_world = pycolmap.Rigid3d(matrix)
+    bundle_adjust(made, refine_camera)
+    return made

@@ -1,0 +1,90 @@
+"""Millimetres per unit of a model, from the colon's diameter or the distance between two cameras."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.reconstruction.structure.sfm import Reconstruction
+
+#: Least number of points beside the path for an estimate of the diameter.
+_FEWEST_BESIDE = 30
+
+
+def distances_beside(path: Float[np.ndarray, "M 3"], points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "K"]:
+    """Distances of points from a polyline, for those nearest to its inside instead of one of its ends. [K]
+
+    Args:
+        path: Vertices, at least two.
+        points: Points; those ahead of and behind the path are left out.
+    """
+    start, along = path[:-1], np.diff(path, axis=0)
+    squares = np.maximum((along**2).sum(axis=1), 1e-30)
+    best = np.full(len(points), np.inf)
+    where = np.zeros(len(points))
+    for index, (origin, direction, square) in enumerate(zip(start, along, squares, strict=True)):
+        share = np.clip((points - origin) @ direction / square, 0.0, 1.0)
+        distance = np.linalg.norm(points - origin - share[:, None] * direction, axis=1)
+        nearer = distance < best
+        best[nearer], where[nearer] = distance[nearer], index + share[nearer]
+    return best[(where > 0.0) & (where < len(along))]
+
+
+def from_diameter(found: Reconstruction, diameter: float) -> float:
+    """Millimetres per unit, for a colon of an inner diameter: twice the median distance of the wall from the path.
+
+    Args:
+        found: The model; only points beside its path count.
+        diameter: Typical inner diameter, mm.
+
+    Raises:
+        InputError: The path is so short that too few points lie beside it.
+    """
+    points = np.array([point.xyz for point in found.model.points3D.values()]).reshape(-1, 3)
+    beside = distances_beside(found.camera_to_world[:, :3, 3], points)
+    if len(beside) < _FEWEST_BESIDE:
+        raise InputError(
+            f"--diameter {diameter:g}, and {len(beside)} of {len(points)} points lie beside the camera's path",
+            f"at least {_FEWEST_BESIDE}",
+            "Take a longer part of the video, or give the distance of two cameras (--distance), or neither",
+        )
+    return float(diameter / (2.0 * np.median(beside)))
+
+
+def from_distance(found: Reconstruction, first: str, second: str, distance: float) -> float:
+    """Millimetres per unit, from a known distance between the cameras of two images.
+
+    Args:
+        found: The model.
+        first: File name of an image, or its stem.
+        second: Likewise.
+        distance: Between the two optical centres, mm.
+
+    Raises:
+        InputError: An image is unknown or has no pose, or the two poses coincide.
+    """
+    rows = {}
+    for row, index in enumerate(found.registered):
+        rows[found.images[index].stem] = rows[found.images[index].name] = row
+    for name in (first, second):
+        if name not in rows:
+            raise InputError(f"--distance: no image '{name}' with a pose", "two of the registered images, by name")
+    centers = found.camera_to_world[[rows[first], rows[second]], :3, 3]
+    units = float(np.linalg.norm(centers[1] - centers[0]))
+    if not units > 0.0:
+        raise InputError(f"--distance: the cameras of {first} and {second} coincide", "two positions")
+    return distance / units
+
+
+def scaled(found: Reconstruction, factor: float) -> Reconstruction:
+    """The model with positions of cameras and points multiplied by a factor."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction(found.model)
+    model.transform(pycolmap.Sim3d(factor, pycolmap.Rotation3d(), np.zeros(3)))
+    camera_to_world = found.camera_to_world.copy()
+    camera_to_world[:, :3, 3] *= factor
+    return replace(found, model=model, camera_to_world=camera_to_world)

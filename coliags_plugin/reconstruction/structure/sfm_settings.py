@@ -1,0 +1,74 @@
+"""Options of structure from motion."""
+
+from __future__ import annotations
+
+from pydantic import Field, model_validator
+from typing_extensions import Self
+
+from coliags_plugin.core.settings import Settings
+from coliags_plugin.reconstruction.structure.features import FeatureSettings
+
+
+class CameraSettings(Settings):
+    """Camera model and initial intrinsics, shared by all images."""
+
+    model: str = Field(
+        default="SIMPLE_RADIAL",
+        description="COLMAP camera model, for instance OPENCV_FISHEYE; or a calibrated camera, scaled to the images: "
+        "c3vd, c3vd-undistorted.",
+    )
+    params: tuple[float, ...] | None = Field(
+        default=None,
+        description="The model's parameters, in COLMAP's order; pixels, pixel centres at integers + 0.5. None: "
+        "estimated, or those of the calibrated camera.",
+    )
+    refine: bool | None = Field(
+        default=None, description="Whether focal length and distortion are refined. None: if they are not known."
+    )
+    focal_factors: tuple[float, ...] = Field(
+        default=(0.5, 0.75, 1.1),
+        min_length=1,
+        description="Initial focal lengths to try, relative to the image's larger side. Endoscopes have 0.4 to 1.2.",
+    )
+    field_of_view: tuple[float, float] = Field(
+        default=(40.0, 150.0),
+        description="Plausible nominal fields of view, degrees: 2 atan(side / 2f) of the image's larger side. A model "
+        "with another focal length is refused.",
+    )
+
+    @model_validator(mode="after")
+    def _ranges(self) -> Self:
+        if not min(self.focal_factors) > 0.0:
+            raise ValueError(f"focal_factors = {self.focal_factors}: they must be positive")
+        if not 0.0 < self.field_of_view[0] < self.field_of_view[1] < 180.0:
+            raise ValueError(f"field_of_view = {self.field_of_view}: two ascending angles between 0 and 180 degrees")
+        return self
+
+
+class SfmSettings(Settings):
+    """Options of matching and incremental mapping."""
+
+    camera: CameraSettings = CameraSettings()
+    """Camera model and initial intrinsics, shared by all images."""
+    features: FeatureSettings = FeatureSettings(max_features=6000, peak_threshold=0.002)
+    """Feature extraction."""
+    exhaustive_up_to: int = Field(default=25, ge=0, description="Up to this many images are matched exhaustively.")
+    min_alike: int = Field(
+        default=12,
+        ge=1,
+        description="Images further apart than two are matched if at least this many of their largest features match.",
+    )
+    max_ratio: float = Field(default=0.8, gt=0.0, le=1.0, description="Largest ratio in Lowe's ratio test.")
+    max_distance: float = Field(
+        default=0.7, gt=0.0, le=2.0, description="Largest L2 distance between matched unit-length descriptors."
+    )
+    max_error: float = Field(
+        default=4.0, gt=0.0, description="RANSAC inlier threshold of two-view geometric verification, pixels."
+    )
+    min_model_size: int = Field(default=3, ge=2, description="Least number of registered images of a model.")
+    search_images: int = Field(
+        default=24,
+        ge=3,
+        description="The initial focal length is chosen on this many images from the middle of the video.",
+    )
+    seed: int = Field(default=0, ge=0, description="Seed of COLMAP's random samples.")

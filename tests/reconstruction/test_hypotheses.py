@@ -1,0 +1,164 @@
+"""Choice among models by the lamp; reversal of depth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+import pytest
+from scipy.spatial.transform import Rotation
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.reconstruction.structure.hypotheses import Hypothesis, choose, is_ambiguous, reversed_in_depth
+from coliags_plugin.reconstruction.structure.observations import brightness_at, brightness_correlation, depths_of
+
+RANGE = (40.0, 150.0)
+#: Of a camera so far away that its images are nearly affine.
+NARROW = (3.0, 150.0)
+WIDTH, FOCAL = 200, 2000.0
+COUNT, POINTS = 8, 120
+BRIGHTNESS = 1e8
+
+
+def turntable(depth=1000.0, relief=8.0, noise=0.3, seed=0):
+    """A shallow, distant surface that turns in front of the camera, and its exact depths: nearly affine images."""
+    rng = np.random.default_rng(seed)
+    points = np.column_stack([rng.uniform(-30, 30, (POINTS, 2)), rng.uniform(-relief, relief, POINTS)])
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", FOCAL, WIDTH, WIDTH)
+    camera.camera_id = 1
+    model.add_camera_with_trivial_rig(camera)
+    depths = []
+    for index in range(COUNT):
+        rotation = Rotation.from_euler("yx", [2.0 * (index - COUNT / 2), 1.5 * np.sin(index)], degrees=True).as_matrix()
+        pose = np.column_stack([rotation, (0.0, 0.0, depth)])
+        local = points @ rotation.T + pose[:, 3]
+        pixels = FOCAL * local[:, :2] / local[:, 2:] + WIDTH / 2 + rng.normal(0.0, noise, (POINTS, 2))
+        image = pycolmap.Image(name=f"{index}.png", camera_id=1, image_id=index + 1)
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in pixels])
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
+        depths.append(local[:, 2])
+    for number, position in enumerate(points):
+        track = pycolmap.Track()
+        for index in range(COUNT):
+            track.add_element(index + 1, number)
+        model.add_point3D(position, track, np.zeros(3, np.uint8))
+    model.update_point_3d_errors()
+    return model, np.array(depths)
+
+
+def shape_correlation(model, depths):
+    """Correlation of a model's depths in the middle image with the true ones."""
+    features, z = depths_of(model)[COUNT // 2 + 1]
+    return np.corrcoef(z, depths[COUNT // 2][features])[0, 1]
+
+
+@pytest.fixture(scope="module")
+def ambiguous():
+    model, depths = turntable()
+    return model, reversed_in_depth(model, refine_camera=False), depths
+
+
+def test_a_shallow_surface_reversed_in_depth_fits_nearly_as_well(ambiguous):
+    model, other, depths = ambiguous
+    assert shape_correlation(model, depths) > 0.99
+    assert shape_correlation(other, depths) < -0.9
+    assert other.compute_num_observations() > 0.95 * model.compute_num_observations()
+    assert other.compute_mean_reprojection_error() < 1.0
+    # The model that was given stays as it was.
+    assert model.compute_num_observations() == COUNT * POINTS
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_the_lamp_chooses_between_a_model_and_its_reversal(ambiguous, swapped):
+    """Light falls off with the squared distance; the gain of each image is arbitrary."""
+    model, other, depths = ambiguous
+    gain = np.linspace(0.5, 2.0, COUNT)[:, None]
+    brightness = list(gain * BRIGHTNESS / depths**2)
+    pair = [Hypothesis.of(model, brightness), Hypothesis.of(other, brightness, is_reversed=True)]
+    assert choose(pair[::-1] if swapped else pair, NARROW) is pair[0]
+    assert pair[0].correlation == pytest.approx(-1.0, abs=0.02)
+    assert pair[1].correlation > 0.8
+    # Under a light that grows with the distance, the reversed model is taken, whatever the errors.
+    inverse = list(gain * depths**2 / 1e4)
+    pair = [Hypothesis.of(model, inverse), Hypothesis.of(other, inverse, is_reversed=True)]
+    assert choose(pair, NARROW).is_reversed
+
+
+def test_two_reversals_are_none():
+    model, depths = turntable(noise=0.0)
+    again = reversed_in_depth(reversed_in_depth(model, False), False)
+    assert shape_correlation(again, depths) > 0.95
+
+
+@dataclass
+class Camera:
+    width: int
+    height: int
+    focal: float
+
+    def mean_focal_length(self):
+        return self.focal
+
+
+@dataclass
+class Model:
+    """Numbers of a model that the choice uses."""
+
+    focal: float = 200.0
+    images: int = 20
+    observations: int = 1000
+    error: float = 0.5
+
+    @property
+    def cameras(self):
+        return {1: Camera(320, 240, self.focal)}
+
+    def num_reg_images(self):
+        return self.images
+
+    def compute_num_observations(self):
+        return self.observations
+
+    def compute_mean_reprojection_error(self):
+        return self.error
+
+
+def test_plausible_then_complete_then_lit_then_exact():
+    best = Hypothesis(Model(error=0.6), -0.7)
+    others = [
+        Hypothesis(Model(focal=1967.0, observations=2000, error=0.1), -0.9),
+        Hypothesis(Model(images=15, error=0.1), -0.9),
+        Hypothesis(Model(observations=500, error=0.1), -0.9),
+        Hypothesis(Model(error=0.1), 0.2),
+        Hypothesis(Model(error=0.1), None),
+        Hypothesis(Model(error=0.7), -0.9),
+    ]
+    assert choose([*others, best], RANGE) is best
+    with pytest.raises(InputError, match=r"1967 px \(9 degrees\).*nominal field of view of 40 to 150 degrees"):
+        choose(others[:1], RANGE)
+
+
+def test_other_focal_lengths_that_fit_as_well_are_told():
+    chosen = Hypothesis(Model(), -0.7)
+    assert not is_ambiguous([chosen], chosen, RANGE)
+    assert is_ambiguous([chosen, Hypothesis(Model(focal=260.0, error=0.52), -0.5)], chosen, RANGE)
+    assert not is_ambiguous([chosen, Hypothesis(Model(focal=210.0, error=0.52), -0.5)], chosen, RANGE)
+    assert not is_ambiguous([chosen, Hypothesis(Model(focal=260.0, error=0.7), -0.5)], chosen, RANGE)
+    assert not is_ambiguous([chosen, Hypothesis(Model(focal=260.0, error=0.52), 0.5)], chosen, RANGE)
+
+
+def test_correlation_of_exact_falloff_and_of_too_few_points():
+    model, depths = turntable(noise=0.0)
+    brightness = list(BRIGHTNESS / depths**2 - 1.0)
+    assert brightness_correlation(model, brightness) == pytest.approx(-1.0, abs=1e-9)
+    assert brightness_correlation(model, [np.full(POINTS, 50.0)] * COUNT) is None
+    assert brightness_correlation(pycolmap.Reconstruction(), []) is None
+
+
+def test_brightness_is_the_mean_around_a_pixel():
+    image = np.zeros((20, 30, 3), np.uint8)
+    image[5:12, 10:17] = 70
+    found = brightness_at(image, np.array([(13.5, 8.5), (25.0, 18.0), (29.9, 19.9)]))
+    np.testing.assert_allclose(found, [70.0, 0.0, 0.0])

@@ -1,0 +1,68 @@
+"""Cameras that structure from motion starts with."""
+
+from __future__ import annotations
+
+import numpy as np
+import pycolmap
+import pytest
+from pydantic import ValidationError
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.lenses.models import LENSES
+from coliags_plugin.reconstruction.structure.sfm_cameras import (
+    CALIBRATED,
+    calibrated_camera,
+    field_of_view,
+    is_refined,
+    starting_cameras,
+)
+from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings
+
+
+def test_c3vd_at_full_size_is_the_official_calibration():
+    model, params = calibrated_camera("c3vd", 1350, 1080)
+    assert model == "OPENCV_FISHEYE"
+    # REIM-NeRF's c3vd_calib.json, whose pixel centres are at integers.
+    expected = (767.3861511125845, 767.5058656118406, 679.554265997005, 544.146891684636)
+    assert params[:4] == pytest.approx(expected, rel=1e-14)
+    assert params[4:] == (-0.18867185058223412, -0.003927337093919806, 0.030524814153620117, -0.012756926010904904)
+
+
+def test_undistorted_images_are_those_of_the_legacy_pinhole():
+    model, params = calibrated_camera("c3vd-undistorted", 675, 540)
+    assert model == "PINHOLE"
+    assert params == pytest.approx((401.1595, 400.9425, 0.5 * (668.286 + 0.5), 0.5 * (547.733 + 0.5)))
+
+
+@pytest.mark.parametrize("name", CALIBRATED)
+@pytest.mark.parametrize("size", [(1350, 1080), (675, 540), (338, 270)])
+def test_colmaps_camera_projects_as_the_lens(name, size):
+    (camera,) = starting_cameras(CameraSettings(model=name), [], [size], 1.0)
+    points = np.random.default_rng(0).uniform((-0.8, -0.6, 1.0), (0.8, 0.6, 1.0), (50, 3))
+    lens = LENSES[CALIBRATED[name]].resized(*size)
+    k = lens.pinhole
+    pinhole = points[:, :2] * (k.fx, k.fy) + (k.cx, k.cy)
+    expected = lens.project(points) if camera.model_name == "OPENCV_FISHEYE" else pinhole
+    np.testing.assert_allclose(camera.img_from_cam(points), expected, atol=1e-6)
+
+
+def test_crops_are_refused_and_known_cameras_are_kept():
+    with pytest.raises(InputError, match=r"--camera c3vd, and images of 800 x 800. Expected the whole frame"):
+        calibrated_camera("c3vd", 800, 800)
+    assert not is_refined(CameraSettings(model="c3vd"))
+    assert is_refined(CameraSettings(model="c3vd", refine=True))
+    assert is_refined(CameraSettings())
+    assert not is_refined(CameraSettings(params=(1.0,)))
+    assert is_refined(CameraSettings(params=(1.0,), refine=True))
+    assert not is_refined(CameraSettings(refine=False))
+
+
+def test_field_of_view_has_a_closed_form():
+    camera = pycolmap.Camera.create_from_model_name(0, "PINHOLE", 100.0, 200, 120)
+    assert field_of_view(camera) == pytest.approx(90.0)
+
+
+@pytest.mark.parametrize("wrong", [{"focal_factors": (0.5, 0.0)}, {"field_of_view": (90, 40)}, {"focal_factors": ()}])
+def test_ranges_that_are_none_are_refused(wrong):
+    with pytest.raises(ValidationError):
+        CameraSettings(**wrong)
