@@ -113,7 +113,7 @@ def check_scene(
     found_suspect = [
         *suspect.agreement_findings(readings, scale, path, depth),
         *suspect.match_findings(matched),
-        *suspect.depth_findings(depth),
+        *suspect.depth_findings(depth, scene.provenance.get("unit", "mm") == "mm"),
         *suspect.lamp_findings(lamp),
         *suspect.path_findings(path),
         *suspect.calibration_findings(video),

@@ -128,6 +128,8 @@ def test_everything_in_metres(scene):
     found = whats(metres)
     assert "depth looks like metres" in found
     assert "different units" not in found
+    unknown = replace(metres, provenance={**metres.provenance, "unit": "unknown"})
+    assert [finding.what for finding in check_scene(unknown).findings] == ["depth is beside the near plane"]
 
 
 def test_depth_of_other_frames(frames):
