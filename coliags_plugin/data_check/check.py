@@ -101,8 +101,9 @@ def check_scene(
         scale = best_scale(with_depth)
     else:
         # Epipolar errors grow with the baseline, so frames further apart are compared.
-        pairs = video_pairs(video if at_stored_size is None else video_of(at_stored_size()), farther=3)
-        matches = match(pairs)
+        pairs = video_pairs(video, farther=3)
+        full = {frame.name: frame for frame in (video if at_stored_size is None else video_of(at_stored_size()))}
+        matches = match([(full[source.name], full[target.name]) for source, target in pairs])
         found = {name: epipolar_agreement(matches, name) for name in CHANGES}
         matched = {name: reading for name, reading in found.items() if reading is not None}
     if progress is not None:
@@ -112,7 +113,7 @@ def check_scene(
     found_suspect = [
         *suspect.agreement_findings(readings, scale, path, depth),
         *suspect.match_findings(matched),
-        *suspect.depth_findings(depth),
+        *suspect.depth_findings(depth, scene.provenance.get("unit", "mm") == "mm"),
         *suspect.lamp_findings(lamp),
         *suspect.path_findings(path),
         *suspect.calibration_findings(video),

@@ -55,8 +55,13 @@ class Finding:
     do: str
 
 
-def depth_findings(depth: DepthFacts | None) -> Iterator[Finding]:
-    """Implausible depth: mostly unknown, constant, or in another unit."""
+def depth_findings(depth: DepthFacts | None, metric: bool) -> Iterator[Finding]:
+    """Implausible depth: mostly unknown, constant, or in another unit.
+
+    Args:
+        depth: Its statistics.
+        metric: Whether lengths are stated to be in mm; False where their unit is unknown.
+    """
     if depth is None:
         return
     if depth.invalid_share > 0.5:
@@ -73,14 +78,20 @@ def depth_findings(depth: DepthFacts | None) -> Iterator[Finding]:
             f"{depth.nearest:.4g} to {depth.farthest:.4g}",
             "Check the depth files: a failed export can leave images of one value",
         )
-    if depth.median < 1.0:
+    if depth.median < 1.0 and not metric:
+        yield Finding(
+            "depth is beside the near plane",
+            f"median {depth.median:.4g}; renderers clip at {NEAR:g}",
+            "Multiply poses and depth by one factor, for instance 10: their unit is unknown anyway",
+        )
+    elif depth.median < 1.0:
         yield Finding(
             "depth looks like metres",
             f"median {depth.median:.4g}; this package expects millimetres, and renderers clip at a near plane of "
             f"{NEAR:g}",
             "Give lengths in mm: poses and depth times 1000, or the format's unit option",
         )
-    elif depth.median > 1000.0:
+    elif depth.median > 1000.0 and metric:
         yield Finding(
             "depth is too far for an endoscope",
             f"median {depth.median:.4g} mm",

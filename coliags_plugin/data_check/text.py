@@ -34,12 +34,14 @@ def fact_rows(check: SceneCheck) -> Iterator[tuple[str, str]]:
         f"f {camera.fx:.2f}, {camera.fy:.2f}, centre {camera.cx:.2f}, {camera.cy:.2f} px, {angle:.1f} degrees across",
     )
     yield "pose convention", _convention(data.get("pose_convention"))
+    unit = data.get("unit", "mm")
+    yield "unit of length", str(unit)
     if check.depth is not None:
-        depth = check.depth
+        depth, mm = check.depth, " mm" if unit == "mm" else ""
         yield (
             "depth",
-            f"median {depth.median:.4g}, 1 % to 99 %: {depth.nearest:.4g} to {depth.farthest:.4g} (mm, if the data are "
-            f"metric); {depth.invalid_share:.1%} unknown, of which {depth.clipped_share:.1%} clipped",
+            f"median {depth.median:.4g}, 1 % to 99 %: {depth.nearest:.4g} to {depth.farthest:.4g}{mm}; "
+            f"{depth.invalid_share:.1%} unknown, of which {depth.clipped_share:.1%} clipped",
         )
     else:
         yield "depth", "none"

@@ -72,7 +72,7 @@ def _frames(check: DepthCheck) -> str:
     bar = color_bar_svg((0.0, limit), unit, "error", "|dz|", "depth-error")
     views = "".join("".join(_view(check, place, limit)) for place in places)
     note = "Errors are hatched where the truth is unknown, and grey where there is no estimate."
-    return f'<section><h2>Frames</h2><p class="hint">{note}</p>{bar}{views}</section>'
+    return f'<section><h2>Frames</h2><p class="hint">{note}</p><div class="scales">{bar}</div>{views}</section>'
 
 
 def _view(check: DepthCheck, place: int, limit: float) -> Iterator[str]:

@@ -65,7 +65,7 @@ class DepthSource:
 def open_depth(
     path: Path, data_format: str | None = None, options: Sequence[str] = (), progress: Progress | None = None
 ) -> DepthSource:
-    """The depth maps of a scene, or of a folder of TIFF or NPY files.
+    """The depth maps of a scene's video, or of a folder of TIFF or NPY files.
 
     Args:
         path: A scene's folder; or one of float32 TIFF or ``.npy`` files, mm. 8-bit PNGs of the same stems in a folder
@@ -85,8 +85,7 @@ def open_depth(
 
 
 def _of_scene(path: Path, scene: Scene) -> DepthSource:
-    frames = [*scene.train, *(frame for frames in scene.test_sets.values() for frame in frames)]
-    frames.sort(key=lambda frame: frame.index)
+    frames = sorted([*scene.train, *scene.test_sets.get("test", [])], key=lambda frame: frame.index)
     kept = [frame for frame in frames if frame.depth is not None or frame.sparse_depth is not None]
     if not kept:
         raise InputError(f"{path} has no depth", "a scene with depth files or sparse depth", "Name a scene with depth")

@@ -13,7 +13,8 @@ import torch
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene, SparseDepth
 from coliags_plugin.data_check.check import check_scene
-from coliags_plugin.data_check.facts import moving_step, video_of
+from coliags_plugin.data_check.facts import image_facts, moving_step, path_facts, video_of
+from coliags_plugin.data_check.findings import image_findings, path_findings
 from coliags_plugin.data_check.hypotheses import CHANGES
 from coliags_plugin.data_check.lamp import lamp_facts
 from coliags_plugin.data_check.matches import epipolar_agreement, match
@@ -124,8 +125,11 @@ def test_depth_in_another_unit_than_poses(scene, factor, told):
 
 def test_everything_in_metres(scene):
     metres = changed(scene, pose=lambda pose: scaled_translation(pose, 1e-3), depth=lambda depth: depth * 1e-3)
-    assert "depth looks like metres" in whats(metres)
-    assert "different units" not in whats(metres)
+    found = whats(metres)
+    assert "depth looks like metres" in found
+    assert "different units" not in found
+    unknown = replace(metres, provenance={**metres.provenance, "unit": "unknown"})
+    assert [finding.what for finding in check_scene(unknown).findings] == ["depth is beside the near plane"]
 
 
 def test_depth_of_other_frames(frames):
@@ -146,18 +150,25 @@ def test_a_jump_a_standstill_black_and_repeated_images(scene):
         moved[0, 3] += 500.0 * (pose[2, 3] > middle)
         return moved
 
+    def of_path(wrong: Scene) -> str:
+        return next(path_findings(path_facts(video_of(wrong)))).what
+
+    def of_images(wrong: Scene) -> str:
+        return next(image_findings(image_facts(video_of(wrong)))).what
+
     assert "the camera jumps" in whats(changed(scene, pose=jumping))
-    assert "the camera does not move" in whats(changed(scene, pose=lambda pose: torch.eye(4)))
-    assert "an image is black" in whats(changed(scene, image=lambda image, index: image * (index != 5)))
+    assert of_path(changed(scene, pose=lambda pose: torch.eye(4))) == "the camera does not move"
+    assert of_images(changed(scene, image=lambda image, index: image * (index != 5))) == "an image is black"
     first = scene.train[0].image
     repeated = changed(scene, image=lambda image, index: first if index in (1, 2, 3) else image)
-    assert "images repeat" in whats(repeated)
+    assert of_images(repeated) == "images repeat"
 
 
 def test_constant_and_unknown_depth(scene):
     flat = changed(scene, depth=lambda depth: torch.full_like(depth, 30.0))
-    assert whats(flat).startswith("depth is the same everywhere: ")
-    assert "; " not in whats(flat)
+    found = whats(flat)
+    assert found.startswith("depth is the same everywhere: ")
+    assert "; " not in found
     noise = torch.rand(128, 160, generator=torch.Generator().manual_seed(0))
     dummy = changed(scene, depth=lambda depth: 30.0 + 0.1 * noise)
     assert "different units" not in whats(dummy)
@@ -192,7 +203,11 @@ def paused(frames: list[Frame], pauses=(6, 15), length=40, jitter=0.002) -> Scen
         pose[:3, 3] += torch.from_numpy(rng.normal(size=3) * jitter)
         noise = torch.from_numpy(rng.integers(0, 2, frame.image.shape, dtype=np.uint8))
         camera = replace(frame.camera, camera_to_world=pose)
-        video.append(replace(frame, index=len(video), camera=camera, depth=None, image=frame.image + noise))
+        video.append(
+            replace(
+                frame, name=f"{len(video):04d}", index=len(video), camera=camera, depth=None, image=frame.image + noise
+            )
+        )
     return Scene("paused", video, {}, PointCloud(torch.zeros(0, 3)), {})
 
 
