@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from coliags_plugin.config.method_config import MethodConfig
     from coliags_plugin.core.cameras import Camera
     from coliags_plugin.core.scenes import Scene
+    from coliags_plugin.engine.rendering import DepthKind
     from coliags_plugin.engine.trained import TrainedRun
     from coliags_plugin.results.record import Result
 
@@ -170,6 +171,8 @@ class Run:
         video: bool = True,
         fps: float = 15.0,
         channels: Sequence[str] = (),
+        depth_kind: DepthKind = "accumulated",
+        depth_tiff: bool = False,
         overwrite: bool = False,
     ) -> Path:
         """Write colour, depth and error images of a set of frames, and a video along the trajectory.
@@ -180,6 +183,8 @@ class Run:
             video: Also write ``trajectory.mp4``, rgb beside depth.
             fps: Frames per second of the video.
             channels: Feature channels to write as images too.
+            depth_kind: ``accumulated``, ``expected`` or ``median`` (docs/conventions.md 3).
+            depth_tiff: Also write depth as float32 TIFF, scene units.
             overwrite: Replace the folder where it exists.
 
         Returns:
@@ -192,7 +197,7 @@ class Run:
 
         trained = self.load()
         folder = Path(output) if output is not None else self.path / ("renders" if trained.lamp is None else "relit")
-        render_run(trained, folder, frames, video, fps, overwrite, channels)
+        render_run(trained, folder, frames, video, fps, overwrite, channels, depth_kind, depth_tiff)
         return folder
 
     def relight(self, /, **lamp: Any) -> Run:

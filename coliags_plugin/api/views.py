@@ -17,7 +17,13 @@ from coliags_plugin.core.render_output import DEPTH_KINDS
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.engine import rendering
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.outputs.colormaps import DEPTH_ERROR_LIMIT_MM, colorize_depth, colorize_depth_error, depth_limits
+from coliags_plugin.outputs.colormaps import (
+    DEPTH_ERROR_LIMIT_MM,
+    colorize_depth,
+    colorize_depth_error,
+    common_limits,
+    depth_limits,
+)
 from coliags_plugin.outputs.image_files import as_array, eight_bit, encode_png
 
 #: Smallest width of an image in a notebook, px on the screen.
@@ -37,6 +43,7 @@ class View:
         outputs: The other outputs asked for. [H, W] or [H, W, C] each
         true_rgb: Recorded colours; None for a free camera, and under another lamp. [H, W, 3]
         true_depth: True z-depth, mm; NaN where unknown or not to be looked at. None where there is none. [H, W]
+        unit: Of depths.
     """
 
     name: str
@@ -47,11 +54,13 @@ class View:
     outputs: Mapping[str, np.ndarray] = field(repr=False)
     true_rgb: UInt8[np.ndarray, "H W 3"] | None = field(default=None, repr=False)
     true_depth: Float32[np.ndarray, "H W"] | None = field(default=None, repr=False)
+    unit: str = "mm"
 
     def images(self) -> dict[str, UInt8[np.ndarray, "H W 3"]]:
         """Truth, rendering, depths on one scale, and depth error as images, by captions. [H, W, 3] each"""
-        limits = depth_limits([self.depth] if self.true_depth is None else [self.depth, self.true_depth])
-        scale = f"0 to {limits[1]:.0f} mm"
+        depths = [self.depth] if self.true_depth is None else [self.depth, self.true_depth]
+        limits = depth_limits(depths) if self.unit == "mm" else common_limits(depths)
+        scale = f"0 to {limits[1]:g} {self.unit}"
         shown = {} if self.true_rgb is None else {"truth": self.true_rgb}
         shown["rendered"] = self.rgb
         if self.true_depth is not None:
@@ -60,7 +69,7 @@ class View:
         if self.true_depth is not None:
             known, limit = np.isfinite(self.true_depth), DEPTH_ERROR_LIMIT_MM
             errors = colorize_depth_error(self.depth, self.true_depth, known, limit)
-            shown[f"depth error, 0 to {limit:g} mm"] = errors
+            shown[f"depth error, 0 to {limit:g} {self.unit}"] = errors
         return shown
 
     def _repr_html_(self) -> str:
@@ -101,6 +110,7 @@ def view_of(trained: TrainedRun, of: str | Camera, depth: str, outputs: Sequence
         outputs={name: as_array(found[name]) for name in outputs},
         true_rgb=None if frame is None or trained.lamp is not None else as_array(frame.image),
         true_depth=None if frame is None else _true_depth(frame),
+        unit=trained.scene.length_unit,
     )
 
 
@@ -117,6 +127,6 @@ def _frame(scene: Scene, name: str) -> tuple[Frame, Camera]:
 
 
 def _true_depth(frame: Frame) -> Float32[np.ndarray, "H W"] | None:
-    if frame.depth is None:
+    if frame.depth is None or frame.depth_confidence is not None:
         return None
     return as_array(frame.depth.masked_fill(~frame.valid, math.nan).float())

@@ -25,6 +25,11 @@ class Render:
     """Also write trajectory.mp4, rgb beside depth."""
     fps: float = 15.0
     """Frames per second of the video."""
+    depth_kind: Literal["accumulated", "expected", "median"] = "accumulated"
+    """Which depth: sum w z; the same divided by alpha; or that of the Gaussian at which half of the light is
+    absorbed. Pictures are hatched where alpha is below 0.5."""
+    depth_tiff: bool = False
+    """Also write depth as float32 TIFF, scene units: depth_tiff/."""
     light: LampOptions = ()
     """Render under another lamp, for methods that model it: offset=[X,Y,Z] from the camera in its axes (mm),
     turn=[A,B] about its x and y axes (degrees), power=P (exponent of the cosine to the lamp's axis), intensity=F
@@ -54,6 +59,8 @@ class Render:
                 video=self.video,
                 fps=self.fps,
                 channels=self.channel,
+                depth_kind=self.depth_kind,
+                depth_tiff=self.depth_tiff,
                 overwrite=self.overwrite,
             )
         )

@@ -26,6 +26,9 @@ OUTPUTS = (
     "distortion",  # sum_{j<i} w_i w_j (m_i - m_j)^2, m a depth in [0, 1]; surfels only
 )
 
+#: Alpha below which a pixel shows more background than tissue, so that its depth means little.
+OPAQUE_ALPHA = 0.5
+
 #: Outputs that only surfels have.
 SURFEL_OUTPUTS = frozenset({"distortion"})
 
@@ -64,6 +67,17 @@ class RenderOutput:
     camera: Camera | None
     maps: dict[str, Tensor] = field(default_factory=dict)
     splats: Splats | None = None
+
+    @property
+    def expected_depth(self) -> Float[Tensor, "H W"] | None:
+        """Expected depth, sum w z / sum w, NaN where alpha is below :data:`OPAQUE_ALPHA`. [H, W]
+
+        Of a view with accumulated depth; None where that was not requested.
+        """
+        accumulated = self.maps.get("depth_accumulated")
+        if accumulated is None:
+            return None
+        return torch.where(self.alpha >= OPAQUE_ALPHA, accumulated / self.alpha, torch.nan)
 
     @property
     def drawn(self) -> Splats:

@@ -212,6 +212,11 @@ class Scene:
     points: PointCloud
     provenance: dict[str, Any] = field(default_factory=dict)
 
+    @property
+    def length_unit(self) -> str:
+        """Unit of lengths, as printed: ``mm``, or ``units`` where it is unknown."""
+        return "mm" if self.provenance.get("unit", "mm") == "mm" else "units"
+
     def __repr__(self) -> str:
         """Counts, not pixels."""
         sets = {"train": self.train, **self.test_sets}

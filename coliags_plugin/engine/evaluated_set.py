@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from coliags_plugin.contracts import Comparison
+from coliags_plugin.core.render_output import OPAQUE_ALPHA
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.scoring import Scorer, Scores, within_seen
 from coliags_plugin.results.hashing import ArraysHash
@@ -26,9 +29,19 @@ class EvaluatedSet:
         self._predictions, self._truth = ArraysHash(), ArraysHash()
         self._profiles = ErrorProfiles()
         self._optional: tuple[str, ...] = ()
+        self._pixels = self._transparent = 0
 
-    def add(self, frame: Frame, comparison: Comparison, scorer: Scorer) -> None:
-        """Score a frame and take it up."""
+    def add(self, frame: Frame, comparison: Comparison, scorer: Scorer, alpha: Float[Tensor, "H W"]) -> None:
+        """Score a frame and take it up.
+
+        Args:
+            frame: The frame.
+            comparison: It and what was rendered, prepared by the protocol.
+            scorer: Whose metrics are computed.
+            alpha: As rendered. [H, W]
+        """
+        self._pixels += int(frame.valid.sum())
+        self._transparent += int(((alpha < OPAQUE_ALPHA) & frame.valid).sum())
         self._add_scores(frame.name, scorer.score(comparison))
         self._optional = tuple(scorer.optional_metrics)
         if frame.seen is not None:
@@ -81,6 +94,7 @@ class EvaluatedSet:
             predictions_sha256=self._predictions.hexdigest(),
             truth_sha256=self._truth.hexdigest(),
             profiles=self._profiles.records(),
+            transparent=self._transparent / self._pixels if self._pixels else None,
         )
 
 

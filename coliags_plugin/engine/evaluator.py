@@ -12,6 +12,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, atomic_write, write_json
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.engine.costs import RenderMeter
+from coliags_plugin.engine.depth_pictures import EXPECTED_DEPTH, write_depth_pictures
 from coliags_plugin.engine.evaluated_set import EvaluatedSet
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.progress import ProgressReport
@@ -65,10 +66,13 @@ def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None
                 placed = frame.to(trained.device)
                 output = meter.render(partial(scorer.render, trained.model, placed))
                 comparison = scorer.protocol.compare(output, placed)
-                evaluated[set_name].add(placed, comparison, scorer)
+                evaluated[set_name].add(placed, comparison, scorer, output.alpha)
                 _write_images(scratch, set_name, frame, comparison)
+                if (depth := output.expected_depth) is not None:
+                    write_depth_tiff(scratch / EXPECTED_DEPTH / set_name / f"{frame.name}.tiff", depth)
                 done += 1
                 progress.update(done)
+        write_depth_pictures(scratch, scene.length_unit)
         result = run_result(trained, scorer, evaluated, meter, truth)
         write_result(scratch / RESULT_FILE, result)
         write_json(scratch / "metrics.json", means_summary(result))

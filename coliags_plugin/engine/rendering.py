@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -13,7 +14,7 @@ from coliags_plugin.config.yaml_tree import dump
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.files import atomic_folder, atomic_write
-from coliags_plugin.core.render_output import RenderOutput
+from coliags_plugin.core.render_output import OPAQUE_ALPHA, RenderOutput
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.trained import TrainedRun
@@ -23,14 +24,17 @@ from coliags_plugin.outputs.colormaps import (
     colorize_depth,
     colorize_depth_error,
     colorize_rgb_error,
+    common_limits,
     depth_limits,
 )
-from coliags_plugin.outputs.image_files import eight_bit, write_png
+from coliags_plugin.outputs.image_files import as_array, eight_bit, write_depth_tiff, write_png
 from coliags_plugin.outputs.video import write_video
 
 #: Upper limit of the colour error images, as a share of the colour range.
 RGB_ERROR_LIMIT = 0.2
-#: Outputs that the images are made of.
+#: Kinds of depth that can be written, by the names that users give them.
+DepthKind = Literal["accumulated", "expected", "median"]
+#: Outputs of a view unless others are asked for.
 _WANTS = ("rgb", "alpha", "depth_accumulated")
 
 
@@ -42,10 +46,13 @@ def render_run(
     fps: float,
     overwrite: bool,
     channels: Sequence[str] = (),
+    depth_kind: DepthKind = "accumulated",
+    depth_tiff: bool = False,
 ) -> None:
     """Write colour, depth and error images of a set of frames, and a video along the trajectory.
 
-    A relit run has its lamp in ``lamp.yaml``, and no colour errors, there being no images under that lamp.
+    A relit run has its lamp in ``lamp.yaml``, and no colour errors, there being no images under that lamp. Depth is
+    hatched where alpha is below 0.5, and has no errors where the scene's own is estimated.
 
     Args:
         trained: The run.
@@ -55,33 +62,42 @@ def render_run(
         fps: Of the video.
         overwrite: Replace ``output`` where it exists.
         channels: Feature channels of one or three numbers to write as images too, 1 as white.
+        depth_kind: Which depth (docs/conventions.md 3).
+        depth_tiff: Also write depth as float32 TIFF, scene units, of every pixel.
 
     Raises:
-        InputError: No such frames or channel, or the folder exists or cannot be written.
+        InputError: No such frames or channel, the renderer does not deliver that depth, or the folder exists or cannot
+            be written.
     """
     chosen = choose_frames(trained.scene, frames)
     _check_channels(trained, channels)
+    depth = f"depth_{depth_kind}"
+    wants, unit = ("rgb", "alpha", depth), trained.scene.length_unit
+    trained.model.check_outputs(wants, f"depth of kind '{depth_kind}'")
     path = choose_frames(trained.scene, "all")
     sample = chosen[:: max(1, len(chosen) // 4)][:4]
-    limits = depth_limits(render_view(trained, frame)["depth_accumulated"] for frame in sample)
+    sampled = [as_array(render_view(trained, frame, wants)[depth]) for frame in sample]
+    limits = depth_limits(sampled) if unit == "mm" else common_limits(sampled)
     with (
         atomic_folder(output, overwrite) as folder,
         ProgressReport("render", len(chosen) + len(path) * video) as progress,
     ):
         for count, frame in enumerate(chosen, start=1):
-            view = render_view(trained, frame, (*_WANTS, *channels))
-            _write_frame(folder, frame, view, limits, relit=trained.lamp is not None)
+            view = render_view(trained, frame, (*wants, *channels))
+            _write_frame(folder, frame, view, depth, limits, relit=trained.lamp is not None)
+            if depth_tiff:
+                write_depth_tiff(folder / "depth_tiff" / f"{frame.name}.tiff", view[depth])
             for channel in channels:
                 write_png(folder / channel / f"{frame.name}.png", eight_bit(_as_rgb(view[channel])))
             progress.update(count)
-        write_png(folder / "depth_scale.png", color_bar(limits, "mm", "depth"))
-        write_png(folder / "depth_error_scale.png", color_bar((0.0, DEPTH_ERROR_LIMIT_MM), "mm", "error"))
+        write_png(folder / "depth_scale.png", color_bar(limits, unit, "depth"))
+        write_png(folder / "depth_error_scale.png", color_bar((0.0, DEPTH_ERROR_LIMIT_MM), unit, "error"))
         if trained.lamp is None:
             write_png(folder / "rgb_error_scale.png", color_bar((0.0, RGB_ERROR_LIMIT), "of full scale", "error"))
         else:
             atomic_write(folder / "lamp.yaml", dump(trained.lamp.model_dump()))
         if video:
-            write_video(_film(trained, path, limits, progress, len(chosen)), folder / "trajectory.mp4", fps)
+            write_video(_film(trained, path, depth, limits, progress, len(chosen)), folder / "trajectory.mp4", fps)
 
 
 def choose_frames(scene: Scene, frames: str) -> list[Frame]:
@@ -129,25 +145,37 @@ def _as_rgb(channel: Tensor) -> Tensor:
     return channel.reshape(*channel.shape[:2], -1).expand(-1, -1, 3)
 
 
-def _write_frame(folder: Path, frame: Frame, output: RenderOutput, limits: tuple[float, float], relit: bool) -> None:
+def _write_frame(
+    folder: Path, frame: Frame, output: RenderOutput, depth_name: str, limits: tuple[float, float], relit: bool
+) -> None:
     name = f"{frame.name}.png"
-    depth = output["depth_accumulated"]
+    depth = output[depth_name]
     write_png(folder / "rgb" / name, eight_bit(output.rgb))
-    write_png(folder / "depth" / name, colorize_depth(depth, limits))
+    write_png(folder / "depth" / name, _depth_picture(output, depth_name, limits))
     valid = frame.valid.cpu()
     if not relit:
         errors = colorize_rgb_error(output.rgb.cpu(), frame.image, valid, RGB_ERROR_LIMIT)
         write_png(folder / "rgb_error" / name, errors)
-    if frame.depth is not None:
+    if frame.depth is not None and frame.depth_confidence is None:
         errors = colorize_depth_error(depth.cpu(), frame.depth, valid, DEPTH_ERROR_LIMIT_MM)
         write_png(folder / "depth_error" / name, errors)
 
 
+def _depth_picture(output: RenderOutput, depth: str, limits: tuple[float, float]) -> np.ndarray:
+    known = torch.where(output.alpha >= OPAQUE_ALPHA, output[depth], torch.nan)
+    return colorize_depth(known, limits, hatched=True)
+
+
 def _film(
-    trained: TrainedRun, path: list[Frame], limits: tuple[float, float], progress: ProgressReport, done: int
+    trained: TrainedRun,
+    path: list[Frame],
+    depth: str,
+    limits: tuple[float, float],
+    progress: ProgressReport,
+    done: int,
 ) -> Iterator[np.ndarray]:
     for count, frame in enumerate(path, start=1):
-        output = render_view(trained, frame)
+        output = render_view(trained, frame, ("rgb", "alpha", depth))
         rgb = eight_bit(output.rgb).cpu().numpy()
-        yield np.concatenate([rgb, colorize_depth(output["depth_accumulated"], limits)], axis=1)
+        yield np.concatenate([rgb, _depth_picture(output, depth, limits)], axis=1)
         progress.update(done + count)

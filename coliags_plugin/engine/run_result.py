@@ -64,7 +64,7 @@ def run_result(
         protocol=ProtocolRecord(name=protocol.name, version=protocol.version, description=protocol.description),
         seed=trained.seed,
         steps=trained.step,
-        metrics=_metrics(scorer, evaluated, str(data.provenance.get("unit", "mm"))),
+        metrics=_metrics(scorer, evaluated, data.length_unit),
         sets=sets,
         metrics_sha256=metrics_sha256(sets),
         cost=_cost(trained, meter),
@@ -118,8 +118,9 @@ def _metrics(scorer: Scorer, evaluated: Mapping[str, EvaluatedSet], unit: str) -
 
 def _metric(metric: Metric, unit: str) -> MetricRecord:
     """What a metric's values mean, lengths in the scene's unit."""
-    length = metric.unit if unit == "mm" else metric.unit.replace("mm", "units")
-    return MetricRecord(unit=length, direction="higher" if metric.higher_is_better else "lower")
+    return MetricRecord(
+        unit=metric.unit.replace("mm", unit), direction="higher" if metric.higher_is_better else "lower"
+    )
 
 
 def _cost(trained: TrainedRun, meter: RenderMeter) -> CostRecord:

@@ -64,8 +64,12 @@ class Scorer:
 
     @torch.no_grad()
     def render(self, model: Model, frame: Frame) -> RenderOutput:
-        """Render a held-out frame, which is on the model's device, with the outputs that the protocol compares."""
-        return model.render(frame.camera, self.wants, frame.view(trained=False))
+        """Render a held-out frame, which is on the model's device.
+
+        The outputs are those that the protocol compares and, if the renderer has it, accumulated depth for pictures.
+        """
+        wants = sorted({*self.wants} | ({"depth_accumulated"} & model.outputs))
+        return model.render(frame.camera, wants, frame.view(trained=False))
 
     def compare(self, model: Model, frame: Frame, device: torch.device) -> Comparison:
         """Render a held-out frame for comparison with its ground truth."""

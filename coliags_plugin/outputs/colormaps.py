@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.outputs.axis_ticks import linear_ticks, tick_label
+from coliags_plugin.outputs.axis_ticks import linear_ticks, round_up, tick_label
 from coliags_plugin.outputs.image_files import as_array
 
 if TYPE_CHECKING:
@@ -46,13 +46,14 @@ def color_table(color_map: ColorMap) -> UInt8[np.ndarray, "256 3"]:
 
 
 def colorize_depth(
-    depth_mm: Float[np.ndarray, "H W"] | Tensor, limits: tuple[float, float]
+    depth_mm: Float[np.ndarray, "H W"] | Tensor, limits: tuple[float, float], hatched: bool = False
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Colour-mapped depth: near is dark, far is bright, unknown is grey.
 
     Args:
         depth_mm: Depth of any kind, mm; NaN and infinities are unknown. [H, W]
         limits: Depths of the first and the last colour, mm; values beyond them are clipped.
+        hatched: Hatch what is unknown, as of pixels that are nearly transparent.
 
     Raises:
         InputError: ``depth_mm`` is not [H, W], or the limits are not an interval.
@@ -61,8 +62,19 @@ def colorize_depth(
     low, high = _interval(limits)
     known = np.isfinite(depth)
     image = _colored((np.where(known, depth, low) - low) / (high - low), "depth")
-    image[~known] = UNKNOWN_GREY
+    image[~known] = hatch(*known.shape)[~known] if hatched else UNKNOWN_GREY
     return image
+
+
+def common_limits(depths: Iterable[Float[np.ndarray, "H W"]]) -> tuple[float, float]:
+    """Limits of rendered depths, some of which may be far off: from 0 to their 99th percentiles, rounded up.
+
+    Args:
+        depths: Depth maps in any unit; what is not finite is unknown. [H, W] each
+    """
+    known = [depth[np.isfinite(depth)] for depth in depths]
+    largest = max((float(np.percentile(values, 99.0)) for values in known if values.size), default=0.0)
+    return 0.0, round_up(largest) if largest > 0.0 else 1.0
 
 
 def depth_limits(depths: Iterable[Float[np.ndarray, "H W"] | Tensor]) -> tuple[float, float]:

@@ -106,7 +106,7 @@ def _first_difference(one: Mapping[str, Sequence[str]], two: Mapping[str, Sequen
 def cautions(study: Study) -> list[str]:
     """Differences between the results that limit their comparison, and scenes that methods lack."""
     results = [cell.result for cell in study.cells]
-    found = [*_missing_scenes(study), *_unpaired_seeds(study), *_steps(study)]
+    found = [*_missing_scenes(study), *_unpaired_seeds(study), *_steps(study), *_transparent(study)]
     for key, what in (("package_version", "versions of the package"), ("git", "states of the source")):
         if len({str(result.software[key]) for result in results if result.software.get(key) is not None}) > 1:
             found.append(f"The runs come from different {what}.")
@@ -159,6 +159,15 @@ def _steps(study: Study) -> list[str]:
         return []
     each = ", ".join(f"{method} {' or '.join(f'{count:,}' for count in own)}" for method, own in steps.items())
     return [f"The runs were trained for different numbers of steps: {each}."]
+
+
+def _transparent(study: Study) -> list[str]:
+    return [
+        f"{cell.method} on {cell.scene}, set {name}: {part.transparency_warning}."
+        for cell in study.cells
+        for name, part in cell.result.sets.items()
+        if part.transparency_warning
+    ]
 
 
 def _differing_data(results: Sequence[Result]) -> list[str]:

@@ -64,6 +64,8 @@ def _method(study: Study, view: View, method: MethodView, pictures: Pictures) ->
         parts.append(
             image_tag(pictures.address(method.error), method.error, f"{where}, absolute {kind} error of {name}")
         )
+        if method.depth is not None:
+            parts.append(image_tag(pictures.address(method.depth), method.depth, f"{where}, expected depth of {name}"))
     parts.append(f"<figcaption>{_caption(study, view.frame, method.cell)}</figcaption></figure>")
     return "\n".join(parts)
 

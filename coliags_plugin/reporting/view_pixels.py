@@ -32,12 +32,14 @@ class ViewPixels:
         true_depth: mm, NaN where unknown; None where the frame has none.
         renders: One per run.
         depths: One per run, mm; None where there is none to compare.
+        expected: Expected depth, one per run, NaN where pixels are nearly transparent; None where there is none.
     """
 
     truth: Rgb
     true_depth: Depth | None
     renders: Sequence[Rgb]
     depths: Sequence[Depth | None]
+    expected: Sequence[Depth | None]
 
 
 def reduction(width: int) -> int:
@@ -64,8 +66,13 @@ def read_pixels(frame: ChosenFrame, runs: Sequence[Cell]) -> ViewPixels:
     if true_depth is not None:
         found = [_read_depth(run, "depth", frame, shape) for run in runs]
         depths = [None if depth is None else _reduced_map(depth, factor) for depth in found]
+    found = [_read_depth(run, "expected_depth", frame, shape) for run in runs]
     return ViewPixels(
-        _reduced_rgb(truth, factor), None if true_depth is None else _reduced_map(true_depth, factor), renders, depths
+        truth=_reduced_rgb(truth, factor),
+        true_depth=None if true_depth is None else _reduced_map(true_depth, factor),
+        renders=renders,
+        depths=depths,
+        expected=[None if depth is None else _reduced_map(depth, factor) for depth in found],
     )
 
 

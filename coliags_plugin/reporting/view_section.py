@@ -91,6 +91,8 @@ def _how_drawn(study: Study, scales: Scales, reference: str) -> str:
         texts.append("Under each rendering, its absolute depth error.")
     if scales.rgb_error is not None:
         texts.append("Views without true depth show the absolute colour error, the mean of red, green and blue.")
+    if scales.depth is not None:
+        texts.append("Below it the expected depth, hatched where alpha is below 0.5.")
     texts.append(rule)
     texts.append("Errors beyond it, and missing depth where the truth has one, take its last colour.")
     if scales.reduction > 1:
@@ -104,17 +106,17 @@ def _how_drawn(study: Study, scales: Scales, reference: str) -> str:
 def _scales(scales: Scales) -> str:
     parts = []
     if scales.depth_error is not None:
-        parts.append(color_bar_svg((0.0, scales.depth_error), "mm", "error", "|depth error|", "error-scale"))
+        parts.append(color_bar_svg((0.0, scales.depth_error), scales.unit, "error", "|depth error|", "error-scale"))
     if scales.rgb_error is not None:
         parts.append(
             color_bar_svg((0.0, scales.rgb_error), "levels of 255", "error", "|colour error|", "colour-error-scale")
         )
     if scales.depth is not None:
-        parts.append(color_bar_svg(scales.depth, "mm", "depth", "true depth", "depth-scale"))
+        parts.append(color_bar_svg(scales.depth, scales.unit, "depth", "depth", "depth-scale"))
         sample = EncodedImage("image/webp", encode_webp(hatch(14, 34)), 34, 14)
         parts.append(
             f'<div class="unknown">{image_tag(data_uri(sample), sample, "grey hatch")}'
-            "<span>no true depth (plain grey in true depth)</span></div>"
+            "<span>no true depth (plain grey in true depth); in rendered depth: alpha below 0.5</span></div>"
         )
     return f'<div class="scales">{"".join(parts)}</div>'
 

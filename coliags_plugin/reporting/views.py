@@ -13,6 +13,7 @@ from coliags_plugin.outputs.axis_ticks import linear_ticks, round_up
 from coliags_plugin.outputs.colormaps import (
     colorize_depth,
     colorize_error,
+    common_limits,
     depth_error,
     rgb_error,
 )
@@ -49,11 +50,15 @@ class EncodedImage:
 
 @dataclass(frozen=True)
 class MethodView:
-    """Rendering and error map of one method; ``error`` is None where there is no depth to compare."""
+    """Rendering, error map and expected depth of one method.
+
+    ``error`` is None where there is no depth to compare, ``depth`` of runs evaluated by a version that had none.
+    """
 
     cell: Cell
     render: EncodedImage
     error: EncodedImage | None
+    depth: EncodedImage | None
 
 
 @dataclass(frozen=True)
@@ -74,13 +79,15 @@ class Scales:
     Attributes:
         depth_error: Upper end, mm; None where no depth is compared.
         rgb_error: Upper end, levels of 255; None where depth is compared everywhere.
-        depth: Range of the true depth, mm; None without depth.
+        depth: Range of the true depth, or else of the expected depth, scene units; None without depth.
+        unit: Of depths.
         reduction: Largest integer factor by which images are reduced.
     """
 
     depth_error: float | None
     rgb_error: float | None
     depth: tuple[float, float] | None
+    unit: str
     reduction: int
 
 
@@ -95,6 +102,7 @@ class _ReadView:
     cells: Sequence[Cell]
     renders: Sequence[EncodedImage]
     errors: Sequence[np.ndarray | None]
+    expected: Sequence[np.ndarray | None]
 
 
 class Views:
@@ -115,7 +123,9 @@ class Views:
         self.scales = Scales(
             depth_error=self._limit("depth"),
             rgb_error=self._limit("rgb"),
-            depth=_depth_limits(view.true_depth for view in self._read if view.true_depth is not None),
+            depth=_depth_limits(view.true_depth for view in self._read if view.true_depth is not None)
+            or _expected_limits(depth for view in self._read for depth in view.expected if depth is not None),
+            unit=_unit(study),
             reduction=max((reduction(view.cells[0].result.scene.size[0]) for view in self._read), default=1),
         )
 
@@ -138,7 +148,12 @@ class Views:
             None if error is None else _webp(colorize_error(error, ~np.isnan(error), limit or 1.0))
             for error in view.errors
         ]
-        methods = [MethodView(*each) for each in zip(view.cells, view.renders, errors, strict=True)]
+        scale = self.scales.depth
+        depths = [
+            None if depth is None or scale is None else _webp(colorize_depth(depth, scale, hatched=True))
+            for depth in view.expected
+        ]
+        methods = [MethodView(*each) for each in zip(view.cells, view.renders, errors, depths, strict=True)]
         depth = None
         if view.true_depth is not None and self.scales.depth is not None:
             depth = _webp(colorize_depth(view.true_depth, self.scales.depth))
@@ -156,6 +171,7 @@ def _read_view(frame: ChosenFrame, runs: Sequence[Cell]) -> _ReadView:
         cells=runs,
         renders=[_jpeg(render) for render in pixels.renders],
         errors=_depth_errors(pixels) if kind == "depth" else _rgb_errors(pixels),
+        expected=pixels.expected,
     )
 
 
@@ -204,6 +220,17 @@ def _depth_limits(depths: Iterable[np.ndarray]) -> tuple[float, float] | None:
     ticks = linear_ticks(low, high)
     step = ticks[1] - ticks[0] if len(ticks) > 1 else round_up(high - low)
     return math.floor(low / step) * step, math.ceil(high / step) * step
+
+
+def _expected_limits(depths: Iterable[np.ndarray]) -> tuple[float, float] | None:
+    found = [*depths]
+    return common_limits(found) if found else None
+
+
+def _unit(study: Study) -> str:
+    """Unit of depths: that of the metrics that are lengths."""
+    units = {metric.unit for metric in study.metrics.values()}
+    return "units" if any(unit.startswith("units") for unit in units) else "mm"
 
 
 def _jpeg(rgb: np.ndarray) -> EncodedImage:

@@ -18,6 +18,8 @@ from coliags_plugin.results.display import Table, Value, value_text
 VERSION = 1
 #: The split's own test set.
 MAIN_SET = "test"
+#: Share of transparent pixels above which a warning is due.
+MANY_TRANSPARENT = 0.01
 #: Of metrics over the pixels that a training frame sees.
 SEEN_SUFFIX = "_seen"
 #: Of folders of evaluations against another scene's true depth, behind the name of the protocol.
@@ -104,6 +106,8 @@ class SetRecord(_Part):
         predictions_sha256: Hash of the images and depths as rendered.
         truth_sha256: Hash of those that they were compared with.
         profiles: By property: ``distance``, ``angle``; empty without true depth.
+        transparent: Share of the pixels within the masks whose alpha is below 0.5, so that their depth means little;
+            None where it was not measured.
     """
 
     frames: tuple[str, ...]
@@ -112,6 +116,7 @@ class SetRecord(_Part):
     predictions_sha256: str
     truth_sha256: str
     profiles: dict[str, ProfileRecord] = {}
+    transparent: float | None = None
 
     @model_validator(mode="after")
     def _one_value_per_frame(self) -> Self:
@@ -121,6 +126,15 @@ class SetRecord(_Part):
             if len(values) != len(self.frames):
                 raise ValueError(f"metric '{name}' has {len(values)} values for {len(self.frames)} frames")
         return self
+
+    @property
+    def transparency_warning(self) -> str:
+        """What is to be said of transparent pixels; empty where there are hardly any."""
+        if self.transparent is None or self.transparent <= MANY_TRANSPARENT:
+            return ""
+        return (
+            f"{100.0 * self.transparent:.1f} % of the pixels have alpha below 0.5: their depth, hatched, means little"
+        )
 
     def mean(self, metric: str) -> float | None:
         """Mean over the frames that have a metric; None where none has."""
@@ -256,7 +270,14 @@ class Result(_Part):
             ("metric", "unit", *self.sets),
             rows,
             {key: f"{key} ({len(part.frames)} frames)" for key, part in self.sets.items()},
-            [f"{self._not_shown(names)}: {reason}" for reason, names in without.items()],
+            [
+                *(f"{self._not_shown(names)}: {reason}" for reason, names in without.items()),
+                *(
+                    f"warning, {name}: {text}"
+                    for name, part in self.sets.items()
+                    if (text := part.transparency_warning)
+                ),
+            ],
         )
 
     def _not_shown(self, names: list[str]) -> str:

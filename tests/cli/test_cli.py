@@ -16,6 +16,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from coliags_plugin import load_run
+from coliags_plugin.outputs.colormaps import hatch
 from coliags_plugin.outputs.image_files import read_depth_tiff, read_rgb
 from tests.commands import refused, run
 from tests.scenes import SMALL, write_wall
@@ -94,6 +96,37 @@ def test_render_writes_images_scales_and_a_video(trained, tmp_path):
         assert read_rgb(images[0]).shape == (24, 32, 3)
     assert (tmp_path / "out" / "trajectory.mp4").stat().st_size > 0
     assert (tmp_path / "out" / "depth_scale.png").is_file()
+
+
+@pytest.mark.parametrize("kind", ["accumulated", "expected", "median"])
+def test_depth_as_numbers(trained, tmp_path, kind):
+    options = ("--depth-kind", kind, "--depth-tiff", "--no-video", "--output", tmp_path / "out")
+    assert run("render", trained, *options) == 0
+    handle = load_run(trained, device="cpu")
+    for name in handle.frame_names():
+        view = handle.render(name, depth=f"depth_{kind}")
+        stored = read_depth_tiff(tmp_path / "out" / "depth_tiff" / f"{name}.tiff")
+        np.testing.assert_array_equal(stored, view.depth)
+        picture = read_rgb(tmp_path / "out" / "depth" / f"{name}.png")
+        low = view.alpha < 0.5
+        assert (picture[low] == hatch(*low.shape)[low]).all()
+
+
+def test_eval_shows_the_expected_depth(trained):
+    folder, handle = trained / "eval" / "paper", load_run(trained, device="cpu")
+    assert (folder / "depth_pictures" / "scale.png").is_file()
+    record = handle.results["paper"].sets["test"]
+    low = []
+    for name in handle.frame_names():
+        view = handle.render(name)
+        low.append(view.alpha < 0.5)
+        stored = read_depth_tiff(folder / "expected_depth" / "test" / f"{name}.tiff")
+        np.testing.assert_allclose(stored[~low[-1]], (view.depth / view.alpha)[~low[-1]], rtol=1e-6)
+        assert np.isnan(stored[low[-1]]).all()
+        picture = read_rgb(folder / "depth_pictures" / "test" / f"{name}.png")
+        assert (picture[low[-1]] == hatch(*low[-1].shape)[low[-1]]).all()
+    assert record.transparent == np.mean(low)
+    assert ("have alpha below 0.5" in str(handle.results["paper"])) == (record.transparent > 0.01)
 
 
 def test_report_of_two_methods(trained, scene, tmp_path):

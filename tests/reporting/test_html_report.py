@@ -179,7 +179,7 @@ def test_error_maps_share_one_scale(tmp_path, two_runs):
     assert (second[5] == table[255]).all()
     assert not (first[0] == first[5]).all(), "pixels without truth look like pixels with one"
     assert "|depth error| [mm] 0 0.2 0.4 0.6 0.8 1" in page.words
-    assert "true depth [mm]" in page.words
+    assert "depth [mm]" in page.words
     assert "95 %" in page.words
 
 
