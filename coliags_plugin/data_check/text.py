@@ -37,10 +37,10 @@ def fact_rows(check: SceneCheck) -> Iterator[tuple[str, str]]:
     unit = data.get("unit", "mm")
     yield "unit of length", str(unit)
     if check.depth is not None:
-        depth = check.depth
+        depth, mm = check.depth, " mm" if unit == "mm" else ""
         yield (
             "depth",
-            f"median {depth.median:.4g}, 1 % to 99 %: {depth.nearest:.4g} to {depth.farthest:.4g}{' mm' * (unit == 'mm')}; "
+            f"median {depth.median:.4g}, 1 % to 99 %: {depth.nearest:.4g} to {depth.farthest:.4g}{mm}; "
             f"{depth.invalid_share:.1%} unknown, of which {depth.clipped_share:.1%} clipped",
         )
     else:

@@ -85,7 +85,8 @@ def check_depth(
         progress: Called after every frame.
 
     Raises:
-        InputError: Different views, no common frames, no common pixels, or an unknown unit without ``align_scale``.
+        InputError: The truth is an estimate itself; the views differ; no frame or no pixel is common; or a unit is
+            unknown without ``align_scale``.
     """
     _check_units(estimate, truth, align_scale)
     pairs = match_frames(estimate, truth)
@@ -95,6 +96,12 @@ def check_depth(
         if progress is not None:
             progress("compare depth", done, len(pairs.places))
         estimated, true = estimate.read(here), truth.read(there)
+        if true.confidence is not None:
+            raise InputError(
+                f"{truth.path} holds estimated depth: frame {truth.names[there]} has a confidence",
+                "true depth",
+                "Name the estimate first and the truth second",
+            )
         check_same_view(estimate.names[here], estimated, true)
         surface = true_depth_at(estimated, true)
         dense.append(None if surface is None else dense_samples(estimated, surface))

@@ -163,6 +163,12 @@ def test_other_views_are_refused():
     assert check_depth(source(depth_map(intrinsics=camera)), source(depth_map(intrinsics=camera.resized(*SIZE))))
 
 
+def test_an_estimate_is_no_truth():
+    sure = source(depth_map(confidence=np.ones_like(TRUE)))
+    with pytest.raises(InputError, match="holds estimated depth: frame 0000 has a confidence"):
+        check_depth(source(depth_map()), sure)
+
+
 def test_depths_that_do_not_overlap_are_refused():
     left, right = TRUE.copy(), TRUE.copy()
     left[:, :20], right[:, 20:] = np.nan, np.nan
