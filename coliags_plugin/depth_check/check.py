@@ -85,8 +85,8 @@ def check_depth(
         progress: Called after every frame.
 
     Raises:
-        InputError: The truth is an estimate itself, different views, no common frames, no common pixels, or an
-            unknown unit without ``align_scale``.
+        InputError: The truth is an estimate itself; the views differ; no frame or no pixel is common; or a unit is
+            unknown without ``align_scale``.
     """
     _check_units(estimate, truth, align_scale)
     pairs = match_frames(estimate, truth)

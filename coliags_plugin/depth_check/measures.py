@@ -12,6 +12,8 @@ from coliags_plugin.depth_check.pairing import Samples
 
 #: Errors below this share of the depth are good, as in the definition of the confidence.
 WITHIN = 0.05
+#: Confidence from which an estimate is rather good than not.
+SURE = 0.5
 #: Lower edge of a band of distances, scene units; every band is twice as far as the one before.
 _BAND_EDGE = 5.0
 #: Number of bins of confidence.
@@ -75,6 +77,7 @@ class Measures:
 
     Attributes:
         errors: Over all of them.
+        sure: The same with only the estimates of a confidence of 0.5 or more; None where there is no confidence.
         bands: By distance, the nearest first; those without a pixel of known truth are left out.
         bins: By confidence; empty where there is none.
         calibration_error: Expected calibration error: mean of |stated - observed| over the bins of confidence above 0,
@@ -82,6 +85,7 @@ class Measures:
     """
 
     errors: Errors
+    sure: Errors | None
     bands: list[Band]
     bins: list[ConfidenceBin]
     calibration_error: float | None
@@ -97,10 +101,13 @@ def measure(samples: Samples, scale: float = 1.0) -> Measures:
     true = samples.true.astype(np.float64)
     relative = samples.estimated.astype(np.float64) * scale / true - 1.0
     bins = _bins(samples.confidence, relative)
-    sure = [found for found in bins if found.high > 0.0]
-    total = sum(found.pixels for found in sure)
-    gap = sum(found.pixels * abs(found.stated - found.observed) for found in sure)
-    return Measures(_errors(relative, true), _bands(relative, true), bins, gap / total if total else None)
+    stated = [found for found in bins if found.high > 0.0]
+    total = sum(found.pixels for found in stated)
+    gap = sum(found.pixels * abs(found.stated - found.observed) for found in stated)
+    sure = None
+    if samples.confidence is not None:
+        sure = _errors(np.where(samples.confidence >= SURE, relative, np.nan), true)
+    return Measures(_errors(relative, true), sure, _bands(relative, true), bins, gap / total if total else None)
 
 
 def median_scale(samples: Samples) -> float | None:

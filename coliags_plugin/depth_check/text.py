@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from coliags_plugin.depth_check.check import DepthCheck
-from coliags_plugin.depth_check.measures import Errors, Measures
+from coliags_plugin.depth_check.measures import SURE, Errors, Measures
 from coliags_plugin.outputs.text_table import aligned
 
 Table = tuple[list[str], list[list[str]]]
@@ -47,6 +47,8 @@ def kinds(check: DepthCheck) -> Iterator[tuple[str, Measures]]:
 def error_table(check: DepthCheck, measures: Measures) -> Table:
     """Errors over all pixels and by distance."""
     rows = [["all", *_cells(measures.errors)]]
+    if measures.sure is not None:
+        rows.append([f"confidence {SURE:g} or more", *_cells(measures.sure)])
     rows += [[f"{band.low:g} to {band.high:g} {_short(check)}", *_cells(band.errors)] for band in measures.bands]
     return ["true depth", *_head(check)], rows
 

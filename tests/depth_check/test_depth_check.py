@@ -95,6 +95,9 @@ def test_a_calibrated_confidence_has_no_calibration_error():
     found = measure(Samples(estimated, true, confidence))
     assert len(found.bins) == 10
     assert found.calibration_error == pytest.approx(0.0, abs=1e-6)
+    # Of the upper half, k = 11, 13, ... 19 in 20 are good.
+    assert (found.sure.pixels, found.sure.coverage) == (1000, 0.5)
+    assert found.sure.within == pytest.approx(np.mean([11, 13, 15, 17, 19]) / 20)
     # Twice as sure as is right, in the lower half: off by the mean of k / 20 there.
     overconfident = measure(Samples(estimated, true, np.where(confidence < 0.5, 2 * confidence, confidence)))
     assert overconfident.calibration_error > 0.05
