@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.outputs.axis_ticks import round_up
 from coliags_plugin.outputs.colormaps import (
     HATCH_GREYS,
     UNKNOWN_GREY,
@@ -159,11 +158,12 @@ def test_nearly_transparent_pixels_are_hatched_on_demand():
     assert (hatched[:4] == hatch(9, 12)[:4]).all()
 
 
-@pytest.mark.parametrize("unit", [1.0, 0.01, 300.0])
+@pytest.mark.parametrize("unit", [1.0, 0.01, 1000.0])
 def test_common_limits_follow_the_unit_and_leave_out_what_is_far_off(unit):
     depth = np.linspace(0.0, 4.0, 1001).reshape(7, 143)
     far = depth.copy()
     far[0, :3] = 1e6
     far[1, 0] = np.nan
-    assert common_limits([unit * depth, unit * far]) == (0.0, pytest.approx(round_up(unit * 3.99)))
+    assert common_limits([unit * depth, unit * far]) == (0.0, pytest.approx(unit * 4.0))
+    assert common_limits([np.full((2, 2), unit * 4.12)]) == (0.0, pytest.approx(unit * 4.2))
     assert common_limits([np.full((2, 2), np.nan)]) == (0.0, 1.0)

@@ -196,8 +196,8 @@ def test_expected_depth_is_shown_and_hatched(tmp_path, with_truth):
     page = report(tmp_path, [run])
     shown = page.images("expected depth of coliags")
     assert len(shown) == 6
-    # True depths span 20 to 60 mm; without any, the scale ends at 50 mm.
-    color = color_table("depth")[round(0.5 * 255 if with_truth else 0.8 * 255)]
+    # True depths span 20 to 60 mm; without any, the scale ends at 40 mm.
+    color = color_table("depth")[round(0.5 * 255 if with_truth else 255)]
     assert all(np.abs(image[5].astype(int) - color).max() <= 2 for image in shown)
     assert all((image[0] == hatch(HEIGHT, WIDTH)[0]).all() for image in shown)
     assert "Below it the expected depth, hatched where alpha is below 0.5." in page.words
