@@ -18,6 +18,8 @@ from coliags_plugin.datamanagers.reading.ply_vertices import read_vertices
 
 log = logging.getLogger(__name__)
 
+#: Confidence from which on estimated depth makes initial points.
+_TRUSTED = 0.5
 _COLORS = ("red", "green", "blue")
 
 
@@ -25,6 +27,8 @@ def fuse_depth(
     frames: Sequence[Frame], count: int, generator: np.random.Generator, progress: Progress | None = None
 ) -> PointCloud:
     """Surface points back-projected from a uniform sample of the frames' valid depth pixels.
+
+    Of estimated depth, only pixels of confidence 0.5 or more count, in frames that have any.
 
     Pixels are sampled without replacement over all frames; all are used if there are at most ``count``. Rays use the
     true principal point (the authors' code: the image centre, docs/methods.md 6).
@@ -62,15 +66,19 @@ def fuse_depth(
 
 
 def _count_usable(frame: Frame) -> int:
-    return len(_usable(frame.depth, frame.mask))
+    return len(_usable(frame.depth, frame.mask, frame.depth_confidence))
 
 
-def _usable(depth: Tensor | None, mask: Tensor | None) -> np.ndarray:
-    """Flat indices of unmasked pixels with known depth. [N]"""
+def _usable(depth: Tensor | None, mask: Tensor | None, confidence: Tensor | None) -> np.ndarray:
+    """Flat indices of unmasked pixels with known depth, if possible of those that are trusted. [N]"""
     if depth is None:
         return np.zeros(0, np.int64)
     known = np.isfinite(depth.numpy())
-    return np.flatnonzero(known if mask is None else known & mask.numpy())
+    if mask is not None:
+        known &= mask.numpy()
+    if confidence is not None and (trusted := known & (confidence.numpy() >= _TRUSTED)).any():
+        known = trusted
+    return np.flatnonzero(known)
 
 
 def _fused(wanted: tuple[Frame, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -78,7 +86,7 @@ def _fused(wanted: tuple[Frame, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     frame, chosen = wanted[0].to("cpu"), wanted[1]
     if frame.depth is None:
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
-    pixels = _usable(frame.depth, frame.mask)[chosen]
+    pixels = _usable(frame.depth, frame.mask, frame.depth_confidence)[chosen]
     camera = frame.camera
     row, column = np.divmod(pixels, camera.width)
     z = frame.depth.numpy().ravel()[pixels].astype(np.float64)

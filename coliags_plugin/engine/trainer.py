@@ -314,7 +314,7 @@ def _resident(frames: list[Frame], device: torch.device) -> list[Frame]:
     """
     if device.type != "cuda":
         return frames
-    tensors = [(f.image, f.depth, f.depth_at_least, f.mask, f.seen) for f in frames]
+    tensors = [(f.image, f.depth, f.depth_at_least, f.mask, f.seen, f.depth_confidence) for f in frames]
     size = sum(tensor.nbytes for group in tensors for tensor in group if tensor is not None)
     return [frame.to(device) for frame in frames] if size < torch.cuda.mem_get_info(device)[0] / 2 else frames
 

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.outputs.axis_ticks import linear_ticks, round_up, tick_label
+from coliags_plugin.outputs.axis_ticks import linear_ticks, tick_label
 from coliags_plugin.outputs.image_files import as_array
 
 if TYPE_CHECKING:
@@ -67,14 +67,19 @@ def colorize_depth(
 
 
 def common_limits(depths: Iterable[Float[np.ndarray, "H W"]]) -> tuple[float, float]:
-    """Limits of rendered depths, some of which may be far off: from 0 to their 99th percentiles, rounded up.
+    """Limits of rendered depths, some of which may be far off: from 0 to the largest of their 99th percentiles.
+
+    Rounded up to two significant digits.
 
     Args:
         depths: Depth maps in any unit; what is not finite is unknown. [H, W] each
     """
     known = [depth[np.isfinite(depth)] for depth in depths]
     largest = max((float(np.percentile(values, 99.0)) for values in known if values.size), default=0.0)
-    return 0.0, round_up(largest) if largest > 0.0 else 1.0
+    if largest <= 0.0:
+        return 0.0, 1.0
+    step = 10.0 ** (math.floor(math.log10(largest)) - 1)
+    return 0.0, math.ceil(largest / step) * step
 
 
 def depth_limits(depths: Iterable[Float[np.ndarray, "H W"] | Tensor]) -> tuple[float, float]:

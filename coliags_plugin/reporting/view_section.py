@@ -91,7 +91,7 @@ def _how_drawn(study: Study, scales: Scales, reference: str) -> str:
         texts.append("Under each rendering, its absolute depth error.")
     if scales.rgb_error is not None:
         texts.append("Views without true depth show the absolute colour error, the mean of red, green and blue.")
-    if scales.depth is not None:
+    if scales.expected:
         texts.append("Below it the expected depth, hatched where alpha is below 0.5.")
     texts.append(rule)
     texts.append("Errors beyond it, and missing depth where the truth has one, take its last colour.")

@@ -80,6 +80,7 @@ class Scales:
         depth_error: Upper end, mm; None where no depth is compared.
         rgb_error: Upper end, levels of 255; None where depth is compared everywhere.
         depth: Range of the true depth, or else of the expected depth, scene units; None without depth.
+        expected: Whether expected depth is shown.
         unit: Of depths.
         reduction: Largest integer factor by which images are reduced.
     """
@@ -87,6 +88,7 @@ class Scales:
     depth_error: float | None
     rgb_error: float | None
     depth: tuple[float, float] | None
+    expected: bool
     unit: str
     reduction: int
 
@@ -125,6 +127,7 @@ class Views:
             rgb_error=self._limit("rgb"),
             depth=_depth_limits(view.true_depth for view in self._read if view.true_depth is not None)
             or _expected_limits(depth for view in self._read for depth in view.expected if depth is not None),
+            expected=any(depth is not None for view in self._read for depth in view.expected),
             unit=_unit(study),
             reduction=max((reduction(view.cells[0].result.scene.size[0]) for view in self._read), default=1),
         )

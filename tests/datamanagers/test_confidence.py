@@ -134,6 +134,14 @@ def test_depth_none_ignores_it(tmp_path):
     assert all(shot.confidence is None and shot.depth is None for shot in shots)
 
 
+def test_initial_points_are_fused_from_trusted_depth(folder):
+    cv2.imwrite(str(folder / "confidence" / "1.png"), np.full((HEIGHT, WIDTH), 127, np.uint8))  # a frame without any
+    scene = manager(folder).load(folder)
+    trusted = {frame.index: int((stored(frame.index) >= 128).sum()) for frame in scene.train}
+    trusted[1] = WIDTH * HEIGHT
+    assert len(scene.points) == sum(trusted.values())
+
+
 # Refused
 
 

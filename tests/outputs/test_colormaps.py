@@ -12,6 +12,7 @@ from coliags_plugin.outputs.colormaps import (
     colorize_depth,
     colorize_depth_error,
     colorize_rgb_error,
+    common_limits,
     depth_error,
     hatch,
     side_by_side,
@@ -147,3 +148,22 @@ def test_side_by_side_refuses():
             side_by_side(images, labels)
     with pytest.raises(InputError, match="uint8"):
         side_by_side([image.astype(float)], ["a"])
+
+
+def test_nearly_transparent_pixels_are_hatched_on_demand():
+    depth = np.full((9, 12), 30.0)
+    depth[:4] = np.nan
+    plain, hatched = (colorize_depth(depth, (0.0, 60.0), hatched=each) for each in (False, True))
+    assert (plain[4:] == hatched[4:]).all() and (plain[:4] == UNKNOWN_GREY).all()
+    assert (hatched[:4] == hatch(9, 12)[:4]).all()
+
+
+@pytest.mark.parametrize("unit", [1.0, 0.01, 1000.0])
+def test_common_limits_follow_the_unit_and_leave_out_what_is_far_off(unit):
+    depth = np.linspace(0.0, 4.0, 1001).reshape(7, 143)
+    far = depth.copy()
+    far[0, :3] = 1e6
+    far[1, 0] = np.nan
+    assert common_limits([unit * depth, unit * far]) == (0.0, pytest.approx(unit * 4.0))
+    assert common_limits([np.full((2, 2), unit * 4.12)]) == (0.0, pytest.approx(unit * 4.2))
+    assert common_limits([np.full((2, 2), np.nan)]) == (0.0, 1.0)

@@ -20,6 +20,7 @@ from coliags_plugin.reporting.statistics_text import p_text
 from coliags_plugin.reporting.study import Failure
 from coliags_plugin.reporting.tables import Table
 from coliags_plugin.results.hashing import metrics_sha256
+from coliags_plugin.results.record import MetricRecord
 from tests.reporting.made import FRAMES, NO_LPIPS, made_scenes, result_of, write_comparison
 
 
@@ -239,6 +240,31 @@ def test_p_text(p, text):
 
 
 # Cautions
+
+
+def test_transparent_pixels_are_a_caution(study_of):
+    result = result_of("coliags")
+    sets = {name: part.model_copy(update={"transparent": 0.1234}) for name, part in result.sets.items()}
+    said = of(study_of, [result.model_copy(update={"sets": sets})]).cautions
+    assert said[0].startswith("coliags on cecum, set test: 12.3 % of the pixels have alpha below 0.5")
+    assert len(said) == len(sets)
+    few = {name: part.model_copy(update={"transparent": 0.01}) for name, part in result.sets.items()}
+    assert of(study_of, [result.model_copy(update={"sets": few})]).cautions == []
+
+
+def test_metrics_at_points_are_shown_where_there_is_no_true_depth(study_of):
+    result = result_of("coliags", depth=None)
+    part = result.sets["test"]
+    reasons = {name: "estimated depth is no truth" for name in result.metrics if name.startswith("depth")}
+    values = {**part.values, "sparse_depth_median": (3.0,) * len(part.frames)}
+    sets = {**result.sets, "test": part.model_copy(update={"values": values, "reasons": reasons})}
+    metrics = {**result.metrics, "sparse_depth_median": MetricRecord(unit="%", direction="lower")}
+    changed = result.model_copy(update={"sets": sets, "metrics": metrics, "metrics_sha256": metrics_sha256(sets)})
+    table = tables(of(study_of, [changed]))["summary-test"]
+    shown = [column.key for column in table.columns if column.shown]
+    assert "sparse_depth_median" in shown and not any(name.startswith("depth") for name in shown)
+    (note,) = [note for note in table.notes if "estimated depth is no truth" in note]
+    assert note.startswith("Not shown, without values: Depth MSE; ")
 
 
 def test_cautions(study_of):

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.outputs.colormaps import color_table
-from coliags_plugin.outputs.image_files import write_png
+from coliags_plugin.outputs.colormaps import color_table, hatch
+from coliags_plugin.outputs.image_files import write_depth_tiff, write_png
 from coliags_plugin.reporting import html_report
 from coliags_plugin.reporting.content import Choices
 from coliags_plugin.reporting.report import write_report
@@ -183,6 +183,27 @@ def test_error_maps_share_one_scale(tmp_path, two_runs):
     assert "95 %" in page.words
 
 
+@pytest.mark.parametrize("with_truth", [True, False])
+def test_expected_depth_is_shown_and_hatched(tmp_path, with_truth):
+    error = 0.5 if with_truth else None
+    result = result_of("coliags", depth=error)
+    run = write_run(tmp_path / "run", result, depth=error)
+    for name, part in result.sets.items():
+        for frame in part.frames:
+            depth = np.full((HEIGHT, WIDTH), 40.0, np.float32)
+            depth[:4] = np.nan
+            write_depth_tiff(run / "eval" / "paper" / "expected_depth" / name / f"{frame}.tiff", depth)
+    page = report(tmp_path, [run])
+    shown = page.images("expected depth of coliags")
+    assert len(shown) == 6
+    # True depths span 20 to 60 mm; without any, the scale ends at 40 mm.
+    color = color_table("depth")[round(0.5 * 255 if with_truth else 255)]
+    assert all(np.abs(image[5].astype(int) - color).max() <= 2 for image in shown)
+    assert all((image[0] == hatch(HEIGHT, WIDTH)[0]).all() for image in shown)
+    assert "Below it the expected depth, hatched where alpha is below 0.5." in page.words
+    assert "depth [mm]" in page.words
+
+
 def test_error_limit():
     assert error_limit([np.array([0.0, 1.3]), np.array([1.3, np.inf])]) == 2.0
     assert error_limit([np.linspace(0, 1, 101)]) == 1.0
@@ -196,7 +217,7 @@ def test_without_depth_colors_are_compared(tmp_path):
     page = report(tmp_path, [run])
     assert "|colour error| [levels of 255]" in page.words
     assert len(page.images("colour error of coliags")) == 6
-    assert "true depth [mm]" not in page.words
+    assert "depth [mm]" not in page.words and "expected depth" not in page.words
     assert "Error against distance" not in page.words
 
 
