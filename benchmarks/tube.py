@@ -7,7 +7,7 @@ import math
 import torch
 
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.scenes import Frame, PointCloud, Scene
+from coliags_plugin.core.scenes import Frame, PointCloud, Scene, SparseDepth
 
 RADIUS = 20.0
 DEPTH_LIMIT = 100.0
@@ -46,4 +46,12 @@ def _frame(index: int, frames: int, width: int, height: int) -> Frame:
     pattern = 0.5 + 0.4 * torch.sin(surface * torch.tensor([0.9, 1.1, 0.7]))
     rgb = (pattern * (15.0 / distance) ** (2 / 2.2)).clamp(0, 1)
     depth = torch.where(z < DEPTH_LIMIT, z, torch.nan)
-    return Frame(f"{index:04d}", index, (rgb * 255).round().byte(), camera, depth)
+    return Frame(
+        f"{index:04d}", index, (rgb * 255).round().byte(), camera, depth, sparse_depth=_at_every_eighth_pixel(depth)
+    )
+
+
+def _at_every_eighth_pixel(depth: torch.Tensor) -> SparseDepth:
+    row, column = torch.meshgrid(*(torch.arange(4, size, 8) for size in depth.shape), indexing="ij")
+    known = torch.isfinite(depth[row, column])
+    return SparseDepth(torch.stack([column[known], row[known]], dim=1) + 0.5, depth[row, column][known])

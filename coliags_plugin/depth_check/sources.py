@@ -96,7 +96,7 @@ def _of_scene(path: Path, scene: Scene) -> DepthSource:
 def _of_frame(frame: Frame) -> DepthMap:
     valid = frame.valid.numpy()
     depth = None if frame.depth is None else np.where(valid, frame.depth.numpy(), np.float32(np.nan))
-    stated = getattr(frame, "depth_confidence", None)
+    stated = frame.depth_confidence
     confidence = None if stated is None else stated.numpy()
     camera = frame.camera
     return DepthMap(

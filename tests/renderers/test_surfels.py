@@ -80,7 +80,7 @@ def scene(name):
 
 #: Scenes and the accuracy of float32 that they allow: outputs, gradients.
 SCENES = {
-    "random": (1e-5, 1e-4),
+    "random": (2e-5, 1e-4),
     "needles": (2e-4, 1e-3),
     "around the camera": (1e-5, 1e-4),
     "crowd in one tile": (2e-4, 2e-4),
