@@ -36,7 +36,7 @@ class Report:
     reference: OptionalText = None
     """Method that the others are compared with; default: coliags, or the best where it is not there."""
     protocol: str = "paper"
-    """Evaluation protocol to read."""
+    """Evaluation protocol to read; NAME-truth: evaluations by `coliags eval RUN --truth SCENE`."""
     frames: int = 4
     """Held-out frames to show per scene and test set; the worst ones are added."""
     title: OptionalText = None

@@ -11,6 +11,7 @@ from coliags_plugin.reporting.comparison_folders import FoundResult, is_comparis
 from coliags_plugin.reporting.labels import told_apart
 from coliags_plugin.reporting.study import Cell, Failure, Study
 from coliags_plugin.results.reading import RESULT_FILE
+from coliags_plugin.results.record import TRUTH_SUFFIX
 
 
 def read_study(paths: Sequence[Path], protocol: str = "paper", methods: Sequence[str] = ()) -> Study:
@@ -67,7 +68,9 @@ def _read_run(folder: Path, protocol: str) -> FoundResult:
     file = evaluation / RESULT_FILE
     if file.is_file():
         return read_file(file, folder.resolve().name, folder)
-    do = f"Run `coliags eval {folder} --protocol {protocol}`"
+    name = protocol.removesuffix(TRUTH_SUFFIX)
+    truth = "" if name == protocol else " --truth SCENE"
+    do = f"Run `coliags eval {folder} --protocol {name}{truth}`"
     if (evaluation / "metrics.json").is_file():
         raise InputError(
             f"{folder} was evaluated by an older release, which wrote no {RESULT_FILE}",

@@ -26,6 +26,18 @@ def written(tmp_path, result):
     return path
 
 
+def test_an_evaluation_against_the_truth_is_asked_for_by_name(tmp_path):
+    result = result_of("coliags")
+    run = write_run(tmp_path / "run", result)
+    with pytest.raises(InputError, match=r"Run `coliags eval \S+ --protocol paper --truth SCENE` first"):
+        read_study([run], protocol="paper-truth")
+    against = result.model_copy(update={"provenance": {**result.provenance, "truth": {"scene": "cecum"}}})
+    (run / "eval" / "paper").rename(run / "eval" / "paper-truth")
+    write_result(run / "eval" / "paper-truth" / "result.json", against)
+    (cell,) = read_study([run], protocol="paper-truth").cells
+    assert cell.evaluation == run / "eval" / "paper-truth" and (cell.evaluation / "renders").is_dir()
+
+
 def test_a_run_a_file_and_a_comparison_are_read_alike(tmp_path):
     result, other = result_of("coliags"), result_of("3dgs")
     run = write_run(tmp_path / "run", result)
