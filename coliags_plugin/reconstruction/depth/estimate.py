@@ -13,8 +13,8 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.reading.parallel import parallel_map
-from coliags_plugin.reconstruction.depth.completion import complete
-from coliags_plugin.reconstruction.depth.confidence import fused_confidence, known_weight, sweep_weight
+from coliags_plugin.reconstruction.depth.completion import complete, data_weight, near_rim
+from coliags_plugin.reconstruction.depth.confidence import depth_confidence, sweep_weight
 from coliags_plugin.reconstruction.depth.depth_range import DepthRange
 from coliags_plugin.reconstruction.depth.fusion import DepthMap, fuse_frame
 from coliags_plugin.reconstruction.depth.neighbours import choose_neighbours
@@ -29,6 +29,8 @@ log = logging.getLogger(__name__)
 #: Fewest neighbours that a frame's depth is trusted with, and fewest frames that can have as many.
 FEWEST_NEIGHBOURS = 3
 FEWEST_FRAMES = FEWEST_NEIGHBOURS + 1
+#: Mean weight of a frame's own matches below which it shows nothing that others do: blur, darkness, a touched wall.
+LEAST_MATCHED = 0.1
 #: Frames and depth maps held in memory.
 _HELD = 40
 
@@ -88,9 +90,7 @@ class Estimation:
             neighbours = self._neighbours(f"neighbours-{number}", self.medians)
             base = self.last or None
             self._sweep(f"swept-{number}", sweep, neighbours, base, f"sweep {number + 1}")
-            fusions = self.settings.fusions if number == len(self.settings.sweeps) - 1 else 1
-            for again in range(fusions):
-                self._fuse(f"fused-{number}-{again}", sweep, neighbours, again > 0)
+            self._fuse(f"fused-{number}", sweep, neighbours, f"fuse {number + 1}")
             self.medians = self.work.value(f"medians-{number}", lambda: self._medians(self.last))
 
     def result(self, index: int) -> Estimate:
@@ -123,9 +123,7 @@ class Estimation:
     def _sweep(
         self, stage: str, sweep: SweepSettings, neighbours: Sequence[Sequence[int]], base: str | None, title: str
     ) -> None:
-        guides: Recent[Guide] = Recent(
-            lambda index: guide_of(self.frames[index].to("cpu"), sweep.reduction, self.settings.features), _HELD
-        )
+        guides = self._guides(sweep.reduction)
         factors = ratios(sweep, (self.range.near, self.range.far))
 
         def swept(index: int) -> Arrays:
@@ -143,50 +141,36 @@ class Estimation:
 
         self._stage(stage, swept, title)
 
-    def _fuse(
-        self,
-        stage: str,
-        sweep: SweepSettings,
-        neighbours: Sequence[Sequence[int]],
-        again: bool,
-    ) -> None:
-        before = self.last
-        guides: Recent[Guide] = Recent(
-            lambda index: guide_of(self.frames[index].to("cpu"), sweep.reduction, self.settings.features), 4
-        )
+    def _fuse(self, stage: str, sweep: SweepSettings, neighbours: Sequence[Sequence[int]], title: str) -> None:
+        swept = self.last
+        guides = self._guides(sweep.reduction)
 
-        def depth_map(index: int) -> tuple[DepthMap, np.ndarray]:
-            found, pose = self.work.load(before, index), guides(index).pose
-            if again:
-                return DepthMap(pose, found["known"], found["confidence"]), found["match"]
-            swept = Swept(found["depth"], found["match"], found["margin"])
-            return DepthMap(pose, swept.depth, sweep_weight(swept)), swept.match
+        def depth_map(index: int) -> DepthMap:
+            found = Swept(**self.work.load(swept, index))
+            return DepthMap(guides(index).pose, found.depth, sweep_weight(found))
 
-        maps: Recent[tuple[DepthMap, np.ndarray]] = Recent(depth_map, _HELD)
+        maps: Recent[DepthMap] = Recent(depth_map, _HELD)
+        low, high = np.log(self.range.near), np.log(self.range.far)
 
         def fused(index: int) -> Arrays:
-            (own, match), guide = maps(index), guides(index)
-            found = fuse_frame(own, [maps(other)[0] for other in neighbours[index]], self.settings.agreement)
-            confidence = fused_confidence(found, match)
-            confidence[(found.votes <= 0.0) | ~guide.usable] = 0.0
-            weight = known_weight(confidence)
+            own, guide = maps(index), guides(index)
+            found = fuse_frame(own, [maps(other) for other in neighbours[index]], self.settings.agreement)
+            support = np.where(guide.usable, found.votes, np.float32(0.0))
             known = np.log(found.depth)
-            frame = self.frames[index].to("cpu")
-            size = (guide.intensity.shape[1], guide.intensity.shape[0])
-            prior = self.prior.log_depth(frame, size, guide.usable, known, weight, self.medians[index])
-            low, high = np.log(self.range.near), np.log(self.range.far)
-            depth = np.exp(complete(known, weight, np.clip(prior, low, high), guide.intensity))
-            return {
-                "depth": np.clip(depth, self.range.near, self.range.far).astype(np.float32),
-                "confidence": confidence,
-                "known": found.depth,
-                "match": match,
-                "votes": found.votes,
-                "against": found.against,
-                "spread": found.spread,
-            }
+            prior = self.prior.log_depth(
+                self.frames[index].to("cpu"), guide.usable, known, data_weight(support), self.medians[index]
+            )
+            rim = near_rim(known, 2 * sweep.radius)
+            log_depth = np.clip(complete(known, support, np.clip(prior, low, high), guide.intensity, rim), low, high)
+            confidence = depth_confidence(log_depth, support, found.spread, rim)
+            if len(neighbours[index]) < FEWEST_NEIGHBOURS or own.weight.mean() < LEAST_MATCHED:
+                confidence[:] = 0.0
+            return {"depth": np.exp(log_depth), "confidence": confidence}
 
-        self._stage(stage, fused, stage.replace("fused-", "fuse "))
+        self._stage(stage, fused, title)
+
+    def _guides(self, reduction: int) -> Recent[Guide]:
+        return Recent(lambda index: guide_of(self.frames[index].to("cpu"), reduction, self.settings.features), _HELD)
 
     def _stage(self, stage: str, function: Callable[[int], Arrays], title: str) -> None:
         def one(index: int) -> None:

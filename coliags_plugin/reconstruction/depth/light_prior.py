@@ -12,6 +12,8 @@ from coliags_plugin.reconstruction.depth.views import Pose
 
 #: Exponent from stored to linear intensity, and the least linear intensity.
 _GAMMA, _DARKEST = 2.2, 2e-4
+#: Standard deviations of smoothing, pixels; the last that reaches usable pixels counts.
+_SIGMAS = (24.0, 6.0, 1.5)
 #: Weight of the physical law, in pixels: what a frame with few known depths falls back to.
 _LAW_WEIGHT = 20.0
 
@@ -26,7 +28,6 @@ class LightPrior(DepthPrior):
     def log_depth(
         self,
         frame: Frame,
-        size: tuple[int, int],
         usable: Bool[np.ndarray, "H W"],
         known: Float32[np.ndarray, "H W"],
         weight: Float32[np.ndarray, "H W"],
@@ -35,6 +36,7 @@ class LightPrior(DepthPrior):
         """See :class:`DepthPrior`."""
         import cv2
 
+        size = (known.shape[1], known.shape[0])
         image = cv2.resize(frame.image.cpu().numpy(), size, interpolation=cv2.INTER_AREA)
         design = light_terms(image, usable, Pose.resized(frame.camera, size))
         columns = design.reshape(-1, design.shape[-1])
@@ -61,15 +63,17 @@ def light_terms(
 ) -> Float[np.ndarray, "H W 7"]:
     """Terms of the polynomial: 1, log red, log green, their squares and product, cosine to the optical axis.
 
-    Colours are smoothed over a few pixels, without those that are not usable.
+    Colours are smoothed over a few pixels, without those that are not usable; these take the colours around them.
     """
     import cv2
 
     linear = (image[..., :2].astype(np.float32) / 255.0) ** _GAMMA
     good = usable.astype(np.float32)
-    share = cv2.GaussianBlur(good, (0, 0), 1.5)
-    smooth = cv2.GaussianBlur(linear * good[..., None], (0, 0), 1.5) / np.maximum(share, 1e-3)[..., None]
-    smooth = np.where(share[..., None] > 0.05, smooth, cv2.GaussianBlur(linear, (0, 0), 1.5))
+    smooth = linear
+    for sigma in _SIGMAS:
+        share = cv2.GaussianBlur(good, (0, 0), sigma)[..., None]
+        around = cv2.GaussianBlur(linear * good[..., None], (0, 0), sigma) / np.maximum(share, 1e-3)
+        smooth = np.where(share > 0.05, around, smooth)
     red, green = np.moveaxis(np.log(np.maximum(smooth, _DARKEST)).astype(np.float64), -1, 0)
     cosine = 1.0 / np.linalg.norm(pose.rays(), axis=-1)
     return np.stack([np.ones_like(red), red, green, red * red, red * green, green * green, cosine], axis=-1)

@@ -66,7 +66,6 @@ class FilePrior(DepthPrior):
     def log_depth(
         self,
         frame: Frame,
-        size: tuple[int, int],
         usable: Bool[np.ndarray, "H W"],
         known: Float32[np.ndarray, "H W"],
         weight: Float32[np.ndarray, "H W"],
@@ -75,6 +74,7 @@ class FilePrior(DepthPrior):
         """See :class:`DepthPrior`; unknown pixels of a map take the typical depth."""
         import cv2
 
+        size = (known.shape[1], known.shape[0])
         stored = self._read(frame)
         values = np.asarray(cv2.resize(stored, size, interpolation=cv2.INTER_NEAREST), np.float64)
         there = np.isfinite(values) & (values > 0.0)

@@ -17,7 +17,6 @@ class DepthPrior(ABC):
     def log_depth(
         self,
         frame: Frame,
-        size: tuple[int, int],
         usable: Bool[np.ndarray, "H W"],
         known: Float32[np.ndarray, "H W"],
         weight: Float32[np.ndarray, "H W"],
@@ -26,8 +25,7 @@ class DepthPrior(ABC):
         """The prior of a frame, fitted to its known depth.
 
         Args:
-            frame: The frame.
-            size: Width and height of the maps, which may be smaller than the frame.
+            frame: The frame, of the size of the maps or larger.
             usable: Neither masked nor near a highlight. [H, W]
             known: Log of z-depth; anything where the weight is 0. [H, W]
             weight: Of the known depth, 0 to 1. [H, W]

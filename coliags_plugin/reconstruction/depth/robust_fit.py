@@ -18,7 +18,7 @@ def robust_fit(
     default: Float[np.ndarray, "K"],
     default_weight: float,
 ) -> Float[np.ndarray, "K"]:
-    """Least squares reweighted by Cauchy's function of the residual, its scale 1.5 median deviations.
+    """Least squares reweighted by Cauchy's function of the residual, its scale four median deviations.
 
     Args:
         columns: Terms; the first is constant. [N, K]
@@ -46,7 +46,7 @@ def robust_fit(
     pull[0] = 1e-3 * default_weight  # the level follows the data at once
     solution, left = start, wanted - standard @ start
     for _ in range(_ROUNDS):
-        spread = max(1.5 * float(np.median(np.abs(left - np.median(left)))), 1e-4)
+        spread = max(4.0 * float(np.median(np.abs(left - np.median(left)))), 1e-4)
         centred = left - (np.median(left) if solution is start else 0.0)
         each = trust / (1.0 + (centred / spread) ** 2)
         normal = standard.T @ (each[:, None] * standard) + np.diag(pull)

@@ -62,7 +62,6 @@ class DepthSettings(Settings):
     agreement: float = Field(
         default=0.02, gt=0.0, lt=0.5, description="Relative difference up to which two frames' depths agree."
     )
-    fusions: int = Field(default=2, ge=1, le=5, description="Passes of fusion over all frames after the last sweep.")
     features: FeatureSettings = Field(
         default=FeatureSettings(), description="Features that the depth range is found from, and highlights."
     )

@@ -12,6 +12,9 @@ from jaxtyping import Float32
 from coliags_plugin.reconstruction.depth.settings import DepthSettings, SweepSettings
 from coliags_plugin.reconstruction.depth.views import Guide
 
+#: Log of the factor on depth over which a hypothesis must have had rivals.
+_RIVALS = math.log(2.0)
+
 
 @dataclass(frozen=True, eq=False)
 class Swept:
@@ -19,7 +22,7 @@ class Swept:
 
     Attributes:
         depth: z-depth. [H, W]
-        match: Correlation with the better neighbours, -1 to 1. [H, W]
+        match: Correlation with the better neighbours, -1 to 1; 0 where too few neighbours see it. [H, W]
         margin: By how much other depths match worse, after aggregation. [H, W]
     """
 
@@ -94,6 +97,6 @@ def sweep_frame(
         total,
     )
     index, fit, margin = (np.empty(shape, np.float32) for _ in range(3))
-    pick(total, cost, index, fit, margin)
+    pick(total, cost, math.ceil(_RIVALS / math.log1p(sweep.step)), index, fit, margin)
     position = np.interp(index.ravel(), np.arange(len(factors)), np.log(factors)).reshape(shape)
     return Swept((base * np.exp(position)).astype(np.float32), fit, margin)

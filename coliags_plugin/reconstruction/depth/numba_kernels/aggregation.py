@@ -88,15 +88,18 @@ def aggregate(cost, guide, small, large, contrast, total):
 
 
 @kernel
-def pick(total, cost, index, match, margin):
+def pick(total, cost, rivals, index, match, margin):
     """The hypothesis of the least aggregated cost, to a part of a step by a parabola.
 
     Args:
         total: Aggregated costs. float32 [H, W, D]
         cost: Before aggregation. float32 [H, W, D]
+        rivals: How many hypotheses before the best one must have been compared, where there are as many: at the rim of
+            an image, what is near leaves the neighbours' views, and what is left wins for want of rivals.
         index: Written: position among the hypotheses, fractional. float32 [H, W]
-        match: Written: correlation at it, -1 to 1. float32 [H, W]
-        margin: Written: by how much the aggregated cost of any hypothesis more than two steps away is greater. [H, W]
+        match: Written: correlation at it, -1 to 1; 0 without its rivals. float32 [H, W]
+        margin: Written: by how much the aggregated cost of any hypothesis more than two steps away is greater, of those
+            with a cost other than exactly 1, which says that nothing was compared. float32 [H, W]
     """
     height, width, count = total.shape
     for y in range(height):
@@ -108,7 +111,7 @@ def pick(total, cost, index, match, margin):
                     best = d
             second = np.float32(np.inf)
             for d in range(count):
-                if abs(d - best) > 2:
+                if abs(d - best) > 2 and cost[y, x, d] != 1.0:
                     second = min(second, costs[d])
             offset = np.float32(0.0)
             if 0 < best < count - 1:
@@ -117,4 +120,7 @@ def pick(total, cost, index, match, margin):
                     offset = np.float32(0.5) * (costs[best - 1] - costs[best + 1]) / bend
             index[y, x] = np.float32(best) + offset
             match[y, x] = np.float32(1.0) - cost[y, x, best]
-            margin[y, x] = second - costs[best] if count > 5 else np.float32(0.0)
+            for d in range(max(0, best - rivals), best):
+                if cost[y, x, d] == 1.0:
+                    match[y, x] = 0.0
+            margin[y, x] = second - costs[best] if second < np.inf else np.float32(0.0)

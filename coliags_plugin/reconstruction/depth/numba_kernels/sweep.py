@@ -117,7 +117,7 @@ def sweep(base, ratios, reference, usable, images, masks, turns, shifts, radius,
         radius: Of the windows, pixels.
         floor: Variance of the guides' noise.
         share: Part of the neighbours that counts at each pixel, the best ones.
-        cost: Written; 0 (equal) to 2, 1 where nothing can be compared. float32 [H, W, D]
+        cost: Written; 0 (equal) to 2, exactly 1 where fewer than a quarter of the neighbours see it. float32 [H, W, D]
     """
     height, width = base.shape
     count = images.shape[0]
@@ -126,6 +126,7 @@ def sweep(base, ratios, reference, usable, images, masks, turns, shifts, radius,
     scores = np.empty((count, height, width), np.float32)
     best = np.empty(count, np.float32)
     least = 0.5 * (2 * radius + 1) ** 2
+    fewest = min(count, max(2, (count + 3) // 4))
     for d in range(len(ratios)):
         for n in range(count):
             _warp(base, ratios[d], images[n], masks[n], turns[n], shifts[n], warped, seen)
@@ -147,10 +148,10 @@ def sweep(base, ratios, reference, usable, images, masks, turns, shifts, radius,
                     best[place] = value
                     found += 1
                 taken = int(np.ceil(share * found))
-                if taken == 0:
+                if found < fewest:
                     cost[y, x, d] = 1.0
                     continue
                 total = np.float32(0.0)
                 for place in range(taken):
                     total += best[place]
-                cost[y, x, d] = np.float32(1.0) - total / np.float32(taken)
+                cost[y, x, d] = max(np.float32(0.0), np.float32(1.0) - total / np.float32(taken))
