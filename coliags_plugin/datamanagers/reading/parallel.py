@@ -1,4 +1,4 @@
-"""Thread pool for reading and decoding files in parallel."""
+"""Thread pool for work on many items, such as reading and decoding files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,11 @@ _READERS = 8
 
 
 def parallel_map(
-    function: Callable[[_Item], _Result], items: Sequence[_Item], what: str, progress: Progress | None = None
+    function: Callable[[_Item], _Result],
+    items: Sequence[_Item],
+    what: str,
+    progress: Progress | None = None,
+    threads: int | None = None,
 ) -> list[_Result]:
     """Apply a function to every item in a thread pool and return the results in order.
 
@@ -26,12 +30,13 @@ def parallel_map(
         items: Items.
         what: Name of the task, for ``progress``.
         progress: Progress callback.
+        threads: Number of threads. None: as many as read files fastest.
 
     Raises:
         Exception: The exception of the first item that failed; the remaining items are cancelled.
     """
     results = []
-    with ThreadPoolExecutor(min(_READERS, os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(threads or min(_READERS, os.cpu_count() or 1)) as pool:
         pending = [pool.submit(function, item) for item in items]
         try:
             for done, future in enumerate(pending, start=1):

@@ -50,7 +50,7 @@ def kernel(function: _Function) -> _Function:
 class _KernelCache(FunctionCache):
     """numba's on-disk cache with three changes.
 
-    - A kernel is invalidated when any file of this folder changes (numba checks the kernel's own file only).
+    - A kernel is invalidated when any file of its folder changes (numba checks the kernel's own file only).
     - A cache that cannot be read or written causes a compilation, never an error.
     - A message is logged before compilation.
     """
@@ -72,19 +72,19 @@ class _KernelCache(FunctionCache):
             _logger.warning("kernel cache in %s cannot be written (%s)", self.cache_path, error)
 
     def _index_key(self, sig: Any, codegen: Any) -> Any:
-        return (*super()._index_key(sig, codegen), _fingerprint())
+        return (*super()._index_key(sig, codegen), _fingerprint(Path(self._py_func.__code__.co_filename).parent))
 
 
 @cache
 def _announce(where: str) -> None:
     """Log once per cache location that kernels are being compiled."""
-    _logger.info("cpu renderer: compiling kernels for this machine, about half a minute, once (%s)", where)
+    _logger.info("compiling kernels for this machine, about half a minute, once (%s)", where)
 
 
 @cache
-def _fingerprint() -> str:
-    """Hash of the sources of all kernels."""
+def _fingerprint(folder: Path) -> str:
+    """Hash of the sources of all kernels of a folder."""
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
+    for path in sorted(folder.glob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()

@@ -1,0 +1,79 @@
+"""``coliags depth estimate``: dense depth with confidence from posed images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from coliags_plugin.cli.arguments import Assignments, DataFormat, OptionalInt, OptionalPath
+
+if TYPE_CHECKING:
+    from coliags_plugin.core.scenes import Scene
+
+#: Prefix of the options of estimation; all others are the data manager's.
+_OWN = "depth."
+_OptionalLength = Annotated[float | None, tyro.conf.arg(metavar="LENGTH")]
+
+
+@dataclass(frozen=True)
+class EstimateDepth:
+    """Estimate the dense depth of a video with known poses, with its confidence; write it as a scene to train on."""
+
+    scene: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCENE")]
+    """The scene's folder. Depth that it has is ignored."""
+    out: Path
+    """Folder to create, in nerfstudio's layout."""
+    format: DataFormat = None
+    """Dataset format (`coliags list datamanagers`); default: recognised from the files."""
+    prior: OptionalPath = None
+    """Folder of depth maps by image name (.png of 16 bits, .npy or .exr), in any unit, to fit instead of brightness."""
+    near: _OptionalLength = None
+    """Nearest depth, in the scene's unit of length, with --far; default: found from features."""
+    far: _OptionalLength = None
+    """Farthest depth."""
+    jobs: OptionalInt = None
+    """Number of threads; default: one for each core."""
+    set: Assignments = ()
+    """An option of the data manager, as width=675, or of estimation, as depth.agreement=0.01 (docs/depth.md)."""
+    overwrite: bool = False
+    """Replace the output folder where it exists."""
+
+    def run(self) -> None:
+        """Estimate, or resume; write the scene and print a summary."""
+        from coliags_plugin.cli.poses.arguments import refuse_output, settings_among, train_command
+        from coliags_plugin.core.errors import InputError
+        from coliags_plugin.engine.data_formats import open_scene
+        from coliags_plugin.engine.progress import progress_callback
+        from coliags_plugin.reconstruction.depth.scene import DepthRequest, estimate_scene
+        from coliags_plugin.reconstruction.depth.settings import DepthSettings
+
+        refuse_output(self.out, self.scene, self.overwrite)
+        if (self.near is None) != (self.far is None):
+            raise InputError("--near without --far, or the reverse", "both or neither")
+        if self.jobs is not None and self.jobs < 1:
+            raise InputError(f"--jobs {self.jobs}", "a number of threads of 1 or more")
+        settings, options = settings_among(DepthSettings, self.set, _OWN)
+        with progress_callback() as progress:
+            # Images are read when they are needed, so that memory does not grow with the video.
+            reading = ["initial_points=none", "keep_pixels=false", *options]
+            scene = open_scene(self.scene, self.format, reading, progress)
+            near_far = None if self.near is None or self.far is None else (self.near, self.far)
+            request = DepthRequest(settings, near_far, self.prior, self.jobs)
+            summary = estimate_scene(scene, self.out, request, self.overwrite, progress)
+        print(f"{summary}\n{self.out}\n{train_command(self.out, *_same_frames(scene))}")
+
+
+def _same_frames(scene: Scene) -> list[str]:
+    """Options with which the written scene has the split and the size of its source."""
+    from coliags_plugin.datamanagers.rectification import PAPER_SIZE, fitted
+
+    split, camera = scene.provenance["split"], scene.train[0].camera
+    options = [] if split["name"] == "every-8th" else [f"datamanager.split={split['name']}"]
+    if split["name"] == "block":
+        options.append(f"datamanager.block=[{split['block'][0]:g}, {split['block'][1]:g}]")
+    if fitted(camera.width, camera.height, PAPER_SIZE) != (camera.width, camera.height):
+        options += [f"datamanager.width={camera.width}", f"datamanager.height={camera.height}"]
+    return options

@@ -1,0 +1,1 @@
+"""Dense depth with confidence from posed images without depth (docs/depth.md)."""

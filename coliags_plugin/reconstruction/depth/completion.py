@@ -1,0 +1,74 @@
+"""Completion of depth where it is not known: prior plus a smooth residual."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float32
+
+#: Fast global smoother: strength, and the difference of the 8-bit guide at which smoothing ceases.
+_STRENGTH, _EDGE = 10.0, 12.0
+#: Grey levels of the guide for each unit of log intensity.
+_LEVELS = 60.0
+#: Weight of a residual of zero at every pixel, relative to a known pixel's one.
+_ZERO = 1e-4
+#: Log depth across 5 pixels from which they are at a depth edge, and how much is believed of its near side.
+_JUMP, _BELIEF = 0.06, 0.1
+#: Support below which depth is not believed if it is off the prior by more than this, in log depth.
+_FEW, _ABSURD = 1.5, 0.35
+
+
+def complete(
+    log_known: Float32[np.ndarray, "H W"],
+    support: Float32[np.ndarray, "H W"],
+    log_prior: Float32[np.ndarray, "H W"],
+    intensity: Float32[np.ndarray, "H W"],
+    rim: Bool[np.ndarray, "H W"],
+) -> Float32[np.ndarray, "H W"]:
+    """Log depth that keeps to what is known and elsewhere is the prior plus a smooth residual.
+
+    The residual is known depth minus prior, spread by an edge-aware global smoother (Min et al. 2014) normalised by
+    the spread weight. Depth that several frames agree on is kept; what has less support is mixed with the smooth one.
+    Correlation windows make a near surface too wide at its edges: there, its rim has little weight, and the edges of
+    the image decide. Depth with little support that is far off the prior is not believed.
+
+    Args:
+        log_known: Log of z-depth; anything where there is no support. [H, W]
+        support: Number of frames that agree with it, weighted; 0 where it is not known. [H, W]
+        log_prior: Log of z-depth by the prior. [H, W]
+        intensity: Log intensity, whose edges stop the smoothing. [H, W]
+        rim: Where a near surface may be too wide: :func:`near_rim`. [H, W]
+    """
+    import cv2
+
+    residual = log_known - log_prior
+    absurd = (support < _FEW) & (np.abs(residual) > _ABSURD)
+    belief = np.where(absurd, 0.0, np.where(rim, _BELIEF, 1.0)).astype(np.float32)
+    data = data_weight(support) * belief
+    guide = np.clip(128.0 + _LEVELS * intensity, 0, 255).astype(np.uint8)
+    smooth = cv2.ximgproc.createFastGlobalSmootherFilter(guide, _STRENGTH, _EDGE)
+    residual = np.where(data > 0.0, residual, 0.0).astype(np.float32)
+    filled = log_prior + smooth.filter(data * residual) / (smooth.filter(data) + np.float32(_ZERO))
+    position = np.clip((support - 0.2) / 0.8, 0.0, 1.0)
+    kept = position * position * (3.0 - 2.0 * position) * belief
+    return np.asarray(np.where(kept > 0.0, kept * log_known + (1.0 - kept) * filled, filled), np.float32)
+
+
+def data_weight(support: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
+    """Weight of known depth beside other known depth, where priors are fitted and residuals spread: 0 to 1. [H, W]"""
+    return np.where(support > 0.0, np.minimum(0.3 + support, 1.0), 0.0).astype(np.float32)
+
+
+def near_rim(log_depth: Float32[np.ndarray, "H W"], reach: int) -> Bool[np.ndarray, "H W"]:
+    """Pixels on the near side of a depth edge, within some pixels of it. [H, W]
+
+    Args:
+        log_depth: Log of z-depth. [H, W]
+        reach: Pixels.
+    """
+    import cv2
+
+    values = cv2.medianBlur(log_depth, 5)
+    small, wide = (np.ones((2 * side + 1, 2 * side + 1), np.uint8) for side in (2, reach))
+    edge = (cv2.dilate(values, small) - cv2.erode(values, small) > _JUMP).astype(np.uint8)
+    middle = 0.5 * (cv2.dilate(values, wide) + cv2.erode(values, wide))
+    return np.asarray((cv2.dilate(edge, wide) > 0) & (values < middle))

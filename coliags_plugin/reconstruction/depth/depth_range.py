@@ -1,0 +1,155 @@
+"""Depth range of a posed video, from triangulated features."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.scenes import Frame
+from coliags_plugin.reconstruction.structure.features import Features, FeatureSettings, feature_extractor
+from coliags_plugin.reconstruction.structure.matching import epipolar_matches, rays, relative_pose
+from coliags_plugin.reconstruction.structure.quiet import quiet_colmap
+
+log = logging.getLogger(__name__)
+
+#: Most frames whose depth is measured, and how many frames later their partners are.
+_FRAMES, _STEPS = 16, (1, 2, 4, 8, 16)
+#: Least triangulation angle, degrees, and largest reprojection error, pixels.
+_LEAST_ANGLE, _ERROR = 1.0, 1.0
+#: Fewest points that give a range, and that give a frame's own median.
+_FEWEST, _FEWEST_OF_FRAME = 30, 10
+#: Relative difference within which two partners must agree about a point.
+_AGREEMENT = 0.15
+#: Percentiles of the points' depth, and the factors on them: features are rare where the lumen is dark.
+_NEAREST, _FARTHEST = (1.0, 0.6), (99.0, 2.0)
+
+
+@dataclass(frozen=True)
+class DepthRange:
+    """Nearest and farthest depth of a video, and each frame's median.
+
+    Attributes:
+        near: Scene units.
+        far: Scene units.
+        medians: Of every frame, scene units. [N]
+    """
+
+    near: float
+    far: float
+    medians: tuple[float, ...]
+
+
+def given_range(near: float, far: float, count: int) -> DepthRange:
+    """The range that a user states; frames' medians are its geometric mean.
+
+    Raises:
+        InputError: It is not one.
+    """
+    if not 0.0 < near < far:
+        raise InputError(f"--near {near:g} --far {far:g}", "0 < near < far")
+    return DepthRange(near, far, (float(np.sqrt(near * far)),) * count)
+
+
+def find_range(
+    frames: Sequence[Frame], settings: FeatureSettings, max_turn: float, progress: Progress | None = None
+) -> DepthRange:
+    """Depth range from points triangulated between pairs of frames, or from sparse depth where the scene has some.
+
+    Args:
+        frames: In video order.
+        settings: Of the features.
+        max_turn: Largest angle between the optical axes of a pair, degrees.
+        progress: Progress callback.
+
+    Raises:
+        InputError: Too few points are found.
+    """
+    if any(frame.sparse_depth is not None and len(frame.sparse_depth.depth) for frame in frames):
+        found = [np.zeros(0) if f.sparse_depth is None else f.sparse_depth.depth.cpu().double().numpy() for f in frames]
+        return _range_of(found, "points of the scene")
+    found = [np.zeros(0)] * len(frames)
+    chosen = np.unique(np.linspace(0, len(frames) - 1, min(_FRAMES, len(frames))).round().astype(int))
+    with quiet_colmap(0):
+        extract = feature_extractor(settings)
+        features: dict[int, Features] = {}
+
+        def features_of(index: int) -> Features:
+            if index not in features:
+                frame = frames[index].to("cpu")
+                features[index] = extract(frame.image.numpy(), None if frame.mask is None else frame.mask.numpy())
+            return features[index]
+
+        for done, index in enumerate(chosen, start=1):
+            partners = [index + step for step in _STEPS if index + step < len(frames)]
+            partners += [index - step for step in _STEPS if index - step >= 0 and not partners]
+            depths = [
+                triangulated_depths(features_of(index), features_of(other), frames[index], frames[other], max_turn)
+                for other in partners
+            ]
+            found[index] = _agreed(np.stack(depths)) if depths else np.zeros(0)
+            for old in [key for key in features if key < index]:
+                del features[old]
+            if progress is not None:
+                progress("find the depth range", done, len(chosen))
+    return _range_of(found, "points triangulated between frames")
+
+
+def triangulated_depths(
+    first: Features, second: Features, one: Frame, other: Frame, max_turn: float
+) -> Float[np.ndarray, "K"]:
+    """z-depths, in the first frame, of its features that match along epipolar lines and are seen at a sufficient angle.
+
+    NaN for all others. [K]
+    """
+    depths = np.full(len(first), np.nan)
+    cameras = (one.camera, other.camera)
+    rotation, translation = relative_pose(cameras)
+    turn = np.degrees(np.arccos(np.clip(float(one.camera.optical_axis @ other.camera.optical_axis), -1.0, 1.0)))
+    if not np.linalg.norm(translation) > 0.0 or turn > max_turn:
+        return depths
+    pairs = epipolar_matches(first, second, cameras, _ERROR, 0.8, 0.7)
+    turned = rays(first.pixels[pairs[:, 0]], one.camera) @ rotation.T
+    seen = rays(second.pixels[pairs[:, 1]], other.camera)
+    # Depth a of least distance between the lines a * turned + translation and b * seen.
+    aa, bb, ab = (np.einsum("ij,ij->i", *pair) for pair in ((turned, turned), (seen, seen), (turned, seen)))
+    sine = 1.0 - ab**2 / (aa * bb)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = (ab * (seen @ translation) - bb * (turned @ translation)) / (aa * bb - ab**2)
+    good = (sine > np.sin(np.radians(_LEAST_ANGLE)) ** 2) & (depth > 0.0)
+    depths[pairs[good, 0]] = depth[good]
+    return depths
+
+
+def _agreed(depths: Float[np.ndarray, "P K"]) -> Float[np.ndarray, "A"]:
+    """Median depths of the features about which two partners agree, and most do. [A]"""
+    depths = depths[:, (~np.isnan(depths)).sum(axis=0) >= min(2, len(depths))]
+    if not depths.size:
+        return np.zeros(0)
+    middle = np.nanmedian(depths, axis=0)
+    near = (np.abs(depths / middle - 1.0) <= _AGREEMENT).sum(axis=0)
+    there = (~np.isnan(depths)).sum(axis=0)
+    return np.asarray(middle[(near >= np.minimum(2, there)) & (2 * near > there)])
+
+
+def _range_of(found: Sequence[Float[np.ndarray, "K"]], what: str) -> DepthRange:
+    every = np.concatenate(found)
+    if len(every) < _FEWEST:
+        raise InputError(
+            f"the depth range is unknown: {len(every)} {what}",
+            f"at least {_FEWEST}: sharp, overlapping frames of a camera that moves, with correct poses",
+            "Check the poses (coliags data check), use frames farther apart, or give --near and --far",
+        )
+    near, far = (factor * float(np.percentile(every, part)) for part, factor in (_NEAREST, _FARTHEST))
+    measured = [index for index, depths in enumerate(found) if len(depths) >= _FEWEST_OF_FRAME]
+    if measured:
+        medians = np.interp(np.arange(len(found)), measured, np.log([np.median(found[index]) for index in measured]))
+    else:
+        medians = np.full(len(found), np.log(np.median(every)))
+    log.info("depth range %.4g to %.4g, from %d %s", near, far, len(every), what)
+    return DepthRange(near, far, tuple(float(value) for value in np.exp(medians)))

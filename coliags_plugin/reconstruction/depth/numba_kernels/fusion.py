@@ -1,0 +1,134 @@
+"""What the neighbours' depth maps say about the depth of a pixel."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from coliags_plugin.renderers.numba_kernels.compilation import kernel
+
+
+@kernel
+def reproject(depth, other, weight, turn, shift, back, origin, steps, tolerance, found, trust):
+    """Where the rays of one camera meet the depth map of another, by fixed-point iteration from a first guess.
+
+    Args:
+        depth: First guess of z-depth. float32 [H, W]
+        other: z-depth of the neighbour; NaN where unknown. float32 [h, w]
+        weight: Of its pixels. float32 [h, w]
+        turn: Pixel of the reference at z-depth 1 -> homogeneous pixel of the neighbour, in its units of z. [3, 3]
+        shift: Homogeneous pixel of the reference's centre in the neighbour. [3]
+        back: Pixel of the neighbour at z-depth 1 -> z-depth in the reference; a row. [3]
+        origin: z-depth of the neighbour's centre in the reference.
+        steps: Largest number of iterations.
+        tolerance: Relative change of depth at which they have converged.
+        found: Written: z-depth in the reference; NaN where the rays do not meet. float32 [H, W]
+        trust: Written: weight of the neighbour's pixel. float32 [H, W]
+    """
+    height, width = depth.shape
+    rows, columns = other.shape
+    for y in range(height):
+        cy = np.float32(y) + np.float32(0.5)
+        for x in range(width):
+            cx = np.float32(x) + np.float32(0.5)
+            found[y, x] = np.nan
+            trust[y, x] = 0.0
+            z = depth[y, x]
+            if not z > 0.0:
+                continue
+            for _ in range(steps):
+                pz = (turn[2, 0] * cx + turn[2, 1] * cy + turn[2, 2]) * z + shift[2]
+                if not pz > np.float32(1e-3) * z:
+                    break
+                u = ((turn[0, 0] * cx + turn[0, 1] * cy + turn[0, 2]) * z + shift[0]) / pz
+                v = ((turn[1, 0] * cx + turn[1, 1] * cy + turn[1, 2]) * z + shift[1]) / pz
+                a, b = u - np.float32(0.5), v - np.float32(0.5)
+                if not (a >= 0.0 and b >= 0.0 and a < columns - 1 and b < rows - 1):
+                    break
+                i, j = int(a), int(b)
+                fx, fy = a - np.float32(i), b - np.float32(j)
+                d00, d01, d10, d11 = other[j, i], other[j, i + 1], other[j + 1, i], other[j + 1, i + 1]
+                low, high = min(min(d00, d01), min(d10, d11)), max(max(d00, d01), max(d10, d11))
+                if not high < np.float32(1.08) * low:  # an edge, or unknown: the nearest pixel
+                    seen = other[int(v), int(u)]
+                else:
+                    top, bottom = d00 + fx * (d01 - d00), d10 + fx * (d11 - d10)
+                    seen = top + fy * (bottom - top)
+                if not seen > 0.0:
+                    break
+                after = (back[0] * u + back[1] * v + back[2]) * seen + origin
+                if not after > 0.0:
+                    break
+                if abs(after - z) <= tolerance * z:
+                    found[y, x] = after
+                    trust[y, x] = weight[int(v), int(u)]
+                    break
+                z = after
+
+
+@kernel
+def vote(depth, own, candidates, trusts, tolerance, fused, votes, against, spread):
+    """Weighted median of the densest group of the candidates.
+
+    Args:
+        depth: The frame's own z-depth. float32 [H, W]
+        own: Its weight. float32 [H, W]
+        candidates: z-depths by the neighbours; NaN where there is none. float32 [N, H, W]
+        trusts: Their weights. float32 [N, H, W]
+        tolerance: Relative difference from the median within which a candidate agrees; the group is twice as wide.
+        fused: Written: z-depth. float32 [H, W]
+        votes: Written: weight of the candidates that agree with it, its own included. float32 [H, W]
+        against: Written: weight of those that do not. float32 [H, W]
+        spread: Written: weighted mean relative deviation within the group. float32 [H, W]
+    """
+    count, height, width = candidates.shape
+    values = np.empty(count + 1, np.float32)
+    weights = np.empty(count + 1, np.float32)
+    for y in range(height):
+        for x in range(width):
+            n = 0
+            for k in range(count + 1):
+                value = depth[y, x] if k == count else candidates[k, y, x]
+                weight = own[y, x] if k == count else trusts[k, y, x]
+                if value > 0.0 and weight > 0.0:
+                    place = n
+                    while place > 0 and values[place - 1] > value:
+                        values[place], weights[place] = values[place - 1], weights[place - 1]
+                        place -= 1
+                    values[place], weights[place] = value, weight
+                    n += 1
+            if n == 0:
+                fused[y, x], votes[y, x], against[y, x], spread[y, x] = depth[y, x], 0.0, 0.0, 1.0
+                continue
+            # The candidate amid the densest group, by a kernel as wide as four tolerances to either side.
+            most, centre, total = np.float32(-1.0), values[0], np.float32(0.0)
+            for k in range(n):
+                total += weights[k]
+                density, wide = np.float32(0.0), np.float32(4.0) * tolerance * values[k]
+                for j in range(n):
+                    away = (values[j] - values[k]) / wide
+                    if -1.0 < away < 1.0:
+                        density += weights[j] * (np.float32(1.0) - away * away)
+                if density > most:
+                    most, centre = density, values[k]
+            wide = np.float32(2.0) * tolerance * centre
+            first, last, inside = n, 0, np.float32(0.0)
+            for k in range(n):
+                if abs(values[k] - centre) <= wide:
+                    first, last = min(first, k), k + 1
+                    inside += weights[k]
+            reached, middle = np.float32(0.0), centre
+            for k in range(first, last):  # the median, between two values where the weight is halved between them
+                reached += weights[k]
+                if reached >= np.float32(0.5) * inside:
+                    middle = values[k]
+                    if k + 1 < last and reached <= np.float32(0.500001) * inside:
+                        middle = np.float32(0.5) * (values[k] + values[k + 1])
+                    break
+            agree, away = np.float32(0.0), np.float32(0.0)
+            for k in range(n):
+                difference = abs(values[k] - middle) / middle
+                if difference <= tolerance:
+                    agree += weights[k]
+                if first <= k < last:
+                    away += weights[k] * difference
+            fused[y, x], votes[y, x], against[y, x], spread[y, x] = middle, agree, total - agree, away / inside

@@ -1,0 +1,148 @@
+"""A scene with estimated depth, made from one without."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import atomic_folder
+from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.scenes import Frame, Scene
+from coliags_plugin.datamanagers.nerfstudio.estimated import EstimatedSceneWriter
+from coliags_plugin.datamanagers.units import write_unit
+from coliags_plugin.reconstruction.depth.depth_range import DepthRange, find_range, given_range
+from coliags_plugin.reconstruction.depth.estimate import Estimation, check_motion
+from coliags_plugin.reconstruction.depth.light_prior import LightPrior
+from coliags_plugin.reconstruction.depth.points import VoxelPoints
+from coliags_plugin.reconstruction.depth.prior_files import FilePrior
+from coliags_plugin.reconstruction.depth.priors import DepthPrior
+from coliags_plugin.reconstruction.depth.settings import DepthSettings
+from coliags_plugin.reconstruction.depth.views import Pose
+from coliags_plugin.reconstruction.depth.work_files import WorkFolder, work_folder
+
+log = logging.getLogger(__name__)
+
+#: Confidence from which a pixel counts as known in the summary.
+_KNOWN = 0.5
+#: Changes when the results of the same request do, so that old work files are not mixed with new ones.
+_VERSION = 1
+#: Edge of the voxels of points, pixels on the surface.
+_VOXEL = 2.0
+
+
+@dataclass(frozen=True)
+class DepthRequest:
+    """What is asked for.
+
+    Attributes:
+        settings: Options of estimation.
+        near_far: Depth range, scene units; None: found.
+        prior: Folder of depth maps; None: brightness.
+        jobs: Number of threads; None: one for each core.
+    """
+
+    settings: DepthSettings
+    near_far: tuple[float, float] | None = None
+    prior: Path | None = None
+    jobs: int | None = None
+
+
+def estimate_scene(
+    scene: Scene, out: Path, request: DepthRequest, overwrite: bool = False, progress: Progress | None = None
+) -> str:
+    """Estimate the depth of a scene's video and write it as a scene in nerfstudio's layout.
+
+    Training and test frames take part; test sets of their own do not. Work files stay beside ``out`` until all is
+    written, and the same request resumes from them.
+
+    Args:
+        scene: With poses, opened with its images read when needed.
+        out: Folder to create.
+        request: What is asked for.
+        overwrite: Replace an existing folder.
+        progress: Progress callback.
+
+    Returns:
+        A summary of one line.
+
+    Raises:
+        InputError: The frames give no depth, the prior does not fit them, or a folder cannot be written.
+    """
+    frames = sorted([*scene.train, *scene.test_sets.get("test", ())], key=lambda frame: frame.index)
+    if others := [name for name in scene.test_sets if name != "test"]:
+        log.warning("left out: %s, which are apart from the video", ", ".join(others))
+    check_motion(frames)
+    prior: DepthPrior = LightPrior() if request.prior is None else FilePrior.of(request.prior, frames)
+    described = {
+        "version": _VERSION,
+        "data": scene.provenance["fingerprint"],
+        "frames": [frame.name for frame in frames],
+        "size": [frames[0].camera.width, frames[0].camera.height],
+        "poses": [frame.camera.camera_to_world.flatten().tolist() for frame in frames],
+        "settings": request.settings.model_dump(),
+        "near_far": request.near_far,
+        "prior": prior.described(),
+    }
+    with work_folder(out, described) as work:
+        depth_range = _range(frames, request, work, progress)
+        jobs = request.jobs or os.cpu_count() or 1
+        estimation = Estimation(frames, prior, depth_range, request.settings, work, jobs, progress)
+        estimation.run()
+        with atomic_folder(out, overwrite) as folder:
+            summary = _write(scene, frames, estimation, folder, progress)
+    return summary
+
+
+def _range(frames: Sequence[Frame], request: DepthRequest, work: WorkFolder, progress: Progress | None) -> DepthRange:
+    if request.near_far is not None:
+        return given_range(*request.near_far, len(frames))
+    settings = request.settings
+    kept = work.value("range", lambda: vars(find_range(frames, settings.features, settings.max_turn, progress)))
+    return DepthRange(kept["near"], kept["far"], tuple(kept["medians"]))
+
+
+def _write(
+    scene: Scene, frames: Sequence[Frame], estimation: Estimation, folder: Path, progress: Progress | None
+) -> str:
+    """Write all frames, the points and the unit; the summary."""
+    writer = EstimatedSceneWriter(folder, estimation.range.far / 65000.0)
+    trained = {frame.name for frame in scene.train}
+    k = frames[0].camera
+    footprint = float(np.median(estimation.medians)) / float(np.sqrt(k.fx * k.fy))
+    voxels = VoxelPoints(_VOXEL * footprint, frames[len(frames) // 2].camera.center.cpu().double().numpy())
+    pixels, known = 0, 0
+    for done, stored in enumerate(frames, start=1):
+        frame, found = stored.to("cpu"), estimation.result(done - 1)
+        image = frame.image.numpy()
+        mask = None if frame.mask is None else frame.mask.numpy()
+        confidence = found.confidence if mask is None else np.where(mask, found.confidence, np.float32(0.0))
+        writer.write_frame(frame.name, frame.camera, image, mask, found.depth, confidence)
+        if frame.name in trained:
+            voxels.add(Pose.of(frame.camera), found.depth, confidence, image)
+        pixels += int(frame.valid.sum())
+        known += int((confidence >= _KNOWN).sum())
+        if progress is not None:
+            progress("write", done, len(frames))
+    positions, colors = voxels.points()
+    if not len(positions):
+        raise InputError(
+            f"no surface that {len(frames)} frames agree on: {100.0 * known / max(pixels, 1):.1f} % of the pixels have "
+            f"a confidence of {_KNOWN:g} or more",
+            "sharp frames of the same surface from different positions, with correct poses",
+            "Check the poses (coliags data check), or the images: blurred or dark frames give no depth",
+        )
+    own = scene.provenance["split"]["name"] == "own"
+    test = [frame.name for frame in scene.test_sets.get("test", ())]
+    writer.finish(positions, colors, ([frame.name for frame in scene.train], test) if own else None)
+    write_unit(folder, scene.provenance["unit"])
+    return (
+        f"{len(frames)} frames, depth {estimation.range.near:.4g} to {estimation.range.far:.4g}, "
+        f"{100.0 * known / max(pixels, 1):.0f} % of the pixels with a confidence of {_KNOWN:g} or more; "
+        f"{len(positions)} points"
+    )

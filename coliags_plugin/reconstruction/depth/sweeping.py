@@ -1,0 +1,102 @@
+"""Depth of one frame by sweeping a surface through its neighbours."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32
+
+from coliags_plugin.reconstruction.depth.settings import DepthSettings, SweepSettings
+from coliags_plugin.reconstruction.depth.views import Guide
+
+#: Log of the factor on depth over which a hypothesis must have had rivals.
+_RIVALS = math.log(2.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Swept:
+    """Depth of one frame from its own sweep.
+
+    Attributes:
+        depth: z-depth. [H, W]
+        match: Correlation with the better neighbours, -1 to 1; 0 where too few neighbours see it. [H, W]
+        margin: By how much other depths match worse, after aggregation. [H, W]
+    """
+
+    depth: Float32[np.ndarray, "H W"]
+    match: Float32[np.ndarray, "H W"]
+    margin: Float32[np.ndarray, "H W"]
+
+
+def ratios(sweep: SweepSettings, depth_range: tuple[float, float]) -> Float32[np.ndarray, "D"]:
+    """Hypotheses as factors on the swept surface, equally spaced in their logarithm. [D]
+
+    Args:
+        sweep: Its step and, unless the whole range is swept, its reach.
+        depth_range: Nearest and farthest depth; the surface of a whole sweep is at the nearest.
+    """
+    step = math.log1p(sweep.step)
+    if sweep.reach is None:
+        span = math.log(depth_range[1] / depth_range[0])
+        return np.exp(np.linspace(0.0, span, max(3, math.ceil(span / step) + 1))).astype(np.float32)
+    side = max(1, round(math.log1p(sweep.reach) / step))
+    return np.exp(step * np.arange(-side, side + 1)).astype(np.float32)
+
+
+def sweep_frame(
+    guide: Guide,
+    neighbours: Sequence[Guide],
+    base: Float32[np.ndarray, "H W"],
+    factors: Float32[np.ndarray, "D"],
+    sweep: SweepSettings,
+    settings: DepthSettings,
+) -> Swept:
+    """Match a frame with its neighbours at multiples of a surface, and take the best.
+
+    Correlation of log intensity in square windows, sampled on the surface itself, so that windows follow its slant;
+    semi-global aggregation; a parabola between hypotheses.
+
+    Args:
+        guide: The frame.
+        neighbours: At least one, of any size.
+        base: The surface, z-depth. [H, W]
+        factors: Multiples of it, ascending. [D]
+        sweep: Options of this sweep.
+        settings: Options of all.
+    """
+    from coliags_plugin.reconstruction.depth.numba_kernels.aggregation import aggregate, pick
+    from coliags_plugin.reconstruction.depth.numba_kernels.sweep import sweep as match
+
+    shape = base.shape
+    pairs = [guide.pose.homography(other.pose) for other in neighbours]
+    cost = np.empty((*shape, len(factors)), np.float32)
+    match(
+        np.ascontiguousarray(base, np.float32),
+        factors,
+        guide.intensity,
+        guide.usable.astype(np.float32),
+        np.stack([other.intensity for other in neighbours]),
+        np.stack([other.usable for other in neighbours]).astype(np.uint8),
+        np.stack([turn for turn, _ in pairs]),
+        np.stack([shift for _, shift in pairs]),
+        sweep.radius,
+        settings.noise**2,
+        settings.best_share,
+        cost,
+    )
+    total = np.empty_like(cost)
+    aggregate(
+        cost,
+        guide.intensity,
+        np.float32(sweep.small_penalty),
+        np.float32(sweep.large_penalty),
+        np.float32(settings.edge_contrast),
+        total,
+    )
+    index, fit, margin = (np.empty(shape, np.float32) for _ in range(3))
+    pick(total, cost, math.ceil(_RIVALS / math.log1p(sweep.step)), index, fit, margin)
+    position = np.interp(index.ravel(), np.arange(len(factors)), np.log(factors)).reshape(shape)
+    return Swept((base * np.exp(position)).astype(np.float32), fit, margin)

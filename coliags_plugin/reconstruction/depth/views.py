@@ -1,0 +1,118 @@
+"""Images prepared for matching, with their cameras as matrices."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.core.scenes import Frame
+from coliags_plugin.reconstruction.structure.features import FeatureSettings, usable
+
+#: Added to intensity before the logarithm, which would amplify the noise of dark pixels.
+_OFFSET = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """Intrinsics and pose of a view in float64.
+
+    Attributes:
+        intrinsics: Of the view.
+        camera_to_world: Rigid. [4, 4]
+    """
+
+    intrinsics: Intrinsics
+    camera_to_world: Float[np.ndarray, "4 4"]
+
+    @classmethod
+    def of(cls, camera: Camera, reduction: int = 1) -> Pose:
+        """The camera, of an image reduced by a whole number."""
+        return cls.resized(camera, reduced_size(camera.width, camera.height, reduction))
+
+    @classmethod
+    def resized(cls, camera: Camera, size: tuple[int, int]) -> Pose:
+        """The camera, of an image of another width and height."""
+        return cls(camera.intrinsics.resized(*size), camera.camera_to_world.cpu().double().numpy())
+
+    @property
+    def matrix(self) -> Float[np.ndarray, "3 3"]:
+        """K for pixel centres at integers + 0.5. [3, 3]"""
+        k = self.intrinsics
+        return np.array([[k.fx, 0.0, k.cx], [0.0, k.fy, k.cy], [0.0, 0.0, 1.0]])
+
+    def rays(self) -> Float[np.ndarray, "H W 3"]:
+        """Directions through the pixel centres in the camera's axes, z = 1. [H, W, 3]"""
+        k = self.intrinsics
+        x = (np.arange(k.width) + 0.5 - k.cx) / k.fx
+        y = (np.arange(k.height) + 0.5 - k.cy) / k.fy
+        return np.stack([*np.meshgrid(x, y), np.ones((k.height, k.width))], axis=-1)
+
+    def to(self, other: Pose) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
+        """Rotation and translation from this camera's axes to another's."""
+        turn = other.camera_to_world[:3, :3].T
+        return turn @ self.camera_to_world[:3, :3], turn @ (self.camera_to_world[:3, 3] - other.camera_to_world[:3, 3])
+
+    def homography(self, other: Pose) -> tuple[Float32[np.ndarray, "3 3"], Float32[np.ndarray, "3"]]:
+        """A and b with which pixel p at z-depth z lies at A (p, 1) z + b in another view, homogeneous."""
+        rotation, translation = self.to(other)
+        turn = other.matrix @ rotation @ np.linalg.inv(self.matrix)
+        return turn.astype(np.float32), (other.matrix @ translation).astype(np.float32)
+
+    def depth_from(self, other: Pose) -> tuple[Float32[np.ndarray, "3"], np.float32]:
+        """The a and b with which pixel p of another view at z-depth z has z-depth a . (p, 1) z + b here."""
+        rotation, translation = other.to(self)
+        return (rotation[2] @ np.linalg.inv(other.matrix)).astype(np.float32), np.float32(translation[2])
+
+
+@dataclass(frozen=True, eq=False)
+class Guide:
+    """An image prepared for matching.
+
+    Attributes:
+        pose: Camera of its size.
+        intensity: Log of green; comparable up to a constant. [H, W]
+        usable: Neither masked nor near a highlight. [H, W]
+    """
+
+    pose: Pose
+    intensity: Float32[np.ndarray, "H W"]
+    usable: Bool[np.ndarray, "H W"]
+
+
+def reduced_size(width: int, height: int, reduction: int) -> tuple[int, int]:
+    """Size of an image reduced by a whole number, at least 8 pixels a side unless it was smaller."""
+    return max(min(8, width), round(width / reduction)), max(min(8, height), round(height / reduction))
+
+
+def guide_of(frame: Frame, reduction: int, features: FeatureSettings) -> Guide:
+    """Prepare a frame for matching.
+
+    Args:
+        frame: The frame.
+        reduction: Factor by which it is reduced.
+        features: Says what a highlight is.
+    """
+    import cv2
+
+    image = frame.image.cpu().numpy()
+    mask = None if frame.mask is None else frame.mask.cpu().numpy()
+    good = usable(image, mask, features)
+    size = reduced_size(image.shape[1], image.shape[0], reduction)
+    green = image[..., 1].astype(np.float32) / 255.0
+    if reduction > 1:
+        green = cv2.resize(green, size, interpolation=cv2.INTER_AREA)
+        good = cv2.resize(good.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
+    intensity = np.log(green + _OFFSET).astype(np.float32)
+    middle = float(intensity[good].mean()) if good.any() else 0.0
+    return Guide(Pose.of(frame.camera, reduction), np.ascontiguousarray(intensity - np.float32(middle)), good)
+
+
+def resized_map(values: Float32[np.ndarray, "H W"], size: tuple[int, int]) -> Float32[np.ndarray, "h w"]:
+    """A map without unknown values at another width and height, bilinearly."""
+    import cv2
+
+    return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_LINEAR), np.float32)

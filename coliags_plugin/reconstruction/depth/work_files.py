@@ -1,0 +1,142 @@
+"""Work files of an estimation, which an interrupted one is resumed from."""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import shutil
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import atomic_write, make_folder, write_json
+from coliags_plugin.core.locks import LockedError, locked
+
+log = logging.getLogger(__name__)
+
+Arrays = Mapping[str, np.ndarray]
+_Value = TypeVar("_Value")
+#: What describes the estimation, in the folder of its work files.
+_REQUEST = "request.json"
+
+
+class WorkFolder:
+    """The folder of an estimation's work files: one folder for each pass, one file in it for each frame.
+
+    Args:
+        path: The folder.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def has(self, stage: str, index: int) -> bool:
+        """Whether a frame of a pass is there."""
+        return self._file(stage, index).is_file()
+
+    def save(self, stage: str, index: int, arrays: Arrays) -> None:
+        """Keep the results of a frame of a pass; atomic.
+
+        Raises:
+            InputError: The folder cannot be written.
+        """
+        data = io.BytesIO()
+        np.savez(data, allow_pickle=False, **arrays)
+        atomic_write(self._file(stage, index), data.getvalue())
+
+    def load(self, stage: str, index: int) -> dict[str, np.ndarray]:
+        """The results of a frame of a pass."""
+        with np.load(self._file(stage, index)) as stored:
+            return {name: stored[name] for name in stored.files}
+
+    def is_done(self, stage: str) -> bool:
+        """Whether all frames of a pass were kept at one time."""
+        return (self.path / f"{stage}.done").is_file()
+
+    def finish(self, stage: str, before: str | None) -> None:
+        """Mark a pass as done, and remove the files of one that is no longer needed."""
+        atomic_write(self.path / f"{stage}.done", "")
+        if before is not None:
+            shutil.rmtree(self.path / before, ignore_errors=True)
+
+    def value(self, name: str, make: Callable[[], Any]) -> Any:
+        """A JSON value: the kept one, or else a new one, which is kept."""
+        file = self.path / f"{name}.json"
+        if not file.is_file():
+            write_json(file, make())
+        return json.loads(file.read_text())
+
+    def _file(self, stage: str, index: int) -> Path:
+        return self.path / stage / f"{index:06d}.npz"
+
+
+@contextmanager
+def work_folder(out: Path, request: Mapping[str, Any]) -> Iterator[WorkFolder]:
+    """The work files for an output folder, beside it; removed when the block ends without an error.
+
+    Those of an estimation with another request are removed first.
+
+    Args:
+        out: The output folder.
+        request: Everything that determines the results, as JSON values.
+
+    Raises:
+        InputError: Another process works there, or the folder cannot be written.
+    """
+    path = out.parent / f".{out.name}.work"
+    make_folder(path)
+    try:
+        with locked(path / "lock"):
+            file, wanted = path / _REQUEST, json.loads(json.dumps(dict(request)))
+            kept = json.loads(file.read_text()) if file.is_file() else None
+            if kept is not None and kept != wanted:
+                log.warning("%s: work files of other data or options are removed", path)
+            if kept != wanted:
+                for old in path.iterdir():
+                    if old.is_dir():
+                        shutil.rmtree(old)
+                    elif old.name != "lock":
+                        old.unlink()
+                write_json(file, wanted)
+            else:
+                log.info("resuming from the work files in %s", path)
+            yield WorkFolder(path)
+    except LockedError as error:
+        raise InputError(
+            f"{error} is writing {out}", "one process for each output", "Wait for it, or choose another"
+        ) from error
+    shutil.rmtree(path, ignore_errors=True)
+
+
+class Recent(Generic[_Value]):
+    """The most recently used values of a function of an index, for several threads.
+
+    Args:
+        make: The function; may run twice for the same index.
+        most: How many values are held.
+    """
+
+    def __init__(self, make: Callable[[int], _Value], most: int) -> None:
+        self._make, self._most = make, most
+        self._held: OrderedDict[int, _Value] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def __call__(self, index: int) -> _Value:
+        """The value of an index."""
+        with self._lock:
+            if index in self._held:
+                self._held.move_to_end(index)
+                return self._held[index]
+        value = self._make(index)
+        with self._lock:
+            self._held[index] = value
+            while len(self._held) > self._most:
+                self._held.popitem(last=False)
+        return value

@@ -1,0 +1,254 @@
+"""``coliags depth estimate`` as a user meets it: a textured wall with closed-form depth."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from coliags_plugin.core.images import write_mask
+from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
+from coliags_plugin.datamanagers.fusion import load_points
+from coliags_plugin.datamanagers.reading.images import read_gray
+from coliags_plugin.datamanagers.units import write_unit
+from coliags_plugin.engine.data_formats import open_scene
+from coliags_plugin.reconstruction.depth.estimate import Estimation
+from coliags_plugin.reconstruction.depth.work_files import WorkFolder
+from tests import commands
+from tests.commands import run
+from tests.reconstruction.depth.walls import NORMAL, OFFSET, sideways, wall_depth, wall_frames
+
+COUNT = 9
+OPTIONS = ("--set", "depth.features.highlight_level=256", "--jobs", 2)
+
+
+def write_wall(folder: Path, frames) -> Path:
+    write_c3vd_scene(
+        folder,
+        [frame.image.numpy() for frame in frames],
+        np.stack([frame.camera.camera_to_world.numpy() for frame in frames]),
+        frames[0].camera.intrinsics,
+    )
+    return folder
+
+
+@pytest.fixture(scope="module")
+def wall(tmp_path_factory):
+    return write_wall(tmp_path_factory.mktemp("walls") / "wall", wall_frames(sideways(COUNT)))
+
+
+@pytest.fixture(scope="module")
+def estimated(wall, tmp_path_factory):
+    """The wall with estimated depth, and what was printed is discarded."""
+    out = tmp_path_factory.mktemp("estimates") / "out"
+    assert run("depth", "estimate", wall, "--out", out, *OPTIONS) == 0
+    return out
+
+
+def refused(capsys, *argv):
+    """What a command that must fail says, in one line."""
+    return " ".join(commands.refused(capsys, "depth", "estimate", *argv).split())
+
+
+def frames_of(folder, *options):
+    scene = open_scene(folder, options=["initial_points=none", *options])
+    return sorted([*scene.train, *scene.test_sets.get("test", ())], key=lambda frame: frame.index)
+
+
+def confidence_of(folder, name):
+    return read_gray(folder / "confidence" / f"{name}.png", 8, "confidence") / 255.0
+
+
+def contents(folder):
+    return {path.relative_to(folder): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_a_wall(wall, estimated):
+    errors, sure = [], []
+    for one, other in zip(frames_of(estimated), frames_of(wall), strict=True):
+        assert one.name == other.name
+        np.testing.assert_array_equal(one.image, other.image)
+        np.testing.assert_allclose(one.camera.camera_to_world, other.camera.camera_to_world, atol=1e-5)
+        np.testing.assert_allclose(one.camera.intrinsics_matrix, other.camera.intrinsics_matrix, atol=1e-4)
+        assert np.isfinite(one.depth).all()
+        errors.append(np.abs(one.depth.numpy() / wall_depth(other.camera) - 1.0))
+        sure.append(confidence_of(estimated, one.name))
+    error, confidence = np.stack(errors), np.stack(sure)
+    assert np.median(error) < 0.01
+    assert np.percentile(error[confidence > 0.8], 90) < 0.03
+    assert (confidence > 0.8).mean() > 0.7
+    assert (error[confidence > 0.8] < 0.05).mean() > 0.9
+
+
+def test_the_points_are_on_the_wall(estimated):
+    points = load_points(estimated / "points.ply")
+    distance = (points.positions.numpy() @ NORMAL - OFFSET) / np.linalg.norm(NORMAL)
+    assert len(points) > 300
+    assert np.percentile(np.abs(distance), 95) < 1.5
+    assert points.colors is not None
+
+
+def test_the_layout(estimated):
+    content = json.loads((estimated / "transforms.json").read_text())
+    assert content["ply_file_path"] == "points.ply"
+    assert len(content["frames"]) == COUNT
+    for frame in content["frames"]:
+        for key in ("file_path", "depth_file_path", "confidence_file_path"):
+            assert (estimated / frame[key]).is_file()
+        assert "mask_path" not in frame
+    assert "train_filenames" not in content
+    assert (estimated / "unit.txt").read_text() == "mm\n"
+    assert not list(estimated.parent.glob(".*"))
+
+
+def test_what_is_printed(wall, tmp_path, capsys):
+    out = tmp_path / "out"
+    options = (*OPTIONS, "--set", "split=endogslam", "--set", "max_frames=6", "--near", 20, "--far", 80)
+    assert run("depth", "estimate", wall, "--out", out, *options) == 0
+    summary, place, command = capsys.readouterr().out.splitlines()
+    assert summary.startswith("6 frames, depth 20 to 80, ")
+    assert summary.endswith(" points")
+    assert place == str(out)
+    assert command == f"coliags train coliags --data {out} --set datamanager.split=endogslam"
+
+
+def test_resuming_gives_the_same_bytes(wall, estimated, tmp_path, monkeypatch, caplog):
+    out = tmp_path / "out"
+    save, saved = WorkFolder.save, []
+
+    def killed(self, stage, index, arrays):
+        if stage == "swept-1" and len(saved) == 20:
+            raise KeyboardInterrupt
+        save(self, stage, index, arrays)
+        saved.append((stage, index))
+
+    monkeypatch.setattr(WorkFolder, "save", killed)
+    assert run("depth", "estimate", wall, "--out", out, *OPTIONS[:2], "--jobs", 1) == 130
+    assert not out.exists()
+    assert (tmp_path / ".out.work" / "swept-1").is_dir()
+    again = []
+    monkeypatch.setattr(WorkFolder, "save", lambda *call: (again.append(call[1:3]), save(*call))[1])
+    caplog.set_level("INFO")
+    assert run("depth", "estimate", wall, "--out", out, *OPTIONS) == 0
+    assert "resuming" in caplog.text
+    assert not set(saved) & set(again)
+    assert contents(out) == contents(estimated)
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_work_files_of_other_options_are_not_used(wall, tmp_path, monkeypatch, caplog):
+    out = tmp_path / "out"
+
+    def killed(self):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Estimation, "run", killed)
+        assert run("depth", "estimate", wall, "--out", out, *OPTIONS) == 130
+    options = (*OPTIONS, "--set", "depth.agreement=0.03", "--set", "max_frames=5")
+    assert run("depth", "estimate", wall, "--out", out, *options) == 0
+    assert "work files of other data or options are removed" in caplog.text
+    assert len(frames_of(out)) == 5
+
+
+def test_unit_mask_and_own_split_are_kept(estimated, tmp_path):
+    """The output is a scene like others, which can be estimated again."""
+    source = tmp_path / "source"
+    frames = frames_of(estimated)
+    content = json.loads((estimated / "transforms.json").read_text())
+    shutil.copytree(estimated, source)
+    mask = np.ones(frames[0].image.shape[:2], bool)
+    mask[:20, :20] = False
+    for frame, entry in zip(frames, content["frames"], strict=True):
+        write_mask(source / "masks" / f"{frame.name}.png", mask)
+        entry["mask_path"] = f"masks/{frame.name}.png"
+    names = [entry["file_path"] for entry in content["frames"]]
+    content |= {"train_filenames": names[1:], "test_filenames": names[:1]}
+    (source / "transforms.json").write_text(json.dumps(content))
+    write_unit(source, "unknown")
+    out = tmp_path / "out"
+    assert run("depth", "estimate", source, "--out", out, *OPTIONS, "--set", "split=own") == 0
+    assert (out / "unit.txt").read_text() == "unknown\n"
+    scene = open_scene(out, options=["split=own", "initial_points=data"])
+    assert [frame.name for frame in scene.test_sets["test"]] == [frames[0].name]
+    assert len(scene.points) > 300
+    for frame in scene.train:
+        np.testing.assert_array_equal(frame.mask, mask)
+        assert np.isnan(frame.depth.numpy()[~mask]).all()
+        assert np.isfinite(frame.depth.numpy()[mask]).all()
+        assert (confidence_of(out, frame.name)[~mask] == 0.0).all()
+
+
+def test_bad_options_are_refused(wall, tmp_path, capsys):
+    out = ("--out", tmp_path / "out")
+    assert "--near without --far" in refused(capsys, wall, *out, "--near", 3)
+    assert "0 < near < far" in refused(capsys, wall, *out, "--near", 30, "--far", 20)
+    assert "--jobs 0" in refused(capsys, wall, *out, "--jobs", 0)
+    assert "Did you mean 'agreement'" in refused(capsys, wall, *out, "--set", "depth.agrement=0.1")
+    assert "no such folder" in refused(capsys, wall, *out, "--prior", tmp_path / "none")
+    assert "a folder apart from the input" in refused(capsys, wall, "--out", wall / "inside")
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_gives_no_depth_is_refused(tmp_path, capsys):
+    out = ("--out", tmp_path / "out", *OPTIONS)
+    few = write_wall(tmp_path / "few", wall_frames(sideways(3)))
+    assert "3 frames. Expected at least 4" in refused(capsys, few, *out, "--set", "split=all-train")
+    still = write_wall(tmp_path / "still", wall_frames(sideways(6, 0.0)))
+    assert "all 6 cameras are at the same position" in refused(capsys, still, *out)
+    turning = sideways(6, 1e-4)
+    angles = np.radians(3.0 * np.arange(6))
+    turning[:, 0, 0], turning[:, 0, 2], turning[:, 2, 0], turning[:, 2, 2] = (
+        np.cos(angles),
+        np.sin(angles),
+        -np.sin(angles),
+        np.cos(angles),
+    )
+    turned = write_wall(tmp_path / "turned", wall_frames(turning))
+    assert "the depth range is unknown" in refused(capsys, turned, *out)
+    assert "no frame has 3 others" in refused(capsys, turned, *out, "--near", 20, "--far", 80)
+    assert not (tmp_path / "out").exists()
+
+
+def noisy(frames, level, seed=0):
+    """The frames without what they show, which is camera noise about a level."""
+    rng = np.random.default_rng(seed)
+    size = frames[0].image.shape
+    images = [np.clip(rng.normal(level, 1.5, size), 0, 255).astype(np.uint8) for _ in frames]
+    return [
+        dataclasses.replace(frame, image=torch.from_numpy(image)) for frame, image in zip(frames, images, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("level", [2, 90])
+def test_black_or_blurred_frames_give_no_confident_depth(tmp_path, capsys, level):
+    frames = wall_frames(sideways(COUNT))
+    nothing = write_wall(tmp_path / "nothing", noisy(frames, level))
+    assert "the depth range is unknown" in refused(capsys, nothing, "--out", tmp_path / "a", *OPTIONS)
+    told = ("--near", 20, "--far", 80)
+    assert "no surface that 9 frames agree on" in refused(capsys, nothing, "--out", tmp_path / "a", *OPTIONS, *told)
+    some = write_wall(tmp_path / "some", [*frames[:4], *noisy(frames[4:5], level), *frames[5:]])
+    assert run("depth", "estimate", some, "--out", tmp_path / "b", *OPTIONS, *told) == 0
+    found = frames_of(tmp_path / "b")
+    assert confidence_of(tmp_path / "b", found[4].name).max() == 0.0
+    assert np.isfinite(found[4].depth.numpy()).all()
+    assert (confidence_of(tmp_path / "b", found[2].name) > 0.8).mean() > 0.5
+
+
+def test_a_prior_by_another(wall, tmp_path):
+    priors = tmp_path / "priors"
+    priors.mkdir()
+    for frame in frames_of(wall):
+        np.save(priors / f"{frame.name}.npy", 5.0 + 100.0 / wall_depth(frame.camera))
+    out = tmp_path / "out"
+    assert run("depth", "estimate", wall, "--out", out, "--prior", priors, *OPTIONS, "--set", "max_frames=6") == 0
+    frames = frames_of(out)
+    error = np.stack([np.abs(frame.depth.numpy() / wall_depth(frame.camera) - 1.0) for frame in frames])
+    unknown = np.stack([confidence_of(out, frame.name) for frame in frames]) == 0.0
+    assert unknown.any()
+    assert np.median(error[unknown]) < 0.04

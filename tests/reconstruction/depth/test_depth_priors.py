@@ -1,0 +1,149 @@
+"""Priors, completion, confidence and points against closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import write_image
+from coliags_plugin.core.scenes import Frame
+from coliags_plugin.reconstruction.depth.completion import complete, near_rim
+from coliags_plugin.reconstruction.depth.confidence import depth_confidence
+from coliags_plugin.reconstruction.depth.light_prior import LightPrior
+from coliags_plugin.reconstruction.depth.points import VoxelPoints
+from coliags_plugin.reconstruction.depth.prior_files import FilePrior
+from coliags_plugin.reconstruction.depth.robust_fit import robust_fit
+from coliags_plugin.reconstruction.depth.views import Pose
+from tests.reconstruction.depth.walls import sideways, wall_depth, wall_frames
+
+ALL = np.ones((80, 96), bool)
+FLOAT = np.ones((80, 96), np.float32)
+NOWHERE = np.zeros((80, 96), np.float32)
+
+
+def lit_frame(law=2.0):
+    """A plane of one colour lit by a lamp at the lens: linear intensity ~ depth^-law; and its depth."""
+    frame = wall_frames(sideways(1))[0]
+    depth = wall_depth(frame.camera)
+    linear = 0.9 * (depth.min() / depth) ** law
+    image = np.repeat(np.rint(255.0 * linear ** (1 / 2.2)).astype(np.uint8)[..., None], 3, axis=2)
+    return Frame("lit", 0, torch.from_numpy(image), frame.camera), depth
+
+
+def test_a_robust_fit_ignores_a_third_of_outliers():
+    rng = np.random.default_rng(0)
+    columns = np.stack([np.ones(900), rng.normal(size=900), rng.normal(size=900)], axis=1)
+    values = columns @ [1.0, 2.0, -3.0]
+    values[::3] += rng.uniform(20, 30, 300)
+    found = robust_fit(columns, values, np.ones(900), np.zeros(3), 1e-6)
+    np.testing.assert_allclose(found, [1.0, 2.0, -3.0], atol=0.05)
+    np.testing.assert_array_equal(robust_fit(columns[:0], values[:0], values[:0], np.arange(3.0), 1.0), [0.0, 1.0, 2.0])
+
+
+def test_brightness_gives_depth():
+    frame, depth = lit_frame()
+    known = np.log(depth).astype(np.float32)
+    half = FLOAT.copy()
+    half[:, ::2] = 0.0
+    prior = np.exp(LightPrior().log_depth(frame, ALL, known, half, 40.0))
+    assert np.abs(prior / depth - 1.0)[5:-5, 5:-5].max() < 0.03
+
+
+def test_without_known_depth_the_law_of_a_lamp_at_the_lens_holds():
+    frame, depth = lit_frame()
+    prior = np.exp(LightPrior().log_depth(frame, ALL, NOWHERE, NOWHERE, float(np.median(depth))))
+    np.testing.assert_allclose(prior[5:-5, 5:-5], depth[5:-5, 5:-5], rtol=0.02)
+
+
+def test_completion_keeps_what_is_known_and_shifts_the_prior_to_it():
+    truth = np.log(np.linspace(30.0, 40.0, 96, dtype=np.float32))[None].repeat(80, axis=0)
+    support = 5.0 * FLOAT
+    support[20:60, 30:60] = 0.0
+    known = np.where(support > 0.0, truth, np.float32(9.9))
+    found = complete(known, support, truth - np.float32(0.3), NOWHERE, ~ALL)
+    np.testing.assert_array_equal(found[support > 0.0], truth[support > 0.0])
+    np.testing.assert_allclose(found, truth, atol=0.01)
+
+
+def test_the_rim_is_the_near_side_of_an_edge():
+    log_depth = np.where(np.arange(96) < 50, 3.0, 3.5).astype(np.float32)[None].repeat(80, axis=0)
+    rim = near_rim(log_depth, 6)
+    assert rim[40, 45:50].all()
+    assert not rim[:, 50:].any()
+    assert not rim[:, :40].any()
+    assert not near_rim(np.full((80, 96), 3.0, np.float32), 6).any()
+
+
+def test_confidence_rises_with_support_and_falls_at_edges():
+    flat = np.full((80, 96), 3.0, np.float32)
+    levels = [depth_confidence(flat, n * FLOAT, 0.01 * FLOAT, ~ALL)[40, 40] for n in (0.0, 0.3, 1.0, 3.0, 9.0)]
+    assert levels[0] == 0.0
+    assert (np.diff(levels) > 0.0).all()
+    assert levels[-1] < 1.0
+    edge = flat.copy()
+    edge[:, 48:] = 3.4
+    at_edge = depth_confidence(edge, 3.0 * FLOAT, 0.01 * FLOAT, ~ALL)
+    assert at_edge[40, 46] < at_edge[40, 10]
+    assert depth_confidence(flat, 3.0 * FLOAT, 0.01 * FLOAT, ALL)[40, 40] < levels[3]
+
+
+def camera_pose(x):
+    matrix = np.eye(4)
+    matrix[0, 3] = x
+    return Pose.of(Camera(60.0, 60.0, 48.0, 40.0, 96, 80, torch.from_numpy(matrix)))
+
+
+def test_points_are_where_three_frames_are_sure():
+    image = np.full((80, 96, 3), 100, np.uint8)
+    voxels = VoxelPoints(2.0, np.zeros(3))
+    for x in (0.0, 0.3, 0.6):
+        voxels.add(camera_pose(x), 31.0 * FLOAT, FLOAT, image)
+    # A fourth frame that disagrees makes no shell, and one without confidence nothing at all.
+    voxels.add(camera_pose(0.9), 41.0 * FLOAT, FLOAT, image)
+    voxels.add(camera_pose(1.2), 51.0 * FLOAT, 0.5 * FLOAT, image)
+    positions, colors = voxels.points()
+    np.testing.assert_allclose(positions[:, 2], 31.0, atol=1e-4)
+    assert (colors == 100).all()
+    assert len(positions) == len(np.unique(np.floor(positions / 2.0), axis=0))
+    # Some 49 mm by 41 mm of the plane are seen, in cells of 2 mm.
+    assert 0.8 * 49 * 41 / 4 < len(positions) < 1.15 * 49 * 41 / 4
+
+
+@pytest.mark.parametrize("inverse", [False, True])
+@pytest.mark.parametrize("suffix", ["npy", "png"])
+def test_files_as_a_prior_in_any_scale_and_shift(tmp_path, inverse, suffix):
+    frame, depth = lit_frame()
+    values = 1000.0 + 20000.0 * (10.0 / depth if inverse else depth / 100.0)
+    if suffix == "npy":
+        np.save(tmp_path / "lit.npy", values)
+    else:
+        write_image(tmp_path / "lit.png", np.rint(values).astype(np.uint16))
+    half = FLOAT.copy()
+    half[:, 48:] = 0.0
+    prior = FilePrior.of(tmp_path, [frame])
+    found = np.exp(prior.log_depth(frame, ALL, np.log(depth).astype(np.float32), half, 40.0))
+    np.testing.assert_allclose(found, depth, rtol=2e-3)
+    # Without known depth the scale is a guess.
+    guess = np.exp(prior.log_depth(frame, ALL, NOWHERE, NOWHERE, 40.0))
+    assert np.median(guess) == pytest.approx(40.0, rel=1e-3)
+
+
+def test_a_larger_map_of_the_same_aspect_is_taken(tmp_path):
+    frame, depth = lit_frame()
+    np.save(tmp_path / "lit.npy", np.kron(depth, np.ones((2, 2))))
+    found = FilePrior.of(tmp_path, [frame]).log_depth(frame, ALL, np.log(depth).astype(np.float32), FLOAT, 40.0)
+    np.testing.assert_allclose(np.exp(found), depth, rtol=1e-3)
+
+
+def test_files_that_do_not_fit_are_refused(tmp_path):
+    frame, depth = lit_frame()
+    with pytest.raises(InputError, match="no such folder"):
+        FilePrior.of(tmp_path / "none", [frame])
+    with pytest.raises(InputError, match="1 of 1 frames have no depth map: lit"):
+        FilePrior.of(tmp_path, [frame])
+    np.save(tmp_path / "lit.npy", depth[:, :60])
+    with pytest.raises(InputError, match="60 x 80 pixels, frame lit 96 x 80"):
+        FilePrior.of(tmp_path, [frame])
