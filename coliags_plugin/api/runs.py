@@ -171,7 +171,7 @@ class Run:
         video: bool = True,
         fps: float = 15.0,
         channels: Sequence[str] = (),
-        depth_kind: DepthKind = "accumulated",
+        depth_kind: DepthKind = "expected",
         depth_tiff: bool = False,
         overwrite: bool = False,
     ) -> Path:

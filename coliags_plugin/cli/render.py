@@ -25,9 +25,9 @@ class Render:
     """Also write trajectory.mp4, rgb beside depth."""
     fps: float = 15.0
     """Frames per second of the video."""
-    depth_kind: Literal["accumulated", "expected", "median"] = "accumulated"
-    """Which depth: sum w z; the same divided by alpha; or that of the Gaussian at which half of the light is
-    absorbed. Pictures are hatched where alpha is below 0.5."""
+    depth_kind: Literal["accumulated", "expected", "median"] = "expected"
+    """Which depth: sum w z, the paper's; the same divided by alpha; or that of the Gaussian at which half of the light
+    is absorbed. Pictures are hatched where alpha is below 0.5."""
     depth_tiff: bool = False
     """Also write depth as float32 TIFF, scene units: depth_tiff/."""
     light: LampOptions = ()

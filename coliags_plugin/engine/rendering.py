@@ -46,7 +46,7 @@ def render_run(
     fps: float,
     overwrite: bool,
     channels: Sequence[str] = (),
-    depth_kind: DepthKind = "accumulated",
+    depth_kind: DepthKind = "expected",
     depth_tiff: bool = False,
 ) -> None:
     """Write colour, depth and error images of a set of frames, and a video along the trajectory.
