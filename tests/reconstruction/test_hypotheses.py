@@ -136,6 +136,8 @@ def test_plausible_then_complete_then_lit_then_exact():
         Hypothesis(Model(error=0.7), -0.9),
     ]
     assert choose([*others, best], RANGE) is best
+    # Where errors hardly differ, the preferred one.
+    assert choose([best, Hypothesis(Model(focal=150.0, error=0.59), -0.7)], RANGE) is best
     with pytest.raises(InputError, match=r"1967 px \(9 degrees\).*nominal field of view of 40 to 150 degrees"):
         choose(others[:1], RANGE)
 
@@ -143,10 +145,10 @@ def test_plausible_then_complete_then_lit_then_exact():
 def test_other_focal_lengths_that_fit_as_well_are_told():
     chosen = Hypothesis(Model(), -0.7)
     assert not is_ambiguous([chosen], chosen, RANGE)
-    assert is_ambiguous([chosen, Hypothesis(Model(focal=260.0, error=0.52), -0.5)], chosen, RANGE)
-    assert not is_ambiguous([chosen, Hypothesis(Model(focal=210.0, error=0.52), -0.5)], chosen, RANGE)
+    assert is_ambiguous([chosen, Hypothesis(Model(focal=260.0, error=0.51), -0.5)], chosen, RANGE)
+    assert not is_ambiguous([chosen, Hypothesis(Model(focal=210.0, error=0.51), -0.5)], chosen, RANGE)
     assert not is_ambiguous([chosen, Hypothesis(Model(focal=260.0, error=0.7), -0.5)], chosen, RANGE)
-    assert not is_ambiguous([chosen, Hypothesis(Model(focal=260.0, error=0.52), 0.5)], chosen, RANGE)
+    assert not is_ambiguous([chosen, Hypothesis(Model(focal=260.0, error=0.51), 0.5)], chosen, RANGE)
 
 
 def test_correlation_of_exact_falloff_and_of_too_few_points():

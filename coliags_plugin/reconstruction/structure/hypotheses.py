@@ -27,9 +27,9 @@ log = logging.getLogger(__name__)
 
 #: Models with at least these shares of the most images and observations explain the images as well as any.
 _ENOUGH_IMAGES, _ENOUGH_OBSERVATIONS = 0.9, 0.9
-#: A focal length is ambiguous if models whose errors differ by less than this factor have focal lengths that differ by
-#: more than this factor.
-_SAME_ERROR, _OTHER_FOCAL_LENGTH = 1.1, 1.15
+#: Errors that differ by less than this factor do not tell models apart; the focal length is ambiguous if those of such
+#: models differ by more than this factor.
+_SAME_ERROR, _OTHER_FOCAL_LENGTH = 1.05, 1.15
 #: A point nearer than this share of the median depth counts as this near when depth is reversed.
 _NEAREST = 0.05
 #: Reflects the z axis.
@@ -105,7 +105,7 @@ def choose(hypotheses: Sequence[Hypothesis], plausible: tuple[float, float]) -> 
     """The best model: of plausible focal length; explaining the images as well as any; lit from the camera; exact.
 
     Args:
-        hypotheses: At least one.
+        hypotheses: The preferred first, which is taken where errors hardly differ.
         plausible: Least and largest nominal field of view, degrees.
 
     Raises:
@@ -124,7 +124,8 @@ def choose(hypotheses: Sequence[Hypothesis], plausible: tuple[float, float]) -> 
         )
     left = _explaining(left)
     left = [one for one in left if one.is_lit_from_the_camera] or left
-    return min(left, key=lambda one: one.error)
+    exact = min(one.error for one in left)
+    return next(one for one in left if one.error <= _SAME_ERROR * exact)
 
 
 def is_ambiguous(hypotheses: Sequence[Hypothesis], chosen: Hypothesis, plausible: tuple[float, float]) -> bool:

@@ -172,7 +172,7 @@ def reconstruct(
         raise InputError(f"{len(images)} images", "at least two", "Give more of the video")
     with quiet_colmap(settings.seed):
         video = _video(images, settings, masks, progress)
-        focal_factor = settings.camera.focal_factors[len(settings.camera.focal_factors) // 2]
+        focal_factor = settings.camera.focal_factors[0]
         if not has_known_camera(settings.camera):
             focal_factor = _best_focal_factor(video, settings, focal_factor, progress)
         models = video.mapped(settings, focal_factor, progress)
@@ -237,7 +237,8 @@ def _best_focal_factor(video: Video, settings: SfmSettings, default: float, prog
     if is_ambiguous(hypotheses, chosen, settings.camera.field_of_view):
         log.warning(
             "the images hardly determine the focal length, and a wrong one distorts path and surface: give the "
-            "camera's calibration (--camera, --params) if there is one"
+            "camera's calibration (--camera, --params) if there is one, or --camera SIMPLE_RADIAL_FISHEYE for a "
+            "wide-angle lens"
         )
     camera = next(iter(chosen.model.cameras.values()))
     return float(camera.mean_focal_length() / max(camera.width, camera.height))

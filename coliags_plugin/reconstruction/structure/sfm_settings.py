@@ -26,9 +26,10 @@ class CameraSettings(Settings):
         default=None, description="Whether focal length and distortion are refined. None: if they are not known."
     )
     focal_factors: tuple[float, ...] = Field(
-        default=(0.5, 0.75, 1.1),
+        default=(0.75, 0.5, 1.1),
         min_length=1,
-        description="Initial focal lengths to try, relative to the image's larger side. Endoscopes have 0.4 to 1.2.",
+        description="Initial focal lengths to try, relative to the image's larger side, the most likely first. "
+        "Endoscopes have 0.4 to 1.2.",
     )
     field_of_view: tuple[float, float] = Field(
         default=(40.0, 150.0),
