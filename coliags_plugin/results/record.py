@@ -251,8 +251,10 @@ class Result(_Part):
     @property
     def title(self) -> str:
         """What was evaluated and how, in one line."""
+        truth = self.provenance.get("truth")
+        trained_on = f" (trained on {truth['trained_on']['name']})" if truth else ""
         return (
-            f"{self.method} on {self.scene.name}, seed {self.seed}, {self.steps} steps, "
+            f"{self.method} on {self.scene.name}{trained_on}, seed {self.seed}, {self.steps} steps, "
             f"protocol {self.protocol.name} v{self.protocol.version}"
         )
 

@@ -120,6 +120,7 @@ def test_against_the_truth_they_are_measured(trained, true):
     own = read_result(evaluate(trained, "paper") / RESULT_FILE)
     assert folder.name == result.evaluation_name == "paper-truth" and own.evaluation_name == "paper"
     assert result.key != own.key
+    assert result.title.startswith("coliags-estimated-depth on phantom (trained on estimate), seed 0")
     assert result.scene.name == "phantom" and result.scene.fingerprint == "true" and result.scene.split == "every-8th"
     assert result.mean("psnr") == own.mean("psnr")
     assert all(result.mean("depth_mse", name) is not None for name in ("test", "rotation"))

@@ -31,7 +31,9 @@ def test_an_evaluation_against_the_truth_is_asked_for_by_name(tmp_path):
     run = write_run(tmp_path / "run", result)
     with pytest.raises(InputError, match=r"Run `coliags eval \S+ --protocol paper --truth SCENE` first"):
         read_study([run], protocol="paper-truth")
-    against = result.model_copy(update={"provenance": {**result.provenance, "truth": {"scene": "cecum"}}})
+    against = result.model_copy(
+        update={"provenance": {**result.provenance, "truth": {"scene": "cecum", "trained_on": {"name": "estimate"}}}}
+    )
     (run / "eval" / "paper").rename(run / "eval" / "paper-truth")
     write_result(run / "eval" / "paper-truth" / "result.json", against)
     (cell,) = read_study([run], protocol="paper-truth").cells
