@@ -74,7 +74,7 @@ class Estimation:
         jobs: int = 1,
         progress: Progress | None = None,
     ) -> None:
-        check_motion(frames)
+        check_video(frames)
         self.frames, self.prior, self.range, self.settings = frames, prior, depth_range, settings
         self.work, self.jobs, self.progress = work, jobs, progress
         self.last = ""
@@ -129,7 +129,7 @@ class Estimation:
         def swept(index: int) -> Arrays:
             guide = guides(index)
             height, width = guide.intensity.shape
-            if base is None:
+            if base is None or sweep.reach is None:
                 surface = np.full((height, width), self.range.near, np.float32)
             else:
                 surface = resized_map(self.work.load(base, index)["depth"], (width, height))
@@ -179,22 +179,29 @@ class Estimation:
 
         if not self.work.is_done(stage):
             parallel_map(one, range(len(self.frames)), title, self.progress, self.jobs)
-            self.work.finish(stage, None)
+            self.work.finish(stage, self.last or None)
         self.last = stage
 
     def _medians(self, stage: str) -> list[float]:
         return [float(np.median(self.work.load(stage, index)["depth"])) for index in range(len(self.frames))]
 
 
-def check_motion(frames: Sequence[Frame]) -> None:
+def check_video(frames: Sequence[Frame]) -> None:
     """Check that a video can give depth at all.
 
     Raises:
-        InputError: It has too few frames, or all cameras are at one position.
+        InputError: It has too few frames, images of several sizes, or all cameras are at one position.
     """
     if len(frames) < FEWEST_FRAMES:
         raise InputError(
             f"{len(frames)} frames", f"at least {FEWEST_FRAMES}, from different positions", "Give more of the video"
+        )
+    sizes = sorted({(frame.camera.width, frame.camera.height) for frame in frames})
+    if len(sizes) > 1:
+        raise InputError(
+            f"images of {' and '.join(f'{width} x {height}' for width, height in sizes[:3])} pixels",
+            "images of one size",
+            "Set width and height of the data manager, or estimate each camera's frames apart",
         )
     centers = np.stack([frame.camera.center.cpu().double().numpy() for frame in frames])
     if not np.ptp(centers, axis=0).max() > 0.0:

@@ -17,7 +17,7 @@ from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.datamanagers.nerfstudio.estimated import EstimatedSceneWriter
 from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.reconstruction.depth.depth_range import DepthRange, find_range, given_range
-from coliags_plugin.reconstruction.depth.estimate import Estimation, check_motion
+from coliags_plugin.reconstruction.depth.estimate import Estimation, check_video
 from coliags_plugin.reconstruction.depth.light_prior import LightPrior
 from coliags_plugin.reconstruction.depth.points import VoxelPoints
 from coliags_plugin.reconstruction.depth.prior_files import FilePrior
@@ -77,7 +77,7 @@ def estimate_scene(
     frames = sorted([*scene.train, *scene.test_sets.get("test", ())], key=lambda frame: frame.index)
     if others := [name for name in scene.test_sets if name != "test"]:
         log.warning("left out: %s, which are apart from the video", ", ".join(others))
-    check_motion(frames)
+    check_video(frames)
     prior: DepthPrior = LightPrior() if request.prior is None else FilePrior.of(request.prior, frames)
     described = {
         "version": _VERSION,

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import Field, model_validator
+from typing_extensions import Self
 
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.reconstruction.structure.features import FeatureSettings
@@ -65,3 +66,9 @@ class DepthSettings(Settings):
     features: FeatureSettings = Field(
         default=FeatureSettings(), description="Features that the depth range is found from, and highlights."
     )
+
+    @model_validator(mode="after")
+    def _first_sweep_is_whole(self) -> Self:
+        if self.sweeps[0].reach is not None:
+            raise ValueError(f"sweeps: the first has reach {self.sweeps[0].reach:g}: it has no depth to be near to")
+        return self

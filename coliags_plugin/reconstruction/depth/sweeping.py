@@ -61,7 +61,7 @@ def sweep_frame(
 
     Args:
         guide: The frame.
-        neighbours: At least one, of any size.
+        neighbours: At least one, all of one size.
         base: The surface, z-depth. [H, W]
         factors: Multiples of it, ascending. [D]
         sweep: Options of this sweep.

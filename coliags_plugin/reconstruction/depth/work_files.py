@@ -61,7 +61,7 @@ class WorkFolder:
         return (self.path / f"{stage}.done").is_file()
 
     def finish(self, stage: str, before: str | None) -> None:
-        """Mark a pass as done, and remove the files of one that is no longer needed."""
+        """Mark a pass as done, and remove the files of the one before it, which it was made from."""
         atomic_write(self.path / f"{stage}.done", "")
         if before is not None:
             shutil.rmtree(self.path / before, ignore_errors=True)

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 import torch
 
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_mask
 from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.reading.images import read_gray
 from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.engine.data_formats import open_scene
-from coliags_plugin.reconstruction.depth.estimate import Estimation
+from coliags_plugin.reconstruction.depth.estimate import Estimation, check_video
 from coliags_plugin.reconstruction.depth.work_files import WorkFolder
 from tests import commands
 from tests.commands import run
@@ -191,8 +192,17 @@ def test_bad_options_are_refused(wall, tmp_path, capsys):
     assert "--jobs 0" in refused(capsys, wall, *out, "--jobs", 0)
     assert "Did you mean 'agreement'" in refused(capsys, wall, *out, "--set", "depth.agrement=0.1")
     assert "no such folder" in refused(capsys, wall, *out, "--prior", tmp_path / "none")
+    reach = "depth.sweeps=[{reduction: 2, reach: 0.1}]"
+    assert "the first has reach 0.1" in refused(capsys, wall, *out, "--set", reach)
     assert "a folder apart from the input" in refused(capsys, wall, "--out", wall / "inside")
     assert not (tmp_path / "out").exists()
+
+
+def test_frames_of_several_sizes_are_refused():
+    frames = wall_frames(sideways(4))
+    frames[1] = dataclasses.replace(frames[1], camera=frames[1].camera.resized(48, 40))
+    with pytest.raises(InputError, match="images of 48 x 40 and 96 x 80 pixels"):
+        check_video(frames)
 
 
 def test_what_gives_no_depth_is_refused(tmp_path, capsys):

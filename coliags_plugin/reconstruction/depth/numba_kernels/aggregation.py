@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from coliags_plugin.renderers.numba_kernels.compilation import kernel, part
 
 
 @part
-def _path_step(cost, before, least, jump, small, into, total):
+def _path_step(cost: Any, before: Any, least: Any, jump: Any, small: Any, into: Any, total: Any) -> Any:
     """One step of a path: Hirschmueller's recurrence. Returns the least value of ``into``."""
     count = len(cost)
     lowest = np.float32(np.inf)
@@ -26,7 +28,7 @@ def _path_step(cost, before, least, jump, small, into, total):
 
 
 @kernel
-def aggregate(cost, guide, small, large, contrast, total):
+def aggregate(cost: Any, guide: Any, small: Any, large: Any, contrast: Any, total: Any) -> None:
     """Sum of the path costs over eight directions.
 
     Args:
@@ -88,7 +90,7 @@ def aggregate(cost, guide, small, large, contrast, total):
 
 
 @kernel
-def pick(total, cost, rivals, index, match, margin):
+def pick(total: Any, cost: Any, rivals: Any, index: Any, match: Any, margin: Any) -> None:
     """The hypothesis of the least aggregated cost, to a part of a step by a parabola.
 
     Args:

@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from coliags_plugin.renderers.numba_kernels.compilation import kernel
 
 
 @kernel
-def reproject(depth, other, weight, turn, shift, back, origin, steps, tolerance, found, trust):
+def reproject(
+    depth: Any,
+    other: Any,
+    weight: Any,
+    turn: Any,
+    shift: Any,
+    back: Any,
+    origin: Any,
+    steps: Any,
+    tolerance: Any,
+    found: Any,
+    trust: Any,
+) -> None:
     """Where the rays of one camera meet the depth map of another, by fixed-point iteration from a first guess.
 
     Args:
@@ -66,7 +80,17 @@ def reproject(depth, other, weight, turn, shift, back, origin, steps, tolerance,
 
 
 @kernel
-def vote(depth, own, candidates, trusts, tolerance, fused, votes, against, spread):
+def vote(
+    depth: Any,
+    own: Any,
+    candidates: Any,
+    trusts: Any,
+    tolerance: Any,
+    fused: Any,
+    votes: Any,
+    against: Any,
+    spread: Any,
+) -> None:
     """Weighted median of the densest group of the candidates.
 
     Args:

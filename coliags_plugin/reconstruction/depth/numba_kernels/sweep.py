@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from coliags_plugin.renderers.numba_kernels.compilation import kernel, part
 
 
 @part
-def _warp(base, ratio, image, usable, turn, shift, out, seen):
+def _warp(base: Any, ratio: Any, image: Any, usable: Any, turn: Any, shift: Any, out: Any, seen: Any) -> None:
     """Sample a neighbour's image at the surface ``base * ratio`` of the reference, bilinearly."""
     height, width = base.shape
     rows, columns = image.shape
@@ -41,7 +43,7 @@ def _warp(base, ratio, image, usable, turn, shift, out, seen):
 
 
 @part
-def _correlate(reference, warped, seen, radius, floor, least, out):
+def _correlate(reference: Any, warped: Any, seen: Any, radius: Any, floor: Any, least: Any, out: Any) -> None:
     """ZNCC of two images in square windows, of their common pixels; NaN where these are too few.
 
     Sums run along columns, then along rows. ``floor`` is added to both variances.
@@ -102,7 +104,20 @@ def _correlate(reference, warped, seen, radius, floor, least, out):
 
 
 @kernel
-def sweep(base, ratios, reference, usable, images, masks, turns, shifts, radius, floor, share, cost):
+def sweep(
+    base: Any,
+    ratios: Any,
+    reference: Any,
+    usable: Any,
+    images: Any,
+    masks: Any,
+    turns: Any,
+    shifts: Any,
+    radius: Any,
+    floor: Any,
+    share: Any,
+    cost: Any,
+) -> None:
     """Costs of the hypotheses ``base * ratios[d]``: one minus the mean of the best correlations with the neighbours.
 
     Args:
