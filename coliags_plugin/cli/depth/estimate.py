@@ -63,7 +63,7 @@ class EstimateDepth:
             near_far = None if self.near is None or self.far is None else (self.near, self.far)
             request = DepthRequest(settings, near_far, self.prior, self.jobs)
             summary = estimate_scene(scene, self.out, request, self.overwrite, progress)
-        print(f"{summary}\n{self.out}\n{train_command(self.out, *_same_frames(scene))}")
+        print(f"{summary}\n{self.out}\n{train_command(self.out, 'coliags-estimated-depth', _same_frames(scene))}")
 
 
 def _same_frames(scene: Scene) -> list[str]:

@@ -114,20 +114,29 @@ def refuse_output(out: Path, source: Path, overwrite: bool) -> None:
         raise InputError(f"{out} already exists", "a new or empty folder", "Choose another, or pass --overwrite")
 
 
-def train_command(out: Path) -> str:
-    """Shell command that trains on a scene."""
-    return shlex.join(["coliags", "train", "coliags", "--data", str(out)])
+def train_command(out: Path, method: str = "coliags", assignments: Sequence[str] = ()) -> str:
+    """Shell command that trains on a scene.
+
+    Args:
+        out: The scene.
+        method: Name of a method.
+        assignments: Options of training.
+    """
+    return shlex.join(["coliags", "train", method, "--data", str(out), *_set(assignments)])
 
 
-def next_commands(out: Path, *assignments: str) -> str:
+def next_commands(out: Path, assignments: Sequence[str] = ()) -> str:
     """Shell commands that estimate the depth of a scene with poses and points, and train on it; two lines.
 
     Args:
         out: The scene.
-        assignments: Options of training.
+        assignments: Options of its data manager, ``datamanager.KEY=VALUE``.
     """
     with_depth = out.with_name(f"{out.name}-depth")
-    estimate = ["coliags", "depth", "estimate", str(out), "--out", str(with_depth)]
-    train = ["coliags", "train", "coliags-estimated-depth", "--data", str(with_depth)]
-    train += [word for assignment in assignments for word in ("--set", assignment)]
-    return f"{shlex.join(estimate)}\n{shlex.join(train)}"
+    options = _set([assignment.removeprefix("datamanager.") for assignment in assignments])
+    estimate = ["coliags", "depth", "estimate", str(out), "--out", str(with_depth), *options]
+    return f"{shlex.join(estimate)}\n{train_command(with_depth, 'coliags-estimated-depth', assignments)}"
+
+
+def _set(assignments: Sequence[str]) -> list[str]:
+    return [word for assignment in assignments for word in ("--set", assignment)]

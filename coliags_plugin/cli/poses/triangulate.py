@@ -61,7 +61,7 @@ class Triangulate:
             log.info(
                 "points come from the %d training frames; the %d test frames see none", len(scene.train), len(test)
             )
-        print(f"{found.summary()}\n{self.out}\n{next_commands(self.out, *split)}")
+        print(f"{found.summary()}\n{self.out}\n{next_commands(self.out, split)}")
 
     def _at_stored_size(self, scene: Scene, options: list[str]) -> Sequence[Frame]:
         """The training frames, undistorted at the stored size, where more features are found than at a smaller one."""

@@ -115,7 +115,7 @@ def test_what_is_printed(wall, tmp_path, capsys):
     assert summary.startswith("6 frames, depth 20 to 80, ")
     assert summary.endswith(" points")
     assert place == str(out)
-    assert command == f"coliags train coliags --data {out} --set datamanager.split=endogslam"
+    assert command == f"coliags train coliags-estimated-depth --data {out} --set datamanager.split=endogslam"
 
 
 def test_resuming_gives_the_same_bytes(wall, estimated, tmp_path, monkeypatch, caplog):
