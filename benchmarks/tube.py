@@ -7,7 +7,7 @@ import math
 import torch
 
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.scenes import Frame, PointCloud, Scene
+from coliags_plugin.core.scenes import Frame, PointCloud, Scene, SparseDepth
 
 RADIUS = 20.0
 DEPTH_LIMIT = 100.0
@@ -46,4 +46,7 @@ def _frame(index: int, frames: int, width: int, height: int) -> Frame:
     pattern = 0.5 + 0.4 * torch.sin(surface * torch.tensor([0.9, 1.1, 0.7]))
     rgb = (pattern * (15.0 / distance) ** (2 / 2.2)).clamp(0, 1)
     depth = torch.where(z < DEPTH_LIMIT, z, torch.nan)
-    return Frame(f"{index:04d}", index, (rgb * 255).round().byte(), camera, depth)
+    row, column = torch.meshgrid(torch.arange(0, height, 16), torch.arange(0, width, 16), indexing="ij")
+    at = torch.stack([column, row], dim=-1)[depth[row, column].isfinite()]
+    points = SparseDepth(at + 0.5, depth[at[:, 1], at[:, 0]])
+    return Frame(f"{index:04d}", index, (rgb * 255).round().byte(), camera, depth, sparse_depth=points)
