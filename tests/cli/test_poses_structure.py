@@ -26,8 +26,6 @@ from tests.textured_tube import INTRINSICS, tube_frames, write_tube
 
 CAMERA = ("--camera", "PINHOLE", "--params", ",".join(map(str, INTRINSICS)))
 COUNT = 9
-#: Option that trains on the sparse depth of a scene's points.
-SPARSE_DEPTH = "losses.depth={name: sparse-depth, weight: 0.2, final_weight: 0.01}"
 
 
 def refused(capsys, *argv):
@@ -72,7 +70,7 @@ def test_triangulate_makes_a_scene_that_trains(tube, tmp_path, capsys):
         assert one.name == other.name
         torch.testing.assert_close(one.camera.camera_to_world, other.camera.camera_to_world, atol=1e-5, rtol=0)
         np.testing.assert_array_equal(one.image, other.image)
-    terms = trains(f"coliags train coliags --data {out} --set {shlex.quote(SPARSE_DEPTH)}", tmp_path / "run")
+    terms = trains(f"coliags train coliags-sparse-depth --data {out}", tmp_path / "run")
     assert 0.0 < terms["depth"] < 50.0
     # Also where no loss asks for depth, and no option is given.
     assert trains(f"coliags train scaffold-gs --data {out}", tmp_path / "run-2")
@@ -175,7 +173,7 @@ def test_sfm_makes_a_scene_that_trains_and_aligns(tube, tmp_path, capsys, caplog
         f"coliags train coliags-estimated-depth --data {out}-depth",
     ]
     assert sorted(path.name for path in (out / "images").iterdir()) == [f"{n:04d}_color.png" for n in range(0, 9, 2)]
-    command = f"coliags train coliags --data {out} --set {shlex.quote(SPARSE_DEPTH)}"
+    command = f"coliags train coliags-sparse-depth --data {out}"
     assert trains(command, tmp_path / "run")["depth"] > 0.0
     capsys.readouterr()
     assert run("poses", "convert", tube / "camera_pose.txt", tmp_path / "true", "--to", "colmap", "--images",
