@@ -155,7 +155,8 @@ class Estimation:
         def fused(index: int) -> Arrays:
             own, guide = maps(index), guides(index)
             found = fuse_frame(own, [maps(other) for other in neighbours[index]], self.settings.agreement)
-            support = np.where(guide.usable, found.votes, np.float32(0.0))
+            # Where this frame shows a highlight, others may see the surface.
+            support = found.votes
             known = np.log(found.depth)
             prior = self.prior.log_depth(
                 self.frames[index].to("cpu"), guide.usable, known, data_weight(support), self.medians[index]
