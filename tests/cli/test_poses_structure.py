@@ -220,6 +220,7 @@ def test_a_known_distance_or_diameter_fixes_the_scale(tube, tmp_path, capsys, ca
         (("--camera", "PINHOLES"), "camera model PINHOLES"),
         (("--camera", "PINHOLE", "--params", "1,2"), "2 parameters for PINHOLE"),
         (("--params", "1,two"), "--set camera.params"),
+        (("--params", "1,2"), "parameters (--params) without their camera model (--camera)"),
         (("--set", "overlapp=3"), "unknown key 'overlapp'"),
         (("--every", "0"), "--every 0"),
         (("--max-frames", "1"), "--max-frames 1"),
@@ -235,7 +236,7 @@ def test_what_sfm_refuses(tube, monkeypatch, capsys, argv, message):
 
 
 def test_defaults_of_a_part_stay_where_one_of_its_options_is_set():
-    given = settings_of(SfmSettings, ["features.upright=false", "camera.params=[1, 2.5, 3, 4]"])
+    given = settings_of(SfmSettings, ["features.upright=false", "camera.model=PINHOLE", "camera.params=[1, 2.5, 3, 4]"])
     assert given.features == SfmSettings().features.model_copy(update={"upright": False})
     assert given.camera.params == (1.0, 2.5, 3.0, 4.0)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
@@ -93,27 +93,21 @@ def test_two_reversals_are_none():
 
 
 @dataclass
-class Camera:
-    width: int
-    height: int
-    focal: float
-
-    def mean_focal_length(self):
-        return self.focal
-
-
-@dataclass
 class Model:
     """Numbers of a model that the choice uses."""
 
     focal: float = 200.0
+    radial: float = 0.0
+    lens: str = "SIMPLE_RADIAL"
     images: int = 20
     observations: int = 1000
     error: float = 0.5
 
     @property
     def cameras(self):
-        return {1: Camera(320, 240, self.focal)}
+        camera = pycolmap.Camera.create_from_model_name(1, self.lens, self.focal, 320, 240)
+        camera.params = [self.focal, 160.0, 120.0, self.radial]
+        return {1: camera}
 
     def num_reg_images(self):
         return self.images
@@ -136,10 +130,38 @@ def test_plausible_then_complete_then_lit_then_exact():
         Hypothesis(Model(error=0.7), -0.9),
     ]
     assert choose([*others, best], RANGE) is best
-    # Where errors hardly differ, the preferred one.
+    # Where errors hardly differ, the first of the same camera model, whatever its distortion.
+    distorted = Hypothesis(Model(radial=-0.2, error=0.61), -0.7)
     assert choose([best, Hypothesis(Model(focal=150.0, error=0.59), -0.7)], RANGE) is best
+    assert choose([distorted, best], RANGE) is distorted
     with pytest.raises(InputError, match=r"1967 px \(9 degrees\).*nominal field of view of 40 to 150 degrees"):
         choose(others[:1], RANGE)
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_the_least_distorted_of_camera_models_that_fit_as_well(swapped):
+    """To third order, a fisheye with k and a pinhole with k - 1/3 are the same lens."""
+
+    def taken(third, error=0.5):
+        pair = [
+            Hypothesis(Model(radial=third, lens="SIMPLE_RADIAL_FISHEYE", error=error), -0.7),
+            Hypothesis(Model(radial=third - 1 / 3, error=0.51), -0.7),
+        ]
+        return choose(pair[::-1] if swapped else pair, RANGE).camera_model
+
+    assert taken(0.0) == taken(-0.1) == taken(0.1) == "SIMPLE_RADIAL_FISHEYE"
+    assert taken(1 / 3) == taken(0.3) == "SIMPLE_RADIAL"
+    # Errors that differ decide.
+    assert taken(0.0, error=0.6) == "SIMPLE_RADIAL"
+
+
+def test_a_fisheye_is_as_wide_as_its_own_law_says():
+    lens = "SIMPLE_RADIAL_FISHEYE"
+    wide = Hypothesis(Model(focal=130.0, lens=lens), -0.7)
+    assert wide.fields_of_view == [pytest.approx(141.0, abs=0.1)]
+    assert wide.is_plausible(RANGE)
+    # A pinhole of this focal length has 116 degrees, a fisheye 183.
+    assert not Hypothesis(Model(focal=100.0, lens=lens), -0.7).is_plausible((40.0, 180.0))
 
 
 def test_other_focal_lengths_that_fit_as_well_are_told():
@@ -149,6 +171,10 @@ def test_other_focal_lengths_that_fit_as_well_are_told():
     assert not is_ambiguous([chosen, Hypothesis(Model(focal=210.0, error=0.51), -0.5)], chosen, RANGE)
     assert not is_ambiguous([chosen, Hypothesis(Model(focal=260.0, error=0.7), -0.5)], chosen, RANGE)
     assert not is_ambiguous([chosen, Hypothesis(Model(focal=260.0, error=0.51), 0.5)], chosen, RANGE)
+    # Another camera model tells nothing else unless its focal length is another one.
+    fisheye = Model(focal=210.0, error=0.51, lens="SIMPLE_RADIAL_FISHEYE")
+    assert not is_ambiguous([chosen, Hypothesis(fisheye, -0.7)], chosen, RANGE)
+    assert is_ambiguous([chosen, Hypothesis(replace(fisheye, focal=260.0), -0.7)], chosen, RANGE)
 
 
 def test_correlation_of_exact_falloff_and_of_too_few_points():

@@ -20,6 +20,7 @@ from coliags_plugin.poses.trajectory import Trajectory
 from coliags_plugin.reconstruction.structure.features import FeatureSettings
 from coliags_plugin.reconstruction.structure.image_files import file_names, list_images, masks_for
 from coliags_plugin.reconstruction.structure.sfm import reconstruct
+from coliags_plugin.reconstruction.structure.sfm_cameras import distortion
 from coliags_plugin.reconstruction.structure.sfm_scene import write_sfm_scene
 from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings, SfmSettings
 from tests.textured_tube import INTRINSICS, tube_frames, write_tube
@@ -89,11 +90,15 @@ def test_the_written_scene_is_read_as_it_is(found, tmp_path):
 
 def test_a_phantom_is_found_without_its_camera(phantom, caplog):
     images = list_images(phantom / "images")
-    found = reconstruct(images, SfmSettings(camera=CameraSettings(model="SIMPLE_PINHOLE")))
+    with caplog.at_level(logging.INFO):
+        found = reconstruct(images)
     assert len(found.registered) == len(images)
+    assert "SIMPLE_RADIAL is taken; SIMPLE_RADIAL_FISHEYE at best has +" in caplog.text
     assert share_of_path(found.trajectory, np.load(phantom / "truth" / "camera_to_world.npy"))[0] < 0.005
     (camera,) = found.model.cameras.values()
-    assert camera.focal_length == pytest.approx(json.loads((phantom / "camera.json").read_text())["fx"], rel=0.05)
+    assert camera.model_name == "SIMPLE_RADIAL"
+    assert distortion(camera) < 0.1
+    assert camera.focal_length == pytest.approx(json.loads((phantom / "camera.json").read_text())["fx"], rel=0.1)
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
     # The lamp is at the lens.
     assert found.correlation < -0.5
@@ -102,7 +107,7 @@ def test_a_phantom_is_found_without_its_camera(phantom, caplog):
 def test_an_implausible_focal_length_is_refused(tube):
     camera = CameraSettings(model="SIMPLE_PINHOLE", refine=False, focal_factors=(2.5,))
     refusal(
-        r"implausible focal lengths \(focal length 400 px \(23 degrees\).*40 to 150 degrees",
+        r"implausible focal lengths \(SIMPLE_PINHOLE, focal length 400 px \(23 degrees\).*40 to 150 degrees",
         tube,
         SfmSettings(camera=camera),
     )

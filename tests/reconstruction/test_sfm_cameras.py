@@ -11,10 +11,13 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.lenses.models import LENSES
 from coliags_plugin.reconstruction.structure.sfm_cameras import (
     CALIBRATED,
+    Start,
     calibrated_camera,
+    distortion,
     field_of_view,
     is_refined,
     starting_cameras,
+    starts,
 )
 from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings
 
@@ -37,7 +40,7 @@ def test_undistorted_images_are_those_of_the_legacy_pinhole():
 @pytest.mark.parametrize("name", CALIBRATED)
 @pytest.mark.parametrize("size", [(1350, 1080), (675, 540), (338, 270)])
 def test_colmaps_camera_projects_as_the_lens(name, size):
-    (camera,) = starting_cameras(CameraSettings(model=name), [], [size], 1.0)
+    (camera,) = starting_cameras(CameraSettings(model=name), [], [size], Start(name, 1.0))
     points = np.random.default_rng(0).uniform((-0.8, -0.6, 1.0), (0.8, 0.6, 1.0), (50, 3))
     lens = LENSES[CALIBRATED[name]].resized(*size)
     k = lens.pinhole
@@ -52,17 +55,45 @@ def test_crops_are_refused_and_known_cameras_are_kept():
     assert not is_refined(CameraSettings(model="c3vd"))
     assert is_refined(CameraSettings(model="c3vd", refine=True))
     assert is_refined(CameraSettings())
-    assert not is_refined(CameraSettings(params=(1.0,)))
-    assert is_refined(CameraSettings(params=(1.0,), refine=True))
+    assert not is_refined(CameraSettings(model="PINHOLE", params=(1.0,)))
+    assert is_refined(CameraSettings(model="PINHOLE", params=(1.0,), refine=True))
     assert not is_refined(CameraSettings(refine=False))
 
 
-def test_field_of_view_has_a_closed_form():
-    camera = pycolmap.Camera.create_from_model_name(0, "PINHOLE", 100.0, 200, 120)
-    assert field_of_view(camera) == pytest.approx(90.0)
+@pytest.mark.parametrize("size", [(200, 120), (120, 200)])
+@pytest.mark.parametrize(("model", "degrees"), [("PINHOLE", 90.0), ("SIMPLE_FISHEYE", np.degrees(2.0))])
+def test_field_of_view_has_a_closed_form(model, degrees, size):
+    """It is the angle between the rays that COLMAP projects to the ends of the larger side."""
+    camera = pycolmap.Camera.create_from_model_name(0, model, 100.0, *size)
+    assert field_of_view(camera) == pytest.approx(degrees)
+    half = np.radians(0.5 * field_of_view(camera))
+    ray = np.array([[np.sin(half), 0.0, np.cos(half)]])
+    assert camera.img_from_cam(ray)[0, 0] == pytest.approx(0.5 * size[0] + 100.0)
+    assert distortion(camera) == pytest.approx(0.0, abs=1e-12)
 
 
-@pytest.mark.parametrize("wrong", [{"focal_factors": (0.5, 0.0)}, {"field_of_view": (90, 40)}, {"focal_factors": ()}])
+@pytest.mark.parametrize("size", [(200, 120), (120, 200)])
+def test_distortion_is_that_of_the_border(size):
+    radial = pycolmap.Camera.create_from_model_name(0, "SIMPLE_RADIAL", 125.0, *size)
+    radial.params = [125.0, 95.0, 63.0, -0.25]
+    assert distortion(radial) == pytest.approx(0.25 * 0.8**2)
+    fisheye = pycolmap.Camera.create_from_model_name(0, "SIMPLE_RADIAL_FISHEYE", 125.0, *size)
+    fisheye.params = [125.0, 95.0, 63.0, 0.5]
+    assert distortion(fisheye) == pytest.approx(0.5 * 0.8**2)
+
+
+def test_an_unknown_camera_has_several_starts_and_a_known_one_has_one():
+    several = starts(CameraSettings(focal_factors=(0.6, 0.4)))
+    fisheye = "SIMPLE_RADIAL_FISHEYE"
+    assert several == [Start(fisheye, 0.6), Start(fisheye, 0.4), Start("SIMPLE_RADIAL", 0.6)]
+    assert starts(CameraSettings(model="PINHOLE", focal_factors=(0.6, 0.4)))[1:] == [Start("PINHOLE", 0.4)]
+    assert len(starts(CameraSettings(model="c3vd"))) == 1
+    assert len(starts(CameraSettings(model="PINHOLE", params=(1.0,)))) == 1
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"focal_factors": (0.5, 0.0)}, {"field_of_view": (90, 40)}, {"focal_factors": ()}, {"params": (1.0,)}]
+)
 def test_ranges_that_are_none_are_refused(wrong):
     with pytest.raises(ValidationError):
         CameraSettings(**wrong)

@@ -24,7 +24,8 @@ class Sfm:
     """Folder to create, in COLMAP's layout."""
     camera: OptionalText = None
     """A known camera, scaled to the images (c3vd: whole frames of C3VD; c3vd-undistorted), or a camera model of COLMAP,
-    for instance PINHOLE or OPENCV_FISHEYE; default SIMPLE_RADIAL."""
+    for instance PINHOLE or OPENCV_FISHEYE; default: the better of
+    SIMPLE_RADIAL_FISHEYE and SIMPLE_RADIAL."""
     params: Annotated[OptionalText, tyro.conf.arg(metavar="P1,P2,...")] = None
     """Parameters of COLMAP's model in its order, pixel centres at integers + 0.5, kept fixed; default: estimated."""
     diameter: Annotated[float | None, tyro.conf.arg(metavar="MM")] = None

@@ -1,4 +1,4 @@
-"""Choice among models of the same images with other focal lengths, or reversed in depth.
+"""Choice among models of the same images with other cameras, or reversed in depth.
 
 Images of distant, shallow surfaces nearly determine structure only up to a reversal of depth (the bas-relief or Necker
 ambiguity: R. Szeliski and S. B. Kang, "Shape ambiguities in structure from motion", IEEE TPAMI 19(5), 1997). The lamp
@@ -18,7 +18,7 @@ from jaxtyping import Float
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.reconstruction.structure.mapping import bundle_adjust
 from coliags_plugin.reconstruction.structure.observations import brightness_correlation, depths_of
-from coliags_plugin.reconstruction.structure.sfm_cameras import field_of_view
+from coliags_plugin.reconstruction.structure.sfm_cameras import distortion, field_of_view
 
 if TYPE_CHECKING:
     import pycolmap
@@ -73,6 +73,11 @@ class Hypothesis:
         return float(self.model.compute_mean_reprojection_error())
 
     @property
+    def camera_model(self) -> str:
+        """COLMAP's name of the first camera's model."""
+        return str(next(iter(self.model.cameras.values())).model_name)
+
+    @property
     def focal_length(self) -> float:
         """Of the first camera, pixels."""
         return float(next(iter(self.model.cameras.values())).mean_focal_length())
@@ -81,6 +86,11 @@ class Hypothesis:
     def fields_of_view(self) -> list[float]:
         """Nominal field of view of each camera, degrees."""
         return [field_of_view(camera) for camera in self.model.cameras.values()]
+
+    @property
+    def distortion(self) -> float:
+        """Of the first camera, at the border."""
+        return distortion(next(iter(self.model.cameras.values())))
 
     @property
     def is_lit_from_the_camera(self) -> bool:
@@ -95,21 +105,22 @@ class Hypothesis:
         """What tells it from others, in words."""
         light = "unknown" if self.correlation is None else f"{self.correlation:.2f}"
         return (
-            f"focal length {self.focal_length:.0f} px ({self.fields_of_view[0]:.0f} degrees)"
-            f"{', depth reversed' if self.is_reversed else ''}: {self.images} images, {self.observations} observations"
-            f", reprojection error {self.error:.2f} px, correlation of brightness with depth {light}"
+            f"{self.camera_model}, focal length {self.focal_length:.0f} px ({self.fields_of_view[0]:.0f} degrees), "
+            f"distortion {100.0 * self.distortion:.0f} %{', depth reversed' if self.is_reversed else ''}: "
+            f"{self.images} images, {self.observations} observations, reprojection error {self.error:.3g} px, "
+            f"correlation of brightness with depth {light}"
         )
 
 
 def choose(hypotheses: Sequence[Hypothesis], plausible: tuple[float, float]) -> Hypothesis:
-    """The best model: of plausible focal length; explaining the images as well as any; lit from the camera; exact.
+    """The :func:`best` model of plausible field of view; all are logged.
 
     Args:
-        hypotheses: The preferred first, which is taken where errors hardly differ.
+        hypotheses: The most likely first.
         plausible: Least and largest nominal field of view, degrees.
 
     Raises:
-        InputError: No model has a plausible focal length.
+        InputError: No model has a plausible field of view.
     """
     for hypothesis in hypotheses:
         log.info("%s", hypothesis.described())
@@ -122,10 +133,26 @@ def choose(hypotheses: Sequence[Hypothesis], plausible: tuple[float, float]) -> 
             "multiple of the larger side (--set camera.refine=false --set camera.focal_factors=[0.6]), or state the "
             "range (--set camera.field_of_view=[20, 150])",
         )
-    left = _explaining(left)
+    return best(left)
+
+
+def best(hypotheses: Sequence[Hypothesis]) -> Hypothesis:
+    """The best of models, at least one: explaining the images as well as any; lit from the camera; exact; undistorted.
+
+    Where errors hardly differ, the first of each camera model is left, as focal length and distortion compensate each
+    other; and of these, that with the least distortion is taken, as a lens is near the law that it was made for.
+
+    Args:
+        hypotheses: The most likely first.
+    """
+    left = _explaining(hypotheses)
     left = [one for one in left if one.is_lit_from_the_camera] or left
     exact = min(one.error for one in left)
-    return next(one for one in left if one.error <= _SAME_ERROR * exact)
+    firsts: dict[str, Hypothesis] = {}
+    for one in left:
+        if one.error <= _SAME_ERROR * exact:
+            firsts.setdefault(one.camera_model, one)
+    return min(firsts.values(), key=lambda one: one.distortion)
 
 
 def is_ambiguous(hypotheses: Sequence[Hypothesis], chosen: Hypothesis, plausible: tuple[float, float]) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,8 +19,36 @@ if TYPE_CHECKING:
 #: Calibrated cameras by name: the lens of :data:`LENSES` whose pinhole (undistorted images) or which itself took the
 #: images.
 CALIBRATED = {"c3vd": "fisheye", "c3vd-undistorted": "legacy-pinhole"}
+#: Camera models that are tried where none is given: endoscopes have fisheye lenses, but images may be undistorted.
+_FISHEYE, _UNDISTORTED = "SIMPLE_RADIAL_FISHEYE", "SIMPLE_RADIAL"
 #: Largest deviation of an image's aspect ratio from the calibrated one's.
 _ASPECT_TOLERANCE = 0.02
+
+
+@dataclass(frozen=True)
+class Start:
+    """Camera that mapping starts with.
+
+    Attributes:
+        model: Of COLMAP, or of :data:`CALIBRATED`.
+        focal_factor: Focal length relative to the image's larger side, where no parameters are known.
+    """
+
+    model: str
+    focal_factor: float
+
+
+def starts(settings: CameraSettings) -> list[Start]:
+    """Cameras to try, the most likely first; one if it is known.
+
+    Where no model is given, the fisheye starts from every focal length, and the pinhole with distortion from the first:
+    undistorted images are rarely wider than 100 degrees.
+    """
+    likely = settings.focal_factors[0]
+    if settings.model is None:
+        return [*(Start(_FISHEYE, factor) for factor in settings.focal_factors), Start(_UNDISTORTED, likely)]
+    factors = (likely,) if has_known_camera(settings) else settings.focal_factors
+    return [Start(settings.model, factor) for factor in factors]
 
 
 def has_known_camera(settings: CameraSettings) -> bool:
@@ -60,15 +89,15 @@ def calibrated_camera(name: str, width: int, height: int) -> tuple[str, tuple[fl
 
 
 def starting_cameras(
-    settings: CameraSettings, images: Sequence[Path], sizes: Sequence[tuple[int, int]], focal_factor: float
+    settings: CameraSettings, images: Sequence[Path], sizes: Sequence[tuple[int, int]], start: Start
 ) -> list[pycolmap.Camera]:
     """One camera per image size, in order of first appearance.
 
     Args:
-        settings: Model and parameters.
+        settings: With the parameters, where they are known.
         images: Files, for errors.
         sizes: Width and height of each.
-        focal_factor: Focal length relative to the larger side, where no parameters are known.
+        start: Model and focal length.
 
     Raises:
         InputError: The model is unknown, the parameters do not fit it, or sizes differ where parameters are given.
@@ -76,18 +105,17 @@ def starting_cameras(
     import pycolmap
 
     known = {name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"}
-    if settings.model not in known | set(CALIBRATED):
-        raise InputError(
-            f"camera model {settings.model}", f"one of {', '.join(CALIBRATED)}, {', '.join(sorted(known))}"
-        )
-    if settings.model in CALIBRATED and settings.params is not None:
-        raise InputError(f"--params, and --camera {settings.model}", "--params with a model of COLMAP", "Drop --params")
+    if start.model not in known | set(CALIBRATED):
+        raise InputError(f"camera model {start.model}", f"one of {', '.join(CALIBRATED)}, {', '.join(sorted(known))}")
+    if start.model in CALIBRATED and settings.params is not None:
+        raise InputError(f"--params, and --camera {start.model}", "--params with a model of COLMAP", "Drop --params")
     cameras = []
     for width, height in dict.fromkeys(sizes):
-        model, params = settings.model, settings.params
+        model, params = start.model, settings.params
         if model in CALIBRATED:
             model, params = calibrated_camera(model, width, height)
-        camera = pycolmap.Camera.create_from_model_name(0, model, focal_factor * max(width, height), width, height)
+        focal_length = start.focal_factor * max(width, height)
+        camera = pycolmap.Camera.create_from_model_name(0, model, focal_length, width, height)
         if params is not None:
             if len(params) != len(camera.params):
                 raise InputError(f"{len(params)} parameters for {model}", f"{len(camera.params)}: {camera.params_info}")
@@ -108,5 +136,25 @@ def starting_cameras(
 
 
 def field_of_view(camera: pycolmap.Camera) -> float:
-    """Nominal field of view of the larger side, 2 atan(side / 2f), degrees."""
-    return float(np.degrees(2.0 * np.arctan(0.5 * max(camera.width, camera.height) / camera.mean_focal_length())))
+    """Nominal field of view of the larger side, degrees.
+
+    Without distortion, that is 2 atan(side / 2f), and side / f of a fisheye.
+    """
+    return float(np.degrees(2.0 * _border(camera)[1]))
+
+
+def distortion(camera: pycolmap.Camera) -> float:
+    """Displacement by distortion at the nominal border of the larger side, relative to the distance from the centre."""
+    radius, angle = _border(camera)
+    axis = 0 if camera.width >= camera.height else 1
+    ray = np.array([0.0, 0.0, np.cos(angle)])
+    ray[axis] = np.sin(angle)
+    center = (camera.principal_point_x, camera.principal_point_y)[axis]
+    return abs(float(camera.img_from_cam(ray[None])[0][axis] - center) / radius - 1.0)
+
+
+def _border(camera: pycolmap.Camera) -> tuple[float, float]:
+    """Half of the larger side, pixels, and its nominal angle from the optical axis, radians."""
+    radius = 0.5 * max(camera.width, camera.height)
+    tangent = radius / camera.mean_focal_length()
+    return radius, float(tangent if "FISHEYE" in camera.model_name else np.arctan(tangent))

@@ -12,10 +12,10 @@ from coliags_plugin.reconstruction.structure.features import FeatureSettings
 class CameraSettings(Settings):
     """Camera model and initial intrinsics, shared by all images."""
 
-    model: str = Field(
-        default="SIMPLE_RADIAL",
+    model: str | None = Field(
+        default=None,
         description="COLMAP camera model, for instance OPENCV_FISHEYE; or a calibrated camera, scaled to the images: "
-        "c3vd, c3vd-undistorted.",
+        "c3vd, c3vd-undistorted. None: SIMPLE_RADIAL_FISHEYE and SIMPLE_RADIAL are tried.",
     )
     params: tuple[float, ...] | None = Field(
         default=None,
@@ -26,19 +26,21 @@ class CameraSettings(Settings):
         default=None, description="Whether focal length and distortion are refined. None: if they are not known."
     )
     focal_factors: tuple[float, ...] = Field(
-        default=(0.75, 0.5, 1.1),
+        default=(0.75, 0.5),
         min_length=1,
-        description="Initial focal lengths to try, relative to the image's larger side, the most likely first. "
-        "Endoscopes have 0.4 to 1.2.",
+        description="Initial focal lengths to try, relative to the image's larger side, the most likely first, "
+        "which alone is tried of SIMPLE_RADIAL where the camera model is unknown too. Endoscopes have 0.4 to 1.2.",
     )
     field_of_view: tuple[float, float] = Field(
         default=(40.0, 150.0),
-        description="Plausible nominal fields of view, degrees: 2 atan(side / 2f) of the image's larger side. A model "
-        "with another focal length is refused.",
+        description="Plausible nominal fields of view, degrees: of the image's larger side, 2 atan(side / 2f), or "
+        "side / f of a fisheye. A model with another one is refused.",
     )
 
     @model_validator(mode="after")
     def _ranges(self) -> Self:
+        if self.params is not None and self.model is None:
+            raise ValueError("parameters (--params) without their camera model (--camera)")
         if not min(self.focal_factors) > 0.0:
             raise ValueError(f"focal_factors = {self.focal_factors}: they must be positive")
         if not 0.0 < self.field_of_view[0] < self.field_of_view[1] < 180.0:
@@ -70,6 +72,6 @@ class SfmSettings(Settings):
     search_images: int = Field(
         default=24,
         ge=3,
-        description="The initial focal length is chosen on this many images from the middle of the video.",
+        description="An unknown camera is chosen on this many images from the middle of the video.",
     )
     seed: int = Field(default=0, ge=0, description="Seed of COLMAP's random samples.")

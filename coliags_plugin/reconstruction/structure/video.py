@@ -1,0 +1,125 @@
+"""A video's features and matches, and its models by mapping from a starting camera."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.progress import Progress
+from coliags_plugin.reconstruction.structure.colmap_database import write_database
+from coliags_plugin.reconstruction.structure.features import Features, feature_extractor
+from coliags_plugin.reconstruction.structure.image_files import Masks, file_names, mask_of, read_image
+from coliags_plugin.reconstruction.structure.mapping import map_images
+from coliags_plugin.reconstruction.structure.matching import Pairs, mutual_matches
+from coliags_plugin.reconstruction.structure.observations import brightness_at
+from coliags_plugin.reconstruction.structure.pair_selection import alike_pairs
+from coliags_plugin.reconstruction.structure.sfm_cameras import Start, starting_cameras, starts
+from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+@dataclass(frozen=True, eq=False)
+class Video:
+    """Images with features and matches, some or all of a video.
+
+    Attributes:
+        images: Files.
+        names: Names in the model.
+        sizes: Width and height of each.
+        features: Of each.
+        brightness: At the features of each.
+        matches: By pair of indices.
+    """
+
+    images: tuple[Path, ...]
+    names: tuple[str, ...]
+    sizes: tuple[tuple[int, int], ...]
+    features: tuple[Features, ...]
+    brightness: tuple[Float[np.ndarray, "K"], ...]
+    matches: Mapping[tuple[int, int], Pairs]
+
+    def middle(self, count: int) -> Video:
+        """At most ``count`` images around the middle: every second or fourth, if there are enough.
+
+        These are matched like all (:func:`alike_pairs`).
+        """
+        step = next((step for step in (4, 2) if len(self.images) >= step * count), 1)
+        first = max(0, (len(self.images) - (count - 1) * step - 1) // 2)
+        kept = list(range(first, len(self.images), step))[:count]
+        place = {index: row for row, index in enumerate(kept)}
+        matches = {
+            (place[one], place[other]): pairs
+            for (one, other), pairs in self.matches.items()
+            if one in place and other in place
+        }
+        return Video(
+            tuple(self.images[index] for index in kept),
+            tuple(self.names[index] for index in kept),
+            tuple(self.sizes[index] for index in kept),
+            tuple(self.features[index] for index in kept),
+            tuple(self.brightness[index] for index in kept),
+            matches,
+        )
+
+    def mapped(self, settings: SfmSettings, start: Start, progress: Progress | None) -> list[pycolmap.Reconstruction]:
+        """Models by mapping with fixed intrinsics, the largest first."""
+        cameras = starting_cameras(settings.camera, self.images, self.sizes, start)
+        kinds = list(dict.fromkeys(self.sizes))
+        named = [(name, kinds.index(size)) for name, size in zip(self.names, self.sizes, strict=True)]
+        with tempfile.TemporaryDirectory() as scratch:
+            database = Path(scratch) / "database.db"
+            write_database(database, cameras, named, self.features, self.matches, verified=False)
+            return map_images(database, Path(scratch) / "models", settings, len(self.images), progress)
+
+
+def read_video(
+    images: tuple[Path, ...], settings: SfmSettings, masks: Masks = None, progress: Progress | None = None
+) -> Video:
+    """Find and match the features of a video's images.
+
+    Args:
+        images: Files in video order.
+        settings: Of features, matching and the camera.
+        masks: False where a pixel is ignored; one for all images, or one per image.
+        progress: Progress callback.
+
+    Raises:
+        InputError: An image cannot be read, a mask has another size, sizes differ where parameters are given, or the
+            camera model is unknown.
+    """
+    extract = feature_extractor(settings.features)
+    features, sizes, brightness = [], [], []
+    for done, path in enumerate(images, start=1):
+        image, mask = read_image(path), mask_of(path, masks)
+        height, width = image.shape[:2]
+        if mask is not None and mask.shape != (height, width):
+            raise InputError(
+                f"the mask of {path} is {mask.shape[1]} x {mask.shape[0]}, the image {width} x {height}",
+                "a mask of the image's size",
+            )
+        features.append(extract(image, mask))
+        brightness.append(brightness_at(image, features[-1].pixels))
+        sizes.append((width, height))
+        if progress is not None:
+            progress("find features", done, len(images))
+    starting_cameras(settings.camera, images, sizes, starts(settings.camera)[0])
+    pairs = alike_pairs(features, settings, progress)
+    matches = {}
+    for done, (first, second) in enumerate(pairs, start=1):
+        matches[first, second] = mutual_matches(
+            features[first], features[second], settings.max_ratio, settings.max_distance
+        )
+        if progress is not None:
+            progress("match features", done, len(pairs))
+    names = file_names([path.stem for path in images], "")
+    named = tuple(f"{name}{path.suffix}" for name, path in zip(names, images, strict=True))
+    return Video(images, named, tuple(sizes), tuple(features), tuple(brightness), matches)
