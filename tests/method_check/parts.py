@@ -408,12 +408,12 @@ class WantsAlbedo(Protocol):
         raise NotImplementedError
 
 
-class HasNoAccumulatedDepth(CpuRenderer):
-    outputs = CpuRenderer.outputs - {"depth_accumulated"}
+class HasNoExpectedDepth(CpuRenderer):
+    outputs = CpuRenderer.outputs - {"depth_expected"}
 
     def render(self, field, camera, wants=("rgb", "alpha"), pixels=None):
-        if "depth_accumulated" in wants:
-            raise InputError("depth_accumulated", "another output")
+        if "depth_expected" in wants:
+            raise InputError("depth_expected", "another output")
         return super().render(field, camera, wants, pixels)
 
 

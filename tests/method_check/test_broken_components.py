@@ -64,7 +64,7 @@ BROKEN = [
     (["strategy=GoesPastAdam"], "rows", "the optimizer of group 'means' trains what is no longer the field's"),
     (["strategy=ForgetsAfterAnEvent"], "rows", "resumed after the event of step 4"),
     (["protocol=wants-albedo"], "evaluates", "outputs needed by protocol 'wants-albedo': albedo"),
-    (["renderer=HasNoAccumulatedDepth", "protocol=authors-code"], "images", "depth_accumulated"),
+    (["renderer=HasNoExpectedDepth"], "images", "depth_expected"),
     (["losses.colour={name: AssumesDepth, weight: 1.0}"], "other data", "without depth: AttributeError: .*parts"),
     (["sampler=CrashesAlone"], "other data", "with one frame: RuntimeError: .*parts"),
     (["losses.colour={name: CountsMaskedPixels, weight: 1.0}"], "ignored pixels", "masked pixels: colour"),
