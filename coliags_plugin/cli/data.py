@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -40,13 +41,8 @@ class Data:
 
         with progress_callback() as progress:
             scene = open_scene(self.scene, self.format, self.set, progress)
-            data = scene.provenance
-            shrunk = data.get("stored_size") != data.get("size")
-            check = check_scene(
-                scene,
-                progress,
-                (lambda: open_scene(self.scene, self.format, self.set, stored_size=True)) if shrunk else None,
-            )
+            at_stored_size = partial(open_scene, self.scene, self.format, self.set, stored_size=True)
+            check = check_scene(scene, progress, at_stored_size if scene.is_resized else None)
         print("\n".join(lines(check)))
         if self.html is not None:
             write_check_page(check, self.html)

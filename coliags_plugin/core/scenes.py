@@ -213,9 +213,25 @@ class Scene:
     provenance: dict[str, Any] = field(default_factory=dict)
 
     @property
+    def video(self) -> list[Frame]:
+        """Training frames and the split's own test frames, in video order."""
+        return sorted([*self.train, *self.test_sets.get("test", ())], key=lambda frame: frame.index)
+
+    @property
+    def is_resized(self) -> bool:
+        """Whether images are known to be used at another size than they are stored at."""
+        stored = self.provenance.get("stored_size")
+        return stored is not None and stored != self.provenance.get("size")
+
+    @property
+    def is_metric(self) -> bool:
+        """Whether lengths are in mm; False where their unit is unknown."""
+        return bool(self.provenance.get("unit", "mm") == "mm")
+
+    @property
     def length_unit(self) -> str:
         """Unit of lengths, as printed: ``mm``, or ``units`` where it is unknown."""
-        return "mm" if self.provenance.get("unit", "mm") == "mm" else "units"
+        return "mm" if self.is_metric else "units"
 
     def __repr__(self) -> str:
         """Counts, not pixels."""
@@ -267,7 +283,7 @@ def concatenate_targets(parts: Sequence[Target]) -> Target:
 
 
 def _joined(parts: Sequence[Target], maps: Sequence[Tensor | None], instead: float) -> Tensor | None:
-    """Maps of several targets as one, with one value in those of targets without; None where no target has one."""
+    """One map of several targets, concatenated; a constant for targets without it, None where no target has it."""
     if all(own is None for own in maps):
         return None
     return torch.cat(

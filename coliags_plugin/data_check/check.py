@@ -18,7 +18,6 @@ from coliags_plugin.data_check.facts import (
     image_facts,
     path_facts,
     sampled_frames,
-    video_of,
 )
 from coliags_plugin.data_check.findings import Finding
 from coliags_plugin.data_check.hypotheses import CHANGES
@@ -88,7 +87,7 @@ def check_scene(
         at_stored_size: Loads the same scene with images of the stored size, in which features are matched if there is
             no depth; None: those of ``scene``.
     """
-    video = video_of(scene)
+    video = scene.video
     looked = sampled_frames(video)
     pairs = video_pairs(video)
     with_depth = [Pair(a, b) for a, b in pairs if a.depth is not None and b.depth is not None]
@@ -102,7 +101,7 @@ def check_scene(
     else:
         # Epipolar errors grow with the baseline, so frames further apart are compared.
         pairs = video_pairs(video, farther=3)
-        full = {frame.name: frame for frame in (video if at_stored_size is None else video_of(at_stored_size()))}
+        full = {frame.name: frame for frame in (video if at_stored_size is None else at_stored_size().video)}
         matches = match([(full[source.name], full[target.name]) for source, target in pairs])
         found = {name: epipolar_agreement(matches, name) for name in CHANGES}
         matched = {name: reading for name, reading in found.items() if reading is not None}
@@ -113,7 +112,7 @@ def check_scene(
     found_suspect = [
         *suspect.agreement_findings(readings, scale, path, depth),
         *suspect.match_findings(matched),
-        *suspect.depth_findings(depth, scene.provenance.get("unit", "mm") == "mm"),
+        *suspect.depth_findings(depth, scene.is_metric),
         *suspect.lamp_findings(lamp),
         *suspect.path_findings(path),
         *suspect.calibration_findings(video),

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from coliags_plugin.core.scenes import Frame, Scene
+from coliags_plugin.core.scenes import Frame
 
 #: Largest number of frames sampled for depth and image statistics.
 _LOOKED_AT = 64
@@ -57,11 +57,6 @@ def sampled_frames(frames: Sequence[Frame]) -> list[Frame]:
     """Evenly spaced sample of the frames, at most 64."""
     places = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), _LOOKED_AT)).astype(int))
     return [frames[place] for place in places]
-
-
-def video_of(scene: Scene) -> list[Frame]:
-    """Training frames and the split's own test frames, in video order."""
-    return sorted([*scene.train, *scene.test_sets.get("test", [])], key=lambda frame: frame.index)
 
 
 def depth_facts(frames: Sequence[Frame]) -> DepthFacts | None:

@@ -100,7 +100,7 @@ def depth_findings(depth: DepthFacts | None, metric: bool) -> Iterator[Finding]:
 
 
 def lamp_findings(lamp: LampFacts | None) -> Iterator[Finding]:
-    """Depth under which the lamp would light what is far more than what is near."""
+    """Brightness that rises with distance, as of depth that is reversed."""
     if lamp is None or lamp.frames < REVERSED_FRAMES:
         return
     if lamp.correlation > REVERSED and lamp.rising_share > REVERSED_SHARE:
@@ -194,7 +194,7 @@ def match_findings(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Findin
 
 
 def undecided(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Finding]:
-    """What matched features are not enough to tell."""
+    """Poses that matched features can neither confirm nor refute, for lack of parallax."""
     given = readings.get(GIVEN)
     if given is not None and given.in_front is None and given.agrees:
         yield Finding(

@@ -1,4 +1,4 @@
-"""Brightness against distance: under the endoscope's lamp, what is near is bright."""
+"""Rank correlation of image brightness with distance from the camera, negative under a lamp at the camera."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class LampFacts:
 
 
 def lamp_facts(frames: Sequence[Frame]) -> LampFacts | None:
-    """Brightness against distance in an even sample of the frames; None where none has enough depth."""
+    """Correlation of brightness with distance in an even sample of the frames; None where none has enough depth."""
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), _FRAMES)).astype(int))
     found = [value for place in chosen if (value := _correlation(frames[place])) is not None]
     if not found:
@@ -47,7 +47,7 @@ def lamp_facts(frames: Sequence[Frame]) -> LampFacts | None:
 
 
 def _correlation(frame: Frame) -> float | None:
-    """Of the frame's dense depth, or else of its single points; None where they are too few or all as far."""
+    """Correlation in one frame, from its dense depth or else its single points; None if these are too few or as far."""
     pixels, depth = _known(frame)
     brightness = frame.image.numpy()[pixels[:, 1], pixels[:, 0]]
     clear = (brightness.min(axis=1) > _DARKEST) & (brightness.max(axis=1) < _BRIGHTEST)

@@ -11,7 +11,6 @@ import torch
 
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.data_check.check import SceneCheck
-from coliags_plugin.data_check.facts import video_of
 from coliags_plugin.data_check.findings import Finding
 from coliags_plugin.data_check.reprojection import warp_image
 from coliags_plugin.data_check.text import fact_rows, reading_rows
@@ -34,7 +33,7 @@ def write_check_page(check: SceneCheck, output: Path) -> None:
     name = check.scene.name
     verdict = f"{len(check.findings)} suspect" if check.findings else "nothing suspect"
     header = f"<h1>{escape(name)}: {verdict}</h1>" + fact_list(dict(fact_rows(check)))
-    sections = [_findings(check), _readings(check), _images(check), _path(video_of(check.scene)), _provenance(check)]
+    sections = [_findings(check), _readings(check), _images(check), _path(check.scene.video), _provenance(check)]
     write_page(output, f"{name}: data check", header, sections)
 
 

@@ -92,9 +92,7 @@ def check_depth(
     pairs = match_frames(estimate, truth)
     dense: list[Samples | None] = []
     sparse: list[Samples | None] = []
-    for done, (here, there) in enumerate(pairs.places):
-        if progress is not None:
-            progress("compare depth", done, len(pairs.places))
+    for done, (here, there) in enumerate(pairs.places, start=1):
         estimated, true = estimate.read(here), truth.read(there)
         if true.confidence is not None:
             raise InputError(
@@ -106,6 +104,8 @@ def check_depth(
         surface = true_depth_at(estimated, true)
         dense.append(None if surface is None else dense_samples(estimated, surface))
         sparse.append(sparse_samples(estimated, true))
+        if progress is not None:
+            progress("compare depth", done, len(pairs.places))
     of_all = [_pooled(dense), _pooled(sparse)]
     counted = [samples for samples in of_all if samples is not None and np.isfinite(samples.estimated).any()]
     if not counted:

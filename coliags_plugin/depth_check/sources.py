@@ -85,12 +85,10 @@ def open_depth(
 
 
 def _of_scene(path: Path, scene: Scene) -> DepthSource:
-    frames = sorted([*scene.train, *scene.test_sets.get("test", [])], key=lambda frame: frame.index)
-    kept = [frame for frame in frames if frame.depth is not None or frame.sparse_depth is not None]
+    kept = [frame for frame in scene.video if frame.depth is not None or frame.sparse_depth is not None]
     if not kept:
         raise InputError(f"{path} has no depth", "a scene with depth files or sparse depth", "Name a scene with depth")
-    metric = scene.provenance.get("unit", "mm") == "mm"
-    return DepthSource(path, metric, [frame.name for frame in kept], lambda place: _of_frame(kept[place]))
+    return DepthSource(path, scene.is_metric, [frame.name for frame in kept], lambda place: _of_frame(kept[place]))
 
 
 def _of_frame(frame: Frame) -> DepthMap:

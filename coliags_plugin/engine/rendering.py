@@ -107,7 +107,7 @@ def choose_frames(scene: Scene, frames: str) -> list[Frame]:
         InputError: There are none.
     """
     groups = {"train": scene.train, **scene.test_sets}
-    groups["all"] = sorted([*scene.train, *scene.test_sets.get("test", [])], key=lambda frame: frame.index)
+    groups["all"] = scene.video
     if not groups.get(frames):
         known = ", ".join(name for name, group in groups.items() if group)
         raise InputError(f"scene '{scene.name}' has no frames called '{frames}'", f"one of {known}")

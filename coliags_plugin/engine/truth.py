@@ -40,7 +40,7 @@ def match_truth(own: Scene, other: Scene) -> Truth:
     Raises:
         InputError: The frames cannot be matched, or their cameras are at different places.
     """
-    mine, theirs = _video(own), _video(other)
+    mine, theirs = own.video, other.video
     by_name = {frame.name: frame for frame in theirs}
     by_index = {frame.index: frame for frame in theirs}
     found: dict[str, Frame]
@@ -68,10 +68,6 @@ def match_truth(own: Scene, other: Scene) -> Truth:
     provenance = {**other.provenance, "split": split}
     held_out = {name: frames for name, frames in sets.items() if frames}
     return Truth(replace(other, train=train, test_sets=held_out, provenance=provenance), matched_by)
-
-
-def _video(scene: Scene) -> list[Frame]:
-    return [*scene.train, *scene.test_sets.get("test", [])]
 
 
 def _refuse_other_world(frames: Sequence[Frame], found: dict[str, Frame], extent: float, name: str) -> None:

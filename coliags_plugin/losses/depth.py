@@ -116,6 +116,28 @@ def known_depth(target: Target) -> tuple[Float[Tensor, "H W"], Bool[Tensor, "H W
     return target.depth, torch.isfinite(target.depth) & target.valid
 
 
+def where_drawn(
+    rendered: Float[Tensor, "H W"], usable: Bool[Tensor, "H W"], kind: str
+) -> tuple[Float[Tensor, "H W"], Bool[Tensor, "H W"]]:
+    """Rendered depth, of inverse depth the reciprocal, and the usable pixels that have one.
+
+    Args:
+        rendered: An output of one of the kinds of depth. [H, W]
+        usable: Pixels that are compared where something was drawn. [H, W]
+        kind: Name of the output.
+    """
+    if kind != "inverse_depth_accumulated":
+        return rendered, usable
+    usable = usable & (rendered > 0)
+    return 1.0 / torch.where(usable, rendered, 1.0), usable
+
+
+def smooth_l1(differences: Float[Tensor, "*N"], beta: float) -> Float[Tensor, "*N"]:
+    """Huber's function of slope 1: x^2 / (2 beta) for |x| up to ``beta``, beyond it |x| - beta / 2. [*N]"""
+    zero = torch.zeros_like(differences)
+    return torch.nn.functional.smooth_l1_loss(differences, zero, reduction="none", beta=beta)
+
+
 def _reciprocal(inverse_depth: Float[Tensor, "H W"], empty_depth: float) -> Float[Tensor, "H W"]:
     """1/E where E > 0, else ``empty_depth``; both operands are masked so that no gradient becomes NaN. [H, W]"""
     drawn = inverse_depth > 0

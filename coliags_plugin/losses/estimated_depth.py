@@ -11,7 +11,7 @@ from torch import Tensor
 
 from coliags_plugin.contracts import Loss, LossSettings, TrainingStep
 from coliags_plugin.core.masked import masked_mean, zero_outside
-from coliags_plugin.losses.depth import DepthKind, known_depth
+from coliags_plugin.losses.depth import DepthKind, known_depth, smooth_l1, where_drawn
 
 
 class EstimatedDepthSettings(LossSettings):
@@ -56,12 +56,9 @@ class EstimatedDepthLoss(Loss):
         known = known & (depth > 0)
         rendered, options = step.output[self.settings.depth], self.settings
         estimate = torch.where(known, depth, 1.0).to(rendered.dtype)
-        if options.depth == "inverse_depth_accumulated":
-            known = known & (rendered > 0)
-            rendered = 1.0 / torch.where(known, rendered, 1.0)
+        rendered, known = where_drawn(rendered, known, options.depth)
         difference = (zero_outside(rendered - estimate, known) / estimate).abs()
-        near = difference.square() / (2.0 * options.delta)
-        penalty = torch.where(difference < options.delta, near, difference - 0.5 * options.delta)
+        penalty = smooth_l1(difference, options.delta)
         if step.target.depth_confidence is not None:
             penalty = penalty * step.target.depth_confidence.to(penalty.dtype).clamp_min(options.floor)
         return masked_mean(penalty, known)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from coliags_plugin.contracts import Loss, LossSettings, TrainingStep
 from coliags_plugin.core.interpolation import interpolated
-from coliags_plugin.losses.depth import DepthKind
+from coliags_plugin.losses.depth import DepthKind, smooth_l1, where_drawn
 
 
 class SparseDepthSettings(LossSettings):
@@ -55,9 +55,7 @@ class SparseDepthLoss(Loss):
         if points is None or not len(points.depth):
             return rendered.reshape(-1)[:0].sum()
         drawn = (step.output.alpha > 0) & step.target.valid & torch.isfinite(rendered)
-        if self.settings.depth == "inverse_depth_accumulated":
-            drawn = drawn & (rendered > 0)
-            rendered = 1.0 / torch.where(drawn, rendered, 1.0)
+        rendered, drawn = where_drawn(rendered, drawn, self.settings.depth)
         sampled, counts = interpolated(rendered, drawn, points.pixels)
         truth = points.depth.to(rendered.dtype)
         if self.settings.relative:
@@ -66,5 +64,5 @@ class SparseDepthLoss(Loss):
         if self.settings.relative:
             difference = difference / torch.where(counts, truth, 1.0)
         if (near := self.settings.huber) is not None:
-            difference = torch.where(difference < near, difference.square() / (2.0 * near), difference - 0.5 * near)
+            difference = smooth_l1(difference, near)
         return difference.sum() / counts.sum().clamp_min(1)

@@ -13,7 +13,7 @@ import torch
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene, SparseDepth
 from coliags_plugin.data_check.check import check_scene
-from coliags_plugin.data_check.facts import image_facts, moving_step, path_facts, video_of
+from coliags_plugin.data_check.facts import image_facts, moving_step, path_facts
 from coliags_plugin.data_check.findings import image_findings, path_findings
 from coliags_plugin.data_check.hypotheses import CHANGES
 from coliags_plugin.data_check.lamp import lamp_facts
@@ -151,10 +151,10 @@ def test_a_jump_a_standstill_black_and_repeated_images(scene):
         return moved
 
     def of_path(wrong: Scene) -> str:
-        return next(path_findings(path_facts(video_of(wrong)))).what
+        return next(path_findings(path_facts(wrong.video))).what
 
     def of_images(wrong: Scene) -> str:
-        return next(image_findings(image_facts(video_of(wrong)))).what
+        return next(image_findings(image_facts(wrong.video))).what
 
     assert "the camera jumps" in whats(changed(scene, pose=jumping))
     assert of_path(changed(scene, pose=lambda pose: torch.eye(4))) == "the camera does not move"
@@ -310,7 +310,7 @@ def test_command_says_it_all(folder, scene, tmp_path, capsys):
 
 def test_command_fails_on_what_is_suspect(scene, tmp_path, capsys):
     inverted = changed(scene, pose=torch.linalg.inv)
-    write_frames(tmp_path / "inverted", video_of(inverted))
+    write_frames(tmp_path / "inverted", inverted.video)
     status = run("data", "check", tmp_path / "inverted", "--json", tmp_path / "check.json")
     assert status == 1
     assert "SUSPECT poses agree with depth when read as: world-to-camera" in capsys.readouterr().out

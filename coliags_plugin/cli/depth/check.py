@@ -18,7 +18,7 @@ class CheckDepth:
     """Compare estimated with true depth: error, bias, coverage, and whether the stated confidence is right."""
 
     estimate: tyro.conf.Positional[Path]
-    """The scene whose depth to judge, or a folder of float32 TIFF or .npy files of z-depth in mm."""
+    """Estimated depth: a scene, or a folder of float32 TIFF or .npy files of z-depth in mm."""
     truth: tyro.conf.Positional[Path]
     """The same with true depth, dense or at single points."""
     align_scale: bool = False

@@ -43,7 +43,7 @@ class EstimateDepth:
 
     def run(self) -> None:
         """Estimate, or resume; write the scene and print a summary."""
-        from coliags_plugin.cli.poses.arguments import refuse_output, settings_among, train_command
+        from coliags_plugin.cli.written_scenes import refuse_output, settings_among, train_command
         from coliags_plugin.core.errors import InputError
         from coliags_plugin.engine.data_formats import open_scene
         from coliags_plugin.engine.progress import progress_callback

@@ -1,11 +1,9 @@
-"""Arguments of the ``poses`` subcommands, and reading of trajectories with a log of their conventions."""
+"""Arguments of the ``poses`` subcommands on trajectories, and reading of these with a log of their conventions."""
 
 from __future__ import annotations
 
-import shlex
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -14,11 +12,8 @@ from coliags_plugin.core.errors import InputError
 
 if TYPE_CHECKING:
     from coliags_plugin.core.intrinsics import Intrinsics
-    from coliags_plugin.core.settings import Settings
     from coliags_plugin.poses.format import Format
     from coliags_plugin.poses.trajectory import Trajectory
-
-S = TypeVar("S", bound="Settings")
 
 OptionalFormat = Annotated[str | None, tyro.conf.arg(metavar="FORMAT")]
 
@@ -58,85 +53,3 @@ def parse_intrinsics(intrinsics: str | None, size: str | None) -> Intrinsics | N
         raise InputError(f"--intrinsics {intrinsics}", "four numbers fx,fy,cx,cy in pixels") from error
     with prefixed_errors("--intrinsics, --size"):
         return Intrinsics(fx, fy, cx, cy, *parse_size(size))
-
-
-def settings_of(kind: type[S], assignments: Sequence[str], prefix: str = "") -> S:
-    """Settings from their defaults and ``--set`` assignments.
-
-    Args:
-        kind: The class.
-        assignments: ``key.path=value``.
-        prefix: Prefix of the keys in messages.
-
-    Raises:
-        InputError: An assignment is malformed, or a key or value is invalid; the message names it.
-    """
-    from pydantic import ValidationError
-
-    from coliags_plugin.config.yaml_tree import Node, override_all
-    from coliags_plugin.core.settings import first_error
-
-    tree = override_all(Node({}, "options"), assignments)
-    try:
-        # Merged with the defaults, as a nested part's defaults may differ from its class's.
-        return kind.model_validate(_upon(kind().model_dump(), tree.plain()))
-    except ValidationError as error:
-        key, message, value = first_error(error)
-        raise InputError(f"--set {prefix}{key}: {message} (got {value!r})") from error
-
-
-def settings_among(kind: type[S], assignments: Sequence[str], prefix: str) -> tuple[S, list[str]]:
-    """Settings from the ``--set`` assignments with a key prefix, and the others, which are the data manager's.
-
-    Raises:
-        InputError: See :func:`settings_of`.
-    """
-    own = [assignment.removeprefix(prefix) for assignment in assignments if assignment.startswith(prefix)]
-    return settings_of(kind, own, prefix), [item for item in assignments if not item.startswith(prefix)]
-
-
-def _upon(base: Any, over: Any) -> Any:
-    if not isinstance(base, dict) or not isinstance(over, dict):
-        return over
-    return {**base, **{key: _upon(base.get(key), value) for key, value in over.items()}}
-
-
-def refuse_output(out: Path, source: Path, overwrite: bool) -> None:
-    """Check an output folder before the work starts.
-
-    Raises:
-        InputError: It is, contains or is inside the input, or is not empty and ``overwrite`` is off.
-    """
-    made, read = out.resolve(), source.resolve()
-    if made == read or made in read.parents or read in made.parents:
-        raise InputError(f"--out {out}, and the input is {source}", "a folder apart from the input", "Choose another")
-    if not overwrite and out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{out} already exists", "a new or empty folder", "Choose another, or pass --overwrite")
-
-
-def train_command(out: Path, method: str = "coliags", assignments: Sequence[str] = ()) -> str:
-    """Shell command that trains on a scene.
-
-    Args:
-        out: The scene.
-        method: Name of a method.
-        assignments: Options of training.
-    """
-    return shlex.join(["coliags", "train", method, "--data", str(out), *_set(assignments)])
-
-
-def next_commands(out: Path, assignments: Sequence[str] = ()) -> str:
-    """Shell commands that estimate the depth of a scene with poses and points, and train on it; two lines.
-
-    Args:
-        out: The scene.
-        assignments: Options of its data manager, ``datamanager.KEY=VALUE``.
-    """
-    with_depth = out.with_name(f"{out.name}-depth")
-    options = _set([assignment.removeprefix("datamanager.") for assignment in assignments])
-    estimate = ["coliags", "depth", "estimate", str(out), "--out", str(with_depth), *options]
-    return f"{shlex.join(estimate)}\n{train_command(with_depth, 'coliags-estimated-depth', assignments)}"
-
-
-def _set(assignments: Sequence[str]) -> list[str]:
-    return [word for assignment in assignments for word in ("--set", assignment)]

@@ -24,8 +24,7 @@ class Sfm:
     """Folder to create, in COLMAP's layout."""
     camera: OptionalText = None
     """A known camera, scaled to the images (c3vd: whole frames of C3VD; c3vd-undistorted), or a camera model of COLMAP,
-    for instance PINHOLE or OPENCV_FISHEYE; default: the better of
-    SIMPLE_RADIAL_FISHEYE and SIMPLE_RADIAL."""
+    for instance PINHOLE or OPENCV_FISHEYE; default: the better of SIMPLE_RADIAL_FISHEYE and SIMPLE_RADIAL."""
     params: Annotated[OptionalText, tyro.conf.arg(metavar="P1,P2,...")] = None
     """Parameters of COLMAP's model in its order, pixel centres at integers + 0.5, kept fixed; default: estimated."""
     diameter: Annotated[float | None, tyro.conf.arg(metavar="MM")] = None
@@ -45,7 +44,7 @@ class Sfm:
 
     def run(self) -> None:
         """Reconstruct, write the scene and print a summary."""
-        from coliags_plugin.cli.poses.arguments import next_commands, refuse_output, settings_of
+        from coliags_plugin.cli.written_scenes import next_commands, refuse_output, settings_of
         from coliags_plugin.core.errors import InputError
         from coliags_plugin.engine.progress import progress_callback
         from coliags_plugin.reconstruction.structure.image_files import list_images, masks_for

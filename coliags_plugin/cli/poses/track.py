@@ -35,7 +35,7 @@ class Track:
 
     def run(self) -> None:
         """Track, write the scene and print a summary."""
-        from coliags_plugin.cli.poses.arguments import refuse_output, settings_among, train_command
+        from coliags_plugin.cli.written_scenes import refuse_output, settings_among, train_command
         from coliags_plugin.datamanagers.rgbd.writer import write_rgbd_scene
         from coliags_plugin.engine.data_formats import open_video
         from coliags_plugin.engine.progress import progress_callback

@@ -39,7 +39,7 @@ class Triangulate:
         """Triangulate the training frames, write all frames and print a summary."""
         import logging
 
-        from coliags_plugin.cli.poses.arguments import next_commands, refuse_output, settings_among
+        from coliags_plugin.cli.written_scenes import next_commands, refuse_output, settings_among
         from coliags_plugin.engine.data_formats import open_scene
         from coliags_plugin.engine.progress import progress_callback
         from coliags_plugin.reconstruction.structure.colmap_scene import write_colmap_scene
@@ -51,11 +51,10 @@ class Triangulate:
         with progress_callback() as progress:
             # Initial points are not needed here unless requested.
             scene = open_scene(self.scene, self.format, ["initial_points=none", *options], progress)
-            detected = self._at_stored_size(scene, options)
+            detected = self._at_stored_size(scene, options) if scene.is_resized else scene.train
             found = in_pixels_of(triangulate(detected, settings, progress), detected, scene.train)
         test, split = _held_out(scene)
-        unit = scene.provenance.get("unit", "mm")
-        write_colmap_scene(self.out, scene.train, found, test, self.overwrite, unit)
+        write_colmap_scene(self.out, scene.train, found, test, self.overwrite, "mm" if scene.is_metric else "unknown")
         log = logging.getLogger(__name__)
         if test:
             log.info(
@@ -64,19 +63,14 @@ class Triangulate:
         print(f"{found.summary()}\n{self.out}\n{next_commands(self.out, split)}")
 
     def _at_stored_size(self, scene: Scene, options: list[str]) -> Sequence[Frame]:
-        """The training frames, undistorted at the stored size, where more features are found than at a smaller one."""
+        """The training frames at the stored size, where more features are found than at a smaller one."""
         import logging
 
         from coliags_plugin.engine.data_formats import open_scene
 
-        stored = scene.provenance.get("stored_size")
-        if stored is None or stored == scene.provenance.get("size"):
-            return scene.train
+        stored = scene.provenance["stored_size"]
         logging.getLogger(__name__).info("features are detected at the stored size, %d x %d", *stored)
-        size = [f"width={stored[0]}", f"height={stored[1]}"]
-        # Read again when needed: images of the stored size may not fit into memory.
-        chosen = [*options, *size, "initial_points=none", "keep_pixels=false"]
-        return open_scene(self.scene, self.format, chosen).train
+        return open_scene(self.scene, self.format, options, stored_size=True).train
 
 
 def _held_out(scene: Scene) -> tuple[list[Frame], list[str]]:
@@ -95,7 +89,7 @@ def _held_out(scene: Scene) -> tuple[list[Frame], list[str]]:
         )
     chosen = scene.provenance.get("split", {})
     block = tuple(chosen.get("block", (0.4, 0.6)))
-    video = sorted([*scene.train, *test], key=lambda frame: frame.index)
+    video = scene.video
     test_indices = {frame.index for frame in test}
     is_test = [frame.index in test_indices for frame in video]
     options: dict[Split, list[str]] = {

@@ -74,7 +74,7 @@ def estimate_scene(
     Raises:
         InputError: The frames give no depth, the prior does not fit them, or a folder cannot be written.
     """
-    frames = sorted([*scene.train, *scene.test_sets.get("test", ())], key=lambda frame: frame.index)
+    frames = scene.video
     if others := [name for name in scene.test_sets if name != "test"]:
         log.warning("left out: %s, which are apart from the video", ", ".join(others))
     check_video(frames)

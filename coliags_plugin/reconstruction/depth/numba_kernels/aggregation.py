@@ -49,7 +49,6 @@ def aggregate(cost: Any, guide: Any, small: Any, large: Any, contrast: Any, tota
     for backward in range(2):
         for step in range(height):
             y = height - 1 - step if backward else step
-            behind = y + 1 if backward else y - 1
             # Along the row: the direction of this pass.
             least = np.float32(0.0)
             for place in range(width):
