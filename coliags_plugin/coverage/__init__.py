@@ -1,0 +1,1 @@
+"""What a camera saw of a surface, and what it missed."""

@@ -1,0 +1,1 @@
+"""Runs to files of Gaussians, baked where need be, and such files to runs."""

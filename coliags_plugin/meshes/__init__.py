@@ -1,0 +1,1 @@
+"""Triangle meshes: files, cleaning, comparison with a true surface."""

@@ -1,0 +1,1 @@
+"""Runs to triangle meshes, by fusion of rendered depth."""

@@ -1,0 +1,1 @@
+"""From a video to mesh, coverage and report, in resumable stages."""

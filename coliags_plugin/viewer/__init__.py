@@ -1,0 +1,1 @@
+"""Interactive view of a run in a browser."""
