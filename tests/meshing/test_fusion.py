@@ -33,7 +33,8 @@ def test_no_triangles_fly_between_a_square_and_the_wall_behind_it():
     assert np.minimum(np.abs(z - SQUARE), np.abs(z - WALL)).max() < 0.3 * settings.truncation
     assert (z < SQUARE - 0.05).sum() == 0
     front = mesh.part(mesh.centers[:, 2] < SQUARE + 0.05)
-    assert front.areas.sum() == pytest.approx(16.0, rel=0.15)
+    # Flat up to a voxel from each of its four edges.
+    assert 3.4**2 <= front.areas.sum() <= 4.0**2
 
 
 def test_small_parts_go_and_large_ones_stay():
