@@ -25,6 +25,7 @@ from coliags_plugin.cli.report import Report
 from coliags_plugin.cli.results import Results
 from coliags_plugin.cli.run import run_command
 from coliags_plugin.cli.train import Train
+from coliags_plugin.cli.view import View
 from coliags_plugin.cli.weights import Weights
 
 Command = (
@@ -32,6 +33,7 @@ Command = (
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("eval")]
     | Annotated[Render, tyro.conf.subcommand("render")]
+    | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Compare, tyro.conf.subcommand("compare")]
     | Annotated[Ablate, tyro.conf.subcommand("ablate")]
     | Annotated[Report, tyro.conf.subcommand("report")]
