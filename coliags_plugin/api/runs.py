@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from coliags_plugin.exchange.exporting import Exported
     from coliags_plugin.meshing.writing import MeshedRun
     from coliags_plugin.results.record import Result
+    from coliags_plugin.viewer.serving import Viewer
 
 
 class Run:
@@ -306,6 +307,35 @@ class Run:
             trained = self.load()
             wall, scene = fuse_run(trained), trained.scene
         return measure_scene(scene, wall, folder, chosen, None if truth is None else Path(truth), overwrite)
+
+    def view(self, *, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
+        """Serve the run to browsers (docs/viewer.md), until the viewer is closed.
+
+        Args:
+            host: Name or address to listen on.
+            port: 0: any free one.
+
+        Raises:
+            InputError: See :meth:`load`; viser is not installed, the port is in use or not allowed, or the host is not
+                of this machine.
+        """
+        from coliags_plugin.viewer.serving import Viewer
+
+        return Viewer(self.load(), host, port)
+
+    def save_view(self, output: str | Path) -> Path:
+        """Write the scene as a page of at most 5 MB that opens in a browser offline (docs/viewer.md 3).
+
+        Args:
+            output: The file; an existing one is replaced.
+
+        Raises:
+            InputError: See :meth:`load`; viser is not installed, the method has no Gaussians, or the file cannot be
+                written.
+        """
+        from coliags_plugin.viewer.saving import save_page
+
+        return save_page(self.load(), Path(output))
 
     def relight(self, /, **lamp: Any) -> Run:
         """The run under another lamp, for rendering; it shares the parameters.

@@ -29,6 +29,7 @@ from coliags_plugin.cli.report import Report
 from coliags_plugin.cli.results import Results
 from coliags_plugin.cli.run import run_command
 from coliags_plugin.cli.train import Train
+from coliags_plugin.cli.view import View
 from coliags_plugin.cli.weights import Weights
 
 Command = (
@@ -40,6 +41,7 @@ Command = (
     | Annotated[Mesh, tyro.conf.subcommand("mesh")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Import, tyro.conf.subcommand("import")]
+    | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Compare, tyro.conf.subcommand("compare")]
     | Annotated[Ablate, tyro.conf.subcommand("ablate")]
     | Annotated[Report, tyro.conf.subcommand("report")]
