@@ -20,8 +20,10 @@ if TYPE_CHECKING:
     from coliags_plugin.coverage.writing import MeasuredCoverage
     from coliags_plugin.engine.rendering import DepthKind
     from coliags_plugin.engine.trained import TrainedRun
+    from coliags_plugin.exchange.exporting import Exported
     from coliags_plugin.meshing.writing import MeshedRun
     from coliags_plugin.results.record import Result
+    from coliags_plugin.viewer.serving import Viewer
 
 
 class Run:

@@ -18,6 +18,8 @@ from coliags_plugin.cli.data import Data
 from coliags_plugin.cli.depth import Depth
 from coliags_plugin.cli.doctor import Doctor
 from coliags_plugin.cli.evaluate import Evaluate
+from coliags_plugin.cli.export import Export
+from coliags_plugin.cli.import_splats import Import
 from coliags_plugin.cli.list import List
 from coliags_plugin.cli.mesh import Mesh
 from coliags_plugin.cli.phantom import Phantom
@@ -27,6 +29,7 @@ from coliags_plugin.cli.report import Report
 from coliags_plugin.cli.results import Results
 from coliags_plugin.cli.run import run_command
 from coliags_plugin.cli.train import Train
+from coliags_plugin.cli.view import View
 from coliags_plugin.cli.weights import Weights
 
 Command = (
@@ -36,6 +39,9 @@ Command = (
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Coverage, tyro.conf.subcommand("coverage")]
     | Annotated[Mesh, tyro.conf.subcommand("mesh")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Import, tyro.conf.subcommand("import")]
+    | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Compare, tyro.conf.subcommand("compare")]
     | Annotated[Ablate, tyro.conf.subcommand("ablate")]
     | Annotated[Report, tyro.conf.subcommand("report")]
