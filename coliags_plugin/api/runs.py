@@ -238,6 +238,34 @@ class Run:
         against = None if truth is None else Path(truth)
         return mesh_run(self.load(), folder, chosen, formats, against, overwrite)
 
+    def export(
+        self,
+        output: str | Path | None = None,
+        form: str = "ply",
+        *,
+        light: str = "mean",
+        measure: bool = True,
+        overwrite: bool = False,
+    ) -> Exported:
+        """Write the run's Gaussians to a file, and a record of what it is and loses to ``FILE.json``.
+
+        Args:
+            output: The file; None: ``export/SCENE.FORMAT`` in the run folder.
+            form: ``ply``, ``spz``, ``splat`` or ``glb``.
+            light: ``mean`` or ``flattened``: what is baked into colours that depend on the lamp (docs/export.md 2).
+            measure: Compare the file with the run on the held-out views, for the record.
+            overwrite: Replace a file that is there.
+
+        Raises:
+            InputError: See :meth:`load`; the method has no Gaussians, the run was relit, there is no such format or
+                light, or the file exists or cannot be written.
+        """
+        from coliags_plugin.exchange.exporting import export_run
+
+        trained = self.load()
+        file = Path(output) if output is not None else self.path / "export" / f"{self.scene_name}.{form}"
+        return export_run(trained, file, form, light, measure, overwrite)
+
     def coverage(
         self,
         output: str | Path | None = None,
@@ -279,6 +307,35 @@ class Run:
             trained = self.load()
             wall, scene = fuse_run(trained), trained.scene
         return measure_scene(scene, wall, folder, chosen, None if truth is None else Path(truth), overwrite)
+
+    def view(self, *, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
+        """Serve the run to browsers (docs/viewer.md), until the viewer is closed.
+
+        Args:
+            host: Name or address to listen on.
+            port: 0: any free one.
+
+        Raises:
+            InputError: See :meth:`load`; viser is not installed, the port is in use or not allowed, or the host is not
+                of this machine.
+        """
+        from coliags_plugin.viewer.serving import Viewer
+
+        return Viewer(self.load(), host, port)
+
+    def save_view(self, output: str | Path) -> Path:
+        """Write the scene as a page of at most 5 MB that opens in a browser offline (docs/viewer.md 3).
+
+        Args:
+            output: The file; an existing one is replaced.
+
+        Raises:
+            InputError: See :meth:`load`; viser is not installed, the method has no Gaussians, or the file cannot be
+                written.
+        """
+        from coliags_plugin.viewer.saving import save_page
+
+        return save_page(self.load(), Path(output))
 
     def relight(self, /, **lamp: Any) -> Run:
         """The run under another lamp, for rendering; it shares the parameters.
