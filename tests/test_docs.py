@@ -30,6 +30,7 @@ from coliags_plugin.datamanagers.splits import held_out
 from coliags_plugin.engine.randomness import PURPOSES
 from coliags_plugin.method_check.check import CHECKS
 from coliags_plugin.phantom.settings import PRESETS, PhantomSettings
+from coliags_plugin.pipeline.settings import FrameSettings
 from tests.scenes import SMALL, write_wall
 
 ROOT = Path(__file__).parents[1]
@@ -264,6 +265,7 @@ OPTIONS = "| option | default | values | what |"
 FORMATS = [name for name in formats() if datamanagers.source(name) == "built in"]
 OPTION_TABLES = [
     (PhantomSettings, "phantom.md", "| setting | default | range | what |"),
+    (FrameSettings, "reconstruct.md", "| setting | default | range | what |"),
     *((datamanagers.get(name).Settings, f"layouts/{name}.md", OPTIONS) for name in FORMATS),
 ]
 

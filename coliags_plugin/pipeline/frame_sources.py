@@ -138,9 +138,13 @@ def frame_source(path: Path) -> FrameSource:
 def _opened(path: Path) -> cv2.VideoCapture:
     import cv2
 
-    # FFmpeg writes its own messages to stderr; what they come to is said by the error.
+    # FFmpeg and OpenCV write messages of their own to stderr; what they come to is said by the error.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    finally:
+        cv2.utils.logging.setLogLevel(level)
     if not video.isOpened():
         size = path.stat().st_size
         raise InputError(

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.locks import LockedError, locked
 from coliags_plugin.core.progress import Progress
@@ -62,10 +63,11 @@ def reconstruct(
         frame_source(source)
     Record.of(out)  # refuses another folder before anything is written
     place = Workplace(out, source, settings, mask, data_format, device, progress)
+    stages = stages_of(place)
     try:
         with locked(out / LOCK_FILE):
             record = Record.of(out)
-            run_stages(stages_of(place), record, overwrite)
+            run_stages(stages, record, overwrite)
     except LockedError as error:
         raise InputError(f"{out} is in use by {error}", "one reconstruction at a time", "Wait for it") from error
     return record
@@ -91,6 +93,7 @@ def stages_of(place: Workplace) -> list[Stage]:
     add("check", filmed.check_data, size, ("check.html", "check.json"))
     if place.estimates_depth:
         add("depth", filmed.estimate_depth, {**size, "depth": settings.depth.model_dump()}, ("depth", ".depth.work"))
+    load_method(trained.method_for(place))  # an unknown method is found out before the work starts
     training = {"method": trained.method_for(place), "steps": settings.steps, "seed": settings.seed}
     add("train", trained.train, training, ("run",))
     add("evaluate", trained.evaluate, {}, ("run/eval",))
