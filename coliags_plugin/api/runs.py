@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from coliags_plugin.core.scenes import Scene
     from coliags_plugin.engine.rendering import DepthKind
     from coliags_plugin.engine.trained import TrainedRun
+    from coliags_plugin.meshing.writing import MeshedRun
     from coliags_plugin.results.record import Result
 
 
@@ -199,6 +200,40 @@ class Run:
         folder = Path(output) if output is not None else self.path / ("renders" if trained.lamp is None else "relit")
         render_run(trained, folder, frames, video, fps, overwrite, channels, depth_kind, depth_tiff)
         return folder
+
+    def mesh(
+        self,
+        output: str | Path | None = None,
+        *,
+        settings: Mapping[str, Any] | None = None,
+        formats: Sequence[str] = ("ply", "obj", "glb"),
+        truth: str | Path | None = None,
+        overwrite: bool = False,
+    ) -> MeshedRun:
+        """Fuse the depth rendered from the training poses into a triangle mesh, and write it.
+
+        Args:
+            output: Folder to make; None: ``mesh`` in the run folder.
+            settings: Options of meshing by name (docs/meshes.md 3), for instance ``{"voxel_size": 0.5}``.
+            formats: Of the files.
+            truth: True surface to compare with: a mesh in the world of the scene, mm, or the folder of a scene with
+                one; None: that of the scene, where there is one.
+            overwrite: Replace the folder where it exists.
+
+        Returns:
+            The mesh, its folder, and the comparison with the true surface where there is one.
+
+        Raises:
+            InputError: See :meth:`load`; an option is unknown or invalid, the method renders no such depth, there is no
+                surface, the truth is of another world or unit, or the folder exists or cannot be written.
+        """
+        from coliags_plugin.meshing.settings import mesh_settings
+        from coliags_plugin.meshing.writing import mesh_run
+
+        chosen = mesh_settings(settings or {})
+        folder = Path(output) if output is not None else self.path / "mesh"
+        against = None if truth is None else Path(truth)
+        return mesh_run(self.load(), folder, chosen, formats, against, overwrite)
 
     def relight(self, /, **lamp: Any) -> Run:
         """The run under another lamp, for rendering; it shares the parameters.

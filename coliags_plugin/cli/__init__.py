@@ -18,6 +18,7 @@ from coliags_plugin.cli.depth import Depth
 from coliags_plugin.cli.doctor import Doctor
 from coliags_plugin.cli.evaluate import Evaluate
 from coliags_plugin.cli.list import List
+from coliags_plugin.cli.mesh import Mesh
 from coliags_plugin.cli.phantom import Phantom
 from coliags_plugin.cli.poses import Poses
 from coliags_plugin.cli.reconstruct import Reconstruct
@@ -34,6 +35,7 @@ Command = (
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("eval")]
     | Annotated[Render, tyro.conf.subcommand("render")]
+    | Annotated[Mesh, tyro.conf.subcommand("mesh")]
     | Annotated[Compare, tyro.conf.subcommand("compare")]
     | Annotated[Ablate, tyro.conf.subcommand("ablate")]
     | Annotated[Report, tyro.conf.subcommand("report")]

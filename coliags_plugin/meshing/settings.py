@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, Literal
 
 from pydantic import Field as Option
+from pydantic import ValidationError
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Scene
-from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.settings import Settings, first_error
 
 #: Approximate number of training cameras, evenly spaced, that the default depth range is computed from.
 _RANGE_CAMERAS = 16
@@ -28,6 +30,19 @@ class MeshSettings(Settings):
     max_incidence: float = Option(default=80.0, gt=0, le=90)  # degrees; surface seen more obliquely is not fused
     min_views: int = Option(default=3, ge=1)  # views that must agree on a place; fewer where there are fewer
     min_part: float = Option(default=0.01, ge=0, le=1)  # connected parts below this share of the largest are removed
+
+
+def mesh_settings(values: Mapping[str, Any]) -> MeshSettings:
+    """Options of plain values by name.
+
+    Raises:
+        InputError: A name is unknown, or a value is invalid.
+    """
+    try:
+        return MeshSettings.model_validate(dict(values))
+    except ValidationError as error:
+        key, message, value = first_error(error)
+        raise InputError(f"mesh option '{key}' = {value!r}: {message}") from error
 
 
 def voxel_size_of(settings: MeshSettings, scene: Scene) -> float:
