@@ -52,6 +52,7 @@ class Reconstruct:
         from coliags_plugin.api.reconstructing import reconstruct
         from coliags_plugin.cli.arguments import parse_size
         from coliags_plugin.config.assignments import parse_assignments
+        from coliags_plugin.pipeline.page import PAGE_FILE
 
         given: dict[str, Any] = {
             "sfm.camera.model": self.camera,
@@ -78,3 +79,4 @@ class Reconstruct:
         for stage in record.stages.values():
             for path, what in stage.files.items():
                 print(f"{self.out / path}: {what}")
+        print(self.out / PAGE_FILE)

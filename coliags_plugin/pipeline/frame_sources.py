@@ -89,11 +89,16 @@ class VideoFile:
         """Number of frames by the file's header."""
         import cv2
 
-        return max(1, int(_opened(self.path).get(cv2.CAP_PROP_FRAME_COUNT)))
+        video = _opened(self.path)
+        try:
+            return max(1, int(video.get(cv2.CAP_PROP_FRAME_COUNT)))
+        finally:
+            video.release()
 
     def __iter__(self) -> Iterator[tuple[str, UInt8[np.ndarray, "H W 3"]]]:
         """Names ``frame_000000``, ... by their number in the video, and images; see :class:`FrameSource`."""
-        video, expected = _opened(self.path), self.expected
+        expected = self.expected
+        video = _opened(self.path)
         count, shape = 0, None
         try:
             while True:

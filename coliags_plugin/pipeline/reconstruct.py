@@ -17,10 +17,12 @@ from coliags_plugin.core.progress import Progress
 from coliags_plugin.datamanagers.recognition import find_format, recognised
 from coliags_plugin.pipeline import filmed, trained
 from coliags_plugin.pipeline.frame_sources import frame_source
+from coliags_plugin.pipeline.page import write_index
 from coliags_plugin.pipeline.record import LOCK_FILE, Record
-from coliags_plugin.pipeline.settings import ReconstructionSettings
+from coliags_plugin.pipeline.settings import FrameSettings, ReconstructionSettings
 from coliags_plugin.pipeline.stages import Outcome, Stage, run_stages
 from coliags_plugin.pipeline.workplace import Workplace
+from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 
 log = logging.getLogger(__name__)
 
@@ -61,6 +63,8 @@ def reconstruct(
     data_format = find_format(source) if source.is_dir() and recognised(source) else None
     if data_format is None:
         frame_source(source)
+    else:
+        _refuse_unused(source, settings, mask)
     Record.of(out)  # refuses another folder before anything is written
     place = Workplace(out, source, settings, mask, data_format, device, progress)
     stages = stages_of(place)
@@ -68,6 +72,7 @@ def reconstruct(
         with locked(out / LOCK_FILE):
             record = Record.of(out)
             run_stages(stages, record, overwrite)
+            write_index(record, f"Reconstruction of {source.resolve().name}")
     except LockedError as error:
         raise InputError(f"{out} is in use by {error}", "one reconstruction at a time", "Wait for it") from error
     return record
@@ -97,9 +102,25 @@ def stages_of(place: Workplace) -> list[Stage]:
     training = {"method": trained.method_for(place), "steps": settings.steps, "seed": settings.seed}
     add("train", trained.train, training, ("run",))
     add("evaluate", trained.evaluate, {}, ("run/eval",))
-    add("mesh", trained.mesh, {}, ("run/mesh",))
+    add("mesh", trained.mesh, {"mesh": settings.mesh.model_dump()}, ("run/mesh",))
     add("report", trained.report, {}, ("report.html",))
     return stages
+
+
+def _refuse_unused(source: Path, settings: ReconstructionSettings, mask: Path | None) -> None:
+    """Refuse settings of stages that a scene with poses does not need."""
+    unused = {
+        "mask": mask is not None,
+        "diameter": settings.diameter is not None,
+        "frames": settings.frames != FrameSettings(),
+        "sfm": settings.sfm != SfmSettings(),
+    }
+    if given := ", ".join(name for name, is_given in unused.items() if is_given):
+        raise InputError(
+            f"{source} has poses, and settings of {given} are given",
+            "these for a video or a folder of images alone",
+            "Leave them out, or give the folder of the scene's images, for their poses to be estimated",
+        )
 
 
 def _identity(path: Path) -> Mapping[str, Any]:

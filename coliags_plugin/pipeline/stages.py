@@ -74,6 +74,9 @@ def run_stages(stages: Sequence[Stage], record: Record, overwrite: bool = False)
         except InputError as error:
             record.put(stage.name, replace(record.stages[stage.name], state="failed"))
             raise _failed(error, stage, stages[: number - 1]) from error
+        except KeyboardInterrupt:
+            log.info("%s: interrupted; the same command goes on from here", title)
+            raise
         seconds = time.monotonic() - began
         ended = replace(
             record.stages[stage.name],

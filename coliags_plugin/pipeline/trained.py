@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from coliags_plugin.config.method_config import method_name
 from coliags_plugin.core.errors import InterruptedRunError
+from coliags_plugin.meshes.files import MESH_FORMATS
 from coliags_plugin.pipeline.stages import Outcome
 from coliags_plugin.pipeline.workplace import Workplace
 
@@ -70,13 +71,13 @@ def evaluate(place: Workplace) -> Outcome:
 def mesh(place: Workplace) -> Outcome:
     """Fuse the rendered depth into a mesh."""
     from coliags_plugin.engine.trained import load_trained
-    from coliags_plugin.meshes.files import write_mesh
-    from coliags_plugin.meshing.fusion import fuse_run
+    from coliags_plugin.meshing.writing import mesh_run
 
     trained = load_trained(place.run, place.device, place.scene)
-    made = fuse_run(trained)
-    write_mesh(place.run / "mesh" / "mesh.ply", made)
-    return Outcome(f"{len(made)} triangles", {"run/mesh/mesh.ply": "the surface"})
+    made = mesh_run(trained, place.run / "mesh", place.settings.mesh, overwrite=True)
+    unit = f" {trained.scene.length_unit}^2" if trained.scene.is_metric else " square units"
+    files = {f"run/mesh/mesh.{kind}": f"the surface as {kind.upper()}" for kind in MESH_FORMATS}
+    return Outcome(f"{len(made.mesh):,} triangles, {made.mesh.areas.sum():.4g}{unit}", files)
 
 
 def report(place: Workplace) -> Outcome:

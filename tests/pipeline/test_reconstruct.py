@@ -63,6 +63,9 @@ def test_stages_of_a_video(done, video, tmp_path, capsys):
     printed = capsys.readouterr().out
     assert printed.splitlines()[0].startswith("frames: 15 of 15 frames, 160 x 120 px")
     assert f"{tmp_path / 'out' / 'frames' / 'images'}: frames of use, PNG" in printed
+    page = (tmp_path / "out" / "index.html").read_text()
+    assert 'href="frames/images"' in page
+    assert "15 of 15 frames, 160 x 120 px" in page
     done.clear()
     assert commands.run(*argv) == 0
     assert done == []
@@ -104,6 +107,8 @@ def test_a_scene_with_poses_needs_neither_frames_nor_poses(done, tmp_path):
     cp.reconstruct(scene, tmp_path / "out")
     with_depth = any(path.name.startswith("depth") for path in scene.iterdir())
     assert done == ["check_data", *([] if with_depth else ["estimate_depth"]), *TRAINED]
+    with pytest.raises(InputError, match=r"tube has poses, and settings of diameter, frames are given"):
+        cp.reconstruct(scene, tmp_path / "other", settings={"diameter": 40.0, "frames.every": 2})
 
 
 @pytest.mark.parametrize(
