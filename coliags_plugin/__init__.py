@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from coliags_plugin.api.comparing import ablate, compare, variant
+    from coliags_plugin.api.exchange import import_splats
     from coliags_plugin.api.reconstructing import reconstruct
     from coliags_plugin.api.reports import report
     from coliags_plugin.api.runs import Run, load_run
@@ -16,6 +17,7 @@ __all__ = [
     "Run",
     "ablate",
     "compare",
+    "import_splats",
     "load_run",
     "load_scene",
     "make_phantom",
@@ -28,6 +30,7 @@ __all__ = [
 #: Names of the API by its modules.
 _MODULES = {
     "comparing": ("ablate", "compare", "variant"),
+    "exchange": ("import_splats",),
     "reconstructing": ("reconstruct",),
     "reports": ("report",),
     "runs": ("Run", "load_run"),

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from coliags_plugin.core.scenes import Scene
     from coliags_plugin.engine.rendering import DepthKind
     from coliags_plugin.engine.trained import TrainedRun
+    from coliags_plugin.exchange.exporting import Exported
     from coliags_plugin.meshing.writing import MeshedRun
     from coliags_plugin.results.record import Result
 
@@ -234,6 +235,34 @@ class Run:
         folder = Path(output) if output is not None else self.path / "mesh"
         against = None if truth is None else Path(truth)
         return mesh_run(self.load(), folder, chosen, formats, against, overwrite)
+
+    def export(
+        self,
+        output: str | Path | None = None,
+        form: str = "ply",
+        *,
+        light: str = "mean",
+        measure: bool = True,
+        overwrite: bool = False,
+    ) -> Exported:
+        """Write the run's Gaussians to a file, and a record of what it is and loses to ``FILE.json``.
+
+        Args:
+            output: The file; None: ``export/SCENE.FORMAT`` in the run folder.
+            form: ``ply``, ``spz``, ``splat`` or ``glb``.
+            light: ``mean`` or ``flattened``: what is baked into colours that depend on the lamp (docs/export.md 2).
+            measure: Compare the file with the run on the held-out views, for the record.
+            overwrite: Replace a file that is there.
+
+        Raises:
+            InputError: See :meth:`load`; the method has no Gaussians, the run was relit, there is no such format or
+                light, or the file exists or cannot be written.
+        """
+        from coliags_plugin.exchange.exporting import export_run
+
+        trained = self.load()
+        file = Path(output) if output is not None else self.path / "export" / f"{self.scene_name}.{form}"
+        return export_run(trained, file, form, light, measure, overwrite)
 
     def relight(self, /, **lamp: Any) -> Run:
         """The run under another lamp, for rendering; it shares the parameters.

@@ -17,6 +17,8 @@ from coliags_plugin.cli.data import Data
 from coliags_plugin.cli.depth import Depth
 from coliags_plugin.cli.doctor import Doctor
 from coliags_plugin.cli.evaluate import Evaluate
+from coliags_plugin.cli.export import Export
+from coliags_plugin.cli.import_splats import Import
 from coliags_plugin.cli.list import List
 from coliags_plugin.cli.mesh import Mesh
 from coliags_plugin.cli.phantom import Phantom
@@ -36,6 +38,8 @@ Command = (
     | Annotated[Evaluate, tyro.conf.subcommand("eval")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Mesh, tyro.conf.subcommand("mesh")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Import, tyro.conf.subcommand("import")]
     | Annotated[Compare, tyro.conf.subcommand("compare")]
     | Annotated[Ablate, tyro.conf.subcommand("ablate")]
     | Annotated[Report, tyro.conf.subcommand("report")]

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.splats.cloud import SplatCloud
 from coliags_plugin.splats.dot_splat import read_dot_splat, write_dot_splat
 from coliags_plugin.splats.gltf import write_splat_glb
@@ -52,6 +52,22 @@ FORMATS: Mapping[str, SplatFormat] = {
 }
 
 
+def check_format(name: str) -> None:
+    """Refuse a name of no format.
+
+    Raises:
+        InputError: See above.
+    """
+    if name not in FORMATS:
+        raise InputError(f"no format '{name}'", f"one of {', '.join(FORMATS)}", did_you_mean(name, FORMATS))
+
+
+def kept_by(name: str, path: Path, cloud: SplatCloud) -> SplatCloud:
+    """What a file that was just written holds of a cloud: as read back, or the cloud where the format is not read."""
+    reader = FORMATS[name].read
+    return cloud if reader is None else reader(path)
+
+
 def write_splats(path: Path, cloud: SplatCloud, name: str, comment: str = "") -> None:
     """Write Gaussians; surfels become flat Gaussians.
 
@@ -64,8 +80,7 @@ def write_splats(path: Path, cloud: SplatCloud, name: str, comment: str = "") ->
     Raises:
         InputError: There is no such format, nothing to write, or the file cannot be written.
     """
-    if name not in FORMATS:
-        raise InputError(f"no format '{name}'", f"one of {', '.join(FORMATS)}")
+    check_format(name)
     if not len(cloud):
         raise InputError("no Gaussian to write", "at least one")
     FORMATS[name].write(path, cloud.with_thickness(THICKNESS_SHARE), comment)
