@@ -24,6 +24,7 @@ from coliags_plugin.config.method_config import MethodConfig, OptimizerSettings,
 from coliags_plugin.config.registry import REGISTRIES, datamanagers
 from coliags_plugin.core.render_output import OUTPUTS
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.coverage.settings import CoverageSettings
 from coliags_plugin.datamanagers.recognition import formats
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
 from coliags_plugin.datamanagers.splits import held_out
@@ -265,6 +266,7 @@ OPTIONS = "| option | default | values | what |"
 FORMATS = [name for name in formats() if datamanagers.source(name) == "built in"]
 OPTION_TABLES = [
     (PhantomSettings, "phantom.md", "| setting | default | range | what |"),
+    (CoverageSettings, "coverage.md", OPTIONS),
     (FrameSettings, "reconstruct.md", "| setting | default | range | what |"),
     *((datamanagers.get(name).Settings, f"layouts/{name}.md", OPTIONS) for name in FORMATS),
 ]

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from coliags_plugin.config.method_config import MethodConfig
     from coliags_plugin.core.cameras import Camera
     from coliags_plugin.core.scenes import Scene
+    from coliags_plugin.coverage.writing import MeasuredCoverage
     from coliags_plugin.engine.rendering import DepthKind
     from coliags_plugin.engine.trained import TrainedRun
     from coliags_plugin.exchange.exporting import Exported
@@ -263,6 +264,48 @@ class Run:
         trained = self.load()
         file = Path(output) if output is not None else self.path / "export" / f"{self.scene_name}.{form}"
         return export_run(trained, file, form, light, measure, overwrite)
+
+    def coverage(
+        self,
+        output: str | Path | None = None,
+        *,
+        settings: Mapping[str, Any] | None = None,
+        mesh: str | Path | None = None,
+        truth: str | Path | None = None,
+        overwrite: bool = False,
+    ) -> MeasuredCoverage:
+        """Measure what the recording shows of the wall and what it misses, and write it. Research use only.
+
+        Args:
+            output: Folder to make; None: ``coverage`` in the run folder.
+            settings: What counts as seen, by name (docs/coverage.md 3), for instance ``{"far": 40.0}``.
+            mesh: The wall, PLY, OBJ or GLB, in mm in the world of the poses; None: ``mesh/mesh.ply`` in the run folder,
+                or else the fused depth of the run.
+            truth: True surface to measure against: a mesh in the world of the scene, mm, or the folder of a scene with
+                one; None: that of the scene, where there is one.
+            overwrite: Replace the folder where it exists.
+
+        Raises:
+            InputError: See :meth:`load`; an option is unknown or invalid, the unit of length is unknown, the mesh
+                cannot be read, is not where the cameras look or is no tube around them, or the folder exists or cannot
+                be written.
+        """
+        from coliags_plugin.coverage.settings import coverage_settings
+        from coliags_plugin.coverage.writing import check_free, measure_scene, open_recording
+        from coliags_plugin.meshes.files import read_mesh
+
+        chosen = coverage_settings(settings or {})
+        folder = Path(output) if output is not None else self.path / "coverage"
+        check_free(folder, overwrite)
+        file = Path(mesh) if mesh is not None else self.path / "mesh" / "mesh.ply"
+        if mesh is not None or file.is_file():
+            wall, scene = read_mesh(file), open_recording(self.data or self.folder.identity().scene_path)
+        else:
+            from coliags_plugin.meshing.fusion import fuse_run
+
+            trained = self.load()
+            wall, scene = fuse_run(trained), trained.scene
+        return measure_scene(scene, wall, folder, chosen, None if truth is None else Path(truth), overwrite)
 
     def relight(self, /, **lamp: Any) -> Run:
         """The run under another lamp, for rendering; it shares the parameters.

@@ -13,6 +13,7 @@ from coliags_plugin.cli.ablate import Ablate
 from coliags_plugin.cli.check import Check
 from coliags_plugin.cli.compare import Compare
 from coliags_plugin.cli.config import Config
+from coliags_plugin.cli.coverage import Coverage
 from coliags_plugin.cli.data import Data
 from coliags_plugin.cli.depth import Depth
 from coliags_plugin.cli.doctor import Doctor
@@ -37,6 +38,7 @@ Command = (
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("eval")]
     | Annotated[Render, tyro.conf.subcommand("render")]
+    | Annotated[Coverage, tyro.conf.subcommand("coverage")]
     | Annotated[Mesh, tyro.conf.subcommand("mesh")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Import, tyro.conf.subcommand("import")]
