@@ -103,6 +103,7 @@ def stages_of(place: Workplace) -> list[Stage]:
     add("train", trained.train, training, ("run",))
     add("evaluate", trained.evaluate, {}, ("run/eval",))
     add("mesh", trained.mesh, {"mesh": settings.mesh.model_dump()}, ("run/mesh",))
+    add("coverage", trained.coverage, {"coverage": settings.coverage.model_dump()}, ("run/coverage",))
     add("report", trained.report, {}, ("report.html",))
     return stages
 

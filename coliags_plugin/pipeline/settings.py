@@ -7,6 +7,7 @@ from typing import Annotated
 from pydantic import Field
 
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.coverage.settings import CoverageSettings
 from coliags_plugin.meshing.settings import MeshSettings
 from coliags_plugin.reconstruction.depth.settings import DepthSettings
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
@@ -67,4 +68,6 @@ class ReconstructionSettings(Settings):
     steps: int = Field(default=2000, ge=1, description="Training steps.")
     mesh: MeshSettings = MeshSettings()
     """Fusion of the rendered depth into a mesh."""
+    coverage: CoverageSettings = CoverageSettings()
+    """What counts as seen."""
     seed: int = Field(default=0, ge=0, description="Seed of training.")

@@ -1,12 +1,16 @@
-"""Stages from a scene with depth to a report: training, evaluation, mesh, report."""
+"""Stages from a scene with depth to a report: training, evaluation, mesh, coverage, report."""
 
 from __future__ import annotations
 
+import logging
+
 from coliags_plugin.config.method_config import method_name
-from coliags_plugin.core.errors import InterruptedRunError
+from coliags_plugin.core.errors import InputError, InterruptedRunError
 from coliags_plugin.meshes.files import MESH_FORMATS
 from coliags_plugin.pipeline.stages import Outcome
 from coliags_plugin.pipeline.workplace import Workplace
+
+log = logging.getLogger(__name__)
 
 #: Largest time between two checkpoints, seconds, and the number of checkpoints kept.
 _SAVE_SECONDS, _KEPT = 60.0, 2
@@ -78,6 +82,30 @@ def mesh(place: Workplace) -> Outcome:
     unit = f" {trained.scene.length_unit}^2" if trained.scene.is_metric else " square units"
     files = {f"run/mesh/mesh.{kind}": f"the surface as {kind.upper()}" for kind in MESH_FORMATS}
     return Outcome(f"{len(made.mesh):,} triangles, {made.mesh.areas.sum():.4g}{unit}", files)
+
+
+def coverage(place: Workplace) -> Outcome:
+    """Measure what the video shows of the wall, through the lens that filmed it; left out where that is impossible."""
+    from coliags_plugin.coverage.text import summary
+    from coliags_plugin.coverage.writing import measure_scene
+    from coliags_plugin.meshes.files import read_mesh
+
+    scene = place.open_posed()
+    if not scene.is_metric:
+        return Outcome("left out, as the unit of length is unknown (--diameter gives one)")
+    folder = place.run / "coverage"
+    try:
+        made = measure_scene(
+            scene, read_mesh(place.run / "mesh" / "mesh.ply"), folder, place.settings.coverage, overwrite=True
+        )
+    except InputError as error:
+        log.warning("no coverage: %s", error)
+        return Outcome(f"left out: {error}")
+    what = "what was seen and missed, for research use only"
+    return Outcome(
+        "; ".join(summary(made.coverage, made.evaluation)),
+        {"run/coverage/coverage.html": what, "run/coverage/coverage.ply": "the same on the mesh"},
+    )
 
 
 def report(place: Workplace) -> Outcome:

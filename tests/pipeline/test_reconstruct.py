@@ -23,7 +23,7 @@ from tests import commands
 from tests.pipeline.films import blurred, film, write_images
 from tests.textured_tube import INTRINSICS, tube_frames, write_tube
 
-FILMED, TRAINED = ("make_poses", "check_data", "estimate_depth"), ("train", "evaluate", "mesh", "report")
+FILMED, TRAINED = ("make_poses", "check_data", "estimate_depth"), ("train", "evaluate", "mesh", "coverage", "report")
 
 
 class Killed(BaseException):
