@@ -173,20 +173,8 @@ def parsed(argv: list[str], monkeypatch: pytest.MonkeyPatch) -> Any:
 
 #: Subcommands that running text names alone.
 ALONE = (
-    "train",
-    "eval",
-    "render",
-    "mesh",
-    "coverage",
-    "report",
-    "compare",
-    "ablate",
-    "phantom",
-    "config",
-    "check",
-    "poses",
-    "coverage",
-    "reconstruct",
+    *("train", "eval", "render", "mesh", "export", "import", "coverage", "view", "reconstruct"),
+    *("report", "compare", "ablate", "phantom", "config", "check", "poses"),
 )
 #: Methods that docs/example_package adds; tests/test_third_party_package.py trains them.
 OF_THE_EXAMPLE = {path.stem for path in (DOCS / "example_package").rglob("*.yaml")}
