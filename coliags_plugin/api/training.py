@@ -44,7 +44,7 @@ def train(
 
     Raises:
         InputError: Method, data or options are invalid or do not fit each other; nothing was written.
-        InterruptedRunError: Ctrl-C, after the state was saved.
+        InterruptedRunError: Ctrl-C, SIGTERM or SIGHUP, after the state was saved.
         NotFiniteError: A loss or parameter became NaN or infinite.
     """
     from coliags_plugin.engine.devices import choose_device
@@ -57,8 +57,9 @@ def train(
     chosen = {key: value for key, value in named.items() if value is not None}
     request = TrainingRequest(method, data, (*assignments(settings), *assignments(chosen)), seed, data_format)
     folder = _run_folder(method, data, output, resume)
-    trainer = resume_training(request, folder, on) if resume else start_training(request, folder, on, overwrite)
-    trainer.train()
+    training = resume_training(request, folder, on) if resume else start_training(request, folder, on, overwrite)
+    with training as trainer:
+        trainer.train()
     return Run(folder.path, data=data, device=device)
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,10 +38,11 @@ class TrainingRequest:
     data_format: str | None = None
 
 
+@contextmanager
 def start_training(
     request: TrainingRequest, folder: RunFolder, device: torch.device, overwrite: bool = False
-) -> Trainer:
-    """Make a run folder and what trains in it.
+) -> Iterator[Trainer]:
+    """Make a run folder and what trains in it; no other process can train it until the block ends.
 
     Args:
         request: What to train.
@@ -49,18 +51,20 @@ def start_training(
         overwrite: Replace an existing run folder.
 
     Raises:
-        InputError: Method, data or options are invalid or do not fit each other, or the folder exists; nothing was
-            written.
+        InputError: Method, data or options are invalid or do not fit each other, or the folder exists or is another
+            process's; nothing was written.
     """
     folder.check_free(overwrite)
     loaded = load_method_for(request.data, request.method, request.overrides, request.data_format)
     trainer = _trainer(loaded, request, folder, request.seed or 0, device)
-    trainer.start(overwrite)
-    return trainer
+    with folder.owned():
+        trainer.start(overwrite)
+        yield trainer
 
 
-def resume_training(request: TrainingRequest, folder: RunFolder, device: torch.device) -> Trainer:
-    """What trains on in a run folder, from its latest checkpoint.
+@contextmanager
+def resume_training(request: TrainingRequest, folder: RunFolder, device: torch.device) -> Iterator[Trainer]:
+    """What trains on in a run folder, from its newest whole checkpoint; no other process can until the block ends.
 
     Args:
         request: What is trained; overrides are applied to the run's own config.
@@ -68,13 +72,14 @@ def resume_training(request: TrainingRequest, folder: RunFolder, device: torch.d
         device: Where to compute.
 
     Raises:
-        InputError: There is no run, or it is of another method, seed, other settings or data.
+        InputError: There is no run, it is another process's, or of another method, seed, other settings or data.
     """
     folder = RunFolder.existing(folder.path)
     loaded = resumed_method(folder, request.method, request.data, request.overrides, request.data_format)
     trainer = _trainer(loaded, request, folder, resumed_seed(folder, request.seed), device)
-    trainer.resume()
-    return trainer
+    with folder.owned():
+        trainer.resume()
+        yield trainer
 
 
 def _trainer(

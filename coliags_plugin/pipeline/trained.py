@@ -43,16 +43,15 @@ def train(place: Workplace) -> Outcome:
         method_for(place), place.scene, options, settings.seed, None if place.estimates_depth else place.data_format
     )
     folder = RunFolder(place.run)
-    if folder.config_file.is_file():
-        trainer = resume_training(request, folder, place.device)
-    else:
-        trainer = start_training(request, folder, place.device)
-    try:
-        trainer.train(_SAVE_SECONDS, _KEPT)
-    except InterruptedRunError as error:
-        raise InterruptedRunError(
-            f"stopped after step {trainer.step} of {trainer.steps}, which is saved; the same command goes on from there"
-        ) from error
+    begun = folder.config_file.is_file()
+    with (resume_training if begun else start_training)(request, folder, place.device) as trainer:
+        try:
+            trainer.train(_SAVE_SECONDS, _KEPT)
+        except InterruptedRunError as error:
+            raise InterruptedRunError(
+                f"stopped after step {trainer.step} of {trainer.steps}, which is saved; the same command goes on from "
+                "there"
+            ) from error
     rows = folder.log_rows()
     last = f", {rows[-1]['psnr']:.2f} dB in the last view" if rows else ""
     return Outcome(f"{method_name(request.method)}, {trainer.steps} steps{last}", {"run": "the trained run"})
