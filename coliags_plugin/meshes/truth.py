@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
+from coliags_plugin.core.arrays import read_arrays
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.meshes.files import read_flagged_mesh
 from coliags_plugin.meshes.mesh import TriangleMesh
@@ -44,14 +45,16 @@ def find_true_surface(scene: Path) -> Path | None:
     return next((scene / place for place in _PLACES if (scene / place).is_file()), None)
 
 
-def read_true_surface(path: Path) -> TrueSurface:
+def read_true_surface(path: Path, any_frame: bool = False) -> TrueSurface:
     """Read a true surface and what was seen of it.
 
     Seen are, of a phantom, the triangles of ``face_seen`` in ``mesh_seen.npz`` beside it: those that are the first hit
-    of a pixel of a training frame. Of C3VD's ``coverage_mesh.obj``, those of texture index 1: observed in any frame.
+    of a pixel of a training frame; or those of ``face_seen_by_any_frame``. Of C3VD's ``coverage_mesh.obj``, those of
+    texture index 1: observed in any frame.
 
     Args:
         path: A mesh, or the folder of a scene with one.
+        any_frame: Of a phantom, what any frame of the video saw, held out or not.
 
     Raises:
         InputError: There is no mesh, or a file is damaged or does not belong to it.
@@ -64,18 +67,15 @@ def read_true_surface(path: Path) -> TrueSurface:
     mesh, textures = read_flagged_mesh(path)
     flags = path.parent / "mesh_seen.npz"
     if path.suffix.lower() == ".ply" and flags.is_file():
-        return TrueSurface(path, mesh, _phantom_flags(flags, mesh), "first hit of a pixel of a training frame")
+        of, key = ("any", "face_seen_by_any_frame") if any_frame else ("a training", "face_seen")
+        return TrueSurface(path, mesh, _phantom_flags(flags, key, mesh), f"first hit of a pixel of {of} frame")
     if textures is not None and set(np.unique(textures)) <= {_OBSERVED, _UNOBSERVED}:
         return _checked(TrueSurface(path, mesh, textures == _OBSERVED, "observed in any frame, by its vt 1"))
     return TrueSurface(path, mesh, np.ones(len(mesh), bool), "")
 
 
-def _phantom_flags(path: Path, mesh: TriangleMesh) -> Bool[np.ndarray, "F"]:
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            seen = data["face_seen"]
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(f"cannot read {path}: {error}", "an NPZ file with 'face_seen'") from error
+def _phantom_flags(path: Path, key: str, mesh: TriangleMesh) -> Bool[np.ndarray, "F"]:
+    seen = read_arrays(path, f"an NPZ file with '{key}'", [key])[key]
     if seen.shape != (len(mesh),) or seen.dtype != bool:
         raise InputError(
             f"{path} has {seen.dtype} flags of shape {list(seen.shape)}", f"one bool for each of {len(mesh)} triangles"
