@@ -170,7 +170,20 @@ def parsed(argv: list[str], monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 #: Subcommands that running text names alone.
-ALONE = ("train", "eval", "render", "report", "compare", "ablate", "phantom", "config", "check", "poses")
+ALONE = (
+    "train",
+    "eval",
+    "render",
+    "report",
+    "compare",
+    "ablate",
+    "phantom",
+    "config",
+    "check",
+    "poses",
+    "export",
+    "import",
+)
 #: Methods that docs/example_package adds; tests/test_third_party_package.py trains them.
 OF_THE_EXAMPLE = {path.stem for path in (DOCS / "example_package").rglob("*.yaml")}
 

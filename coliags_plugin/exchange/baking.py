@@ -28,8 +28,8 @@ def bake(trained: TrainedRun, light: HeldLight) -> tuple[SplatCloud, dict[str, A
     """One cloud of Gaussians for all views, under a held light.
 
     Every Gaussian is averaged over training views, and its colours are fitted with spherical harmonics by least
-    squares, both weighted by how much each view shows of it. Then all is refined on the training views
-    (:func:`~coliags_plugin.exchange.refinement.refine`).
+    squares, both weighted by how much each view shows of it. Where they were not the same in all views, they are then
+    refined on the training views (:func:`~coliags_plugin.exchange.refinement.refine`).
 
     Args:
         trained: The run, of Gaussians.
@@ -42,12 +42,13 @@ def bake(trained: TrainedRun, light: HeldLight) -> tuple[SplatCloud, dict[str, A
         InputError: The run has no Gaussians, or none of them is seen in training.
     """
     views = trained.scene.train[:: -(-len(trained.scene.train) // _VIEWS)]
-    field = _averaged(trained, views, light)
-    steps = refine(field, trained, light)
+    field, vary = _averaged(trained, views, light)
+    steps = refine(field, trained, light) if vary else 0
     return cloud_of_field(field), {"views": len(views), "refinement_steps": steps}
 
 
-def _averaged(trained: TrainedRun, views: list[Frame], light: HeldLight) -> ExplicitGaussians:
+def _averaged(trained: TrainedRun, views: list[Frame], light: HeldLight) -> tuple[ExplicitGaussians, bool]:
+    """The averages, and whether shapes and places depend on the view."""
     field, renderer = gaussians_of(trained.model), splatting_of(trained.model)
     averages = GaussianAverages(field.element_count, field.slots_per_element, trained.device)
     seen: list[SeenColors] = []
@@ -63,4 +64,4 @@ def _averaged(trained: TrainedRun, views: list[Frame], light: HeldLight) -> Expl
                 seen.append(SeenColors.of(gaussians, weights, camera))
             progress.update(index + 1)
     kept = averages.kept()
-    return averages.field(kept, fit_harmonics(seen, kept, averages.colors(kept), MAX_DEGREE))
+    return averages.field(kept, fit_harmonics(seen, kept, averages.colors(kept), MAX_DEGREE)), averages.vary
