@@ -17,8 +17,6 @@ from coliags_plugin.renderers.splatting import SplattingRenderer
 #: A Gaussian is kept whose blending weights add up to so many pixels over the views, and which is on average at least
 #: so opaque: others are invisible.
 _LEAST_WEIGHT, _LEAST_OPACITY = 0.02, 1.0 / 255.0
-#: Opacities that differ by less are the same.
-_SAME = 1e-4
 #: Below it a weight is no weight, pixels.
 _NONE = 1e-12
 
@@ -56,9 +54,7 @@ class GaussianAverages:
 
         self._weights, self._opacities, self._element_weights = zeros(slots), zeros(slots), zeros(elements)
         self._means, self._log_scales, self._rotations = zeros(slots, 3), zeros(slots, 3), zeros(slots, 4, 4)
-        self._colors, self._latest = zeros(slots, 3), zeros(slots)
-        #: Whether a Gaussian has another opacity in another view: whether its shape and place depend on the view.
-        self.vary = False
+        self._colors = zeros(slots, 3)
 
     def add(self, gaussians: Gaussians, weights: Float[Tensor, "N"]) -> None:
         """Add a view.
@@ -72,9 +68,6 @@ class GaussianAverages:
         shown = torch.zeros_like(self._element_weights).index_add_(0, elements, weights)
         quats = torch.nn.functional.normalize(gaussians.quats_wxyz, dim=1)
         products = quats[:, :, None] * quats[:, None]
-        known = self._weights[slots] > 0
-        self.vary |= bool((known & ((gaussians.opacities - self._latest[slots]).abs() > _SAME)).any())
-        self._latest[slots] = gaussians.opacities
         self._element_weights += shown
         self._opacities.index_add_(0, slots, shown[elements] * gaussians.opacities)
         self._weights.index_add_(0, slots, weights)

@@ -75,7 +75,6 @@ def test_averages_of_the_same_gaussians_are_these():
     averages = GaussianAverages(12, 1, torch.device("cpu"))
     for flip in (1.0, -1.0, 2.5):  # a quaternion and its negative are the same rotation
         averages.add(replace(gaussians, quats_wxyz=flip * gaussians.quats_wxyz), torch.rand(12) + 0.1)
-    assert not averages.vary
     field = averages.field(averages.kept(), torch.zeros(12, 16, 3))
     assert int(field.degree) == 3
     torch.testing.assert_close(field.means, gaussians.means)
@@ -94,9 +93,6 @@ def test_a_child_that_is_absent_from_a_view_counts_as_transparent():
     averages = GaussianAverages(1, 2, torch.device("cpu"))
     averages.add(both, torch.tensor([3.0, 1.0]))
     averages.add(first, torch.tensor([4.0]))
-    assert not averages.vary
-    averages.add(replace(first, opacities=torch.tensor([0.7])), torch.zeros(1))
-    assert averages.vary
     field = averages.field(averages.kept(), torch.zeros(2, 1, 3))
     # Both views show 4 pixels of the anchor; the second child is in the first view only.
     torch.testing.assert_close(field.opacities.sigmoid(), torch.tensor([0.8, 0.3]))
