@@ -10,9 +10,12 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+#: Draws WebGL in software, which `--disable-gpu` alone forbids.
+SOFTWARE_WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
 #: Makes two descriptors those that the browser expects, and becomes the browser.
 _LAUNCH = """
 import fcntl, os, sys
@@ -35,9 +38,10 @@ class Browser:
 
     Args:
         executable: The browser.
+        flags: Further options of its command line.
     """
 
-    def __init__(self, executable: str) -> None:
+    def __init__(self, executable: str, flags: Sequence[str] = ()) -> None:
         self._profile = tempfile.mkdtemp(prefix="chromium-")
         their_in, self._out = os.pipe()
         self._in, their_out = os.pipe()
@@ -55,6 +59,7 @@ class Browser:
                 "--no-first-run",
                 "--disable-background-networking",
                 "--disable-component-update",
+                *flags,
                 f"--user-data-dir={self._profile}",
                 "about:blank",
             ],
@@ -113,8 +118,8 @@ class Browser:
 
     # ---- What tests use
 
-    def open(self, page: Path, width: int, height: int = 900, phone: bool = False, scripts: bool = True) -> None:
-        """Open a page at a width in CSS pixels, as a phone with a touch screen or not."""
+    def open(self, page: Path | str, width: int, height: int = 900, phone: bool = False, scripts: bool = True) -> None:
+        """Open a file or an address at a width in CSS pixels, as a phone with a touch screen or not."""
         self.events.clear()
         self._call("Emulation.setScriptExecutionDisabled", value=not scripts)
         self._call(
@@ -125,7 +130,7 @@ class Browser:
             mobile=phone,
         )
         self._call("Emulation.setTouchEmulationEnabled", enabled=phone)
-        self._call("Page.navigate", url=page.resolve().as_uri())
+        self._call("Page.navigate", url=page.resolve().as_uri() if isinstance(page, Path) else page)
         self._wait_for("Page.loadEventFired")
 
     def _wait_for(self, method: str, seconds: float = 60.0) -> None:

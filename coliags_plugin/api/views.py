@@ -21,7 +21,6 @@ from coliags_plugin.outputs.colormaps import (
     DEPTH_ERROR_LIMIT_MM,
     colorize_depth,
     colorize_depth_error,
-    common_limits,
     depth_limits,
 )
 from coliags_plugin.outputs.image_files import as_array, eight_bit, encode_png
@@ -59,7 +58,7 @@ class View:
     def images(self) -> dict[str, UInt8[np.ndarray, "H W 3"]]:
         """Truth, rendering, depths on one scale, and depth error as images, by captions. [H, W, 3] each"""
         depths = [self.depth] if self.true_depth is None else [self.depth, self.true_depth]
-        limits = depth_limits(depths) if self.unit == "mm" else common_limits(depths)
+        limits = depth_limits(depths, self.unit)
         scale = f"0 to {limits[1]:g} {self.unit}"
         shown = {} if self.true_rgb is None else {"truth": self.true_rgb}
         shown["rendered"] = self.rgb

@@ -24,7 +24,6 @@ from coliags_plugin.outputs.colormaps import (
     colorize_depth,
     colorize_depth_error,
     colorize_rgb_error,
-    common_limits,
     depth_limits,
 )
 from coliags_plugin.outputs.image_files import as_array, eight_bit, write_depth_tiff, write_png
@@ -77,7 +76,7 @@ def render_run(
     path = choose_frames(trained.scene, "all")
     sample = chosen[:: max(1, len(chosen) // 4)][:4]
     sampled = [as_array(render_view(trained, frame, wants)[depth]) for frame in sample]
-    limits = depth_limits(sampled) if unit == "mm" else common_limits(sampled)
+    limits = depth_limits(sampled, unit)
     with (
         atomic_folder(output, overwrite) as folder,
         ProgressReport("render", len(chosen) + len(path) * video) as progress,

@@ -82,12 +82,15 @@ def common_limits(depths: Iterable[Float[np.ndarray, "H W"]]) -> tuple[float, fl
     return 0.0, math.ceil(largest / step) * step
 
 
-def depth_limits(depths: Iterable[Float[np.ndarray, "H W"] | Tensor]) -> tuple[float, float]:
-    """From 0 to the largest known depth, rounded up to 10 mm.
+def depth_limits(depths: Iterable[Float[np.ndarray, "H W"] | Tensor], unit: str = "mm") -> tuple[float, float]:
+    """From 0 to the largest known depth, rounded up to 10 mm; in another unit than mm, :func:`common_limits`.
 
     Args:
-        depths: Depth maps, mm; what is not finite is unknown. [H, W] each
+        depths: Depth maps; what is not finite is unknown. [H, W] each
+        unit: Of the depths, see ``Scene.length_unit``.
     """
+    if unit != "mm":
+        return common_limits(map(as_array, depths))
     known = [array[np.isfinite(array)] for array in map(as_array, depths)]
     largest = max((float(values.max()) for values in known if values.size), default=0.0)
     return 0.0, max(10.0, 10.0 * math.ceil(largest / 10.0))

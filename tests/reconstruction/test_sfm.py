@@ -104,6 +104,12 @@ def test_a_phantom_is_found_without_its_camera(phantom, caplog):
     assert found.correlation < -0.5
 
 
+def test_the_focal_length_of_a_known_camera_model_is_found(phantom):
+    found = reconstruct(list_images(phantom / "images"), SfmSettings(camera=CameraSettings(model="SIMPLE_PINHOLE")))
+    (camera,) = found.model.cameras.values()
+    assert camera.focal_length == pytest.approx(json.loads((phantom / "camera.json").read_text())["fx"], rel=0.05)
+
+
 def test_an_implausible_focal_length_is_refused(tube):
     camera = CameraSettings(model="SIMPLE_PINHOLE", refine=False, focal_factors=(2.5,))
     refusal(

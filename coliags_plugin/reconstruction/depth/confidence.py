@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float32
 from coliags_plugin.reconstruction.depth.sweeping import Swept
 
 #: Of the regression: constant, log support, log spread, near side of an edge, log depth across a window.
-_COEFFICIENTS = (0.775, 0.797, -0.187, -1.396, -2.229)
+_COEFFICIENTS = (1.125, 0.797, -0.187, -1.396, -2.229)
 #: Half the width of that window, pixels.
 _STEP_REACH = 6
 

@@ -1,0 +1,126 @@
+"""What a view shows of a run, computed once and shared by all browsers that look at it."""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from coliags_plugin.contracts import GaussianField
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.scenes import Frame
+from coliags_plugin.engine.trained import TrainedRun
+from coliags_plugin.viewer.baking import bake, baking_cameras
+from coliags_plugin.viewer.decoding import ViewDecoder, in_view
+from coliags_plugin.viewer.pictures import Pictures
+from coliags_plugin.viewer.splats import Splats, wire_unit
+
+logger = logging.getLogger(__name__)
+
+#: Distance of the point that the browser's camera turns about, where nothing is in view: as a share of the extent.
+_DEFAULT_DISTANCE = 1.0
+
+
+@dataclass(frozen=True)
+class Content:
+    """A run, ready to be shown.
+
+    Attributes:
+        trained: The run.
+        frames: Of the video, in its order.
+        baked: Its Gaussians for no view in particular; none for a method without Gaussians.
+        decoder: Its Gaussians for a view; None for a method without Gaussians.
+        pictures: Of the frames.
+        unit: See :func:`~coliags_plugin.viewer.splats.wire_unit`.
+        lock: Held while something is computed: browsers take turns.
+    """
+
+    trained: TrainedRun
+    frames: list[Frame]
+    baked: Splats
+    decoder: ViewDecoder | None
+    pictures: Pictures
+    unit: float
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    @classmethod
+    def of(cls, trained: TrainedRun) -> Content:
+        """Bake the Gaussians of a run, where its method has any."""
+        frames = trained.scene.video
+        gaussian_field = trained.model.field
+        baked, decoder = none_at_all(), None
+        if isinstance(gaussian_field, GaussianField):
+            logger.info("decoding the Gaussians of %s", trained.method)
+            cameras = [frame.camera.to(trained.device) for frame in trained.scene.train]
+            baked = Splats.of(bake(gaussian_field, baking_cameras(cameras)))
+            decoder = ViewDecoder(gaussian_field, baked, trained.device)
+        else:
+            logger.warning(
+                "method '%s' has no Gaussians to draw in the browser: there are cameras, meshes and rendered pictures",
+                trained.method,
+            )
+        return cls(trained, frames, baked, decoder, Pictures(trained), wire_unit(baked))
+
+    @property
+    def title(self) -> str:
+        """What is shown, in one line."""
+        return f"{self.trained.method} on {self.trained.scene.name}"
+
+    @property
+    def first_camera(self) -> Camera:
+        """Of the first training frame: where a view starts."""
+        return self.trained.scene.train[0].camera
+
+    @property
+    def up(self) -> Float[np.ndarray, "3"]:
+        """Up in the image of the first training frame, world frame. [3]"""
+        return -self.first_camera.camera_to_world[:3, 1].double().cpu().numpy()
+
+    @cached_property
+    def look_distance(self) -> float:
+        """Distance of the point that the browser's camera turns about: the median depth in the first view."""
+        camera = self.first_camera
+        seen = self.baked.centers[in_view(self.baked.centers, camera)]
+        if len(seen):
+            _, depth = camera.to("cpu", torch.float64).project(torch.as_tensor(seen, dtype=torch.float64))
+            return float(depth.median())
+        return _DEFAULT_DISTANCE * self.trained.scene.extent or 1.0
+
+    @cached_property
+    def near_plane(self) -> float:
+        """z-depth from which on the browser draws, scene units: what renderers use, or a share of the distance."""
+        return min(0.2, 0.02 * self.look_distance)
+
+
+def none_at_all() -> Splats:
+    """No splats."""
+    return Splats(
+        np.zeros((0, 3), np.float32),
+        np.zeros((0, 3, 3), np.float32),
+        np.zeros((0, 3), np.uint8),
+        np.zeros(0, np.float32),
+    )
+
+
+def vertical_fov(camera: Camera) -> float:
+    """Vertical field of view of a camera, radians; the browser's camera has its principal point in the middle."""
+    return 2.0 * math.atan(0.5 * camera.height / camera.fy)
+
+
+def aspect(camera: Camera) -> float:
+    """Width of the image over its height, of pixels as wide as they are high."""
+    return camera.width / camera.fx * camera.fy / camera.height
+
+
+def mesh_files(run: Path) -> dict[str, Path]:
+    """Meshes in a run folder by the names of their layers: of ``coliags mesh`` and ``coliags coverage``."""
+    files = {"mesh": run / "mesh" / "mesh.ply"}
+    files |= {f"coverage: {file.stem}": file for file in sorted((run / "coverage").glob("*.ply"))}
+    return {name: file for name, file in files.items() if file.is_file()}

@@ -1,0 +1,62 @@
+"""Gaussians of a run for the view of a browser."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+
+from coliags_plugin.contracts import GaussianField
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.viewer.splats import Splats
+
+#: How much wider than the view, on every side, Gaussians are decoded, so that a small turn shows no gap.
+MARGIN = 1.25
+
+
+class ViewDecoder:
+    """Decodes a field for a view, and takes what lies beside it from Gaussians of no view in particular.
+
+    A field yields the Gaussians that a camera sees; without the others, a turn of the head would show nothing until
+    the next decoding.
+
+    Args:
+        field: Of the run.
+        baked: Gaussians of the whole scene (:func:`~coliags_plugin.viewer.baking.bake`).
+        device: Of the field.
+    """
+
+    def __init__(self, field: GaussianField, baked: Splats, device: torch.device) -> None:
+        self.baked = baked
+        self._field = field
+        self._device = device
+
+    @torch.no_grad()
+    def of(self, camera: Camera) -> Splats:
+        """Gaussians with their colours, and, of anchor methods, their shapes, as this camera sees them.
+
+        Args:
+            camera: View of the browser.
+        """
+        wide = widened(camera)
+        seen = Splats.of(self._field.gaussians(wide.to(self._device)))
+        return seen.and_also(self.baked.part(~in_view(self.baked.centers, wide)))
+
+
+def widened(camera: Camera) -> Camera:
+    """The camera with a field of view wider by :data:`MARGIN`, tangents compared."""
+    return replace(camera, fx=camera.fx / MARGIN, fy=camera.fy / MARGIN)
+
+
+def in_view(points: Float[np.ndarray, "N 3"], camera: Camera) -> Bool[np.ndarray, "N"]:
+    """Whether points are in front of a camera and within its image. [N]
+
+    Args:
+        points: World frame, scene units. [N, 3]
+        camera: The camera.
+    """
+    pixels, depth = camera.to("cpu", torch.float64).project(torch.as_tensor(points, dtype=torch.float64))
+    inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < pixels.new_tensor([camera.width, camera.height])).all(1)
+    return np.asarray(inside.numpy())

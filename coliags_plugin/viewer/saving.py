@@ -1,0 +1,117 @@
+"""A scene as one HTML page that needs neither a server nor a network."""
+
+from __future__ import annotations
+
+import logging
+from html import escape
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import atomic_write
+from coliags_plugin.engine.trained import TrainedRun
+from coliags_plugin.outputs.image_files import as_array
+from coliags_plugin.outputs.page import refuse_folder
+from coliags_plugin.viewer.content import Content
+from coliags_plugin.viewer.layers import add_cameras
+from coliags_plugin.viewer.library import start_server, stop_server
+from coliags_plugin.viewer.merging import merged_to
+from coliags_plugin.viewer.serving import set_start
+from coliags_plugin.viewer.splats import Splats, on_wire
+
+logger = logging.getLogger(__name__)
+
+#: Largest page, bytes.
+LARGEST_PAGE = 5_000_000
+#: How much of the room found in one attempt the next one uses.
+_CAUTION = 0.98
+#: Bytes of a page that a Gaussian takes at least: 32, compressed and in base 64.
+_FEWEST_BYTES = 30
+#: Share of the Gaussians that are near enough to need no smaller cells.
+_NEAR_SHARE = 0.2
+
+
+def save_page(trained: TrainedRun, output: Path, largest: int = LARGEST_PAGE) -> Path:
+    """Write the Gaussians of a run, under the average light of its training views, as a page.
+
+    Where the page would be too large, neighbouring Gaussians are merged.
+
+    Args:
+        trained: The run.
+        output: The file; an existing one is replaced.
+        largest: Size of the page, bytes.
+
+    Raises:
+        InputError: viser cannot be imported, the method has no Gaussians, not even a few fit, or the file cannot be
+            written.
+    """
+    refuse_folder(output)
+    content = Content.of(trained)
+    if content.decoder is None:
+        raise InputError(
+            f"method '{trained.method}' has no Gaussians to draw in a browser",
+            "a method of Gaussians",
+            "Write pictures with `coliags render`, or a mesh with `coliags mesh`",
+        )
+    splats, page = fitting_page(content, largest)
+    if len(splats) < len(content.baked):
+        logger.warning(
+            "%d Gaussians are merged into %d, for a page of at most %.1f MB",
+            *(len(content.baked), len(splats), largest / 1e6),
+        )
+    atomic_write(output, page)
+    return output
+
+
+def fitting_page(content: Content, largest: int) -> tuple[Splats, str]:
+    """The Gaussians of a run, merged into fewer where their page would be too large, and the page.
+
+    Raises:
+        InputError: Not even a few fit.
+    """
+    nothing = content.baked.part(np.zeros(len(content.baked), bool))
+    empty = len(_page(content, nothing).encode())
+    count = min(len(content.baked), max(0, largest - empty) // _FEWEST_BYTES)
+    distances = _distances(content)
+    while count > 0:
+        splats = merged_to(content.baked, count, distances)
+        page = _page(content, splats)
+        size = len(page.encode())
+        if size <= largest:
+            return splats, page
+        count = min(count - 1, int(_CAUTION * len(splats) * (largest - empty) / (size - empty)))
+    raise InputError(f"a page of {largest} bytes", f"more than {empty} bytes, what an empty one takes")
+
+
+def _distances(content: Content) -> Float[np.ndarray, "N"]:
+    """From each Gaussian to the nearest training camera, the nearest fifth counted alike. [N]"""
+    centers = np.stack([as_array(frame.camera.center).astype(np.float64) for frame in content.trained.scene.train])
+    found = np.asarray(cKDTree(centers).query(content.baked.centers)[0])
+    return np.maximum(found, np.quantile(found, _NEAR_SHARE)) if len(found) else found
+
+
+def _page(content: Content, splats: Splats) -> str:
+    server = start_server("127.0.0.1", 0)
+    try:
+        set_start(server, content)
+        server.scene.add_gaussian_splats("/splats", **on_wire(splats, content.unit), scale=content.unit)
+        for handle in add_cameras(server.scene, content):
+            handle.visible = False
+        page: str = server.get_scene_serializer().as_html()
+    finally:
+        stop_server(server)
+    return page.replace("<title>Viser</title>", f"<title>{escape(content.title)}</title>").replace(
+        "</body>", f"{_caption(content, splats)}</body>"
+    )
+
+
+def _caption(content: Content, splats: Splats) -> str:
+    """What is seen, at the bottom of the page."""
+    text = f"{content.title}, step {content.trained.step}: average light of the training views"
+    if len(splats) < len(content.baked):
+        text += f"; {len(content.baked):,} Gaussians merged into {len(splats):,}"
+    style = "position:fixed;left:0;bottom:0;padding:4px 8px;font:12px sans-serif;background:#fffc;pointer-events:none"
+    return f'<div style="{style}">{escape(text)}</div>'

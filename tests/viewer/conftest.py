@@ -1,0 +1,35 @@
+"""Runs to look at."""
+
+from __future__ import annotations
+
+import pytest
+
+import coliags_plugin as cp
+from coliags_plugin.config.assignments import parse_assignments
+from tests.scenes import SMALL, write_wall
+
+FRAMES = 9
+
+
+@pytest.fixture(scope="session")
+def wall(tmp_path_factory):
+    return write_wall(tmp_path_factory.mktemp("data") / "wall", frames=FRAMES)
+
+
+@pytest.fixture(scope="session")
+def run_of(wall, tmp_path_factory):
+    """A handle of a run of a method after two steps; each is trained once."""
+    made = {}
+
+    def trained(method, *settings):
+        if method not in made:
+            folder = tmp_path_factory.mktemp("runs") / method
+            made[method] = cp.train(method, wall, folder, steps=2, settings=parse_assignments(settings))
+        return made[method]
+
+    return trained
+
+
+@pytest.fixture(scope="session")
+def anchors(run_of):
+    return run_of("coliags", *SMALL)
