@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from coliags_plugin.api.comparing import ablate, compare, variant
     from coliags_plugin.api.exchange import import_splats
+    from coliags_plugin.api.reconstructing import reconstruct
     from coliags_plugin.api.reports import report
     from coliags_plugin.api.runs import Run, load_run
     from coliags_plugin.api.scenes import load_scene, make_phantom
@@ -20,6 +21,7 @@ __all__ = [
     "load_run",
     "load_scene",
     "make_phantom",
+    "reconstruct",
     "report",
     "train",
     "variant",
@@ -29,6 +31,7 @@ __all__ = [
 _MODULES = {
     "comparing": ("ablate", "compare", "variant"),
     "exchange": ("import_splats",),
+    "reconstructing": ("reconstruct",),
     "reports": ("report",),
     "runs": ("Run", "load_run"),
     "scenes": ("load_scene", "make_phantom"),

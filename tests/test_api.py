@@ -49,6 +49,27 @@ def test_train_is_the_command(scene, trained, tmp_path):
     assert all(torch.equal(states[0][name], states[1][name]) for name in states[0])
 
 
+@pytest.mark.parametrize("how", [{"overwrite": True}, {"resume": True}])
+def test_a_run_that_another_process_trains_is_left_alone(scene, trained, tmp_path, how):
+    mine = tmp_path / "run"
+    shutil.copytree(trained.path, mine)
+    before = {path: path.read_bytes() for path in mine.rglob("*") if path.is_file()}
+    owner = f"""if True:
+        from coliags_plugin.engine.run_folder import Path, RunFolder
+        with RunFolder(Path({str(mine)!r})).owned():
+            print("owned", flush=True)
+            input()
+    """
+    with subprocess.Popen([sys.executable, "-c", owner], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout.readline() == b"owned\n"
+        with pytest.raises(InputError, match=rf"is being trained by process {other.pid} on .* since 20\d\d-"):
+            cp.train("coliags", scene, mine, steps=8, seed=3, settings=SETTINGS, **how)
+        other.kill()
+    assert {path: path.read_bytes() for path in mine.rglob("*") if path.is_file()} == before
+    # A lock ends with its process.
+    assert cp.train("coliags", scene, mine, steps=8, seed=3, settings=SETTINGS, **how).step == 8
+
+
 def test_a_run_says_what_it_is(trained):
     assert (trained.method, trained.scene_name, trained.seed, trained.step) == ("coliags", "wall", 3, 8)
     assert repr(trained) == f"coliags on wall, seed 3, step 8 of 8: {trained.path}"

@@ -31,6 +31,7 @@ from coliags_plugin.datamanagers.splits import held_out
 from coliags_plugin.engine.randomness import PURPOSES
 from coliags_plugin.method_check.check import CHECKS
 from coliags_plugin.phantom.settings import PRESETS, PhantomSettings
+from coliags_plugin.pipeline.settings import FrameSettings
 from tests.scenes import SMALL, write_wall
 
 ROOT = Path(__file__).parents[1]
@@ -172,18 +173,8 @@ def parsed(argv: list[str], monkeypatch: pytest.MonkeyPatch) -> Any:
 
 #: Subcommands that running text names alone.
 ALONE = (
-    "train",
-    "eval",
-    "render",
-    "mesh",
-    "coverage",
-    "report",
-    "compare",
-    "ablate",
-    "phantom",
-    "config",
-    "check",
-    "poses",
+    *("train", "eval", "render", "mesh", "export", "import", "coverage", "view", "reconstruct"),
+    *("report", "compare", "ablate", "phantom", "config", "check", "poses"),
 )
 #: Methods that docs/example_package adds; tests/test_third_party_package.py trains them.
 OF_THE_EXAMPLE = {path.stem for path in (DOCS / "example_package").rglob("*.yaml")}
@@ -279,6 +270,7 @@ FORMATS = [name for name in formats() if datamanagers.source(name) == "built in"
 OPTION_TABLES = [
     (PhantomSettings, "phantom.md", "| setting | default | range | what |"),
     (CoverageSettings, "coverage.md", OPTIONS),
+    (FrameSettings, "reconstruct.md", "| setting | default | range | what |"),
     *((datamanagers.get(name).Settings, f"layouts/{name}.md", OPTIONS) for name in FORMATS),
 ]
 

@@ -24,6 +24,7 @@ from coliags_plugin.cli.list import List
 from coliags_plugin.cli.mesh import Mesh
 from coliags_plugin.cli.phantom import Phantom
 from coliags_plugin.cli.poses import Poses
+from coliags_plugin.cli.reconstruct import Reconstruct
 from coliags_plugin.cli.render import Render
 from coliags_plugin.cli.report import Report
 from coliags_plugin.cli.results import Results
@@ -33,7 +34,8 @@ from coliags_plugin.cli.view import View
 from coliags_plugin.cli.weights import Weights
 
 Command = (
-    Annotated[Phantom, tyro.conf.subcommand("phantom")]
+    Annotated[Reconstruct, tyro.conf.subcommand("reconstruct")]
+    | Annotated[Phantom, tyro.conf.subcommand("phantom")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("eval")]
     | Annotated[Render, tyro.conf.subcommand("render")]

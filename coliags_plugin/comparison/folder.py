@@ -20,6 +20,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import make_folder, write_json
 from coliags_plugin.core.locks import LockedError, locked
 from coliags_plugin.core.settings import first_error
+from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.results.reading import NewerResultError, read_result, write_result
 from coliags_plugin.results.record import Result
 
@@ -144,8 +145,7 @@ class ComparisonFolder:
 
     def lock(self, cell: Cell) -> Path:
         """File whose lock the process has that works on a cell's run."""
-        run = self.run(cell)
-        return run.with_name(f".{run.name}.lock")
+        return RunFolder(self.run(cell)).lock_file
 
     def result(self, cell: Cell) -> Path:
         """Results file of a cell."""

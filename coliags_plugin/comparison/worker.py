@@ -111,7 +111,7 @@ def _train(task: Task, run: RunFolder, device: torch.device) -> None:
     import cv2
     import torch
 
-    from coliags_plugin.engine.checkpoints import keep_newest, set_damaged_aside
+    from coliags_plugin.engine.checkpoints import keep_newest, take_newest
     from coliags_plugin.engine.data_formats import load_method_for, load_scene
     from coliags_plugin.engine.evaluator import check_evaluable
     from coliags_plugin.engine.resuming import resumed_method
@@ -124,7 +124,8 @@ def _train(task: Task, run: RunFolder, device: torch.device) -> None:
     cv2.setNumThreads(threads)
     if begun:
         method = resumed_method(run, task.name, data)
-        step = set_damaged_aside(run.checkpoints, task.name)
+        saved = take_newest(run.checkpoints, task.name, torch.device("cpu"))
+        step = 0 if saved is None else saved.step
         if step == method.config.schedule.steps:
             log.info("trained: %d steps", step)
             return

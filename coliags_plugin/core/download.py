@@ -6,7 +6,6 @@ Only ``coliags weights`` downloads, and nothing else imports this.
 from __future__ import annotations
 
 import fcntl
-import hashlib
 import os
 import re
 from collections.abc import Iterator
@@ -19,6 +18,7 @@ from urllib.parse import urlsplit
 from urllib.request import Request, build_opener
 
 from coliags_plugin import __version__
+from coliags_plugin.core.checksums import file_sha256
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import make_folder, not_writable
 from coliags_plugin.core.progress import Progress
@@ -68,22 +68,6 @@ def download(url: str, target: Path, sha256: str, progress: Progress, otherwise:
             os.replace(part, target)
         except OSError as error:
             raise not_writable(part.parent, error) from error
-
-
-def file_sha256(file: Path) -> str:
-    """SHA-256 of a file, in hexadecimal.
-
-    Raises:
-        InputError: It cannot be read.
-    """
-    digest = hashlib.sha256()
-    try:
-        with file.open("rb") as stream:
-            while block := stream.read(_MIB):
-                digest.update(block)
-    except OSError as error:
-        raise InputError(f"cannot read {file}: {error.strerror or error}", "a readable file") from error
-    return digest.hexdigest()
 
 
 @contextmanager

@@ -1,67 +1,106 @@
-"""Atomic writes: files and folders are written under a temporary name and then renamed."""
+"""Atomic writes: files and folders are written under a temporary name, forced onto the disk, and then renamed.
+
+So a target is either as it was or whole, whatever happens: an error, a full disk, a kill.
+"""
 
 from __future__ import annotations
 
+import errno
+import io
 import json
 import os
 import shutil
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.scratch import (
+    final_place,
+    is_in_scratch,
+    put_in_place,
+    scratch_file,
+    scratch_folder,
+    sweep,
+    sync,
+    sync_tree,
+)
+
+if TYPE_CHECKING:
+    import numpy as np
+
+#: Errors of a disk, quota or size limit that is used up.
+_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
 @contextmanager
 def atomic_folder(target: Path, overwrite: bool = False) -> Iterator[Path]:
-    """Temporary folder that is renamed to ``target`` when the block ends without an error.
+    """Scratch folder that becomes ``target`` when the block ends without an error; first, killed ones are removed.
 
     Args:
         target: The folder to create, with its parents.
         overwrite: Replace an existing folder.
 
     Raises:
-        InputError: ``target`` exists and ``overwrite`` is off, or its parent cannot be written.
+        InputError: ``target`` exists and ``overwrite`` is off, or it cannot be written.
     """
-    if not overwrite and target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise InputError(f"{target} already exists", "a new or empty folder", "Choose another, or pass --overwrite")
+    durable = not is_in_scratch(target)
     make_folder(target.parent)
-    try:
-        scratch = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
-    except OSError as error:
-        raise not_writable(target.parent, error) from error
-    try:
-        yield scratch
-        scratch.chmod(0o755)
-        replaced = None
-        if target.exists():
-            replaced = Path(tempfile.mkdtemp(prefix=f".{target.name}.old.", dir=target.parent))
-            target.rename(replaced / target.name)
-        scratch.rename(target)
-        if replaced is not None:
-            shutil.rmtree(replaced)
-    except BaseException:
-        shutil.rmtree(scratch, ignore_errors=True)
-        raise
+    with ExitStack() as scratches:
+        with _reported(target.parent):
+            if durable:
+                sweep(target)
+            if not overwrite and target.exists() and (not target.is_dir() or any(target.iterdir())):
+                raise InputError(
+                    f"{target} already exists", "a new or empty folder", "Choose another, or pass --overwrite"
+                )
+            scratch = scratches.enter_context(scratch_folder(target))
+        with _full_disk_reported(target.parent):
+            yield scratch
+        with _reported(target.parent):
+            if durable:
+                sync_tree(scratch)
+            put_in_place(scratch, target)
+            if durable:
+                sync(target.parent)
 
 
 def atomic_write(target: Path, data: bytes | str) -> None:
     """Write a file under a temporary name, then rename it to ``target``.
 
     Raises:
-        InputError: The folder cannot be written.
+        InputError: It cannot be written.
     """
     with _renamed_at_the_end(target) as file:
         file.write(data.encode() if isinstance(data, str) else data)
+
+
+@contextmanager
+def atomic_path(target: Path) -> Iterator[Path]:
+    """A path of the same suffix for a library to write to; it becomes ``target`` when the block ends without an error.
+
+    Raises:
+        InputError: It cannot be written.
+    """
+    make_folder(target.parent)
+    with ExitStack() as scratches:
+        with _reported(target.parent):
+            sweep(target)
+            path = scratches.enter_context(scratch_folder(target)) / target.name
+        with _full_disk_reported(target.parent):
+            yield path
+        with _reported(target.parent):
+            sync(path)
+            os.replace(path, target)
+            sync(target.parent)
 
 
 def atomic_copy(source: Path, target: Path) -> None:
     """Copy a file under a temporary name, then rename that to ``target``.
 
     Raises:
-        InputError: The folder cannot be written.
+        InputError: It cannot be written.
     """
     with source.open("rb") as original, _renamed_at_the_end(target) as file:
         shutil.copyfileobj(original, file)
@@ -69,20 +108,56 @@ def atomic_copy(source: Path, target: Path) -> None:
 
 @contextmanager
 def _renamed_at_the_end(target: Path) -> Iterator[IO[bytes]]:
+    durable, scratch = not is_in_scratch(target), None
     make_folder(target.parent)
-    scratch = None
     try:
-        handle, scratch = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
-        with os.fdopen(handle, "wb") as file:
-            yield file
-        os.chmod(scratch, 0o644)
-        os.replace(scratch, target)
-        scratch = None
-    except OSError as error:
-        raise not_writable(target.parent, error) from error
+        with _reported(target.parent):
+            if durable:
+                sweep(target)
+            handle, scratch = scratch_file(target)
+            with os.fdopen(handle, "wb") as file:
+                yield file
+                file.flush()
+                if durable:
+                    os.fsync(handle)
+                os.replace(scratch, target)
+            if durable:
+                sync(target.parent)
     finally:
         if scratch is not None:
-            Path(scratch).unlink(missing_ok=True)
+            scratch.unlink(missing_ok=True)
+
+
+@contextmanager
+def _reported(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise not_writable(folder, error) from error
+
+
+@contextmanager
+def _full_disk_reported(folder: Path) -> Iterator[None]:
+    """Report a full disk; the caller's other errors may not be about this folder."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _FULL:
+            raise
+        raise not_writable(folder, error) from error
+
+
+def write_arrays(target: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write named arrays as NPZ, atomically and without pickle.
+
+    Raises:
+        InputError: It cannot be written.
+    """
+    import numpy as np
+
+    data = io.BytesIO()
+    np.savez(data, allow_pickle=False, **arrays)
+    atomic_write(target, data.getvalue())
 
 
 def write_json(target: Path, data: Any) -> None:
@@ -104,6 +179,7 @@ def make_folder(folder: Path) -> None:
 
 def not_writable(folder: Path, error: OSError) -> InputError:
     """The error for a folder that cannot be written."""
-    return InputError(
-        f"cannot write to {folder}: {error.strerror or error}", "a writable folder", "Choose another output"
-    )
+    seen = f"cannot write to {final_place(folder)}: {error.strerror or error}"
+    if error.errno in _FULL:
+        return InputError(seen, "a disk with space left", "Free some, or choose another output")
+    return InputError(seen, "a writable folder", "Choose another output")

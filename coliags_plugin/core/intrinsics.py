@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 from typing_extensions import Self
 
+from coliags_plugin.core import bounds
 from coliags_plugin.core.errors import InputError
 
 
@@ -36,14 +36,17 @@ class Intrinsics:
         """Check that the values are valid.
 
         Raises:
-            InputError: A number is not finite, or a focal length or size not positive.
+            InputError: A number is not finite or absurdly large, or a focal length or size not positive.
         """
         numbers = (self.fx, self.fy, self.cx, self.cy)
-        if not all(map(math.isfinite, numbers)) or min(self.fx, self.fy, self.width, self.height) <= 0:
+        good = all(abs(number) <= bounds.PIXELS for number in numbers)  # NaN is not
+        good = good and min(self.fx, self.fy) >= 1.0 / bounds.PIXELS
+        if not good or not all(0 < side <= bounds.IMAGE_SIDE for side in (self.width, self.height)):
             raise InputError(
                 f"intrinsics fx {self.fx:g}, fy {self.fy:g}, cx {self.cx:g}, cy {self.cy:g} "
                 f"of an image {self.width} x {self.height}",
-                "finite numbers in pixels, focal lengths and size positive",
+                f"numbers in pixels up to {bounds.PIXELS:g}, focal lengths and size positive, size up to "
+                f"{bounds.IMAGE_SIDE}",
             )
 
     def resized(self, width: int, height: int) -> Self:

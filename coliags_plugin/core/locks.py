@@ -8,6 +8,7 @@ import platform
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import datetime
 from pathlib import Path
 
 from coliags_plugin.core.files import make_folder, not_writable
@@ -35,12 +36,13 @@ def locked(file: Path, wait: float = 0.0, waiting: Callable[[str], None] | None 
     """
     make_folder(file.parent)
     try:
-        handle = os.open(file, os.O_RDWR | os.O_CREAT, 0o644)
+        handle = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
     except OSError as error:
         raise not_writable(file.parent, error) from error
     try:
         _acquire(handle, wait, waiting)
-        holder = f"process {os.getpid()} on {platform.node()}".encode()
+        began = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
+        holder = f"process {os.getpid()} on {platform.node()} since {began}".encode()
         os.ftruncate(handle, os.pwrite(handle, holder, 0))
         yield
     finally:

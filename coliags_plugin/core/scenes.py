@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -249,19 +250,32 @@ class Scene:
     def pixel_footprint(self) -> float:
         """Median size of a training pixel on the surface, scene units: depth over focal length of the points in view.
 
-        Occlusion is not tested. Falls back to all points in front of the cameras where none is in view.
+        Occlusion is not tested. Falls back to all points in front of the cameras where none is in view; NaN where none
+        is in front.
         """
         sizes, fallback = [], []
+        for camera, depth, inside in self._projected_points():
+            size = depth / (camera.fx * camera.fy) ** 0.5
+            sizes.append(size[inside])
+            fallback.append(size[depth > 0])
+        found, others = torch.cat(sizes), torch.cat(fallback)
+        return float((found if len(found) else others).median()) if len(others) else math.nan
+
+    def depths_in_view(self) -> Float[Tensor, "K"]:
+        """z-depths of the points inside the images of up to 16 training frames, scene units; occlusion is not tested.
+
+        [K]
+        """
+        return torch.cat([depth[inside] for _, depth, inside in self._projected_points()])
+
+    def _projected_points(self) -> Iterator[tuple[Camera, Tensor, Tensor]]:
+        """Of up to 16 training frames: camera, z-depth of every point and whether the point is inside the image."""
         points = self.points.positions.double()
         for frame in self.train[:: max(1, len(self.train) // 16)]:
-            camera = frame.camera
-            pixels, depth = camera.to(points.device, points.dtype).project(points)
-            size = depth / (camera.fx * camera.fy) ** 0.5
+            camera = frame.camera.to(points.device, points.dtype)
+            pixels, depth = camera.project(points)
             inside = ((pixels >= 0) & (pixels < pixels.new_tensor([camera.width, camera.height]))).all(dim=1)
-            sizes.append(size[(depth > 0) & inside])
-            fallback.append(size[depth > 0])
-        found = torch.cat(sizes)
-        return float((found if len(found) else torch.cat(fallback)).median())
+            yield camera, depth, inside & (depth > 0)
 
 
 def concatenate_targets(parts: Sequence[Target]) -> Target:

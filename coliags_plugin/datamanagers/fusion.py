@@ -10,6 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from coliags_plugin.core import bounds
+from coliags_plugin.core.arrays import read_arrays
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame, PointCloud
@@ -126,31 +128,33 @@ def load_points(path: Path) -> PointCloud:
 
 
 def subsampled(points: PointCloud, count: int, generator: np.random.Generator, source: Path | None) -> PointCloud:
-    """Sample at most ``count`` finite points without replacement.
+    """Sample at most ``count`` usable points without replacement: finite, and not absurdly far away.
 
     Raises:
-        InputError: No point is finite.
+        InputError: No point is usable.
     """
-    finite = np.flatnonzero(torch.isfinite(points.positions).all(dim=1).numpy())
-    if len(finite) < len(points):
+    usable = np.flatnonzero((points.positions.abs() <= bounds.LENGTH).all(dim=1).numpy())  # NaN is not
+    if len(usable) < len(points):
         log.warning(
-            "%s: %d of %d points are not finite and are left out", source, len(points) - len(finite), len(points)
+            "%s: %d of %d points are not finite, or beyond %g, and are left out",
+            source,
+            len(points) - len(usable),
+            len(points),
+            bounds.LENGTH,
         )
-    if len(finite) == 0:
+    if len(usable) == 0:
         raise InputError(f"{source} holds no points", "positions x, y, z in the world of the poses")
-    if len(finite) > count:
-        finite = np.sort(generator.choice(finite, count, replace=False))
-    chosen = torch.from_numpy(finite)
+    if len(usable) > count:
+        usable = np.sort(generator.choice(usable, count, replace=False))
+    chosen = torch.from_numpy(usable)
     return PointCloud(points.positions[chosen], None if points.colors is None else points.colors[chosen])
 
 
 def _read_npz(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            positions = np.asarray(data["positions"], np.float64)
-            colors = data["colors"] if "colors" in data else None
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"cannot read {path}: {error}", "an NPZ file with an array 'positions' [N, 3]") from error
+    arrays = read_arrays(path, "an NPZ file with an array 'positions' [N, 3]", ["positions"], ["colors"])
+    positions, colors = arrays["positions"], arrays.get("colors")
+    if positions.dtype.kind not in "fiu":
+        raise InputError(f"{path}: positions are {positions.dtype}", "numbers")
     if positions.ndim != 2 or positions.shape[1] != 3:
         raise InputError(f"{path}: positions of shape {positions.shape}", "[N, 3]")
     if colors is not None and (colors.shape != positions.shape or colors.dtype != np.uint8):

@@ -18,19 +18,25 @@ from torch import Tensor
 
 from coliags_plugin.config.method_config import MethodConfig
 from coliags_plugin.contracts import Renderer, Sampler, Strategy
+from coliags_plugin.core.checksums import differing_files, write_checksums
 from coliags_plugin.core.errors import InputError, NotFiniteError
-from coliags_plugin.core.files import atomic_folder
+from coliags_plugin.core.files import atomic_folder, write_json
 from coliags_plugin.core.scenes import Scene
+from coliags_plugin.core.scratch import final_place
 from coliags_plugin.engine.costs import TrainingCost
 from coliags_plugin.engine.model import Model, make_view_modules
 from coliags_plugin.engine.optimizers import Optimizers
-from coliags_plugin.engine.run_folder import checkpoints_in_order
+from coliags_plugin.engine.run_folder import checkpoint_step, checkpoints_in_order
 
 logger = logging.getLogger(__name__)
 
-#: Written. Format 2 lacks view modules and is otherwise the same.
-FORMAT = 3
-READABLE = (2, FORMAT)
+#: Written. Format 3 lacks checksums, format 2 view modules too; otherwise they are the same.
+FORMAT = 4
+READABLE = (2, 3, FORMAT)
+
+
+class DamagedCheckpointError(InputError):
+    """A file of a checkpoint is missing or is not what was written."""
 
 
 @dataclass(frozen=True)
@@ -91,9 +97,26 @@ def save_checkpoint(
     if cost is not None:
         state["cost"] = cost.model_dump()
     with atomic_folder(target, overwrite=True) as scratch:
-        save_file({key: value.detach().contiguous() for key, value in tensors.items()}, scratch / "state.safetensors")
-        (scratch / "state.json").write_text(json.dumps(state, indent=2) + "\n", encoding="utf-8")
+        save_tensors(tensors, scratch / "state.safetensors")
+        write_json(scratch / "state.json", state)
+        write_checksums(scratch)
     return target
+
+
+def save_tensors(tensors: Mapping[str, Tensor], file: Path) -> None:
+    """Write named tensors as safetensors.
+
+    Raises:
+        InputError: The file cannot be written.
+    """
+    try:
+        save_file({key: value.detach().contiguous() for key, value in tensors.items()}, file)
+    except SafetensorError as error:  # the only error it knows, of a full disk too
+        raise InputError(
+            f"cannot write to {final_place(file.parent)}: {error}",
+            "a disk with space left",
+            "Free some; --resume goes on",
+        ) from error
 
 
 def _check_finite(tensors: Mapping[str, Tensor], step: int) -> None:
@@ -122,23 +145,28 @@ def keep_newest(folder: Path, count: int) -> None:
         shutil.rmtree(path)
 
 
-def set_damaged_aside(folder: Path, method: str) -> int:
-    """Rename checkpoints that cannot be read, newest first, until one can be: so that a run goes on from that one.
+def take_newest(folder: Path, method: str, device: torch.device) -> Checkpoint | None:
+    """Read the newest whole checkpoint, to go on from; damaged ones are renamed to ``damaged-*``, with a warning.
 
     Args:
         folder: The run's checkpoints.
         method: Name of its method.
+        device: Where to.
 
     Returns:
-        The step of the newest whole checkpoint; 0 where there is none.
+        None where there is no whole checkpoint.
+
+    Raises:
+        InputError: The newest whole one is of another format or method.
     """
     while (newest := newest_checkpoint(folder)) is not None:
         try:
-            return read_checkpoint(newest, method, torch.device("cpu")).step
-        except InputError as error:
-            logger.warning("%s", error)
-            newest.rename(newest.with_name(f"damaged-{newest.name}-{time.time_ns()}"))
-    return 0
+            return read_checkpoint(newest, method, device)
+        except DamagedCheckpointError as error:
+            aside = newest.with_name(f"damaged-{newest.name}-{time.time_ns()}")
+            logger.warning("%s; set aside as %s", error.seen, aside.name)
+            newest.rename(aside)
+    return None
 
 
 def latest_checkpoint(folder: Path) -> Path:
@@ -157,15 +185,19 @@ def read_checkpoint(path: Path, method: str, device: torch.device) -> Checkpoint
     """Read one checkpoint.
 
     Raises:
-        InputError: It is damaged, of another format, or of another method.
+        DamagedCheckpointError: A file of it is not what was written.
+        InputError: It is of another format, or of another method.
     """
+    differing = differing_files(path)
+    if differing:
+        raise _damaged(path, f"{', '.join(differing)} is not what was written")
     try:
         state = json.loads((path / "state.json").read_text(encoding="utf-8"))
         tensors = load_file(path / "state.safetensors")
         step, owner, queue, version = (state[key] for key in ("step", "method", "frame_queue", "format"))
         cost = None if state.get("cost") is None else TrainingCost.model_validate(state["cost"])
-    except (OSError, ValueError, KeyError, SafetensorError) as error:
-        raise InputError(f"checkpoint {path} cannot be read: {error}", "an intact checkpoint") from error
+    except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
+        raise _damaged(path, str(error)) from error
     if version not in READABLE:
         known = " or ".join(map(str, READABLE))
         raise InputError(f"checkpoint {path} has format {version}", f"format {known}", "Train again with this version")
@@ -232,3 +264,12 @@ def restore_generators(checkpoint: Checkpoint, generators: Mapping[str, torch.Ge
     """Load the states of the random generators."""
     for name, state in checkpoint.part("generator").items():
         generators[name].set_state(state)
+
+
+def _damaged(path: Path, reason: str) -> DamagedCheckpointError:
+    """The error of a damaged checkpoint, which names the one before it."""
+    before = [
+        other.name for other in checkpoints_in_order(path.parent) if checkpoint_step(other) < checkpoint_step(path)
+    ]
+    way = f"`--resume` sets it aside and goes on from {before[-1] if before else 'the start'}"
+    return DamagedCheckpointError(f"checkpoint {path} is damaged: {reason}", "an intact checkpoint", way)

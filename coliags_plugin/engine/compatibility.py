@@ -24,12 +24,14 @@ def check_components(
 
     Raises:
         InputError: The strategy is for another field; the sampler's batches are not for the renderer or a loss; a loss
-            needs data that no training frame has; or no loss counts at some step.
+            needs data that no training frame has; no initial point is where cameras look; or no loss counts at some
+            step.
     """
     _check_strategy(config)
     _check_sampler(config, chosen, losses)
     _check_splats(config, losses)
     _check_data(scene, losses)
+    _check_points_in_view(chosen, scene)
     _warn_of_trusted_estimates(scene, losses)
     _check_schedule(losses, schedule)
 
@@ -95,6 +97,26 @@ def _check_data(scene: Scene, losses: Mapping[str, Loss]) -> None:
                 f"frames with {_DATA.get(missing, missing)}, or no such term",
                 f"Remove it with --set losses.{key}=null{instead}",
             )
+
+
+def _check_points_in_view(chosen: ChosenRenderer, scene: Scene) -> None:
+    near = getattr(chosen.renderer.settings, "near_plane", None)
+    if near is None or not len(scene.points):
+        return
+    depths = scene.depths_in_view()
+    if (depths > near).any():
+        return
+    seen = (
+        f"the initial points in view are at most {float(depths.max()):.2g} from the cameras"
+        if len(depths)
+        else f"none of the {len(scene.points)} initial points is in view of the training cameras"
+    )
+    raise InputError(
+        f"{seen}, and nothing nearer than {near:g} is drawn",
+        "lengths in mm, and poses and points of one world",
+        "`coliags data check` looks into poses, depth and units; small units on purpose need "
+        "--set renderer.near_plane=LENGTH",
+    )
 
 
 def _warn_of_trusted_estimates(scene: Scene, losses: Mapping[str, Loss]) -> None:

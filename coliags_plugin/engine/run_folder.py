@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -12,6 +14,7 @@ from typing import Any
 from coliags_plugin.config.method_config import LoadedMethod, load_method
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, atomic_write, write_json
+from coliags_plugin.core.locks import LockedError, locked
 from coliags_plugin.results.record import TRUTH_SUFFIX
 
 FORMAT = 1
@@ -63,6 +66,28 @@ class RunFolder:
     def checkpoints(self) -> Path:
         """One folder per checkpoint."""
         return self.path / "checkpoints"
+
+    @property
+    def lock_file(self) -> Path:
+        """File beside the folder, whose lock the process has that trains the run."""
+        return self.path.with_name(f".{self.path.name}.lock")
+
+    @contextmanager
+    def owned(self) -> Iterator[None]:
+        """Keep other processes from training this run; the lock ends with the process, however that ends.
+
+        Raises:
+            InputError: Another process trains it, or the parent folder cannot be written.
+        """
+        try:
+            with locked(self.lock_file):
+                yield
+        except LockedError as error:
+            raise InputError(
+                f"{self.path} is being trained by {error}",
+                "one process per run",
+                "Wait for it, or choose another --output",
+            ) from error
 
     @property
     def evaluations(self) -> Path:

@@ -5,11 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
-import signal
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -23,6 +19,7 @@ from coliags_plugin.core.masked import masked_mean
 from coliags_plugin.core.render_output import RenderOutput, Splats, concatenate_pixels
 from coliags_plugin.core.scenes import Frame, Scene, Target, concatenate_targets
 from coliags_plugin.engine import checkpoints
+from coliags_plugin.engine.blank_views import BlankViews
 from coliags_plugin.engine.compatibility import check_components
 from coliags_plugin.engine.costs import CostMeter, TrainingCost
 from coliags_plugin.engine.devices import device_name
@@ -33,6 +30,7 @@ from coliags_plugin.engine.provenance import run_provenance
 from coliags_plugin.engine.randomness import generators
 from coliags_plugin.engine.resuming import check_same_run, record_schedule, resume_command
 from coliags_plugin.engine.run_folder import RunFolder
+from coliags_plugin.engine.stopping import deferred_stop
 from coliags_plugin.renderers.choice import ChosenRenderer, choose_renderer
 
 logger = logging.getLogger(__name__)
@@ -84,6 +82,7 @@ class Trainer:
         self.chosen.renderer.check_field(field)
         self.optimizers = self._optimizers()
         self.step = 0
+        self.blank_views = BlankViews()
         self.costs = CostMeter(device)
 
     def start(self, overwrite: bool = False) -> None:
@@ -95,7 +94,7 @@ class Trainer:
         self.run.create(self.method.config.to_yaml(), self.provenance(), overwrite)
 
     def resume(self) -> None:
-        """Resume from the run's latest checkpoint, or from the start without one; bitwise identical on the CPU.
+        """Resume from the run's newest whole checkpoint, or from the start without one; bitwise identical on the CPU.
 
         A schedule that differs from the run's own is taken as a change on purpose and recorded.
 
@@ -104,18 +103,17 @@ class Trainer:
                 more steps behind it than the schedule has.
         """
         check_same_run(self.run, self.method, self.scene, self.scene_path)
-        path = checkpoints.newest_checkpoint(self.run.checkpoints)
-        cost = None if path is None else self._restore(path)
+        saved = checkpoints.take_newest(self.run.checkpoints, self.method.name, self.device)
+        cost = None if saved is None else self._restore(saved)
         record_schedule(self.run, self.method.config, self.step)
         rows = self._cut_log()
-        if cost is None and path is not None:  # of a version that measured seconds alone
+        if cost is None and saved is not None:  # of a version that measured seconds alone
             cost = TrainingCost(device=device_name(self.device), seconds=rows[-1]["seconds"] if rows else None)
         self.costs = CostMeter(self.device, cost)
         logger.info("resuming %s at step %d of %d", self.run.path, self.step, self.steps)
 
-    def _restore(self, path: Path) -> TrainingCost | None:
+    def _restore(self, saved: checkpoints.Checkpoint) -> TrainingCost | None:
         """Load model, optimizers, strategy, sampler and random generators from a checkpoint; what it had cost."""
-        saved = checkpoints.read_checkpoint(path, self.method.name, self.device)
         self.model = checkpoints.restore_model(saved, self.method.config, self.scene, self.chosen.renderer)
         self.model.to(self.device)
         self.optimizers = self._optimizers()
@@ -139,7 +137,7 @@ class Trainer:
             keep: How many checkpoints to keep, the newest; None: all.
 
         Raises:
-            InterruptedRunError: Ctrl-C; what was done is saved.
+            InterruptedRunError: Ctrl-C, SIGTERM or SIGHUP; what was done is saved.
             NotFiniteError: A loss term or a parameter is NaN or infinite.
         """
         schedule = self.method.config.schedule
@@ -149,7 +147,7 @@ class Trainer:
         saved = time.monotonic()
         with (
             self.costs.running(),
-            _deferred_interrupt() as interrupted,
+            deferred_stop() as interrupted,
             ProgressReport(f"train {self.method.name}", self.steps, self.step) as progress,
             self.run.log_file.open("a", encoding="utf-8") as log,
         ):
@@ -180,6 +178,7 @@ class Trainer:
 
         Raises:
             NotFiniteError: A loss term, or a parameter as the step before left it, is NaN or infinite.
+            NothingDrawnError: Views stay empty.
         """
         step = self.step + 1
         self.model.field.before_step(step, self.schedule)
@@ -193,11 +192,13 @@ class Trainer:
         # A NaN opacity draws nothing and leaves every term finite, so parameters are looked at themselves.
         sums = _parameter_sums(self.model)
         # Everything the log and the checks need, in one wait for the device.
-        scalars = [total, _squared_error(output, target), *terms.values(), *sums.values()]
-        loss, error, *rest = torch.stack(scalars).tolist()
+        error_and_alpha = [_squared_error(output, target), output.alpha.detach().amax()]
+        scalars = [total, *error_and_alpha, *terms.values(), *sums.values()]
+        loss, error, alpha, *rest = torch.stack(scalars).tolist()
         values, totals = rest[: len(terms)], rest[len(terms) :]
         self._check_parameters(dict(zip(sums, totals, strict=True)), step)
         self._check_terms(dict(zip(terms, values, strict=True)), step, target)
+        self.blank_views.see(alpha, step)
         if total.requires_grad:
             torch.autograd.backward(total)
         done = self.strategy.after_backward(seen, self.optimizers)
@@ -299,26 +300,3 @@ def _resident(frames: list[Frame], device: torch.device) -> list[Frame]:
     tensors = [(f.image, f.depth, f.depth_at_least, f.mask, f.seen, f.depth_confidence) for f in frames]
     size = sum(tensor.nbytes for group in tensors for tensor in group if tensor is not None)
     return [frame.to(device) for frame in frames] if size < torch.cuda.mem_get_info(device)[0] / 2 else frames
-
-
-@contextmanager
-def _deferred_interrupt() -> Iterator[Any]:
-    """Defer Ctrl-C to the end of the step; a second one interrupts at once."""
-    asked = False
-
-    def remember(number: int, frame: Any) -> None:
-        nonlocal asked
-        if asked:
-            raise KeyboardInterrupt
-        asked = True
-        logger.info("stopping after this step; Ctrl-C again to stop at once")
-
-    try:
-        before = signal.signal(signal.SIGINT, remember)
-    except ValueError:  # not the main thread: there Ctrl-C cannot arrive anyway
-        yield lambda: False
-        return
-    try:
-        yield lambda: asked
-    finally:
-        signal.signal(signal.SIGINT, before)

@@ -35,8 +35,9 @@ def blending_weights(renderer: SplattingRenderer, gaussians: Gaussians, camera: 
 class GaussianAverages:
     """Running averages of the Gaussians of a field over views, each weighted by what a view shows of it.
 
-    Centres and logarithms of scales are means, rotations the main axes of the quaternions' outer products. Opacities
-    are weighted by the weight of the whole element: a child that an anchor does not yield in a view counts with 0.
+    Centres, colours and logarithms of scales are means, rotations the main axes of the quaternions' outer products.
+    Opacities are weighted by the weight of the whole element: a child that an anchor does not yield in a view counts
+    with 0.
 
     Args:
         elements: Of the field, E.
@@ -53,6 +54,7 @@ class GaussianAverages:
 
         self._weights, self._opacities, self._element_weights = zeros(slots), zeros(slots), zeros(elements)
         self._means, self._log_scales, self._rotations = zeros(slots, 3), zeros(slots, 3), zeros(slots, 4, 4)
+        self._colors = zeros(slots, 3)
 
     def add(self, gaussians: Gaussians, weights: Float[Tensor, "N"]) -> None:
         """Add a view.
@@ -70,6 +72,7 @@ class GaussianAverages:
         self._opacities.index_add_(0, slots, shown[elements] * gaussians.opacities)
         self._weights.index_add_(0, slots, weights)
         self._means.index_add_(0, slots, weights[:, None] * gaussians.means)
+        self._colors.index_add_(0, slots, weights[:, None] * gaussians.colors)
         self._log_scales.index_add_(0, slots, weights[:, None] * gaussians.scales.log())
         self._rotations.index_add_(0, slots, weights[:, None, None] * products)
 
@@ -83,6 +86,14 @@ class GaussianAverages:
         if not visible.any():
             raise InputError("no Gaussian of this run is visible in a training view", "a trained run")
         return visible.nonzero().squeeze(1)
+
+    def colors(self, kept: Int[Tensor, "N"]) -> Float[Tensor, "N 3"]:
+        """Mean colours. [N, 3]
+
+        Args:
+            kept: Slots. [N]
+        """
+        return self._colors[kept] / self._weights[kept][:, None]
 
     def _mean_opacities(self) -> Float[Tensor, "L"]:
         shown = self._element_weights.repeat_interleave(self._per_element)

@@ -20,8 +20,8 @@ from coliags_plugin.fields.explicit_gaussians import ExplicitGaussians
 from coliags_plugin.fields.spherical_harmonics import MAX_DEGREE
 from coliags_plugin.splats.cloud import SplatCloud
 
-#: Training views, evenly spaced, at most, whose Gaussians are averaged.
-_VIEWS = 48
+#: Training views, evenly spaced, at most: whose Gaussians are averaged, and whose colours are fitted.
+_VIEWS, _COLOR_VIEWS = 120, 30
 
 
 def bake(trained: TrainedRun, light: HeldLight) -> tuple[SplatCloud, dict[str, Any]]:
@@ -51,14 +51,16 @@ def _averaged(trained: TrainedRun, views: list[Frame], light: HeldLight) -> Expl
     field, renderer = gaussians_of(trained.model), splatting_of(trained.model)
     averages = GaussianAverages(field.element_count, field.slots_per_element, trained.device)
     seen: list[SeenColors] = []
+    every = -(-len(views) // _COLOR_VIEWS)
     with ProgressReport("bake: average over views", len(views)) as progress:
-        for count, frame in enumerate(views, start=1):
+        for index, frame in enumerate(views):
             camera = adjusted_camera(trained, frame)
             with torch.no_grad():
                 gaussians = field.gaussians_in_light(camera, light)
             weights = blending_weights(renderer, gaussians, camera)
             averages.add(gaussians, weights)
-            seen.append(SeenColors.of(gaussians, weights, camera))
-            progress.update(count)
+            if index % every == 0:
+                seen.append(SeenColors.of(gaussians, weights, camera))
+            progress.update(index + 1)
     kept = averages.kept()
-    return averages.field(kept, fit_harmonics(seen, kept, MAX_DEGREE))
+    return averages.field(kept, fit_harmonics(seen, kept, averages.colors(kept), MAX_DEGREE))

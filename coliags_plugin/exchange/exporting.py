@@ -115,6 +115,10 @@ def export_run(
 
 def _gaussian_field(trained: TrainedRun) -> GaussianField:
     field = trained.model.field
+    if trained.lamp is not None:
+        raise InputError(
+            "export of a relit run", "the lamp that the data were recorded with", "Export the run as loaded"
+        )
     if not isinstance(field, GaussianField):
         raise InputError(
             f"{trained.run.path} is a run of '{trained.method}', whose field '{trained.config.field.name}' is density "

@@ -50,12 +50,15 @@ class SeenColors:
         return cls(gaussians.source_index[shown], weights[shown], directions, gaussians.colors[shown])
 
 
-def fit_harmonics(views: Sequence[SeenColors], kept: Int[Tensor, "N"], degree: int) -> Float[Tensor, "N B 3"]:
+def fit_harmonics(
+    views: Sequence[SeenColors], kept: Int[Tensor, "N"], mean_colors: Float[Tensor, "N 3"], degree: int
+) -> Float[Tensor, "N B 3"]:
     """Coefficients that reproduce the colours best: weighted least squares per Gaussian, ridge above degree 0.
 
     Args:
         views: At least one.
-        kept: Slots to fit, ascending, each seen in a view. [N]
+        kept: Slots to fit, ascending. [N]
+        mean_colors: Their colours where no view shows them. [N, 3]
         degree: Of the harmonics.
 
     Returns:
@@ -79,8 +82,10 @@ def fit_harmonics(views: Sequence[SeenColors], kept: Int[Tensor, "N"], degree: i
             values = basis(view.directions[here], degree)
             weighted = weights[:, None] * values
             normal.index_add_(0, row, weighted[:, :, None] * values[:, None])
-            right.index_add_(0, row, weighted[:, :, None] * (view.colors[here] - 0.5)[:, None])
+            right.index_add_(0, row, weighted[:, :, None] * (view.colors[here] - mean_colors[start + row])[:, None])
             total.index_add_(0, row, weights)
         scale = total.clamp_min(1e-12)[:, None, None]
         parts.append(torch.linalg.solve(normal / scale + torch.diag(ridge + 1e-6 * Y0**2), right / scale))
-    return torch.cat(parts)
+    coefficients = torch.cat(parts)
+    coefficients[:, 0] += (mean_colors - 0.5) / Y0
+    return coefficients

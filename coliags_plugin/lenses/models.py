@@ -12,17 +12,22 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
+from coliags_plugin.core import bounds
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import Intrinsics
 
 Array = NDArray[np.float64]
 
+#: Largest magnitudes of the numbers of a lens that are not terms of its distortion.
+_LIMITS = dict.fromkeys(("fx", "fy", "cx", "cy", "stretch", "origin"), bounds.PIXELS)
+_LIMITS |= dict.fromkeys(("width", "height"), float(bounds.IMAGE_SIDE))
 #: Where :func:`undistortion_map` sends pixels that no source pixel shows: outside any image, whatever the border.
 NOWHERE = -10.0
 
@@ -91,6 +96,18 @@ class CalibratedLens(Lens):
     height: int
     stretch: tuple[float, float] = (1.0, 1.0)
     origin: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        """Check that the numbers are those of a lens.
+
+        Raises:
+            InputError: One is not finite or absurdly large.
+        """
+        for each in fields(self):
+            value, limit = getattr(self, each.name), _LIMITS.get(each.name, bounds.DISTORTION)
+            for number in value if isinstance(value, tuple) else (value,):
+                if isinstance(number, (int, float)) and not abs(number) <= limit:  # NaN is not
+                    raise InputError(f"a lens with {each.name} {number:g}", f"at most {limit:g} in magnitude")
 
     def resized(self, width: int, height: int) -> Self:
         """See :class:`Lens`."""

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
+from coliags_plugin.core.arrays import read_arrays
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.meshes.files import read_flagged_mesh
 from coliags_plugin.meshes.mesh import TriangleMesh
@@ -74,11 +75,7 @@ def read_true_surface(path: Path, any_frame: bool = False) -> TrueSurface:
 
 
 def _phantom_flags(path: Path, key: str, mesh: TriangleMesh) -> Bool[np.ndarray, "F"]:
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            seen = data[key]
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(f"cannot read {path}: {error}", f"an NPZ file with '{key}'") from error
+    seen = read_arrays(path, f"an NPZ file with '{key}'", [key])[key]
     if seen.shape != (len(mesh),) or seen.dtype != bool:
         raise InputError(
             f"{path} has {seen.dtype} flags of shape {list(seen.shape)}", f"one bool for each of {len(mesh)} triangles"

@@ -71,20 +71,29 @@ def _usable(
 
 
 def incidence_cosines(depth: Float[Tensor, "H W"], camera: Camera) -> Float[Tensor, "H W"]:
-    """Cosine of the angle between ray and normal of the surface that a depth map describes; NaN at the border.
+    """Cosine of the angle between ray and normal of the surface that a depth map describes. [H, W]
 
-    The normal is that of the points left, right, above and below, so that a jump of the depth counts as a very oblique
-    surface, on both of its sides. [H, W]
+    The normal is that of the point and those of its two neighbours, of left or right and above or below, that are
+    nearer in depth, so that the last pixel before a jump counts as the surface that it belongs to, and one in the midst
+    of the jump as a very oblique one. NaN where no neighbours have depth.
     """
     points = camera.unproject(depth)
-    across = points[1:-1, 2:] - points[1:-1, :-2]
-    down = points[2:, 1:-1] - points[:-2, 1:-1]
-    normals = torch.linalg.cross(across, down)
-    rays = camera.rays()[1:-1, 1:-1]
-    cosines = torch.full_like(depth, torch.nan)
-    lengths = normals.norm(dim=-1) * rays.norm(dim=-1)
-    cosines[1:-1, 1:-1] = (normals * rays).sum(-1).abs() / lengths
-    return cosines
+    across, down = (_smaller_step(points, depth, axis) for axis in (1, 0))
+    normals, rays = torch.linalg.cross(across, down), camera.rays()
+    return (normals * rays).sum(-1).abs() / (normals.norm(dim=-1) * rays.norm(dim=-1))
+
+
+def _smaller_step(points: Float[Tensor, "H W 3"], depth: Float[Tensor, "H W"], axis: int) -> Float[Tensor, "H W 3"]:
+    """From each point to the next along an axis, or from the last one to it: whichever depths differ less. [H, W, 3]"""
+    steps, jumps = torch.diff(points, dim=axis), torch.diff(depth, dim=axis).abs()
+    jumps = torch.where(jumps.isfinite(), jumps, torch.inf)
+    nothing, endless = (
+        torch.full_like(points.narrow(axis, 0, 1), torch.nan),
+        torch.full_like(depth.narrow(axis, 0, 1), torch.inf),
+    )
+    ahead, behind = torch.cat([steps, nothing], axis), torch.cat([nothing, steps], axis)
+    nearer = torch.cat([jumps, endless], axis) <= torch.cat([endless, jumps], axis)
+    return torch.where(nearer[..., None], ahead, behind)
 
 
 def _colors(rgb: Tensor) -> UInt8[np.ndarray, "H W 3"]:

@@ -12,7 +12,9 @@ import numpy as np
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, write_json
 from coliags_plugin.core.scenes import Scene
+from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.engine.trained import TrainedRun
+from coliags_plugin.engine.truth import match_truth
 from coliags_plugin.meshes.comparison import SurfaceComparison, compare_meshes
 from coliags_plugin.meshes.distances import nearest_on
 from coliags_plugin.meshes.files import MESH_FORMATS, write_mesh
@@ -86,16 +88,10 @@ def mesh_run(
 
 def _true_surface(scene: Scene, given: Path | None) -> TrueSurface | None:
     path = given or find_true_surface(Path(scene.provenance.get("path", "")))
-    if path is None:
+    if path is None or (given is None and not scene.is_metric):
         return None
     if not scene.is_metric:
-        if given is None:
-            return None
-        raise InputError(
-            f"scene '{scene.name}' is of unknown scale, a true surface in mm",
-            "a run on a scene in mm",
-            "Give the scene its scale first (docs/poses.md)",
-        )
+        _check_same_world(scene, path)
     surface = read_true_surface(path)
     if surface.seen_by:
         return surface
@@ -106,6 +102,17 @@ def _true_surface(scene: Scene, given: Path | None) -> TrueSurface | None:
             "the true surface of this scene, in mm and in the world of its poses",
         )
     return replace(surface, seen=seen, seen_by="first hit of a pixel of a training frame, cast at the mesh")
+
+
+def _check_same_world(scene: Scene, truth: Path) -> None:
+    """Of a scene of unknown scale, accept the truth of a scene with the same poses only, whose scale it then shares."""
+    if not truth.is_dir():
+        raise InputError(
+            f"scene '{scene.name}' is of unknown scale, {truth} in mm",
+            "the folder of a scene with the same poses, and with a true surface",
+            "Pass --truth SCENE, or give the scene its scale first (docs/poses.md)",
+        )
+    match_truth(scene, open_scene(truth))
 
 
 def _write_comparison(folder: Path, mesh: TriangleMesh, truth: TrueSurface, scene: Scene) -> None:

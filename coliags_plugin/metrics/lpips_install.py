@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from coliags_plugin.core.download import download, file_sha256
+from coliags_plugin.core.checksums import file_sha256
+from coliags_plugin.core.download import download
 from coliags_plugin.core.errors import InputError, UnavailableError
 from coliags_plugin.core.files import atomic_copy
 from coliags_plugin.core.progress import Progress

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import os
-import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +13,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import make_folder, not_writable
+from coliags_plugin.core.files import atomic_path
 from coliags_plugin.outputs.image_files import as_array
 
 if TYPE_CHECKING:
@@ -46,23 +44,23 @@ def write_video(frames: Iterable[UInt8[np.ndarray, "H W 3"] | Tensor], path: Pat
         raise InputError(f"video file {path}", "a name that ends in .mp4")
     if not (math.isfinite(fps) and fps > 0.0):
         raise InputError(f"{fps} frames a second", "a positive number")
-    make_folder(path.parent)
-    try:
-        # The suffix is kept: FFmpeg chooses the container by it.
-        handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=".mp4", dir=path.parent)
-        os.close(handle)
-    except OSError as error:
-        raise not_writable(path.parent, error) from error
-    scratch = Path(name)
-    try:
+    # FFmpeg chooses the container by the suffix, and opens the file itself.
+    with atomic_path(path) as scratch:
+        scratch.write_bytes(bytes(4096))  # OpenCV would call a full disk a missing codec
         count = _encode(frames, scratch, fps)
         if count == 0:
             raise InputError(f"no frames for {path}", "at least one")
-        scratch.chmod(0o644)
-        scratch.replace(path)
-    finally:
-        scratch.unlink(missing_ok=True)
+        if _frame_count(scratch) != count:
+            raise InputError(f"the video written to {path} is incomplete", "a disk with space left", "Free some")
     _LOG.info("encoded %s: %d frames, %g per second", path.name, count, fps)
+
+
+def _frame_count(path: Path) -> int:
+    video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    try:
+        return int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+    finally:
+        video.release()
 
 
 def _encode(frames: Iterable[np.ndarray | Tensor], scratch: Path, fps: float) -> int:

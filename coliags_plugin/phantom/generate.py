@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from coliags_plugin import __version__
 from coliags_plugin.config.registry import phantom_layouts
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import atomic_folder
+from coliags_plugin.core.files import atomic_folder, write_arrays
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.phantom.colon import ColonSurface, build_surface, grow_anatomy
@@ -294,13 +294,17 @@ def _write_truth(
     meshes.write_mesh(folder / "mesh.ply", surface, albedo)
     vertices = surface.vertices.astype(np.float64)
     seen = seen_from(vertices, phantom.training_poses, phantom.sensor.lens, phantom.sensor.mask, phantom.world.tracer)
-    np.savez(folder / "mesh_seen.npz", vertex_seen=seen, face_seen=trained_on, face_seen_by_any_frame=observed)
-    np.savez(
+    write_arrays(
+        folder / "mesh_seen.npz", {"vertex_seen": seen, "face_seen": trained_on, "face_seen_by_any_frame": observed}
+    )
+    write_arrays(
         folder / "albedo.npz",
-        texture=phantom.world.mucosa.albedo.astype(np.float16),
-        vertex_albedo=albedo,
-        row_arc_mm=surface.arc,
-        columns=surface.columns,
+        {
+            "texture": phantom.world.mucosa.albedo.astype(np.float16),
+            "vertex_albedo": albedo,
+            "row_arc_mm": surface.arc,
+            "columns": np.array(surface.columns),
+        },
     )
     np.save(folder / "camera_to_world.npy", np.stack(phantom.poses))
     (folder / "gain.csv").write_text(_gain_csv(range(len(phantom.poses)), phantom.gains))

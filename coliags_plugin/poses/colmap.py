@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import atomic_folder
+from coliags_plugin.core.files import atomic_folder, make_folder
 from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.core.scratch import final_place
 from coliags_plugin.poses.format import Format
 from coliags_plugin.poses.rigid import inverse, rigid, rotations_from_wxyz, wxyz_from_rotations
 from coliags_plugin.poses.text import prefixed_errors, read_text, shortened
@@ -170,7 +171,37 @@ def _write(path: Path, trajectory: Trajectory, text: bool) -> None:
     names = trajectory.names_or_numbers()
     model = posed_model(colmap_poses(trajectory.camera_to_world), names, [trajectory.intrinsics], [0] * len(names))
     with atomic_folder(path, overwrite=True) as scratch:
-        (model.write_text if text else model.write_binary)(str(scratch))
+        write_reconstruction(scratch, model, text)
+
+
+def write_reconstruction(folder: Path, model: pycolmap.Reconstruction, text: bool = False) -> None:
+    """Write a COLMAP model into a folder, which is made, and read it back: COLMAP itself ignores a full disk.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    import pycolmap
+
+    make_folder(folder)
+    try:
+        (model.write_text if text else model.write_binary)(str(folder))
+        written = pycolmap.Reconstruction(str(folder))
+    except Exception as error:  # what pycolmap raises depends on where the file ends
+        raise _incomplete(folder) from error
+    if _counts(written) != _counts(model):
+        raise _incomplete(folder)
+
+
+def _counts(model: pycolmap.Reconstruction) -> tuple[int, ...]:
+    return model.num_cameras(), model.num_images(), model.num_points3D(), model.compute_num_observations()
+
+
+def _incomplete(folder: Path) -> InputError:
+    return InputError(
+        f"the COLMAP model written to {final_place(folder)} is incomplete",
+        "a disk with space left",
+        "Free some, or choose another output",
+    )
 
 
 def _text_images(path: Path) -> Iterator[_Image]:

@@ -5,9 +5,6 @@ Its world is the first camera of the sequence, its lengths are mm, its poses wor
 
 from __future__ import annotations
 
-import io
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +12,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from coliags_plugin.core.arrays import read_arrays
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import atomic_write
+from coliags_plugin.core.files import write_arrays
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.poses.format import Format
 from coliags_plugin.poses.rigid import check_rigid, inverse, rigid, rotations_from_wxyz, wxyz_from_rotations
@@ -149,9 +147,7 @@ def write(path: Path, trajectory: Trajectory) -> None:
         "timestep": np.zeros((0,), np.float32),
         "keyframe_time_indices": np.zeros((0,), np.int64),
     }
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **arrays)
-    atomic_write(path, buffer.getvalue())
+    write_arrays(path, arrays)
 
 
 def recognise(path: Path) -> bool:
@@ -212,23 +208,9 @@ def _truth(path: Path, arrays: dict[str, np.ndarray]) -> np.ndarray:
 
 def _arrays(path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> dict[str, np.ndarray]:
     """Load the named arrays as float64 and check their shapes and values; optional ones if present."""
-    arrays: dict[str, np.ndarray] = {}
     faults: list[str] = []
-    try:
-        loaded = np.load(path, allow_pickle=False)
-        if not isinstance(loaded, np.lib.npyio.NpzFile):
-            raise ValueError("it is a single array")
-        with loaded as archive:
-            for key in (*required, *optional):
-                if key not in archive.files:
-                    faults += [f"no {key}"] if key in required else []
-                    continue
-                try:
-                    arrays[key] = archive[key]
-                except ValueError:
-                    faults.append(f"{key} is not an array of numbers")
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"cannot read {path}: {error}", "a params.npz written by EndoGSLAM") from error
+    arrays = read_arrays(path, "a params.npz written by EndoGSLAM", optional=(*required, *optional))
+    faults += [f"no {key}" for key in required if key not in arrays]
     sizes: dict[str, int] = {}
     for key, array in list(arrays.items()):
         fault = _fault(key, array, sizes)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from coliags_plugin.core import bounds
 from coliags_plugin.core.errors import InputError
 
 #: Largest deviation of R^T R from the identity, and of a quaternion from unit length. Six digits in files give 1e-6.
@@ -25,7 +26,7 @@ def check_rigid(
     expected: str = f"both within {RIGID_TOLERANCE:g}",
     do: str = "",
 ) -> None:
-    """Refuse the first matrix that is not finite, rigid and right-handed.
+    """Refuse the first matrix that is not finite, rigid and right-handed, or lies absurdly far away.
 
     Args:
         matrices: Transforms. [N, 4, 4]
@@ -36,7 +37,9 @@ def check_rigid(
     Raises:
         InputError: A matrix is invalid; the message names its place.
     """
-    finite = np.isfinite(matrices).all(axis=(1, 2))
+    with np.errstate(invalid="ignore"):
+        far = np.abs(matrices[:, :3, 3]).max(axis=1) > bounds.LENGTH
+    finite = np.isfinite(matrices).all(axis=(1, 2)) & ~far
     safe = np.where(finite[:, None, None], matrices, np.eye(4))
     rotations = safe[:, :3, :3]
     errors = np.abs(rotations.transpose(0, 2, 1) @ rotations - np.eye(3)).max(axis=(1, 2))
@@ -46,6 +49,12 @@ def check_rigid(
     if not bad.any():
         return
     index = int(np.argmax(bad))
+    if far[index]:
+        raise InputError(
+            f"{place(index)}: a camera at {_listed(matrices[index, :3, 3])}",
+            f"coordinates up to {bounds.LENGTH:g}, in mm where lengths are known",
+            do,
+        )
     if not finite[index]:
         raise InputError(f"{place(index)}: a transform that is not finite", "sixteen finite numbers", do)
     if max(errors[index], borders[index]) > RIGID_TOLERANCE:

@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 
 from coliags_plugin.core import download as module
-from coliags_plugin.core.download import download, file_sha256
+from coliags_plugin.core.checksums import file_sha256
+from coliags_plugin.core.download import download
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.progress import progress_callback
 from tests.file_server import file_server

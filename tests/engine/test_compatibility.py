@@ -186,3 +186,32 @@ def test_modules_of_whole_images_are_refused_with_batches_of_pixels(monkeypatch)
     chosen = ChosenRenderer("volume", VolumeRenderer(VolumeRenderer.Settings()), "")
     with pytest.raises(InputError, match="module 'exposure' needs whole images, and sampler 'pixels'"):
         _check_sampler(config, chosen, {})
+
+
+def scaled(scene, factor):
+    """The scene in another unit of length."""
+
+    def moved(frame):
+        pose = frame.camera.camera_to_world.clone()
+        pose[:3, 3] *= factor
+        return replace(frame, camera=replace(frame.camera, camera_to_world=pose))
+
+    points = replace(scene.points, positions=scene.points.positions * factor)
+    return replace(scene, train=[moved(frame) for frame in scene.train], points=points)
+
+
+@pytest.mark.parametrize("method", ["scaffold-gs", "3dgs", "2dgs"])
+def test_metres_are_refused(tmp_path, method):
+    with pytest.raises(InputError, match=r"in view are at most 0\.0\d+ from the cameras, and nothing nearer than"):
+        start(tmp_path / "run", method=method, scene=scaled(wall_scene(), 1e-3))
+    assert not (tmp_path / "run").exists()
+    start(tmp_path / "run", ["renderer.near_plane=0.0001"], method, scaled(wall_scene(), 1e-3))
+
+
+def test_points_behind_all_cameras_are_refused(tmp_path):
+    scene = wall_scene()
+    behind = replace(scene.points, positions=scene.points.positions * torch.tensor([1.0, 1.0, -1.0]))
+    assert torch.isnan(torch.tensor(replace(scene, points=behind).pixel_footprint))
+    with pytest.raises(InputError, match=r"none of the .* initial points is in view of the training cameras"):
+        start(tmp_path / "run", scene=replace(scene, points=behind))
+    assert not (tmp_path / "run").exists()

@@ -5,14 +5,25 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
 
+import numpy as np
 import pytest
 import torch
 
 from coliags_plugin.config.method_config import load_method
+from coliags_plugin.core.checksums import CHECKSUMS, write_checksums
 from coliags_plugin.core.errors import InputError, InterruptedRunError, NotFiniteError
+from coliags_plugin.engine import blank_views
 from coliags_plugin.engine import trainer as trainer_module
-from coliags_plugin.engine.checkpoints import latest_checkpoint, newest_checkpoint, read_checkpoint, set_damaged_aside
+from coliags_plugin.engine.blank_views import NothingDrawnError
+from coliags_plugin.engine.checkpoints import (
+    DamagedCheckpointError,
+    latest_checkpoint,
+    newest_checkpoint,
+    read_checkpoint,
+    take_newest,
+)
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer
 from tests.scenes import SMALL, wall_scene
@@ -79,12 +90,13 @@ def test_another_seed_is_another_run(tmp_path):
     assert not torch.equal(final_state(first).tensors["field/features"], final_state(other).tensors["field/features"])
 
 
-def test_an_interrupted_run_resumes_to_the_bit(tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_an_interrupted_run_resumes_to_the_bit(tmp_path, number):
     """Interrupted in the middle of a round, resumed by a fresh trainer: the same bits as never interrupted."""
     whole = train(tmp_path / "whole", steps=16, overrides=EARLY_GROWTH)
     cut = make_trainer(tmp_path / "cut", steps=16, overrides=EARLY_GROWTH)
     cut.start()
-    _stop_after(cut, 7)
+    _stop_after(cut, 7, number)
     with pytest.raises(InterruptedRunError, match="stopped after step 7"):
         cut.train()
     resumed = make_trainer(tmp_path / "cut", steps=16, overrides=EARLY_GROWTH)
@@ -107,17 +119,44 @@ def test_resume_forgets_rows_after_the_checkpoint(tmp_path):
     assert [row["step"] for row in log_rows(longer)] == [1, 2, 3, 4, 5, 6]
 
 
-def _stop_after(trainer, steps):
-    """A real SIGINT while a step is in hand."""
+def _stop_after(trainer, steps, number=signal.SIGINT):
+    """A real signal while a step is in hand."""
     take = trainer.take_step
 
     def step():
         row = take()
         if row["step"] == steps:
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), number)
         return row
 
     trainer.take_step = step
+
+
+def test_a_signal_that_nohup_ignores_stays_ignored(tmp_path):
+    trainer = make_trainer(tmp_path / "run", steps=4)
+    trainer.start()
+    _stop_after(trainer, 2, signal.SIGHUP)
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        trainer.train()
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert trainer.step == 4
+
+
+def test_a_run_that_draws_nothing_stops_and_says_so(tmp_path, monkeypatch):
+    monkeypatch.setattr(blank_views, "LIMIT", 3)
+    trainer = make_trainer(tmp_path / "run", steps=12)
+    trainer.start()
+    for _ in range(3):
+        trainer.take_step()
+    with torch.no_grad():
+        trainer.model.field.anchors += 1e4
+    trainer.take_step()
+    trainer.take_step()
+    with pytest.raises(NothingDrawnError, match="in the last 3 views, until step 6"):
+        trainer.take_step()
 
 
 def test_a_second_interrupt_does_not_wait(tmp_path):
@@ -204,23 +243,6 @@ def test_resume_on_other_data_is_refused(tmp_path):
         make_trainer(tmp_path / "run", scene=wall_scene(frames=12)).resume()
 
 
-@pytest.mark.parametrize("damage", ["truncate", "remove", "json", "format"])
-def test_damaged_checkpoint_is_refused(tmp_path, damage):
-    trainer = train(tmp_path / "run", steps=1)
-    checkpoint = latest_checkpoint(trainer.run.checkpoints)
-    tensors, state = checkpoint / "state.safetensors", checkpoint / "state.json"
-    if damage == "truncate":
-        tensors.write_bytes(tensors.read_bytes()[:1000])
-    elif damage == "remove":
-        tensors.unlink()
-    elif damage == "json":
-        state.write_text("{")
-    else:
-        state.write_text(json.dumps({**json.loads(state.read_text()), "format": 99}))
-    with pytest.raises(InputError, match="checkpoint"):
-        make_trainer(tmp_path / "run", steps=1).resume()
-
-
 def test_a_run_killed_before_its_first_checkpoint_starts_again(tmp_path):
     whole = train(tmp_path / "whole", steps=4)
     killed = make_trainer(tmp_path / "run", steps=4)
@@ -275,21 +297,53 @@ def test_checkpoints_by_the_clock_and_how_many_are_kept(tmp_path):
     assert len(list(other.run.checkpoints.iterdir())) == 3
 
 
-def test_damaged_checkpoints_are_set_aside_for_the_one_before(tmp_path):
+def test_damaged_checkpoints_are_set_aside_for_the_one_before(tmp_path, caplog):
     trainer = make_trainer(tmp_path / "run", steps=6, overrides=["schedule.checkpoint_every=2"])
     trainer.start()
     trainer.train()
     folder = trainer.run.checkpoints
-    assert set_damaged_aside(folder, "coliags") == 6
+    assert take_newest(folder, "coliags", CPU).step == 6
     (folder / "step-000006" / "state.safetensors").write_bytes(b"")
     (folder / "step-000004" / "state.json").write_text("{")
-    assert set_damaged_aside(folder, "coliags") == 2
+    with pytest.raises(InputError, match=r"step-000006 is damaged: .*goes on from step-000004"):
+        read_checkpoint(folder / "step-000006", "coliags", CPU)
+    resumed = make_trainer(tmp_path / "run", steps=6)
+    resumed.resume()
+    assert resumed.step == 2
+    assert "step-000006 is damaged: state.safetensors is not what was written; set aside as damaged-" in caplog.text
     assert newest_checkpoint(folder).name == "step-000002"
     assert sorted(path.name.rsplit("-", 1)[0] for path in folder.glob("damaged-*")) == [
         "damaged-step-000004",
         "damaged-step-000006",
     ]
-    assert set_damaged_aside(tmp_path / "none", "coliags") == 0
+    assert take_newest(tmp_path / "none", "coliags", CPU) is None
+
+
+def test_every_flipped_byte_of_a_checkpoint_is_noticed(tmp_path):
+    checkpoint = latest_checkpoint(train(tmp_path / "run", steps=1).run.checkpoints)
+    assert subprocess.run(["sha256sum", "--check", "--quiet", CHECKSUMS], cwd=checkpoint, check=False).returncode == 0
+    generator = np.random.default_rng(0)
+    for file in sorted(checkpoint.iterdir()):
+        whole = file.read_bytes()
+        for place in [0, len(whole) - 1, *generator.integers(0, len(whole), 20)]:
+            spoiled = bytearray(whole)
+            spoiled[place] ^= 1 << int(generator.integers(8))
+            file.write_bytes(spoiled)
+            with pytest.raises(DamagedCheckpointError):
+                read_checkpoint(checkpoint, "coliags", CPU)
+        file.write_bytes(whole)
+    assert read_checkpoint(checkpoint, "coliags", CPU).step == 1
+
+
+@pytest.mark.parametrize("change", [{"format": 99}, {"method": "other"}])
+def test_a_checkpoint_of_something_else_is_not_set_aside(tmp_path, change):
+    checkpoint = latest_checkpoint(train(tmp_path / "run", steps=1).run.checkpoints)
+    state = checkpoint / "state.json"
+    state.write_text(json.dumps({**json.loads(state.read_text()), **change}))
+    write_checksums(checkpoint)
+    with pytest.raises(InputError, match=r"has format 99|is of method 'other'"):
+        make_trainer(tmp_path / "run", steps=1).resume()
+    assert checkpoint.is_dir()
 
 
 def test_optimizer_groups_must_be_the_fields(tmp_path):

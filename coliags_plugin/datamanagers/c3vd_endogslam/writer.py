@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from coliags_plugin.core.arrays import read_arrays
+from coliags_plugin.core.files import write_arrays
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.datamanagers.c3vd_endogslam.reader import PREPARED_DEPTH, SH0
@@ -50,8 +52,7 @@ def write_params(
         InputError: The trajectory has no intrinsics, or the folder cannot be written.
     """
     endogslam.write(path, trajectory)
-    with np.load(path) as file:
-        arrays = dict(file)
+    arrays = read_arrays(path, "what was just written", optional=None)
     to_first = inverse(trajectory.camera_to_world[:1])[0]
     means = positions @ to_first[:3, :3].T + to_first[:3, 3]
     count = len(means)
@@ -63,7 +64,7 @@ def write_params(
         "log_scales": np.full((count, 1), np.log(_SIZE), np.float32),
         "timestep": np.zeros(count, np.float32),
     }
-    np.savez(path, allow_pickle=False, **arrays)
+    write_arrays(path, arrays)
     return np.asarray(means)
 
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from coliags_plugin.core.files import make_folder
 from coliags_plugin.core.images import write_image, write_mask
+from coliags_plugin.poses.colmap import write_reconstruction
 
 if TYPE_CHECKING:
     import pycolmap
@@ -80,6 +80,4 @@ def add_points(
 
 def write_model(folder: Path, model: pycolmap.Reconstruction) -> None:
     """Write a binary model into ``sparse/0`` of a scene's folder."""
-    target = folder / "sparse" / "0"
-    make_folder(target)
-    model.write_binary(str(target))
+    write_reconstruction(folder / "sparse" / "0", model)

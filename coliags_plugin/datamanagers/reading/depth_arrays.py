@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Shaped
 
+from coliags_plugin.core.arrays import read_array
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.reading.depth_formats import DepthFormat, DepthSteps
 
@@ -25,10 +26,7 @@ class DepthArray(DepthFormat):
     def read(self, path: Path) -> Shaped[np.ndarray, "H W"]:
         """See :class:`DepthFormat`."""
         expected = "an .npy array [H, W] of real numbers"
-        try:
-            array = np.load(path, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            raise InputError(f"cannot read {path}: {error}", expected, "Write it again") from error
+        array = read_array(path, expected)
         if array.ndim == 3 and array.shape[2] == 1:
             array = array[..., 0]
         if array.ndim != 2 or not (np.issubdtype(array.dtype, np.floating) or np.issubdtype(array.dtype, np.integer)):
@@ -37,7 +35,8 @@ class DepthArray(DepthFormat):
 
     def z_depth(self, stored: Shaped[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
         """See :class:`DepthFormat`."""
-        depth = (stored * self.size).astype(np.float32)
+        with np.errstate(over="ignore"):
+            depth = (stored * self.size).astype(np.float32)
         depth[~(np.isfinite(depth) & (depth > 0.0))] = np.nan
         return depth
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import io
+import warnings
 from pathlib import Path
 from typing import cast
 
 import numpy as np
 from jaxtyping import Shaped, UInt8
 
+from coliags_plugin.core import bounds
 from coliags_plugin.core.errors import InputError
 
 
@@ -68,6 +71,27 @@ def size_of(path: Path) -> tuple[int, int]:
     return width, height
 
 
+def _check_size(path: Path, data: bytes) -> None:
+    """Refuse what its header says would fill the memory, before anything is decoded."""
+    import PIL.Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the decoder says what is wrong with a damaged file
+            with PIL.Image.open(io.BytesIO(data)) as header:
+                width, height = header.size
+    except PIL.Image.DecompressionBombError as error:
+        raise InputError(f"{path}: {error}", f"an image of at most {bounds.IMAGE_PIXELS:,} pixels") from error
+    except Exception:  # of a kind that Pillow does not know, or damaged: the decoder sees that
+        return
+    if width * height > bounds.IMAGE_PIXELS or max(width, height) > bounds.IMAGE_SIDE:
+        raise InputError(
+            f"{path} says that it has {width} x {height} pixels",
+            f"at most {bounds.IMAGE_PIXELS:,} pixels, and {bounds.IMAGE_SIDE} a side",
+            "It is damaged, or not a frame of a video",
+        )
+
+
 def read_mask(path: Path) -> Shaped[np.ndarray, "H W"]:
     """Read an 8-bit mask, of one channel or of three equal ones: True where it is not black. [H, W]
 
@@ -115,7 +139,11 @@ def _read(path: Path) -> np.ndarray:
         raise InputError(f"cannot read {path}: {error.strerror or error}", "a readable image") from error
     # Decoders accept truncated PNGs to different degrees, so the last chunk is checked.
     complete = bool(data) and (not data.startswith(b"\x89PNG") or b"IEND" in data[-64:])
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if complete else None
+    _check_size(path, data)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if complete else None
+    except cv2.error:  # of more than 2^30 pixels, for instance
+        image = None
     if image is None:
         raise InputError(
             f"{path} ({len(data)} bytes) cannot be decoded",

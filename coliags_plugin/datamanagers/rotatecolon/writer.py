@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import make_folder, write_json
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.ply import point_properties, write_ply
@@ -68,4 +69,7 @@ def _write_exr(path: Path, image: UInt8[np.ndarray, "H W 3"], depth: Float[np.nd
     channels["ViewLayer.Depth.Z"] = depth
     make_folder(path.parent)
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    OpenEXR.File(header, channels).write(str(path))
+    try:
+        OpenEXR.File(header, channels).write(str(path))
+    except RuntimeError as error:  # the only error it knows, of a full disk too
+        raise InputError(f"cannot write {path}: {error}", "a writable folder with space left") from error

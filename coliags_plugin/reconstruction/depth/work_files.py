@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import logging
 import shutil
@@ -16,7 +15,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import atomic_write, make_folder, write_json
+from coliags_plugin.core.files import atomic_write, make_folder, write_arrays, write_json
 from coliags_plugin.core.locks import LockedError, locked
 
 log = logging.getLogger(__name__)
@@ -47,9 +46,7 @@ class WorkFolder:
         Raises:
             InputError: The folder cannot be written.
         """
-        data = io.BytesIO()
-        np.savez(data, allow_pickle=False, **arrays)
-        atomic_write(self._file(stage, index), data.getvalue())
+        write_arrays(self._file(stage, index), arrays)
 
     def load(self, stage: str, index: int) -> dict[str, np.ndarray]:
         """The results of a frame of a pass."""

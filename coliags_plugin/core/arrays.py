@@ -1,0 +1,77 @@
+"""Reading NPZ and NPY files of unknown origin: no pickle, and no more memory than the file is worth."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Collection
+from pathlib import Path
+
+import numpy as np
+
+from coliags_plugin.core.errors import InputError
+
+#: What an archive may always expand to, bytes.
+_SMALL = 64 << 20
+#: How many times its size a larger one may. Depth and points compress to a half or a tenth.
+_RATIO = 50
+#: What NumPy and zipfile raise on damaged files.
+_DAMAGED = (
+    OSError,
+    ValueError,
+    EOFError,
+    KeyError,
+    TypeError,
+    NotImplementedError,
+    RuntimeError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+
+
+def read_arrays(
+    path: Path, expected: str, needed: Collection[str] = (), optional: Collection[str] | None = ()
+) -> dict[str, np.ndarray]:
+    """Read arrays of an NPZ file by name.
+
+    Args:
+        path: The file.
+        expected: What it should be, for messages.
+        needed: Names that must be there.
+        optional: Names that are read where they are there; None: all.
+
+    Raises:
+        InputError: The file cannot be read, is damaged, lacks an array, holds other than plain arrays, or expands to
+            far more than its size.
+    """
+    try:
+        packed = path.stat().st_size
+        with zipfile.ZipFile(path) as archive:
+            unpacked = sum(entry.file_size for entry in archive.infolist())
+        if unpacked > max(_SMALL, _RATIO * packed):
+            raise InputError(f"{path} has {packed:,} bytes and expands to {unpacked:,}", expected, "It is no such data")
+        with np.load(path, allow_pickle=False) as archive:
+            wanted = archive.files if optional is None else {*needed, *optional}
+            arrays = {name: archive[name] for name in archive.files if name in wanted}
+    except _DAMAGED as error:
+        raise InputError(f"cannot read {path}: {error}", expected) from error
+    for name, array in arrays.items():
+        if not isinstance(array, np.ndarray):  # an entry of the archive that is no array
+            raise InputError(f"{path} holds '{name}', which is no array", expected)
+    missing = [name for name in needed if name not in arrays]
+    if missing:
+        raise InputError(f"{path} lacks {', '.join(missing)}", expected)
+    return arrays
+
+
+def read_array(path: Path, expected: str) -> np.ndarray:
+    """Read the array of an NPY file.
+
+    Raises:
+        InputError: The file cannot be read, is damaged, or is shorter than it says.
+    """
+    try:
+        # Mapped first: numpy would reserve what the header says, whatever follows.
+        return np.array(np.load(path, mmap_mode="r", allow_pickle=False))
+    except _DAMAGED as error:
+        raise InputError(f"cannot read {path}: {error}", expected, "Write it again") from error

@@ -1,0 +1,15 @@
+"""Largest magnitudes that are accepted from files, so that everything computed from them stays finite in float32."""
+
+from __future__ import annotations
+
+#: Of a coordinate or a depth, scene units. A kilometre where they are mm; float32 still tells 0.06 mm apart there, and
+#: squared distances stay far below its limit.
+LENGTH = 1e6
+#: Of a focal length or a principal point, pixels: a hundred times that of a telephoto lens on the largest images.
+PIXELS = 1e7
+#: Of the width and height of an image, pixels; OpenCV's remapping takes no more than 32767.
+IMAGE_SIDE = 32767
+#: Of the pixels of an image: an 8-bit RGB image has 300 MB then.
+IMAGE_PIXELS = 100_000_000
+#: Of a coefficient of lens distortion. Real ones are below 100, even of rational models.
+DISTORTION = 1e4

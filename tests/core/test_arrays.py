@@ -1,0 +1,88 @@
+"""NPZ and NPY files that are damaged or lie about their size."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from coliags_plugin.core.arrays import read_array, read_arrays
+from coliags_plugin.core.errors import InputError
+
+EXPECTED = "an NPZ file with an array 'positions'"
+
+
+def npz_bytes(compressed=False, **arrays):
+    data = io.BytesIO()
+    (np.savez_compressed if compressed else np.savez)(data, **arrays)
+    return data.getvalue()
+
+
+def test_wanted_arrays_come_back(tmp_path):
+    path = tmp_path / "a.npz"
+    path.write_bytes(npz_bytes(one=np.arange(6).reshape(2, 3), two=np.array(1.5), three=np.array("text")))
+    assert read_arrays(path, EXPECTED, ["one"])["one"].tolist() == [[0, 1, 2], [3, 4, 5]]
+    assert list(read_arrays(path, EXPECTED, ["one"], ["two", "nine"])) == ["one", "two"]
+    assert list(read_arrays(path, EXPECTED, optional=None)) == ["one", "two", "three"]
+    with pytest.raises(InputError, match=r"a\.npz lacks nine"):
+        read_arrays(path, EXPECTED, ["one", "nine"])
+
+
+def test_an_archive_that_expands_enormously_is_refused_before_it_does(tmp_path):
+    path = tmp_path / "bomb.npz"
+    path.write_bytes(npz_bytes(compressed=True, positions=np.zeros((10_000_000, 3), np.float64)))
+    assert path.stat().st_size < 1_000_000
+    with pytest.raises(InputError, match=r"expands to 240,000,\d\d\d"):
+        read_arrays(path, EXPECTED, ["positions"])
+
+
+def test_objects_are_refused(tmp_path):
+    path = tmp_path / "a.npz"
+    path.write_bytes(npz_bytes(positions=np.array([{}], object)))
+    with pytest.raises(InputError, match="cannot read"):
+        read_arrays(path, EXPECTED, ["positions"])
+    (tmp_path / "a.npy").write_bytes(b"")
+    np.save(tmp_path / "a.npy", np.array([{}], object))
+    with pytest.raises(InputError, match="cannot read"):
+        read_array(tmp_path / "a.npy", EXPECTED)
+
+
+def test_entries_that_are_no_arrays_are_refused(tmp_path):
+    path = tmp_path / "a.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("positions", b"text")
+    with pytest.raises(InputError, match="'positions', which is no array"):
+        read_arrays(path, EXPECTED, ["positions"])
+
+
+def test_a_header_that_promises_more_than_follows_reserves_nothing(tmp_path):
+    path = tmp_path / "a.npy"
+    header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (100000, 1000000), }"
+    path.write_bytes(b"\x93NUMPY\x01\x00" + (len(header)).to_bytes(2, "little") + header + bytes(100))
+    with pytest.raises(InputError, match="cannot read"):
+        read_array(path, EXPECTED)
+
+
+@settings(max_examples=300, deadline=None)
+@given(data=st.data())
+def test_any_damage_is_an_input_error(data, tmp_path_factory):
+    path = tmp_path_factory.getbasetemp() / "damaged.npz"
+    whole = npz_bytes(compressed=data.draw(st.booleans()), positions=np.arange(300.0).reshape(100, 3))
+    spoiled = bytearray(whole)
+    for _ in range(data.draw(st.integers(1, 4))):
+        spoiled[data.draw(st.integers(0, len(whole) - 1))] = data.draw(st.integers(0, 255))
+    path.write_bytes(spoiled[: data.draw(st.integers(0, len(whole)))] if data.draw(st.booleans()) else spoiled)
+    try:
+        arrays = read_arrays(path, EXPECTED, ["positions"])
+    except InputError:
+        return
+    assert arrays["positions"].nbytes <= 64 << 20
+
+
+def test_arrays_survive_a_round_trip(tmp_path):
+    np.save(tmp_path / "a.npy", np.arange(5))
+    assert read_array(tmp_path / "a.npy", EXPECTED).tolist() == [0, 1, 2, 3, 4]
