@@ -12,7 +12,7 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
 
 #: Training views that are decoded, at most.
-VIEWS = 32
+VIEWS = 16
 
 
 def baking_cameras(cameras: Sequence[Camera]) -> list[Camera]:

@@ -17,19 +17,19 @@ MARGIN = 1.25
 
 
 class ViewDecoder:
-    """Decodes a field for a view, and takes what lies beside it from Gaussians of no view in particular.
+    """Decodes a field for a view, and takes what lies beside it from other Gaussians.
 
     A field yields the Gaussians that a camera sees; without the others, a turn of the head would show nothing until
     the next decoding.
 
     Args:
         field: Of the run.
-        baked: Gaussians of the whole scene (:func:`~coliags_plugin.viewer.baking.bake`).
+        beside: Gaussians of the whole scene, of which those outside the view are shown.
         device: Of the field.
     """
 
-    def __init__(self, field: GaussianField, baked: Splats, device: torch.device) -> None:
-        self.baked = baked
+    def __init__(self, field: GaussianField, beside: Splats, device: torch.device) -> None:
+        self.beside = beside
         self._field = field
         self._device = device
 
@@ -42,7 +42,7 @@ class ViewDecoder:
         """
         wide = widened(camera)
         seen = Splats.of(self._field.gaussians(wide.to(self._device)))
-        return seen.and_also(self.baked.part(~in_view(self.baked.centers, wide)))
+        return seen.and_also(self.beside.part(~in_view(self.beside.centers, wide)))
 
 
 def widened(camera: Camera) -> Camera:

@@ -7,13 +7,10 @@ from html import escape
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
-from scipy.spatial import cKDTree
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.outputs.image_files import as_array
 from coliags_plugin.outputs.page import refuse_folder
 from coliags_plugin.viewer.content import Content
 from coliags_plugin.viewer.layers import add_cameras
@@ -30,8 +27,6 @@ LARGEST_PAGE = 5_000_000
 _CAUTION = 0.98
 #: Bytes of a page that a Gaussian takes at least: 32, compressed and in base 64.
 _FEWEST_BYTES = 30
-#: Share of the Gaussians that are near enough to need no smaller cells.
-_NEAR_SHARE = 0.2
 
 
 def save_page(trained: TrainedRun, output: Path, largest: int = LARGEST_PAGE) -> Path:
@@ -75,22 +70,14 @@ def fitting_page(content: Content, largest: int) -> tuple[Splats, str]:
     nothing = content.baked.part(np.zeros(len(content.baked), bool))
     empty = len(_page(content, nothing).encode())
     count = min(len(content.baked), max(0, largest - empty) // _FEWEST_BYTES)
-    distances = _distances(content)
     while count > 0:
-        splats = merged_to(content.baked, count, distances)
+        splats = merged_to(content.baked, count, content.distances)
         page = _page(content, splats)
         size = len(page.encode())
         if size <= largest:
             return splats, page
         count = min(count - 1, int(_CAUTION * len(splats) * (largest - empty) / (size - empty)))
     raise InputError(f"a page of {largest} bytes", f"more than {empty} bytes, what an empty one takes")
-
-
-def _distances(content: Content) -> Float[np.ndarray, "N"]:
-    """From each Gaussian to the nearest training camera, the nearest fifth counted alike. [N]"""
-    centers = np.stack([as_array(frame.camera.center).astype(np.float64) for frame in content.trained.scene.train])
-    found = np.asarray(cKDTree(centers).query(content.baked.centers)[0])
-    return np.maximum(found, np.quantile(found, _NEAR_SHARE)) if len(found) else found
 
 
 def _page(content: Content, splats: Splats) -> str:

@@ -71,7 +71,7 @@ class Session:
         self.controls = Controls(client, content, self)
         client.camera.on_update(lambda _: self.camera_moved())
         if content.decoder is not None:
-            self._send(content.baked, 0.0)
+            self._send(content.decoder.beside, 0.0)
             self._pace.want()
 
     # ---- What has changed
@@ -151,7 +151,7 @@ class Session:
         began = time.perf_counter()
         with self._content.lock:
             at_camera = self.controls.light == AT_CAMERA
-            splats = decoder.of(self._camera()) if at_camera else decoder.baked
+            splats = decoder.of(self._camera()) if at_camera else self._content.baked
         self._send(splats.part(splats.opacities >= self.controls.least_opacity), time.perf_counter() - began)
 
     def _send(self, splats: Splats, decoding: float) -> None:

@@ -76,7 +76,7 @@ def test_splats_come_at_once_and_then_as_seen_from_the_camera(viewer):
     content = viewer.content
     with connected(viewer) as (client, camera):
         first = splats_of(client.wait_for("GaussianSplatsMessage")["props"]["buffer"])
-        np.testing.assert_allclose(first["centers"] * content.unit, content.baked.centers, rtol=1e-5)
+        np.testing.assert_allclose(first["centers"] * content.unit, content.decoder.beside.centers, rtol=1e-5)
         second = newest(client)
     seen = Splats.of(content.trained.model.field.gaussians(widened(session_camera(camera))))
     np.testing.assert_allclose(second["centers"][: len(seen)] * content.unit, seen.centers, atol=1e-4)
