@@ -5,17 +5,33 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from coliags_plugin.api.comparing import ablate, compare, variant
+    from coliags_plugin.api.exchange import import_splats
+    from coliags_plugin.api.reconstructing import reconstruct
     from coliags_plugin.api.reports import report
     from coliags_plugin.api.runs import Run, load_run
     from coliags_plugin.api.scenes import load_scene, make_phantom
     from coliags_plugin.api.training import train
 
 __version__ = "0.1.0"
-__all__ = ["Run", "ablate", "compare", "load_run", "load_scene", "make_phantom", "report", "train", "variant"]
+__all__ = [
+    "Run",
+    "ablate",
+    "compare",
+    "import_splats",
+    "load_run",
+    "load_scene",
+    "make_phantom",
+    "reconstruct",
+    "report",
+    "train",
+    "variant",
+]
 
 #: Names of the API by its modules.
 _MODULES = {
     "comparing": ("ablate", "compare", "variant"),
+    "exchange": ("import_splats",),
+    "reconstructing": ("reconstruct",),
     "reports": ("report",),
     "runs": ("Run", "load_run"),
     "scenes": ("load_scene", "make_phantom"),

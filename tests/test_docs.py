@@ -24,12 +24,14 @@ from coliags_plugin.config.method_config import MethodConfig, OptimizerSettings,
 from coliags_plugin.config.registry import REGISTRIES, datamanagers
 from coliags_plugin.core.render_output import OUTPUTS
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.coverage.settings import CoverageSettings
 from coliags_plugin.datamanagers.recognition import formats
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
 from coliags_plugin.datamanagers.splits import held_out
 from coliags_plugin.engine.randomness import PURPOSES
 from coliags_plugin.method_check.check import CHECKS
 from coliags_plugin.phantom.settings import PRESETS, PhantomSettings
+from coliags_plugin.pipeline.settings import FrameSettings
 from tests.scenes import SMALL, write_wall
 
 ROOT = Path(__file__).parents[1]
@@ -170,7 +172,22 @@ def parsed(argv: list[str], monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 #: Subcommands that running text names alone.
-ALONE = ("train", "eval", "render", "report", "compare", "ablate", "phantom", "config", "check", "poses")
+ALONE = (
+    "train",
+    "eval",
+    "render",
+    "mesh",
+    "coverage",
+    "report",
+    "compare",
+    "ablate",
+    "phantom",
+    "config",
+    "check",
+    "poses",
+    "coverage",
+    "reconstruct",
+)
 #: Methods that docs/example_package adds; tests/test_third_party_package.py trains them.
 OF_THE_EXAMPLE = {path.stem for path in (DOCS / "example_package").rglob("*.yaml")}
 
@@ -264,6 +281,8 @@ OPTIONS = "| option | default | values | what |"
 FORMATS = [name for name in formats() if datamanagers.source(name) == "built in"]
 OPTION_TABLES = [
     (PhantomSettings, "phantom.md", "| setting | default | range | what |"),
+    (CoverageSettings, "coverage.md", OPTIONS),
+    (FrameSettings, "reconstruct.md", "| setting | default | range | what |"),
     *((datamanagers.get(name).Settings, f"layouts/{name}.md", OPTIONS) for name in FORMATS),
 ]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,8 +17,11 @@ if TYPE_CHECKING:
     from coliags_plugin.config.method_config import MethodConfig
     from coliags_plugin.core.cameras import Camera
     from coliags_plugin.core.scenes import Scene
+    from coliags_plugin.coverage.writing import MeasuredCoverage
     from coliags_plugin.engine.rendering import DepthKind
     from coliags_plugin.engine.trained import TrainedRun
+    from coliags_plugin.exchange.exporting import Exported
+    from coliags_plugin.meshing.writing import MeshedRun
     from coliags_plugin.results.record import Result
     from coliags_plugin.viewer.serving import Viewer
 
@@ -200,6 +203,110 @@ class Run:
         folder = Path(output) if output is not None else self.path / ("renders" if trained.lamp is None else "relit")
         render_run(trained, folder, frames, video, fps, overwrite, channels, depth_kind, depth_tiff)
         return folder
+
+    def mesh(
+        self,
+        output: str | Path | None = None,
+        *,
+        settings: Mapping[str, Any] | None = None,
+        formats: Sequence[str] = ("ply", "obj", "glb"),
+        truth: str | Path | None = None,
+        overwrite: bool = False,
+    ) -> MeshedRun:
+        """Fuse the depth rendered from the training poses into a triangle mesh, and write it.
+
+        Args:
+            output: Folder to make; None: ``mesh`` in the run folder.
+            settings: Options of meshing by name (docs/meshes.md 3), for instance ``{"voxel_size": 0.5}``.
+            formats: Of the files.
+            truth: True surface to compare with: a mesh in the world of the scene, mm, or the folder of a scene with
+                one; None: that of the scene, where there is one.
+            overwrite: Replace the folder where it exists.
+
+        Returns:
+            The mesh, its folder, and the comparison with the true surface where there is one.
+
+        Raises:
+            InputError: See :meth:`load`; an option is unknown or invalid, the method renders no such depth, there is no
+                surface, the truth is of another world or unit, or the folder exists or cannot be written.
+        """
+        from coliags_plugin.meshing.settings import mesh_settings
+        from coliags_plugin.meshing.writing import mesh_run
+
+        chosen = mesh_settings(settings or {})
+        folder = Path(output) if output is not None else self.path / "mesh"
+        against = None if truth is None else Path(truth)
+        return mesh_run(self.load(), folder, chosen, formats, against, overwrite)
+
+    def export(
+        self,
+        output: str | Path | None = None,
+        form: str = "ply",
+        *,
+        light: str = "mean",
+        measure: bool = True,
+        overwrite: bool = False,
+    ) -> Exported:
+        """Write the run's Gaussians to a file, and a record of what it is and loses to ``FILE.json``.
+
+        Args:
+            output: The file; None: ``export/SCENE.FORMAT`` in the run folder.
+            form: ``ply``, ``spz``, ``splat`` or ``glb``.
+            light: ``mean`` or ``flattened``: what is baked into colours that depend on the lamp (docs/export.md 2).
+            measure: Compare the file with the run on the held-out views, for the record.
+            overwrite: Replace a file that is there.
+
+        Raises:
+            InputError: See :meth:`load`; the method has no Gaussians, the run was relit, there is no such format or
+                light, or the file exists or cannot be written.
+        """
+        from coliags_plugin.exchange.exporting import export_run
+
+        trained = self.load()
+        file = Path(output) if output is not None else self.path / "export" / f"{self.scene_name}.{form}"
+        return export_run(trained, file, form, light, measure, overwrite)
+
+    def coverage(
+        self,
+        output: str | Path | None = None,
+        *,
+        settings: Mapping[str, Any] | None = None,
+        mesh: str | Path | None = None,
+        truth: str | Path | None = None,
+        overwrite: bool = False,
+    ) -> MeasuredCoverage:
+        """Measure what the recording shows of the wall and what it misses, and write it. Research use only.
+
+        Args:
+            output: Folder to make; None: ``coverage`` in the run folder.
+            settings: What counts as seen, by name (docs/coverage.md 3), for instance ``{"far": 40.0}``.
+            mesh: The wall, PLY, OBJ or GLB, in mm in the world of the poses; None: ``mesh/mesh.ply`` in the run folder,
+                or else the fused depth of the run.
+            truth: True surface to measure against: a mesh in the world of the scene, mm, or the folder of a scene with
+                one; None: that of the scene, where there is one.
+            overwrite: Replace the folder where it exists.
+
+        Raises:
+            InputError: See :meth:`load`; an option is unknown or invalid, the unit of length is unknown, the mesh
+                cannot be read, is not where the cameras look or is no tube around them, or the folder exists or cannot
+                be written.
+        """
+        from coliags_plugin.coverage.settings import coverage_settings
+        from coliags_plugin.coverage.writing import check_free, measure_scene, open_recording
+        from coliags_plugin.meshes.files import read_mesh
+
+        chosen = coverage_settings(settings or {})
+        folder = Path(output) if output is not None else self.path / "coverage"
+        check_free(folder, overwrite)
+        file = Path(mesh) if mesh is not None else self.path / "mesh" / "mesh.ply"
+        if mesh is not None or file.is_file():
+            wall, scene = read_mesh(file), open_recording(self.data or self.folder.identity().scene_path)
+        else:
+            from coliags_plugin.meshing.fusion import fuse_run
+
+            trained = self.load()
+            wall, scene = fuse_run(trained), trained.scene
+        return measure_scene(scene, wall, folder, chosen, None if truth is None else Path(truth), overwrite)
 
     def view(self, *, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
         """Serve the run to browsers (docs/viewer.md), until the viewer is closed.

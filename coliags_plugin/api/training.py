@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,8 +11,6 @@ from coliags_plugin.config.assignments import assignments
 from coliags_plugin.config.method_config import method_name
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.run_folder import RunFolder
-
-log = logging.getLogger(__name__)
 
 
 def train(
@@ -50,31 +47,17 @@ def train(
         InterruptedRunError: Ctrl-C, after the state was saved.
         NotFiniteError: A loss or parameter became NaN or infinite.
     """
-    from coliags_plugin.engine.data_formats import load_method_for, load_scene
     from coliags_plugin.engine.devices import choose_device
-    from coliags_plugin.engine.resuming import resumed_method, resumed_seed
-    from coliags_plugin.engine.trainer import Trainer
+    from coliags_plugin.engine.training import TrainingRequest, resume_training, start_training
 
     if resume and overwrite:
         raise InputError("--resume and --overwrite together", "one of them")
     data, on = Path(data), choose_device(device)
     named = {"schedule.steps": steps, "renderer.name": renderer}
     chosen = {key: value for key, value in named.items() if value is not None}
-    overrides = (*assignments(settings), *assignments(chosen))
+    request = TrainingRequest(method, data, (*assignments(settings), *assignments(chosen)), seed, data_format)
     folder = _run_folder(method, data, output, resume)
-    if resume:
-        folder = RunFolder.existing(folder.path)
-        loaded = resumed_method(folder, method, data, overrides, data_format)
-        seed = resumed_seed(folder, seed)
-    else:
-        folder.check_free(overwrite)
-        loaded = load_method_for(data, method, overrides, data_format)
-    trainer = Trainer(loaded, load_scene(loaded.config, data), str(data.resolve()), folder, seed or 0, on)
-    log.info("renderer %s: %s", trainer.chosen.name, trainer.chosen.reason)
-    if resume:
-        trainer.resume()
-    else:
-        trainer.start(overwrite)
+    trainer = resume_training(request, folder, on) if resume else start_training(request, folder, on, overwrite)
     trainer.train()
     return Run(folder.path, data=data, device=device)
 

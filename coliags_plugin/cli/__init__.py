@@ -13,13 +13,18 @@ from coliags_plugin.cli.ablate import Ablate
 from coliags_plugin.cli.check import Check
 from coliags_plugin.cli.compare import Compare
 from coliags_plugin.cli.config import Config
+from coliags_plugin.cli.coverage import Coverage
 from coliags_plugin.cli.data import Data
 from coliags_plugin.cli.depth import Depth
 from coliags_plugin.cli.doctor import Doctor
 from coliags_plugin.cli.evaluate import Evaluate
+from coliags_plugin.cli.export import Export
+from coliags_plugin.cli.import_splats import Import
 from coliags_plugin.cli.list import List
+from coliags_plugin.cli.mesh import Mesh
 from coliags_plugin.cli.phantom import Phantom
 from coliags_plugin.cli.poses import Poses
+from coliags_plugin.cli.reconstruct import Reconstruct
 from coliags_plugin.cli.render import Render
 from coliags_plugin.cli.report import Report
 from coliags_plugin.cli.results import Results
@@ -29,10 +34,15 @@ from coliags_plugin.cli.view import View
 from coliags_plugin.cli.weights import Weights
 
 Command = (
-    Annotated[Phantom, tyro.conf.subcommand("phantom")]
+    Annotated[Reconstruct, tyro.conf.subcommand("reconstruct")]
+    | Annotated[Phantom, tyro.conf.subcommand("phantom")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("eval")]
     | Annotated[Render, tyro.conf.subcommand("render")]
+    | Annotated[Coverage, tyro.conf.subcommand("coverage")]
+    | Annotated[Mesh, tyro.conf.subcommand("mesh")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Import, tyro.conf.subcommand("import")]
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Compare, tyro.conf.subcommand("compare")]
     | Annotated[Ablate, tyro.conf.subcommand("ablate")]

@@ -5,39 +5,15 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
+from coliags_plugin.config.assigned_settings import settings_of
 from coliags_plugin.core.errors import InputError
 
 if TYPE_CHECKING:
     from coliags_plugin.core.settings import Settings
 
 S = TypeVar("S", bound="Settings")
-
-
-def settings_of(kind: type[S], assignments: Sequence[str], prefix: str = "") -> S:
-    """Settings from their defaults and ``--set`` assignments.
-
-    Args:
-        kind: The class.
-        assignments: ``key.path=value``.
-        prefix: Prefix of the keys in messages.
-
-    Raises:
-        InputError: An assignment is malformed, or a key or value is invalid; the message names it.
-    """
-    from pydantic import ValidationError
-
-    from coliags_plugin.config.yaml_tree import Node, override_all
-    from coliags_plugin.core.settings import first_error
-
-    tree = override_all(Node({}, "options"), assignments)
-    try:
-        # Merged with the defaults, as a nested part's defaults may differ from its class's.
-        return kind.model_validate(_upon(kind().model_dump(), tree.plain()))
-    except ValidationError as error:
-        key, message, value = first_error(error)
-        raise InputError(f"--set {prefix}{key}: {message} (got {value!r})") from error
 
 
 def settings_among(kind: type[S], assignments: Sequence[str], prefix: str) -> tuple[S, list[str]]:
@@ -48,12 +24,6 @@ def settings_among(kind: type[S], assignments: Sequence[str], prefix: str) -> tu
     """
     own = [assignment.removeprefix(prefix) for assignment in assignments if assignment.startswith(prefix)]
     return settings_of(kind, own, prefix), [item for item in assignments if not item.startswith(prefix)]
-
-
-def _upon(base: Any, over: Any) -> Any:
-    if not isinstance(base, dict) or not isinstance(over, dict):
-        return over
-    return {**base, **{key: _upon(base.get(key), value) for key, value in over.items()}}
 
 
 def refuse_output(out: Path, source: Path, overwrite: bool) -> None:

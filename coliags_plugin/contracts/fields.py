@@ -15,7 +15,7 @@ from typing_extensions import Self
 from coliags_plugin.contracts.schedule import Schedule
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
-from coliags_plugin.core.lamps import Lamp
+from coliags_plugin.core.lamps import HeldLight, Lamp
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
 
@@ -64,6 +64,11 @@ class GaussianField(Field):
     """:class:`Camera` -> :class:`Gaussians`, for splatting renderers."""
 
     @property
+    def slots_per_element(self) -> int:
+        """Gaussians that an element may yield: ``source_index`` divided by it is the element."""
+        return 1
+
+    @property
     def feature_channels(self) -> frozenset[str]:
         """Names of the feature channels of its Gaussians, each of which is an output."""
         return frozenset()
@@ -74,6 +79,10 @@ class GaussianField(Field):
 
     def gaussians_in_training(self, camera: Camera, generator: torch.Generator) -> Gaussians:
         """:meth:`gaussians` in a training step: with noise from the generator where there is any; default: without."""
+        return self.gaussians(camera)
+
+    def gaussians_in_light(self, camera: Camera, light: HeldLight) -> Gaussians:
+        """:meth:`gaussians` with the lamp held instead of moving with the camera; default: of fields without a lamp."""
         return self.gaussians(camera)
 
 

@@ -1,9 +1,11 @@
-"""Lamp of an endoscope, for rendering a scene under another light than it was recorded with."""
+"""Lamps of endoscopes, for rendering a scene under another light than it was recorded with."""
 
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Float
@@ -13,6 +15,8 @@ from torch import Tensor
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.settings import Settings
 
+#: Shortest distance to a lamp, scene units.
+_MIN_DISTANCE = 1e-6
 _Finite = Annotated[float, Option(allow_inf_nan=False)]
 
 
@@ -55,3 +59,78 @@ class Lamp(Settings):
         """
         cosines = (directions @ self.axis(camera)).clamp_min(0.0)
         return torch.as_tensor(self.intensity * cosines.pow(self.power))
+
+
+class HeldLight(ABC):
+    """Light that stays as it is while the camera moves."""
+
+    @abstractmethod
+    def incidence(self, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
+        """Distance of points to the lamp, scene units, and cosine of their angle to its axis, in [0, 1]. [N], [N]"""
+
+    @property
+    @abstractmethod
+    def described(self) -> dict[str, Any]:
+        """Plain values, for a record."""
+
+    @abstractmethod
+    def towards(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """Unit vectors from points of a surface to the lamp. [N, 3]
+
+        Args:
+            points: On the surface, world frame. [N, 3]
+            normals: Unit normals there. [N, 3]
+        """
+
+
+@dataclass(frozen=True)
+class LightOfCamera(HeldLight):
+    """The lamp on a camera that stays where it is.
+
+    Attributes:
+        camera: At whose optical centre the lamp is, along whose optical axis it shines.
+    """
+
+    camera: Camera
+
+    @property
+    def described(self) -> dict[str, Any]:
+        """The pose of the camera."""
+        return {"camera_to_world": self.camera.camera_to_world.tolist()}
+
+    def incidence(self, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
+        """See :meth:`HeldLight.incidence`; the cosine is 0 behind the camera."""
+        camera = self.camera.to(points.device, points.dtype)
+        sight = points - camera.center
+        distances = sight.norm(dim=1)
+        return distances, (sight @ camera.optical_axis / distances.clamp_min(_MIN_DISTANCE)).clamp(0.0, 1.0)
+
+    def towards(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """See :meth:`HeldLight.towards`."""
+        return torch.nn.functional.normalize(self.camera.center.to(points) - points, dim=1)
+
+
+@dataclass(frozen=True)
+class FlattenedLight(HeldLight):
+    """The same light everywhere, which falls on every surface along its normal.
+
+    Attributes:
+        distance: To the lamp, scene units.
+        cosine: Of the angle to the lamp's axis.
+    """
+
+    distance: float
+    cosine: float
+
+    @property
+    def described(self) -> dict[str, Any]:
+        """Distance and cosine."""
+        return {"distance": self.distance, "cosine": self.cosine}
+
+    def incidence(self, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
+        """See :meth:`HeldLight.incidence`."""
+        return points.new_full((len(points),), self.distance), points.new_full((len(points),), self.cosine)
+
+    def towards(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """See :meth:`HeldLight.towards`."""
+        return normals

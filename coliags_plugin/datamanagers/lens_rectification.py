@@ -56,6 +56,11 @@ class LensRectification(Rectification):
             undistort=undistort,
         )
 
+    @property
+    def stored_lens(self) -> Lens:
+        """See :class:`Rectification`."""
+        return self.lens
+
     def image(self, rgb: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w 3"]:
         """See :class:`Rectification`."""
         return self._made.image(rgb)

@@ -15,6 +15,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.datamanagers.reading.images import read_rgb, resize_nearest, resize_rgb
 from coliags_plugin.lenses.models import Lens
+from coliags_plugin.lenses.pinhole import PinholeLens
 from coliags_plugin.lenses.undistortion import Undistortion
 
 #: How far a raw frame's aspect ratio may be from the lens's: rounding to whole pixels, but no cropping.
@@ -85,6 +86,18 @@ class Rectification:
     def of_pinhole(cls, pinhole: Intrinsics, described_by: Path, size: tuple[int, int]) -> Rectification:
         """The rectification of images of a pinhole camera; ``size`` as for :meth:`through`."""
         return cls(pinhole.width, pinhole.height, pinhole.resized(*size), described_by)
+
+    @property
+    def stored_lens(self) -> Lens:
+        """The lens of the stored images; a pinhole camera where they are not distorted."""
+        if self.undistortion is not None:
+            return self.undistortion.lens
+        return PinholeLens.of(self.pinhole.resized(self.source_width, self.source_height))
+
+    @property
+    def stored_content(self) -> Bool[np.ndarray, "H W"] | None:
+        """Stored pixels with image content; None where all have."""
+        return None if self.undistortion is None else self.undistortion.source_mask
 
     @property
     def width(self) -> int:

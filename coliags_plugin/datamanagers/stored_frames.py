@@ -54,6 +54,11 @@ class StoredFrame(Frame):
             object.__setattr__(self, name, value)
 
     @property
+    def shot(self) -> Shot:
+        """Files, pose and camera of the frame."""
+        return self._shot
+
+    @property
     def image(self) -> UInt8[Tensor, "H W 3"]:
         """See :class:`Frame`."""
         return torch.from_numpy(self._read().image if self._keep else _image(self._shot))

@@ -1,7 +1,8 @@
-"""Software versions for the provenance of a run."""
+"""Provenance of a run."""
 
 from __future__ import annotations
 
+import math
 import platform
 import subprocess
 from pathlib import Path
@@ -10,6 +11,51 @@ from typing import Any
 import torch
 
 import coliags_plugin
+from coliags_plugin.config.method_config import LoadedMethod
+from coliags_plugin.core.scenes import Scene
+from coliags_plugin.engine.model import Model
+from coliags_plugin.renderers.choice import ChosenRenderer
+
+
+def run_provenance(
+    method: LoadedMethod,
+    scene: Scene,
+    scene_path: str,
+    seed: int,
+    device: torch.device,
+    chosen: ChosenRenderer,
+    model: Model,
+) -> dict[str, Any]:
+    """What a run is and was made with.
+
+    Args:
+        method: The method, resolved.
+        scene: What the run is on.
+        scene_path: Where that was read from.
+        seed: Of every random stream.
+        device: Where it computes.
+        chosen: Its renderer.
+        model: Of the run.
+    """
+    footprint = scene.pixel_footprint
+    return {
+        "method": method.name,
+        "seed": seed,
+        "steps": method.config.schedule.steps,
+        "device": str(device),
+        "renderer": chosen.name,
+        "renderer_reason": chosen.reason,
+        "untrained_views": {name: module.untrained_views for name, module in model.view_modules.items()},
+        **software(),
+        "scene": {
+            "name": scene.name,
+            "path": scene_path,
+            "extent": scene.extent,
+            "pixel_footprint": footprint if math.isfinite(footprint) else None,  # without points there is none
+            "points": len(scene.points),
+            "provenance": scene.provenance,
+        },
+    }
 
 
 def software() -> dict[str, Any]:

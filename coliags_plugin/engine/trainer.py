@@ -29,7 +29,7 @@ from coliags_plugin.engine.devices import device_name
 from coliags_plugin.engine.model import Model, make_view_modules
 from coliags_plugin.engine.optimizers import Optimizers
 from coliags_plugin.engine.progress import ProgressReport
-from coliags_plugin.engine.provenance import software
+from coliags_plugin.engine.provenance import run_provenance
 from coliags_plugin.engine.randomness import generators
 from coliags_plugin.engine.resuming import check_same_run, record_schedule, resume_command
 from coliags_plugin.engine.run_folder import RunFolder
@@ -241,25 +241,7 @@ class Trainer:
 
     def provenance(self) -> dict[str, Any]:
         """Provenance of the run."""
-        footprint = self.scene.pixel_footprint
-        return {
-            "method": self.method.name,
-            "seed": self.seed,
-            "steps": self.steps,
-            "device": str(self.device),
-            "renderer": self.chosen.name,
-            "renderer_reason": self.chosen.reason,
-            "untrained_views": {name: module.untrained_views for name, module in self.model.view_modules.items()},
-            **software(),
-            "scene": {
-                "name": self.scene.name,
-                "path": self.scene_path,
-                "extent": self.scene.extent,
-                "pixel_footprint": footprint if math.isfinite(footprint) else None,  # without points there is none
-                "points": len(self.scene.points),
-                "provenance": self.scene.provenance,
-            },
-        }
+        return run_provenance(self.method, self.scene, self.scene_path, self.seed, self.device, self.chosen, self.model)
 
     def _check_parameters(self, sums: dict[str, float], step: int) -> None:
         for group, total in sums.items():

@@ -16,6 +16,7 @@ from coliags_plugin.config.components import AppearanceHeadNode, GeometryHeadNod
 from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.lamps import HeldLight
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.fields.anchor_points import initial_positions, neighbour_log_scales, voxelize
@@ -123,6 +124,11 @@ class AnchorField(GaussianField):
         """Number of anchors."""
         return len(self.anchors)
 
+    @property
+    def slots_per_element(self) -> int:
+        """Children of an anchor."""
+        return int(self.settings.children)
+
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Offsets, features, scalings, and the three MLPs."""
         return {
@@ -151,6 +157,13 @@ class AnchorField(GaussianField):
 
     def gaussians(self, camera: Camera) -> Gaussians:
         """Decode the visible anchors (docs/methods.md 3.5)."""
+        return self._decoded(camera, None)
+
+    def gaussians_in_light(self, camera: Camera, light: HeldLight) -> Gaussians:
+        """The same with distance and angle of the anchors to the lamp those of a held light."""
+        return self._decoded(camera, light)
+
+    def _decoded(self, camera: Camera, light: HeldLight | None) -> Gaussians:
         camera = camera.to(self.anchors.device, self.anchors.dtype)
         visible = self.visible_anchors(camera)
         # index_select throughout: half the time of indexing, forward and backward.
@@ -162,6 +175,8 @@ class AnchorField(GaussianField):
         directions = sight / distances
         # Anchors behind the lens would have negative cosines; the lamp does not shine there (docs/methods.md 3.3).
         cosines = (directions @ camera.optical_axis).clamp(0.0, 1.0)[:, None]
+        if light is not None:
+            distances, cosines = (values[:, None] for values in light.incidence(anchors))
 
         opacities, covariances = self.geometry_head(features, directions)
         colors = self.appearance_head(features, directions, distances, cosines)

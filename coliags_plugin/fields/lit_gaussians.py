@@ -17,7 +17,7 @@ from coliags_plugin.contracts import LitField, Schedule
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
-from coliags_plugin.core.lamps import Lamp
+from coliags_plugin.core.lamps import HeldLight, Lamp
 from coliags_plugin.core.rotations import third_axes
 from coliags_plugin.core.scenes import PointCloud, Scene
 from coliags_plugin.core.settings import Settings
@@ -159,11 +159,15 @@ class LitGaussians(ExplicitField, LitField):
         """The Gaussians in the camera's view with the light they reflect towards it."""
         return self._gaussians(camera, None)
 
+    def gaussians_in_light(self, camera: Camera, light: HeldLight) -> Gaussians:
+        """The same with a held lamp as intense as the trained one, alike in all directions."""
+        return self._gaussians(camera, None, light)
+
     def gaussians_in_training(self, camera: Camera, generator: torch.Generator) -> Gaussians:
         """The same with noise on the network's inputs, and its products in ``network_precision``."""
         return self._gaussians(camera, generator)
 
-    def _gaussians(self, camera: Camera, generator: torch.Generator | None) -> Gaussians:
+    def _gaussians(self, camera: Camera, generator: torch.Generator | None, held: HeldLight | None = None) -> Gaussians:
         camera = camera.to(self.means.device, self.means.dtype)
         visible = self._visible(camera)
         visible = visible[self.opacities.detach()[visible].sigmoid() >= MIN_OPACITY]
@@ -174,7 +178,7 @@ class LitGaussians(ExplicitField, LitField):
         albedos = albedos.clamp_min(0.0)
         roughness = roughness.clamp(*self.settings.roughness_range)
         f0 = f0.clamp(*self.settings.f0_range)
-        light, factors = self._reflected(camera, means, third_axes(quats), albedos, roughness, f0, generator)
+        light, factors = self._reflected(camera, means, third_axes(quats), albedos, roughness, f0, generator, held)
         return Gaussians(
             means=means,
             quats_wxyz=quats,
@@ -200,22 +204,26 @@ class LitGaussians(ExplicitField, LitField):
         roughness: Float[Tensor, "V"],
         f0: Float[Tensor, "V"],
         generator: torch.Generator | None,
+        held: HeldLight | None,
     ) -> tuple[Float[Tensor, "V 3"], Float[Tensor, "V 3"]]:
         """Linear light from Gaussians to the camera, and the factors of their diffuse reflection. [V, 3], [V, 3]"""
         views = camera.center - means
-        lamps = views if self.lamp.at_camera else self.lamp.position(camera) - means
-        lengths = lamps.norm(dim=1, keepdim=True).clamp_min(_MIN_DISTANCE)
-        distances = lengths / self.extent
-        lamps = lamps / lengths
         facing = (axes * views).sum(1)
         normals = torch.where((facing < 0)[:, None], -axes, axes)
-        if self.lamp.at_camera:
+        if held is None:
+            lamps = views if self.lamp.at_camera else self.lamp.position(camera) - means
+            lengths = lamps.norm(dim=1, keepdim=True).clamp_min(_MIN_DISTANCE)
+            lamps = lamps / lengths
+        else:
+            lamps, lengths = held.towards(means, normals), held.incidence(means)[0][:, None]
+        distances = lengths / self.extent
+        if held is None and self.lamp.at_camera:
             cosines = Cosines.retroreflected((normals * lamps).sum(1).clamp_min(0.0))
         else:
             cosines = Cosines.of(normals, nn.functional.normalize(views, dim=1), lamps)
         intensity, falloff, exponent = self.lamp_parameters.clamp_min(0.0).unbind()
         arriving = intensity / (1.0 + falloff * distances[:, 0].pow(exponent))
-        if self.lamp != Lamp():
+        if held is None and self.lamp != Lamp():
             arriving = arriving * self.lamp.spread(-lamps, camera)
         factors = self._factors(albedos, distances, normals, lamps, generator)
         mirrored = fresnel(cosines, f0)

@@ -24,6 +24,8 @@ class Undistortion:
         source_mask: Source pixels with image content. None means all. [H_source, W_source]
 
     Attributes:
+        lens: The lens of the source images.
+        source_mask: As given.
         supersampling: Bilinear samples per result pixel, along each side.
         valid: Result pixels made only of source pixels with image content. [height, width]
     """
@@ -35,6 +37,7 @@ class Undistortion:
         source_mask: Bool[np.ndarray, "H_source W_source"] | None = None,
     ) -> None:
         self.lens = lens
+        self.source_mask = source_mask
         self.width, self.height = width, height = pinhole.width, pinhole.height
         self._columns, self._rows = undistortion_map(lens, pinhole)
         self.supersampling = s = max(1, round(_longest_step(self._columns, self._rows)))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
@@ -34,15 +34,26 @@ def read_mesh(path: Path) -> TriangleMesh:
     Raises:
         InputError: No such file, another suffix, a damaged file, or one without triangles.
     """
+    return read_flagged_mesh(path)[0]
+
+
+def read_flagged_mesh(path: Path) -> tuple[TriangleMesh, Int[np.ndarray, "F"] | None]:
+    """A mesh as :func:`read_mesh` reads it, with the texture index of each triangle where it is an OBJ file with such.
+
+    Returns:
+        The mesh; and the texture index (``vt``, counted from 1) of the first corner of each triangle. [F]
+
+    Raises:
+        InputError: See there.
+    """
     if not path.is_file():
         raise InputError(f"no file {path}", "a mesh as PLY, OBJ or GLB file", "Check the path")
-    suffix = _suffix(path)
-    mesh = decode_obj(path)[0] if suffix == "obj" else _through_open3d(path)
+    mesh, textures = decode_obj(path) if _suffix(path) == "obj" else (_through_open3d(path), None)
     if not len(mesh):
         raise InputError(f"{path} has no triangles", "a mesh", "Check that it is a mesh, not a cloud of points")
     if not np.isfinite(mesh.vertices).all():
         raise InputError(f"{path} has vertices that are not finite", "finite coordinates")
-    return mesh
+    return mesh, textures
 
 
 def write_mesh(path: Path, mesh: TriangleMesh) -> None:

@@ -67,6 +67,8 @@ def _corners(path: Path, faces: list[str]) -> tuple[np.ndarray, np.ndarray | Non
     """Vertex indices as they stand, [F, 3], and the texture index of each first corner, [F]."""
     vertices, textures = list[tuple[int, int, int]](), list[int]()
     try:
+        if (quick := _triangles_alike(faces)) is not None:
+            return quick
         for face in faces:
             fields = [corner.split("/") for corner in face.split()]
             places = [int(field[0]) for field in fields]
@@ -78,3 +80,16 @@ def _corners(path: Path, faces: list[str]) -> tuple[np.ndarray, np.ndarray | Non
         raise InputError(f"{path} has a face that is not indices", "an OBJ file") from error
     found = np.array(textures, np.int64)
     return np.array(vertices, np.int64).reshape(-1, 3), found if len(found) and found.all() else None
+
+
+def _triangles_alike(faces: list[str]) -> tuple[np.ndarray, np.ndarray | None] | None:
+    """The same of faces that are all triangles of the form ``v`` or ``v/vt``, much faster; None of others."""
+    text = "\n".join(faces)
+    slashes = text.count("/")
+    if not faces or slashes not in (0, 3 * len(faces)) or "//" in text:
+        return None
+    numbers = np.array(text.replace("/", " ").split(), np.int64)
+    if len(numbers) != 3 * len(faces) + slashes:
+        return None
+    rows = numbers.reshape(len(faces), 3, -1)
+    return rows[:, :, 0], rows[:, 0, 1] if slashes and rows[:, 0, 1].all() else None

@@ -2,38 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from pydantic import Field as Option
 from torch import Tensor
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.core.settings import Settings
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.rendering import render_view
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.meshes.cleaning import without_small_parts
 from coliags_plugin.meshes.mesh import TriangleMesh
+from coliags_plugin.meshing.settings import MeshSettings, max_depth_of, voxel_size_of
 from coliags_plugin.meshing.volume import Volume
-
-
-class MeshSettings(Settings):
-    """Options of meshing."""
-
-    # Edge of a voxel in scene units (mm); null: voxel_pixels times the size of a training pixel on the surface.
-    voxel_size: float | None = Option(default=None, gt=0, allow_inf_nan=False)
-    voxel_pixels: float = Option(default=2.0, gt=0, allow_inf_nan=False)  # see voxel_size
-    truncation: float = Option(default=4.0, ge=1, le=32)  # of the signed distance, in voxels
-    depth: Literal["expected", "median"] = "expected"  # kind of rendered depth (docs/conventions.md 3)
-    min_alpha: float = Option(default=0.9, ge=0.5, lt=1)  # pixels with less are not fused
-    max_incidence: float = Option(default=80.0, gt=0, le=90)  # degrees; surface seen more obliquely is not fused
-    min_views: int = Option(default=3, ge=1)  # views that must agree on a place; fewer where there are fewer
-    min_part: float = Option(default=0.01, ge=0, le=1)  # connected parts below this share of the largest are removed
 
 
 def fuse_run(trained: TrainedRun, settings: MeshSettings | None = None) -> TriangleMesh:
@@ -58,13 +41,13 @@ def fuse_run(trained: TrainedRun, settings: MeshSettings | None = None) -> Trian
     frames = trained.scene.train
     if len(frames) < 2:
         raise InputError(f"scene '{trained.scene.name}' has {len(frames)} training view", "two views or more to fuse")
-    size = settings.voxel_size or settings.voxel_pixels * trained.scene.pixel_footprint
+    size, reach = voxel_size_of(settings, trained.scene), max_depth_of(settings, trained.scene)
     volume = Volume(size, settings.truncation)
     with ProgressReport("fuse depth", len(frames)) as progress:
         for count, frame in enumerate(frames, start=1):
             output = render_view(trained, frame, wants)
             camera = frame.camera if output.camera is None else output.camera
-            known = _usable(output[depth], output.alpha, frame, camera, settings)
+            known = _usable(output[depth], output.alpha, frame, camera, settings, reach)
             volume.add(known, _colors(output.rgb), camera)
             progress.update(count)
     mesh = volume.mesh(min(settings.min_views, len(frames)))
@@ -78,30 +61,39 @@ def fuse_run(trained: TrainedRun, settings: MeshSettings | None = None) -> Trian
 
 
 def _usable(
-    depth: Tensor, alpha: Tensor, frame: Frame, camera: Camera, settings: MeshSettings
+    depth: Tensor, alpha: Tensor, frame: Frame, camera: Camera, settings: MeshSettings, max_depth: float
 ) -> Float[np.ndarray, "H W"]:
-    """Depth to fuse, 0 elsewhere: opaque, not ignored and not seen too obliquely. [H, W]"""
+    """Depth to fuse, 0 elsewhere: opaque, not ignored, not too far and not seen too obliquely. [H, W]"""
     depth, camera = depth.detach().cpu().double(), camera.to("cpu", torch.float64)
-    good = (alpha.detach().cpu() >= settings.min_alpha) & frame.valid & depth.isfinite() & (depth > 0)
+    good = (alpha.detach().cpu() >= settings.min_alpha) & frame.valid & (depth > 0) & (depth <= max_depth)
     good &= incidence_cosines(depth, camera) >= np.cos(np.radians(settings.max_incidence))
     return torch.where(good, depth, 0.0).float().numpy()
 
 
 def incidence_cosines(depth: Float[Tensor, "H W"], camera: Camera) -> Float[Tensor, "H W"]:
-    """Cosine of the angle between ray and normal of the surface that a depth map describes; NaN at the border.
+    """Cosine of the angle between ray and normal of the surface that a depth map describes. [H, W]
 
-    The normal is that of the points left, right, above and below, so that a jump of the depth counts as a very oblique
-    surface, on both of its sides. [H, W]
+    The normal is that of the point and those of its two neighbours, of left or right and above or below, that are
+    nearer in depth, so that the last pixel before a jump counts as the surface that it belongs to, and one in the midst
+    of the jump as a very oblique one. NaN where no neighbours have depth.
     """
     points = camera.unproject(depth)
-    across = points[1:-1, 2:] - points[1:-1, :-2]
-    down = points[2:, 1:-1] - points[:-2, 1:-1]
-    normals = torch.linalg.cross(across, down)
-    rays = camera.rays()[1:-1, 1:-1]
-    cosines = torch.full_like(depth, torch.nan)
-    lengths = normals.norm(dim=-1) * rays.norm(dim=-1)
-    cosines[1:-1, 1:-1] = (normals * rays).sum(-1).abs() / lengths
-    return cosines
+    across, down = (_smaller_step(points, depth, axis) for axis in (1, 0))
+    normals, rays = torch.linalg.cross(across, down), camera.rays()
+    return (normals * rays).sum(-1).abs() / (normals.norm(dim=-1) * rays.norm(dim=-1))
+
+
+def _smaller_step(points: Float[Tensor, "H W 3"], depth: Float[Tensor, "H W"], axis: int) -> Float[Tensor, "H W 3"]:
+    """From each point to the next along an axis, or from the last one to it: whichever depths differ less. [H, W, 3]"""
+    steps, jumps = torch.diff(points, dim=axis), torch.diff(depth, dim=axis).abs()
+    jumps = torch.where(jumps.isfinite(), jumps, torch.inf)
+    nothing, endless = (
+        torch.full_like(points.narrow(axis, 0, 1), torch.nan),
+        torch.full_like(depth.narrow(axis, 0, 1), torch.inf),
+    )
+    ahead, behind = torch.cat([steps, nothing], axis), torch.cat([nothing, steps], axis)
+    nearer = torch.cat([jumps, endless], axis) <= torch.cat([endless, jumps], axis)
+    return torch.where(nearer[..., None], ahead, behind)
 
 
 def _colors(rgb: Tensor) -> UInt8[np.ndarray, "H W 3"]:

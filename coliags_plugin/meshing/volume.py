@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
@@ -19,6 +20,9 @@ _BLOCK = 8
 _MAX_BLOCKS = 300_000
 #: open3d divides depth by this; ours is in scene units already.
 _DEPTH_SCALE = 1.0
+#: Blocks are counted from minus this along each axis, so that a key of 60 bits holds all three.
+_HALF_RANGE = 2**19
+_KEY = np.array([4 * _HALF_RANGE**2, 2 * _HALF_RANGE, 1])
 
 
 class Volume:
@@ -64,13 +68,31 @@ class Volume:
         world_to_camera = camera.to("cpu", torch.float64).world_to_camera.numpy()
         pose = tensor(np.ascontiguousarray(matrix)), tensor(np.ascontiguousarray(world_to_camera))
         reach = float(depth.max()) * 1.001 + self.voxel_size
-        blocks = self._grid.compute_unique_block_coordinates(depth_image, *pose, _DEPTH_SCALE, reach, self.truncation)
+        blocks = self._blocks_near(depth, camera)
         if self._grid.hashmap().size() + len(blocks) > _MAX_BLOCKS:
             self._refuse_more()
         color_image = image(tensor(np.ascontiguousarray(colors, np.float32) / np.float32(255.0)))
         self._grid.integrate(
-            blocks, depth_image, color_image, pose[0], pose[0], pose[1], _DEPTH_SCALE, reach, self.truncation
+            tensor(blocks), depth_image, color_image, pose[0], *pose, _DEPTH_SCALE, reach, self.truncation
         )
+
+    def _blocks_near(self, depth: Float[np.ndarray, "H W"], camera: Camera) -> Int[np.ndarray, "B 3"]:
+        """Blocks within the truncation of a pixel's surface point along its ray. [B, 3]
+
+        open3d's own search looks at every fourth pixel of every fourth row only, which misses small blocks.
+        """
+        row, column = np.nonzero(depth > 0)
+        pixels = torch.from_numpy(np.stack([column, row], axis=1))
+        rays = camera.to("cpu", torch.float64).rays_at(pixels).numpy()
+        center, z = camera.center.cpu().double().numpy(), depth[row, column].astype(np.float64)
+        edge, band = _BLOCK * self.voxel_size, self.truncation * self.voxel_size
+        found = []
+        for shift in np.linspace(-band, band, 2 * math.ceil(2 * self.truncation / _BLOCK) + 1):
+            places = np.floor((center + (z + shift)[:, None] * rays) / edge).astype(np.int64) + _HALF_RANGE
+            # One number per block, as rows take ten times as long to sort.
+            found.append(np.unique(places @ _KEY))
+        keys = np.unique(np.concatenate(found))
+        return np.asarray(np.stack(np.unravel_index(keys, (2 * _HALF_RANGE,) * 3), axis=1) - _HALF_RANGE, np.int32)
 
     def _refuse_more(self) -> None:
         raise InputError(

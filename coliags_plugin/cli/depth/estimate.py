@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
 from coliags_plugin.cli.arguments import Assignments, DataFormat, OptionalInt, OptionalPath
-
-if TYPE_CHECKING:
-    from coliags_plugin.core.scenes import Scene
 
 #: Prefix of the options of estimation; all others are the data manager's.
 _OWN = "depth."
@@ -47,7 +44,7 @@ class EstimateDepth:
         from coliags_plugin.core.errors import InputError
         from coliags_plugin.engine.data_formats import open_scene
         from coliags_plugin.engine.progress import progress_callback
-        from coliags_plugin.reconstruction.depth.scene import DepthRequest, estimate_scene
+        from coliags_plugin.reconstruction.depth.scene import DepthRequest, estimate_scene, training_options
         from coliags_plugin.reconstruction.depth.settings import DepthSettings
 
         refuse_output(self.out, self.scene, self.overwrite)
@@ -63,17 +60,4 @@ class EstimateDepth:
             near_far = None if self.near is None or self.far is None else (self.near, self.far)
             request = DepthRequest(settings, near_far, self.prior, self.jobs)
             summary = estimate_scene(scene, self.out, request, self.overwrite, progress)
-        print(f"{summary}\n{self.out}\n{train_command(self.out, 'coliags-estimated-depth', _same_frames(scene))}")
-
-
-def _same_frames(scene: Scene) -> list[str]:
-    """Options with which the written scene has the split and the size of its source."""
-    from coliags_plugin.datamanagers.rectification import PAPER_SIZE, fitted
-
-    split, camera = scene.provenance["split"], scene.train[0].camera
-    options = [] if split["name"] == "every-8th" else [f"datamanager.split={split['name']}"]
-    if split["name"] == "block":
-        options.append(f"datamanager.block=[{split['block'][0]:g}, {split['block'][1]:g}]")
-    if fitted(camera.width, camera.height, PAPER_SIZE) != (camera.width, camera.height):
-        options += [f"datamanager.width={camera.width}", f"datamanager.height={camera.height}"]
-    return options
+        print(f"{summary}\n{self.out}\n{train_command(self.out, 'coliags-estimated-depth', training_options(scene))}")

@@ -44,11 +44,12 @@ class Sfm:
 
     def run(self) -> None:
         """Reconstruct, write the scene and print a summary."""
-        from coliags_plugin.cli.written_scenes import next_commands, refuse_output, settings_of
+        from coliags_plugin.cli.written_scenes import next_commands, refuse_output
+        from coliags_plugin.config.assigned_settings import settings_of
         from coliags_plugin.core.errors import InputError
         from coliags_plugin.engine.progress import progress_callback
         from coliags_plugin.reconstruction.structure.image_files import list_images, masks_for
-        from coliags_plugin.reconstruction.structure.model_scale import scaled
+        from coliags_plugin.reconstruction.structure.model_scale import millimetres, scaled
         from coliags_plugin.reconstruction.structure.sfm import reconstruct
         from coliags_plugin.reconstruction.structure.sfm_scene import write_sfm_scene
         from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
@@ -64,7 +65,7 @@ class Sfm:
         masks = None if self.mask is None else masks_for(self.mask, images)
         with progress_callback() as progress:
             found = reconstruct(images, settings, masks, progress)
-        factor = self._factor(found, known_distance)
+        factor = millimetres(found, self.diameter, known_distance)
         if factor is not None:
             found = scaled(found, factor)
         write_sfm_scene(self.out, found, masks, self.overwrite, "unknown" if factor is None else "mm")
@@ -90,22 +91,6 @@ class Sfm:
         if not (math.isfinite(length) and length > 0.0):
             raise InputError(f"--distance {self.distance}", "a length in mm above 0")
         return first, second, length
-
-    def _factor(self, found: Reconstruction, known_distance: tuple[str, str, float] | None) -> float | None:
-        """Millimetres per unit of the model; None where the scale stays unknown."""
-        import logging
-
-        from coliags_plugin.core.errors import InputError
-        from coliags_plugin.reconstruction.structure.model_scale import from_diameter, from_distance
-
-        try:
-            if known_distance is not None:
-                return from_distance(found, *known_distance)
-            return None if self.diameter is None else from_diameter(found, self.diameter)
-        except InputError as error:
-            # The poses took minutes: they are written all the same.
-            logging.getLogger(__name__).warning("%s The scale stays unknown", error)
-            return None
 
 
 def _unit(found: Reconstruction, factor: float | None) -> str:

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import Bool, Float32
 
+from coliags_plugin.reconstruction.depth.views import resized_map
+
 #: Fast global smoother: strength, and the difference of the 8-bit guide at which smoothing ceases.
 _STRENGTH, _EDGE = 10.0, 12.0
+#: The same of surfaces that are swept.
+_SURFACE_STRENGTH, _SURFACE_EDGE = 10.0, 6.0
 #: Grey levels of the guide for each unit of log intensity.
 _LEVELS = 60.0
 #: Weight of a residual of zero at every pixel, relative to a known pixel's one.
@@ -20,37 +26,65 @@ _FEW, _ABSURD = 1.5, 0.35
 def complete(
     log_known: Float32[np.ndarray, "H W"],
     support: Float32[np.ndarray, "H W"],
+    belief: Float32[np.ndarray, "H W"],
     log_prior: Float32[np.ndarray, "H W"],
     intensity: Float32[np.ndarray, "H W"],
-    rim: Bool[np.ndarray, "H W"],
 ) -> Float32[np.ndarray, "H W"]:
     """Log depth that keeps to what is known and elsewhere is the prior plus a smooth residual.
 
     The residual is known depth minus prior, spread by an edge-aware global smoother (Min et al. 2014) normalised by
     the spread weight. Depth that several frames agree on is kept; what has less support is mixed with the smooth one.
-    Correlation windows make a near surface too wide at its edges: there, its rim has little weight, and the edges of
-    the image decide. Depth with little support that is far off the prior is not believed.
 
     Args:
         log_known: Log of z-depth; anything where there is no support. [H, W]
         support: Number of frames that agree with it, weighted; 0 where it is not known. [H, W]
+        belief: How much of the support counts, 0 to 1. [H, W]
         log_prior: Log of z-depth by the prior. [H, W]
         intensity: Log intensity, whose edges stop the smoothing. [H, W]
-        rim: Where a near surface may be too wide: :func:`near_rim`. [H, W]
     """
-    import cv2
-
-    residual = log_known - log_prior
-    absurd = (support < _FEW) & (np.abs(residual) > _ABSURD)
-    belief = np.where(absurd, 0.0, np.where(rim, _BELIEF, 1.0)).astype(np.float32)
     data = data_weight(support) * belief
-    guide = np.clip(128.0 + _LEVELS * intensity, 0, 255).astype(np.uint8)
-    smooth = cv2.ximgproc.createFastGlobalSmootherFilter(guide, _STRENGTH, _EDGE)
-    residual = np.where(data > 0.0, residual, 0.0).astype(np.float32)
-    filled = log_prior + smooth.filter(data * residual) / (smooth.filter(data) + np.float32(_ZERO))
+    smooth = _smoother(intensity, _STRENGTH, _EDGE)
+    residual = np.where(data > 0.0, log_known - log_prior, 0.0).astype(np.float32)
+    filled = log_prior + smooth(data * residual) / (smooth(data) + np.float32(_ZERO))
     position = np.clip((support - 0.2) / 0.8, 0.0, 1.0)
     kept = position * position * (3.0 - 2.0 * position) * belief
     return np.asarray(np.where(kept > 0.0, kept * log_known + (1.0 - kept) * filled, filled), np.float32)
+
+
+def first_belief(
+    log_known: Float32[np.ndarray, "H W"],
+    support: Float32[np.ndarray, "H W"],
+    log_prior: Float32[np.ndarray, "H W"],
+    rim: Bool[np.ndarray, "H W"],
+) -> Float32[np.ndarray, "H W"]:
+    """How much of a sweep without a surface to start from is believed, 0 to 1. [H, W]
+
+    Large windows make a near surface too wide at its edges: there, its rim has little weight, and the edges of the
+    image decide. Depth with little support that is far off the prior is not believed.
+
+    Args:
+        log_known: See :func:`complete`. [H, W]
+        support: Likewise. [H, W]
+        log_prior: Likewise. [H, W]
+        rim: Where a near surface may be too wide: :func:`near_rim`. [H, W]
+    """
+    absurd = (support < _FEW) & (np.abs(log_known - log_prior) > _ABSURD)
+    return np.where(absurd, 0.0, np.where(rim, _BELIEF, 1.0)).astype(np.float32)
+
+
+def smooth_surface(
+    depth: Float32[np.ndarray, "h w"], intensity: Float32[np.ndarray, "H W"]
+) -> Float32[np.ndarray, "H W"]:
+    """z-depth at the size of an image and smoothed up to its edges, as a surface to sweep.
+
+    Windows of correlation lie on the surface: where its slant is wrong, so is what they find. [H, W]
+
+    Args:
+        depth: z-depth at any size.
+        intensity: Log intensity, whose edges stop the smoothing.
+    """
+    log_depth = np.log(resized_map(depth, (intensity.shape[1], intensity.shape[0])))
+    return np.asarray(np.exp(_smoother(intensity, _SURFACE_STRENGTH, _SURFACE_EDGE)(log_depth)), np.float32)
 
 
 def data_weight(support: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
@@ -72,3 +106,13 @@ def near_rim(log_depth: Float32[np.ndarray, "H W"], reach: int) -> Bool[np.ndarr
     edge = (cv2.dilate(values, small) - cv2.erode(values, small) > _JUMP).astype(np.uint8)
     middle = 0.5 * (cv2.dilate(values, wide) + cv2.erode(values, wide))
     return np.asarray((cv2.dilate(edge, wide) > 0) & (values < middle))
+
+
+def _smoother(
+    intensity: Float32[np.ndarray, "H W"], strength: float, edge: float
+) -> Callable[[Float32[np.ndarray, "H W"]], Float32[np.ndarray, "H W"]]:
+    """An edge-aware global smoother (Min et al. 2014) guided by log intensity."""
+    import cv2
+
+    guide = np.clip(128.0 + _LEVELS * intensity, 0, 255).astype(np.uint8)
+    return cv2.ximgproc.createFastGlobalSmootherFilter(guide, strength, edge).filter

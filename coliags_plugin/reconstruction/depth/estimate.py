@@ -13,7 +13,13 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.reading.parallel import parallel_map
-from coliags_plugin.reconstruction.depth.completion import complete, data_weight, near_rim
+from coliags_plugin.reconstruction.depth.completion import (
+    complete,
+    data_weight,
+    first_belief,
+    near_rim,
+    smooth_surface,
+)
 from coliags_plugin.reconstruction.depth.confidence import depth_confidence, sweep_weight
 from coliags_plugin.reconstruction.depth.depth_range import DepthRange
 from coliags_plugin.reconstruction.depth.fusion import DepthMap, fuse_frame
@@ -21,7 +27,7 @@ from coliags_plugin.reconstruction.depth.neighbours import choose_neighbours
 from coliags_plugin.reconstruction.depth.priors import DepthPrior
 from coliags_plugin.reconstruction.depth.settings import DepthSettings, SweepSettings
 from coliags_plugin.reconstruction.depth.sweeping import Swept, ratios, sweep_frame
-from coliags_plugin.reconstruction.depth.views import Guide, guide_of, resized_map
+from coliags_plugin.reconstruction.depth.views import Guide, guide_of
 from coliags_plugin.reconstruction.depth.work_files import Arrays, Recent, WorkFolder
 
 log = logging.getLogger(__name__)
@@ -87,7 +93,7 @@ class Estimation:
             InputError: No frame has enough neighbours.
         """
         for number, sweep in enumerate(self.settings.sweeps):
-            neighbours = self._neighbours(f"neighbours-{number}", self.medians)
+            neighbours = self._neighbours(f"neighbours-{number}", sweep, self.medians)
             base = self.last or None
             self._sweep(f"swept-{number}", sweep, neighbours, base, f"sweep {number + 1}")
             self._fuse(f"fused-{number}", sweep, neighbours, f"fuse {number + 1}")
@@ -98,18 +104,20 @@ class Estimation:
         found = self.work.load(self.last, index)
         return Estimate(found["depth"], found["confidence"])
 
-    def _neighbours(self, name: str, medians: Sequence[float]) -> list[list[int]]:
+    def _neighbours(self, name: str, sweep: SweepSettings, medians: Sequence[float]) -> list[list[int]]:
         centers = np.stack([frame.camera.center.cpu().double().numpy() for frame in self.frames])
         axes = np.stack([frame.camera.optical_axis.cpu().double().numpy() for frame in self.frames])
-        found: list[list[int]] = self.work.value(name, lambda: choose_neighbours(centers, axes, medians, self.settings))
+        found: list[list[int]] = self.work.value(
+            name, lambda: choose_neighbours(centers, axes, medians, sweep.baselines, self.settings)
+        )
         lonely = sum(len(others) < FEWEST_NEIGHBOURS for others in found)
         if lonely == len(found):
             span = float(np.linalg.norm(np.ptp(centers, axis=0)))
             raise InputError(
-                f"no frame has {FEWEST_NEIGHBOURS} others at a distance of {100 * min(self.settings.baselines):g} % "
+                f"no frame has {FEWEST_NEIGHBOURS} others at a distance of {100 * min(sweep.baselines):g} % "
                 f"of the depth or more: the path spans {span:.3g}, the median depth is {np.median(medians):.3g}",
                 "a camera that moves: rotation alone gives no depth",
-                "Use a longer stretch, check the poses, or lower depth.baselines",
+                "Use a longer stretch, check the poses, or lower the baselines of depth.sweeps",
             )
         if lonely:
             log.warning(
@@ -132,7 +140,7 @@ class Estimation:
             if base is None or sweep.reach is None:
                 surface = np.full((height, width), self.range.near, np.float32)
             else:
-                surface = resized_map(self.work.load(base, index)["depth"], (width, height))
+                surface = smooth_surface(self.work.load(base, index)["depth"], guide.intensity)
             others = [guides(other) for other in neighbours[index]]
             if len(others) < FEWEST_NEIGHBOURS:
                 nothing = np.zeros((height, width), np.float32)
@@ -162,7 +170,11 @@ class Estimation:
                 self.frames[index].to("cpu"), guide.usable, known, data_weight(support), self.medians[index]
             )
             rim = near_rim(known, 2 * sweep.radius)
-            log_depth = np.clip(complete(known, support, np.clip(prior, low, high), guide.intensity, rim), low, high)
+            prior = np.clip(prior, low, high)
+            # Later sweeps have a surface, and small windows: their edges are where they belong.
+            whole = sweep.reach is None
+            belief = first_belief(known, support, prior, rim) if whole else np.ones_like(support)
+            log_depth = np.clip(complete(known, support, belief, prior, guide.intensity), low, high)
             confidence = depth_confidence(log_depth, support, found.spread, rim)
             if len(neighbours[index]) < FEWEST_NEIGHBOURS or own.weight.mean() < LEAST_MATCHED:
                 confidence[:] = 0.0

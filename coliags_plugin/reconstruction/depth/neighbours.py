@@ -14,6 +14,7 @@ def choose_neighbours(
     centers: Float[np.ndarray, "N 3"],
     axes: Float[np.ndarray, "N 3"],
     depths: Sequence[float],
+    baselines: Sequence[float],
     settings: DepthSettings,
 ) -> list[list[int]]:
     """Neighbours of every frame of a video: for each baseline the first frame so far away, before and after it.
@@ -24,13 +25,14 @@ def choose_neighbours(
     Args:
         centers: Camera centres in video order. [N, 3]
         axes: Unit optical axes. [N, 3]
-        depths: Median depth of every frame; baselines are multiples of it. [N]
-        settings: See ``baselines``, ``max_baseline`` and ``max_turn``.
+        depths: Median depth of every frame. [N]
+        baselines: Distances in units of it.
+        settings: See ``max_baseline`` and ``max_turn``.
 
     Returns:
         For every frame the indices of its neighbours, ascending.
     """
-    baselines = sorted(settings.baselines)
+    baselines = sorted(baselines)
     farther = [baselines[-1] + (baselines[-1] / len(baselines)) * step for step in range(1, len(baselines) + 1)]
     least_cosine = np.cos(np.radians(settings.max_turn))
     found = []

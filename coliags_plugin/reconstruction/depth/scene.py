@@ -15,6 +15,7 @@ from coliags_plugin.core.files import atomic_folder
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.datamanagers.nerfstudio.estimated import EstimatedSceneWriter
+from coliags_plugin.datamanagers.rectification import PAPER_SIZE, fitted
 from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.reconstruction.depth.depth_range import DepthRange, find_range, given_range
 from coliags_plugin.reconstruction.depth.estimate import Estimation, check_video
@@ -31,7 +32,7 @@ log = logging.getLogger(__name__)
 #: Confidence from which a pixel counts as known in the summary.
 _KNOWN = 0.5
 #: Changes when the results of the same request do, so that old work files are not mixed with new ones.
-_VERSION = 1
+_VERSION = 2
 #: Edge of the voxels of points, pixels on the surface.
 _VOXEL = 2.0
 
@@ -97,6 +98,21 @@ def estimate_scene(
         with atomic_folder(out, overwrite) as folder:
             summary = _write(scene, frames, estimation, folder, progress)
     return summary
+
+
+def training_options(scene: Scene) -> list[str]:
+    """Options of training with which the written scene has the split and the size of its source.
+
+    Args:
+        scene: The source, as it was opened for :func:`estimate_scene`.
+    """
+    split, camera = scene.provenance["split"], scene.train[0].camera
+    options = [] if split["name"] == "every-8th" else [f"datamanager.split={split['name']}"]
+    if split["name"] == "block":
+        options.append(f"datamanager.block=[{split['block'][0]:g}, {split['block'][1]:g}]")
+    if fitted(camera.width, camera.height, PAPER_SIZE) != (camera.width, camera.height):
+        options += [f"datamanager.width={camera.width}", f"datamanager.height={camera.height}"]
+    return options
 
 
 def _range(frames: Sequence[Frame], request: DepthRequest, work: WorkFolder, progress: Progress | None) -> DepthRange:

@@ -24,6 +24,12 @@ class SweepSettings(Settings):
         lt=1.0,
         description="Relative depth about the depth of the sweep before that is swept. None: the whole depth range.",
     )
+    baselines: tuple[Positive, ...] = Field(
+        default=(0.05, 0.08, 0.12, 0.16, 0.2, 0.25),
+        min_length=1,
+        description="Distances of the neighbours from a frame, in units of its median depth; one frame to either side "
+        "in the video for each.",
+    )
     radius: int = Field(default=3, ge=1, le=15, description="Half the width of the correlation windows, pixels.")
     small_penalty: float = Field(
         default=0.08, ge=0.0, description="Semi-global penalty P1 of a change by one hypothesis; costs are in [0, 2]."
@@ -34,13 +40,7 @@ class SweepSettings(Settings):
 class DepthSettings(Settings):
     """Options of depth estimation."""
 
-    baselines: tuple[Positive, ...] = Field(
-        default=(0.05, 0.08, 0.12, 0.16, 0.2, 0.25),
-        min_length=1,
-        description="Distances of the neighbours from a frame, in units of its median depth; one frame to either side "
-        "in the video for each.",
-    )
-    max_baseline: float = Field(default=0.5, gt=0.0, description="Largest such distance.")
+    max_baseline: float = Field(default=0.6, gt=0.0, description="Largest distance of a neighbour.")
     max_turn: float = Field(
         default=40.0, gt=0.0, le=180.0, description="Largest angle between the optical axes of neighbours, degrees."
     )
@@ -56,9 +56,15 @@ class DepthSettings(Settings):
         default=10.0, ge=0.0, description="How much edges of the log image lower the large penalty."
     )
     sweeps: tuple[SweepSettings, ...] = Field(
-        default=(SweepSettings(reduction=2, radius=4), SweepSettings(step=0.01, reach=0.15)),
+        default=(
+            SweepSettings(reduction=2, radius=4),
+            SweepSettings(
+                step=0.01, reach=0.15, baselines=(0.05, 0.1, 0.2, 0.3, 0.4, 0.5), radius=2, small_penalty=0.01
+            ),
+        ),
         min_length=1,
-        description="Sweeps, one after the other; each but the first is about the completed depth of the one before.",
+        description="Sweeps, one after the other; each but the first is about the completed depth of the one before, "
+        "smoothed.",
     )
     agreement: float = Field(
         default=0.02, gt=0.0, lt=0.5, description="Relative difference up to which two frames' depths agree."

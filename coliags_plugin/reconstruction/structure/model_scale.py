@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 
 import numpy as np
@@ -10,8 +11,30 @@ from jaxtyping import Float
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.reconstruction.structure.sfm import Reconstruction
 
+log = logging.getLogger(__name__)
+
 #: Least number of points beside the path for an estimate of the diameter.
 _FEWEST_BESIDE = 30
+
+
+def millimetres(
+    found: Reconstruction, diameter: float | None = None, distance: tuple[str, str, float] | None = None
+) -> float | None:
+    """Millimetres per unit of a model by what is known of it; None where the scale stays unknown, with a warning.
+
+    Args:
+        found: The model.
+        diameter: Typical inner diameter of the colon, mm; None: unknown.
+        distance: Names of two images, and the distance of their cameras, mm; it takes precedence. None: unknown.
+    """
+    try:
+        if distance is not None:
+            return from_distance(found, *distance)
+        return None if diameter is None else from_diameter(found, diameter)
+    except InputError as error:
+        # The poses took minutes: they are kept all the same.
+        log.warning("%s The scale stays unknown", error)
+        return None
 
 
 def distances_beside(path: Float[np.ndarray, "M 3"], points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "K"]:

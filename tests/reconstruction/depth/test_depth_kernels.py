@@ -121,6 +121,23 @@ def test_a_plane_seen_by_cameras_at_known_places():
     assert np.median(found.match[inner]) > 0.98
 
 
+def test_a_surface_whose_slant_is_wrong_is_swept_to_the_right_one():
+    """A smoothness that holds to the shape of the swept surface would keep part of its error: far lumens too near."""
+    frames = wall_frames(sideways(5))
+    guides = [guide_of(frame, 1, NO_HIGHLIGHTS) for frame in frames]
+    truth = wall_depth(frames[2].camera)
+    sweep_settings = DepthSettings().sweeps[-1]
+    across = np.linspace(-0.06, 0.06, truth.shape[1])
+    base = (truth * np.exp(across)[None]).astype(np.float32)
+    factors = ratios(sweep_settings, (20.0, 80.0))
+    found = sweep_frame(guides[2], [guides[k] for k in (0, 1, 3, 4)], base, factors, sweep_settings, DepthSettings())
+    inner = (slice(12, -12), slice(16, -16))
+    error = np.log(found.depth / truth)[inner]
+    assert np.median(np.abs(error)) < 0.004
+    trend = np.polyfit(np.broadcast_to(across, truth.shape)[inner].ravel(), error.ravel(), 1)[0]
+    assert abs(trend) < 0.1
+
+
 def voted(own, candidates, weights=None, tolerance=0.02):
     candidates = np.array(candidates, np.float32)[:, None, None]
     weights = np.ones_like(candidates) if weights is None else np.array(weights, np.float32)[:, None, None]

@@ -10,7 +10,7 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.reconstruction.depth.completion import complete, near_rim
+from coliags_plugin.reconstruction.depth.completion import complete, near_rim, smooth_surface
 from coliags_plugin.reconstruction.depth.confidence import depth_confidence
 from coliags_plugin.reconstruction.depth.light_prior import LightPrior
 from coliags_plugin.reconstruction.depth.points import VoxelPoints
@@ -63,9 +63,22 @@ def test_completion_keeps_what_is_known_and_shifts_the_prior_to_it():
     support = 5.0 * FLOAT
     support[20:60, 30:60] = 0.0
     known = np.where(support > 0.0, truth, np.float32(9.9))
-    found = complete(known, support, truth - np.float32(0.3), NOWHERE, ~ALL)
+    found = complete(known, support, FLOAT, truth - np.float32(0.3), NOWHERE)
     np.testing.assert_array_equal(found[support > 0.0], truth[support > 0.0])
     np.testing.assert_allclose(found, truth, atol=0.01)
+
+
+def test_a_swept_surface_is_smooth_up_to_the_edges_of_the_image():
+    columns = np.arange(96, dtype=np.float32)[None].repeat(80, axis=0)
+    truth = np.where(columns < 48, 20.0, 60.0) * np.exp(0.002 * columns)
+    rough = truth * np.exp(np.random.default_rng(0).normal(0.0, 0.02, truth.shape))
+    found = smooth_surface(rough.astype(np.float32), np.where(columns < 48, 0.5, -0.5).astype(np.float32))
+    error = np.abs(np.log(found / truth))
+    assert np.median(error) < 0.005
+    assert error[:, 47:49].max() < 0.05
+    # Depth of half the size is brought to the image's.
+    half = smooth_surface(np.full((40, 48), 7.0, np.float32), np.zeros((80, 96), np.float32))
+    np.testing.assert_allclose(half, np.full((80, 96), 7.0), rtol=1e-4)
 
 
 def test_the_rim_is_the_near_side_of_an_edge():

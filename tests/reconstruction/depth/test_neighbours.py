@@ -7,7 +7,7 @@ import numpy as np
 from coliags_plugin.reconstruction.depth.neighbours import choose_neighbours
 from coliags_plugin.reconstruction.depth.settings import DepthSettings
 
-SETTINGS = DepthSettings(baselines=(0.1, 0.2))
+SETTINGS = DepthSettings(max_baseline=0.5)
 
 
 def along(distances):
@@ -18,7 +18,8 @@ def along(distances):
 
 def chosen(distances, depth=10.0, settings=SETTINGS, axes=None):
     ahead = np.tile([0.0, 0.0, 1.0], (len(distances), 1))
-    return choose_neighbours(along(distances), ahead if axes is None else axes, [depth] * len(distances), settings)
+    directions = ahead if axes is None else axes
+    return choose_neighbours(along(distances), directions, [depth] * len(distances), (0.1, 0.2), settings)
 
 
 def test_the_first_frame_beyond_each_baseline_on_either_side():

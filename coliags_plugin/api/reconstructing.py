@@ -1,0 +1,52 @@
+"""From a video to mesh and report in one call."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from coliags_plugin.config.assignments import assignments
+
+if TYPE_CHECKING:
+    from coliags_plugin.pipeline.record import Record
+
+
+def reconstruct(
+    video: str | Path,
+    output: str | Path,
+    *,
+    settings: Mapping[str, Any] | None = None,
+    mask: str | Path | None = None,
+    device: str = "auto",
+    overwrite: bool = False,
+) -> Record:
+    """Reconstruct a colon from a video: frames, poses, depth, training, mesh and report, one folder for all.
+
+    What is done is kept: the same call goes on with what an interrupted one has left (docs/reconstruct.md).
+
+    Args:
+        video: Video file, folder of images, or folder of a scene with poses.
+        output: Folder of the results.
+        settings: Of the stages by key path, for instance ``{"steps": 5000, "diameter": 40.0, "frames.every": 2}``.
+        mask: Image of the frames' size, black where pixels are ignored; None: black surroundings are found.
+        device: ``auto``, ``cpu`` or ``cuda``.
+        overwrite: Repeat stages that were made with other settings, and what follows them.
+
+    Returns:
+        The record: what each stage made, with which options, in what time.
+
+    Raises:
+        InputError: The video or a setting is not valid, or a stage cannot be done; what was done before stands.
+        InterruptedRunError: Ctrl-C in training, after the state was saved.
+    """
+    from coliags_plugin.config.assigned_settings import settings_of
+    from coliags_plugin.engine.devices import choose_device
+    from coliags_plugin.engine.progress import progress_callback
+    from coliags_plugin.pipeline.reconstruct import reconstruct as run
+    from coliags_plugin.pipeline.settings import ReconstructionSettings
+
+    chosen = settings_of(ReconstructionSettings, assignments(settings))
+    masked = None if mask is None else Path(mask)
+    with progress_callback() as progress:
+        return run(Path(video), Path(output), chosen, choose_device(device), masked, overwrite, progress)

@@ -1,0 +1,82 @@
+"""``coliags reconstruct``: from a video to mesh, coverage and report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from coliags_plugin.cli.arguments import Assignments, OptionalInt, OptionalPath, OptionalText
+
+
+@dataclass(frozen=True)
+class Reconstruct:
+    """Reconstruct a colon from a video alone: frames, poses, depth, training, mesh, coverage and report.
+
+    Each stage is kept: repeated, the command goes on with what is missing, also after a kill.
+    """
+
+    video: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="VIDEO")]
+    """Video file, folder of images ordered by the numbers in their names, or folder of a scene with poses."""
+    out: Path
+    """Folder of the results."""
+    camera: OptionalText = None
+    """A known camera, scaled to the frames (c3vd: whole frames of C3VD; c3vd-undistorted), or a camera model of COLMAP;
+    default: found from the frames."""
+    params: Annotated[OptionalText, tyro.conf.arg(metavar="P1,P2,...")] = None
+    """Parameters of COLMAP's model, for the frames' size, pixel centres at integers + 0.5; default: estimated."""
+    diameter: Annotated[float | None, tyro.conf.arg(metavar="MM")] = None
+    """The colon's typical inner diameter, which gives lengths in mm, roughly; default: their unit stays unknown."""
+    every: OptionalInt = None
+    """Use the sharpest of every n frames; default: such that at most 200 are left."""
+    mask: OptionalPath = None
+    """Image of the frames' size, black where pixels are ignored; default: black surroundings are found."""
+    size: OptionalText = None
+    """Size WxH of the images that depth is estimated from and training sees, pixels; default: what fits 338x270."""
+    method: OptionalText = None
+    """Method to train; default: coliags-estimated-depth, or coliags for a scene with depth."""
+    steps: OptionalInt = None
+    """Training steps; default 2000."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Device to compute on."""
+    set: Assignments = ()
+    """Any setting of a stage, for instance frames.least_motion=0, sfm.max_ratio=0.9 or depth.agreement=0.03
+    (docs/reconstruct.md)."""
+    overwrite: bool = False
+    """Repeat the stages that were made with other options, and what follows them."""
+
+    def run(self) -> None:
+        """Run the stages that are not done, and print what there is."""
+        from coliags_plugin.api.reconstructing import reconstruct
+        from coliags_plugin.cli.arguments import parse_size
+        from coliags_plugin.config.assignments import parse_assignments
+        from coliags_plugin.pipeline.page import PAGE_FILE
+
+        given: dict[str, Any] = {
+            "sfm.camera.model": self.camera,
+            "sfm.camera.params": None
+            if self.params is None
+            else parse_assignments([f"params=[{self.params}]"])["params"],
+            "diameter": self.diameter,
+            "frames.every": self.every,
+            "size": None if self.size is None else parse_size(self.size),
+            "method": self.method,
+            "steps": self.steps,
+        }
+        settings = {key: value for key, value in given.items() if value is not None}
+        record = reconstruct(
+            self.video,
+            self.out,
+            settings={**settings, **parse_assignments(self.set)},
+            mask=self.mask,
+            device=self.device,
+            overwrite=self.overwrite,
+        )
+        for name, stage in record.stages.items():
+            print(f"{name}: {stage.summary}")
+        for stage in record.stages.values():
+            for path, what in stage.files.items():
+                print(f"{self.out / path}: {what}")
+        print(self.out / PAGE_FILE)

@@ -1,0 +1,65 @@
+"""Settings of the measurement of coverage."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import Field, ValidationError
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.settings import Settings, first_error
+
+
+class CoverageSettings(Settings):
+    """What counts as seen, and which missed regions are listed. Lengths are mm."""
+
+    max_distance: float = Field(
+        default=100.0, gt=0.0, description="Farthest z-depth at which surface counts as seen, mm."
+    )
+    far: float = Field(
+        default=60.0, gt=0.0, description="Surface that no frame shows from nearer is seen too far away, mm."
+    )
+    dark: float = Field(
+        default=0.12,
+        ge=0.0,
+        le=1.0,
+        description="Grey value, of 1, below which a pixel is too dark to judge the surface.",
+    )
+    grazing: float = Field(
+        default=75.0,
+        gt=0.0,
+        le=90.0,
+        description="Angle to the surface's normal above which it is only glanced at, degrees.",
+    )
+    glance_frames: int = Field(
+        default=3, ge=1, description="Fewest frames that show a surface well; with fewer it is seen only at a glance."
+    )
+    region_diameter: float = Field(
+        default=5.0, gt=0.0, description="Diameter of the circle of the smallest missed area that is listed, mm."
+    )
+    rays: int = Field(
+        default=150_000,
+        ge=1000,
+        description="Most viewing rays per frame. Images with fewer pixels get 2 x 2 rays a pixel, larger ones are "
+        "sampled more coarsely.",
+    )
+
+    @property
+    def region_area(self) -> float:
+        """Area of the smallest missed region that is listed, mm^2."""
+        return 0.25 * math.pi * self.region_diameter**2
+
+
+def coverage_settings(values: Mapping[str, Any]) -> CoverageSettings:
+    """Settings of plain values by name.
+
+    Raises:
+        InputError: A name is unknown, or a value is invalid.
+    """
+    try:
+        return CoverageSettings.model_validate(dict(values))
+    except ValidationError as error:
+        key, message, value = first_error(error)
+        raise InputError(f"coverage option '{key}' = {value!r}: {message}") from error

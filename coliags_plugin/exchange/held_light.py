@@ -1,0 +1,111 @@
+"""Lamps that stay where they are, for baking what they light."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import torch
+
+from coliags_plugin.contracts import GaussianField
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.lamps import FlattenedLight, HeldLight, LightOfCamera
+from coliags_plugin.core.render_output import OPAQUE_ALPHA, RenderOutput
+from coliags_plugin.engine.model import Model
+from coliags_plugin.renderers.splatting import SplattingRenderer
+
+#: Approximate number of training cameras, evenly spaced, that the flattened light is the median of.
+_CAMERAS = 16
+
+
+def mean_camera(cameras: Sequence[Camera]) -> Camera:
+    """The first camera at the mean position and the mean rotation of all (the rotation nearest to their mean matrix).
+
+    Args:
+        cameras: At least one.
+    """
+    poses = torch.stack([camera.camera_to_world.double() for camera in cameras])
+    left, _, right = torch.linalg.svd(poses[:, :3, :3].mean(0))
+    rotation = left @ torch.diag(torch.tensor([1.0, 1.0, float(torch.det(left @ right))], dtype=left.dtype)) @ right
+    pose = torch.eye(4, dtype=poses.dtype)
+    pose[:3, :3], pose[:3, 3] = rotation, poses[:, :3, 3].mean(0)
+    return replace(cameras[0], camera_to_world=pose)
+
+
+def light_of_mean_camera(model: Model, cameras: Sequence[Camera]) -> HeldLight:
+    """The lamp of the mean training camera."""
+    return LightOfCamera(mean_camera(cameras))
+
+
+@torch.no_grad()
+def flattened_light(model: Model, cameras: Sequence[Camera]) -> HeldLight:
+    """The median distance and the median angle to the optical axis of what the training cameras see, for everything."""
+    distances, cosines = [], []
+    device = next(model.field.parameters()).device
+    for camera in cameras[:: max(1, len(cameras) // _CAMERAS)]:
+        placed = camera.to(device)
+        output = model.renderer.render(model.field, placed, ("rgb", "alpha", "depth_accumulated"))
+        seen = output.alpha >= OPAQUE_ALPHA
+        lengths = placed.rays().norm(dim=-1)[seen]
+        distances.append(output["depth_accumulated"][seen] / output.alpha[seen] * lengths)
+        cosines.append(1.0 / lengths)
+    return FlattenedLight(float(torch.cat(distances).median()), float(torch.cat(cosines).median()))
+
+
+#: Ways to hold the light, by the names that users give them.
+LIGHTS: Mapping[str, Callable[[Model, Sequence[Camera]], HeldLight]] = {
+    "mean": light_of_mean_camera,
+    "flattened": flattened_light,
+}
+
+
+def held_light(name: str, model: Model, cameras: Sequence[Camera]) -> HeldLight:
+    """The light of a name.
+
+    Args:
+        name: ``mean`` or ``flattened``.
+        model: Of Gaussians.
+        cameras: The training cameras.
+
+    Raises:
+        InputError: There is no such light.
+    """
+    if name not in LIGHTS:
+        raise InputError(f"no light '{name}'", f"one of {', '.join(LIGHTS)}", did_you_mean(name, LIGHTS))
+    return LIGHTS[name](model, cameras)
+
+
+def render_held(model: Model, camera: Camera, light: HeldLight, wants: Sequence[str]) -> RenderOutput:
+    """What the field and the renderer of a model show of a view under a held light; view modules are left out.
+
+    Args:
+        model: Of Gaussians, with a splatting renderer.
+        camera: The view.
+        light: What lights it.
+        wants: Names of outputs.
+    """
+    field, renderer = gaussians_of(model), splatting_of(model)
+    return renderer.draw(field.gaussians_in_light(camera, light), camera, wants)
+
+
+def gaussians_of(model: Model) -> GaussianField:
+    """The model's field of Gaussians.
+
+    Raises:
+        InputError: It has none.
+    """
+    if not isinstance(model.field, GaussianField):
+        raise InputError(f"a field of '{model.field.primitive}'", "Gaussians", "Choose a splatting method")
+    return model.field
+
+
+def splatting_of(model: Model) -> SplattingRenderer:
+    """The model's splatting renderer.
+
+    Raises:
+        InputError: It is another one.
+    """
+    if not isinstance(model.renderer, SplattingRenderer):
+        raise InputError(f"renderer {type(model.renderer).__name__}", "one of this package's splatting renderers")
+    return model.renderer

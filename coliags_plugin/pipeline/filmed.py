@@ -1,0 +1,89 @@
+"""Stages from a video to a posed scene with depth: frames, poses, check, depth."""
+
+from __future__ import annotations
+
+import logging
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import write_json
+from coliags_plugin.pipeline.frame_sources import frame_source
+from coliags_plugin.pipeline.frames import FEWEST, IMAGES, read_lens_mask, write_frames
+from coliags_plugin.pipeline.stages import Outcome
+from coliags_plugin.pipeline.workplace import Workplace
+
+log = logging.getLogger(__name__)
+
+#: Median depth of a model whose scale is unknown, units: with about the depth that colons have in mm, constants in mm
+#: (docs/methods.md 4.4) have about the effect that they have on a colon.
+UNKNOWN_MEDIAN_DEPTH = 30.0
+#: Share of the frames below which it is said that the poses are of a part of the video only.
+_MOST = 0.7
+
+
+def make_frames(place: Workplace) -> Outcome:
+    """Write the frames of use, and their mask."""
+    source = frame_source(place.source)
+    summary = write_frames(source, place.frames, place.settings.frames, place.mask, place.progress)
+    return Outcome(
+        summary,
+        {"frames/images": "frames of use, PNG", "frames/frames.json": "which frames were dropped, and why"},
+    )
+
+
+def make_poses(place: Workplace) -> Outcome:
+    """Estimate poses and points by structure from motion, and write them as a scene."""
+    from coliags_plugin.reconstruction.structure.image_files import list_images
+    from coliags_plugin.reconstruction.structure.model_scale import millimetres, scaled
+    from coliags_plugin.reconstruction.structure.sfm import reconstruct
+    from coliags_plugin.reconstruction.structure.sfm_scene import write_sfm_scene
+
+    mask = read_lens_mask(place.frames)
+    found = reconstruct(list_images(place.frames / IMAGES), place.settings.sfm, mask, place.progress)
+    posed, count = len(found.registered), len(found.images)
+    if posed < FEWEST:
+        raise InputError(
+            f"{posed} of {count} frames have poses",
+            f"at least {FEWEST}",
+            "Choose a part of the video in which the camera moves along tissue that it sees well, keep more frames "
+            "(--every), or give the camera (--camera)",
+        )
+    if posed < _MOST * count:
+        log.warning("only %d of %d frames have poses: the rest of the video is not reconstructed", posed, count)
+    factor = millimetres(found, place.settings.diameter)
+    scene = scaled(found, UNKNOWN_MEDIAN_DEPTH / found.median_depth if factor is None else factor)
+    write_sfm_scene(place.posed, scene, mask, overwrite=True, unit="unknown" if factor is None else "mm")
+    unit = (
+        f"unit of length unknown (--diameter gives one): the median depth is made {UNKNOWN_MEDIAN_DEPTH:g}"
+        if factor is None
+        else f"unit mm, by a diameter of {place.settings.diameter:g} mm; median depth {scene.median_depth:.3g} mm"
+    )
+    return Outcome(f"{found.summary()}; {unit}", {"poses": "scene in COLMAP's layout: images, poses, points"})
+
+
+def check_data(place: Workplace) -> Outcome:
+    """Check that images, poses and calibration agree. What is suspect is said, and does not stop."""
+    from coliags_plugin.data_check.check import check_scene
+    from coliags_plugin.data_check.page import write_check_page
+
+    scene = place.open_posed()
+    check = check_scene(
+        scene, place.progress, (lambda: place.open_posed(stored_size=True)) if scene.is_resized else None
+    )
+    write_check_page(check, place.out / "check.html")
+    write_json(place.out / "check.json", check.as_json())
+    for finding in check.findings:
+        log.warning("suspect: %s (%s). %s", finding.what, finding.evidence, finding.do)
+    count = len(check.findings)
+    return Outcome(
+        f"{count} suspect finding{'' if count == 1 else 's'}" if count else "nothing suspect",
+        {"check.html": "consistency of images, poses and calibration", "check.json": "the same as JSON"},
+    )
+
+
+def estimate_depth(place: Workplace) -> Outcome:
+    """Estimate dense depth with its confidence; goes on where a kill has left it."""
+    from coliags_plugin.reconstruction.depth.scene import DepthRequest, estimate_scene
+
+    request = DepthRequest(place.settings.depth)
+    summary = estimate_scene(place.open_posed(), place.estimated, request, overwrite=True, progress=place.progress)
+    return Outcome(summary, {"depth": "scene in nerfstudio's layout: images, poses, depth, confidence, points"})

@@ -1,0 +1,148 @@
+"""Writes the frames of a video that are of use, without loss, with a record of those that are not."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, UInt8
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import atomic_folder, write_json
+from coliags_plugin.core.images import write_image, write_mask
+from coliags_plugin.core.progress import Progress
+from coliags_plugin.pipeline.frame_measures import motion, reduced, sharpness
+from coliags_plugin.pipeline.frame_selection import RESTING, THINNED, interval, lens_mask, sharp_frames
+from coliags_plugin.pipeline.frame_sources import FrameSource
+from coliags_plugin.pipeline.settings import FrameSettings
+from coliags_plugin.reconstruction.structure.image_files import read_mask
+
+#: Names within the folder.
+IMAGES, MASK, RECORD = "images", "mask.png", "frames.json"
+#: Fewest frames that can give depth (docs/depth.md 6).
+FEWEST = 4
+
+
+@dataclass(frozen=True)
+class _Survey:
+    """What the first pass over a video finds."""
+
+    sharpness: list[float]
+    brightest: UInt8[np.ndarray, "H W"]
+
+
+def write_frames(
+    source: FrameSource,
+    folder: Path,
+    settings: FrameSettings,
+    mask: Path | None = None,
+    progress: Progress | None = None,
+) -> str:
+    """Choose frames and write them: ``images/NAME.png``, ``frames.json``, and ``mask.png`` where there is a mask.
+
+    The video is read twice: for the sharpness of all frames, and to write those chosen.
+
+    Args:
+        source: The video.
+        folder: To create; replaced if it is there.
+        settings: Which frames.
+        mask: Image of the frames' size, black where pixels are ignored; None: black surroundings of the lens's image
+            are found.
+        progress: Progress callback.
+
+    Returns:
+        A summary of one line.
+
+    Raises:
+        InputError: The video cannot be read, the mask does not fit, fewer than four frames are left, or the folder
+            cannot be written.
+    """
+    given = None if mask is None else read_mask(mask)
+    survey = _survey(source, progress)
+    size = survey.brightest.shape
+    if given is not None and given.shape != size:
+        raise InputError(
+            f"{mask} is {given.shape[1]} x {given.shape[0]}, the frames {size[1]} x {size[0]}",
+            "a mask of the frames' size",
+        )
+    used = lens_mask(survey.brightest) if given is None else given
+    chosen, dropped = sharp_frames(survey.sharpness, settings)
+    with atomic_folder(folder, overwrite=True) as scratch:
+        kept = []
+        for index, name, image, moved in _moving(source, set(chosen), settings, progress, len(survey.sharpness)):
+            if not moved:
+                dropped[index] = RESTING
+                continue
+            kept.append((index, name))
+            write_image(scratch / IMAGES / f"{name}.png", image)
+        counts = Counter(dropped.values())
+        why = ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items()))
+        if len(kept) < FEWEST:
+            raise InputError(
+                f"{len(kept)} of {len(survey.sharpness)} frames of {source.path} are of use: {why or 'it has no more'}",
+                f"at least {FEWEST}",
+                "Give a longer part of the video in which the camera moves, or keep more frames with --every, "
+                "--set frames.least_motion=0 or --set frames.least_sharpness=0",
+            )
+        if used is not None:
+            write_mask(scratch / MASK, used)
+        write_json(
+            scratch / RECORD,
+            {
+                "source": source.path.name,
+                "frames": len(survey.sharpness),
+                "every": interval(len(survey.sharpness), settings),
+                "size": [size[1], size[0]],
+                "masked": None if used is None else round(float(1.0 - used.mean()), 4),
+                "kept": [{"frame": index, "name": name, "sharpness": survey.sharpness[index]} for index, name in kept],
+                "dropped": [
+                    {"frame": index, "why": why, "sharpness": survey.sharpness[index]}
+                    for index, why in sorted(dropped.items())
+                    if why != THINNED
+                ],
+            },
+        )
+    outside = "" if used is None else f"; {100.0 * (1.0 - used.mean()):.0f} % of the image masked"
+    return (
+        f"{len(kept)} of {len(survey.sharpness)} frames, {size[1]} x {size[0]} px{f'; {why}' if why else ''}{outside}"
+    )
+
+
+def read_lens_mask(folder: Path) -> Bool[np.ndarray, "H W"] | None:
+    """The mask of written frames; None where there is none."""
+    return read_mask(folder / MASK) if (folder / MASK).is_file() else None
+
+
+def _survey(source: FrameSource, progress: Progress | None) -> _Survey:
+    """Sharpness of all frames, and the brightest value of each pixel."""
+    total = source.expected
+    values: list[float] = []
+    brightest: UInt8[np.ndarray, "H W"] | None = None
+    for done, (_, image) in enumerate(source, start=1):
+        values.append(sharpness(reduced(image)))
+        peak = image.max(axis=2)
+        brightest = peak if brightest is None else np.maximum(brightest, peak)
+        if progress is not None:
+            progress("look at frames", done, max(done, total))
+    if brightest is None:
+        raise InputError(f"no frames in {source.path}", "a video")
+    return _Survey(values, brightest)
+
+
+def _moving(
+    source: FrameSource, chosen: set[int], settings: FrameSettings, progress: Progress | None, total: int
+) -> Iterator[tuple[int, str, UInt8[np.ndarray, "H W 3"], bool]]:
+    """The chosen frames: index, name, image, and whether the image has moved since the last that had."""
+    last = None
+    for index, (name, image) in enumerate(source):
+        if progress is not None:
+            progress("write frames", index + 1, total)
+        if index not in chosen:
+            continue
+        gray = reduced(image)
+        moved = last is None or motion(last, gray) >= settings.least_motion
+        last = gray if moved else last
+        yield index, name, image, moved

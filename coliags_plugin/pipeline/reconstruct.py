@@ -1,0 +1,130 @@
+"""From a video, a folder of images or a posed scene to mesh and report, in stages that a repeated call goes on with."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from coliags_plugin.config.method_config import load_method
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.locks import LockedError, locked
+from coliags_plugin.core.progress import Progress
+from coliags_plugin.datamanagers.recognition import find_format, recognised
+from coliags_plugin.pipeline import filmed, trained
+from coliags_plugin.pipeline.frame_sources import frame_source
+from coliags_plugin.pipeline.page import write_index
+from coliags_plugin.pipeline.record import LOCK_FILE, Record
+from coliags_plugin.pipeline.settings import FrameSettings, ReconstructionSettings
+from coliags_plugin.pipeline.stages import Outcome, Stage, run_stages
+from coliags_plugin.pipeline.workplace import Workplace
+from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
+
+log = logging.getLogger(__name__)
+
+
+def reconstruct(
+    source: Path,
+    out: Path,
+    settings: ReconstructionSettings,
+    device: torch.device,
+    mask: Path | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Record:
+    """Reconstruct a video, or go on with what was begun.
+
+    Args:
+        source: Video file, folder of images, or folder of a scene with poses, whose frames and poses are used.
+        out: Folder of the results.
+        settings: Of all stages.
+        device: Where to compute.
+        mask: Image of the frames' size, black where pixels are ignored; None: black surroundings are found.
+        overwrite: Repeat stages that were made with other settings, and what follows them.
+        progress: Progress callback.
+
+    Returns:
+        The record of what was made.
+
+    Raises:
+        InputError: The source cannot be read; a stage cannot be done; ``out`` is something else, or was made with
+            other settings; or another process works on it.
+        InterruptedRunError: Ctrl-C in training, after the state was saved.
+    """
+    made, read = out.resolve(), source.resolve()
+    if made == read or made in read.parents or (source.is_dir() and read in made.parents):
+        raise InputError(f"--out {out}, and the input is {source}", "a folder apart from the input", "Choose another")
+    if mask is not None and not mask.is_file():
+        raise InputError(f"no file {mask}", "an image, black where pixels are ignored", "Check --mask")
+    data_format = find_format(source) if source.is_dir() and recognised(source) else None
+    if data_format is None:
+        frame_source(source)
+    else:
+        _refuse_unused(source, settings, mask)
+    Record.of(out)  # refuses another folder before anything is written
+    place = Workplace(out, source, settings, mask, data_format, device, progress)
+    stages = stages_of(place)
+    try:
+        with locked(out / LOCK_FILE):
+            record = Record.of(out)
+            run_stages(stages, record, overwrite)
+            write_index(record, f"Reconstruction of {source.resolve().name}")
+    except LockedError as error:
+        raise InputError(f"{out} is in use by {error}", "one reconstruction at a time", "Wait for it") from error
+    return record
+
+
+def stages_of(place: Workplace) -> list[Stage]:
+    """The stages for a source, in order."""
+    settings = place.settings
+    source: Mapping[str, Any] = {"source": _identity(place.source)}
+    size = {"size": settings.size}
+    stages: list[Stage] = []
+
+    def add(
+        name: str, work: Callable[[Workplace], Outcome], options: Mapping[str, Any], outputs: tuple[str, ...]
+    ) -> None:
+        stages.append(Stage(name, {**options, **({} if stages else source)}, partial(work, place), outputs))
+
+    if place.data_format is None:
+        mask = None if place.mask is None else _identity(place.mask)
+        add("frames", filmed.make_frames, {"frames": settings.frames.model_dump(), "mask": mask}, ("frames",))
+        posing = {"diameter": settings.diameter, "sfm": settings.sfm.model_dump()}
+        add("poses", filmed.make_poses, posing, ("poses",))
+    add("check", filmed.check_data, size, ("check.html", "check.json"))
+    if place.estimates_depth:
+        add("depth", filmed.estimate_depth, {**size, "depth": settings.depth.model_dump()}, ("depth", ".depth.work"))
+    load_method(trained.method_for(place))  # an unknown method is found out before the work starts
+    training = {"method": trained.method_for(place), "steps": settings.steps, "seed": settings.seed}
+    add("train", trained.train, training, ("run",))
+    add("evaluate", trained.evaluate, {}, ("run/eval",))
+    add("mesh", trained.mesh, {"mesh": settings.mesh.model_dump()}, ("run/mesh",))
+    add("coverage", trained.coverage, {"coverage": settings.coverage.model_dump()}, ("run/coverage",))
+    add("report", trained.report, {}, ("report.html",))
+    return stages
+
+
+def _refuse_unused(source: Path, settings: ReconstructionSettings, mask: Path | None) -> None:
+    """Refuse settings of stages that a scene with poses does not need."""
+    unused = {
+        "mask": mask is not None,
+        "diameter": settings.diameter is not None,
+        "frames": settings.frames != FrameSettings(),
+        "sfm": settings.sfm != SfmSettings(),
+    }
+    if given := ", ".join(name for name, is_given in unused.items() if is_given):
+        raise InputError(
+            f"{source} has poses, and settings of {given} are given",
+            "these for a video or a folder of images alone",
+            "Leave them out, or give the folder of the scene's images, for their poses to be estimated",
+        )
+
+
+def _identity(path: Path) -> Mapping[str, Any]:
+    """Name and size of a file or folder: enough to notice that it is another one."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    return {"name": path.resolve().name, "bytes": sum(file.stat().st_size for file in files if file.is_file())}

@@ -1,0 +1,73 @@
+"""Settings of a reconstruction from frames."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from coliags_plugin.core.settings import Settings
+from coliags_plugin.coverage.settings import CoverageSettings
+from coliags_plugin.meshing.settings import MeshSettings
+from coliags_plugin.reconstruction.depth.settings import DepthSettings
+from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
+
+Pixels = Annotated[int, Field(gt=0)]
+
+
+class FrameSettings(Settings):
+    """Which frames of a video are used."""
+
+    every: int | None = Field(
+        default=None,
+        ge=1,
+        description="Use the sharpest of every n frames. None: such that at most 'at_most' are left.",
+    )
+    at_most: int = Field(
+        default=200,
+        ge=2,
+        description="Largest number of frames where 'every' is not given, spread over the whole video.",
+    )
+    least_sharpness: float = Field(
+        default=0.5,
+        ge=0.0,
+        lt=1.0,
+        description="Frames less sharp than this share of the median of their neighbours are dropped; 0: none.",
+    )
+    least_motion: float = Field(
+        default=0.0015,
+        ge=0.0,
+        description="Frames in which the image has moved by less than this share of its larger side since the last "
+        "frame kept are dropped, as the scope rests; 0: none.",
+    )
+
+
+class ReconstructionSettings(Settings):
+    """What is done with a video, stage by stage."""
+
+    frames: FrameSettings = FrameSettings()
+    """Which frames are used."""
+    sfm: SfmSettings = SfmSettings()
+    """Structure from motion, with the camera."""
+    diameter: float | None = Field(
+        default=None,
+        gt=0.0,
+        description="The colon's typical inner diameter, mm. None: the unit of length stays unknown.",
+    )
+    depth: DepthSettings = DepthSettings()
+    """Estimation of dense depth."""
+    size: tuple[Pixels, Pixels] | None = Field(
+        default=None,
+        description="Width and height of the images that depth is estimated from and training sees, pixels. "
+        "None: what fits 338 x 270.",
+    )
+    method: str | None = Field(
+        default=None,
+        description="Method to train. None: coliags-estimated-depth, or coliags where the scene has depth.",
+    )
+    steps: int = Field(default=2000, ge=1, description="Training steps.")
+    mesh: MeshSettings = MeshSettings()
+    """Fusion of the rendered depth into a mesh."""
+    coverage: CoverageSettings = CoverageSettings()
+    """What counts as seen."""
+    seed: int = Field(default=0, ge=0, description="Seed of training.")

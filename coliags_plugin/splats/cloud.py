@@ -1,0 +1,108 @@
+"""Gaussians of a file: a world frame, plain numbers, colours as spherical harmonics."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float32
+
+from coliags_plugin.fields.spherical_harmonics import Y0
+
+#: Opacities are kept this far from 0 and 1, where their logits would be infinite.
+OPACITY_MARGIN = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class SplatCloud:
+    """Gaussians or surfels in the world frame and scene units (mm for C3VD), as files hold them.
+
+    The colour seen along a direction is max(0, 0.5 + sum of coefficients times basis), in display sRGB, with the order
+    and the signs of 3DGS.
+
+    Attributes:
+        means: Centres. [N, 3]
+        quats_wxyz: Rotations; need not be normalised. [N, 4]
+        scales: Standard deviations along the local axes; two for surfels. [N, 3] or [N, 2]
+        opacities: In [0, 1]. [N]
+        harmonics: Coefficients of spherical harmonics to degree D, B = (D + 1)^2. [N, B, 3]
+    """
+
+    means: Float32[np.ndarray, "N 3"]
+    quats_wxyz: Float32[np.ndarray, "N 4"]
+    scales: Float32[np.ndarray, "N S"]
+    opacities: Float32[np.ndarray, "N"]
+    harmonics: Float32[np.ndarray, "N B 3"]
+
+    def __len__(self) -> int:
+        """Number of Gaussians."""
+        return len(self.means)
+
+    @property
+    def degree(self) -> int:
+        """Degree of the spherical harmonics, 0 to 3."""
+        return math.isqrt(self.harmonics.shape[1]) - 1
+
+    @property
+    def colors(self) -> Float32[np.ndarray, "N 3"]:
+        """Colours without their dependence on the direction, in [0, 1]. [N, 3]"""
+        return np.clip(0.5 + Y0 * self.harmonics[:, 0], 0.0, 1.0)
+
+    @property
+    def unit_quats_wxyz(self) -> Float32[np.ndarray, "N 4"]:
+        """Rotations of length 1. [N, 4]"""
+        lengths = np.linalg.norm(self.quats_wxyz, axis=1, keepdims=True)
+        return self.quats_wxyz / np.maximum(lengths, np.finfo(np.float32).tiny)
+
+    @property
+    def log_scales(self) -> Float32[np.ndarray, "N S"]:
+        """Natural logarithms of the scales, finite. [N, 3] or [N, 2]"""
+        return np.log(np.maximum(self.scales, np.finfo(np.float32).tiny))
+
+    @property
+    def logits(self) -> Float32[np.ndarray, "N"]:
+        """Logits of the opacities, finite. [N]"""
+        inside = np.clip(self.opacities.astype(np.float64), OPACITY_MARGIN, 1.0 - OPACITY_MARGIN)
+        return np.log(inside / (1.0 - inside)).astype(np.float32)
+
+    def part(self, kept: Bool[np.ndarray, "N"]) -> SplatCloud:
+        """Some of the Gaussians.
+
+        Args:
+            kept: True for those to keep. [N]
+        """
+        rows = (self.means, self.quats_wxyz, self.scales, self.opacities, self.harmonics)
+        return SplatCloud(*(values[kept] for values in rows))
+
+    def usable(self) -> Bool[np.ndarray, "N"]:
+        """Which Gaussians are finite and have a rotation. [N]"""
+        values = (self.means, self.quats_wxyz, self.scales, self.opacities[:, None], self.harmonics)
+        finite = np.all([np.isfinite(part).reshape(len(self), -1).all(axis=1) for part in values], axis=0)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return finite & (np.square(self.quats_wxyz.astype(np.float64)).sum(axis=1) > 1e-24)
+
+    def with_thickness(self, share: float) -> SplatCloud:
+        """Surfels as flat Gaussians; Gaussians unchanged.
+
+        Args:
+            share: Third scale as a share of the smaller one of the other two.
+        """
+        if self.scales.shape[1] == 3:
+            return self
+        third = share * self.scales.min(axis=1, keepdims=True)
+        return replace(self, scales=np.concatenate([self.scales, third], axis=1))
+
+
+def sigmoid(logits: Float32[np.ndarray, "N"]) -> Float32[np.ndarray, "N"]:
+    """Opacities of logits. [N]"""
+    return (0.5 * (1.0 + np.tanh(0.5 * logits.astype(np.float64)))).astype(np.float32)
+
+
+def harmonics_of_colors(colors: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 1 3"]:
+    """Coefficients of degree 0 of colours that do not depend on the direction. [N, 1, 3]
+
+    Args:
+        colors: RGB in [0, 1]. [N, 3]
+    """
+    return ((colors - 0.5) / Y0)[:, None].astype(np.float32)

@@ -1,0 +1,76 @@
+"""Frames written for a reconstruction."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import write_mask
+from coliags_plugin.outputs.image_files import read_rgb
+from coliags_plugin.pipeline.frame_sources import frame_source
+from coliags_plugin.pipeline.frames import read_lens_mask, write_frames
+from coliags_plugin.pipeline.settings import FrameSettings
+from tests.pipeline.films import HEIGHT, WIDTH, blurred, film, write_images
+
+FILM = film(range(0, 120, 6))
+
+
+def test_frames_are_written_without_loss_and_what_is_dropped_is_recorded(tmp_path):
+    frames = [*FILM[:5], blurred(FILM[5]), *FILM[6:10], FILM[9], FILM[9], np.zeros_like(FILM[0]), *FILM[10:]]
+    out = tmp_path / "frames"
+    summary = write_frames(frame_source(write_images(tmp_path / "film", frames)), out, FrameSettings())
+    dropped = {5: "blurred", 10: "the camera rests", 11: "the camera rests", 12: "black or without any texture"}
+    record = json.loads((out / "frames.json").read_text())
+    assert {each["frame"]: each["why"] for each in record["dropped"]} == dropped
+    kept = [index for index in range(len(frames)) if index not in dropped]
+    assert [each["frame"] for each in record["kept"]] == kept
+    assert sorted(path.name for path in (out / "images").iterdir()) == sorted(f"{index}.png" for index in kept)
+    for index in kept:
+        np.testing.assert_array_equal(read_rgb(out / "images" / f"{index}.png"), frames[index])
+    assert summary.startswith(f"19 of 23 frames, {WIDTH} x {HEIGHT} px; 1 black")
+    assert read_lens_mask(out) is None
+
+
+def test_a_slow_camera_does_not_rest(tmp_path):
+    """Motion counts from the last frame kept, so that slow motion adds up."""
+    frames = film([place // 3 for place in range(60)])
+    write_frames(frame_source(write_images(tmp_path / "film", frames)), tmp_path / "out", FrameSettings())
+    kept = json.loads((tmp_path / "out" / "frames.json").read_text())["kept"]
+    assert [each["frame"] for each in kept] == list(range(0, 60, 3))
+
+
+def test_the_mask_is_found_or_given(tmp_path):
+    ring = np.ones((HEIGHT, WIDTH), bool)
+    ring[:, :20] = False
+    frames = [np.where(ring[..., None], frame, 0).astype(np.uint8) for frame in FILM]
+    source = frame_source(write_images(tmp_path / "film", frames))
+    summary = write_frames(source, tmp_path / "found", FrameSettings(least_motion=0.0))
+    assert summary.endswith("% of the image masked")
+    mask = read_lens_mask(tmp_path / "found")
+    assert not mask[:, :20].any()
+    assert mask[:, 24:].all()
+    ring[:30] = False
+    write_mask(tmp_path / "mask.png", ring)
+    write_frames(source, tmp_path / "given", FrameSettings(), tmp_path / "mask.png")
+    np.testing.assert_array_equal(read_lens_mask(tmp_path / "given"), ring)
+    write_mask(tmp_path / "small.png", ring[:50])
+    with pytest.raises(InputError, match=r"small.png is 160 x 50, the frames 160 x 120"):
+        write_frames(source, tmp_path / "no", FrameSettings(), tmp_path / "small.png")
+    assert not (tmp_path / "no").exists()
+
+
+@pytest.mark.parametrize(
+    ("frames", "message"),
+    [
+        (FILM[:2], "2 of 2 frames .* it has no more. Expected at least 4"),
+        ([FILM[0]] * 9, "1 of 9 frames .* 8 the camera rests"),
+        ([np.full_like(FILM[0], 70)] * 9, "0 of 9 frames .* 9 black or without any texture"),
+    ],
+)
+def test_too_few_frames_of_use_are_refused(tmp_path, frames, message):
+    with pytest.raises(InputError, match=message):
+        write_frames(frame_source(write_images(tmp_path / "film", frames)), tmp_path / "out", FrameSettings())
+    assert not (tmp_path / "out").exists()

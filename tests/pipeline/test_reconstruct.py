@@ -1,0 +1,176 @@
+"""From a video to the results, as a command and as a function."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+import coliags_plugin as cp
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.datamanagers.units import read_unit
+from coliags_plugin.meshes.files import read_mesh
+from coliags_plugin.outputs.video import write_video
+from coliags_plugin.pipeline import filmed, trained
+from coliags_plugin.pipeline.stages import Outcome
+from coliags_plugin.poses import colmap
+from coliags_plugin.poses.alignment import align
+from coliags_plugin.poses.association import associate
+from coliags_plugin.poses.trajectory import Trajectory
+from tests import commands
+from tests.pipeline.films import blurred, film, write_images
+from tests.textured_tube import INTRINSICS, tube_frames, write_tube
+
+FILMED, TRAINED = ("make_poses", "check_data", "estimate_depth"), ("train", "evaluate", "mesh", "coverage", "report")
+
+
+class Killed(BaseException):
+    """Ends a process wherever it is."""
+
+
+@pytest.fixture
+def done(monkeypatch):
+    """Names of the stages that were run; all but the first, which is quick, are faked."""
+    names: list[str] = []
+
+    def faked(name):
+        def work(place):
+            names.append(name)
+            return Outcome(f"{name} done", {name: "a file"})
+
+        return work
+
+    write = filmed.make_frames
+    monkeypatch.setattr(filmed, "make_frames", lambda place: (names.append("make_frames"), write(place))[1])
+    for module, functions in ((filmed, FILMED), (trained, TRAINED)):
+        for function in functions:
+            monkeypatch.setattr(module, function, faked(function))
+    return names
+
+
+@pytest.fixture
+def video(tmp_path):
+    write_video(film(range(0, 120, 8)), tmp_path / "film.mp4", 15.0)
+    return tmp_path / "film.mp4"
+
+
+def test_stages_of_a_video(done, video, tmp_path, capsys):
+    argv = ("reconstruct", video, "--out", tmp_path / "out", "--steps", 50, "--diameter", 40)
+    assert commands.run(*argv) == 0
+    assert done == ["make_frames", *FILMED, *TRAINED]
+    printed = capsys.readouterr().out
+    assert printed.splitlines()[0].startswith("frames: 15 of 15 frames, 160 x 120 px")
+    assert f"{tmp_path / 'out' / 'frames' / 'images'}: frames of use, PNG" in printed
+    page = (tmp_path / "out" / "index.html").read_text()
+    assert 'href="frames/images"' in page
+    assert "15 of 15 frames, 160 x 120 px" in page
+    done.clear()
+    assert commands.run(*argv) == 0
+    assert done == []
+    # Of other options, those that no stage that is done depends on are taken.
+    message = commands.refused(capsys, *argv[:-3], 60, *argv[-2:])
+    assert "stage train was made with steps 50, not 60" in message
+    assert commands.run(*argv[:-3], 60, *argv[-2:], "--overwrite") == 0
+    assert done == [*TRAINED]
+
+
+def test_a_killed_reconstruction_goes_on(done, video, tmp_path, monkeypatch):
+    def killed(place):
+        raise Killed
+
+    with monkeypatch.context() as patched, pytest.raises(Killed):
+        patched.setattr(filmed, "estimate_depth", killed)
+        cp.reconstruct(video, tmp_path / "out")
+    record = json.loads((tmp_path / "out" / "reconstruction.json").read_text())
+    assert {name: stage["state"] for name, stage in record["stages"].items()} == {
+        "frames": "done",
+        "poses": "done",
+        "check": "done",
+        "depth": "begun",
+    }
+    done.clear()
+    cp.reconstruct(video, tmp_path / "out")
+    assert done == ["estimate_depth", *TRAINED]
+
+
+def test_another_video_is_noticed(done, video, tmp_path):
+    cp.reconstruct(video, tmp_path / "out")
+    write_video(film(range(0, 60, 4)), video, 15.0)
+    with pytest.raises(InputError, match=r"stage frames was made with source.bytes \d+, not \d+"):
+        cp.reconstruct(video, tmp_path / "out")
+
+
+def test_a_scene_with_poses_needs_neither_frames_nor_poses(done, tmp_path):
+    scene = write_tube(tmp_path / "tube", 6, 3.0)
+    cp.reconstruct(scene, tmp_path / "out")
+    with_depth = any(path.name.startswith("depth") for path in scene.iterdir())
+    assert done == ["check_data", *([] if with_depth else ["estimate_depth"]), *TRAINED]
+    with pytest.raises(InputError, match=r"tube has poses, and settings of diameter, frames are given"):
+        cp.reconstruct(scene, tmp_path / "other", settings={"diameter": 40.0, "frames.every": 2})
+
+
+@pytest.mark.parametrize(
+    ("frames", "message"),
+    [
+        (film(range(0, 20, 10)), "stage frames: 2 of 2 frames"),
+        (
+            [blurred(frame, 25.0) for frame in film(range(0, 60, 5))],
+            "stage frames: .* of 12 frames|stage poses: no model",
+        ),
+    ],
+)
+def test_frames_that_show_too_little_are_refused(tmp_path, frames, message):
+    folder = write_images(tmp_path / "film", frames)
+    with pytest.raises(InputError, match=message):
+        cp.reconstruct(folder, tmp_path / "out")
+    assert not (tmp_path / "out" / "poses").exists()
+
+
+def test_bad_input_leaves_nothing(tmp_path, capsys):
+    (tmp_path / "noise.mp4").write_bytes(b"no video" * 100)
+    (tmp_path / "empty").mkdir()
+    folder = write_images(tmp_path / "film", film(range(0, 60, 6)))
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.tex").touch()
+    out = tmp_path / "out"
+    for argv, message in (
+        ((tmp_path / "noise.mp4", "--out", out), "cannot be opened as a video by OpenCV"),
+        ((tmp_path / "empty", "--out", out), "holds 0 images"),
+        ((tmp_path / "nowhere", "--out", out), "Expected a video file, or a folder of images"),
+        ((folder, "--out", folder), "Expected a folder apart from the input"),
+        ((folder, "--out", folder / "out"), "Expected a folder apart from the input"),
+        ((folder, "--out", tmp_path / "full"), "already exists and is no reconstruction"),
+        ((folder, "--out", out, "--mask", tmp_path / "no.png"), "no file"),
+        ((folder, "--out", out, "--diameter", 0), "diameter"),
+        ((folder, "--out", out, "--set", "frames.evry=2"), "Did you mean 'every'?"),
+        ((folder, "--out", out, "--size", "big"), "--size big"),
+        ((folder, "--out", out, "--method", "coliagz"), "coliagz"),
+    ):
+        assert message in commands.refused(capsys, "reconstruct", *argv)
+        assert not out.exists()
+
+
+def test_a_tube_is_reconstructed_from_its_frames(tmp_path):
+    """All stages on ten small frames; a few steps of training, so that only the path is exact."""
+    torch.set_num_threads(1)
+    frames = tube_frames(10, 2.0)
+    folder = write_images(tmp_path / "film", [frame.image.numpy() for frame in frames])
+    settings = {
+        "sfm.camera.model": "PINHOLE",
+        "sfm.camera.params": INTRINSICS,
+        "method": "coliags-estimated-depth",
+        "steps": 20,
+    }
+    record = cp.reconstruct(folder, tmp_path / "out", settings=settings)
+    assert {stage.state for stage in record.stages.values()} == {"done"}
+    assert read_unit(tmp_path / "out" / "poses") == "unknown"
+    found = colmap.read(tmp_path / "out" / "poses" / "sparse" / "0")
+    truth = Trajectory(np.stack([frame.camera.camera_to_world.numpy() for frame in frames]))
+    assert align(found, truth, associate(found, truth, "index"), with_scale=True).ate.rmse < 0.1
+    assert len(read_mesh(tmp_path / "out" / "run" / "mesh" / "mesh.ply")) > 100
+    for stage in record.stages.values():
+        for path in stage.files:
+            assert (tmp_path / "out" / path).exists()
+    assert (tmp_path / "out" / "report.html").stat().st_size > 10_000

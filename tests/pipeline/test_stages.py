@@ -1,0 +1,110 @@
+"""Stages that are done once, in order."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.pipeline.record import RECORD_FILE, Record
+from coliags_plugin.pipeline.stages import Outcome, Stage, duration, run_stages
+
+
+class Killed(BaseException):
+    """Ends a process wherever it is."""
+
+
+class Workshop:
+    """Three stages that write a file each, and a list of what was done."""
+
+    def __init__(self, folder, kill=None, fail=None):
+        self.folder, self.kill, self.fail, self.done = folder, kill, fail, []
+
+    def stages(self, **options):
+        return [
+            Stage(name, {"value": options.get(name, 0)}, lambda name=name: self.work(name), (f"{name}.txt",))
+            for name in ("first", "second", "third")
+        ]
+
+    def work(self, name):
+        if name == self.fail:
+            raise InputError("nothing to see", "something", "Look elsewhere")
+        (self.folder / f"{name}.txt").write_text(name)
+        if name == self.kill:
+            raise Killed
+        self.done.append(name)
+        return Outcome(f"{name} is there", {f"{name}.txt": "a file"})
+
+    def run(self, overwrite=False, **options):
+        self.done = []
+        run_stages(self.stages(**options), Record.of(self.folder), overwrite)
+        return self.done
+
+
+def test_done_stages_are_left_out(tmp_path):
+    shop = Workshop(tmp_path)
+    assert shop.run() == ["first", "second", "third"]
+    assert shop.run() == []
+    record = Record.of(tmp_path)
+    assert [stage.state for stage in record.stages.values()] == ["done"] * 3
+    assert record.stages["second"].summary == "second is there"
+    assert record.stages["third"].files == {"third.txt": "a file"}
+
+
+@pytest.mark.parametrize("name", ["first", "second", "third"])
+def test_a_killed_run_goes_on(tmp_path, name):
+    with pytest.raises(Killed):
+        Workshop(tmp_path, kill=name).run()
+    order = ["first", "second", "third"]
+    assert Workshop(tmp_path).run() == order[order.index(name) :]
+
+
+def test_other_options_are_refused_or_repeat_what_depends_on_them(tmp_path):
+    shop = Workshop(tmp_path)
+    shop.run()
+    with pytest.raises(InputError, match=r"stage second was made with value 0, not 5.*--overwrite to repeat second"):
+        shop.run(second=5)
+    assert shop.run() == []
+    (tmp_path / "third.txt").write_text("old")
+    assert shop.run(overwrite=True, second=5) == ["second", "third"]
+    assert (tmp_path / "third.txt").read_text() == "third"
+    assert shop.run(second=5) == []
+
+
+def test_what_a_kill_has_left_is_not_mixed_with_other_options(tmp_path):
+    with pytest.raises(Killed):
+        Workshop(tmp_path, kill="second").run()
+    with pytest.raises(InputError, match="stage second was made with"):
+        Workshop(tmp_path).run(second=1)
+
+
+def test_a_stage_that_failed_can_be_tried_with_other_options(tmp_path):
+    with pytest.raises(InputError) as refused:
+        Workshop(tmp_path, fail="third").run()
+    assert str(refused.value) == (
+        "stage third: nothing to see. Expected something. Look elsewhere. "
+        "first, second stand: the same command goes on from there."
+    )
+    assert Record.of(tmp_path).stages["third"].state == "failed"
+    assert Workshop(tmp_path).run(third=1) == ["third"]
+
+
+def test_a_folder_of_something_else_is_refused(tmp_path):
+    (tmp_path / "thesis.tex").write_text("")
+    with pytest.raises(InputError, match="already exists and is no reconstruction"):
+        Record.of(tmp_path)
+    (tmp_path / RECORD_FILE).write_text('{"stages": 3}')
+    with pytest.raises(InputError, match=r"cannot read .*reconstruction.json"):
+        Record.of(tmp_path)
+
+
+def test_the_record_is_json_with_version(tmp_path):
+    Workshop(tmp_path).run()
+    found = json.loads((tmp_path / RECORD_FILE).read_text())
+    assert found["format"] == 1
+    assert list(found["stages"]) == ["first", "second", "third"]
+
+
+def test_durations_in_words():
+    assert [duration(seconds) for seconds in (0.4, 59.4, 60, 3725)] == ["0 s", "59 s", "1 min 0 s", "62 min 5 s"]
