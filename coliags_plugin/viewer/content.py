@@ -6,7 +6,7 @@ import logging
 import math
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -17,8 +17,10 @@ from scipy.spatial import cKDTree
 
 from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.lamps import HeldLight
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.trained import TrainedRun
+from coliags_plugin.exchange.held_light import flattened_light
 from coliags_plugin.outputs.image_files import as_array
 from coliags_plugin.viewer.baking import bake, baking_cameras
 from coliags_plugin.viewer.decoding import ViewDecoder, in_view
@@ -43,7 +45,8 @@ class Content:
     Attributes:
         trained: The run.
         frames: Of the video, in its order.
-        baked: Its Gaussians for no view in particular; none for a method without Gaussians.
+        baked: Its Gaussians for no view in particular, under the light that they got on average; none for a method
+            without Gaussians.
         decoder: Its Gaussians for a view; None for a method without Gaussians.
         pictures: Of the frames.
         unit: See :func:`~coliags_plugin.viewer.splats.wire_unit`.
@@ -61,7 +64,6 @@ class Content:
     @classmethod
     def of(cls, trained: TrainedRun) -> Content:
         """Bake the Gaussians of a run, where its method has any."""
-        frames = trained.scene.video
         gaussian_field = trained.model.field
         baked, decoder = none_at_all(), None
         if isinstance(gaussian_field, GaussianField):
@@ -75,7 +77,15 @@ class Content:
                 "method '%s' has no Gaussians to draw in the browser: there are cameras, meshes and rendered pictures",
                 trained.method,
             )
-        return cls(trained, frames, baked, decoder, Pictures(trained), wire_unit(baked))
+        return cls(trained, trained.scene.video, baked, decoder, Pictures(trained), wire_unit(baked))
+
+    def relit_evenly(self) -> Content:
+        """The same, its Gaussians baked under the flattened light."""
+        field = self.trained.model.field
+        if not isinstance(field, GaussianField):
+            return self
+        cameras = [frame.camera.to(self.trained.device) for frame in self.trained.scene.train]
+        return replace(self, baked=Splats.of(bake(field, baking_cameras(cameras), self.flattened)))
 
     @property
     def title(self) -> str:
@@ -101,6 +111,11 @@ class Content:
             _, depth = camera.to("cpu", torch.float64).project(torch.as_tensor(seen, dtype=torch.float64))
             return float(depth.median())
         return _DEFAULT_DISTANCE * self.trained.scene.extent or 1.0
+
+    @cached_property
+    def flattened(self) -> HeldLight:
+        """The same light everywhere: median distance and angle of what training cameras see; renders some views."""
+        return flattened_light(self.trained.model, [frame.camera for frame in self.trained.scene.train])
 
     @cached_property
     def distances(self) -> Float[np.ndarray, "N"]:

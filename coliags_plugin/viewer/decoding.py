@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 
 from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.lamps import HeldLight
 from coliags_plugin.viewer.splats import Splats
 
 #: How much wider than the view, on every side, Gaussians are decoded, so that a small turn shows no gap.
@@ -34,14 +35,15 @@ class ViewDecoder:
         self._device = device
 
     @torch.no_grad()
-    def of(self, camera: Camera) -> Splats:
+    def of(self, camera: Camera, light: HeldLight | None = None) -> Splats:
         """Gaussians with their colours, and, of anchor methods, their shapes, as this camera sees them.
 
         Args:
             camera: View of the browser.
+            light: What lights them; None: the lamp on the camera.
         """
-        wide = widened(camera)
-        seen = Splats.of(self._field.gaussians(wide.to(self._device)))
+        wide = widened(camera).to(self._device)
+        seen = Splats.of(self._field.gaussians(wide) if light is None else self._field.gaussians_in_light(wide, light))
         return seen.and_also(self.beside.part(~in_view(self.beside.centers, wide)))
 
 

@@ -30,7 +30,7 @@ _FEWEST_BYTES = 30
 
 
 def save_page(trained: TrainedRun, output: Path, largest: int = LARGEST_PAGE) -> Path:
-    """Write the Gaussians of a run, under the average light of its training views, as a page.
+    """Write the Gaussians of a run, under the same light everywhere, as a page.
 
     Where the page would be too large, neighbouring Gaussians are merged.
 
@@ -51,6 +51,7 @@ def save_page(trained: TrainedRun, output: Path, largest: int = LARGEST_PAGE) ->
             "a method of Gaussians",
             "Write pictures with `coliags render`, or a mesh with `coliags mesh`",
         )
+    content = content.relit_evenly()
     splats, page = fitting_page(content, largest)
     if len(splats) < len(content.baked):
         logger.warning(
@@ -97,7 +98,7 @@ def _page(content: Content, splats: Splats) -> str:
 
 def _caption(content: Content, splats: Splats) -> str:
     """What is seen, at the bottom of the page."""
-    text = f"{content.title}, step {content.trained.step}: average light of the training views"
+    text = f"{content.title}, step {content.trained.step}: flattened light"
     if len(splats) < len(content.baked):
         text += f"; {len(content.baked):,} Gaussians merged into {len(splats):,}"
     style = "position:fixed;left:0;bottom:0;padding:4px 8px;font:12px sans-serif;background:#fffc;pointer-events:none"
