@@ -28,6 +28,7 @@ def report(
     frames: int = 4,
     title: str | None = None,
     note: str | None = None,
+    scene: Run | str | Path | None = None,
 ) -> list[Path]:
     """Write a report of evaluated methods: tables with statistics, held-out views, errors, curves and costs.
 
@@ -42,6 +43,7 @@ def report(
         frames: Held-out frames to show per scene and test set; the worst ones are added.
         title: Heading; None: methods and scenes.
         note: A remark shown at the top.
+        scene: A run whose scene the HTML page lets its reader fly through, at most 5 MB more (docs/viewer.md 3).
 
     Returns:
         The files.
@@ -64,4 +66,14 @@ def report(
         if each not in SUFFIXES:
             raise InputError(f"no format '{each}'", f"one of {', '.join(SUFFIXES)}", did_you_mean(each, SUFFIXES))
     file = Path(f"report{SUFFIXES[wanted[0]]}") if output is None else Path(output)
-    return write_report(paths, file, wanted, Choices(columns, reference, title, note), protocol, frames, methods)
+    section = _scene_section(scene) if scene is not None and "html" in wanted else ""
+    choices = Choices(columns, reference, title, note)
+    return write_report(paths, file, wanted, choices, protocol, frames, methods, section)
+
+
+def _scene_section(of: Run | str | Path) -> str:
+    from coliags_plugin.reporting.scene_section import scene_section
+    from coliags_plugin.viewer.saving import scene_page
+
+    run = of if isinstance(of, Run) else Run(of)
+    return scene_section(scene_page(run.load()), f"{run.method} on {run.scene_name}, seed {run.seed}")

@@ -43,6 +43,8 @@ class Report:
     """Heading; default: methods and scenes."""
     note: OptionalText = None
     """A remark shown at the top."""
+    scene: OptionalPath = None
+    """Run folder whose scene the HTML page lets its reader fly through, offline; needs the extra `viewer`."""
 
     def run(self) -> None:
         """Write the report and print the paths."""
@@ -61,6 +63,7 @@ class Report:
             frames=self.frames,
             title=self.title,
             note=self.note,
+            scene=self.scene,
         )
         for file in files:
             print(file.resolve())

@@ -28,8 +28,16 @@ _FIXED, _PER_FIGURE = 30_000, 1_200
 _STYLE, _SCRIPT = (Path(__file__).with_name(name) for name in ("report.css", "report.js"))
 
 
-def write_html(study: Study, content: Content, choices: Choices, views: Views, output: Path) -> None:
+def write_html(study: Study, content: Content, choices: Choices, views: Views, output: Path, scene: str = "") -> None:
     """Write the page, and the pictures for which it has no room into a folder beside it.
+
+    Args:
+        study: The results.
+        content: Its tables.
+        choices: Columns, reference, title and note.
+        views: Held-out views.
+        output: The file.
+        scene: Section with a scene (:func:`~coliags_plugin.reporting.scene_section.scene_section`); empty: none.
 
     Raises:
         InputError: A training log is damaged, or the page cannot be written.
@@ -37,6 +45,7 @@ def write_html(study: Study, content: Content, choices: Choices, views: Views, o
     style, script = (path.read_text(encoding="utf-8") for path in (_STYLE, _SCRIPT))
     before = [html_section(content.metrics), html_section(content.failures) if content.failures else ""]
     after = [
+        scene,
         profile_section(study),
         "\n".join(
             ["<section><h2>Training</h2>", *map(html_block, content.costs.blocks), training_charts(study), "</section>"]

@@ -32,6 +32,7 @@ def write_report(
     protocol: str = "paper",
     frames: int = 4,
     methods: Sequence[str] = (),
+    scene: str = "",
 ) -> list[Path]:
     """Write a report of methods on scenes: metrics and statistics, views, errors, curves, costs and provenance.
 
@@ -43,6 +44,7 @@ def write_report(
         protocol: Name of the evaluation to read from folders.
         frames: Held-out views to show per scene and test set, beside the worst ones.
         methods: Names of methods to show, in this order; empty: all.
+        scene: Section with a scene, of the HTML page alone (:mod:`coliags_plugin.reporting.scene_section`).
 
     Returns:
         The files.
@@ -62,7 +64,7 @@ def write_report(
     views = Views(study, content.reference, frames) if "html" in files else None
     for each, file in files.items():
         if views is not None and each == "html":
-            write_html(study, content, choices, views, file)
+            write_html(study, content, choices, views, file, scene)
         elif each == "csv":
             atomic_write(file, per_frame_csv(study))
         else:

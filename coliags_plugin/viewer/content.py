@@ -163,5 +163,6 @@ def aspect(camera: Camera) -> float:
 def mesh_files(run: Path) -> dict[str, Path]:
     """Meshes in a run folder by the names of their layers: of ``coliags mesh`` and ``coliags coverage``."""
     files = {"mesh": run / "mesh" / "mesh.ply"}
-    files |= {f"coverage: {file.stem}": file for file in sorted((run / "coverage").glob("*.ply"))}
+    for file in sorted((run / "coverage").glob("*.ply")):
+        files["coverage" if file.stem == "coverage" else f"coverage: {file.stem}"] = file
     return {name: file for name, file in files.items() if file.is_file()}

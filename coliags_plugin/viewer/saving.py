@@ -8,13 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
+from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.outputs.page import refuse_folder
 from coliags_plugin.viewer.content import Content
 from coliags_plugin.viewer.layers import add_cameras
-from coliags_plugin.viewer.library import start_server, stop_server
+from coliags_plugin.viewer.library import import_viser, start_server, stop_server
 from coliags_plugin.viewer.merging import merged_to
 from coliags_plugin.viewer.serving import set_start
 from coliags_plugin.viewer.splats import Splats, on_wire
@@ -30,9 +31,7 @@ _FEWEST_BYTES = 30
 
 
 def save_page(trained: TrainedRun, output: Path, largest: int = LARGEST_PAGE) -> Path:
-    """Write the Gaussians of a run, under the same light everywhere, as a page.
-
-    Where the page would be too large, neighbouring Gaussians are merged.
+    """Write :func:`scene_page` to a file.
 
     Args:
         trained: The run.
@@ -40,26 +39,40 @@ def save_page(trained: TrainedRun, output: Path, largest: int = LARGEST_PAGE) ->
         largest: Size of the page, bytes.
 
     Raises:
-        InputError: viser cannot be imported, the method has no Gaussians, not even a few fit, or the file cannot be
-            written.
+        InputError: See :func:`scene_page`; or the file cannot be written.
     """
     refuse_folder(output)
-    content = Content.of(trained)
-    if content.decoder is None:
+    atomic_write(output, scene_page(trained, largest))
+    return output
+
+
+def scene_page(trained: TrainedRun, largest: int = LARGEST_PAGE) -> str:
+    """The Gaussians of a run, under the same light everywhere, as an HTML page.
+
+    Where the page would be too large, neighbouring Gaussians are merged.
+
+    Args:
+        trained: The run.
+        largest: Size of the page, bytes.
+
+    Raises:
+        InputError: viser cannot be imported, the method has no Gaussians, or not even a few fit.
+    """
+    if not isinstance(trained.model.field, GaussianField):
         raise InputError(
             f"method '{trained.method}' has no Gaussians to draw in a browser",
             "a method of Gaussians",
             "Write pictures with `coliags render`, or a mesh with `coliags mesh`",
         )
-    content = content.relit_evenly()
+    import_viser()
+    content = Content.of(trained).relit_evenly()
     splats, page = fitting_page(content, largest)
     if len(splats) < len(content.baked):
         logger.warning(
             "%d Gaussians are merged into %d, for a page of at most %.1f MB",
             *(len(content.baked), len(splats), largest / 1e6),
         )
-    atomic_write(output, page)
-    return output
+    return page
 
 
 def fitting_page(content: Content, largest: int) -> tuple[Splats, str]:

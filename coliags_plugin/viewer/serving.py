@@ -42,6 +42,7 @@ class Viewer:
         self._server = start_server(host, port)
         self._host = host
         self._sessions: dict[int, Session] = {}
+        self._threads: list[threading.Thread] = []
         self._lock = threading.Lock()
         try:
             self.content = Content.of(trained)
@@ -77,9 +78,11 @@ class Viewer:
         return has_display() and webbrowser.open(self.url)
 
     def close(self) -> None:
-        """Stop serving."""
+        """Stop serving, once what is being computed for a browser is done: threads that end later crash the process."""
         for session in self.sessions:
             session.close()
+        for thread in self._threads:
+            thread.join()
         stop_server(self._server)
 
     def __enter__(self) -> Self:
@@ -96,7 +99,9 @@ class Viewer:
             self._sessions[client.client_id] = session
         if client.client_id not in self._server.get_clients():  # it has left in the meantime
             self._gone(client)
-        threading.Thread(target=session.run, name=f"view-{client.client_id}", daemon=True).start()
+        thread = threading.Thread(target=session.run, name=f"view-{client.client_id}", daemon=True)
+        self._threads = [*(one for one in self._threads if one.is_alive()), thread]
+        thread.start()
 
     def _gone(self, client: Any) -> None:
         with self._lock:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+from html import unescape
 
 import pytest
 
+import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError
 from tests.commands import refused, run
 
@@ -62,3 +64,13 @@ def test_a_radiance_field_has_no_gaussians_to_save(run_of, tmp_path, capsys):
     message = refused(capsys, "view", radiance.path, "--save", tmp_path / "a.html")
     assert "has no Gaussians to draw in a browser" in message
     assert not (tmp_path / "a.html").exists()
+
+
+def test_a_report_embeds_a_scene(anchors, tmp_path):
+    anchors.evaluate()
+    (page,) = cp.report(anchors, tmp_path / "report.html", scene=anchors)
+    text = page.read_text(encoding="utf-8")
+    (embedded,) = re.findall(r'<iframe title="coliags on wall, seed 0" [^>]*data-page="([^"]*)"', text)
+    assert "__VISER_EMBED_DATA__" in embedded and "<title>coliags on wall</title>" in unescape(embedded)
+    (plain,) = cp.report(anchors, tmp_path / "plain.html")
+    assert "<iframe" not in plain.read_text(encoding="utf-8")

@@ -7,6 +7,7 @@ import time
 import numpy as np
 import pytest
 
+import coliags_plugin as cp
 from coliags_plugin.outputs.image_files import read_rgb
 from tests.browser import SOFTWARE_WEBGL, Browser, find_chromium
 
@@ -83,3 +84,15 @@ def test_the_saved_page_shows_splats_offline(browser, anchors, tmp_path):
     until(browser, tmp_path / "page.png", drawn)
     assert elsewhere(browser, page.resolve().as_uri()) == []
     assert browser.run("document.title") == "coliags on wall"
+
+
+def test_a_scene_in_a_report_is_seen_once_it_is_opened(browser, anchors, tmp_path):
+    anchors.evaluate()
+    (page,) = cp.report(anchors, tmp_path / "report.html", scene=anchors)
+    browser.open(page, WIDTH, HEIGHT)
+    time.sleep(1.0)
+    assert browser.run("document.querySelector('iframe').contentDocument?.querySelector('canvas') == null")
+    browser.run("document.querySelector('details:has(iframe)').open = true")
+    browser.run("document.querySelector('iframe').scrollIntoView()")
+    until(browser, tmp_path / "report.png", drawn)
+    assert elsewhere(browser, page.resolve().as_uri()) == []
