@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from coliags_plugin.api.runs import Run
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.meshing.writing import mesh_run
 from tests.commands import refused, run
 from tests.meshing.exact import exact_run
@@ -46,6 +47,6 @@ def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("coliags_plugin.meshing.writing.write_mesh", full)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(InputError, match="No space"):
         mesh_run(exact_run(frames=9), tmp_path / "mesh")
     assert not any(tmp_path.iterdir())
