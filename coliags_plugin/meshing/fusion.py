@@ -63,9 +63,11 @@ def fuse_run(trained: TrainedRun, settings: MeshSettings | None = None) -> Trian
 def _usable(
     depth: Tensor, alpha: Tensor, frame: Frame, camera: Camera, settings: MeshSettings, max_depth: float
 ) -> Float[np.ndarray, "H W"]:
-    """Depth to fuse, 0 elsewhere: opaque, not ignored, not too far and not seen too obliquely. [H, W]"""
+    """Depth to fuse, 0 elsewhere: opaque, not ignored, within the depth range and not seen too obliquely. [H, W]"""
     depth, camera = depth.detach().cpu().double(), camera.to("cpu", torch.float64)
     good = (alpha.detach().cpu() >= settings.min_alpha) & frame.valid & (depth > 0) & (depth <= max_depth)
+    if frame.depth_at_least is not None:
+        good &= ~frame.depth_at_least.cpu().isfinite()
     good &= incidence_cosines(depth, camera) >= np.cos(np.radians(settings.max_incidence))
     return torch.where(good, depth, 0.0).float().numpy()
 

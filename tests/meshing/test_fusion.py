@@ -53,6 +53,16 @@ def test_what_is_masked_is_not_fused():
     assert 0.4 < half / whole < 0.65
 
 
+def test_where_the_sensor_clipped_nothing_is_fused():
+    scene = wall_scene(9, 160, 120)
+    bound = torch.full((120, 160), torch.nan)
+    bound[:, :80] = 15.0
+    clipped = replace(scene, train=[replace(frame, depth_at_least=bound) for frame in scene.train])
+    settings = MeshSettings(voxel_size=0.3)
+    half, whole = (fuse_run(exact_run(scene=s), settings).areas.sum() for s in (clipped, scene))
+    assert 0.4 < half / whole < 0.65
+
+
 def test_what_lies_too_far_is_not_fused():
     with pytest.raises(InputError, match="no surface"):
         fuse_run(exact_run(), MeshSettings(max_depth=10.0))

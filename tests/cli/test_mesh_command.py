@@ -1,0 +1,52 @@
+"""``coliags mesh``: what it passes on, prints and refuses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from coliags_plugin.api.runs import Run
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.meshing.writing import mesh_run
+from tests.commands import refused, run
+from tests.meshing.exact import exact_run
+
+
+@pytest.fixture
+def run_folder(tmp_path, monkeypatch):
+    """A run whose depth is exact; ``Run`` finds it whatever folder it is given."""
+    folder = tmp_path / "run"
+    monkeypatch.setattr(Run, "__init__", lambda self, path, **_: setattr(self, "folder", None))
+    monkeypatch.setattr(Run, "path", folder)
+    monkeypatch.setattr(Run, "load", lambda self: exact_run(frames=9))
+    return folder
+
+
+def test_the_mesh_of_a_run(run_folder, capsys):
+    assert run("mesh", run_folder, "--voxel", 0.4, "--format", "ply", "glb", "--set", "depth=expected") == 0
+    assert capsys.readouterr().out.strip() == str(run_folder / "mesh")
+    assert {path.name for path in (run_folder / "mesh").iterdir()} == {"mesh.ply", "mesh.glb", "mesh.json"}
+    text = (run_folder / "mesh/mesh.json").read_text()
+    assert '"voxel_size": 0.4' in text and '"depth": "expected"' in text
+
+
+def test_options_are_refused_before_anything_is_made(run_folder, capsys):
+    assert "Did you mean 'depth'" in refused(capsys, "mesh", run_folder, "--set", "dept=median")
+    assert "voxel_size" in refused(capsys, "mesh", run_folder, "--voxel", -1)
+    assert run("mesh", run_folder, "--format", "stl") == 2
+    assert not run_folder.exists()
+
+
+def test_the_command_is_refused_without_a_run(tmp_path, capsys):
+    assert "not a run folder" in refused(capsys, "mesh", tmp_path)
+
+
+def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch):
+    def full(path: Path, mesh) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("coliags_plugin.meshing.writing.write_mesh", full)
+    with pytest.raises(InputError, match="No space"):
+        mesh_run(exact_run(frames=9), tmp_path / "mesh")
+    assert not any(tmp_path.iterdir())
