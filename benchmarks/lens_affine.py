@@ -169,11 +169,9 @@ def main(options: Options) -> None:
     cv2.setNumThreads(1)
     plain = LENSES["omnidirectional"]
     assert isinstance(plain, OmnidirectionalLens) and isinstance(plain, CalibratedLens)
-    numbers = sorted((plain.d, plain.e))
-    # By the sign of d in A = [[c, d'], [e', 1]].
     readings = {
-        "[[c, d], [e, 1]]": replace(plain, d=numbers[1], e=numbers[0]),
-        "[[c, e], [d, 1]]": replace(plain, d=numbers[0], e=numbers[1]),
+        "[[c, d], [e, 1]], example loader": replace(plain, d=plain.e, e=plain.d),
+        "[[c, e], [d, 1]], renderer": plain,
         "no affine part": replace(plain, d=0.0, e=0.0),
     }
     files = sorted(path for path in options.frames.iterdir() if path.suffix.lower() in (".png", ".jpg", ".jpeg"))

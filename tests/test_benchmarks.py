@@ -55,6 +55,11 @@ def test_a_training_curve(method, tmp_path):
     assert all(row["elements"] > 0 and row["psnr"] > 0 and row["depth_mse"] >= 0 for row in rows)
 
 
+def test_updates_of_the_browser_view():
+    pytest.importorskip("viser")
+    assert "| 300 anchors |" in run("view.py", "--anchors", 300, "--repeats", 1)
+
+
 @pytest.mark.slow
 def test_all_methods_on_a_scene(tmp_path):
     write_wall(tmp_path / "wall")

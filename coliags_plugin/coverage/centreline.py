@@ -193,7 +193,8 @@ def _curve(points: Array, poses: Array) -> Centreline:
     places = cKDTree(line).query(poses[:, :3, 3])[1]
     middle = int(np.median(places))
     frames = _frames(tangents, middle, -poses[:, :3, 1].mean(axis=0))
-    return Centreline(line, frames, arc - arc[places.min()])
+    along, _, _ = Centreline(line, frames, arc).unroll(poses[:, :3, 3])
+    return Centreline(line, frames, arc - along.min())
 
 
 def _frames(tangents: Array, start: int, up: Array) -> Array:

@@ -15,7 +15,7 @@ from coliags_plugin.exchange.cameras import adjusted_camera
 from coliags_plugin.exchange.explicit import cloud_of_field
 from coliags_plugin.exchange.harmonics import SeenColors, fit_harmonics
 from coliags_plugin.exchange.held_light import gaussians_of, splatting_of
-from coliags_plugin.exchange.refinement import refine
+from coliags_plugin.exchange.refinement import loses_much, refine
 from coliags_plugin.fields.explicit_gaussians import ExplicitGaussians
 from coliags_plugin.fields.spherical_harmonics import MAX_DEGREE
 from coliags_plugin.splats.cloud import SplatCloud
@@ -28,8 +28,9 @@ def bake(trained: TrainedRun, light: HeldLight) -> tuple[SplatCloud, dict[str, A
     """One cloud of Gaussians for all views, under a held light.
 
     Every Gaussian is averaged over training views, and its colours are fitted with spherical harmonics by least
-    squares, both weighted by how much each view shows of it. Then all is refined on the training views
-    (:func:`~coliags_plugin.exchange.refinement.refine`).
+    squares, both weighted by how much each view shows of it. Where these averages lose much, as they do of Gaussians
+    that are others in every view, they are refined on the training views
+    (:mod:`~coliags_plugin.exchange.refinement`).
 
     Args:
         trained: The run, of Gaussians.
@@ -43,7 +44,7 @@ def bake(trained: TrainedRun, light: HeldLight) -> tuple[SplatCloud, dict[str, A
     """
     views = trained.scene.train[:: -(-len(trained.scene.train) // _VIEWS)]
     field = _averaged(trained, views, light)
-    steps = refine(field, trained, light)
+    steps = refine(field, trained, light) if loses_much(field, trained, light) else 0
     return cloud_of_field(field), {"views": len(views), "refinement_steps": steps}
 
 

@@ -30,6 +30,8 @@ _RATES = {"means": 0.005, "scales": 0.005, "quats": 0.001, "opacities": 0.02, "s
 _LAST = 0.03
 #: Weights of squared colour errors, and of depth errors in pixels on the surface, beside absolute colour errors.
 _SQUARED, _DEPTH = 20.0, 0.004
+#: Training views, at most, that averages are compared on; and how much larger their squared error may be: 0.2 dB.
+_COMPARED, _MUCH = 8, 1.047
 #: Memory for targets.
 _TARGET_BYTES = 1 << 30
 _WANTS = ("rgb", "alpha", "depth_accumulated")
@@ -107,6 +109,26 @@ def _some_frames(frames: list[Frame]) -> list[Frame]:
     height, width = frames[0].camera.height, frames[0].camera.width
     count = max(1, min(STEPS, _TARGET_BYTES // (16 * height * width)))
     return frames[:: -(-len(frames) // count)]
+
+
+@torch.no_grad()
+def loses_much(field: ExplicitGaussians, trained: TrainedRun, light: HeldLight) -> bool:
+    """Whether baked Gaussians miss training frames in the held light by more than the run does.
+
+    Args:
+        field: The baked Gaussians.
+        trained: The run that they were baked from.
+        light: What lights them.
+    """
+    renderer, frames = splatting_of(trained.model), trained.scene.train
+    own, baked = [], []
+    for frame in frames[:: -(-len(frames) // _COMPARED)]:
+        target = _target(trained, frame, light)
+        held = render_held(trained.model, target.camera, light, ("rgb", "alpha")).rgb
+        shown = renderer.draw(field.gaussians(target.camera), target.camera, ("rgb", "alpha")).rgb
+        own.append(masked_mean((held - target.rgb).square(), target.mask))
+        baked.append(masked_mean((shown - target.rgb).square(), target.mask))
+    return float(torch.stack(baked).mean()) > _MUCH * float(torch.stack(own).mean())
 
 
 @torch.no_grad()

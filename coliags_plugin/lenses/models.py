@@ -162,10 +162,11 @@ class OmnidirectionalLens(CalibratedLens):
     A pixel (u, v) lies at ``A q + (cx, cy)``, and its ray is ``(q_x, q_y, a0 + a2 rho^2 + a3 rho^3 + a4 rho^4)`` with
     ``rho = |q|``.
 
-    The source says ``c, d, e`` and leaves the order open. C3VD's Python loader, followed here, has
-    ``A = [[c, d], [e, 1]]``; its C++ renderer fills the same numbers column by column, ``A = [[c, e], [d, 1]]``,
-    which is this lens with ``d`` and ``e`` exchanged. As d is nearly -e, the two differ by a turn of the image of
-    0.33 degrees about its centre: up to 3.9 pixels at the left and right edges. Which is right is not known.
+    The source says ``c, d, e`` and leaves the order open. ``A = [[c, e], [d, 1]]``, as C3VD's renderer fills it, column
+    by column: depth and normals were rendered so, and poses registered to them. C3VD's example loader has
+    ``[[c, d], [e, 1]]``, which is this lens with ``d`` and ``e`` exchanged. As d is nearly -e, the two differ by a turn
+    of the image of 0.33 degrees about its centre: up to 3.9 pixels at the left and right edges. Tracks through real
+    frames, triangulated with C3VD's poses, agree better with the renderer's (docs/layouts/c3vd.md 2).
 
     Attributes:
         cx, cy: Centre, pixels.
@@ -189,7 +190,7 @@ class OmnidirectionalLens(CalibratedLens):
 
     @property
     def _affine(self) -> Array:
-        return np.array([[self.c, self.d], [self.e, 1.0]])
+        return np.array([[self.c, self.e], [self.d, 1.0]])
 
     def _height(self, rho: Array) -> Array:
         return self.a0 + rho**2 * (self.a2 + rho * (self.a3 + rho * self.a4))

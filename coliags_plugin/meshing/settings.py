@@ -22,8 +22,8 @@ class MeshSettings(Settings):
     # Edge of a voxel in scene units (mm); null: voxel_pixels times the size of a training pixel on the surface.
     voxel_size: float | None = Option(default=None, gt=0, allow_inf_nan=False)
     voxel_pixels: float = Option(default=2.0, gt=0, allow_inf_nan=False)  # see voxel_size
-    truncation: float = Option(default=4.0, ge=1, le=32)  # of the signed distance, in voxels
-    depth: Literal["expected", "median"] = "expected"  # kind of rendered depth (docs/conventions.md 3)
+    truncation: float = Option(default=3.0, ge=1, le=32)  # of the signed distance, in voxels
+    depth: Literal["expected", "median"] = "median"  # kind of rendered depth (docs/conventions.md 3)
     # z-depth in scene units beyond which nothing is fused; null: that of the farthest initial point in a training view.
     max_depth: float | None = Option(default=None, gt=0, allow_inf_nan=False)
     min_alpha: float = Option(default=0.9, ge=0.5, lt=1)  # pixels with less are not fused

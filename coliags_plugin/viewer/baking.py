@@ -10,9 +10,10 @@ from torch import Tensor
 from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.lamps import HeldLight
 
 #: Training views that are decoded, at most.
-VIEWS = 32
+VIEWS = 16
 
 
 def baking_cameras(cameras: Sequence[Camera]) -> list[Camera]:
@@ -22,8 +23,8 @@ def baking_cameras(cameras: Sequence[Camera]) -> list[Camera]:
 
 
 @torch.no_grad()
-def bake(field: GaussianField, cameras: Sequence[Camera]) -> Gaussians:
-    """Every Gaussian that some camera sees, once: the light it got on average, and one shape.
+def bake(field: GaussianField, cameras: Sequence[Camera], light: HeldLight | None = None) -> Gaussians:
+    """Every Gaussian that some camera sees, once, with one colour and one shape.
 
     Colours are means over the views, weighted by opacity; opacities are means over the views that drew it. The shape
     is that of the view in which it is most opaque (explicit Gaussians have only one).
@@ -31,10 +32,11 @@ def bake(field: GaussianField, cameras: Sequence[Camera]) -> Gaussians:
     Args:
         field: What is decoded.
         cameras: From where; at least one.
+        light: What lights it; None: the lamp of each camera, so that colours are of the average light.
     """
     sums: dict[str, Tensor] = {}
     for camera in cameras:
-        _add(sums, field.gaussians(camera))
+        _add(sums, field.gaussians(camera) if light is None else field.gaussians_in_light(camera, light))
     drawn = sums["views"] > 0
     kept = {name: values[drawn] for name, values in sums.items()}
     slots = drawn.nonzero().squeeze(1)

@@ -5,20 +5,26 @@ from __future__ import annotations
 import logging
 import math
 import threading
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.spatial import cKDTree
 
 from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.lamps import HeldLight
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.trained import TrainedRun
+from coliags_plugin.exchange.held_light import flattened_light
+from coliags_plugin.outputs.image_files import as_array
 from coliags_plugin.viewer.baking import bake, baking_cameras
 from coliags_plugin.viewer.decoding import ViewDecoder, in_view
+from coliags_plugin.viewer.merging import merged_to
 from coliags_plugin.viewer.pictures import Pictures
 from coliags_plugin.viewer.splats import Splats, wire_unit
 
@@ -26,6 +32,10 @@ logger = logging.getLogger(__name__)
 
 #: Distance of the point that the browser's camera turns about, where nothing is in view: as a share of the extent.
 _DEFAULT_DISTANCE = 1.0
+#: Gaussians beside a view, at most: they are seen only until the next decoding.
+MOST_BESIDE = 40_000
+#: Share of the Gaussians that are near enough to need no smaller cells when they are merged.
+_NEAR_SHARE = 0.2
 
 
 @dataclass(frozen=True)
@@ -35,7 +45,8 @@ class Content:
     Attributes:
         trained: The run.
         frames: Of the video, in its order.
-        baked: Its Gaussians for no view in particular; none for a method without Gaussians.
+        baked: Its Gaussians for no view in particular, under the light that they got on average; none for a method
+            without Gaussians.
         decoder: Its Gaussians for a view; None for a method without Gaussians.
         pictures: Of the frames.
         unit: See :func:`~coliags_plugin.viewer.splats.wire_unit`.
@@ -53,20 +64,28 @@ class Content:
     @classmethod
     def of(cls, trained: TrainedRun) -> Content:
         """Bake the Gaussians of a run, where its method has any."""
-        frames = trained.scene.video
         gaussian_field = trained.model.field
         baked, decoder = none_at_all(), None
         if isinstance(gaussian_field, GaussianField):
             logger.info("decoding the Gaussians of %s", trained.method)
             cameras = [frame.camera.to(trained.device) for frame in trained.scene.train]
             baked = Splats.of(bake(gaussian_field, baking_cameras(cameras)))
-            decoder = ViewDecoder(gaussian_field, baked, trained.device)
+            beside = merged_to(baked, MOST_BESIDE, distances(baked, cameras))
+            decoder = ViewDecoder(gaussian_field, beside, trained.device)
         else:
             logger.warning(
                 "method '%s' has no Gaussians to draw in the browser: there are cameras, meshes and rendered pictures",
                 trained.method,
             )
-        return cls(trained, frames, baked, decoder, Pictures(trained), wire_unit(baked))
+        return cls(trained, trained.scene.video, baked, decoder, Pictures(trained), wire_unit(baked))
+
+    def relit_evenly(self) -> Content:
+        """The same, its Gaussians baked under the flattened light."""
+        field = self.trained.model.field
+        if not isinstance(field, GaussianField):
+            return self
+        cameras = [frame.camera.to(self.trained.device) for frame in self.trained.scene.train]
+        return replace(self, baked=Splats.of(bake(field, baking_cameras(cameras), self.flattened)))
 
     @property
     def title(self) -> str:
@@ -94,9 +113,31 @@ class Content:
         return _DEFAULT_DISTANCE * self.trained.scene.extent or 1.0
 
     @cached_property
+    def flattened(self) -> HeldLight:
+        """The same light everywhere: median distance and angle of what training cameras see; renders some views."""
+        return flattened_light(self.trained.model, [frame.camera for frame in self.trained.scene.train])
+
+    @cached_property
+    def distances(self) -> Float[np.ndarray, "N"]:
+        """See :func:`distances`, of the baked Gaussians. [N]"""
+        return distances(self.baked, [frame.camera for frame in self.trained.scene.train])
+
+    @cached_property
     def near_plane(self) -> float:
         """z-depth from which on the browser draws, scene units: what renderers use, or a share of the distance."""
         return min(0.2, 0.02 * self.look_distance)
+
+
+def distances(splats: Splats, cameras: Sequence[Camera]) -> Float[np.ndarray, "N"]:
+    """Distance of each splat to the nearest camera, the nearest fifth counted alike. [N]
+
+    Args:
+        splats: Scene units.
+        cameras: At least one.
+    """
+    centers = np.stack([as_array(camera.center).astype(np.float64) for camera in cameras])
+    found = np.asarray(cKDTree(centers).query(splats.centers)[0])
+    return np.maximum(found, np.quantile(found, _NEAR_SHARE)) if len(found) else found
 
 
 def none_at_all() -> Splats:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
+import numpy as np
+from jaxtyping import Float
+
 from coliags_plugin.meshes.files import read_mesh
 from coliags_plugin.outputs.image_files import as_array
 from coliags_plugin.viewer.content import Content, mesh_files
@@ -11,9 +14,11 @@ from coliags_plugin.viewer.layers import add_cameras, add_mesh
 from coliags_plugin.viewer.pictures import Picture
 
 #: Where the light comes from.
-AT_CAMERA, AVERAGE = "follows the camera", "average of the training views"
+AT_CAMERA, FLATTENED = "follows the camera", "flattened"
 #: Largest value of the opacity threshold.
 _LARGEST_THRESHOLD = 0.9
+#: Frusta within so many of their sizes of the browser's camera are hidden.
+_HIDING_SIZES = 3.0
 
 
 class Listener(Protocol):
@@ -51,7 +56,7 @@ class Controls:
         self._about_frame = gui.add_markdown(self._frame_text())
         self._light = self._threshold = None
         if content.decoder is not None:
-            self._light = gui.add_dropdown("Light", (AT_CAMERA, AVERAGE))
+            self._light = gui.add_dropdown("Light", (AT_CAMERA, FLATTENED))
             self._threshold = gui.add_slider("Least opacity", 0.0, _LARGEST_THRESHOLD, 0.01, 0.0)
             for handle in (self._light, self._threshold):
                 handle.on_update(lambda _: listener.options_changed())
@@ -77,7 +82,7 @@ class Controls:
     @property
     def light(self) -> str:
         """Where the light comes from."""
-        return AVERAGE if self._light is None else str(self._light.value)
+        return AT_CAMERA if self._light is None else str(self._light.value)
 
     @property
     def least_opacity(self) -> float:
@@ -121,8 +126,8 @@ class Controls:
         if self._content.decoder is not None:
             splats = gui.add_checkbox("Gaussians", True)
             splats.on_update(lambda _: self._show_splats(splats.value))
-        cameras = gui.add_checkbox("Cameras", False)
-        cameras.on_update(lambda _: self._show("cameras", cameras.value))
+        self._cameras = gui.add_checkbox("Cameras", False)
+        self._cameras.on_update(lambda _: self._show("cameras", self._cameras.value))
         for name in mesh_files(self._content.trained.run.path):
             box = gui.add_checkbox(name.capitalize(), False)
             box.on_update(lambda _, name=name, box=box: self._show(name, box.value))
@@ -138,6 +143,17 @@ class Controls:
             self._layers[layer] = self._made(layer)
         for handle in self._layers[layer]:
             handle.visible = visible
+        self.camera_rests(self._client.camera.position)
+
+    def camera_rests(self, position: Float[np.ndarray, "3"]) -> None:
+        """Hide the frusta that the browser's camera is in or behind, whose pictures would fill the view.
+
+        Args:
+            position: Of the browser's camera, world frame. [3]
+        """
+        for handle in self._layers.get("cameras", ()):
+            near = np.linalg.norm(np.asarray(handle.position) - position) < _HIDING_SIZES * handle.scale
+            handle.visible = self._cameras.value and not near
 
     def _made(self, layer: str) -> list[Any]:
         if layer == "cameras":

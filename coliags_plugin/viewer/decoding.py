@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 
 from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.lamps import HeldLight
 from coliags_plugin.viewer.splats import Splats
 
 #: How much wider than the view, on every side, Gaussians are decoded, so that a small turn shows no gap.
@@ -17,32 +18,33 @@ MARGIN = 1.25
 
 
 class ViewDecoder:
-    """Decodes a field for a view, and takes what lies beside it from Gaussians of no view in particular.
+    """Decodes a field for a view, and takes what lies beside it from other Gaussians.
 
     A field yields the Gaussians that a camera sees; without the others, a turn of the head would show nothing until
     the next decoding.
 
     Args:
         field: Of the run.
-        baked: Gaussians of the whole scene (:func:`~coliags_plugin.viewer.baking.bake`).
+        beside: Gaussians of the whole scene, of which those outside the view are shown.
         device: Of the field.
     """
 
-    def __init__(self, field: GaussianField, baked: Splats, device: torch.device) -> None:
-        self.baked = baked
+    def __init__(self, field: GaussianField, beside: Splats, device: torch.device) -> None:
+        self.beside = beside
         self._field = field
         self._device = device
 
     @torch.no_grad()
-    def of(self, camera: Camera) -> Splats:
+    def of(self, camera: Camera, light: HeldLight | None = None) -> Splats:
         """Gaussians with their colours, and, of anchor methods, their shapes, as this camera sees them.
 
         Args:
             camera: View of the browser.
+            light: What lights them; None: the lamp on the camera.
         """
-        wide = widened(camera)
-        seen = Splats.of(self._field.gaussians(wide.to(self._device)))
-        return seen.and_also(self.baked.part(~in_view(self.baked.centers, wide)))
+        wide = widened(camera).to(self._device)
+        seen = Splats.of(self._field.gaussians(wide) if light is None else self._field.gaussians_in_light(wide, light))
+        return seen.and_also(self.beside.part(~in_view(self.beside.centers, wide)))
 
 
 def widened(camera: Camera) -> Camera:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -11,6 +13,7 @@ from jaxtyping import Float, UInt8
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.scenes import Frame
+from coliags_plugin.meshes.files import write_mesh
 from coliags_plugin.meshes.mesh import TriangleMesh
 from coliags_plugin.outputs.image_files import as_array
 from coliags_plugin.viewer.content import Content, aspect, vertical_fov
@@ -24,6 +27,8 @@ _SIZE_OF_STEP, _SIZE_OF_DEPTH = 1.0, 0.03
 _PICTURE_WIDTH = 96
 _LINE_SHARE = 0.03
 _COLOR = (30, 120, 200)
+#: Intensities; together they show a surface seen from the front in its own colour.
+_AMBIENT, _HEADLIGHT = 1.4, 1.8
 
 
 def add_cameras(scene: Any, content: Content, chosen: Callable[[int], None] | None = None) -> list[Any]:
@@ -92,16 +97,23 @@ def add_mesh(scene: Any, name: str, mesh: TriangleMesh) -> Any:
 
     Args:
         scene: viser's, of a server or a client.
-        name: Of the node.
+        name: Of the layer.
         mesh: The mesh.
     """
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "mesh.glb"
+        write_mesh(file, mesh)
+        data = file.read_bytes()
     node = "/" + name.replace(": ", "/").replace(" ", "-")
-    if mesh.colors is None:
-        return scene.add_mesh_simple(
-            node, mesh.vertices, mesh.triangles, color=(200, 180, 170), side="double", cast_shadow=False
-        )
-    import trimesh
+    return scene.add_glb(node, data, cast_shadow=False, receive_shadow=False)
 
-    colored = trimesh.Trimesh(mesh.vertices, mesh.triangles, vertex_colors=mesh.colors, process=False)
-    colored.visual = trimesh.visual.ColorVisuals(colored, vertex_colors=mesh.colors)
-    return scene.add_mesh_trimesh(node, colored, cast_shadow=False, receive_shadow=False)
+
+def add_headlight(scene: Any, position: tuple[float, float, float]) -> Any:
+    """Add a light for meshes that is to move with the camera, alike at all distances, and dim light from everywhere.
+
+    Args:
+        scene: viser's, of a client.
+        position: Of the camera.
+    """
+    scene.add_light_ambient("/lights/everywhere", intensity=_AMBIENT)
+    return scene.add_light_point("/lights/camera", intensity=_HEADLIGHT, decay=0.0, position=position)

@@ -9,8 +9,9 @@ from coliags_plugin.viewer.splats import Splats
 
 #: Largest opacity whose optical depth is counted: that of 1 is infinite.
 _MOST_OPAQUE = 0.999
-#: Halvings of the interval in which the edge of the cells is sought.
-_HALVINGS = 16
+#: Attempts at the edge of the cells; it is found when the number is at least this share of the largest one.
+_ATTEMPTS = 20
+_AIM, _ENOUGH = 0.98, 0.95
 #: Factor of the variance of the members' centres within a merged splat. Splats on a grid of step 1 look smooth from a
 #: standard deviation of about 0.45 on; that of a square's points about its middle is 0.29.
 _SPREAD = 2.0
@@ -32,15 +33,22 @@ def merged_to(splats: Splats, count: int, distances: Float[np.ndarray, "N"]) -> 
     sizes = _octaves(np.sqrt(np.linalg.eigvalsh(splats.covariances.astype(np.float64))[:, 2].clip(0.0)))
     levels = _octaves(distances)
     classes = np.stack([sizes, levels], axis=1)
-    low, high = 0.0, float(np.ptp(splats.centers, axis=0).max()) + 1e-6
+    places = splats.centers / (2.0**levels)[:, None]
+    extent = float(np.ptp(places, axis=0).max()) + 1e-6
+    low, high, edge = 0.0, extent, extent / count**0.5
     best = np.zeros(len(splats), np.int64)
-    for _ in range(_HALVINGS):
-        edge = 0.5 * (low + high)
-        cells = _cells(splats.centers / (edge * 2.0**levels)[:, None], classes)
-        if cells.max() < count:
+    for _ in range(_ATTEMPTS):
+        cells = _cells(places / edge, classes)
+        found = int(cells.max()) + 1
+        if found <= count:
             best, high = cells, edge
+            if found >= _ENOUGH * count:
+                break
         else:
             low = edge
+        # Cells on a surface: their number falls with the square of the edge.
+        aimed = edge * (found / (_AIM * count)) ** 0.5
+        edge = aimed if low < aimed < high else 0.5 * (low + high)
     return merged(splats, best)
 
 

@@ -7,13 +7,10 @@ from html import escape
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
-from scipy.spatial import cKDTree
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.outputs.image_files import as_array
 from coliags_plugin.outputs.page import refuse_folder
 from coliags_plugin.viewer.content import Content
 from coliags_plugin.viewer.layers import add_cameras
@@ -30,12 +27,10 @@ LARGEST_PAGE = 5_000_000
 _CAUTION = 0.98
 #: Bytes of a page that a Gaussian takes at least: 32, compressed and in base 64.
 _FEWEST_BYTES = 30
-#: Share of the Gaussians that are near enough to need no smaller cells.
-_NEAR_SHARE = 0.2
 
 
 def save_page(trained: TrainedRun, output: Path, largest: int = LARGEST_PAGE) -> Path:
-    """Write the Gaussians of a run, under the average light of its training views, as a page.
+    """Write the Gaussians of a run, under the same light everywhere, as a page.
 
     Where the page would be too large, neighbouring Gaussians are merged.
 
@@ -56,6 +51,7 @@ def save_page(trained: TrainedRun, output: Path, largest: int = LARGEST_PAGE) ->
             "a method of Gaussians",
             "Write pictures with `coliags render`, or a mesh with `coliags mesh`",
         )
+    content = content.relit_evenly()
     splats, page = fitting_page(content, largest)
     if len(splats) < len(content.baked):
         logger.warning(
@@ -75,22 +71,14 @@ def fitting_page(content: Content, largest: int) -> tuple[Splats, str]:
     nothing = content.baked.part(np.zeros(len(content.baked), bool))
     empty = len(_page(content, nothing).encode())
     count = min(len(content.baked), max(0, largest - empty) // _FEWEST_BYTES)
-    distances = _distances(content)
     while count > 0:
-        splats = merged_to(content.baked, count, distances)
+        splats = merged_to(content.baked, count, content.distances)
         page = _page(content, splats)
         size = len(page.encode())
         if size <= largest:
             return splats, page
         count = min(count - 1, int(_CAUTION * len(splats) * (largest - empty) / (size - empty)))
     raise InputError(f"a page of {largest} bytes", f"more than {empty} bytes, what an empty one takes")
-
-
-def _distances(content: Content) -> Float[np.ndarray, "N"]:
-    """From each Gaussian to the nearest training camera, the nearest fifth counted alike. [N]"""
-    centers = np.stack([as_array(frame.camera.center).astype(np.float64) for frame in content.trained.scene.train])
-    found = np.asarray(cKDTree(centers).query(content.baked.centers)[0])
-    return np.maximum(found, np.quantile(found, _NEAR_SHARE)) if len(found) else found
 
 
 def _page(content: Content, splats: Splats) -> str:
@@ -110,7 +98,7 @@ def _page(content: Content, splats: Splats) -> str:
 
 def _caption(content: Content, splats: Splats) -> str:
     """What is seen, at the bottom of the page."""
-    text = f"{content.title}, step {content.trained.step}: average light of the training views"
+    text = f"{content.title}, step {content.trained.step}: flattened light"
     if len(splats) < len(content.baked):
         text += f"; {len(content.baked):,} Gaussians merged into {len(splats):,}"
     style = "position:fixed;left:0;bottom:0;padding:4px 8px;font:12px sans-serif;background:#fffc;pointer-events:none"

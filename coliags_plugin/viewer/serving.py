@@ -106,7 +106,7 @@ class Viewer:
 
 
 def set_start(server: Any, content: Content) -> None:
-    """Let browsers start at the first training frame, upright there, before black, with a plain panel.
+    """Let browsers start at the first training frame, upright there, before black, with a plain panel and no lights.
 
     Args:
         server: viser's.
@@ -121,6 +121,8 @@ def set_start(server: Any, content: Content) -> None:
     start.look_at = position + content.look_distance * axis
     start.fov = vertical_fov(camera)
     start.near, start.far = content.near_plane, 1000.0 * content.look_distance
+    server.scene.configure_default_lights(enabled=False)
+    server.scene.configure_environment_map(hdri=None)
     server.scene.set_background_image(np.zeros((1, 1, 3), np.uint8), format="png")
     server.gui.set_panel_label(content.title)
     server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)

@@ -13,9 +13,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.rotations import rotation_matrices
 from coliags_plugin.viewer.content import Content, vertical_fov
-from coliags_plugin.viewer.controls import AT_CAMERA, Controls
-from coliags_plugin.viewer.layers import pose
+from coliags_plugin.viewer.controls import FLATTENED, Controls
+from coliags_plugin.viewer.layers import add_headlight, pose
 from coliags_plugin.viewer.pacing import Pace
 from coliags_plugin.viewer.splats import BYTES_PER_SPLAT, Splats, on_wire
 
@@ -67,20 +68,21 @@ class Session:
         self._closed = False
         self._picture_of: tuple[int, str] | None = None
         self._splats: Any = None
+        self._headlight = add_headlight(client.scene, tuple(client.camera.position))
         self.last_update: Update | None = None
         self.controls = Controls(client, content, self)
         client.camera.on_update(lambda _: self.camera_moved())
         if content.decoder is not None:
-            self._send(content.baked, 0.0)
+            self._send(content.decoder.beside, 0.0)
             self._pace.want()
 
     # ---- What has changed
 
     def camera_moved(self) -> None:
         """The camera of the browser has moved."""
-        if self.controls.light == AT_CAMERA:
-            self._pace.moved()
-            self._wake.set()
+        self._pace.moved()
+        self._headlight.position = tuple(self._client.camera.position)
+        self._wake.set()
 
     def options_changed(self) -> None:
         """Light, threshold or kind of picture has changed."""
@@ -104,7 +106,6 @@ class Session:
             theirs.wxyz = wxyz
             theirs.fov = vertical_fov(camera)
         self.camera_moved()
-        self._wake.set()
 
     def close(self) -> None:
         """The browser has gone."""
@@ -136,6 +137,7 @@ class Session:
         wanted = (self.controls.frame, self.controls.picture)
         if self._pace.wait() == 0.0:
             self._pace.begin()
+            self.controls.camera_rests(self._client.camera.position)
             self._update_splats()
             self._pace.end()
         elif wanted != self._picture_of:
@@ -150,8 +152,8 @@ class Session:
             return
         began = time.perf_counter()
         with self._content.lock:
-            at_camera = self.controls.light == AT_CAMERA
-            splats = decoder.of(self._camera()) if at_camera else decoder.baked
+            light = self._content.flattened if self.controls.light == FLATTENED else None
+            splats = decoder.of(self._camera(), light)
         self._send(splats.part(splats.opacities >= self.controls.least_opacity), time.perf_counter() - began)
 
     def _send(self, splats: Splats, decoding: float) -> None:
@@ -181,8 +183,6 @@ class Session:
 
 def _matrix(theirs: Any) -> Float[Tensor, "4 4"]:
     """Pose of viser's camera. [4, 4]"""
-    from coliags_plugin.core.rotations import rotation_matrices
-
     matrix = torch.eye(4, dtype=torch.float64)
     matrix[:3, :3] = rotation_matrices(torch.as_tensor(theirs.wxyz, dtype=torch.float64)[None])[0]
     matrix[:3, 3] = torch.as_tensor(theirs.position, dtype=torch.float64)

@@ -51,6 +51,12 @@ def test_the_centreline_of_a_cylinder_is_its_axis():
     assert np.allclose(radius, [10.0, 10.0, 10.0, 4.0], atol=0.1)
 
 
+def test_places_count_from_the_shallowest_camera_also_where_it_is_before_the_wall():
+    line = find_centreline(tube(radius=10.0, start=12.0), poses(path(0.0, 4.0, 8.0)))
+    arc, _, _ = line.unroll(np.array([[0.0, 10.0, 30.0], [10.0, 0.0, 60.0]]))
+    assert np.allclose(arc, [30.0, 60.0], atol=0.5)
+
+
 def test_the_centreline_follows_a_bend_around_folds():
     turn, bend = np.linspace(0.0, np.pi / 2.0, 150), 50.0
     angle = np.arange(72) * (2.0 * np.pi / 72)

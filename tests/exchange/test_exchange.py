@@ -15,6 +15,8 @@ from coliags_plugin.config.assignments import parse_assignments
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.lamps import FlattenedLight, LightOfCamera
 from coliags_plugin.exchange import refinement
+from coliags_plugin.exchange.baking import bake
+from coliags_plugin.exchange.explicit import field_of_cloud
 from coliags_plugin.exchange.held_light import flattened_light
 from coliags_plugin.splats.files import read_splats, write_splats
 from coliags_plugin.splats.ply import write_splat_ply
@@ -46,6 +48,7 @@ def runs(scene, tmp_path_factory):
 @pytest.fixture
 def few_steps(monkeypatch):
     monkeypatch.setattr(refinement, "STEPS", 3)
+    monkeypatch.setattr(refinement, "_MUCH", 0.0)
 
 
 def test_an_imported_export_renders_what_the_run_renders(runs, scene, tmp_path):
@@ -82,6 +85,29 @@ def test_anchors_are_baked(runs, scene, tmp_path, few_steps, capsys):
     assert run("import", file, "--data", scene, "--output", tmp_path / "imported") == 0
     imported = cp.load_run(tmp_path / "imported")
     assert imported.render(imported.frame_names()[0]).rgb.std() > 5
+
+
+def test_refinement_comes_nearer_to_the_frames(runs, monkeypatch):
+    """The run was hardly trained, and is no better than its averages; frames in its own light are the frames."""
+    trained = runs("coliags", settings=ANCHORS).load()
+    frame = trained.scene.train[0]
+    light = LightOfCamera(frame.camera)
+    baked = field_of_cloud(bake(trained, light)[0])
+    camera = replace(frame.camera, camera_to_world=frame.camera.camera_to_world.float())
+
+    def error() -> float:
+        with torch.no_grad():
+            shown = trained.model.renderer.draw(baked.gaussians(camera), camera, ("rgb", "alpha")).rgb
+        return float((shown - frame.rgb).square().mean())
+
+    assert not refinement.loses_much(baked, trained, light)
+    before = error()
+    monkeypatch.setattr(refinement, "STEPS", 40)
+    assert refinement.refine(baked, trained, light) == 40
+    assert error() < 0.9 * before
+    with torch.no_grad():
+        baked.sh0 += 1.0
+    assert refinement.loses_much(baked, trained, light)
 
 
 def test_surfels_are_exported_thin_and_come_back_as_surfels(runs, scene, tmp_path):

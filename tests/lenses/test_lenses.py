@@ -18,7 +18,7 @@ NAMES = sorted(LENSES)
 FISHEYE = LENSES["fisheye"]
 BROWN = LENSES["legacy-pinhole"]
 OMNI = LENSES["omnidirectional"]
-#: The C++ renderer's reading of the affine part.
+#: The reading of the affine part in C3VD's example loader.
 OMNI_TRANSPOSED = replace(OMNI, d=OMNI.e, e=OMNI.d)
 
 
@@ -81,7 +81,7 @@ def test_legacy_pinhole_is_opencvs():
 
 def test_omnidirectional_follows_its_written_definition():
     u, v = 200.0, 900.0
-    q = np.linalg.solve([[OMNI.c, OMNI.d], [OMNI.e, 1.0]], [u - OMNI.cx, v - OMNI.cy])
+    q = np.linalg.solve([[OMNI.c, OMNI.e], [OMNI.d, 1.0]], [u - OMNI.cx, v - OMNI.cy])
     rho = np.hypot(*q)
     ray = [q[0], q[1], OMNI.a0 + OMNI.a2 * rho**2 + OMNI.a3 * rho**3 + OMNI.a4 * rho**4]
     np.testing.assert_allclose(OMNI.unproject([[u, v]])[0], np.array(ray) / ray[2], rtol=1e-13)
@@ -272,8 +272,8 @@ def sparse_depth(shared_data):
     ("lens", "pixel_error", "mm_error"),
     [
         (FISHEYE, (0.0001, 0.0002), (0.0002, 0.0003)),
-        (OMNI, (1.25, 2.2), (0.11, 0.18)),
-        (OMNI_TRANSPOSED, (1.35, 2.2), (0.12, 0.22)),
+        (OMNI, (1.35, 2.2), (0.12, 0.22)),
+        (OMNI_TRANSPOSED, (1.25, 2.2), (0.11, 0.18)),
         (BROWN, (21.0, 35.0), (1.9, 4.0)),
     ],
     ids=["fisheye", "omnidirectional", "omnidirectional transposed", "legacy-pinhole"],

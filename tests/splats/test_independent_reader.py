@@ -10,12 +10,16 @@ import os
 import shutil
 import struct
 import subprocess
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from coliags_plugin.outputs.image_files import read_rgb
+from coliags_plugin.splats.cloud import SplatCloud, harmonics_of_colors
 from coliags_plugin.splats.files import write_splats
+from tests.browser import SOFTWARE_WEBGL, Browser, find_chromium
 from tests.splats.clouds import covariances, random_cloud
 
 PROGRAM = shutil.which("splat-transform")
@@ -113,3 +117,35 @@ def test_glb_has_what_the_program_writes(tmp_path):
     for name in ("SCALE", "OPACITY", "SH_DEGREE_0_COEF_0"):
         own = ours[f"KHR_gaussian_splatting:{name}"]
         np.testing.assert_allclose(theirs[f"KHR_gaussian_splatting:{name}"], own, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_chromium() is None, reason="no Chromium")
+def test_supersplat_draws_the_gaussians_where_and_as_they_are(tmp_path):
+    """Red to the right of the optical axis, green below, blue straight ahead; seen along z from the origin."""
+    places = np.array([[3.0, 0.0, 10.0], [0.0, 3.0, 10.0], [0.0, 0.0, 10.0]], np.float32)
+    cloud = SplatCloud(
+        means=places,
+        quats_wxyz=np.array([[1.0, 0.0, 0.0, 0.0]] * 3, np.float32),
+        scales=np.full((3, 3), 0.5, np.float32),
+        opacities=np.full(3, 0.99, np.float32),
+        harmonics=harmonics_of_colors(np.eye(3, dtype=np.float32)),
+    )
+    write_splats(tmp_path / "a.ply", cloud, "ply")
+    # The viewer turns PLY files by half a turn about z.
+    view = {"fov": 90.0, "position": [0.0, 0.0, 0.0], "target": [0.0, 0.0, 10.0], "startAnim": "none"}
+    settings = {"camera": view, "background": {"color": [0, 0, 0]}, "animTracks": []}
+    (tmp_path / "view.json").write_text(json.dumps(settings))
+    transform(tmp_path / "a.ply", "--viewer-settings", tmp_path / "view.json", tmp_path / "a.html")
+    with Browser(str(find_chromium()), SOFTWARE_WEBGL) as browser:
+        browser.open(f"{(tmp_path / 'a.html').as_uri()}?noui&noanim", 400, 400)
+        for _ in range(30):
+            time.sleep(2.0)
+            browser.screenshot(tmp_path / "seen.png")
+            seen = read_rgb(tmp_path / "seen.png")
+            if seen[195:205, 195:205, 2].mean() > 100:
+                break
+    assert seen[200, 200].argmax() == 2 and seen[200, 200, 2] > 150
+    assert seen[200, 260].argmax() == 0 and seen[200, 260, 0] > 150
+    assert seen[260, 200].argmax() == 1 and seen[260, 200, 1] > 150
+    assert seen[200, 140].max() < 60 and seen[140, 200].max() < 60

@@ -26,7 +26,7 @@ def test_the_command_writes_a_page_that_needs_no_network(anchors, tmp_path, caps
     assert capsys.readouterr().out.strip() == str(page)
     text = page.read_text(encoding="utf-8")
     assert len(text.encode()) < LARGEST_PAGE
-    assert "<title>coliags on wall</title>" in text and "step 2: average light of the training views" in text
+    assert "<title>coliags on wall</title>" in text and "step 2: flattened light" in text
     assert "__VISER_EMBED_DATA__" in text and "merged" not in text
     assert not re.search(r"""(?:src|href)\s*=\s*["']?(?:https?:)?//""", text)
     assert set(re.findall(r"https?://[\w./-]+", text)) <= {"http://www.w3.org/2000/svg"}

@@ -13,7 +13,7 @@ import pytest
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.meshes.files import write_mesh
+from coliags_plugin.meshes.files import read_mesh, write_mesh
 from coliags_plugin.meshes.mesh import TriangleMesh
 from coliags_plugin.outputs.image_files import as_array
 from coliags_plugin.viewer import serving
@@ -76,7 +76,7 @@ def test_splats_come_at_once_and_then_as_seen_from_the_camera(viewer):
     content = viewer.content
     with connected(viewer) as (client, camera):
         first = splats_of(client.wait_for("GaussianSplatsMessage")["props"]["buffer"])
-        np.testing.assert_allclose(first["centers"] * content.unit, content.baked.centers, rtol=1e-5)
+        np.testing.assert_allclose(first["centers"] * content.unit, content.decoder.beside.centers, rtol=1e-5)
         second = newest(client)
     seen = Splats.of(content.trained.model.field.gaussians(widened(session_camera(camera))))
     np.testing.assert_allclose(second["centers"][: len(seen)] * content.unit, seen.centers, atol=1e-4)
@@ -91,30 +91,35 @@ def session_camera(camera):
     return Camera(focal, focal, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT, camera.camera_to_world)
 
 
-def test_a_moved_camera_is_decoded_for_and_average_light_is_not(viewer):
+def test_a_moved_camera_is_decoded_for(viewer):
     frames = viewer.content.trained.scene.train
     with connected(viewer) as (client, _):
         before = newest(client)
         client.look(frames[-1].camera)
         after = newest(client)
-        assert len(after["centers"]) != len(before["centers"]) or (after["rgba"] != before["rgba"]).any()
-        client.set("Light", "average of the training views")
-        average = newest(client)
-        assert len(average["centers"]) == len(viewer.content.baked)
-        client.look(frames[0].camera)
-        with pytest.raises(TimeoutError):
-            newest(client, seconds=2.0)
+    assert len(after["centers"]) != len(before["centers"]) or (after["rgba"] != before["rgba"]).any()
+
+
+def test_flattened_light_is_the_exchange_packages(viewer):
+    content = viewer.content
+    with connected(viewer) as (client, camera):
+        newest(client)
+        client.set("Light", "flattened")
+        shown = newest(client)
+    field, placed = content.trained.model.field, widened(session_camera(camera))
+    seen = Splats.of(field.gaussians_in_light(placed, content.flattened))
+    np.testing.assert_allclose(shown["rgba"][: len(seen), :3], seen.colors, atol=1)
+    assert (np.abs(seen.colors.astype(int) - Splats.of(field.gaussians(placed)).colors) > 2).any()
 
 
 def test_the_threshold_leaves_out_the_fainter_ones(viewer):
     with connected(viewer) as (client, _):
-        newest(client)
-        client.set("Light", "average of the training views")
-        newest(client)
+        every = newest(client)
         client.set("Least opacity", 0.3)
         kept = newest(client)
-    opacities = viewer.content.baked.opacities
-    assert 0 < len(kept["centers"]) == (opacities >= 0.3).sum() < len(opacities)
+    opaque = every["rgba"][:, 3] >= round(0.3 * 255)
+    assert 0 < len(kept["centers"]) < len(opaque)
+    assert abs(len(kept["centers"]) - opaque.sum()) <= 0.02 * len(opaque)
 
 
 def test_the_slider_moves_the_camera_and_shows_the_frame(viewer):
@@ -129,13 +134,15 @@ def test_the_slider_moves_the_camera_and_shows_the_frame(viewer):
         np.testing.assert_allclose(position["position"], as_array(frame.camera.center), atol=1e-6)
 
 
-def test_a_mesh_of_the_run_is_sent_when_it_is_wanted(viewer):
+def test_a_mesh_of_the_run_is_sent_when_it_is_wanted(viewer, tmp_path):
     with connected(viewer) as (client, _):
         newest(client)
         client.set("Mesh", True)
-        mesh = client.wait_for("MeshMessage")
+        mesh = client.wait_for("GlbMessage")
         assert mesh["name"] == "/mesh"
-        np.testing.assert_array_equal(mesh["props"]["vertices"].reshape(-1, 3), np.eye(3))
+        sent = tmp_path / "sent.glb"
+        sent.write_bytes(mesh["props"]["glb_data"])
+        np.testing.assert_array_equal(read_mesh(sent).vertices, np.eye(3))
 
 
 def test_cameras_come_with_their_pictures(viewer):

@@ -1,0 +1,85 @@
+"""The view and the saved page in a headless Chromium that draws WebGL in software."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from coliags_plugin.outputs.image_files import read_rgb
+from tests.browser import SOFTWARE_WEBGL, Browser, find_chromium
+
+pytest.importorskip("viser")
+
+CHROMIUM = find_chromium()
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+
+WIDTH, HEIGHT = 900, 420
+#: Where neither the panel nor a notice is, px.
+FREE = (slice(180, 400), slice(20, 460))
+
+
+#: JavaScript: the checkbox of a label.
+CHECKBOX = """label => [...document.querySelectorAll('input[type=checkbox]')].find(box => {
+    let around = box;
+    while (!around.textContent.trim()) around = around.parentElement;
+    return around.textContent.trim() === label;
+})"""
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with Browser(CHROMIUM, SOFTWARE_WEBGL) as one:
+        yield one
+
+
+def until(browser, file, condition, seconds=90.0):
+    """The free part of the first screenshot that meets a condition."""
+    ends = time.monotonic() + seconds
+    while True:
+        browser.screenshot(file)
+        seen = read_rgb(file)[FREE].astype(float)
+        if condition(seen):
+            return seen
+        assert time.monotonic() < ends, f"still mean {seen.mean((0, 1))}, spread {seen.std((0, 1))}"
+        time.sleep(0.5)
+
+
+def drawn(seen):
+    """Neither black nor white: Gaussians over the background."""
+    return seen.std() > 3.0 and 20.0 < seen.mean() < 235.0
+
+
+def elsewhere(browser, own):
+    return [url for url in browser.requests() if not url.startswith((own, "blob:"))]
+
+
+def test_splats_are_seen_from_the_first_frame_on_and_the_slider_moves_the_view(browser, anchors, tmp_path):
+    with anchors.view(port=0) as viewer:
+        browser.open(viewer.url, WIDTH, HEIGHT)
+        until(browser, tmp_path / "first.png", drawn)
+        (session,) = viewer.sessions
+        first = session.last_update
+        before = np.array(session._client.camera.position)
+        browser.run("document.querySelector('[role=slider]').focus()")
+        browser.key("End", 35)
+        ends = time.monotonic() + 60.0
+        while session.controls.frame == 0 or session.last_update is first:
+            assert time.monotonic() < ends
+            time.sleep(0.2)
+        last = viewer.content.frames[-1].camera.center.numpy()
+        assert session.controls.frame == len(viewer.content.frames) - 1
+        np.testing.assert_allclose(session._client.camera.position, last, atol=1e-3)
+        assert not np.allclose(before, last)
+        browser.run(f"({CHECKBOX})('Gaussians').click()")
+        until(browser, tmp_path / "none.png", lambda seen: seen.max() < 20.0)
+        assert elsewhere(browser, viewer.url) == []
+
+
+def test_the_saved_page_shows_splats_offline(browser, anchors, tmp_path):
+    page = anchors.save_view(tmp_path / "scene.html")
+    browser.open(page, WIDTH, HEIGHT)
+    until(browser, tmp_path / "page.png", drawn)
+    assert elsewhere(browser, page.resolve().as_uri()) == []
+    assert browser.run("document.title") == "coliags on wall"
