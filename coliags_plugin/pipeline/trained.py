@@ -102,7 +102,7 @@ def coverage(place: Workplace) -> Outcome:
         return Outcome(f"left out: {error}")
     what = "what was seen and missed, for research use only"
     return Outcome(
-        "; ".join(summary(made.coverage, made.evaluation)),
+        "; ".join(" ".join(line.split()).rstrip(";") for line in summary(made.coverage, made.evaluation)),
         {"run/coverage/coverage.html": what, "run/coverage/coverage.ply": "the same on the mesh"},
     )
 
