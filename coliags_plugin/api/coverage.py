@@ -33,11 +33,12 @@ def measure_scene_coverage(
         InputError: An option is unknown or invalid; the scene, the mesh or the truth cannot be read, do not belong
             together, or are not in mm; or the folder exists or cannot be written.
     """
-    from coliags_plugin.coverage.settings import coverage_settings
+    from coliags_plugin.core.settings import validated
+    from coliags_plugin.coverage.settings import CoverageSettings
     from coliags_plugin.coverage.writing import check_free, measure_scene, open_recording
     from coliags_plugin.meshes.files import read_mesh
 
-    chosen, folder = coverage_settings(settings or {}), Path(output)
+    chosen, folder = validated(CoverageSettings, settings or {}, "coverage option"), Path(output)
     check_free(folder, overwrite)
     other = None if truth is None else Path(truth)
     return measure_scene(open_recording(Path(data)), read_mesh(Path(mesh)), folder, chosen, other, overwrite)

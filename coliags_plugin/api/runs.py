@@ -230,10 +230,11 @@ class Run:
             InputError: See :meth:`load`; an option is unknown or invalid, the method renders no such depth, there is no
                 surface, the truth is of another world or unit, or the folder exists or cannot be written.
         """
-        from coliags_plugin.meshing.settings import mesh_settings
+        from coliags_plugin.core.settings import validated
+        from coliags_plugin.meshing.settings import MeshSettings
         from coliags_plugin.meshing.writing import mesh_run
 
-        chosen = mesh_settings(settings or {})
+        chosen = validated(MeshSettings, settings or {}, "mesh option")
         folder = Path(output) if output is not None else self.path / "mesh"
         against = None if truth is None else Path(truth)
         return mesh_run(self.load(), folder, chosen, formats, against, overwrite)
@@ -291,11 +292,12 @@ class Run:
                 cannot be read, is not where the cameras look or is no tube around them, or the folder exists or cannot
                 be written.
         """
-        from coliags_plugin.coverage.settings import coverage_settings
+        from coliags_plugin.core.settings import validated
+        from coliags_plugin.coverage.settings import CoverageSettings
         from coliags_plugin.coverage.writing import check_free, measure_scene, open_recording
         from coliags_plugin.meshes.files import read_mesh
 
-        chosen = coverage_settings(settings or {})
+        chosen = validated(CoverageSettings, settings or {}, "coverage option")
         folder = Path(output) if output is not None else self.path / "coverage"
         check_free(folder, overwrite)
         file = Path(mesh) if mesh is not None else self.path / "mesh" / "mesh.ply"
@@ -346,9 +348,11 @@ class Run:
         Raises:
             InputError: See :meth:`load`; an option is unknown or invalid, or the field does not model the lamp.
         """
-        from coliags_plugin.engine.relighting import make_lamp, relight
+        from coliags_plugin.core.lamps import Lamp
+        from coliags_plugin.core.settings import validated
+        from coliags_plugin.engine.relighting import relight
 
-        made = make_lamp(lamp)
+        made = validated(Lamp, lamp, "lamp option")
         relit = Run(self.path, data=self.data, device=self.device)
         relit._loaded = relight(self.load(), made)
         return relit

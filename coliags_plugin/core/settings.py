@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from coliags_plugin.core.errors import did_you_mean
+from coliags_plugin.core.errors import InputError, did_you_mean
+
+Model = TypeVar("Model", bound=BaseModel)
 
 
 class Settings(BaseModel):
@@ -48,6 +51,24 @@ class Settings(BaseModel):
                 ],
             )
         return data
+
+
+def validated(kind: type[Model], values: Mapping[str, Any], what: str) -> Model:
+    """Settings of plain values by name.
+
+    Args:
+        kind: Their class.
+        values: Those that are not to have their defaults.
+        what: What to call one of them in the message, for instance ``mesh option``.
+
+    Raises:
+        InputError: A name is unknown, or a value is invalid.
+    """
+    try:
+        return kind.model_validate(dict(values))
+    except ValidationError as error:
+        key, message, value = first_error(error)
+        raise InputError(f"{what} '{key}' = {value!r}: {message}") from error
 
 
 def first_error(error: ValidationError) -> tuple[str, str, Any]:

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
-from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.settings import Settings, first_error
+from coliags_plugin.core.settings import Settings
 
 
 class CoverageSettings(Settings):
@@ -50,16 +47,3 @@ class CoverageSettings(Settings):
     def region_area(self) -> float:
         """Area of the smallest missed region that is listed, mm^2."""
         return 0.25 * math.pi * self.region_diameter**2
-
-
-def coverage_settings(values: Mapping[str, Any]) -> CoverageSettings:
-    """Settings of plain values by name.
-
-    Raises:
-        InputError: A name is unknown, or a value is invalid.
-    """
-    try:
-        return CoverageSettings.model_validate(dict(values))
-    except ValidationError as error:
-        key, message, value = first_error(error)
-        raise InputError(f"coverage option '{key}' = {value!r}: {message}") from error

@@ -2,32 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
-
-from pydantic import ValidationError
 
 from coliags_plugin.config.registry import fields
 from coliags_plugin.contracts import LitField
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.lamps import Lamp
-from coliags_plugin.core.settings import first_error
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.trained import TrainedRun
-
-
-def make_lamp(values: Mapping[str, Any]) -> Lamp:
-    """The lamp of plain values by name.
-
-    Raises:
-        InputError: A name is unknown, or a value is invalid.
-    """
-    try:
-        return Lamp.model_validate(dict(values))
-    except ValidationError as error:
-        key, message, value = first_error(error)
-        raise InputError(f"lamp option '{key}' = {value!r}: {message}") from error
 
 
 def relight(trained: TrainedRun, lamp: Lamp) -> TrainedRun:

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
-import struct
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
+from coliags_plugin.core.glb import GlbArray, write_glb
 from coliags_plugin.core.open3d_library import import_open3d
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.meshes.mesh import TriangleMesh
@@ -21,9 +19,8 @@ from coliags_plugin.meshes.obj import decode_obj, encode_obj
 #: Suffixes of the formats.
 MESH_FORMATS = ("ply", "obj", "glb")
 
-_GLB_MAGIC, _GLB_JSON, _GLB_BINARY = 0x46546C67, 0x4E4F534A, 0x004E4942
-_FLOAT, _UNSIGNED_INT, _UNSIGNED_BYTE = 5126, 5125, 5121
-_VERTICES, _INDICES = 34962, 34963
+#: glTF's number of a primitive of triangles.
+_TRIANGLES = 4
 
 
 def read_mesh(path: Path) -> TriangleMesh:
@@ -101,55 +98,25 @@ def _write_obj(path: Path, mesh: TriangleMesh) -> None:
 
 def _write_glb(path: Path, mesh: TriangleMesh) -> None:
     """One primitive with 32-bit indices, float positions and 8-bit colours (glTF 2.0)."""
-    positions = np.ascontiguousarray(mesh.vertices, "<f4")
-    parts: list[tuple[np.ndarray, dict[str, Any]]] = [
-        (
-            np.ascontiguousarray(mesh.triangles, "<u4"),
-            {"componentType": _UNSIGNED_INT, "count": mesh.triangles.size, "type": "SCALAR"},
-        ),
-        (
-            positions,
-            {
-                "componentType": _FLOAT,
-                "count": len(positions),
-                "type": "VEC3",
-                "min": positions.min(axis=0).tolist(),
-                "max": positions.max(axis=0).tolist(),
-            },
-        ),
+    arrays = [
+        GlbArray(mesh.triangles.astype(np.uint32).reshape(-1, 1), indices=True),
+        GlbArray(mesh.vertices.astype(np.float32), bounds=True),
     ]
     attributes = {"POSITION": 1}
     if mesh.colors is not None:
         attributes["COLOR_0"] = 2
         # Of four bytes each, as glTF aligns the elements of a vertex attribute.
-        rgba = np.full((len(positions), 4), 255, np.uint8)
+        rgba = np.full((len(mesh.vertices), 4), 255, np.uint8)
         rgba[:, :3] = np.rint(_linear(mesh.colors) * 255.0)
-        parts.append(
-            (rgba, {"componentType": _UNSIGNED_BYTE, "normalized": True, "count": len(positions), "type": "VEC4"})
-        )
-    body, views, accessors = b"", [], []
-    for number, (values, accessor) in enumerate(parts):
-        data = values.tobytes()
-        target = _INDICES if number == 0 else _VERTICES
-        views.append({"buffer": 0, "byteOffset": len(body), "byteLength": len(data), "target": target})
-        accessors.append({"bufferView": number, **accessor})
-        body += data
+        arrays.append(GlbArray(rgba, normalized=True))
     document = {
-        "asset": {"version": "2.0", "generator": "coliags_plugin"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": attributes, "indices": 0, "material": 0, "mode": 4}]}],
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": 0, "material": 0, "mode": _TRIANGLES}]}],
         "materials": [{"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}],
-        "buffers": [{"byteLength": len(body)}],
-        "bufferViews": views,
-        "accessors": accessors,
     }
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    body += b"\0" * (-len(body) % 4)
-    chunks = struct.pack("<II", len(text), _GLB_JSON) + text + struct.pack("<II", len(body), _GLB_BINARY) + body
-    atomic_write(path, struct.pack("<III", _GLB_MAGIC, 2, 12 + len(chunks)) + chunks)
+    write_glb(path, document, arrays)
 
 
 def _linear(colors: UInt8[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:

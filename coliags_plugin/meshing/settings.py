@@ -2,47 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import Field as Option
-from pydantic import ValidationError
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Scene
-from coliags_plugin.core.settings import Settings, first_error
-
-#: Approximate number of training cameras, evenly spaced, that the default depth range is computed from.
-_RANGE_CAMERAS = 16
+from coliags_plugin.core.settings import Settings
 
 
 class MeshSettings(Settings):
     """Options of meshing."""
 
     # Edge of a voxel in scene units (mm); null: voxel_pixels times the size of a training pixel on the surface.
-    voxel_size: float | None = Option(default=None, gt=0, allow_inf_nan=False)
-    voxel_pixels: float = Option(default=2.0, gt=0, allow_inf_nan=False)  # see voxel_size
+    voxel_size: float | None = Option(default=None, gt=0)
+    voxel_pixels: float = Option(default=2.0, gt=0)  # see voxel_size
     truncation: float = Option(default=3.0, ge=1, le=32)  # of the signed distance, in voxels
     depth: Literal["expected", "median"] = "median"  # kind of rendered depth (docs/conventions.md 3)
     # z-depth in scene units beyond which nothing is fused; null: that of the farthest initial point in a training view.
-    max_depth: float | None = Option(default=None, gt=0, allow_inf_nan=False)
+    max_depth: float | None = Option(default=None, gt=0)
     min_alpha: float = Option(default=0.9, ge=0.5, lt=1)  # pixels with less are not fused
     max_incidence: float = Option(default=80.0, gt=0, le=90)  # degrees; surface seen more obliquely is not fused
     min_views: int = Option(default=3, ge=1)  # views that must agree on a place; fewer where there are fewer
     min_part: float = Option(default=0.01, ge=0, le=1)  # connected parts below this share of the largest are removed
-
-
-def mesh_settings(values: Mapping[str, Any]) -> MeshSettings:
-    """Options of plain values by name.
-
-    Raises:
-        InputError: A name is unknown, or a value is invalid.
-    """
-    try:
-        return MeshSettings.model_validate(dict(values))
-    except ValidationError as error:
-        key, message, value = first_error(error)
-        raise InputError(f"mesh option '{key}' = {value!r}: {message}") from error
 
 
 def voxel_size_of(settings: MeshSettings, scene: Scene) -> float:
@@ -64,10 +46,5 @@ def max_depth_of(settings: MeshSettings, scene: Scene) -> float:
     """z-depth beyond which nothing is fused, scene units; infinite where the scene has no points in view."""
     if settings.max_depth is not None:
         return settings.max_depth
-    farthest = []
-    for frame in scene.train[:: max(1, len(scene.train) // _RANGE_CAMERAS)]:
-        camera = frame.camera.to(scene.points.positions.device, scene.points.positions.dtype)
-        pixels, depth = camera.project(scene.points.positions)
-        inside = ((pixels >= 0) & (pixels < pixels.new_tensor([camera.width, camera.height]))).all(dim=1) & (depth > 0)
-        farthest += [float(depth[inside].max())] if inside.any() else []
-    return max(farthest, default=float("inf"))
+    depths = scene.depths_in_view()
+    return float(depths.max()) if len(depths) else float("inf")

@@ -11,7 +11,7 @@ import pytest
 from coliags_plugin.api.scenes import make_phantom
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.coverage.scene_views import recorded_views
-from coliags_plugin.coverage.settings import coverage_settings
+from coliags_plugin.coverage.settings import CoverageSettings
 from coliags_plugin.coverage.text import RESEARCH_USE
 from coliags_plugin.coverage.writing import measure_scene, open_recording
 from coliags_plugin.lenses.models import OmnidirectionalLens
@@ -49,7 +49,7 @@ def test_the_true_mesh_has_its_true_coverage(phantom, tmp_path):
     scene = open_recording(phantom)
     lens = recorded_views(scene)[0].lens
     # The truth counts wall at any distance.
-    settings = coverage_settings({"rays": lens.width * lens.height, "max_distance": 500.0})
+    settings = CoverageSettings(rays=lens.width * lens.height, max_distance=500.0)
     made = measure_scene(scene, read_mesh(true_mesh(phantom)), tmp_path / "made", settings)
     scores = made.evaluation.surface
     # Only triangles between the rays, seen by their centroids, differ.
@@ -101,8 +101,8 @@ def test_a_mesh_of_another_world_and_a_scene_of_unknown_unit_are_refused(phantom
     scene, mesh = open_recording(phantom), read_mesh(true_mesh(phantom))
     away = type(mesh)(mesh.vertices + np.float32(5000.0), mesh.triangles)
     with pytest.raises(InputError, match="no viewing ray"):
-        measure_scene(scene, away, tmp_path / "out", coverage_settings({}))
+        measure_scene(scene, away, tmp_path / "out", CoverageSettings())
     scene.provenance["unit"] = "unknown"
     with pytest.raises(InputError, match="unit of length"):
-        measure_scene(scene, mesh, tmp_path / "out", coverage_settings({}))
+        measure_scene(scene, mesh, tmp_path / "out", CoverageSettings())
     assert not (tmp_path / "out").exists()

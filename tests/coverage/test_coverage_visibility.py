@@ -7,8 +7,9 @@ import pytest
 from tubes import joined, pinhole, plane, sphere, tube, view_at
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.settings import validated
 from coliags_plugin.coverage.levels import Level, classify
-from coliags_plugin.coverage.settings import CoverageSettings, coverage_settings
+from coliags_plugin.coverage.settings import CoverageSettings
 from coliags_plugin.coverage.views import RayGrid
 from coliags_plugin.coverage.visibility import facing_cameras, see_faces
 from coliags_plugin.lenses.models import LENSES, octagon_mask
@@ -139,6 +140,6 @@ def test_input_that_cannot_be_measured_is_refused():
     with pytest.raises(InputError, match="without triangles"):
         see_faces(mesh.part(np.zeros(len(mesh), bool)), [view_at((0, 0, 0))])
     with pytest.raises(InputError, match="'near'"):
-        coverage_settings({"near": 3.0})
+        validated(CoverageSettings, {"near": 3.0}, "coverage option")
     with pytest.raises(InputError, match="'far'"):
-        coverage_settings({"far": -3.0})
+        validated(CoverageSettings, {"far": -3.0}, "coverage option")

@@ -10,8 +10,9 @@ import torch
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud
+from coliags_plugin.core.settings import validated
 from coliags_plugin.meshing.fusion import fuse_run, incidence_cosines
-from coliags_plugin.meshing.settings import MeshSettings, max_depth_of, mesh_settings, voxel_size_of
+from coliags_plugin.meshing.settings import MeshSettings, max_depth_of, voxel_size_of
 from tests.meshing.exact import SQUARE, WALL, depth_of, exact_run
 from tests.scenes import camera_at, wall_color, wall_scene
 
@@ -132,8 +133,8 @@ def test_defaults_follow_the_scene():
 
 
 def test_settings_by_name():
-    assert mesh_settings({"depth": "expected"}).depth == "expected"
+    assert validated(MeshSettings, {"depth": "expected"}, "mesh option").depth == "expected"
     with pytest.raises(InputError, match=r"unknown key 'dept'.*Did you mean 'depth'"):
-        mesh_settings({"dept": "expected"})
+        validated(MeshSettings, {"dept": "expected"}, "mesh option")
     with pytest.raises(InputError, match="voxel_size"):
-        mesh_settings({"voxel_size": 0.0})
+        validated(MeshSettings, {"voxel_size": 0.0}, "mesh option")
