@@ -23,6 +23,9 @@ class Mesh:
     """Edge of a voxel in scene units (mm); default: two training pixels on the surface."""
     format: tuple[Literal["ply", "obj", "glb"], ...] = ("ply", "obj", "glb")
     """Formats of the mesh."""
+    color: Literal["plain", "flattened"] = "plain"
+    """Colours: as the views show them, each under its lamp; or under one distance and angle to the lamp everywhere, the
+    medians of what the training views see, for methods of Gaussians."""
     set: Assignments = ()
     """Another option of meshing (docs/meshes.md 3), for instance depth=median."""
     truth: OptionalPath = None
@@ -42,6 +45,7 @@ class Mesh:
         from coliags_plugin.meshing.text import comparison_text
 
         settings = parse_assignments(self.set, "--set", "KEY=VALUE, for instance depth=median")
+        settings.setdefault("color", self.color)
         if self.voxel is not None:
             settings["voxel_size"] = self.voxel
         run = load_run(self.path, data=self.data, device=self.device)

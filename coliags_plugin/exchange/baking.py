@@ -8,13 +8,13 @@ import torch
 
 from coliags_plugin.core.lamps import HeldLight
 from coliags_plugin.core.scenes import Frame
+from coliags_plugin.engine.held_light import gaussians_of, splatting_of
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.exchange.averages import GaussianAverages, blending_weights
 from coliags_plugin.exchange.cameras import adjusted_camera
 from coliags_plugin.exchange.explicit import cloud_of_field
 from coliags_plugin.exchange.harmonics import SeenColors, fit_harmonics
-from coliags_plugin.exchange.held_light import gaussians_of, splatting_of
 from coliags_plugin.exchange.refinement import loses_much, refine
 from coliags_plugin.fields.explicit_gaussians import ExplicitGaussians
 from coliags_plugin.fields.spherical_harmonics import MAX_DEGREE

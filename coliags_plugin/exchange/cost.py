@@ -11,12 +11,12 @@ import torch
 from coliags_plugin.contracts import Comparison
 from coliags_plugin.core.lamps import HeldLight
 from coliags_plugin.core.scenes import Frame
+from coliags_plugin.engine.held_light import render_held
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.scoring import Scorer
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.exchange.explicit import field_of_cloud
-from coliags_plugin.exchange.held_light import render_held
 from coliags_plugin.renderers.choice import choose_renderer
 from coliags_plugin.splats.cloud import SplatCloud
 

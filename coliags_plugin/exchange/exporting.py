@@ -13,12 +13,12 @@ from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.lamps import HeldLight
+from coliags_plugin.engine.held_light import held_light
 from coliags_plugin.engine.provenance import software
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.exchange.baking import bake
 from coliags_plugin.exchange.cost import export_cost
 from coliags_plugin.exchange.explicit import cloud_of_field
-from coliags_plugin.exchange.held_light import held_light
 from coliags_plugin.fields.explicit_gaussians import ExplicitGaussians
 from coliags_plugin.splats.cloud import SplatCloud
 from coliags_plugin.splats.files import FORMATS, THICKNESS_SHARE, check_format, kept_by, write_splats

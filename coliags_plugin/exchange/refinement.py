@@ -14,12 +14,12 @@ from coliags_plugin.core.errors import NotFiniteError
 from coliags_plugin.core.lamps import HeldLight
 from coliags_plugin.core.masked import masked_mean
 from coliags_plugin.core.scenes import Frame
+from coliags_plugin.engine.held_light import render_held, splatting_of
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.randomness import generators
 from coliags_plugin.engine.rendering import render_view
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.exchange.cameras import adjusted_camera
-from coliags_plugin.exchange.held_light import render_held, splatting_of
 from coliags_plugin.fields.explicit_gaussians import ExplicitGaussians
 
 #: Steps, one training view each.

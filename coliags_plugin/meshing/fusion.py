@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Frame
+from coliags_plugin.engine.held_light import held_light, render_held
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.rendering import render_view
 from coliags_plugin.engine.trained import TrainedRun
@@ -17,6 +21,7 @@ from coliags_plugin.meshes.cleaning import without_small_parts
 from coliags_plugin.meshes.mesh import TriangleMesh
 from coliags_plugin.meshing.settings import MeshSettings, max_depth_of, voxel_size_of
 from coliags_plugin.meshing.volume import Volume
+from coliags_plugin.outputs.image_files import eight_bit
 
 
 def fuse_run(trained: TrainedRun, settings: MeshSettings | None = None) -> TriangleMesh:
@@ -31,8 +36,8 @@ def fuse_run(trained: TrainedRun, settings: MeshSettings | None = None) -> Trian
         seen from where the cameras were.
 
     Raises:
-        InputError: The method renders no such depth, there are fewer than two training views, the voxels are too small
-            for the memory, or no surface is found.
+        InputError: The method renders no such depth, or no such colours; there are fewer than two training views, the
+            voxels are too small for the memory, or no surface is found.
     """
     settings = settings or MeshSettings()
     depth = f"depth_{settings.depth}"
@@ -43,12 +48,13 @@ def fuse_run(trained: TrainedRun, settings: MeshSettings | None = None) -> Trian
         raise InputError(f"scene '{trained.scene.name}' has {len(frames)} training view", "two views or more to fuse")
     size, reach = voxel_size_of(settings, trained.scene), max_depth_of(settings, trained.scene)
     volume = Volume(size, settings.truncation)
+    colors = _rendered if settings.color == "plain" else _flattened(trained)
     with ProgressReport("fuse depth", len(frames)) as progress:
         for count, frame in enumerate(frames, start=1):
             output = render_view(trained, frame, wants)
             camera = frame.camera if output.camera is None else output.camera
             known = _usable(output[depth], output.alpha, frame, camera, settings, reach)
-            volume.add(known, _colors(output.rgb), camera)
+            volume.add(known, eight_bit(colors(output, camera)).cpu().numpy(), camera)
             progress.update(count)
     mesh = volume.mesh(min(settings.min_views, len(frames)))
     if not len(mesh):
@@ -58,6 +64,21 @@ def fuse_run(trained: TrainedRun, settings: MeshSettings | None = None) -> Trian
             "Look at `coliags render RUN`; perhaps train longer, or lower min_views or min_alpha",
         )
     return without_small_parts(mesh, settings.min_part)
+
+
+def _rendered(output: RenderOutput, camera: Camera) -> Float[Tensor, "H W 3"]:
+    return output.rgb
+
+
+def _flattened(trained: TrainedRun) -> Callable[[RenderOutput, Camera], Float[Tensor, "H W 3"]]:
+    """Renders the colours of a view under the same light everywhere."""
+    light = held_light("flattened", trained.model, [frame.camera for frame in trained.scene.train])
+
+    @torch.no_grad()
+    def colors(output: RenderOutput, camera: Camera) -> Float[Tensor, "H W 3"]:
+        return render_held(trained.model, camera.to(trained.device, torch.float32), light, ("rgb",)).rgb
+
+    return colors
 
 
 def _usable(
@@ -96,7 +117,3 @@ def _smaller_step(points: Float[Tensor, "H W 3"], depth: Float[Tensor, "H W"], a
     ahead, behind = torch.cat([steps, nothing], axis), torch.cat([nothing, steps], axis)
     nearer = torch.cat([jumps, endless], axis) <= torch.cat([endless, jumps], axis)
     return torch.where(nearer[..., None], ahead, behind)
-
-
-def _colors(rgb: Tensor) -> UInt8[np.ndarray, "H W 3"]:
-    return np.asarray((rgb.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8).numpy())

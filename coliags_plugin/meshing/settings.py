@@ -21,6 +21,8 @@ class MeshSettings(Settings):
     depth: Literal["expected", "median"] = "median"  # kind of rendered depth (docs/conventions.md 3)
     # z-depth in scene units beyond which nothing is fused; null: that of the farthest initial point in a training view.
     max_depth: float | None = Option(default=None, gt=0)
+    # Colours as rendered, under the lamp of each view; or under one distance and angle to the lamp everywhere.
+    color: Literal["plain", "flattened"] = "plain"
     min_alpha: float = Option(default=0.9, ge=0.5, lt=1)  # pixels with less are not fused
     max_incidence: float = Option(default=80.0, gt=0, le=90)  # degrees; surface seen more obliquely is not fused
     min_views: int = Option(default=3, ge=1)  # views that must agree on a place; fewer where there are fewer

@@ -19,8 +19,8 @@ from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.lamps import HeldLight
 from coliags_plugin.core.scenes import Frame
+from coliags_plugin.engine.held_light import flattened_light
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.exchange.held_light import flattened_light
 from coliags_plugin.outputs.image_files import as_array
 from coliags_plugin.viewer.baking import bake, baking_cameras
 from coliags_plugin.viewer.decoding import ViewDecoder, in_view

@@ -14,10 +14,10 @@ import coliags_plugin as cp
 from coliags_plugin.config.assignments import parse_assignments
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.lamps import FlattenedLight, LightOfCamera
+from coliags_plugin.engine.held_light import flattened_light
 from coliags_plugin.exchange import refinement
 from coliags_plugin.exchange.baking import bake
 from coliags_plugin.exchange.explicit import field_of_cloud
-from coliags_plugin.exchange.held_light import flattened_light
 from coliags_plugin.splats.files import read_splats, write_splats
 from coliags_plugin.splats.ply import write_splat_ply
 from tests.commands import refused, run

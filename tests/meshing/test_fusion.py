@@ -9,8 +9,10 @@ import pytest
 import torch
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.core.settings import validated
+from coliags_plugin.meshing import fusion
 from coliags_plugin.meshing.fusion import fuse_run, incidence_cosines
 from coliags_plugin.meshing.settings import MeshSettings, max_depth_of, voxel_size_of
 from tests.meshing.exact import SQUARE, WALL, depth_of, exact_run
@@ -80,6 +82,29 @@ def test_transparent_views_have_no_surface():
     with pytest.raises(InputError, match=r"no surface.*units|no surface.*mm"):
         fuse_run(exact_run(alpha=0.7))
     assert len(fuse_run(exact_run(alpha=0.7), MeshSettings(min_alpha=0.5)))
+
+
+def test_flattened_colours_are_those_of_a_held_light(monkeypatch):
+    run = exact_run()
+    asked = []
+
+    def held(name, model, cameras):
+        asked.append((name, len(cameras)))
+        return "light"
+
+    def dark(model, camera, light, wants):
+        assert light == "light"
+        return RenderOutput(
+            torch.full((camera.height, camera.width, 3), 0.2), torch.ones(camera.height, camera.width), camera
+        )
+
+    monkeypatch.setattr(fusion, "held_light", held)
+    monkeypatch.setattr(fusion, "render_held", dark)
+    mesh = fuse_run(run, MeshSettings(color="flattened"))
+    assert asked == [("flattened", len(run.scene.train))]
+    assert set(np.unique(mesh.colors)) == {51}
+    plain = fuse_run(run)
+    assert np.array_equal(mesh.vertices, plain.vertices) and not np.array_equal(mesh.colors, plain.colors)
 
 
 def test_one_view_is_refused():

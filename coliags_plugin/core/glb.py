@@ -1,0 +1,95 @@
+"""Writing GLB files: glTF 2.0 with its arrays in one binary file."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Shaped
+
+from coliags_plugin.core.files import atomic_write
+
+_MAGIC, _VERSION, _JSON_CHUNK, _BINARY_CHUNK = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
+#: glTF's numbers of types, and names of shapes by their channels.
+_COMPONENTS = {"|u1": 5121, "<u4": 5125, "<f4": 5126}
+_SHAPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+#: What a part of the buffer is for.
+_VERTICES, _INDICES = 34962, 34963
+
+
+@dataclass(frozen=True, eq=False)
+class GlbArray:
+    """An array of a GLB file, which becomes an accessor.
+
+    Attributes:
+        values: uint8, uint32 or float32. [N, C]
+        indices: Whether these are indices of vertices, instead of attributes of them.
+        normalized: Whether integers stand for numbers from 0 to 1.
+        bounds: Whether to state the smallest and largest values, as glTF requires of positions.
+    """
+
+    values: Shaped[np.ndarray, "N C"]
+    indices: bool = False
+    normalized: bool = False
+    bounds: bool = False
+
+    def accessor(self, view: int) -> dict[str, Any]:
+        """Its description."""
+        stored = self.values.dtype.newbyteorder("<")
+        made: dict[str, Any] = {
+            "bufferView": view,
+            "componentType": _COMPONENTS[stored.str],
+            "count": len(self.values),
+            "type": _SHAPES[self.values.shape[1]],
+        }
+        if self.normalized:
+            made["normalized"] = True
+        if self.bounds:
+            made |= {"min": self.values.min(axis=0).tolist(), "max": self.values.max(axis=0).tolist()}
+        return made
+
+
+def write_glb(path: Path, document: Mapping[str, Any], arrays: Sequence[GlbArray], extras: str = "") -> None:
+    """Write a GLB file atomically; the folder is made.
+
+    Args:
+        path: Where to.
+        document: The glTF document without asset, buffers, views and accessors; accessor i is array i.
+        arrays: Each of rows of a multiple of four bytes.
+        extras: A comment.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    views, chunks, offset = [], [], 0
+    for array in arrays:
+        data = np.ascontiguousarray(array.values, array.values.dtype.newbyteorder("<")).tobytes()
+        target = _INDICES if array.indices else _VERTICES
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(data), "target": target})
+        chunks.append(data)
+        offset += len(data)
+    asset: dict[str, Any] = {"version": "2.0", "generator": "coliags_plugin"}
+    if extras:
+        asset["extras"] = {"comment": extras}
+    whole = {
+        "asset": asset,
+        **document,
+        "buffers": [{"byteLength": offset}],
+        "bufferViews": views,
+        "accessors": [array.accessor(view) for view, array in enumerate(arrays)],
+    }
+    text = _padded(json.dumps(whole, allow_nan=False).encode(), b" ")
+    body = _padded(b"".join(chunks), b"\0")
+    header = struct.pack("<III", _MAGIC, _VERSION, 12 + 8 + len(text) + 8 + len(body))
+    parts = [header, struct.pack("<II", len(text), _JSON_CHUNK), text, struct.pack("<II", len(body), _BINARY_CHUNK)]
+    atomic_write(path, b"".join([*parts, body]))
+
+
+def _padded(data: bytes, filling: bytes) -> bytes:
+    """Filled up to a multiple of four bytes."""
+    return data + filling * (-len(data) % 4)
