@@ -94,9 +94,8 @@ def test_flattened_colours_are_those_of_a_held_light(monkeypatch):
 
     def dark(model, camera, light, wants):
         assert light == "light"
-        return RenderOutput(
-            torch.full((camera.height, camera.width, 3), 0.2), torch.ones(camera.height, camera.width), camera
-        )
+        size = (camera.height, camera.width)
+        return RenderOutput(torch.full((*size, 3), 0.2), torch.ones(size), camera)
 
     monkeypatch.setattr(fusion, "held_light", held)
     monkeypatch.setattr(fusion, "render_held", dark)
