@@ -71,6 +71,10 @@ def fields(options: Options) -> list[tuple[str, GaussianField, list[Camera]]]:
     return made
 
 
+#: Of a splat on the wire after compression.
+_LEAST_BYTES = 8
+
+
 def timed(name: str, field: GaussianField, cameras: list[Camera], repeats: int) -> dict[str, str | float]:
     """Medians of one field."""
     viser = import_viser()
@@ -111,8 +115,8 @@ def timed(name: str, field: GaussianField, cameras: list[Camera], repeats: int) 
 
 
 def arrived(browser: ClientConnection, count: int) -> None:
-    """Wait until so many splats have arrived."""
-    while len(browser.recv(timeout=60.0)) < count * BYTES_PER_SPLAT:
+    """Wait until so many splats have arrived, of whose bytes compression leaves those of the centres at least."""
+    while len(browser.recv(timeout=60.0)) < count * _LEAST_BYTES:
         pass
 
 

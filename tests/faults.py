@@ -6,6 +6,7 @@ import errno
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from coliags_plugin.core import files, scratch
@@ -100,3 +101,10 @@ def fault(when: int, kind: Callable[[], None]) -> Iterator[FaultyOs]:
         yield faulty
     finally:
         files.os = scratch.os = real
+
+
+def content(path: Path) -> bytes | dict[str, bytes] | None:
+    """Bytes of a file, or of all files of a folder by name; None where there is nothing."""
+    if path.is_dir():
+        return {str(file.relative_to(path)): file.read_bytes() for file in sorted(path.rglob("*")) if file.is_file()}
+    return path.read_bytes() if path.exists() else None

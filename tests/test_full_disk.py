@@ -17,7 +17,7 @@ from coliags_plugin.engine.checkpoints import save_tensors
 from coliags_plugin.outputs.video import write_video
 from coliags_plugin.poses import colmap
 from coliags_plugin.poses.trajectory import Trajectory
-from tests.core.test_files import content
+from tests.faults import content
 
 FRAMES = np.random.default_rng(0).integers(0, 255, (12, 48, 64, 3)).astype(np.uint8)
 

@@ -11,7 +11,7 @@ import pytest
 from coliags_plugin.core import scratch
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_copy, atomic_folder, atomic_path, atomic_write, write_arrays, write_json
-from tests.faults import broken_disk, fault, killed, no_space
+from tests.faults import broken_disk, content, fault, killed, no_space
 
 OLD, NEW = b"old" * 5000, b"new!" * 7000
 
@@ -32,13 +32,6 @@ def copy(target):
 def by_a_library(target):
     with atomic_path(target) as path:
         path.write_bytes(NEW)
-
-
-def content(path):
-    """Bytes of a file, or of all files of a folder by name; None where there is nothing."""
-    if path.is_dir():
-        return {str(file.relative_to(path)): file.read_bytes() for file in sorted(path.rglob("*")) if file.is_file()}
-    return path.read_bytes() if path.exists() else None
 
 
 def old_file(target):

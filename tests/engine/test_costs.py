@@ -14,6 +14,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from coliags_plugin.core.checksums import write_checksums
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine import costs
 from coliags_plugin.engine.checkpoints import checkpoint_folder
@@ -186,6 +187,7 @@ def test_a_checkpoint_without_cost_goes_on_from_the_log(tmp_path, clocks):
     content = json.loads(state.read_text())
     del content["cost"]
     state.write_text(json.dumps(content))
+    write_checksums(state.parent)
     longer = make_trainer(tmp_path / "run", steps=5)
     longer.resume()
     _tick(longer, clocks)
@@ -206,7 +208,8 @@ def test_a_damaged_cost_is_refused(tmp_path):
     trainer = train(tmp_path / "run", steps=1)
     state = checkpoint_folder(trainer.run.checkpoints, 1) / "state.json"
     state.write_text(state.read_text().replace('"seconds": ', '"hours": '))
-    with pytest.raises(InputError, match="cannot be read"):
+    write_checksums(state.parent)
+    with pytest.raises(InputError, match="is damaged: 1 validation error"):
         final_state(trainer)
 
 

@@ -15,7 +15,6 @@ from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.checksums import CHECKSUMS, write_checksums
 from coliags_plugin.core.errors import InputError, InterruptedRunError, NotFiniteError
 from coliags_plugin.engine import blank_views
-from coliags_plugin.engine import trainer as trainer_module
 from coliags_plugin.engine.blank_views import NothingDrawnError
 from coliags_plugin.engine.checkpoints import (
     DamagedCheckpointError,
@@ -24,6 +23,7 @@ from coliags_plugin.engine.checkpoints import (
     read_checkpoint,
     take_newest,
 )
+from coliags_plugin.engine.provenance import software
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer
 from tests.scenes import SMALL, wall_scene
@@ -379,4 +379,4 @@ def test_provenance_says_where_the_run_came_from(tmp_path):
     assert found["renderer"] == "cpu"
     assert "auto" in found["renderer_reason"]
     assert found["scene"]["provenance"]["fingerprint"] == "wall-9-True"
-    assert trainer_module.software().items() <= found.items()
+    assert software().items() <= found.items()

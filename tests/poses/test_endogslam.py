@@ -107,7 +107,6 @@ def test_one_message_names_every_fault(tmp_path):
         rgb_colors=np.zeros((GAUSSIANS, 4)),
         log_scales=np.full((GAUSSIANS, 1), np.nan),
         org_width=np.array("wide"),
-        keyframe_time_indices=np.array([{}], dtype=object),
     )
     with pytest.raises(InputError) as caught:
         endogslam.read_params(path)
@@ -118,9 +117,14 @@ def test_one_message_names_every_fault(tmp_path):
         "rgb_colors has the shape [7, 4], not [N, 3]",
         "log_scales holds numbers that are not finite",
         "org_width holds <U4, not numbers",
-        "keyframe_time_indices is not an array of numbers",
     ):
         assert fault in str(caught.value)
+
+
+def test_objects_are_refused(tmp_path):
+    path = saved(tmp_path / "params.npz", keyframe_time_indices=np.array([{}], dtype=object))
+    with pytest.raises(InputError, match=r"cannot read .*params\.npz: Object arrays"):
+        endogslam.read_params(path)
 
 
 @pytest.mark.parametrize(
