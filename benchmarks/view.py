@@ -64,7 +64,7 @@ def fields(options: Options) -> list[tuple[str, GaussianField, list[Camera]]]:
         return [(trained.method, field, [frame.camera for frame in trained.scene.train])]
     made = []
     for anchors in map(int, options.anchors.split(",")):
-        scene = tube_scene(anchors, frames=options.repeats)
+        scene = tube_scene(anchors, frames=options.repeats + 1)  # viser does not send the same splats again
         node = load_method("coliags", ["field.voxel_size=0.01"]).config.field
         field = node.target.from_scene(scene, node.settings, torch.Generator().manual_seed(0))
         made.append((f"{anchors} anchors", field, [frame.camera for frame in scene.train]))

@@ -103,7 +103,8 @@ def test_flattened_colours_are_those_of_a_held_light(monkeypatch):
     assert asked == [("flattened", len(run.scene.train))]
     assert set(np.unique(mesh.colors)) == {51}
     plain = fuse_run(run)
-    assert np.array_equal(mesh.vertices, plain.vertices) and not np.array_equal(mesh.colors, plain.colors)
+    # open3d's threads leave the order of vertices open.
+    assert mesh.areas.sum() == pytest.approx(plain.areas.sum()) and len(np.unique(plain.colors)) > 1
 
 
 def test_one_view_is_refused():
