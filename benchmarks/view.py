@@ -115,7 +115,7 @@ def timed(name: str, field: GaussianField, cameras: list[Camera], repeats: int) 
 
 
 def arrived(browser: ClientConnection, count: int) -> None:
-    """Wait until so many splats have arrived, of whose bytes compression leaves those of the centres at least."""
+    """Wait for a message that is large enough to hold so many splats, compressed."""
     while len(browser.recv(timeout=60.0)) < count * _LEAST_BYTES:
         pass
 

@@ -126,6 +126,7 @@ def _frame(scene: Scene, name: str) -> tuple[Frame, Camera]:
 
 
 def _true_depth(frame: Frame) -> Float32[np.ndarray, "H W"] | None:
-    if frame.depth is None or frame.depth_confidence is not None:
+    true = frame.true_depth
+    if true is None:
         return None
-    return as_array(frame.depth.masked_fill(~frame.valid, math.nan).float())
+    return as_array(true.masked_fill(~frame.valid, math.nan).float())

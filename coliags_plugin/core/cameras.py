@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from coliags_plugin.core.intrinsics import Intrinsics
@@ -97,6 +97,15 @@ class Camera(Intrinsics):
         local = (points - self.center) @ self.camera_to_world[:3, :3]
         x, y, z = local.unbind(-1)
         return torch.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], dim=-1), z
+
+    def sees(self, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Bool[Tensor, "N"]]:
+        """z-depths of world points, and which of them are in front of the camera and inside its image; [N], [N].
+
+        Occlusion is not tested.
+        """
+        pixels, depth = self.project(points)
+        inside = ((pixels >= 0) & (pixels < pixels.new_tensor([self.width, self.height]))).all(dim=-1)
+        return depth, inside & (depth > 0)
 
     def unproject(self, depth: Float[Tensor, "H W"]) -> Float[Tensor, "H W 3"]:
         """World position of every pixel at its z-depth (NaN where the depth is NaN). [H, W, 3]"""

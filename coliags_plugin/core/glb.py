@@ -1,4 +1,4 @@
-"""Writing GLB files: glTF 2.0 with its arrays in one binary file."""
+"""Encoding of GLB files: glTF 2.0 with its arrays in one binary file."""
 
 from __future__ import annotations
 
@@ -6,13 +6,10 @@ import json
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Shaped
-
-from coliags_plugin.core.files import atomic_write
 
 _MAGIC, _VERSION, _JSON_CHUNK, _BINARY_CHUNK = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 #: glTF's numbers of types, and names of shapes by their channels.
@@ -54,17 +51,13 @@ class GlbArray:
         return made
 
 
-def write_glb(path: Path, document: Mapping[str, Any], arrays: Sequence[GlbArray], extras: str = "") -> None:
-    """Write a GLB file atomically; the folder is made.
+def encode_glb(document: Mapping[str, Any], arrays: Sequence[GlbArray], extras: str = "") -> bytes:
+    """The bytes of a GLB file.
 
     Args:
-        path: Where to.
         document: The glTF document without asset, buffers, views and accessors; accessor i is array i.
         arrays: Each of rows of a multiple of four bytes.
         extras: A comment.
-
-    Raises:
-        InputError: The folder cannot be written.
     """
     views, chunks, offset = [], [], 0
     for array in arrays:
@@ -87,7 +80,7 @@ def write_glb(path: Path, document: Mapping[str, Any], arrays: Sequence[GlbArray
     body = _padded(b"".join(chunks), b"\0")
     header = struct.pack("<III", _MAGIC, _VERSION, 12 + 8 + len(text) + 8 + len(body))
     parts = [header, struct.pack("<II", len(text), _JSON_CHUNK), text, struct.pack("<II", len(body), _BINARY_CHUNK)]
-    atomic_write(path, b"".join([*parts, body]))
+    return b"".join([*parts, body])
 
 
 def _padded(data: bytes, filling: bytes) -> bytes:

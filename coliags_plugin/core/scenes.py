@@ -166,6 +166,11 @@ class Frame(_MaskedImage):
             depth_confidence=taken(self.depth_confidence),
         )
 
+    @property
+    def true_depth(self) -> Float[Tensor, "H W"] | None:
+        """The depth, if it was measured or rendered; None where there is none or it is an estimate. [H, W]"""
+        return self.depth if self.depth_confidence is None else None
+
     def view(self, trained: bool) -> View:
         """This frame, for the modules of a model."""
         return View(self.name, float(self.index), trained)
@@ -273,9 +278,7 @@ class Scene:
         points = self.points.positions.double()
         for frame in self.train[:: max(1, len(self.train) // 16)]:
             camera = frame.camera.to(points.device, points.dtype)
-            pixels, depth = camera.project(points)
-            inside = ((pixels >= 0) & (pixels < pixels.new_tensor([camera.width, camera.height]))).all(dim=1)
-            yield camera, depth, inside & (depth > 0)
+            yield camera, *camera.sees(points)
 
 
 def concatenate_targets(parts: Sequence[Target]) -> Target:

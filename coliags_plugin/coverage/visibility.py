@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.open3d_library import import_open3d
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.coverage.settings import CoverageSettings
 from coliags_plugin.coverage.views import CoverageView, RayGrid
@@ -80,26 +78,18 @@ class RayCaster:
     def __init__(self, mesh: TriangleMesh) -> None:
         if not len(mesh):
             raise InputError("a mesh without triangles", "the surface that the camera filmed")
-        self._open3d = import_open3d("casts viewing rays at the surface")
-        self._scene = self._open3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(mesh.to_open3d())
+        self._rays = mesh.rays
         self._normals, self._centers = mesh.normals.astype(np.float32), mesh.centers
 
     def cast(
         self, origins: Float[np.ndarray, "N 3"] | Float[np.ndarray, "3"], directions: Float[np.ndarray, "N 3"]
     ) -> tuple[Int[np.ndarray, "N"], Float32[np.ndarray, "N"]]:
         """Triangle that each ray hits first, -1 without a hit, and how many lengths of the ray it is away. [N], [N]"""
-        rays = np.empty((len(directions), 6), np.float32)
-        rays[:, :3], rays[:, 3:] = origins, directions
-        answer = self._scene.cast_rays(self._open3d.core.Tensor(rays))
-        parameter = answer["t_hit"].numpy()
-        triangle = np.where(np.isfinite(parameter), answer["primitive_ids"].numpy(), -1).astype(np.int64)
-        return triangle, parameter
+        return self._rays.cast(origins, directions)
 
     def distance(self, points: Float[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N"]:
         """Distance of points to the surface, mm. [N]"""
-        query: Any = self._open3d.core.Tensor(np.ascontiguousarray(points, np.float32))
-        return np.asarray(self._scene.compute_distance(query).numpy())
+        return self._rays.distance(points)
 
     def seen_by(self, view: CoverageView, grid: RayGrid, farthest: float, both_sides: bool = False) -> _Hits:
         """What a view sees.
@@ -140,10 +130,7 @@ class RayCaster:
         kept = np.flatnonzero(ahead)
         rays = grid.nearest(view.lens, view.lens.project(local[kept]))
         kept, rays = kept[rays >= 0], rays[rays >= 0]
-        targets = np.empty((len(kept), 6), np.float32)
-        targets[:, :3], targets[:, 3:] = view.center, offset[kept]
-        # The last thousandth of the ray is left out, as it ends on the triangle itself.
-        blocked = self._scene.test_occlusions(self._open3d.core.Tensor(targets), tnear=0.0, tfar=0.999).numpy()
+        blocked = self._rays.blocked(view.center, offset[kept])
         kept, rays = kept[~blocked], rays[~blocked]
         return _Hits(triangles[kept], rays, distance[kept].astype(np.float32), cosine[kept].astype(np.float32))
 

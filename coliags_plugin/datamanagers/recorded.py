@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import shlex
 from abc import abstractmethod
@@ -14,6 +13,7 @@ import numpy as np
 import torch
 
 from coliags_plugin.contracts import DataManager
+from coliags_plugin.core.checksums import file_sha256
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
@@ -196,7 +196,7 @@ class RecordedDataManager(DataManager):
     def _described_points(self, source: Path | str, points: PointCloud) -> dict[str, Any]:
         facts: dict[str, Any] = {"source": str(source), "count": len(points), "seed": self.settings.seed}
         if isinstance(source, Path) and source.is_file():
-            facts["sha256"] = hashlib.sha256(source.read_bytes()).hexdigest()
+            facts["sha256"] = file_sha256(source)
         return facts
 
 

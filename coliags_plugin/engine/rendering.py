@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from jaxtyping import UInt8
 from torch import Tensor
 
 from coliags_plugin.config.yaml_tree import dump
@@ -150,17 +151,24 @@ def _write_frame(
     name = f"{frame.name}.png"
     depth = output[depth_name]
     write_png(folder / "rgb" / name, eight_bit(output.rgb))
-    write_png(folder / "depth" / name, _depth_picture(output, depth_name, limits))
+    write_png(folder / "depth" / name, depth_picture(output, depth_name, limits))
     valid = frame.valid.cpu()
     if not relit:
         errors = colorize_rgb_error(output.rgb.cpu(), frame.image, valid, RGB_ERROR_LIMIT)
         write_png(folder / "rgb_error" / name, errors)
-    if frame.depth is not None and frame.depth_confidence is None:
-        errors = colorize_depth_error(depth.cpu(), frame.depth, valid, DEPTH_ERROR_LIMIT_MM)
+    if (true := frame.true_depth) is not None:
+        errors = colorize_depth_error(depth.cpu(), true, valid, DEPTH_ERROR_LIMIT_MM)
         write_png(folder / "depth_error" / name, errors)
 
 
-def _depth_picture(output: RenderOutput, depth: str, limits: tuple[float, float]) -> np.ndarray:
+def depth_picture(output: RenderOutput, depth: str, limits: tuple[float, float]) -> UInt8[np.ndarray, "H W 3"]:
+    """A rendered depth in colours, hatched where alpha is below :data:`OPAQUE_ALPHA`. [H, W, 3]
+
+    Args:
+        output: A rendered view.
+        depth: Name of the output.
+        limits: Depths of the first and the last colour.
+    """
     known = torch.where(output.alpha >= OPAQUE_ALPHA, output[depth], torch.nan)
     return colorize_depth(known, limits, hatched=True)
 
@@ -176,5 +184,5 @@ def _film(
     for count, frame in enumerate(path, start=1):
         output = render_view(trained, frame, ("rgb", "alpha", depth))
         rgb = eight_bit(output.rgb).cpu().numpy()
-        yield np.concatenate([rgb, _depth_picture(output, depth, limits)], axis=1)
+        yield np.concatenate([rgb, depth_picture(output, depth, limits)], axis=1)
         progress.update(done + count)

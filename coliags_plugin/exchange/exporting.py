@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from coliags_plugin.contracts import GaussianField
+from coliags_plugin.core.checksums import file_sha256
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.lamps import HeldLight
@@ -90,7 +90,7 @@ def export_run(
             "format": form,
             "keeps": FORMATS[form].keeps,
             "bytes": output.stat().st_size,
-            "sha256": hashlib.sha256(output.read_bytes()).hexdigest(),
+            "sha256": file_sha256(output),
         },
         "gaussians": len(cloud),
         "sh_degree": cloud.degree,

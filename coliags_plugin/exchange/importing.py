@@ -89,9 +89,7 @@ def _warn_of_another_frame(scene: Scene, cloud: SplatCloud, file: Path) -> None:
     means = torch.from_numpy(cloud.means).double()
     seen = torch.zeros(len(means), dtype=torch.bool)
     for frame in scene.train[:: max(1, len(scene.train) // _CAMERAS)]:
-        pixels, depth = frame.camera.to(dtype=torch.float64).project(means)
-        inside = (pixels >= 0) & (pixels < pixels.new_tensor([frame.camera.width, frame.camera.height]))
-        seen |= (depth > 0) & inside.all(dim=1)
+        seen |= frame.camera.to(dtype=torch.float64).sees(means)[1]
     share = float(seen.float().mean())
     if share < _FEW:
         log.warning(

@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.meshes.distances import nearest_on
 from coliags_plugin.meshes.mesh import TriangleMesh
 from coliags_plugin.meshes.sampling import sample_surface
 from coliags_plugin.meshes.truth import TrueSurface
@@ -117,9 +116,9 @@ def compare_meshes(mesh: TriangleMesh, truth: TrueSurface, samples: int = SAMPLE
     """
     _check_same_place(mesh, truth.mesh)
     points, triangles = sample_surface(mesh, samples)
-    distances, nearest = nearest_on(truth.mesh, points)
+    distances, nearest = truth.mesh.rays.nearest(points)
     seen_points, _ = sample_surface(truth.mesh, samples, truth.seen)
-    gaps, _ = nearest_on(mesh, seen_points)
+    gaps, _ = mesh.rays.nearest(seen_points)
     angles = angles_between(mesh.normals[triangles], truth.mesh.normals[nearest])
     return SurfaceComparison(
         accuracy=_direction(distances),
@@ -146,7 +145,7 @@ def _direction(distances: Float[np.ndarray, "N"]) -> Direction:
 def _check_same_place(mesh: TriangleMesh, truth: TriangleMesh) -> None:
     size, true_size = _diagonal(mesh), _diagonal(truth)
     # Few points, as points far away take long.
-    apart = float(np.median(nearest_on(truth, sample_surface(mesh, _FEW)[0])[0]))
+    apart = float(np.median(truth.rays.nearest(sample_surface(mesh, _FEW)[0])[0]))
     if apart > _ELSEWHERE * size:
         raise InputError(
             f"a reconstructed surface {size:.3g} across whose median distance to the true one, {true_size:.3g} across, "

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int, UInt8
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
-from coliags_plugin.core.glb import GlbArray, write_glb
+from coliags_plugin.core.glb import GlbArray, encode_glb
 from coliags_plugin.core.open3d_library import import_open3d
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.meshes.mesh import TriangleMesh
@@ -97,7 +97,11 @@ def _write_obj(path: Path, mesh: TriangleMesh) -> None:
 
 
 def _write_glb(path: Path, mesh: TriangleMesh) -> None:
-    """One primitive with 32-bit indices, float positions and 8-bit colours (glTF 2.0)."""
+    atomic_write(path, encode_mesh(mesh))
+
+
+def encode_mesh(mesh: TriangleMesh) -> bytes:
+    """Bytes of a GLB file: one primitive with 32-bit indices, float positions and 8-bit colours."""
     arrays = [
         GlbArray(mesh.triangles.astype(np.uint32).reshape(-1, 1), indices=True),
         GlbArray(mesh.vertices.astype(np.float32), bounds=True),
@@ -116,7 +120,7 @@ def _write_glb(path: Path, mesh: TriangleMesh) -> None:
         "meshes": [{"primitives": [{"attributes": attributes, "indices": 0, "material": 0, "mode": _TRIANGLES}]}],
         "materials": [{"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}],
     }
-    write_glb(path, document, arrays)
+    return encode_glb(document, arrays)
 
 
 def _linear(colors: UInt8[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from coliags_plugin.core.open3d_library import import_open3d
+from coliags_plugin.meshes.ray_scene import RayScene
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +51,15 @@ class TriangleMesh:
     def centers(self) -> Float[np.ndarray, "F 3"]:
         """Centroid of each triangle. [F, 3]"""
         return self.vertices[self.triangles].mean(axis=1, dtype=np.float64)
+
+    @cached_property
+    def rays(self) -> RayScene:
+        """Casts rays at the mesh and measures distances to it; made once.
+
+        Raises:
+            InputError: open3d cannot be imported.
+        """
+        return RayScene(self.to_open3d())
 
     def part(self, kept: Bool[np.ndarray, "F"]) -> TriangleMesh:
         """The mesh of some triangles, without the vertices that no longer belong to any.

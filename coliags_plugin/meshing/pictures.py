@@ -10,8 +10,6 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.open3d_library import import_open3d
-from coliags_plugin.meshes.distances import nearest_on
 from coliags_plugin.meshes.mesh import TriangleMesh
 from coliags_plugin.meshes.truth import TrueSurface
 from coliags_plugin.outputs.colormaps import (
@@ -60,8 +58,10 @@ def comparison_picture(mesh: TriangleMesh, truth: TrueSurface, cameras: Sequence
     drawn = _Surface(truth.mesh), _Surface(mesh)
     for number, (name, camera) in enumerate(views, start=1):
         images = [
-            drawn[0].picture(camera, lambda points, hit: distance_colors(nearest_on(mesh, points)[0], truth.seen[hit])),
-            drawn[1].picture(camera, lambda points, hit: distance_colors(nearest_on(truth.mesh, points)[0])),
+            drawn[0].picture(
+                camera, lambda points, hit: distance_colors(mesh.rays.nearest(points)[0], truth.seen[hit])
+            ),
+            drawn[1].picture(camera, lambda points, hit: distance_colors(truth.mesh.rays.nearest(points)[0])),
             drawn[1].picture(camera, lambda points, hit: drawn[1].colors(hit)),
         ]
         labels = (f"{name} {number}: true, mm to the mesh", "mesh, mm to the true surface", "mesh, colour")
@@ -100,27 +100,22 @@ def _resized(camera: Camera) -> Camera:
 
 
 class _Surface:
-    """A mesh to cast rays at."""
+    """A mesh to draw."""
 
     def __init__(self, mesh: TriangleMesh) -> None:
-        self._open3d = import_open3d("casts rays at meshes")
-        self._scene = self._open3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(mesh.to_open3d())
         self._mesh = mesh
 
     def picture(self, camera: Camera, color: Any) -> UInt8[np.ndarray, "H W 3"]:
         """What a camera sees, coloured by a function of the points hit and their triangles, and lit from the camera."""
         camera = camera.to("cpu", torch.float64)
-        directions = camera.rays().reshape(-1, 3)
-        rays = torch.cat([camera.center.expand_as(directions), directions], dim=1).float().numpy()
-        cast = self._scene.cast_rays(self._open3d.core.Tensor(np.ascontiguousarray(rays)))
-        z, triangles = cast["t_hit"].numpy(), cast["primitive_ids"].numpy()
-        hit = np.isfinite(z)
-        image = np.full((len(rays), 3), _SURROUNDINGS, np.uint8)
+        center, directions = camera.center.float().numpy(), camera.rays().reshape(-1, 3).float().numpy()
+        triangles, z = self._mesh.rays.cast(center, directions)
+        hit = triangles >= 0
+        image = np.full((len(directions), 3), _SURROUNDINGS, np.uint8)
         if hit.any():
-            toward = rays[hit, 3:] / np.linalg.norm(rays[hit, 3:], axis=1, keepdims=True)
+            toward = directions[hit] / np.linalg.norm(directions[hit], axis=1, keepdims=True)
             facing = np.abs((self._mesh.normals[triangles[hit]] * toward).sum(axis=1))
-            colors = color(rays[hit, :3] + z[hit, None] * rays[hit, 3:], triangles[hit].astype(np.int64))
+            colors = color(center + z[hit, None] * directions[hit], triangles[hit])
             image[hit] = np.rint(colors * (_AMBIENT + (1.0 - _AMBIENT) * facing)[:, None])
         return image.reshape(camera.height, camera.width, 3)
 

@@ -16,7 +16,6 @@ from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.engine.truth import match_truth
 from coliags_plugin.meshes.comparison import SurfaceComparison, compare_meshes
-from coliags_plugin.meshes.distances import nearest_on
 from coliags_plugin.meshes.files import MESH_FORMATS, write_mesh
 from coliags_plugin.meshes.mesh import TriangleMesh
 from coliags_plugin.meshes.truth import TrueSurface, find_true_surface, read_true_surface
@@ -119,11 +118,11 @@ def _write_comparison(folder: Path, mesh: TriangleMesh, truth: TrueSurface, scen
     frames = scene.train
     cameras = [frames[index].camera for index in sorted({0, len(frames) // 2, len(frames) - 1})]
     write_png(folder / "comparison.png", comparison_picture(mesh, truth, cameras))
-    errors = distance_colors(nearest_on(truth.mesh, mesh.vertices)[0])
+    errors = distance_colors(truth.mesh.rays.nearest(mesh.vertices)[0])
     write_mesh(folder / "mesh_error.ply", replace(mesh, colors=errors))
     seen = np.zeros(len(truth.mesh.vertices), bool)
     seen[truth.mesh.triangles[truth.seen]] = True
-    gaps = distance_colors(nearest_on(mesh, truth.mesh.vertices)[0], seen)
+    gaps = distance_colors(mesh.rays.nearest(truth.mesh.vertices)[0], seen)
     write_mesh(folder / "truth_error.ply", replace(truth.mesh, colors=gaps))
 
 

@@ -69,7 +69,7 @@ class PaperProtocol(Protocol):
         if frame.sparse_depth is not None:
             rendered, known = _at_points(depth, output.alpha.detach(), frame.valid, frame.sparse_depth)
             image = replace(image, point_depth=rendered, true_point_depth=known)
-        if (truth := _true_depth(frame)) is None:
+        if (truth := frame.true_depth) is None:
             return replace(image, estimated=frame.depth_confidence is not None)
         return replace(image, depth=depth, true_depth=truth, depth_valid=torch.isfinite(truth) & frame.valid)
 
@@ -107,7 +107,7 @@ class AuthorsCodeProtocol(Protocol):
         """Rendered and true image and depth as read back from the files; every pixel counts."""
         everywhere = torch.ones_like(frame.valid)
         image = Comparison(rgb=through_8_bit(output.rgb.detach()), true_rgb=through_8_bit(frame.rgb), valid=everywhere)
-        if (known := _true_depth(frame)) is None:
+        if (known := frame.true_depth) is None:
             return replace(image, estimated=frame.depth_confidence is not None)
         rendered = 1.0 / output["inverse_depth_accumulated"].detach()  # infinite where nothing was drawn
         if frame.depth_at_least is not None:
@@ -121,11 +121,6 @@ class AuthorsCodeProtocol(Protocol):
             true_depth=through_16_bit(known, self.true_full_scale),
             depth_valid=everywhere,
         )
-
-
-def _true_depth(frame: Frame) -> Float[Tensor, "H W"] | None:
-    """The frame's depth, if it is true; None where it is estimated or missing. [H, W]"""
-    return frame.depth if frame.depth_confidence is None else None
 
 
 def _at_points(

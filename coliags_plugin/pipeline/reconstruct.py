@@ -98,8 +98,9 @@ def stages_of(place: Workplace) -> list[Stage]:
     add("check", filmed.check_data, size, ("check.html", "check.json"))
     if place.estimates_depth:
         add("depth", filmed.estimate_depth, {**size, "depth": settings.depth.model_dump()}, ("depth", ".depth.work"))
-    load_method(trained.method_for(place))  # an unknown method is found out before the work starts
-    training = {"method": trained.method_for(place), "steps": settings.steps, "seed": settings.seed}
+    method = trained.method_for(place)
+    load_method(method)  # an unknown method is found out before the work starts
+    training = {"method": method, "steps": settings.steps, "seed": settings.seed}
     add("train", trained.train, training, ("run",))
     add("evaluate", trained.evaluate, {}, ("run/eval",))
     add("mesh", trained.mesh, {"mesh": settings.mesh.model_dump()}, ("run/mesh",))

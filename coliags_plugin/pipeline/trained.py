@@ -19,11 +19,7 @@ _SAVE_SECONDS, _KEPT = 60.0, 2
 def method_for(place: Workplace) -> str:
     """Name of the method to train: the one given, or else by what is known of the depth."""
     given = place.settings.method
-    return given or ("coliags-estimated-depth" if place.estimates_depth or _is_estimate(place) else "coliags")
-
-
-def _is_estimate(place: Workplace) -> bool:
-    return place.open_posed().train[0].depth_confidence is not None
+    return given or ("coliags-estimated-depth" if place.estimates_depth or place.has_estimates else "coliags")
 
 
 def train(place: Workplace) -> Outcome:

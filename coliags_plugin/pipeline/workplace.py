@@ -13,7 +13,7 @@ from coliags_plugin.pipeline.settings import ReconstructionSettings
 if TYPE_CHECKING:
     import torch
 
-    from coliags_plugin.core.scenes import Scene
+    from coliags_plugin.core.scenes import Frame, Scene
 
 
 @dataclass(frozen=True)
@@ -75,4 +75,13 @@ class Workplace:
     @cached_property
     def estimates_depth(self) -> bool:
         """Whether depth has to be estimated: the source is no scene, or one without dense depth."""
-        return self.data_format is None or self.open_posed().train[0].depth is None
+        return self.data_format is None or self._first_frame.depth is None
+
+    @cached_property
+    def has_estimates(self) -> bool:
+        """Whether the source is a scene with estimated depth."""
+        return not self.estimates_depth and self._first_frame.depth_confidence is not None
+
+    @cached_property
+    def _first_frame(self) -> Frame:
+        return self.open_posed().train[0]

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from coliags_plugin.core.glb import GlbArray, write_glb
+from coliags_plugin.core.files import atomic_write
+from coliags_plugin.core.glb import GlbArray, encode_glb
 from coliags_plugin.splats.cloud import SplatCloud
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -44,7 +45,7 @@ def write_splat_glb(path: Path, cloud: SplatCloud, comment: str = "") -> None:
         "meshes": [{"primitives": [primitive]}],
     }
     arrays = [GlbArray(values, bounds=name == "POSITION") for name, values in attributes.items()]
-    write_glb(path, document, arrays, comment)
+    atomic_write(path, encode_glb(document, arrays, comment))
 
 
 def _attributes(cloud: SplatCloud) -> dict[str, np.ndarray]:

@@ -23,7 +23,7 @@ from coliags_plugin.engine.held_light import flattened_light
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.outputs.image_files import as_array
 from coliags_plugin.viewer.baking import bake, baking_cameras
-from coliags_plugin.viewer.decoding import ViewDecoder, in_view
+from coliags_plugin.viewer.decoding import ViewDecoder
 from coliags_plugin.viewer.merging import merged_to
 from coliags_plugin.viewer.pictures import Pictures
 from coliags_plugin.viewer.splats import Splats, wire_unit
@@ -106,10 +106,10 @@ class Content:
     def look_distance(self) -> float:
         """Distance of the point that the browser's camera turns about: the median depth in the first view."""
         camera = self.first_camera
-        seen = self.baked.centers[in_view(self.baked.centers, camera)]
-        if len(seen):
-            _, depth = camera.to("cpu", torch.float64).project(torch.as_tensor(seen, dtype=torch.float64))
-            return float(depth.median())
+        centers = torch.as_tensor(self.baked.centers, dtype=torch.float64)
+        depth, seen = camera.to("cpu", torch.float64).sees(centers)
+        if seen.any():
+            return float(depth[seen].median())
         return _DEFAULT_DISTANCE * self.trained.scene.extent or 1.0
 
     @cached_property
@@ -122,7 +122,7 @@ class Content:
         """See :func:`distances`, of the baked Gaussians. [N]"""
         return distances(self.baked, [frame.camera for frame in self.trained.scene.train])
 
-    @cached_property
+    @property
     def near_plane(self) -> float:
         """z-depth from which on the browser draws, scene units: what renderers use, or a share of the distance."""
         return min(0.2, 0.02 * self.look_distance)

@@ -59,6 +59,5 @@ def in_view(points: Float[np.ndarray, "N 3"], camera: Camera) -> Bool[np.ndarray
         points: World frame, scene units. [N, 3]
         camera: The camera.
     """
-    pixels, depth = camera.to("cpu", torch.float64).project(torch.as_tensor(points, dtype=torch.float64))
-    inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < pixels.new_tensor([camera.width, camera.height])).all(1)
+    _, inside = camera.to("cpu", torch.float64).sees(torch.as_tensor(points, dtype=torch.float64))
     return np.asarray(inside.numpy())

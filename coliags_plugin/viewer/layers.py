@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -13,7 +11,7 @@ from jaxtyping import Float, UInt8
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.meshes.files import write_mesh
+from coliags_plugin.meshes.files import encode_mesh
 from coliags_plugin.meshes.mesh import TriangleMesh
 from coliags_plugin.outputs.image_files import as_array
 from coliags_plugin.viewer.content import Content, aspect, vertical_fov
@@ -100,12 +98,8 @@ def add_mesh(scene: Any, name: str, mesh: TriangleMesh) -> Any:
         name: Of the layer.
         mesh: The mesh.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "mesh.glb"
-        write_mesh(file, mesh)
-        data = file.read_bytes()
     node = "/" + name.replace(": ", "/").replace(" ", "-")
-    return scene.add_glb(node, data, cast_shadow=False, receive_shadow=False)
+    return scene.add_glb(node, encode_mesh(mesh), cast_shadow=False, receive_shadow=False)
 
 
 def add_headlight(scene: Any, position: tuple[float, float, float]) -> Any:

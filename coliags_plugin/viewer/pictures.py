@@ -10,13 +10,12 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from coliags_plugin.core.render_output import OPAQUE_ALPHA, RenderOutput
+from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.engine.rendering import RGB_ERROR_LIMIT, render_view
+from coliags_plugin.engine.rendering import RGB_ERROR_LIMIT, depth_picture, render_view
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.outputs.colormaps import (
     DEPTH_ERROR_LIMIT_MM,
-    colorize_depth,
     colorize_depth_error,
     colorize_rgb_error,
     depth_limits,
@@ -55,7 +54,7 @@ class Pictures:
             self._makers["colour error"] = self._colour_error
         if "depth_expected" in trained.model.outputs:
             self._makers["depth"] = self._depth
-            if _has_true_depth(trained.scene.video[0]):
+            if trained.scene.video[0].true_depth is not None:
                 self._makers["depth error"] = self._depth_error
 
     @property
@@ -84,13 +83,12 @@ class Pictures:
         return Picture(image, f"colour error, 0 to {RGB_ERROR_LIMIT:g} of full scale")
 
     def _depth(self, frame: Frame, output: RenderOutput) -> Picture:
-        known = torch.where(output.alpha >= OPAQUE_ALPHA, output["depth_expected"], torch.nan)
         low, high = self._depth_limits
-        image = colorize_depth(known, (low, high), hatched=True)
+        image = depth_picture(output, "depth_expected", (low, high))
         return Picture(image, f"expected depth, {low:g} to {high:g} {self._unit}")
 
     def _depth_error(self, frame: Frame, output: RenderOutput) -> Picture:
-        true = frame.depth if _has_true_depth(frame) else None
+        true = frame.true_depth
         true = torch.full_like(output.alpha, torch.nan) if true is None else true
         rendered = output["depth_expected"].cpu()
         image = colorize_depth_error(rendered, true.cpu(), frame.valid.cpu(), DEPTH_ERROR_LIMIT_MM)
@@ -102,8 +100,3 @@ class Pictures:
         frames = self._trained.scene.video
         sample = frames[:: max(1, len(frames) // _SAMPLED)][:_SAMPLED]
         return depth_limits([as_array(self._render(frame)["depth_expected"]) for frame in sample], self._unit)
-
-
-def _has_true_depth(frame: Frame) -> bool:
-    """Whether a frame has depth that was measured or rendered, not estimated."""
-    return frame.depth is not None and frame.depth_confidence is None
