@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -92,17 +93,21 @@ class Estimation:
         Raises:
             InputError: No frame has enough neighbours.
         """
-        for number, sweep in enumerate(self.settings.sweeps):
-            neighbours = self._neighbours(f"neighbours-{number}", sweep, self.medians)
-            base = self.last or None
-            self._sweep(f"swept-{number}", sweep, neighbours, base, f"sweep {number + 1}")
-            self._fuse(f"fused-{number}", sweep, neighbours, f"fuse {number + 1}")
-            self.medians = self.work.value(f"medians-{number}", lambda: self._medians(self.last))
+        with _one_thread_of_opencv():
+            for number, sweep in enumerate(self.settings.sweeps):
+                self._pass(number, sweep)
 
     def result(self, index: int) -> Estimate:
         """The estimate of a frame, after :meth:`run`."""
         found = self.work.load(self.last, index)
         return Estimate(found["depth"], found["confidence"])
+
+    def _pass(self, number: int, sweep: SweepSettings) -> None:
+        neighbours = self._neighbours(f"neighbours-{number}", sweep, self.medians)
+        base = self.last or None
+        self._sweep(f"swept-{number}", sweep, neighbours, base, f"sweep {number + 1}")
+        self._fuse(f"fused-{number}", sweep, neighbours, f"fuse {number + 1}")
+        self.medians = self.work.value(f"medians-{number}", lambda: self._medians(self.last))
 
     def _neighbours(self, name: str, sweep: SweepSettings, medians: Sequence[float]) -> list[list[int]]:
         centers = np.stack([frame.camera.center.cpu().double().numpy() for frame in self.frames])
@@ -197,6 +202,19 @@ class Estimation:
 
     def _medians(self, stage: str) -> list[float]:
         return [float(np.median(self.work.load(stage, index)["depth"])) for index in range(len(self.frames))]
+
+
+@contextmanager
+def _one_thread_of_opencv() -> Iterator[None]:
+    """Keep OpenCV to the calling thread: the last bits of its global smoother depend on how it splits an image."""
+    import cv2
+
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
 
 
 def check_video(frames: Sequence[Frame]) -> None:

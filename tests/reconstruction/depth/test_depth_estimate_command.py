@@ -7,6 +7,7 @@ import json
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -140,6 +141,17 @@ def test_resuming_gives_the_same_bytes(wall, estimated, tmp_path, monkeypatch, c
     assert not set(saved) & set(again)
     assert contents(out) == contents(estimated)
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_the_number_of_threads_does_not_matter(wall, estimated, tmp_path):
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(8)
+    try:
+        assert run("depth", "estimate", wall, "--out", tmp_path / "out", *OPTIONS[:2], "--jobs", 3) == 0
+        assert cv2.getNumThreads() == 8
+    finally:
+        cv2.setNumThreads(before)
+    assert contents(tmp_path / "out") == contents(estimated)
 
 
 def test_work_files_of_other_options_are_not_used(wall, tmp_path, monkeypatch, caplog):
