@@ -15,9 +15,9 @@ import torch
 from numba import types
 from numba.core.registry import cpu_target
 
+from coliags_plugin.core import numba_compilation as compilation
 from coliags_plugin.renderers import cpu_renderer
 from coliags_plugin.renderers.numba_kernels import (
-    compilation,
     surfel_layout,
     surfel_sweep_backward,
     surfel_sweep_forward,

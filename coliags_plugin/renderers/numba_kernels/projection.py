@@ -5,8 +5,8 @@ The formulas are those of ``docs/rendering.md``, section "Projection", for sixte
 
 from __future__ import annotations
 
+from coliags_plugin.core.numba_compilation import inline, kernel, part
 from coliags_plugin.renderers.numba_kernels import layout
-from coliags_plugin.renderers.numba_kernels.compilation import inline, kernel, part
 from coliags_plugin.renderers.numba_kernels.geometry import (
     cross,
     project_axes,

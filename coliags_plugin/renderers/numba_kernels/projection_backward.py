@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from coliags_plugin.core.numba_compilation import inline, kernel, part
 from coliags_plugin.renderers.numba_kernels import layout
-from coliags_plugin.renderers.numba_kernels.compilation import inline, kernel, part
 from coliags_plugin.renderers.numba_kernels.geometry import project_axes, shortest_axes, shortest_column
 from coliags_plugin.renderers.numba_kernels.lanes import (
     add,

@@ -6,8 +6,8 @@ counts are summed in order, so the result does not depend on their number.
 
 from __future__ import annotations
 
+from coliags_plugin.core.numba_compilation import kernel
 from coliags_plugin.renderers.numba_kernels import layout
-from coliags_plugin.renderers.numba_kernels.compilation import kernel
 from coliags_plugin.renderers.numba_kernels.lanes import lowest_bit
 from coliags_plugin.renderers.numba_kernels.threads import take
 

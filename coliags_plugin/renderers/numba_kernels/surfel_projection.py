@@ -5,8 +5,8 @@ The formulas are those of ``docs/rendering.md``, section "Surfels".
 
 from __future__ import annotations
 
+from coliags_plugin.core.numba_compilation import inline, kernel, part
 from coliags_plugin.renderers.numba_kernels import layout, surfel_layout
-from coliags_plugin.renderers.numba_kernels.compilation import inline, kernel, part
 from coliags_plugin.renderers.numba_kernels.geometry import squared_distance_to_box
 from coliags_plugin.renderers.numba_kernels.lanes import (
     add,

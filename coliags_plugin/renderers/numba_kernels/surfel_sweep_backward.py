@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 
+from coliags_plugin.core.numba_compilation import inline, kernel, part
 from coliags_plugin.renderers.numba_kernels import layout, surfel_layout
-from coliags_plugin.renderers.numba_kernels.compilation import inline, kernel, part
 from coliags_plugin.renderers.numba_kernels.lanes import (
     add,
     at_least,

@@ -8,8 +8,8 @@ it composited.
 
 from __future__ import annotations
 
+from coliags_plugin.core.numba_compilation import inline, kernel, part
 from coliags_plugin.renderers.numba_kernels import layout
-from coliags_plugin.renderers.numba_kernels.compilation import inline, kernel, part
 from coliags_plugin.renderers.numba_kernels.lanes import (
     add,
     at_least,

@@ -6,8 +6,8 @@ formulas are those of ``docs/rendering.md``, section "Compositing".
 
 from __future__ import annotations
 
+from coliags_plugin.core.numba_compilation import kernel, part
 from coliags_plugin.renderers.numba_kernels import layout
-from coliags_plugin.renderers.numba_kernels.compilation import kernel, part
 from coliags_plugin.renderers.numba_kernels.lanes import (
     add,
     at_least,

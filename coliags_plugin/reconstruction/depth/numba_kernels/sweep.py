@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from coliags_plugin.renderers.numba_kernels.compilation import kernel, part
+from coliags_plugin.core.numba_compilation import kernel, part
 
 
 @part

@@ -34,10 +34,10 @@ def part(function: _Function) -> _Function:
 def kernel(function: _Function) -> _Function:
     """Compile a function that Python calls, on several threads by ``threads.Crew``; cached on disk.
 
-    numba's own parallel loops are not used. They wait for every thread at their end, also for those that the system has
-    not let run yet, which on a shared machine costs more than the loop; two of them at once, or one in a forked process,
-    abort the interpreter; and numba moves what stands behind such a loop in front of it when the loop's writes are out
-    of its sight, in a function called.
+    numba's own parallel loops are not used. They wait for every thread at their end, also for those that the system
+    has not let run yet, which on a shared machine costs more than the loop; two of them at once, or one in a forked
+    process, abort the interpreter; and numba moves what stands behind such a loop in front of it when the loop's
+    writes are out of its sight, in a function called.
     """
     dispatcher = numba.njit(function, **_OPTIONS)
     try:
@@ -50,7 +50,7 @@ def kernel(function: _Function) -> _Function:
 class _KernelCache(FunctionCache):
     """numba's on-disk cache with three changes.
 
-    - A kernel is invalidated when any file of its folder changes (numba checks the kernel's own file only).
+    - A kernel is invalidated when any file of its folder or this one changes (numba checks the kernel's own file only).
     - A cache that cannot be read or written causes a compilation, never an error.
     - A message is logged before compilation.
     """
@@ -83,8 +83,8 @@ def _announce(where: str) -> None:
 
 @cache
 def _fingerprint(folder: Path) -> str:
-    """Hash of the sources of all kernels of a folder."""
+    """Hash of this file and of the sources of all kernels of a folder."""
     digest = hashlib.sha256()
-    for path in sorted(folder.glob("*.py")):
+    for path in [Path(__file__), *sorted(folder.glob("*.py"))]:
         digest.update(path.read_bytes())
     return digest.hexdigest()
