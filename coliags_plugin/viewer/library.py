@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import io
+import logging
 import socket
 import warnings
 from typing import Any
@@ -44,6 +45,7 @@ def start_server(host: str, port: int) -> Any:
     viser = import_viser()
     # A browser may leave while something is computed for it.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
+    logging.getLogger("websockets").setLevel(logging.WARNING)  # else it reports each start and end of a server
     _check_address(host, port)
     with contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=host, port=port, verbose=False)
