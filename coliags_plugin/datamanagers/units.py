@@ -33,6 +33,18 @@ def read_unit(folder: Path) -> Unit:
     return cast(Unit, word)
 
 
+def printed_unit(folder: Path) -> str:
+    """The unit of a scene as it is printed: ``mm``, or ``units`` where it is unknown.
+
+    Args:
+        folder: The scene's folder.
+
+    Raises:
+        InputError: See :func:`read_unit`.
+    """
+    return "mm" if read_unit(folder) == "mm" else "units"
+
+
 def write_unit(folder: Path, unit: Unit) -> None:
     """State the unit of a scene.
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.datamanagers.units import read_unit, write_unit
+from coliags_plugin.datamanagers.units import printed_unit, read_unit, write_unit
 
 
 def test_a_scene_is_in_millimetres_where_nothing_is_stated(tmp_path: Path) -> None:
@@ -18,6 +18,7 @@ def test_a_scene_is_in_millimetres_where_nothing_is_stated(tmp_path: Path) -> No
 def test_a_stated_unit_is_read_back(tmp_path: Path, unit: str) -> None:
     write_unit(tmp_path, unit)  # type: ignore[arg-type]
     assert read_unit(tmp_path) == unit
+    assert printed_unit(tmp_path) == ("mm" if unit == "mm" else "units")
 
 
 def test_another_word_is_refused(tmp_path: Path) -> None:

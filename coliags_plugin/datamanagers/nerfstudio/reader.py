@@ -22,6 +22,7 @@ from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
 from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
 from coliags_plugin.datamanagers.seen import find_seen_masks
+from coliags_plugin.datamanagers.units import printed_unit
 from coliags_plugin.lenses.models import Lens
 from coliags_plugin.lenses.pinhole import PinholeLens
 from coliags_plugin.poses import nerfstudio as nerfstudio_poses
@@ -117,7 +118,7 @@ class NerfstudioDataManager(RecordedDataManager):
         }
         own_points, source = self._own_points(path, transforms)
         return Recording(
-            kind=f"nerfstudio, {trajectory.summary()}",
+            kind=f"nerfstudio, {trajectory.summary(printed_unit(path))}",
             shots=shots,
             facts=facts,
             fingerprint=fingerprint(path, [*images, *others], [file]),

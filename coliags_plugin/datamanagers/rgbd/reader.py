@@ -35,6 +35,7 @@ from coliags_plugin.datamanagers.rgbd.files import (
 )
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
 from coliags_plugin.datamanagers.seen import find_seen_masks
+from coliags_plugin.datamanagers.units import printed_unit
 from coliags_plugin.poses import tum
 from coliags_plugin.poses.trajectory import Trajectory
 
@@ -147,7 +148,7 @@ class RGBDDataManager(RecordedDataManager):
             else {
                 "order": "TUM: camera-to-world, quaternion with w last",
                 "poses": len(trajectory),
-                "summary": trajectory.summary(),
+                "summary": trajectory.summary(printed_unit(path)),
             },
         }
         points = next((found for found in (path / POINTS_FILE, find_mesh(path)) if found and found.is_file()), None)
