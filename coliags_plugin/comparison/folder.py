@@ -217,7 +217,7 @@ class ComparisonFolder:
         except ValidationError as error:
             key, message, _ = first_error(error)
             raise InputError(f"{self.plan_file}: {key}: {message}", "what `coliags compare` wrote") from error
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise InputError(f"{self.plan_file} cannot be read: {error}", "what `coliags compare` wrote") from error
 
     def check_extends(self, request: Request) -> None:

@@ -170,8 +170,8 @@ def _check_same_phantom(source: SceneSource) -> None:
     """Refuse a folder with another phantom than the benchmark's."""
     file = source.path / "phantom.json"
     try:
-        settings = json.loads(file.read_text(encoding="utf-8"))["settings"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        settings = dict(json.loads(file.read_text(encoding="utf-8"))["settings"])
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(
             f"{source.path} is not a phantom: {file.name} cannot be read", "the benchmark's phantom, or no folder"
         ) from error

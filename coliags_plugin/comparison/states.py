@@ -125,8 +125,8 @@ def _last_rows(file: Path) -> list[dict[str, Any]]:
     for line in lines:
         try:
             row = json.loads(line)
-        except ValueError:
+        except (ValueError, RecursionError):
             continue
-        if {"step", "seconds"} <= row.keys():
+        if isinstance(row, dict) and {"step", "seconds"} <= row.keys():
             rows.append(row)
     return rows

@@ -47,6 +47,10 @@ class Node:
         return node
 
 
+#: Of a file, aliases expanded; the largest method config has 200.
+_MOST_VALUES = 10_000
+
+
 class _Loader(yaml.SafeLoader):
     """Safe loader in which ``1e-5`` is a number and ``on`` is a word, as YAML 1.2 has it."""
 
@@ -100,14 +104,18 @@ def parse_tree(text: str, source: str) -> Node:
         loader = _Loader(text)
         try:
             root = loader.get_single_node()
+            if root is not None:
+                _check_extent(root, source)
             tree = Node({}, source) if root is None else _convert(loader, root, source)
         finally:
             loader.dispose()
     except yaml.MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 0
         raise InputError(f"{source}:{line}: {error.problem}", "valid YAML") from error
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError) as error:
         raise InputError(f"{source}: {error}", "valid YAML") from error
+    except RecursionError as error:
+        raise InputError(f"{source} is nested too deeply", "a few levels") from error
     if not tree.is_mapping:
         raise InputError(f"{source} holds {type(tree.value).__name__}", "a mapping at the top level")
     return tree
@@ -117,8 +125,32 @@ def parse_value(text: str) -> Any:
     """The value of ``--set key=VALUE``, read as YAML."""
     try:
         return _tuples(yaml.load(text, _Loader))
-    except yaml.YAMLError:
+    except (yaml.YAMLError, ValueError, RecursionError):
         return text
+
+
+def _check_extent(root: yaml.Node, source: str) -> None:
+    """Refuse aliases that refer to themselves, or that expand a short text to more values than any config has.
+
+    Raises:
+        InputError: See above.
+    """
+    extents: dict[int, float] = {}
+
+    def extent(node: yaml.Node) -> float:
+        if isinstance(node, yaml.ScalarNode):
+            return 1
+        if id(node) not in extents:
+            extents[id(node)] = math.inf  # while it is being counted: what refers to itself is endless
+            pairs = isinstance(node, yaml.MappingNode)
+            children = [child for pair in node.value for child in pair] if pairs else node.value
+            extents[id(node)] = 1 + sum(map(extent, children))
+        return extents[id(node)]
+
+    found = extent(root)
+    if found > _MOST_VALUES:
+        many = "endlessly many" if math.isinf(found) else f"{found:,}"
+        raise InputError(f"{source} has {many} values, aliases expanded", f"at most {_MOST_VALUES:,}")
 
 
 def _convert(loader: _Loader, node: yaml.Node, source: str) -> Node:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -72,14 +73,29 @@ class Recording:
 
 
 def fingerprint(folder: Path, large: Iterable[Path | None], small: Iterable[Path | None]) -> str:
-    """SHA-256 of the names and sizes of large files and the contents of small ones."""
+    """SHA-256 of the names and sizes of large files and the contents of small ones.
+
+    Raises:
+        InputError: A file cannot be read.
+    """
     digest = hashlib.sha256()
     for path in filter(None, large):
         name = path.relative_to(folder) if path.is_relative_to(folder) else path.name
-        digest.update(f"{Path(name).as_posix()} {path.stat().st_size}\n".encode())
+        with _readable(path):
+            size = path.stat().st_size
+        digest.update(f"{Path(name).as_posix()} {size}\n".encode("utf-8", "surrogateescape"))
     for path in filter(None, small):
-        digest.update(path.read_bytes())
+        with _readable(path):
+            digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}", "a readable file", "Restore it") from error
 
 
 def check_pose_count(file: Path, poses: int, images: int) -> None:

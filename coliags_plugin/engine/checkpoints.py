@@ -196,7 +196,7 @@ def read_checkpoint(path: Path, method: str, device: torch.device) -> Checkpoint
         tensors = load_file(path / "state.safetensors")
         step, owner, queue, version = (state[key] for key in ("step", "method", "frame_queue", "format"))
         cost = None if state.get("cost") is None else TrainingCost.model_validate(state["cost"])
-    except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
+    except (OSError, ValueError, KeyError, TypeError, SafetensorError, RecursionError) as error:
         raise _damaged(path, str(error)) from error
     if version not in READABLE:
         known = " or ".join(map(str, READABLE))

@@ -182,7 +182,7 @@ class RunFolder:
         """
         try:
             found: dict[str, Any] = json.loads(self.provenance_file.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise InputError(f"cannot read {self.provenance_file}: {error}", "what `coliags train` wrote") from error
         return found
 
@@ -235,7 +235,7 @@ def _log_row(line: str) -> dict[str, Any] | None:
     """A row of the training log; None where the line is damaged."""
     try:
         row = json.loads(line)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     whole = isinstance(row, dict) and all(
         isinstance(row.get(name), (int, float)) for name in ("step", "psnr", "seconds")

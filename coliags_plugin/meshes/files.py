@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from coliags_plugin.core import bounds
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.glb import GlbArray, encode_glb
@@ -15,6 +16,7 @@ from coliags_plugin.core.open3d_library import import_open3d
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.meshes.mesh import TriangleMesh
 from coliags_plugin.meshes.obj import decode_obj, encode_obj
+from coliags_plugin.meshes.ply import read_ply_mesh
 
 #: Suffixes of the formats.
 MESH_FORMATS = ("ply", "obj", "glb")
@@ -45,11 +47,15 @@ def read_flagged_mesh(path: Path) -> tuple[TriangleMesh, Int[np.ndarray, "F"] | 
     """
     if not path.is_file():
         raise InputError(f"no file {path}", "a mesh as PLY, OBJ or GLB file", "Check the path")
-    mesh, textures = decode_obj(path) if _suffix(path) == "obj" else (_through_open3d(path), None)
+    suffix, textures = _suffix(path), None
+    if suffix == "obj":
+        mesh, textures = decode_obj(path)
+    else:
+        mesh = read_ply_mesh(path) if suffix == "ply" else _through_open3d(path)
     if not len(mesh):
         raise InputError(f"{path} has no triangles", "a mesh", "Check that it is a mesh, not a cloud of points")
-    if not np.isfinite(mesh.vertices).all():
-        raise InputError(f"{path} has vertices that are not finite", "finite coordinates")
+    if not (np.abs(mesh.vertices) <= bounds.LENGTH).all():  # neither NaN
+        raise InputError(f"{path} has vertices that are not finite or beyond {bounds.LENGTH:g}", "coordinates in mm")
     return mesh, textures
 
 
@@ -83,7 +89,7 @@ def _through_open3d(path: Path) -> TriangleMesh:
     if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(vertices)):
         raise InputError(f"{path} has triangles of vertices that are not there", "a mesh", "Fetch it again")
     colors = np.rint(np.asarray(read.vertex_colors) * 255.0).clip(0, 255).astype(np.uint8)
-    if path.suffix.lower() == ".glb" and len(colors):
+    if len(colors):
         colors = _encoded(colors / 255.0)
     return TriangleMesh(vertices, triangles.astype(np.int64), colors if len(colors) else None)
 

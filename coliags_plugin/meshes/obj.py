@@ -76,10 +76,10 @@ def _corners(path: Path, faces: list[str]) -> tuple[np.ndarray, np.ndarray | Non
             for second, third in pairwise(places[1:]):
                 vertices.append((places[0], second, third))
                 textures.append(texture)
-    except (ValueError, IndexError) as error:
+        corners, found = np.array(vertices, np.int64).reshape(-1, 3), np.array(textures, np.int64)
+    except (ValueError, IndexError, OverflowError) as error:
         raise InputError(f"{path} has a face that is not indices", "an OBJ file") from error
-    found = np.array(textures, np.int64)
-    return np.array(vertices, np.int64).reshape(-1, 3), found if len(found) and found.all() else None
+    return corners, found if len(found) and found.all() else None
 
 
 def _triangles_alike(faces: list[str]) -> tuple[np.ndarray, np.ndarray | None] | None:

@@ -61,7 +61,7 @@ class Record:
             try:
                 found = json.loads(file.read_text(encoding="utf-8"))
                 return cls(folder, {name: StageRecord(**stage) for name, stage in found["stages"].items()})
-            except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
                 raise InputError(
                     f"cannot read {file}: {error}", "what `coliags reconstruct` wrote", "Choose another --out"
                 ) from error

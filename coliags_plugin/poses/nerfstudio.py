@@ -5,7 +5,6 @@ Poses are camera-to-world with OpenGL axes.
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -15,9 +14,10 @@ import numpy as np
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.core.json_files import read_json
 from coliags_plugin.poses.format import Format
 from coliags_plugin.poses.rigid import FLIP_Y_AND_Z, check_rigid
-from coliags_plugin.poses.text import head, prefixed_errors, read_text
+from coliags_plugin.poses.text import head, prefixed_errors
 from coliags_plugin.poses.trajectory import Trajectory, natural_order, refuse_repeated
 
 _PINHOLE = ("fl_x", "fl_y", "cx", "cy", "w", "h")
@@ -92,10 +92,7 @@ def recognise(path: Path) -> bool:
 
 
 def _json(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(read_text(path, "a transforms.json"))
-    except (json.JSONDecodeError, RecursionError) as error:
-        raise InputError(f"{path} is not JSON: {error}", "a transforms.json") from error
+    content = read_json(path, "a transforms.json")
     if not isinstance(content, dict):
         raise InputError(f"{path} holds a JSON {type(content).__name__}", "a JSON object with 'frames'")
     return content

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.json_files import read_json
 from coliags_plugin.reporting.study import Cell, Failure
 from coliags_plugin.results.reading import RESULT_FILE, read_result
 
@@ -114,7 +115,7 @@ def _run_of(folder: Path, stem: str, key: str, protocol: str) -> Path | None:
     for run in sorted(folder.glob(f"{seed}-*")):
         try:
             content = json.loads((run / "eval" / protocol / RESULT_FILE).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+        except (OSError, ValueError, RecursionError):
             continue
         if isinstance(content, dict) and content.get("key") == key:
             return _with_images(run, protocol)
@@ -140,10 +141,7 @@ def _reason(file: Path) -> str:
 
 
 def _read_json(file: Path, expected: str) -> dict[str, Any]:
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file} cannot be read: {error}", expected) from error
+    content = read_json(file, expected)
     if not isinstance(content, dict):
         raise InputError(f"{file} holds a {type(content).__name__}", expected)
     return content

@@ -39,7 +39,7 @@ def read_training_log(run: Path) -> dict[str, Float[np.ndarray, "L"]]:
             continue
         try:
             values = json.loads(line)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise InputError(f"{path}, line {number} is not JSON: {error}", "one JSON object per line") from error
         if not isinstance(values, dict):
             raise InputError(f"{path}, line {number} holds a {type(values).__name__}", "one JSON object per line")

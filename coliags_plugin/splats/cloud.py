@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float32
 
+from coliags_plugin.core import bounds
 from coliags_plugin.fields.spherical_harmonics import Y0
 
 #: Opacities are kept this far from 0 and 1, where their logits would be infinite.
@@ -76,10 +77,12 @@ class SplatCloud:
         return SplatCloud(*(values[kept] for values in rows))
 
     def usable(self) -> Bool[np.ndarray, "N"]:
-        """Which Gaussians are finite and have a rotation. [N]"""
+        """Which Gaussians are finite, have a rotation, and lie and extend within the bounds of lengths. [N]"""
         values = (self.means, self.quats_wxyz, self.scales, self.opacities[:, None], self.harmonics)
-        finite = np.all([np.isfinite(part).reshape(len(self), -1).all(axis=1) for part in values], axis=0)
+        finite = np.all([np.isfinite(part).all(axis=tuple(range(1, part.ndim))) for part in values], axis=0)
         with np.errstate(over="ignore", invalid="ignore"):
+            for lengths in (self.means, self.scales):
+                finite &= (np.abs(lengths) <= bounds.LENGTH).all(axis=1)
             return finite & (np.square(self.quats_wxyz.astype(np.float64)).sum(axis=1) > 1e-24)
 
     def with_thickness(self, share: float) -> SplatCloud:

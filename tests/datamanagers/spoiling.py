@@ -93,12 +93,12 @@ KINDS = {
 }
 
 
-def write_all(folder: Path) -> dict[str, Path]:
+def write_all(folder: Path, frames: int = FRAMES) -> dict[str, Path]:
     """The phantom in every kind: the folder to copy, by the kind's name."""
     layouts = {kind.layout for kind in KINDS.values()}
     coarse = {"mesh_spacing": 3.0, "texture_spacing": 1.0}
     made = {
-        layout: write_phantom(folder / layout, layout, WIDTH, HEIGHT, frames=FRAMES, **coarse) for layout in layouts
+        layout: write_phantom(folder / layout, layout, WIDTH, HEIGHT, frames=frames, **coarse) for layout in layouts
     }
     found = {}
     for name, kind in KINDS.items():

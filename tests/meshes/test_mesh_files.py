@@ -70,8 +70,9 @@ def test_obj_polygons_and_negative_indices(tmp_path):
         ("m.obj", "v 0 0 0\nf a b c\n", "not indices"),
         ("m.obj", "v 0 0 0\n", "no triangles"),
         ("m.obj", "v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "not finite"),
-        ("m.ply", "", "no triangles"),
-        ("m.ply", "ply\nformat ascii 1.0\nelement vertex 9\n", "no triangles"),
+        ("m.ply", "", "no PLY header"),
+        ("m.ply", "ply\nformat ascii 1.0\nelement vertex 9\n", "no PLY header"),
+        ("m.obj", "v 1e30 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "beyond 1e"),
         ("m.glb", "glTF", "no triangles"),
     ],
 )
@@ -79,6 +80,46 @@ def test_damaged_files_are_refused(name, content, message, tmp_path):
     (tmp_path / name).write_text(content)
     with pytest.raises(InputError, match=message):
         read_mesh(tmp_path / name)
+
+
+HEADER = """ply
+format {} 1.0
+element vertex 5
+property float x
+property float y
+property float z
+element face 2
+property uchar kind
+property list uchar int vertex_indices
+property list uchar float texcoord
+end_header
+"""
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize("corners", [([0, 1, 2], [2, 3, 4]), ([0, 1, 2, 3], [2, 3, 4])])
+def test_ply_of_any_form_with_other_lists_and_polygons(tmp_path, form, corners):
+    positions = np.arange(15.0).reshape(5, 3)
+    order = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}[form]
+    if order:
+        body = positions.astype(f"{order}f4").tobytes()
+        for face in corners:
+            body += struct.pack("BB", 7, len(face)) + np.array(face, f"{order}i4").tobytes()
+            body += struct.pack("B", 3) + np.zeros(3, "f4").tobytes()
+    else:
+        rows = [" ".join(map(str, row)) for row in positions]
+        rows += [f"7 {len(face)} {' '.join(map(str, face))} 3 0 0 0" for face in corners]
+        body = "\n".join([*rows, ""]).encode()
+    (tmp_path / "m.ply").write_bytes(HEADER.format(form).encode() + body)
+    mesh = read_mesh(tmp_path / "m.ply")
+    assert mesh.vertices.tolist() == positions.tolist()
+    expected = [[0, 1, 2], [2, 3, 4]] if len(corners[0]) == 3 else [[0, 1, 2], [0, 2, 3], [2, 3, 4]]
+    assert mesh.triangles.tolist() == expected
+    for cut in range(1, 40):
+        (tmp_path / "m.ply").write_bytes((HEADER.format(form).encode() + body)[:-cut])
+        if order or cut > 2:
+            with pytest.raises(InputError):
+                read_mesh(tmp_path / "m.ply")
 
 
 def test_a_missing_file_is_refused(tmp_path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import posixpath
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from typing import Any, cast
 import numpy as np
 
 from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.json_files import read_json
 from coliags_plugin.datamanagers.nerfstudio.cameras import PixelCenters, camera_of, number
 from coliags_plugin.datamanagers.reading.image_names import first_few
 from coliags_plugin.datamanagers.reading.images import size_of
@@ -46,10 +46,7 @@ class Transforms:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        try:
-            self.content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8-sig"))
-        except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-            raise InputError(f"cannot read {path}: {error}", "a transforms.json") from error
+        self.content: dict[str, Any] = read_json(path, "a transforms.json")
         self.frames: dict[str, dict[str, Any]] = {frame["file_path"]: frame for frame in self.content["frames"]}
 
     def entries(self, names: Sequence[str], pixel_centers: PixelCenters) -> list[Entry]:

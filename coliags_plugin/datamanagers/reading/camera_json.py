@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.core.json_files import read_json
 
 
 def read_intrinsics(path: Path) -> Intrinsics:
@@ -17,10 +17,7 @@ def read_intrinsics(path: Path) -> Intrinsics:
     Raises:
         InputError: It is not JSON, or keys are missing, or their values are not sizes and focal lengths.
     """
-    try:
-        data = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"cannot read {path}: {error}", "a JSON object") from error
+    data = read_json(path, "a JSON object")
     keys = ("fx", "fy", "cx", "cy", "w", "h")
     if not isinstance(data, dict) or any(key not in data for key in keys):
         missing = [key for key in keys if not isinstance(data, dict) or key not in data]

@@ -19,16 +19,65 @@ _KINDS = {
     **{name: "f4" for name in ("float", "float32")},
     **{name: "f8" for name in ("double", "float64")},
 }
+#: Most digits of a count.
+_DIGITS = 12
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
 
 
 @dataclass
-class _Element:
-    """A PLY ``element`` with its properties in order: name and data type, None for a list."""
+class PlyElement:
+    """An ``element`` of a PLY header.
+
+    Attributes:
+        name: Of the element.
+        count: Of its rows.
+        properties: In order: name and data type, without byte order; of a list, those of its length and its items.
+    """
 
     name: str
     count: int
-    properties: list[tuple[str, str | None]] = field(default_factory=list)
+    properties: list[tuple[str, str | tuple[str, str]]] = field(default_factory=list)
+
+    @property
+    def has_lists(self) -> bool:
+        """Whether rows are of different lengths."""
+        return any(isinstance(kind, tuple) for _, kind in self.properties)
+
+    def layout(self, form: str) -> np.dtype:
+        """A row without lists, as it is stored in a file of a format."""
+        return np.dtype([(name, _ORDERS[form] + str(kind)) for name, kind in self.properties])
+
+
+@dataclass(frozen=True)
+class PlyFile:
+    """A PLY file whose header is read.
+
+    Attributes:
+        form: ``ascii``, ``binary_little_endian`` or ``binary_big_endian``.
+        elements: In order.
+        body: What follows the header.
+    """
+
+    form: str
+    elements: list[PlyElement]
+    body: bytes
+
+
+def open_ply(path: Path) -> PlyFile:
+    """Read the header of a PLY file.
+
+    Raises:
+        InputError: The file cannot be read, or has no valid header.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}", "a PLY file") from error
+    header, _, body = data.partition(b"end_header")
+    if not data.startswith(b"ply") or not body:
+        raise InputError(f"{path} ({len(data)} bytes) has no PLY header", "a PLY file", "Fetch it again")
+    form, elements = _parsed(path, header.decode("ascii", errors="replace"))
+    return PlyFile(form, elements, body[body.find(b"\n") + 1 :])
 
 
 def read_vertices(path: Path, needed: tuple[str, ...] = ("x", "y", "z")) -> dict[str, np.ndarray]:
@@ -44,16 +93,10 @@ def read_vertices(path: Path, needed: tuple[str, ...] = ("x", "y", "z")) -> dict
     Raises:
         InputError: The file is damaged or not a PLY file, or its vertices lack a property.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}", "a PLY file") from error
-    header, _, body = data.partition(b"end_header")
-    if not data.startswith(b"ply") or not body:
-        raise InputError(f"{path} ({len(data)} bytes) has no PLY header", "a PLY file", "Fetch it again")
-    form, elements = _parsed(path, header.decode("ascii", errors="replace"))
+    file = open_ply(path)
+    elements = file.elements
     # Only files with the vertices first are supported: behind a list, their offset would be unknown.
-    if not elements or elements[0].name != "vertex" or any(kind is None for _, kind in elements[0].properties):
+    if not elements or elements[0].name != "vertex" or elements[0].has_lists:
         raise InputError(f"{path} does not begin with vertices of plain numbers", "a PLY file of points")
     vertex = elements[0]
     names = [name for name, _ in vertex.properties]
@@ -62,39 +105,52 @@ def read_vertices(path: Path, needed: tuple[str, ...] = ("x", "y", "z")) -> dict
             f"{path}: vertices have {', '.join(names) or 'no properties'}, but no {', '.join(missing)}",
             f"vertices with {', '.join(needed)}",
         )
-    layout = np.dtype([(name, _ORDERS[form] + str(kind)) for name, kind in vertex.properties])
-    # Skip the rest of the header's last line.
-    body = body[body.find(b"\n") + 1 :]
-    if form == "ascii":
+    return vertex_columns(path, file)
+
+
+def vertex_columns(path: Path, file: PlyFile) -> dict[str, np.ndarray]:
+    """The properties of the first element of a PLY file, which has no lists. Each [N]
+
+    Raises:
+        InputError: The file is damaged.
+    """
+    vertex, body = file.elements[0], file.body
+    layout = vertex.layout(file.form)
+    if file.form == "ascii":
         return _ascii(path, body, vertex, layout)
     if len(body) < vertex.count * layout.itemsize:
         raise _cut_short(path, vertex.count, len(body) // layout.itemsize)
     vertices = np.frombuffer(body, layout, vertex.count)
-    return {name: vertices[name].astype(layout[name].newbyteorder("=")) for name in names}
+    return {name: vertices[name].astype(layout[name].newbyteorder("=")) for name in layout.names or ()}
 
 
-def _parsed(path: Path, header: str) -> tuple[str, list[_Element]]:
-    form, elements = "", list[_Element]()
+def _parsed(path: Path, header: str) -> tuple[str, list[PlyElement]]:
+    form, elements = "", list[PlyElement]()
     for line in header.splitlines():
         match line.split():
             case ["format", name, *_] if name in _ORDERS:
                 form = name
-            case ["element", name, count] if count.isdecimal():
-                elements.append(_Element(name, int(count)))
-            case ["property", "list", _, _, name] if elements:
-                elements[-1].properties.append((name, None))
+            case ["element", name, count] if count.isdecimal() and len(count) <= _DIGITS:
+                elements.append(PlyElement(name, int(count)))
+            case ["property", "list", length, kind, name] if elements and length in _KINDS and kind in _KINDS:
+                elements[-1].properties.append((name, (_KINDS[length], _KINDS[kind])))
             case ["property", kind, name] if elements and kind in _KINDS:
                 elements[-1].properties.append((name, _KINDS[kind]))
             case [] | ["ply"] | ["comment" | "obj_info", *_]:
                 pass
             case _:
                 raise InputError(f"{path}: header line '{line.strip()[:60]}'", "a PLY header")
+    for element in elements:
+        names = [name for name, _ in element.properties]
+        if len(set(names)) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise InputError(f"{path}: the header names property {twice} of {element.name} twice", "each once")
     if not form:
         raise InputError(f"{path}: the header names no format", f"one of {', '.join(_ORDERS)}")
     return form, elements
 
 
-def _ascii(path: Path, body: bytes, vertex: _Element, layout: np.dtype) -> dict[str, np.ndarray]:
+def _ascii(path: Path, body: bytes, vertex: PlyElement, layout: np.dtype) -> dict[str, np.ndarray]:
     lines = [line for line in body.splitlines() if line.strip()][: vertex.count]
     if len(lines) < vertex.count:
         raise _cut_short(path, vertex.count, len(lines))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Mapping
@@ -14,12 +13,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Shaped
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.json_files import read_json
 from coliags_plugin.datamanagers.reading.depth_formats import DepthFormat
 from coliags_plugin.datamanagers.reading.frame_files import inventory
 from coliags_plugin.datamanagers.reading.images import read_gray
 from coliags_plugin.lenses.models import FisheyeLens, Lens
 from coliags_plugin.poses.rigid import FLIP_Y_AND_Z, check_rigid
-from coliags_plugin.poses.text import read_text
 from coliags_plugin.poses.trajectory import natural_order, refuse_repeated
 
 #: Parts of a sequence; ``test`` is all frames, ``true_test`` those in neither training nor validation.
@@ -183,10 +182,7 @@ def read_sequence(folder: Path) -> Sequence:
 
 
 def _read(file: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(read_text(file, "a JSON object"))
-    except (json.JSONDecodeError, RecursionError) as error:
-        raise InputError(f"{file} is not JSON: {error}", "a JSON object with frames") from error
+    content = read_json(file, "a JSON object with frames")
     frames = content.get("frames") if isinstance(content, dict) else None
     # A short video may have no validation frames, but there must be training frames.
     if not isinstance(frames, list) or (not frames and file.name == "transforms_train.json"):

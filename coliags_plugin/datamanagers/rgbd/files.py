@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ import torch
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.reading.camera_json import read_intrinsics
 from coliags_plugin.datamanagers.reading.frame_files import DEPTH_SUFFIXES, IMAGE_SUFFIXES, inventory
@@ -237,7 +237,7 @@ def _trajectories(folder: Path) -> list[Path]:
 
 def _read_json(path: Path, image: Path) -> CameraFile:
     intrinsics = read_intrinsics(path)
-    scale = json.loads(path.read_text(encoding="utf-8-sig")).get("depth_scale")
+    scale = read_json(path, "a JSON object").get("depth_scale")
     if scale is None:
         return CameraFile(path, intrinsics)
     if isinstance(scale, bool) or not isinstance(scale, (int, float)) or not (math.isfinite(scale) and scale > 0):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 from collections.abc import Mapping, Sequence
@@ -13,9 +12,9 @@ import numpy as np
 from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.json_files import read_json
 from coliags_plugin.datamanagers.reading.frame_files import inventory, numbered
 from coliags_plugin.poses.nerfstudio import read as read_transforms
-from coliags_plugin.poses.text import read_text
 
 log = logging.getLogger(__name__)
 
@@ -149,7 +148,7 @@ def _depths(numbers: Sequence[int], folder: Path | None) -> tuple[Path, ...] | N
 
 
 def _angle(transforms: Path) -> float:
-    angle = json.loads(read_text(transforms)).get("camera_angle_x")
+    angle = read_json(transforms, "a transforms.json").get("camera_angle_x")
     if isinstance(angle, bool) or not isinstance(angle, int | float) or not 0.0 < angle < math.pi:
         raise InputError(
             f"{transforms}: camera_angle_x is {angle!r}", "the horizontal field of view, radians, between 0 and pi"

@@ -1,0 +1,428 @@
+"""Mutations of files: each is a small JSON object, so that a case can be stored and repeated.
+
+An edit is ``{"file": NAME, "op": NAME, ...}`` with the arguments of one of :data:`EDITS`. Positions count from the
+start of the file and wrap around its length, so that an edit can be applied to any file.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+import shutil
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+
+Edit = dict[str, Any]
+
+#: What numbers, words and strings of text files are replaced by.
+HOSTILE = (
+    *("1e308", "-1e308", "1e400", "nan", "inf", "-inf", ".inf", ".nan", "NaN", "Infinity", "-1", "0", "-0.0", "1e-320"),
+    *("1e38", "3.5e38", "1e20", "1e7", "1e-7", "2", "0.5", "60000", "99999999999999999999", "4294967296", "2147483648"),
+    *("-9223372036854775809", "0x10", "1_000", "1,5", "\u0663", "null", "true", "[]"),
+    *("{}", "[1, 2]", '""', '"nan"', '"1e400"', '"\\ud800"', '"\\u0000"', "\\"),
+    *("..", "/dev/zero", "/", '"/dev/zero"', '"/etc/hostname"', '"../../../etc/hostname"', '"."', '"loop"', "*a", "&a"),
+    *("!!python/object:os.system", "%s%n", "\x00", "\x1b[31m", "é", "#", "--- "),
+)
+#: What is repeated to replace them: text and how often.
+REPEATED = (("9", 5000), ("0", 400), ("a", 5000), ("/a", 3000), ("[", 20000), ("{", 300), ("- ", 2000), ("x ", 100_000))
+#: What stretches of binary files are overwritten by.
+BYTES = (
+    *(b"\x00", b"\xff", b"\x00" * 8, b"\xff" * 8, b"\x7f\xff\xff\xff", b"\xff\xff\xff\x7f", b"\x00\x00\x00\x80"),
+    *(struct.pack("<d", value) for value in (np.nan, np.inf, 1e308, -1e308, 1e38, 1e12, -1.0, 0.0)),
+    *(struct.pack("<f", value) for value in (np.nan, np.inf, 3e38, -3e38, 1e30, 1e8, -1.0, 0.0)),
+    *(struct.pack("<Q", value) for value in (1 << 63, 1 << 40, 1 << 31, 1 << 20)),
+)
+#: What arrays of NPZ and NPY files become.
+ARRAYS = ("nan", "inf", "1e308", "1e30", "zeros", "negative", "text", "empty", "flat", "transposed", "first", "complex")
+#: What images become.
+IMAGES = (
+    "gray",
+    "rgba",
+    "16-bit",
+    "half",
+    "pixel",
+    "strip",
+    "float",
+    "nan",
+    "1e38",
+    "inf",
+    "negative",
+    "black",
+    "jpeg",
+)
+#: What becomes of a file as a whole.
+NODES = ("missing", "folder", "loop", "dangling", "empty", "unreadable")
+
+_TOKEN = re.compile(rb'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|"[^"\n]*"|[A-Za-z_][\w.-]*')
+_TEXT = frozenset({".txt", ".json", ".yaml", ".yml", ".obj", ".csv", ".jsonl", ".freiburg", ""})
+_IMAGE = frozenset({".png", ".tiff", ".tif", ".jpg"})
+_HEADERS = frozenset({".ply", ".safetensors", ".glb"})
+
+
+# Edits of bytes
+
+
+def _flip(data: bytes, at: int, bit: int) -> bytes:
+    changed = bytearray(data)
+    if changed:
+        changed[at % len(changed)] ^= 1 << bit
+    return bytes(changed)
+
+
+def _write(data: bytes, at: int, hex: str) -> bytes:
+    new = bytes.fromhex(hex)
+    at %= len(data) or 1
+    return (data[:at] + new + data[at + len(new) :])[: max(len(data), len(new))]
+
+
+def _cut(data: bytes, at: int) -> bytes:
+    return data[: at % (len(data) or 1)]
+
+
+def _drop(data: bytes, at: int, count: int) -> bytes:
+    at %= len(data) or 1
+    return data[:at] + data[at + count :]
+
+
+def _double(data: bytes, at: int, count: int) -> bytes:
+    at %= len(data) or 1
+    return data[: at + count] + data[at:]
+
+
+def _splice(data: bytes, at: int, source: int, count: int) -> bytes:
+    at, source = at % (len(data) or 1), source % (len(data) or 1)
+    return data[:at] + data[source : source + count] + data[at + count :]
+
+
+def _insert(data: bytes, at: int, text: str, times: int = 1) -> bytes:
+    at %= len(data) + 1
+    return data[:at] + (text * times).encode("utf-8", "surrogatepass") + data[at:]
+
+
+def _token(data: bytes, index: int, text: str, times: int = 1) -> bytes:
+    found = list(_TOKEN.finditer(data))
+    if not found:
+        return data
+    token = found[index % len(found)]
+    return data[: token.start()] + (text * times).encode("utf-8", "surrogatepass") + data[token.end() :]
+
+
+def _header_token(data: bytes, index: int, text: str, times: int = 1) -> bytes:
+    """Replace a token of the text that a binary file begins with; lengths that follow from it are made right."""
+    new = (text * times).encode("utf-8", "surrogatepass")
+    if data[:4] == b"glTF":
+        length = struct.unpack_from("<I", data, 12)[0]
+        header = _token(data[20 : 20 + length], index, text, times).ljust(-(-length // 4) * 4)
+        header += b" " * (-len(header) % 4)
+        rest = data[20 + length :]
+        return struct.pack("<4sIIII", b"glTF", 2, 20 + len(header) + len(rest), len(header), 0x4E4F534A) + header + rest
+    if data[:3] == b"ply":
+        end = data.find(b"end_header")
+        return _token(data[:end], index, text, times) + data[end:]
+    if len(data) > 8 and data[8:9] == b"{":
+        length = struct.unpack_from("<Q", data)[0]
+        header = _token(data[8 : 8 + length], index, text, times)
+        return struct.pack("<Q", len(header)) + header + data[8 + length :]
+    return data[: len(data) // 2] + new + data[len(data) // 2 :]
+
+
+def _line(data: bytes, index: int, how: str) -> bytes:
+    lines = data.splitlines(keepends=True)
+    if not lines:
+        return data
+    at = index % len(lines)
+    if how == "drop":
+        del lines[at]
+    elif how == "double":
+        lines.insert(at, lines[at])
+    elif how == "indent":
+        lines[at] = b"  " + lines[at]
+    elif how == "many":
+        lines[at:at] = [lines[at]] * 3000
+    else:
+        lines.insert(0, lines.pop(at))
+    return b"".join(lines)
+
+
+def _json(data: bytes, path: list[Any], text: str | None, times: int = 1) -> bytes:
+    """Replace a value of a JSON file by other text, or delete it, or (``text`` = "twice") give its key twice."""
+    mark = "@@here@@"
+    try:
+        content = json.loads(data)
+        place = content
+        for key in path[:-1]:
+            place = place[key]
+        value = place[path[-1]]
+        if text is None:
+            del place[path[-1]]
+            return json.dumps(content).encode()
+        place[path[-1]] = mark
+    except (ValueError, LookupError, TypeError):
+        return data
+    if text == "twice":
+        text = f"{json.dumps(value)}, {json.dumps(str(path[-1]))}: {json.dumps(value)}"
+    return json.dumps(content).replace(json.dumps(mark), text * times).encode("utf-8", "surrogatepass")
+
+
+def _yaml_bomb(data: bytes) -> bytes:
+    lines = ["a0: &a0 [x, x]"] + [f"a{level}: &a{level} [*a{level - 1}, *a{level - 1}]" for level in range(1, 40)]
+    return data + "\n".join(["", *lines, ""]).encode()
+
+
+def _array(array: np.ndarray, how: str) -> np.ndarray:
+    if how in ("nan", "inf", "1e308", "1e30", "negative", "zeros"):
+        changed = array.astype(np.float64) if array.dtype.kind in "fiub" else np.zeros(array.shape)
+        if changed.size:
+            flat = changed.reshape(-1)
+            value = {"negative": -1.0, "zeros": 0.0}.get(how)
+            flat[flat.size // 2] = float(how) if value is None else value
+            if how in ("negative", "zeros"):
+                flat[:] = value
+        return changed
+    if how == "text":
+        return np.full(array.shape, "x")
+    if how == "complex":
+        return np.zeros(array.shape, np.complex128)
+    if how == "empty":
+        return array[..., :0] if array.ndim else np.zeros(0)
+    if how == "flat":
+        return array.reshape(-1)
+    return array.T if how == "transposed" else np.atleast_1d(array)[0]
+
+
+def _npz(data: bytes, index: int, how: str) -> bytes:
+    try:
+        if data[:6] == b"\x93NUMPY":
+            made = io.BytesIO()
+            np.save(made, _array(np.load(io.BytesIO(data)), how))
+            return made.getvalue()
+        with np.load(io.BytesIO(data)) as stored:
+            arrays = dict(stored)
+        name = sorted(arrays)[index % len(arrays)]
+        if how == "missing":
+            del arrays[name]
+        elif how == "renamed":
+            arrays["../" + name] = arrays.pop(name)
+        elif how == "bomb":
+            made = io.BytesIO()
+            with zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED) as archive, archive.open(f"{name}.npy", "w") as file:
+                file.write(b"\x93NUMPY\x01\x00v\x00{'descr': '|u1', 'fortran_order': False, 'shape': (720000000,), }")
+                file.write(b" " * 42 + b"\n")
+                for _ in range(180):
+                    file.write(bytes(4_000_000))
+            return made.getvalue()
+        else:
+            arrays[name] = _array(arrays[name], how)
+    except (ValueError, OSError, zipfile.BadZipFile):
+        return data
+    made = io.BytesIO()
+    np.savez(made, **arrays)
+    return made.getvalue()
+
+
+def _png_size(data: bytes, width: int, height: int) -> bytes:
+    """A PNG whose header says another size, with a right checksum."""
+    if data[:4] != b"\x89PNG":
+        return data
+    header = b"IHDR" + struct.pack(">II", width, height) + data[24:29]
+    return data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:]
+
+
+def _image(data: bytes, how: str) -> bytes:
+    import cv2
+
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        return data
+    suffix, floats = ".tiff" if data[:2] in (b"II", b"MM") else ".png", pixels.astype(np.float32)
+    middle = pixels.shape[0] // 2
+    if how in ("nan", "1e38", "inf", "negative"):
+        suffix = ".tiff"
+        floats[middle] = -floats[middle] if how == "negative" else float(how)
+        pixels = floats
+    elif how == "gray":
+        pixels = pixels[..., 0] if pixels.ndim == 3 else np.dstack([pixels] * 3)
+    elif how == "rgba":
+        pixels = np.dstack(
+            [pixels if pixels.ndim == 3 else np.dstack([pixels] * 3), pixels.reshape(*pixels.shape[:2], -1)[..., 0]]
+        )
+    elif how == "16-bit":
+        pixels = (
+            pixels.astype(np.uint16) if pixels.dtype == np.uint8 else (pixels.astype(np.float64) % 256).astype(np.uint8)
+        )
+    elif how == "half":
+        pixels = pixels[::2, ::2]
+    elif how == "pixel":
+        pixels = pixels[:1, :1]
+    elif how == "strip":
+        pixels = pixels[:1]
+    elif how == "black":
+        pixels = np.zeros_like(pixels)
+    elif how == "jpeg":
+        suffix, pixels = ".jpg", np.clip(pixels, 0, 255).astype(np.uint8)
+    else:
+        suffix, pixels = ".tiff", floats
+    try:
+        return bytes(cv2.imencode(suffix, np.ascontiguousarray(pixels))[1])
+    except cv2.error:
+        return data
+
+
+EDITS: dict[str, Callable[..., bytes]] = {
+    "flip": _flip,
+    "write": _write,
+    "cut": _cut,
+    "drop": _drop,
+    "double": _double,
+    "splice": _splice,
+    "insert": _insert,
+    "token": _token,
+    "header": _header_token,
+    "line": _line,
+    "json": _json,
+    "yaml-bomb": _yaml_bomb,
+    "npz": _npz,
+    "png-size": _png_size,
+    "image": _image,
+}
+
+
+def apply(folder: Path, edit: Edit) -> None:
+    """Spoil a file of a folder; others may share its content by hard links."""
+    path = folder / edit["file"]
+    options = {key: value for key, value in edit.items() if key not in ("file", "op")}
+    if edit["op"] == "node":
+        _node(path, options["how"])
+    elif path.is_file():
+        data = path.read_bytes()
+        with suppress(Exception):  # it is of another form after the edits before
+            data = EDITS[edit["op"]](data, **options)
+        path.unlink()
+        path.write_bytes(data)
+
+
+def _node(path: Path, how: str) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+    if how == "folder":
+        path.mkdir()
+    elif how == "loop":
+        path.symlink_to(path.name)
+    elif how == "dangling":
+        path.symlink_to("nowhere")
+    elif how == "empty":
+        path.write_bytes(b"")
+    elif how == "unreadable":
+        path.write_bytes(b"")
+        os.chmod(path, 0)
+
+
+# Drawing
+
+
+def draw(files: dict[str, int], folder: Path, random: Random) -> list[Edit]:
+    """One to three edits of files of a folder.
+
+    Args:
+        files: How likely each is, by its name.
+        folder: Where they are.
+        random: Decides everything.
+    """
+    names = random.choices(list(files), list(files.values()), k=random.choice((1, 1, 1, 2, 3)))
+    return [_drawn(name, (folder / name).read_bytes(), random) for name in names]
+
+
+def _drawn(name: str, data: bytes, random: Random) -> Edit:
+    suffix = Path(name).suffix.lower()
+    if random.random() < 0.04:
+        return {"file": name, "op": "node", "how": random.choice(NODES)}
+    kinds: list[Callable[[bytes, Random], Edit]] = [_random_bytes]
+    if suffix in _TEXT:
+        kinds += [_random_text] * 4
+    if suffix == ".json" or (suffix == "" and data[:1] == b"{"):
+        kinds += [_random_json] * 4
+    if suffix in (".yaml", ".yml") and random.random() < 0.05:
+        return {"file": name, "op": "yaml-bomb"}
+    if suffix in (".npz", ".npy"):
+        kinds += [_random_array] * 2
+    if suffix in _IMAGE:
+        kinds += [_random_image]
+    if suffix in _HEADERS:
+        kinds += [_random_header] * 2
+    return {"file": name, **random.choice(kinds)(data, random)}
+
+
+def _random_bytes(data: bytes, random: Random) -> Edit:
+    size = max(len(data), 1)
+    # Headers are where a byte matters most.
+    at = random.randrange(size) if random.random() < 0.5 else random.randrange(min(size, 400))
+    count = random.choice((1, 2, 4, 8, 30, 100, 1000, 5000))
+    op = random.choice(("flip", "write", "write", "write", "cut", "drop", "double", "splice"))
+    if op == "flip":
+        return {"op": op, "at": at, "bit": random.randrange(8)}
+    if op == "write":
+        new = random.choice((*BYTES, random.randbytes(4), bytes(count)))
+        return {"op": op, "at": at - at % 4 if random.random() < 0.7 else at, "hex": new.hex()}
+    if op == "cut":
+        return {"op": op, "at": at}
+    if op == "splice":
+        return {"op": op, "at": at, "source": random.randrange(size), "count": count}
+    return {"op": op, "at": at, "count": count}
+
+
+def _text(random: Random) -> dict[str, Any]:
+    if random.random() < 0.1:
+        text, times = random.choice(REPEATED)
+        return {"text": text, "times": times}
+    return {"text": random.choice(HOSTILE)}
+
+
+def _random_text(data: bytes, random: Random) -> Edit:
+    op = random.choice(("token", "token", "token", "token", "line", "insert"))
+    if op == "token":
+        return {"op": op, "index": random.randrange(100_000), **_text(random)}
+    if op == "line":
+        how = random.choice(("drop", "double", "indent", "first", "many"))
+        return {"op": op, "index": random.randrange(100_000), "how": how}
+    return {"op": op, "at": random.randrange(len(data) + 1), **_text(random)}
+
+
+def _random_header(data: bytes, random: Random) -> Edit:
+    return {"op": "header", "index": random.randrange(1000), **_text(random)}
+
+
+def _random_json(data: bytes, random: Random) -> Edit:
+    try:
+        place, path = json.loads(data), []
+    except ValueError:
+        return _random_text(data, random)
+    while isinstance(place, (dict, list)) and place and (not path or random.random() < 0.85):
+        key = random.choice(sorted(place)) if isinstance(place, dict) else random.randrange(len(place))
+        path.append(key)
+        place = place[key]
+    chosen = random.choice((None, "twice")) if random.random() < 0.1 else ""
+    return {"op": "json", "path": path, **({"text": chosen} if chosen != "" else _text(random))}
+
+
+def _random_array(data: bytes, random: Random) -> Edit:
+    how = random.choice((*ARRAYS, "missing", "renamed") * 4 + ("bomb",))
+    return {"op": "npz", "index": random.randrange(100), "how": how}
+
+
+def _random_image(data: bytes, random: Random) -> Edit:
+    if random.random() < 0.3:
+        sizes = (0, 1, 65, 4000, 20_000, 60_000, 2**31 - 1)
+        return {"op": "png-size", "width": random.choice(sizes), "height": random.choice(sizes)}
+    return {"op": "image", "how": random.choice(IMAGES)}

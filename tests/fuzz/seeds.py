@@ -1,0 +1,169 @@
+"""Files that are mutated: a tiny scene in every layout, and one of everything else that is read."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import open3d
+
+from coliags_plugin.api.exchange import import_splats
+from coliags_plugin.api.training import train
+from coliags_plugin.config.registry import pose_formats
+from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.meshes.files import read_mesh, write_mesh
+from coliags_plugin.meshes.mesh import TriangleMesh
+from coliags_plugin.outputs.video import write_video
+from coliags_plugin.poses.formats import format_named, write_trajectory
+from coliags_plugin.poses.trajectory import Trajectory
+from coliags_plugin.splats.files import write_splats
+from tests.comparison.small import TINY
+from tests.datamanagers.spoiling import KINDS, write_all
+from tests.splats.clouds import random_cloud
+
+FRAMES = 9
+METHOD = "coliags"
+
+
+def make_seeds(folder: Path) -> None:
+    """Make a folder of seeds for each target (:mod:`tests.fuzz.targets`)."""
+    work = folder / "work"
+    made = write_all(work, FRAMES)
+    for name, scene in made.items():
+        place = folder / name
+        shutil.copytree(scene, place)
+        truth = place / "truth"
+        for file in [*truth.glob("albedo.npz"), *place.rglob("*_normals.tiff"), *place.rglob("coverage_mesh.obj")]:
+            file.unlink()
+    poses = np.load(made["c3vd"] / "truth/camera_to_world.npy")
+    surface = read_mesh(made["c3vd"] / "truth/mesh.ply")
+    _rich_transforms(folder / "nerfstudio", folder / "nerfstudio-rich")
+    _trajectories(folder / "poses", poses)
+    _meshes(folder / "meshes", surface)
+    _splats(folder / "splats", folder / "c3vd")
+    _runs(folder, work)
+    _methods(folder / "methods")
+    _depth_maps(folder / "depth-maps", made["c3vd"])
+    _points(folder / "points", folder / "c3vd")
+    (folder / "video").mkdir()
+    frames = [cv2.imread(str(path))[..., ::-1] for path in sorted((made["c3vd"] / "images").iterdir())]
+    write_video(np.stack(frames), folder / "video/film.mp4", 10.0)
+    shutil.rmtree(work)
+
+
+def _rich_transforms(scene: Path, target: Path) -> None:
+    """A scene with everything that a transforms.json can say."""
+    shutil.copytree(scene, target)
+    file = target / "transforms.json"
+    content = json.loads(file.read_text())
+    content.update(camera_model="OPENCV", k1=0.01, k2=-0.001, p1=0.0, p2=0.0, applied_scale=1.0)
+    content.update(applied_transform=[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], ply_file_path="cloud.ply")
+    names = [frame["file_path"] for frame in content["frames"]]
+    content.update(train_filenames=names[1:], test_filenames=names[:1])
+    mesh = open3d.io.read_triangle_mesh(str(target / "truth/mesh.ply"))
+    cloud = open3d.geometry.PointCloud(mesh.vertices)
+    open3d.io.write_point_cloud(str(target / "cloud.ply"), cloud)
+    for part, value in (("masks", 255), ("confidence", 200)):
+        (target / part).mkdir()
+        for frame in content["frames"]:
+            name = f"{part}/{Path(frame['depth_file_path']).name}"
+            image = cv2.imread(str(target / frame["depth_file_path"]), cv2.IMREAD_UNCHANGED)
+            cv2.imwrite(str(target / name), np.full(image.shape[:2], value, np.uint8))
+            frame["mask_path" if part == "masks" else "confidence_file_path"] = name
+    file.write_text(json.dumps(content))
+    shutil.rmtree(target / "truth")
+
+
+def _trajectories(folder: Path, poses: np.ndarray) -> None:
+    """The same trajectory in every format that is written, and EndoGSLAM's."""
+    folder.mkdir()
+    names = tuple(f"{index:04d}.png" for index in range(len(poses)))
+    trajectory = Trajectory(poses, names, np.arange(len(poses)) / 30.0, Intrinsics(50.0, 50.0, 32.0, 25.5, 64, 51))
+    for name in pose_formats:
+        known = format_named(name)
+        if known.write is not None:
+            suffix = {"nerfstudio": "/transforms.json", "endogslam": "/params.npz"}.get(
+                name, "" if known.folder else ".txt"
+            )
+            (folder / name).mkdir() if suffix.startswith("/") else None
+            write_trajectory(folder / f"{name}{suffix}", trajectory, name)
+    write_trajectory(folder / "reference.txt", replace(trajectory, names=None), "tum")
+
+
+def _meshes(folder: Path, surface: TriangleMesh) -> None:
+    folder.mkdir()
+    part = surface.triangles[:200]
+    used, triangles = np.unique(part, return_inverse=True)
+    colors = None if surface.colors is None else surface.colors[used]
+    small = TriangleMesh(surface.vertices[used], triangles.reshape(-1, 3), colors)
+    for suffix in ("ply", "obj", "glb"):
+        write_mesh(folder / f"mesh.{suffix}", small)
+    open3d.io.write_triangle_mesh(
+        str(folder / "text.ply"),
+        open3d.geometry.TriangleMesh(
+            open3d.utility.Vector3dVector(small.vertices.astype(np.float64)),
+            open3d.utility.Vector3iVector(small.triangles),
+        ),
+        write_ascii=True,
+    )
+    seen = np.arange(len(small)) % 2 == 0
+    np.savez(folder / "mesh_seen.npz", face_seen=seen, face_seen_by_any_frame=seen)
+
+
+def _splats(folder: Path, scene: Path) -> None:
+    folder.mkdir()
+    for name in ("ply", "spz", "splat"):
+        write_splats(folder / f"cloud.{name}", random_cloud(20, degree=1), name, "a comment")
+    shutil.copytree(scene, folder / "scene", ignore=shutil.ignore_patterns("truth", "rotation"))
+
+
+def _runs(folder: Path, work: Path) -> None:
+    """A run that can be resumed, and one with results."""
+    target = folder / "run"
+    target.mkdir()
+    scene = target / "scene"
+    shutil.copytree(folder / "c3vd", scene, ignore=shutil.ignore_patterns("truth", "rotation"))
+    given = {key: json.loads(value) for key, value in (setting.split("=") for setting in TINY)}
+    given["schedule.checkpoint_every"] = 2
+    run = train(METHOD, scene, target / "run", steps=3, settings=given)
+    run.evaluate()
+    shutil.copytree(target / "run", folder / "results/run")
+    for name in ("checkpoints",):
+        shutil.rmtree(folder / "results/run" / name)
+    (target / "run/eval").rename(work / "eval")
+    import_splats(folder / "splats/cloud.ply", scene, work / "imported")
+
+
+def _methods(folder: Path) -> None:
+    folder.mkdir()
+    shipped = Path(__file__).parents[2] / "method_configs"
+    for name in ("coliags", "3dgs", "reim-nerf", "pr-endo"):
+        shutil.copy(shipped / f"{name}.yaml", folder / f"{name}.yaml")
+    shutil.copy(shipped / "benchmarks/phantoms-8.yaml", folder / "benchmark.yaml")
+    shutil.copy(shipped / "benchmarks/ablations/embedding-sizes.yaml", folder / "ablation.yaml")
+
+
+def _depth_maps(folder: Path, scene: Path) -> None:
+    """Depth maps by others, beside images that they belong to."""
+    for part in ("npy", "png", "tiff"):
+        (folder / part).mkdir(parents=True)
+    for path in sorted((scene / "depths").iterdir())[:3]:
+        depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(folder / f"png/{path.stem[:4]}.png"), depth)
+        cv2.imwrite(str(folder / f"tiff/{path.stem[:4]}.tiff"), depth.astype(np.float32))
+        np.save(folder / f"npy/{path.stem[:4]}.npy", depth.astype(np.float32))
+
+
+def _points(folder: Path, scene: Path) -> None:
+    """A scene whose initial points are in files of their own."""
+    shutil.copytree(scene, folder, ignore=shutil.ignore_patterns("truth", "rotation"))
+    random = np.random.default_rng(0)
+    positions = random.uniform(-20, 20, (300, 3)).astype(np.float32)
+    np.savez(folder / "cloud.npz", positions=positions, colors=random.integers(0, 255, (300, 3)).astype(np.uint8))
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(positions.astype(np.float64)))
+    open3d.io.write_point_cloud(str(folder / "cloud.ply"), cloud)
+    assert KINDS
