@@ -450,7 +450,8 @@ REFUSED: dict[str, Rows] = {
     },
     "a camera file cut short": {
         **per_kind(
-            ("c3vd", *TUM), lambda name, kind: (cut("camera.json"), (r"camera\.json is not JSON: .* line", "JSON object"))
+            ("c3vd", *TUM),
+            lambda name, kind: (cut("camera.json"), (r"camera\.json is not JSON: .* line", "JSON object")),
         ),
         "c3vd-v2": (cut("camera_intrinsics.txt"), (r"camera_intrinsics\.txt is ambiguous or implausible: no a3, a4",)),
         "colmap": (cut("sparse/0/cameras.bin"), (r"cameras\.bin \(\d+ bytes\) is damaged or cut short",)),
