@@ -15,6 +15,7 @@ def import_splats(
     data_format: str | None = None,
     device: str = "auto",
     overwrite: bool = False,
+    anonymous: bool = False,
 ) -> Run:
     """Make a run of a file of 3D Gaussians on a scene, at step 0, to evaluate, render and mesh.
 
@@ -25,6 +26,7 @@ def import_splats(
         data_format: Name of a data manager; None: the one that recognises the folder.
         device: ``auto``, ``cpu`` or ``cuda``.
         overwrite: Replace an existing run folder.
+        anonymous: Keep absolute paths out of the run's files; what reads the run then has to be given ``data``.
 
     Raises:
         InputError: The file is damaged, compressed or of another lineage, the scene cannot be read, or the folder
@@ -36,5 +38,5 @@ def import_splats(
 
     scene = Path(data)
     folder = RunFolder.default(scene.resolve().name, "imported") if output is None else RunFolder(Path(output))
-    import_run(Path(file), scene, folder, choose_device(device), data_format, overwrite)
+    import_run(Path(file), scene, folder, choose_device(device), data_format, overwrite, anonymous)
     return Run(folder.path, data=scene, device=device)

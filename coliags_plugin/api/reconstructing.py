@@ -20,6 +20,7 @@ def reconstruct(
     mask: str | Path | None = None,
     device: str = "auto",
     overwrite: bool = False,
+    anonymous: bool = False,
 ) -> Record:
     """Reconstruct a colon from a video: frames, poses, depth, training, mesh and report, one folder for all.
 
@@ -32,6 +33,7 @@ def reconstruct(
         mask: Image of the frames' size, black where pixels are ignored; None: black surroundings are found.
         device: ``auto``, ``cpu`` or ``cuda``.
         overwrite: Repeat stages that were made with other settings, and what follows them.
+        anonymous: Keep absolute paths out of what is written (docs/security.md 4).
 
     Returns:
         The record: what each stage made, with which options, in what time.
@@ -49,4 +51,4 @@ def reconstruct(
     chosen = settings_of(ReconstructionSettings, assignments(settings))
     masked = None if mask is None else Path(mask)
     with progress_callback() as progress:
-        return run(Path(video), Path(output), chosen, choose_device(device), masked, overwrite, progress)
+        return run(Path(video), Path(output), chosen, choose_device(device), masked, overwrite, progress, anonymous)

@@ -26,6 +26,7 @@ def train(
     device: str = "auto",
     resume: bool = False,
     overwrite: bool = False,
+    anonymous: bool = False,
 ) -> Run:
     """Train a method on a scene.
 
@@ -41,6 +42,7 @@ def train(
         device: ``auto``, ``cpu`` or ``cuda``.
         resume: Continue from the run's latest checkpoint.
         overwrite: Replace an existing run folder.
+        anonymous: Keep absolute paths out of the run's files; what reads the run then has to be given ``data``.
 
     Raises:
         InputError: Method, data or options are invalid or do not fit each other; nothing was written.
@@ -55,7 +57,9 @@ def train(
     data, on = Path(data), choose_device(device)
     named = {"schedule.steps": steps, "renderer.name": renderer}
     chosen = {key: value for key, value in named.items() if value is not None}
-    request = TrainingRequest(method, data, (*assignments(settings), *assignments(chosen)), seed, data_format)
+    request = TrainingRequest(
+        method, data, (*assignments(settings), *assignments(chosen)), seed, data_format, anonymous
+    )
     folder = _run_folder(method, data, output, resume)
     training = resume_training(request, folder, on) if resume else start_training(request, folder, on, overwrite)
     with training as trainer:

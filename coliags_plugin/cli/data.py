@@ -27,6 +27,8 @@ class Data:
     """Also write an HTML page with images and the trajectory."""
     json: OptionalPath = None
     """Also write the results as JSON."""
+    anonymous: bool = False
+    """Keep absolute paths out of the page and the JSON (docs/security.md 4)."""
     set: Assignments = ()
     """An option of the data manager, for instance split=block."""
 
@@ -44,6 +46,8 @@ class Data:
             at_stored_size = partial(open_scene, self.scene, self.format, self.set, stored_size=True)
             check = check_scene(scene, progress, at_stored_size if scene.is_resized else None)
         print("\n".join(lines(check)))
+        if self.anonymous:
+            check = check.anonymous()
         if self.html is not None:
             write_check_page(check, self.html)
             print(self.html.resolve())

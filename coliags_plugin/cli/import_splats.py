@@ -27,6 +27,8 @@ class Import:
     """Device to compute on."""
     overwrite: bool = False
     """Replace an existing run folder."""
+    anonymous: bool = False
+    """Keep absolute paths out of the run's files (docs/security.md 4); eval and others then need --data."""
 
     def run(self) -> None:
         """Import and print the run folder."""
@@ -39,5 +41,6 @@ class Import:
             data_format=self.format,
             device=self.device,
             overwrite=self.overwrite,
+            anonymous=self.anonymous,
         )
         print(run.path)

@@ -46,6 +46,8 @@ class Reconstruct:
     (docs/reconstruct.md)."""
     overwrite: bool = False
     """Repeat the stages that were made with other options, and what follows them."""
+    anonymous: bool = False
+    """Keep absolute paths out of what is written (docs/security.md 4)."""
 
     def run(self) -> None:
         """Run the stages that are not done, and print what there is."""
@@ -73,6 +75,7 @@ class Reconstruct:
             mask=self.mask,
             device=self.device,
             overwrite=self.overwrite,
+            anonymous=self.anonymous,
         )
         for name, stage in record.stages.items():
             print(f"{name}: {stage.summary}")

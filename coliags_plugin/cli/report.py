@@ -43,6 +43,8 @@ class Report:
     """Heading; default: methods and scenes."""
     note: OptionalText = None
     """A remark shown at the top."""
+    anonymous: bool = False
+    """Leave out absolute paths that results hold (docs/security.md 4)."""
     scene: OptionalPath = None
     """Run folder whose scene the HTML page lets its reader fly through, offline; needs the extra `viewer`."""
 
@@ -64,6 +66,7 @@ class Report:
             title=self.title,
             note=self.note,
             scene=self.scene,
+            anonymous=self.anonymous,
         )
         for file in files:
             print(file.resolve())

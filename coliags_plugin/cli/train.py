@@ -37,6 +37,8 @@ class Train:
     """Continue from the run's latest checkpoint (without --output: the newest run of this method on this scene)."""
     overwrite: bool = False
     """Replace an existing run folder."""
+    anonymous: bool = False
+    """Keep absolute paths out of the run's files (docs/security.md 4); eval and others then need --data."""
 
     def run(self) -> None:
         """Train and print the run folder."""
@@ -55,5 +57,6 @@ class Train:
             device=self.device,
             resume=self.resume,
             overwrite=self.overwrite,
+            anonymous=self.anonymous,
         )
         print(run.path)

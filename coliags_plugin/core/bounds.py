@@ -7,6 +7,8 @@ from __future__ import annotations
 LENGTH = 1e6
 #: Of a focal length or a principal point, pixels: a hundred times that of a telephoto lens on the largest images.
 PIXELS = 1e7
+#: Of the tangent of the angle between a pinhole's axis and a pixel's ray: 89.4 degrees. Pinholes have less than 10.
+SLOPE = 100.0
 #: Of the width and height of an image, pixels; OpenCV's remapping takes no more than 32767.
 IMAGE_SIDE = 32767
 #: Of the pixels of an image: an 8-bit RGB image has 300 MB then.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -40,14 +41,20 @@ class Intrinsics:
         """
         numbers = (self.fx, self.fy, self.cx, self.cy)
         good = all(abs(number) <= bounds.PIXELS for number in numbers)  # NaN is not
-        good = good and min(self.fx, self.fy) >= 1.0 / bounds.PIXELS
+        good = good and min(self.fx, self.fy) > 0.0 and self._slope <= bounds.SLOPE
         if not good or not all(0 < side <= bounds.IMAGE_SIDE for side in (self.width, self.height)):
             raise InputError(
                 f"intrinsics fx {self.fx:g}, fy {self.fy:g}, cx {self.cx:g}, cy {self.cy:g} "
                 f"of an image {self.width} x {self.height}",
                 f"numbers in pixels up to {bounds.PIXELS:g}, focal lengths and size positive, size up to "
-                f"{bounds.IMAGE_SIDE}",
+                f"{bounds.IMAGE_SIDE}, rays within {math.degrees(math.atan(bounds.SLOPE)):.1f} degrees of the axis",
             )
+
+    @property
+    def _slope(self) -> float:
+        """Largest tangent of the angle between the axis and a ray, along x or y."""
+        across = max(abs(self.cx), abs(self.width - self.cx)) / self.fx
+        return max(across, max(abs(self.cy), abs(self.height - self.cy)) / self.fy)
 
     def resized(self, width: int, height: int) -> Self:
         """The same view sampled at another size, pixels; the image's edges stay where they are."""

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from coliags_plugin.core.anonymity import without_places
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.data_check import findings as suspect
@@ -53,6 +54,10 @@ class SceneCheck:
     matches: dict[str, EpipolarAgreement]
     findings: list[Finding]
     undecided: list[Finding]
+
+    def anonymous(self) -> SceneCheck:
+        """The same without absolute paths."""
+        return replace(self, scene=replace(self.scene, provenance=without_places(self.scene.provenance)))
 
     def as_json(self) -> dict[str, Any]:
         """The same as JSON values; unavailable ones are null."""

@@ -54,6 +54,10 @@ class SceneSettings(Settings):
     )
     points_count: int = Field(200_000, ge=1, description="Largest number of initial points, sampled at random.")
     seed: int = Field(0, ge=0, description="Seed of the sampling of initial points.")
+    outside_files: bool = Field(
+        False,
+        description="Whether files of the scene may name others outside of its folder, by absolute paths or '..'.",
+    )
     keep_pixels: bool = Field(
         True,
         description="Whether to cache images in memory in the stored data type; otherwise they are read from disk at "

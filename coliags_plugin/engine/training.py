@@ -5,12 +5,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 
 from coliags_plugin.config.method_config import LoadedMethod
+from coliags_plugin.core.anonymity import without_places
 from coliags_plugin.engine.data_formats import load_method_for, load_scene
 from coliags_plugin.engine.resuming import resumed_method, resumed_seed
 from coliags_plugin.engine.run_folder import RunFolder
@@ -29,6 +30,7 @@ class TrainingRequest:
         overrides: ``key.path=value`` assignments.
         seed: Of all random generators; None: 0, or that of the resumed run.
         data_format: Name of a data manager; None: the method's, or the one that recognises the folder.
+        anonymous: Keep absolute paths out of the run, so that ``--data`` has to name the scene afterwards.
     """
 
     method: str
@@ -36,6 +38,7 @@ class TrainingRequest:
     overrides: Sequence[str] = ()
     seed: int | None = None
     data_format: str | None = None
+    anonymous: bool = False
 
 
 @contextmanager
@@ -86,6 +89,9 @@ def _trainer(
     loaded: LoadedMethod, request: TrainingRequest, folder: RunFolder, seed: int, device: torch.device
 ) -> Trainer:
     data = request.data
-    trainer = Trainer(loaded, load_scene(loaded.config, data), str(data.resolve()), folder, seed, device)
+    scene, path = load_scene(loaded.config, data), str(data.resolve())
+    if request.anonymous:
+        scene, path = replace(scene, provenance=without_places(scene.provenance)), scene.name
+    trainer = Trainer(loaded, scene, path, folder, seed, device)
     log.info("renderer %s: %s", trainer.chosen.name, trainer.chosen.reason)
     return trainer

@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 
 from coliags_plugin.contracts import Schedule
+from coliags_plugin.core.anonymity import without_places
 from coliags_plugin.core.files import atomic_folder
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.checkpoints import save_checkpoint
@@ -37,6 +38,7 @@ def import_run(
     device: torch.device,
     data_format: str | None = None,
     overwrite: bool = False,
+    anonymous: bool = False,
 ) -> None:
     """Make a run of a file of Gaussians: a run folder at step 0, to evaluate, render and report like any other.
 
@@ -47,6 +49,7 @@ def import_run(
         device: What the run is recorded to compute on.
         data_format: Name of a data manager; None: the one that recognises the folder.
         overwrite: Replace an existing run folder.
+        anonymous: Keep absolute paths out of the run.
 
     Raises:
         InputError: The file or the scene cannot be read, or the folder exists or cannot be written.
@@ -69,6 +72,8 @@ def import_run(
         **run_provenance(method, scene, str(data.resolve()), 0, device, chosen, model),
         "imported": {"file": str(file.resolve()), "gaussians": len(cloud), "sh_degree": cloud.degree},
     }
+    if anonymous:
+        provenance = without_places(provenance)
     with atomic_folder(output.path, overwrite=True) as scratch:
         run = RunFolder(scratch)
         run.rewrite(config.to_yaml(), provenance)

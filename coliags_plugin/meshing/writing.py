@@ -148,6 +148,12 @@ def _summary(
         "triangles": len(mesh),
         "area": float(mesh.areas.sum()),
         "bounds": [mesh.vertices.min(axis=0).tolist(), mesh.vertices.max(axis=0).tolist()],
-        "truth": None if truth is None else str(truth.path),
+        "truth": None if truth is None else _place_of(truth.path, scene),
         "comparison": None if compared is None else compared.as_json(),
     }
+
+
+def _place_of(path: Path, scene: Scene) -> str:
+    """The path of a file in the scene's folder, or the name of another."""
+    folder, file = Path(scene.provenance.get("path", "")).resolve(), path.resolve()
+    return file.relative_to(folder).as_posix() if file.is_relative_to(folder) else file.name

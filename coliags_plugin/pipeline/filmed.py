@@ -69,6 +69,8 @@ def check_data(place: Workplace) -> Outcome:
     check = check_scene(
         scene, place.progress, (lambda: place.open_posed(stored_size=True)) if scene.is_resized else None
     )
+    if place.anonymous:
+        check = check.anonymous()
     write_check_page(check, place.out / "check.html")
     write_json(place.out / "check.json", check.as_json())
     for finding in check.findings:

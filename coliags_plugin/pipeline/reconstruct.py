@@ -35,6 +35,7 @@ def reconstruct(
     mask: Path | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
+    anonymous: bool = False,
 ) -> Record:
     """Reconstruct a video, or go on with what was begun.
 
@@ -46,6 +47,7 @@ def reconstruct(
         mask: Image of the frames' size, black where pixels are ignored; None: black surroundings are found.
         overwrite: Repeat stages that were made with other settings, and what follows them.
         progress: Progress callback.
+        anonymous: Keep absolute paths out of what is written.
 
     Returns:
         The record of what was made.
@@ -66,7 +68,7 @@ def reconstruct(
     else:
         _refuse_unused(source, settings, mask)
     Record.of(out)  # refuses another folder before anything is written
-    place = Workplace(out, source, settings, mask, data_format, device, progress)
+    place = Workplace(out, source, settings, mask, data_format, device, progress, anonymous)
     stages = stages_of(place)
     try:
         with locked(out / LOCK_FILE):

@@ -35,9 +35,8 @@ def train(place: Workplace) -> Outcome:
     settings = place.settings
     steps = f"schedule.steps={settings.steps}"
     options = [*training_options(place.open_posed()), steps]
-    request = TrainingRequest(
-        method_for(place), place.scene, options, settings.seed, None if place.estimates_depth else place.data_format
-    )
+    data_format = None if place.estimates_depth else place.data_format
+    request = TrainingRequest(method_for(place), place.scene, options, settings.seed, data_format, place.anonymous)
     folder = RunFolder(place.run)
     begun = folder.config_file.is_file()
     with (resume_training if begun else start_training)(request, folder, place.device) as trainer:

@@ -28,6 +28,7 @@ class Workplace:
         data_format: Of a source that is a scene; None: it is none.
         device: Where to compute.
         progress: Progress callback.
+        anonymous: Keep absolute paths out of what is written.
     """
 
     out: Path
@@ -37,6 +38,7 @@ class Workplace:
     data_format: str | None
     device: torch.device
     progress: Progress | None = None
+    anonymous: bool = False
 
     @property
     def frames(self) -> Path:

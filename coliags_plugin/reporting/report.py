@@ -33,6 +33,7 @@ def write_report(
     frames: int = 4,
     methods: Sequence[str] = (),
     scene: str = "",
+    anonymous: bool = False,
 ) -> list[Path]:
     """Write a report of methods on scenes: metrics and statistics, views, errors, curves, costs and provenance.
 
@@ -44,6 +45,7 @@ def write_report(
         protocol: Name of the evaluation to read from folders.
         frames: Held-out views to show per scene and test set, beside the worst ones.
         methods: Names of methods to show, in this order; empty: all.
+        anonymous: Leave out absolute paths that results hold.
         scene: Section with a scene, of the HTML page alone (:mod:`coliags_plugin.reporting.scene_section`).
 
     Returns:
@@ -60,6 +62,8 @@ def write_report(
     for file in files.values():
         refuse_folder(file)
     study = read_study(paths, protocol, methods)
+    if anonymous:
+        study = study.anonymous()
     content = make_content(study, choices)
     views = Views(study, content.reference, frames) if "html" in files else None
     for each, file in files.items():

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+from coliags_plugin.core.anonymity import without_places
 from coliags_plugin.results.record import MAIN_SET, SEEN_SUFFIX, MetricRecord, ProtocolRecord, Result, SetRecord
 
 
@@ -35,6 +36,11 @@ class Cell:
     def evaluation(self) -> Path | None:
         """Folder of its images."""
         return None if self.run is None else self.run / "eval" / self.result.evaluation_name
+
+
+def _without_places(result: Result) -> Result:
+    kept = {name: without_places(getattr(result, name)) for name in ("config", "software", "provenance")}
+    return result.model_copy(update=kept)
 
 
 @dataclass(frozen=True)
@@ -70,6 +76,11 @@ class Study:
 
     cells: tuple[Cell, ...]
     failures: tuple[Failure, ...] = ()
+
+    def anonymous(self) -> Study:
+        """The same without absolute paths."""
+        cells = tuple(replace(cell, result=_without_places(cell.result)) for cell in self.cells)
+        return Study(cells, tuple(replace(one, reason=without_places(one.reason)) for one in self.failures))
 
     @cached_property
     def by_method(self) -> dict[str, list[Cell]]:

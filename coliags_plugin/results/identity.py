@@ -11,6 +11,8 @@ from pydantic_core import to_json
 
 #: Keys of a method config that do not change a trained model; the protocol has a place of its own in a result's key.
 _IGNORED = ("description", "protocol")
+#: Likewise of its data manager: what it allows to be read.
+_IGNORED_OF_DATA = ("outside_files",)
 #: Likewise of its schedule.
 _IGNORED_OF_SCHEDULE = ("log_every", "checkpoint_every")
 
@@ -31,6 +33,9 @@ def training_key(config: Mapping[str, Any], fingerprint: str, seed: int, package
         package_version: Of this package.
     """
     relevant = {name: value for name, value in plain_config(config).items() if name not in _IGNORED}
+    data = relevant.get("datamanager")
+    if isinstance(data, Mapping):
+        relevant["datamanager"] = {name: value for name, value in data.items() if name not in _IGNORED_OF_DATA}
     schedule = relevant.get("schedule")
     if isinstance(schedule, Mapping):
         relevant["schedule"] = {name: value for name, value in schedule.items() if name not in _IGNORED_OF_SCHEDULE}

@@ -33,11 +33,14 @@ class CheckDepth:
     """Also write the results as JSON."""
     maps: OptionalPath = None
     """Also write maps of the error, PNG, to this folder, which must be new or empty."""
+    anonymous: bool = False
+    """Keep absolute paths out of the JSON (docs/security.md 4)."""
     set: Assignments = ()
     """An option of both data managers, for instance max_frames=20."""
 
     def run(self) -> None:
         """Compare, and print the results."""
+        from coliags_plugin.core.anonymity import without_places
         from coliags_plugin.core.files import write_json
         from coliags_plugin.depth_check.check import check_depth
         from coliags_plugin.depth_check.error_maps import write_error_maps
@@ -55,7 +58,8 @@ class CheckDepth:
             write_depth_page(check, self.html)
             print(self.html.resolve())
         if self.json is not None:
-            write_json(self.json, check.as_json())
+            found = check.as_json()
+            write_json(self.json, without_places(found) if self.anonymous else found)
         if self.maps is not None:
             write_error_maps(check, self.maps)
             print(self.maps.resolve())

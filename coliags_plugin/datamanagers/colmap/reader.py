@@ -17,6 +17,7 @@ from coliags_plugin.datamanagers.colmap.lens import PINHOLES, ColmapLens
 from coliags_plugin.datamanagers.lens_rectification import LensRectification, undistorter
 from coliags_plugin.datamanagers.reading.depth_arrays import depth_format
 from coliags_plugin.datamanagers.reading.image_names import first_few, short_names, unposed_images, warn_of_unposed
+from coliags_plugin.datamanagers.reading.named_files import named_file
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
 from coliags_plugin.datamanagers.rectification import Rectification
@@ -84,7 +85,7 @@ class ColmapDataManager(RecordedDataManager):
         if not path.is_dir():
             raise InputError(f"no folder {path}", "a folder with images/ and sparse/0", "Check the path")
         model = read_model(self._model_folder(path))
-        paths = _image_paths(path / settings.images_folder, model)
+        paths = _image_paths(path / settings.images_folder, model, settings.outside_files)
         masks = [sidecar_file(path / "masks", image.name, (".png",)) for image in model.images]
         depths = _depths(path / "depths", model)
         rectifications = self._rectifications(model)
@@ -195,12 +196,12 @@ def _first_of_each(numbers: np.ndarray) -> np.ndarray:
     return first
 
 
-def _image_paths(folder: Path, model: Model) -> list[Path]:
+def _image_paths(folder: Path, model: Model, outside: bool) -> list[Path]:
     if not folder.is_dir():
         raise InputError(
             f"no folder {folder}", "the images that the model was made from", "Set datamanager.images_folder"
         )
-    paths = [folder / image.name for image in model.images]
+    paths = [named_file(folder, image.name, str(model.folder), outside) for image in model.images]
     missing = [path for path in paths if not path.is_file()]
     if missing:
         named = first_few([path.name for path in missing])

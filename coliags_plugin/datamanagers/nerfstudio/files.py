@@ -16,6 +16,7 @@ from coliags_plugin.core.json_files import read_json
 from coliags_plugin.datamanagers.nerfstudio.cameras import PixelCenters, camera_of, number
 from coliags_plugin.datamanagers.reading.image_names import first_few
 from coliags_plugin.datamanagers.reading.images import size_of
+from coliags_plugin.datamanagers.reading.named_files import named_file
 from coliags_plugin.lenses.models import Lens
 
 FILE = "transforms.json"
@@ -39,13 +40,14 @@ class Transforms:
 
     Args:
         path: The file; its poses have been read before, so that its structure is valid.
+        outside: Whether it may name files outside of its folder.
 
     Raises:
         InputError: The file cannot be read.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, outside: bool = False) -> None:
+        self.path, self._outside = path, outside
         self.content: dict[str, Any] = read_json(path, "a transforms.json")
         self.frames: dict[str, dict[str, Any]] = {frame["file_path"]: frame for frame in self.content["frames"]}
 
@@ -90,7 +92,7 @@ class Transforms:
         name = self.content.get("ply_file_path")
         if name is None:
             return None
-        path = self.path.parent / str(name)
+        path = self._named(str(name))
         if not path.is_file():
             raise InputError(f"{self.path}: no file {path}", "the point cloud of ply_file_path", "Restore or remove it")
         return path
@@ -145,7 +147,7 @@ class Transforms:
         folder = self.path.parent
         found: list[Path | None] = []
         for name in names:
-            candidates = (folder / name, *(folder / f"{name}{suffix}" for suffix in _IMAGE_SUFFIXES))
+            candidates = [self._named(f"{name}{suffix}") for suffix in ("", *_IMAGE_SUFFIXES)]
             found.append(next((path for path in candidates if path.is_file()), None))
         missing = [name for name, path in zip(names, found, strict=True) if path is None]
         if missing:
@@ -155,6 +157,9 @@ class Transforms:
                 "Restore them, or remove their frames",
             )
         return cast(list[Path], found)
+
+    def _named(self, name: str) -> Path:
+        return named_file(self.path.parent, name, str(self.path), self._outside)
 
     def _for_all_or_none(self, names: Sequence[str], key: str, what: str) -> list[Path | None]:
         files = [self._file(name, key) for name in names]
@@ -171,7 +176,7 @@ class Transforms:
         value = self.frames[name].get(key)
         if value is None:
             return None
-        path = self.path.parent / str(value)
+        path = self._named(str(value))
         if not path.is_file():
             raise InputError(f"{self.path}, frame {name}: no file {path}", f"the file of {key}", "Restore it")
         return path

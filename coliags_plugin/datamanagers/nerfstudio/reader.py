@@ -73,7 +73,7 @@ class NerfstudioDataManager(RecordedDataManager):
         if not file.is_file():
             raise InputError(f"no file {file}", "a folder with a transforms.json", "Check the path")
         trajectory = nerfstudio_poses.read(file)
-        transforms, names = Transforms(file), trajectory.names_or_numbers()
+        transforms, names = Transforms(file, settings.outside_files), trajectory.names_or_numbers()
         entries = transforms.entries(names, settings.pixel_centers)
         camera_to_world = trajectory.camera_to_world.copy()
         camera_to_world[:, :3, 3] *= settings.scale

@@ -17,6 +17,7 @@ from coliags_plugin.core.json_files import read_json
 from coliags_plugin.datamanagers.reading.depth_formats import DepthFormat
 from coliags_plugin.datamanagers.reading.frame_files import inventory
 from coliags_plugin.datamanagers.reading.images import read_gray
+from coliags_plugin.datamanagers.reading.named_files import named_file
 from coliags_plugin.lenses.models import FisheyeLens, Lens
 from coliags_plugin.poses.rigid import FLIP_Y_AND_Z, check_rigid
 from coliags_plugin.poses.trajectory import natural_order, refuse_repeated
@@ -130,8 +131,12 @@ def recognise(folder: Path) -> str | None:
     return None if beside is None else f"transforms_train.json beside {beside}"
 
 
-def read_sequence(folder: Path) -> Sequence:
+def read_sequence(folder: Path, outside: bool = False) -> Sequence:
     """Read and combine the JSON files of a folder.
+
+    Args:
+        folder: Of the scene.
+        outside: Whether files may be named outside of it.
 
     Raises:
         InputError: The folder or ``transforms_train.json`` is missing; a file is invalid (the message names the frame);
@@ -153,7 +158,7 @@ def read_sequence(folder: Path) -> Sequence:
     named: dict[str, list[str]] = {}
     for part, content in contents.items():
         named[part] = []
-        for name, frame in _frames(folder, files[part], content, scale, shift):
+        for name, frame in _frames(folder, files[part], content, scale, shift, outside):
             known = found.setdefault(name, frame)
             if known.distances != frame.distances or not np.allclose(
                 known.camera_to_world, frame.camera_to_world, atol=1e-4
@@ -227,7 +232,7 @@ def _normalisation(file: Path, content: Mapping[str, Any]) -> tuple[float, Float
 
 
 def _frames(
-    folder: Path, file: Path, content: Mapping[str, Any], scale: float, shift: Float[np.ndarray, "3"]
+    folder: Path, file: Path, content: Mapping[str, Any], scale: float, shift: Float[np.ndarray, "3"], outside: bool
 ) -> list[tuple[str, FrameEntry]]:
     result, names, matrices = [], [], []
     for index, frame in enumerate(content["frames"]):
@@ -249,7 +254,8 @@ def _frames(
         camera_to_world = matrix @ FLIP_Y_AND_Z
         camera_to_world[:3, 3] = camera_to_world[:3, 3] / scale - shift
         distances = frame.get("distmap_path")
-        named = [folder / name, *([folder / distances] if isinstance(distances, str) else [])]
+        texts = [name, *([distances] if isinstance(distances, str) else [])]
+        named = [named_file(folder, text, str(file), outside) for text in texts]
         paths = [_stored(path) for path in named]
         for path, found in zip(named, paths, strict=True):
             if not found.is_file():

@@ -53,7 +53,7 @@ class ReimNerfDataManager(RecordedDataManager):
     def open(self, path: Path) -> Recording:
         """See :class:`RecordedDataManager`."""
         settings = self.settings
-        sequence = read_sequence(path)
+        sequence = read_sequence(path, self.settings.outside_files)
         if settings.split == "own" and "true_test" not in sequence.parts:
             raise InputError(
                 f"{path} has no transforms_true_test.json",

@@ -1,0 +1,301 @@
+"""Every command that writes, at a size at which it takes a second, and whether what it wrote is whole."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+#: Exit status that stands for an exception that no message was made of.
+TRACEBACK = 99
+_TEXTS = frozenset({".json", ".jsonl", ".html", ".yaml", ".csv", ".md", ".log"})
+
+
+@dataclass(frozen=True)
+class Writer:
+    """A command that writes.
+
+    Attributes:
+        argv: Its words, of the folder of inputs and the folder to write to.
+        again: Words that it needs to replace what is there, or to go on.
+        prepare: Puts something into the folder before, from the inputs.
+        goes_on: Whether it is done in steps of which each is kept, so that a repetition goes on.
+        within: Where in that folder it writes.
+    """
+
+    argv: Callable[[Path, Path], Sequence[object]]
+    again: tuple[str, ...] = ("--overwrite",)
+    prepare: Callable[[Path, Path], object] | None = None
+    goes_on: bool = False
+    within: str = "."
+
+    def words(self, inputs: Path, place: Path, repeated: bool) -> list[str]:
+        """The command line; with options of repeating where something is there."""
+        return [str(word) for word in (*self.argv(inputs, place), *(self.again if repeated else ()))]
+
+
+def _settings(*pairs: str) -> tuple[str, ...]:
+    return tuple(word for pair in pairs for word in ("--set", pair))
+
+
+_PHANTOM = ("--frames", 9, "--size", "64x52", "--rotation-views", 0)
+_COARSE = _settings("mesh_spacing=3", "texture_spacing=1", "interreflection=0", "supersampling=1")
+_SMALL = _settings(
+    *("datamanager.points_count=500", "field.features=8", "field.children=4", "field.voxel_size=4"),
+    *("schedule.log_every=1", "schedule.checkpoint_every=1", "strategy.statistics_from=0", "strategy.growth_from=2"),
+    *("strategy.every=3", "strategy.gradient_threshold=1e-6", "strategy.pixels_per_birth=100"),
+)
+
+
+def _run(inputs: Path, place: Path) -> None:
+    shutil.copytree(inputs / "run", place / "run")
+
+
+WRITERS: dict[str, Writer] = {
+    "phantom": Writer(lambda i, o: ("phantom", o / "phantom", *_PHANTOM, *_COARSE)),
+    "train": Writer(
+        lambda i, o: ("train", "coliags", "--data", i / "scene", "--output", o / "run", "--steps", 3, *_SMALL),
+        again=("--resume",),
+        goes_on=True,
+    ),
+    "import": Writer(lambda i, o: ("import", i / "cloud.ply", "--data", i / "scene", "--output", o / "run")),
+    "eval": Writer(lambda i, o: ("eval", o / "run"), again=(), prepare=_run, within="run/eval"),
+    "render": Writer(lambda i, o: ("render", i / "run", "--output", o / "renders")),
+    "mesh": Writer(
+        lambda i, o: (
+            "mesh",
+            i / "run",
+            "--out",
+            o / "mesh",
+            *_settings("voxel_size=4", "min_views=1", "min_alpha=0.001"),
+        )
+    ),
+    "coverage": Writer(lambda i, o: ("coverage", i / "run", "--mesh", i / "mesh.ply", "--out", o / "coverage")),
+    "export": Writer(lambda i, o: ("export", i / "run", "--output", o / "cloud.ply")),
+    "view --save": Writer(lambda i, o: ("view", i / "run", "--save", o / "view.html"), again=()),
+    "report": Writer(lambda i, o: ("report", i / "run", "--output", o / "report.html", "--format", "all"), again=()),
+    "results export": Writer(lambda i, o: ("results", "export", i / "run", "--output", o / "table.csv"), again=()),
+    "results export (nerfbaselines)": Writer(
+        lambda i, o: ("results", "export", i / "run", "--output", o / "table", "--format", "nerfbaselines"), again=()
+    ),
+    "compare": Writer(
+        lambda i, o: (
+            *("compare", "coliags", "--scenes", i / "scene", "--output", o / "comparison", "--steps", 3, *_SMALL),
+        ),
+        again=(),
+        goes_on=True,
+    ),
+    "poses convert (TUM)": Writer(lambda i, o: ("poses", "convert", i / "poses.txt", o / "poses.txt", "--to", "tum")),
+    "poses convert (COLMAP)": Writer(
+        lambda i, o: ("poses", "convert", i / "poses.json", o / "model", "--to", "colmap")
+    ),
+    "poses align": Writer(
+        lambda i, o: (
+            *("poses", "align", i / "poses.txt", i / "poses.json", "--match", "index"),
+            *("--json", o / "errors.json", "--plot", o / "errors.png"),
+        ),
+    ),
+    "poses triangulate": Writer(lambda i, o: ("poses", "triangulate", i / "tube", "--out", o / "tube")),
+    "poses track": Writer(
+        lambda i, o: (
+            *("poses", "track", i / "unposed", "--out", o / "tracked"),
+            *_settings("tracking.method=hybrid", "tracking.pose_graph=false"),
+        ),
+    ),
+    "poses sfm": Writer(
+        lambda i, o: (
+            *("poses", "sfm", i / "unposed/rgb", "--out", o / "found"),
+            *("--camera", "PINHOLE", "--params", (i / "params.txt").read_text()),
+        ),
+    ),
+    "depth estimate": Writer(
+        lambda i, o: ("depth", "estimate", i / "tube", "--out", o / "depth", "--jobs", 1), goes_on=True
+    ),
+    "depth check": Writer(
+        lambda i, o: (
+            *("depth", "check", i / "scene", i / "scene", "--html", o / "depth.html", "--json", o / "depth.json"),
+        ),
+        again=(),
+    ),
+    "data check": Writer(
+        lambda i, o: ("data", "check", i / "scene", "--html", o / "data.html", "--json", o / "data.json"), again=()
+    ),
+    "reconstruct": Writer(
+        lambda i, o: (
+            *("reconstruct", i / "scene", "--out", o / "reconstructed", "--steps", 3),
+            *_settings("mesh.voxel_size=4"),
+        ),
+        again=(),
+        goes_on=True,
+    ),
+}
+
+
+def make_inputs(folder: Path) -> None:
+    """Make what the commands read."""
+    import torch
+
+    from coliags_plugin.datamanagers.rgbd.writer import write_rgbd_scene
+    from coliags_plugin.splats.files import write_splats
+    from tests.splats.clouds import random_cloud
+    from tests.textured_tube import INTRINSICS, tube_frames, write_tube
+
+    folder.mkdir(parents=True)
+    _done("phantom", folder / "scene", *_PHANTOM, *_COARSE)
+    _done("train", "coliags", "--data", folder / "scene", "--output", folder / "run", "--steps", 3, *_SMALL)
+    _done("eval", folder / "run")
+    shutil.copy(folder / "scene/truth/mesh.ply", folder / "mesh.ply")
+    shutil.copy(folder / "scene/camera_pose.txt", folder / "poses.txt")
+    _done(
+        "poses",
+        "convert",
+        folder / "poses.txt",
+        folder / "poses.json",
+        "--to",
+        "nerfstudio",
+        "--intrinsics",
+        "50,50,32,26",
+        "--size",
+        "64x52",
+    )
+    write_splats(folder / "cloud.ply", random_cloud(20, degree=0), "ply")
+    write_tube(folder / "tube", 9)
+    frames = tube_frames(6, step=0.5)
+    poses = torch.stack([frame.camera.camera_to_world for frame in frames]).numpy()
+    write_rgbd_scene(folder / "unposed", frames, poses)
+    (folder / "unposed/trajectory.txt").unlink()
+    (folder / "params.txt").write_text(",".join(map(str, INTRINSICS)))
+
+
+def _done(*words: object) -> None:
+    status = in_child(lambda: command([str(word) for word in words]))
+    if status not in (0, 1):
+        raise RuntimeError(f"{' '.join(map(str, words))} ended with {status}")
+
+
+def command(words: Sequence[str]) -> int:
+    """Exit status of a command in this process."""
+    from coliags_plugin.cli import main
+
+    try:
+        main(words)
+    except SystemExit as stopped:
+        return int(stopped.code or 0)
+    except BaseException:
+        traceback.print_exc()
+        return TRACEBACK
+    return 0
+
+
+def start(work: Callable[[], int], messages: Path | None = None) -> int:
+    """Do something in a process forked from this one, which is warm; returns its number."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    pid = os.fork()
+    if pid:
+        return pid
+    status = TRACEBACK
+    try:
+        os.setsid()
+        target = os.open(messages or os.devnull, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o600)
+        for stream in (1, 2):
+            os.dup2(target, stream)
+        import torch
+
+        torch.set_num_threads(1)
+        status = work()
+        sys.stdout.flush()
+        sys.stderr.flush()
+    finally:
+        os._exit(status)
+
+
+def in_child(work: Callable[[], int], messages: Path | None = None) -> int:
+    """Exit status of something done in a forked process."""
+    return os.waitstatus_to_exitcode(os.waitpid(start(work, messages), 0)[1])
+
+
+def warm_up() -> None:
+    """Import what the commands import, and start no thread."""
+    import cv2
+    import open3d
+    import pycolmap
+    import torch
+
+    import coliags_plugin.cli
+    from coliags_plugin.config import registry
+
+    for component in registry.datamanagers:
+        registry.datamanagers.get(component)
+    assert cv2 and open3d and pycolmap and torch and coliags_plugin.cli
+
+
+def contents(place: Path) -> dict[str, bytes]:
+    """Every file at its final place by name: not those of locks, nor unfinished work."""
+    found = {}
+    for path in sorted(place.rglob("*")):
+        name = path.relative_to(place)
+        if path.is_file() and not any(part.startswith(".") for part in name.parts):
+            found[str(name)] = path.read_bytes()
+    return found
+
+
+def scratch(place: Path) -> list[str]:
+    """What is being written, or was when its process ended."""
+    return [str(path.relative_to(place)) for path in place.rglob(".*") if path.suffix in (".partial", ".replaced")]
+
+
+def is_whole(name: str, data: bytes, reference: bytes | None) -> bool:
+    """Whether a file is one that the command wrote to the end, as it wrote the reference."""
+    suffix = Path(name).suffix
+    if suffix == ".json":
+        try:
+            json.loads(data)
+        except ValueError:
+            return False
+        return True
+    if suffix == ".html":
+        return data.rstrip().endswith(b"</html>")
+    if suffix in _TEXTS or reference is None or name.endswith("SHA256SUMS") or suffix == ".safetensors":
+        return data.endswith(b"\n") or suffix in (".safetensors", ".log", "") or not data
+    if suffix in (".npz", ".npy", ".db"):
+        return len(data) > 0
+    return data == reference
+
+
+def units(found: dict[str, bytes]) -> set[str]:
+    """What is replaced as one: files and folders at the top."""
+    return {name.split("/")[0] for name in found}
+
+
+def judge(found: dict[str, bytes], old: dict[str, bytes], new: dict[str, bytes]) -> str:
+    """``old``, ``new`` or what is wrong: every unit must be exactly as before, or whole as it is to be."""
+    states = set()
+    for unit in sorted(units(old) | units(new) | units(found)):
+        parts = [{n: d for n, d in some.items() if n.split("/")[0] == unit} for some in (found, old, new)]
+        now, before, after = parts
+        if now == before:
+            states.add("old")
+        elif now.keys() == after.keys() and all(is_whole(name, now[name], after[name]) for name in now):
+            states.add("new")
+        else:
+            broken = [name for name in now if name in after and not is_whole(name, now[name], after[name])]
+            return (
+                f"{unit}: missing {sorted(after.keys() - now.keys())[:3]}, "
+                f"extra {sorted(now.keys() - after.keys())[:3]}, broken {broken[:3]}"
+            )
+    return "new" if states == {"new"} else "old" if states <= {"old"} else "old and new"
+
+
+def mark_old(place: Path) -> dict[str, bytes]:
+    """Make what is there tell itself from what will replace it; its new content."""
+    for unit in sorted(units(contents(place))):
+        path = place / unit
+        last = path if path.is_file() else max(found for found in path.rglob("*") if found.is_file())
+        last.write_bytes(last.read_bytes() + b"\n# old\n")
+    return contents(place)
