@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import resource
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from coliags_plugin.core.files import atomic_folder
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.datamanagers.rotatecolon.writer import write_view
 from coliags_plugin.engine.checkpoints import save_tensors
+from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.outputs.video import write_video
 from coliags_plugin.poses import colmap
 from coliags_plugin.poses.trajectory import Trajectory
@@ -88,3 +90,18 @@ def test_what_was_there_stays_until_all_fits(tmp_path, write):
         assert found() == new
     assert refused >= 3
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
+def test_the_training_log_on_a_full_disk_is_a_message(tmp_path):
+    run = RunFolder(tmp_path)
+    run.log_file.symlink_to("/dev/full")
+    with pytest.raises(InputError, match="No space left"), run.log_writer() as append:
+        append({"step": 1})
+
+
+def test_a_training_log_that_is_no_file_is_a_message(tmp_path):
+    run = RunFolder(tmp_path)
+    run.log_file.symlink_to("metrics.jsonl")
+    with pytest.raises(InputError, match="cannot write"), run.log_writer():
+        pass

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any
 
 from coliags_plugin.config.method_config import LoadedMethod, load_method
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import atomic_folder, atomic_write, write_json
+from coliags_plugin.core.files import atomic_folder, atomic_write, not_writable, write_json
 from coliags_plugin.core.locks import LockedError, locked
 from coliags_plugin.results.record import TRUTH_SUFFIX
 
@@ -205,6 +205,32 @@ class RunFolder:
             )
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise InputError(f"{self.provenance_file} lacks {error}", "what `coliags train` wrote") from error
+
+    @contextmanager
+    def log_writer(self) -> Iterator[Callable[[Mapping[str, Any]], None]]:
+        """What appends rows to the training log.
+
+        Raises:
+            InputError: It cannot be written.
+        """
+        try:
+            file = self.log_file.open("a", encoding="utf-8")
+        except OSError as error:
+            raise not_writable(self.path, error) from error
+
+        def append(row: Mapping[str, Any]) -> None:
+            text = json.dumps(row, allow_nan=False) + "\n"
+            try:
+                file.write(text)
+                file.flush()
+            except OSError as error:
+                raise not_writable(self.path, error) from error
+
+        try:
+            yield append
+        finally:
+            with suppress(OSError):  # of what could not be flushed, which was reported
+                file.close()
 
     def log_rows(self, until: float = math.inf) -> list[dict[str, Any]]:
         """Rows of the training log up to a step, without lines that a kill cut short; none without a log.

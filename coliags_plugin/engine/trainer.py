@@ -149,13 +149,12 @@ class Trainer:
             self.costs.running(),
             deferred_stop() as interrupted,
             ProgressReport(f"train {self.method.name}", self.steps, self.step) as progress,
-            self.run.log_file.open("a", encoding="utf-8") as log,
+            self.run.log_writer() as log,
         ):
             while self.step < self.steps:
                 row = self.take_step()
                 if self.step % schedule.log_every == 0 or self.step == self.steps:
-                    log.write(json.dumps({**row, "seconds": round(self.seconds, 3)}, allow_nan=False) + "\n")
-                    log.flush()
+                    log({**row, "seconds": round(self.seconds, 3)})
                 progress.update(self.step, f"loss {row['loss']:.4f}, {row['psnr']:.2f} dB")
                 stop = interrupted() or self.step == self.steps
                 late = time.monotonic() - saved >= save_seconds

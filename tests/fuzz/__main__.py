@@ -7,6 +7,7 @@ import sys
 import tempfile
 import time
 from contextlib import ExitStack
+from itertools import takewhile
 from pathlib import Path
 
 from tests.fuzz.campaign import FINE, Tally, cases, run_all, save, shortened
@@ -20,6 +21,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=1000, help="cases")
     parser.add_argument("--first", type=int, default=0, help="number of the first; the same numbers, the same cases")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after these, and say how many")
     parser.add_argument("--targets", nargs="*", default=[], choices=list(TARGETS), metavar="NAME", help="only these")
     parser.add_argument("--seeds", type=Path, help="folder to keep the seeds in, for the next time")
     parser.add_argument("--save", action="store_true", help="store what breaks in tests/fuzz/corpus")
@@ -29,9 +31,11 @@ def main() -> None:
         if not seeds.is_dir():
             make_seeds(seeds)
         began = time.monotonic()
-        tally = run_all(
-            seeds, cases(seeds, options.first, options.count, options.targets), options.jobs, _Teller(began).tell
+        until = began + 60.0 * options.minutes
+        chosen = takewhile(
+            lambda case: time.monotonic() < until, cases(seeds, options.first, options.count, options.targets)
         )
+        tally = run_all(seeds, chosen, options.jobs, _Teller(began).tell)
         print(tally.table(), flush=True)
         print(f"\n{tally.count:,} cases in {time.monotonic() - began:.0f} s")
         for kind, (case, found) in tally.broken.items():

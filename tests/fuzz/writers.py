@@ -10,6 +10,10 @@ import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from coliags_plugin.splats.cloud import SplatCloud
 
 #: Exit status that stands for an exception that no message was made of.
 TRACEBACK = 99
@@ -66,15 +70,7 @@ WRITERS: dict[str, Writer] = {
     "import": Writer(lambda i, o: ("import", i / "cloud.ply", "--data", i / "scene", "--output", o / "run")),
     "eval": Writer(lambda i, o: ("eval", o / "run"), again=(), prepare=_run, within="run/eval"),
     "render": Writer(lambda i, o: ("render", i / "run", "--output", o / "renders")),
-    "mesh": Writer(
-        lambda i, o: (
-            "mesh",
-            i / "run",
-            "--out",
-            o / "mesh",
-            *_settings("voxel_size=4", "min_views=1", "min_alpha=0.001"),
-        )
-    ),
+    "mesh": Writer(lambda i, o: ("mesh", i / "opaque", "--out", o / "mesh", *_settings("voxel_size=4", "min_views=1"))),
     "coverage": Writer(lambda i, o: ("coverage", i / "run", "--mesh", i / "mesh.ply", "--out", o / "coverage")),
     "export": Writer(lambda i, o: ("export", i / "run", "--output", o / "cloud.ply")),
     "view --save": Writer(lambda i, o: ("view", i / "run", "--save", o / "view.html"), again=()),
@@ -164,12 +160,32 @@ def make_inputs(folder: Path) -> None:
         "64x52",
     )
     write_splats(folder / "cloud.ply", random_cloud(20, degree=0), "ply")
+    write_splats(folder / "wall.ply", _wall(folder / "scene"), "ply")
+    _done("import", folder / "wall.ply", "--data", folder / "scene", "--output", folder / "opaque")
     write_tube(folder / "tube", 9)
     frames = tube_frames(6, step=0.5)
     poses = torch.stack([frame.camera.camera_to_world for frame in frames]).numpy()
     write_rgbd_scene(folder / "unposed", frames, poses)
     (folder / "unposed/trajectory.txt").unlink()
     (folder / "params.txt").write_text(",".join(map(str, INTRINSICS)))
+
+
+def _wall(scene: Path) -> SplatCloud:
+    """Opaque Gaussians on the wall of a scene, which can be meshed."""
+    import numpy as np
+
+    from coliags_plugin.api.scenes import load_scene
+    from coliags_plugin.splats.cloud import SplatCloud
+
+    means = load_scene(scene, settings={"points_count": 3000}).points.positions.numpy()
+    count = len(means)
+    return SplatCloud(
+        means=means,
+        quats_wxyz=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        scales=np.full((count, 3), 0.7, np.float32),
+        opacities=np.full(count, 0.99, np.float32),
+        harmonics=np.zeros((count, 1, 3), np.float32),
+    )
 
 
 def _done(*words: object) -> None:

@@ -123,7 +123,7 @@ def test_the_plan_gives_order_runs_and_what_is_not_finished(tmp_path):
         ("3dgs", 1, None),
     ]
     refuses([folder], "results of protocol paper only", protocol="authors-code")
-    damaged = {"{": "cannot be read", "[]": "holds a list", '{"cells": [{}]}': "a cell lacks 'scene'"}
+    damaged = {"{": "is not JSON", "[]": "holds a list", '{"cells": [{}]}': "a cell lacks 'scene'"}
     for content, match in damaged.items():
         (folder / "plan.json").write_text(content)
         refuses([folder], f"plan.json.*{match}")
@@ -174,7 +174,7 @@ def test_a_damaged_failure_is_refused_by_name(tmp_path):
     folder = write_comparison(tmp_path, [result_of("coliags")], [("cecum", "3dgs", 0, "")])
     (file,) = folder.glob("failures/*/*/*.json")
     file.write_text("{")
-    refuses([folder], f"{file.name} cannot be read")
+    refuses([folder], f"{file.name} is not JSON")
 
 
 def test_what_cannot_be_compared_is_refused(study_of):

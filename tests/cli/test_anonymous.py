@@ -1,0 +1,76 @@
+"""``--anonymous``: nothing that is written says where the data were."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from coliags_plugin.splats.files import write_splats
+from tests.commands import run
+from tests.scenes import SMALL, write_wall
+from tests.splats.clouds import random_cloud
+
+
+@pytest.fixture
+def scene(tmp_path):
+    return write_wall(tmp_path / "Jane Doe" / "scene")
+
+
+def telling(folder, *secrets):
+    """Files that hold one of some texts; locks, which name the process, are not passed on."""
+    files = [path for path in folder.rglob("*") if path.is_file() and not path.name.startswith(".")]
+    assert files
+    return [path for path in files for secret in secrets if secret.encode() in path.read_bytes()]
+
+
+def test_of_a_run_its_evaluation_and_a_report(tmp_path, scene, capsys):
+    small = [word for override in SMALL for word in ("--set", override)]
+    out = tmp_path / "out"
+    options = ("--steps", 2, "--renderer", "torch", *small)
+    assert run("train", "scaffold-gs", "--data", scene, "--output", out / "run", "--anonymous", *options) == 0
+    provenance = json.loads((out / "run/provenance.json").read_text())
+    assert provenance["scene"]["path"] == provenance["scene"]["provenance"]["path"] == "scene"
+    capsys.readouterr()
+    assert run("eval", out / "run") == 2
+    assert "scene" in capsys.readouterr().err
+    assert run("eval", out / "run", "--data", scene) == 0
+    assert run("report", out / "run", "--output", out / "report.html", "--anonymous") == 0
+    assert not telling(out, "Jane Doe", str(tmp_path))
+
+
+def test_of_an_imported_run(tmp_path, scene):
+    write_splats(tmp_path / "Jane Doe/cloud.ply", random_cloud(20, degree=0), "ply")
+    out = tmp_path / "out/run"
+    assert run("import", tmp_path / "Jane Doe/cloud.ply", "--data", scene, "--output", out, "--anonymous") == 0
+    assert json.loads((out / "provenance.json").read_text())["imported"]["file"] == "cloud.ply"
+    assert not telling(out, "Jane Doe", str(tmp_path))
+
+
+def test_of_checks(tmp_path, scene):
+    out = tmp_path / "out"
+    written = ("--html", out / "check.html", "--json", out / "check.json")
+    assert run("data", "check", scene, *written) in (0, 1)
+    assert telling(out, "Jane Doe")
+    assert run("data", "check", scene, *written, "--anonymous") in (0, 1)
+    written = ("--html", out / "depth.html", "--json", out / "depth.json")
+    assert run("depth", "check", scene, scene, *written, "--anonymous") == 0
+    assert not telling(out, "Jane Doe", str(tmp_path))
+
+
+def test_pictures_hold_nothing_but_pixels(tmp_path):
+    from coliags_plugin.outputs.image_files import write_depth_tiff, write_png
+
+    write_png(tmp_path / "a.png", np.zeros((4, 5, 3), np.uint8))
+    data, at, chunks = (tmp_path / "a.png").read_bytes(), 8, set()
+    while at < len(data):
+        chunks.add(data[at + 4 : at + 8])
+        at += 12 + int.from_bytes(data[at : at + 4], "big")
+    assert chunks == {b"IHDR", b"IDAT", b"IEND"}
+    write_depth_tiff(tmp_path / "a.tiff", np.ones((4, 5), np.float32))
+    import PIL.Image
+
+    texts = {270, 271, 272, 285, 305, 306, 315, 316, 33432, 34665, 34853}  # descriptions, makers, dates, names, places
+    with PIL.Image.open(tmp_path / "a.tiff") as image:
+        assert not texts & set(image.tag_v2)
