@@ -53,6 +53,11 @@ class Field(nn.Module, ABC):
         """Length of one unit of the field's own coordinates, scene units; 1 where it uses the scene's. []"""
         return 1.0
 
+    @property
+    def learned(self) -> dict[str, Any]:
+        """Learned numbers that have a meaning of their own, for the record of a run; default: none."""
+        return {}
+
     def before_step(self, step: int, schedule: Schedule) -> None:
         """Called before each training step, counted from 1, by fields that change over the run.
 

@@ -139,6 +139,11 @@ class AnchorField(GaussianField):
             **self.appearance_head.parameter_groups(),
         }
 
+    @property
+    def learned(self) -> dict[str, Any]:
+        """The numbers of the appearance head."""
+        return self.appearance_head.learned
+
     def child_positions(self) -> Float[Tensor, "M K 3"]:
         """Positions of all children (paper, Eq. 3), scene units. [M, K, 3]"""
         return self.anchors[:, None] + self.offsets * self.scalings[:, None, :3].exp()
@@ -186,12 +191,14 @@ class AnchorField(GaussianField):
         covariances = covariances.reshape(-1, 7).index_select(0, slots)
         scales = scalings.exp().index_select(0, parents)
         shifts = offsets.reshape(-1, 3).index_select(0, slots)
+        means = anchors.index_select(0, parents) + shifts * scales[:, :3]
+        drawn = colors.reshape(-1, 3).index_select(0, slots)
         return Gaussians(
-            means=anchors.index_select(0, parents) + shifts * scales[:, :3],
+            means=means,
             quats_wxyz=nn.functional.normalize(covariances[:, 3:], dim=1),
             scales=scales[:, 3:] * covariances[:, :3].sigmoid(),
             opacities=opacities.reshape(-1).index_select(0, slots),
-            colors=colors.reshape(-1, 3).index_select(0, slots),
+            colors=self.appearance_head.lit(drawn, means, camera, light),
             source_index=(visible.index_select(0, parents) - parents) * self.settings.children + slots,
             visible_sources=visible,
         )

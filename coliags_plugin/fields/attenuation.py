@@ -1,0 +1,127 @@
+"""Attenuation of the light by a law: a factor on the colours of any appearance head."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from coliags_plugin.config.components import AppearanceHeadNode
+from coliags_plugin.contracts import AppearanceHead
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.lamps import HeldLight
+from coliags_plugin.core.settings import Settings
+
+#: Largest distance of the lamp from the optical centre along each camera axis, scene units (mm).
+MAX_OFFSET = 20.0
+#: Smallest distance to the lamp, as a share of the reference distance, and smallest cosine that the law is computed at.
+_MIN_DISTANCE, _MIN_COSINE = 0.02, 0.05
+
+
+class AttenuatedAppearanceSettings(Settings):
+    """Options of the attenuation; the initial exponents are those of an inverse-square law at gamma 2.2."""
+
+    head: AppearanceHeadNode  # decoder of the colours that are attenuated
+    distance_exponent: float = -0.9  # initial a
+    cosine_exponent: float = 0.3  # initial b
+    channels: Literal[1, 3] = (
+        3  # exponents for each colour, or one pair for all: red falls off slower (docs/methods.md 3.7)
+    )
+
+
+class AttenuatedAppearanceHead(AppearanceHead):
+    """The colours of another head times (d / d_0)^a cos(theta)^b, a law of all Gaussians (docs/methods.md 3.7).
+
+    d is the distance of a Gaussian, not of its anchor, to a lamp whose offset from the optical centre is learned;
+    theta is its angle to the optical axis. d_0, the median distance of the scene, fixes the unit of the colours.
+
+    Attributes:
+        exponents: a and b of each channel. [C, 2]
+        lamp_offset: Of the lamp in camera axes, before it is bounded to +-:data:`MAX_OFFSET`, scene units. [3]
+        reference: d_0, scene units. []
+    """
+
+    Settings: ClassVar[type[Settings]] = AttenuatedAppearanceSettings
+
+    reference: Tensor
+
+    def __init__(self, settings: Any, features: int, children: int, generator: torch.Generator) -> None:
+        super().__init__()
+        self.settings = settings
+        self.head: AppearanceHead = settings.head.target(settings.head.settings, features, children, generator)
+        initial = torch.tensor([settings.distance_exponent, settings.cosine_exponent])
+        self.exponents = nn.Parameter(initial.repeat(settings.channels, 1))
+        self.lamp_offset = nn.Parameter(torch.zeros(3))
+        self.register_buffer("reference", torch.ones(()))
+
+    @torch.no_grad()
+    def expect(self, distances: Float[Tensor, "D"]) -> None:
+        """Take the median distance as the reference."""
+        self.head.expect(distances)
+        if len(distances):
+            self.reference.copy_(distances.median())
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Those of the head, the exponents, and the offset of the lamp, which needs a rate in scene units."""
+        return {
+            **self.head.parameter_groups(),
+            "attenuation": [self.exponents],
+            "lamp_offset": [self.lamp_offset],
+        }
+
+    def forward(
+        self,
+        features: Float[Tensor, "V F"],
+        directions: Float[Tensor, "V 3"],
+        distances: Float[Tensor, "V 1"],
+        cosines: Float[Tensor, "V 1"],
+    ) -> Float[Tensor, "V K 3"]:
+        """The colours before attenuation."""
+        colors: Tensor = self.head(features, directions, distances, cosines)
+        return colors
+
+    @property
+    def offset(self) -> Float[Tensor, "3"]:
+        """Position of the lamp in camera axes, scene units. [3]"""
+        return MAX_OFFSET * torch.tanh(self.lamp_offset / MAX_OFFSET)
+
+    def attenuation(self, distances: Float[Tensor, "N"], cosines: Float[Tensor, "N"]) -> Float[Tensor, "N C"]:
+        """The law's factor. [N, C]
+
+        Args:
+            distances: To the lamp, scene units. [N]
+            cosines: Of the angle to the optical axis. [N]
+        """
+        relative = (distances / self.reference).clamp_min(_MIN_DISTANCE)
+        logs = torch.stack([relative.log(), cosines.clamp_min(_MIN_COSINE).log()], dim=1)
+        return (logs @ self.exponents.T).exp()
+
+    def lit(
+        self,
+        colors: Float[Tensor, "N 3"],
+        positions: Float[Tensor, "N 3"],
+        camera: Camera,
+        light: HeldLight | None,
+    ) -> Float[Tensor, "N 3"]:
+        """The colours under the lamp, which does not move Gaussians: positions get no gradient from it."""
+        positions = positions.detach()
+        if light is None:
+            turn, sight = camera.camera_to_world[:3, :3], positions - camera.center
+            distances = (sight - turn @ self.offset).norm(dim=1)
+            cosines = sight @ camera.optical_axis / sight.norm(dim=1).clamp_min(1e-9)
+        else:
+            distances, cosines = light.incidence(positions)
+        return colors * self.attenuation(distances, cosines)
+
+    @property
+    def learned(self) -> dict[str, Any]:
+        """The law's numbers."""
+        distance, cosine = self.exponents.detach().T.tolist()
+        return {
+            "distance_exponent": distance,
+            "cosine_exponent": cosine,
+            "lamp_offset": self.offset.detach().tolist(),
+            "reference_distance": float(self.reference),
+        }
