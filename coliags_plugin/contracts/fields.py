@@ -90,6 +90,14 @@ class GaussianField(Field):
         """:meth:`gaussians` with the lamp held instead of moving with the camera; default: of fields without a lamp."""
         return self.gaussians(camera)
 
+    def attenuation(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N C"] | None:
+        """Factor of the light's law on colours, of all channels or each; default: None, without a law. [N, C]
+
+        Args:
+            points: In camera axes, scene units. [N, 3]
+        """
+        return None
+
 
 class LitField(GaussianField):
     """Gaussian field that models the lamp apart from the tissue, so that the lamp can be exchanged after training."""

@@ -95,6 +95,14 @@ class AppearanceHead(Head):
         """
         return colors
 
+    def attenuation(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N C"] | None:
+        """Factor of the light's law on colours, of all channels or each; default: None, without a law. [N, C]
+
+        Args:
+            points: In camera axes, scene units. [N, 3]
+        """
+        return None
+
     @property
     def learned(self) -> dict[str, Any]:
         """Learned numbers that have a meaning of their own, for the record of a run; default: none."""

@@ -47,7 +47,7 @@ def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None
         InputError: The protocol is unknown or wants what the renderer cannot deliver, there is no test frame, the
             folder cannot be written, the run was relit, or the other scene is not of the same world.
     """
-    if trained.lamp is not None:
+    if trained.relit:
         raise InputError(
             "evaluation of a relit run", "the lamp that the data were recorded with", "Evaluate the run as loaded"
         )

@@ -87,7 +87,7 @@ class AttenuatedAppearanceHead(AppearanceHead):
         """Position of the lamp in camera axes, scene units. [3]"""
         return MAX_OFFSET * torch.tanh(self.lamp_offset / MAX_OFFSET)
 
-    def attenuation(self, distances: Float[Tensor, "N"], cosines: Float[Tensor, "N"]) -> Float[Tensor, "N C"]:
+    def law(self, distances: Float[Tensor, "N"], cosines: Float[Tensor, "N"]) -> Float[Tensor, "N C"]:
         """The law's factor. [N, C]
 
         Args:
@@ -98,6 +98,11 @@ class AttenuatedAppearanceHead(AppearanceHead):
         logs = torch.stack([relative.log(), cosines.clamp_min(_MIN_COSINE).log()], dim=1)
         return (logs @ self.exponents.T).exp()
 
+    def attenuation(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N C"]:
+        """See :meth:`AppearanceHead.attenuation`."""
+        distances = (points - self.offset).norm(dim=1)
+        return self.law(distances, points[:, 2] / points.norm(dim=1).clamp_min(1e-9))
+
     def lit(
         self,
         colors: Float[Tensor, "N 3"],
@@ -107,13 +112,9 @@ class AttenuatedAppearanceHead(AppearanceHead):
     ) -> Float[Tensor, "N 3"]:
         """The colours under the lamp, which does not move Gaussians: positions get no gradient from it."""
         positions = positions.detach()
-        if light is None:
-            turn, sight = camera.camera_to_world[:3, :3], positions - camera.center
-            distances = (sight - turn @ self.offset).norm(dim=1)
-            cosines = sight @ camera.optical_axis / sight.norm(dim=1).clamp_min(1e-9)
-        else:
-            distances, cosines = light.incidence(positions)
-        return colors * self.attenuation(distances, cosines)
+        if light is not None:
+            return colors * self.law(*light.incidence(positions))
+        return colors * self.attenuation((positions - camera.center) @ camera.camera_to_world[:3, :3])
 
     @property
     def learned(self) -> dict[str, Any]:

@@ -30,14 +30,14 @@ def test_the_factor_is_the_law_about_the_median_distance():
     head.expect(torch.tensor([10.0, 20.0, 70.0]))
     distances, cosines = torch.tensor([20.0, 40.0, 10.0]), torch.tensor([1.0, 0.9, 0.5])
     expected = [1.0, 2.0**-0.8 * 0.9**1.5, 2.0**0.8 * 0.5**1.5]
-    torch.testing.assert_close(head.attenuation(distances, cosines)[:, 0], torch.tensor(expected))
+    torch.testing.assert_close(head.law(distances, cosines)[:, 0], torch.tensor(expected))
 
 
 def test_each_channel_has_its_own_exponents():
     head = make_head(channels=3)
     with torch.no_grad():
         head.exponents.copy_(torch.tensor([[-0.5, 0.0], [-1.0, 0.0], [-1.0, 2.0]]))
-    factors = head.attenuation(torch.tensor([4.0]), torch.tensor([0.5]))
+    factors = head.law(torch.tensor([4.0]), torch.tensor([0.5]))
     torch.testing.assert_close(factors, torch.tensor([[0.5, 0.25, 0.0625]]))
 
 
