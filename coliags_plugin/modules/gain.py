@@ -18,6 +18,7 @@ from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Scene, View
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.modules.frame_rows import FrameRows
+from coliags_plugin.modules.gain_fit import fit_log_gains
 
 
 class FrameGainSettings(Settings):
@@ -26,6 +27,9 @@ class FrameGainSettings(Settings):
     reference: str | None = None  # training frame whose gain is 1; None: the gains' geometric mean is 1
     untrained: Literal["interpolate", "mean"] = "interpolate"  # between the neighbours in time, or the mean gain
     channels: Literal[1, 3] = 1  # one gain for all colours, or one each, for a white balance that drifts
+    initial: Literal["one", "points"] = (
+        "one"  # 1, or fitted to surface points (docs/methods.md 4.7) where there is depth
+    )
     max_gain: float = Field(default=8.0, gt=1.0)  # gains are at least 1 / max_gain and at most max_gain
 
 
@@ -50,12 +54,17 @@ class FrameGain(GainModule):
 
     @classmethod
     def from_scene(cls, scene: Scene, settings: Any, generator: torch.Generator) -> Self:
-        """Module with gains of 1.
+        """Module with gains of 1, or of the scene's surface points.
 
         Raises:
             InputError: ``reference`` is no training frame.
         """
-        return cls(settings, scene)
+        module = cls(settings, scene)
+        fitted = fit_log_gains(scene) if settings.initial == "points" else None
+        if fitted is not None:
+            with torch.no_grad():
+                module.log_gain.copy_(fitted[:, None].expand_as(module.log_gain))
+        return module
 
     @property
     def untrained_views(self) -> str:
