@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.lamps import HeldLight
+from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
 
 
@@ -57,6 +58,9 @@ class AppearanceHead(Head):
         Args:
             distances: From cameras to anchors in their view, scene units. [D]
         """
+
+    def prepare(self, scene: Scene) -> None:
+        """Adapt the initial parameters to the colours of the scene, before training."""
 
     @abstractmethod
     def forward(

@@ -143,6 +143,9 @@ class ViewModule(nn.Module, ABC):
             InputError: The settings name frames that the scene does not have.
         """
 
+    def prepare(self, scene: Scene) -> None:
+        """Adapt the initial parameters to the scene, before training; not called when a run is loaded."""
+
     @abstractmethod
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Trainable parameters; a method config's ``optimizers`` puts the module's own name and a dot in front."""

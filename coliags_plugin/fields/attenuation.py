@@ -12,6 +12,8 @@ from coliags_plugin.config.components import AppearanceHeadNode
 from coliags_plugin.contracts import AppearanceHead
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.lamps import HeldLight
+from coliags_plugin.core.photometry import fit_light
+from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
 
 #: Largest distance of the lamp from the optical centre along each camera axis, scene units (mm).
@@ -25,7 +27,8 @@ class AttenuatedAppearanceSettings(Settings):
 
     head: AppearanceHeadNode  # decoder of the colours that are attenuated
     distance_exponent: float = -0.9  # initial a
-    cosine_exponent: float = 0.3  # initial b
+    cosine_exponent: float = 0.3  # initial b where it is not fitted
+    initial: Literal["given", "points"] = "given"  # b: as above, or fitted to surface points (docs/methods.md 4.8)
     channels: Literal[1, 3] = (
         3  # exponents for each colour, or one pair for all: red falls off slower (docs/methods.md 3.7)
     )
@@ -62,6 +65,15 @@ class AttenuatedAppearanceHead(AppearanceHead):
         self.head.expect(distances)
         if len(distances):
             self.reference.copy_(distances.median())
+
+    @torch.no_grad()
+    def prepare(self, scene: Scene) -> None:
+        """Start at the fall-off over the angle of the scene's surface points, if the settings say so."""
+        self.head.prepare(scene)
+        fitted = fit_light(scene) if self.settings.initial == "points" else None
+        if fitted is not None:
+            shared = self.settings.channels == 1
+            self.exponents[:, 1] = fitted.cosine_exponents.mean() if shared else fitted.cosine_exponents
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Those of the head, the exponents, and the offset of the lamp, which needs a rate in scene units."""

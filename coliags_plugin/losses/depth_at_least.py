@@ -21,7 +21,7 @@ class DepthAtLeastSettings(LossSettings):
 
 
 class DepthAtLeastLoss(Loss):
-    """Mean over the valid pixels of max(0, z - D) where the sensor clipped at z, 0 elsewhere (docs/methods.md 4.8).
+    """Mean over the valid pixels of max(0, z - D) where the sensor clipped at z, 0 elsewhere (docs/methods.md 4.9).
 
     Divided by the number of valid pixels, not by that of clipped ones, so that a pixel weighs as much as one of
     ``depth-l1``; 0 in frames where nothing is clipped.

@@ -24,7 +24,7 @@ class EdgeAwareDepthL1Settings(DepthL1Settings):
 
 
 class EdgeAwareDepthL1Loss(DepthL1Loss):
-    """``depth-l1`` with a lower weight where the true depth steps within 3x3 pixels (docs/methods.md 4.8).
+    """``depth-l1`` with a lower weight where the true depth steps within 3x3 pixels (docs/methods.md 4.9).
 
     A pixel across a step sees two surfaces, and no single depth of Gaussians that are true elsewhere renders it.
     """

@@ -14,11 +14,11 @@ from torch import Tensor, nn
 from typing_extensions import Self
 
 from coliags_plugin.contracts import GainModule
+from coliags_plugin.core.photometry import fit_light
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Scene, View
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.modules.frame_rows import FrameRows
-from coliags_plugin.modules.gain_fit import fit_log_gains
 
 
 class FrameGainSettings(Settings):
@@ -28,7 +28,7 @@ class FrameGainSettings(Settings):
     untrained: Literal["interpolate", "mean"] = "interpolate"  # between the neighbours in time, or the mean gain
     channels: Literal[1, 3] = 1  # one gain for all colours, or one each, for a white balance that drifts
     initial: Literal["one", "points"] = (
-        "one"  # 1, or fitted to surface points (docs/methods.md 4.7) where there is depth
+        "one"  # 1, or fitted to surface points where there is depth (docs/methods.md 4.8)
     )
     max_gain: float = Field(default=8.0, gt=1.0)  # gains are at least 1 / max_gain and at most max_gain
 
@@ -54,17 +54,19 @@ class FrameGain(GainModule):
 
     @classmethod
     def from_scene(cls, scene: Scene, settings: Any, generator: torch.Generator) -> Self:
-        """Module with gains of 1, or of the scene's surface points.
+        """Module with gains of 1.
 
         Raises:
             InputError: ``reference`` is no training frame.
         """
-        module = cls(settings, scene)
-        fitted = fit_log_gains(scene) if settings.initial == "points" else None
+        return cls(settings, scene)
+
+    @torch.no_grad()
+    def prepare(self, scene: Scene) -> None:
+        """Start at the gains of the scene's surface points, if the settings say so."""
+        fitted = fit_light(scene) if self.settings.initial == "points" else None
         if fitted is not None:
-            with torch.no_grad():
-                module.log_gain.copy_(fitted[:, None].expand_as(module.log_gain))
-        return module
+            self.log_gain.copy_(fitted.log_gains[:, None].expand_as(self.log_gain))
 
     @property
     def untrained_views(self) -> str:
