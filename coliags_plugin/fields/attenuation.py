@@ -20,6 +20,8 @@ from coliags_plugin.core.settings import Settings
 MAX_OFFSET = 20.0
 #: Smallest distance to the lamp, as a share of the reference distance, and smallest cosine that the law is computed at.
 _MIN_DISTANCE, _MIN_COSINE = 0.02, 0.05
+#: Largest b that a fit may start with: cos^9 in linear light.
+_LARGEST_EXPONENT = 4.0
 
 
 class AttenuatedAppearanceSettings(Settings):
@@ -72,8 +74,8 @@ class AttenuatedAppearanceHead(AppearanceHead):
         self.head.prepare(scene)
         fitted = fit_light(scene) if self.settings.initial == "points" else None
         if fitted is not None:
-            shared = self.settings.channels == 1
-            self.exponents[:, 1] = fitted.cosine_exponents.mean() if shared else fitted.cosine_exponents
+            found = fitted.cosine_exponents.clamp(0.0, _LARGEST_EXPONENT)
+            self.exponents[:, 1] = found.mean() if self.settings.channels == 1 else found
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Those of the head, the exponents, and the offset of the lamp, which needs a rate in scene units."""

@@ -52,6 +52,13 @@ def test_a_frame_that_shows_nothing_known_has_a_finite_gain():
     assert found.isfinite().all() and found.abs().max() < 1.0
 
 
+def test_nothing_but_masked_pixels_leave_gains_at_one():
+    scene = gained(GAINS)
+    hidden = [replace(frame, mask=torch.zeros(48, 64, dtype=torch.bool)) for frame in scene.train]
+    found = fit_light(replace(scene, train=hidden))
+    assert found.log_gains.tolist() == [0.0] * 7 and found.cosine_exponents.tolist() == [0.0] * 3
+
+
 def test_the_module_starts_with_them_where_there_is_depth():
     settings = FrameGain.Settings(channels=3, initial="points")
     module = FrameGain.from_scene(gained(GAINS), settings, torch.Generator())

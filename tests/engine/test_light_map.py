@@ -71,6 +71,16 @@ def test_learned_numbers_are_in_the_metrics(trained):
     assert summary["learned"] == learned
 
 
+def test_gains_at_a_bound_are_said(trained, caplog):
+    loaded = coliags_plugin.load_run(trained.path, device="cpu")
+    with torch.no_grad():
+        loaded.load().model.view_modules["exposure"].log_gain[3] = 9.0
+    loaded.evaluate()
+    name = loaded.load().scene.train[3].name
+    assert f"module 'exposure' is at a bound in 1 frames: {name}" in caplog.text
+    trained.evaluate()
+
+
 def test_the_command_writes_the_light_and_flattened_views(trained, capsys):
     run("render", str(trained.path), "--no-video", "--light-map")
     folder = trained.path / "renders"
