@@ -47,7 +47,7 @@ class Run:
 
     def __repr__(self) -> str:
         """What it is, in one line."""
-        relit = ", relit" if self._loaded is not None and self._loaded.lamp is not None else ""
+        relit = ", relit" if self._loaded is not None and self._loaded.relit else ""
         steps = f"step {self.step} of {self._identity.steps}"
         return f"{self.method} on {self.scene_name}, seed {self.seed}, {steps}{relit}: {self.path}"
 
@@ -177,6 +177,7 @@ class Run:
         channels: Sequence[str] = (),
         depth_kind: DepthKind = "expected",
         depth_tiff: bool = False,
+        light_map: bool = False,
         overwrite: bool = False,
     ) -> Path:
         """Write colour, depth and error images of a set of frames, and a video along the trajectory.
@@ -189,6 +190,7 @@ class Run:
             channels: Feature channels to write as images too.
             depth_kind: ``accumulated``, ``expected`` or ``median`` (docs/conventions.md 3).
             depth_tiff: Also write depth as float32 TIFF, scene units.
+            light_map: Also write the learned light, beside a phantom's: ``light.html`` and ``light.json``.
             overwrite: Replace the folder where it exists.
 
         Returns:
@@ -200,8 +202,8 @@ class Run:
         from coliags_plugin.engine.rendering import render_run
 
         trained = self.load()
-        folder = Path(output) if output is not None else self.path / ("renders" if trained.lamp is None else "relit")
-        render_run(trained, folder, frames, video, fps, overwrite, channels, depth_kind, depth_tiff)
+        folder = Path(output) if output is not None else self.path / ("relit" if trained.relit else "renders")
+        render_run(trained, folder, frames, video, fps, overwrite, channels, depth_kind, depth_tiff, light_map)
         return folder
 
     def mesh(
@@ -356,6 +358,20 @@ class Run:
         relit = Run(self.path, data=self.data, device=self.device)
         relit._loaded = relight(self.load(), made)
         return relit
+
+    def flatten(self) -> Run:
+        """The run in the same light everywhere, without gain, for rendering; it shares the parameters.
+
+        Every wall point is as far from the lamp, at the same angle, as what the training cameras see in the median.
+
+        Raises:
+            InputError: See :meth:`load`; or the method does not make Gaussians.
+        """
+        from coliags_plugin.engine.relighting import flatten
+
+        flat = Run(self.path, data=self.data, device=self.device)
+        flat._loaded = flatten(self.load())
+        return flat
 
 
 def _scene_of_size(path: Path, like: Scene) -> Scene:

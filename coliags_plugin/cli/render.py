@@ -18,7 +18,7 @@ class Render:
     path: tyro.conf.Positional[Path]
     """Run folder."""
     output: OptionalPath = None
-    """Folder to create; default RUN/renders, with --light RUN/relit."""
+    """Folder to create; default RUN/renders, with --light or --flatten RUN/relit."""
     frames: str = "test"
     """Which frames: train, all, or the name of a test set."""
     video: bool = True
@@ -34,6 +34,10 @@ class Render:
     """Render under another lamp, for methods that model it: offset=[X,Y,Z] from the camera in its axes (mm),
     turn=[A,B] about its x and y axes (degrees), power=P (exponent of the cosine to the lamp's axis), intensity=F
     (factor)."""
+    flatten: bool = False
+    """Render every wall point as at one distance and angle from the lamp, without gain: default folder RUN/relit."""
+    light_map: bool = False
+    """Also write the light that the method has learned, beside a phantom's: light.html and light.json."""
     channel: Channels = ()
     """Also write a feature channel of the method's Gaussians, for instance albedo."""
     data: OptionalPath = None
@@ -47,11 +51,16 @@ class Render:
         """Render and print the output folder."""
         from coliags_plugin.api.runs import load_run
         from coliags_plugin.config.assignments import parse_assignments
+        from coliags_plugin.core.errors import InputError
 
         lamp = parse_assignments(self.light, "--light", "KEY=VALUE, for instance power=10")
+        if lamp and self.flatten:
+            raise InputError("--light and --flatten together", "one of them")
         run = load_run(self.path, data=self.data, device=self.device)
         if lamp:
             run = run.relight(**lamp)
+        if self.flatten:
+            run = run.flatten()
         print(
             run.write_renders(
                 self.output,
@@ -61,6 +70,7 @@ class Render:
                 channels=self.channel,
                 depth_kind=self.depth_kind,
                 depth_tiff=self.depth_tiff,
+                light_map=self.light_map,
                 overwrite=self.overwrite,
             )
         )

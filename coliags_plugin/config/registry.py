@@ -186,6 +186,7 @@ appearance_heads = Registry(
     {
         "plain": "coliags_plugin.fields.appearance_heads:PlainAppearanceHead",
         "imia": "coliags_plugin.fields.appearance_heads:IMIAAppearanceHead",
+        "attenuated": "coliags_plugin.fields.attenuation:AttenuatedAppearanceHead",
     },
     noun="appearance head",
 )
@@ -232,6 +233,8 @@ losses = Registry(
         "d-ssim": "coliags_plugin.losses.photometric:DSSIMLoss",
         "mse": "coliags_plugin.losses.photometric:MSELoss",
         "depth-l1": "coliags_plugin.losses.depth:DepthL1Loss",
+        "edge-aware-depth-l1": "coliags_plugin.losses.edge_aware_depth:EdgeAwareDepthL1Loss",
+        "depth-at-least": "coliags_plugin.losses.depth_at_least:DepthAtLeastLoss",
         "attribute-variance": "coliags_plugin.losses.attribute_variance:AttributeVarianceLoss",
         "diffuse-factor": "coliags_plugin.losses.diffuse_factor:DiffuseFactorLoss",
         "depth-huber": "coliags_plugin.losses.depth:DepthHuberLoss",
@@ -239,6 +242,7 @@ losses = Registry(
         "opacity": "coliags_plugin.losses.opacity:OpacityLoss",
         "distance-l1": "coliags_plugin.losses.distance:DistanceL1Loss",
         "sparse-depth": "coliags_plugin.losses.sparse_depth:SparseDepthLoss",
+        "smooth-gain": "coliags_plugin.losses.smooth_gain:SmoothGainLoss",
         "scale-volume": "coliags_plugin.losses.scale_volume:ScaleVolumeLoss",
         "surface-normals": "coliags_plugin.losses.surface_normals:SurfaceNormalsLoss",
         "normal-consistency": "coliags_plugin.losses.surfel_regularization:NormalConsistencyLoss",

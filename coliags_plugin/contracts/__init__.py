@@ -12,7 +12,7 @@ from coliags_plugin.contracts.fields import (
 )
 from coliags_plugin.contracts.heads import AppearanceHead, GeometryHead, Head
 from coliags_plugin.contracts.losses import Loss, LossSettings
-from coliags_plugin.contracts.rendering import Availability, Renderer, ViewModule
+from coliags_plugin.contracts.rendering import Availability, GainModule, Renderer, ViewModule
 from coliags_plugin.contracts.schedule import Schedule, log_linear
 from coliags_plugin.contracts.training import (
     Draw,
@@ -30,6 +30,7 @@ __all__ = [
     "DataManager",
     "Draw",
     "Field",
+    "GainModule",
     "GaussianField",
     "GeometryHead",
     "Head",

@@ -53,6 +53,11 @@ class Field(nn.Module, ABC):
         """Length of one unit of the field's own coordinates, scene units; 1 where it uses the scene's. []"""
         return 1.0
 
+    @property
+    def learned(self) -> dict[str, Any]:
+        """Learned numbers that have a meaning of their own, for the record of a run; default: none."""
+        return {}
+
     def before_step(self, step: int, schedule: Schedule) -> None:
         """Called before each training step, counted from 1, by fields that change over the run.
 
@@ -84,6 +89,14 @@ class GaussianField(Field):
     def gaussians_in_light(self, camera: Camera, light: HeldLight) -> Gaussians:
         """:meth:`gaussians` with the lamp held instead of moving with the camera; default: of fields without a lamp."""
         return self.gaussians(camera)
+
+    def attenuation(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N C"] | None:
+        """Factor of the light's law on colours, of all channels or each; default: None, without a law. [N, C]
+
+        Args:
+            points: In camera axes, scene units. [N, 3]
+        """
+        return None
 
 
 class LitField(GaussianField):

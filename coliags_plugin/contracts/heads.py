@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.lamps import HeldLight
+from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
 
 
@@ -56,6 +59,9 @@ class AppearanceHead(Head):
             distances: From cameras to anchors in their view, scene units. [D]
         """
 
+    def prepare(self, scene: Scene) -> None:
+        """Adapt the initial parameters to the colours of the scene, before training."""
+
     @abstractmethod
     def forward(
         self,
@@ -75,3 +81,33 @@ class AppearanceHead(Head):
         Returns:
             RGB in (0, 1). [V, K, 3]
         """
+
+    def lit(
+        self,
+        colors: Float[Tensor, "N 3"],
+        positions: Float[Tensor, "N 3"],
+        camera: Camera,
+        light: HeldLight | None,
+    ) -> Float[Tensor, "N 3"]:
+        """Colours of single children in the light that falls on them; default: as decoded.
+
+        Args:
+            colors: Decoded. [N, 3]
+            positions: Of the children, world frame, scene units. [N, 3]
+            camera: From which they are seen.
+            light: The lamp that lights them, if it does not move with the camera.
+        """
+        return colors
+
+    def attenuation(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N C"] | None:
+        """Factor of the light's law on colours, of all channels or each; default: None, without a law. [N, C]
+
+        Args:
+            points: In camera axes, scene units. [N, 3]
+        """
+        return None
+
+    @property
+    def learned(self) -> dict[str, Any]:
+        """Learned numbers that have a meaning of their own, for the record of a run; default: none."""
+        return {}

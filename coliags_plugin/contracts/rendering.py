@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from typing_extensions import Self
 
@@ -143,9 +143,17 @@ class ViewModule(nn.Module, ABC):
             InputError: The settings name frames that the scene does not have.
         """
 
+    def prepare(self, scene: Scene) -> None:
+        """Adapt the initial parameters to the scene, before training; not called when a run is loaded."""
+
     @abstractmethod
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Trainable parameters; a method config's ``optimizers`` puts the module's own name and a dot in front."""
+
+    @property
+    def learned(self) -> dict[str, Any]:
+        """Learned numbers that have a meaning of their own, for the record of a run; default: none."""
+        return {}
 
     def adjust_camera(self, camera: Camera, view: View | None) -> Camera:
         """The camera to render from, for instance with a corrected pose.
@@ -165,3 +173,16 @@ class ViewModule(nn.Module, ABC):
             view: See :meth:`adjust_camera`.
         """
         return output
+
+
+class GainModule(ViewModule):
+    """View module that multiplies colours by a gain for every training frame."""
+
+    @property
+    @abstractmethod
+    def times(self) -> Sequence[float]:
+        """Index in the video of every training frame."""
+
+    @abstractmethod
+    def log_gains(self) -> Float[Tensor, "F C"]:
+        """Logarithm of every training frame's gain, for all colours or for each of three. [F, C]"""

@@ -32,6 +32,11 @@ class Lamp(Settings):
     intensity: float = Option(default=1.0, ge=0.0, allow_inf_nan=False)  # factor of the trained intensity
 
     @property
+    def described(self) -> dict[str, Any]:
+        """Plain values, for a record."""
+        return self.model_dump()
+
+    @property
     def at_camera(self) -> bool:
         """Whether it is at the optical centre."""
         return not any(self.offset)

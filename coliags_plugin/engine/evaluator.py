@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -24,6 +27,8 @@ from coliags_plugin.outputs.colormaps import DEPTH_ERROR_LIMIT_MM, colorize_dept
 from coliags_plugin.outputs.image_files import eight_bit, write_depth_tiff, write_png
 from coliags_plugin.results.reading import RESULT_FILE, write_result
 from coliags_plugin.results.summaries import means_summary, per_frame_table
+
+logger = logging.getLogger(__name__)
 
 
 def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None) -> Path:
@@ -47,7 +52,7 @@ def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None
         InputError: The protocol is unknown or wants what the renderer cannot deliver, there is no test frame, the
             folder cannot be written, the run was relit, or the other scene is not of the same world.
     """
-    if trained.lamp is not None:
+    if trained.relit:
         raise InputError(
             "evaluation of a relit run", "the lamp that the data were recorded with", "Evaluate the run as loaded"
         )
@@ -74,10 +79,20 @@ def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None
                 progress.update(done)
         write_depth_pictures(scratch, scene.length_unit)
         result = run_result(trained, scorer, evaluated, meter, truth)
+        _warn_of_bounds(trained.model.learned)
         write_result(scratch / RESULT_FILE, result)
         write_json(scratch / "metrics.json", means_summary(result))
         atomic_write(scratch / "per_frame.csv", per_frame_table(result))
     return target
+
+
+def _warn_of_bounds(learned: Mapping[str, Any]) -> None:
+    """Say which frames' learned numbers are at a bound, and so not what the images ask for."""
+    for name, numbers in learned.items():
+        frames = numbers.get("at_bound", ())
+        if frames:
+            shown = ", ".join(frames[:6]) + (", ..." if len(frames) > 6 else "")
+            logger.warning("module '%s' is at a bound in %d frames: %s", name, len(frames), shown)
 
 
 def check_evaluable(model: Model, scene: Scene, scorer: Scorer) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -75,6 +76,15 @@ class Model(nn.Module):
         for name, module in self.view_modules.items():
             groups |= {f"{name}.{group}": parameters for group, parameters in module.parameter_groups().items()}
         return groups
+
+    @property
+    def learned(self) -> dict[str, Any]:
+        """Learned numbers that have a meaning of their own: ``field``, and those of modules under their names.
+
+        Parts without any are left out.
+        """
+        numbers = {"field": self.field.learned, **{name: part.learned for name, part in self.view_modules.items()}}
+        return {name: part for name, part in numbers.items() if part}
 
     @property
     def outputs(self) -> frozenset[str]:

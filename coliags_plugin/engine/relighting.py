@@ -1,4 +1,4 @@
-"""Exchange of the lamp of a trained run."""
+"""Other light for a trained run: another lamp, or the same light everywhere."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from coliags_plugin.config.registry import fields
 from coliags_plugin.contracts import LitField
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.lamps import Lamp
+from coliags_plugin.engine.held_light import gaussians_of, held_light, splatting_of
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.trained import TrainedRun
 
@@ -29,3 +30,17 @@ def relight(trained: TrainedRun, lamp: Lamp) -> TrainedRun:
         )
     lit_model = Model(model.field.with_lamp(lamp), model.renderer, model.view_modules).eval()
     return replace(trained, model=lit_model, lamp=lamp)
+
+
+def flatten(trained: TrainedRun) -> TrainedRun:
+    """The run in the same light everywhere: at the median distance and angle of what the training cameras see.
+
+    View modules are left out, so that no gain is applied; it shares the parameters.
+
+    Raises:
+        InputError: The method does not make Gaussians that are drawn by this package.
+    """
+    splatting_of(trained.model)
+    gaussians_of(trained.model)
+    cameras = [frame.camera for frame in trained.scene.train]
+    return replace(trained, held=held_light("flattened", trained.model, cameras))

@@ -17,6 +17,8 @@ from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.files import atomic_folder, atomic_write
 from coliags_plugin.core.render_output import OPAQUE_ALPHA, RenderOutput
 from coliags_plugin.core.scenes import Frame, Scene
+from coliags_plugin.engine.held_light import render_held
+from coliags_plugin.engine.light_map import write_light_map
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.outputs.colormaps import (
@@ -48,10 +50,11 @@ def render_run(
     channels: Sequence[str] = (),
     depth_kind: DepthKind = "expected",
     depth_tiff: bool = False,
+    light_map: bool = False,
 ) -> None:
     """Write colour, depth and error images of a set of frames, and a video along the trajectory.
 
-    A relit run has its lamp in ``lamp.yaml``, and no colour errors, there being no images under that lamp. Depth is
+    A relit run has its light in ``lamp.yaml``, and no colour errors, there being no images in that light. Depth is
     hatched where alpha is below 0.5, and has no errors where the scene's own is estimated.
 
     Args:
@@ -64,10 +67,11 @@ def render_run(
         channels: Feature channels of one or three numbers to write as images too, 1 as white.
         depth_kind: Which depth (docs/conventions.md 3).
         depth_tiff: Also write depth as float32 TIFF, scene units, of every pixel.
+        light_map: Also write the learned light, ``light.html`` and ``light.json``.
 
     Raises:
-        InputError: No such frames or channel, the renderer does not deliver that depth, or the folder exists or cannot
-            be written.
+        InputError: No such frames, channel or learned light, the renderer does not deliver that depth, or the folder
+            exists or cannot be written.
     """
     chosen = choose_frames(trained.scene, frames)
     _check_channels(trained, channels)
@@ -84,7 +88,7 @@ def render_run(
     ):
         for count, frame in enumerate(chosen, start=1):
             view = render_view(trained, frame, (*wants, *channels))
-            _write_frame(folder, frame, view, depth, limits, relit=trained.lamp is not None)
+            _write_frame(folder, frame, view, depth, limits, trained.relit)
             if depth_tiff:
                 write_depth_tiff(folder / "depth_tiff" / f"{frame.name}.tiff", view[depth])
             for channel in channels:
@@ -92,10 +96,13 @@ def render_run(
             progress.update(count)
         write_png(folder / "depth_scale.png", color_bar(limits, unit, "depth"))
         write_png(folder / "depth_error_scale.png", color_bar((0.0, DEPTH_ERROR_LIMIT_MM), unit, "error"))
-        if trained.lamp is None:
+        if not trained.relit:
             write_png(folder / "rgb_error_scale.png", color_bar((0.0, RGB_ERROR_LIMIT), "of full scale", "error"))
-        else:
-            atomic_write(folder / "lamp.yaml", dump(trained.lamp.model_dump()))
+        for light in (trained.lamp, trained.held):
+            if light is not None:
+                atomic_write(folder / "lamp.yaml", dump(light.described))
+        if light_map:
+            write_light_map(trained, folder)
         if video:
             write_video(_film(trained, path, depth, limits, progress, len(chosen)), folder / "trajectory.mp4", fps)
 
@@ -134,6 +141,9 @@ def render_view(trained: TrainedRun, of: Frame | Camera, wants: Sequence[str] = 
         of: A frame of its scene, or a free camera.
         wants: Names of outputs.
     """
+    if trained.held is not None:
+        camera = of if isinstance(of, Camera) else of.camera
+        return render_held(trained.model, camera.to(trained.device), trained.held, wants)
     if isinstance(of, Camera):
         return trained.model.render(of.to(trained.device), wants)
     view = of.view(trained=of.name in trained.training_frames)

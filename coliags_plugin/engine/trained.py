@@ -12,7 +12,7 @@ import torch
 
 from coliags_plugin.config.method_config import MethodConfig
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.lamps import Lamp
+from coliags_plugin.core.lamps import HeldLight, Lamp
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.checkpoints import latest_checkpoint, read_checkpoint, restore_model
 from coliags_plugin.engine.costs import TrainingCost
@@ -38,6 +38,7 @@ class TrainedRun:
         provenance: As recorded by training.
         cost: What training cost up to the checkpoint; None where it was not measured.
         lamp: What it was relit with; None under the lamp that the data were recorded with.
+        held: Light that stays as it is, in which views are rendered; None under a lamp that moves with the camera.
     """
 
     run: RunFolder
@@ -51,6 +52,12 @@ class TrainedRun:
     provenance: Mapping[str, Any] = field(repr=False)
     cost: TrainingCost | None = None
     lamp: Lamp | None = None
+    held: HeldLight | None = None
+
+    @property
+    def relit(self) -> bool:
+        """Whether it is rendered in another light than the data were recorded with."""
+        return self.lamp is not None or self.held is not None
 
     @cached_property
     def training_frames(self) -> frozenset[str]:

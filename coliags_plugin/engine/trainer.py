@@ -74,6 +74,8 @@ class Trainer:
         self.frames = _resident(scene.train, device)
         field = config.field.target.from_scene(scene, config.field.settings, self.generators["initialisation"])
         modules = make_view_modules(config, scene, self.generators["initialisation"])
+        for module in modules.values():
+            module.prepare(scene)
         self.model = Model(field, self.chosen.renderer, modules).to(device)
         self.wants = tuple(sorted({"rgb", "alpha"}.union(*(loss.wants for loss in self.losses.values()))))
         self.model.check_outputs(self.wants, "the losses")

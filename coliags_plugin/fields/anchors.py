@@ -109,6 +109,7 @@ class AnchorField(GaussianField):
             field.scalings.copy_(log_scales[:, None].expand(-1, 6))
             cameras = [frame.camera for frame in scene.train[:: max(1, len(scene.train) // _DISTANCE_CAMERAS)]]
             field.appearance_head.expect(torch.cat([field._distances(camera) for camera in cameras]))
+        field.appearance_head.prepare(scene)
         logger.info("%d points in voxels of %.3g scene units make %d anchors", len(scene.points), size, len(anchors))
         return field
 
@@ -138,6 +139,15 @@ class AnchorField(GaussianField):
             **self.geometry_head.parameter_groups(),
             **self.appearance_head.parameter_groups(),
         }
+
+    @property
+    def learned(self) -> dict[str, Any]:
+        """The numbers of the appearance head."""
+        return self.appearance_head.learned
+
+    def attenuation(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N C"] | None:
+        """That of the appearance head."""
+        return self.appearance_head.attenuation(points)
 
     def child_positions(self) -> Float[Tensor, "M K 3"]:
         """Positions of all children (paper, Eq. 3), scene units. [M, K, 3]"""
@@ -186,12 +196,14 @@ class AnchorField(GaussianField):
         covariances = covariances.reshape(-1, 7).index_select(0, slots)
         scales = scalings.exp().index_select(0, parents)
         shifts = offsets.reshape(-1, 3).index_select(0, slots)
+        means = anchors.index_select(0, parents) + shifts * scales[:, :3]
+        drawn = colors.reshape(-1, 3).index_select(0, slots)
         return Gaussians(
-            means=anchors.index_select(0, parents) + shifts * scales[:, :3],
+            means=means,
             quats_wxyz=nn.functional.normalize(covariances[:, 3:], dim=1),
             scales=scales[:, 3:] * covariances[:, :3].sigmoid(),
             opacities=opacities.reshape(-1).index_select(0, slots),
-            colors=colors.reshape(-1, 3).index_select(0, slots),
+            colors=self.appearance_head.lit(drawn, means, camera, light),
             source_index=(visible.index_select(0, parents) - parents) * self.settings.children + slots,
             visible_sources=visible,
         )

@@ -5,6 +5,8 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Mapping
 
+import torch
+
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.scenes import Scene, View
 
@@ -14,14 +16,19 @@ class FrameRows:
 
     Args:
         scene: Scene whose training frames have one row each, in their order.
+
+    Attributes:
+        times: Index in the video of every training frame, by row.
     """
 
     def __init__(self, scene: Scene) -> None:
         self.rows: Mapping[str, int] = {frame.name: row for row, frame in enumerate(scene.train)}
+        self.times = [float(frame.index) for frame in scene.train]
         self._held_out = {frame.name for frames in scene.test_sets.values() for frame in frames}
-        by_time = sorted((float(frame.index), row) for row, frame in enumerate(scene.train))
-        self._times = [time for time, _ in by_time]
+        by_time = sorted((time, row) for row, time in enumerate(self.times))
+        self._sorted_times = [time for time, _ in by_time]
         self._rows_by_time = [row for _, row in by_time]
+        self._nearest = _nearest_rows(scene)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -30,15 +37,19 @@ class FrameRows:
         """The row of a training frame; None for other views."""
         return self.rows.get(view.name) if view is not None and view.trained else None
 
-    def neighbours(self, time: float) -> tuple[int, int, float]:
-        """Rows of the training frames before and after a time, and its relative position between them, in [0, 1].
+    def neighbours(self, view: View) -> tuple[int, int, float]:
+        """Rows of the training frames before and after a view, and its relative position between them, in [0, 1].
 
-        Beyond the ends both are the nearest frame's.
+        Beyond the ends both are the nearest frame's. Indices of test sets beside the video are not times in it: for
+        these both are those of the training frame with the nearest camera.
         """
-        index = bisect_right(self._times, time)
-        before, after = max(0, index - 1), min(index, len(self._times) - 1)
-        span = self._times[after] - self._times[before]
-        share = (time - self._times[before]) / span if span > 0 else 0.0
+        if view.name in self._nearest:
+            row = self._nearest[view.name]
+            return row, row, 0.0
+        index = bisect_right(self._sorted_times, view.time)
+        before, after = max(0, index - 1), min(index, len(self._sorted_times) - 1)
+        span = self._sorted_times[after] - self._sorted_times[before]
+        share = (view.time - self._sorted_times[before]) / span if span > 0 else 0.0
         return self._rows_by_time[before], self._rows_by_time[after], share
 
     def require(self, name: str, asking: str) -> int:
@@ -56,3 +67,15 @@ class FrameRows:
             f"a training frame, one of {shown}",
             did_you_mean(name, self.rows),
         )
+
+
+def _nearest_rows(scene: Scene) -> dict[str, int]:
+    """Row of the training frame with the nearest camera, for every view of test sets beside the video, by name."""
+    video = {frame.name for frame in scene.video}
+    others = {frame.name: frame for part in scene.test_sets.values() for frame in part if frame.name not in video}
+    if not others or not scene.train:
+        return {}
+    centers = torch.stack([frame.camera.center.double() for frame in scene.train])
+    return {
+        name: int((centers - frame.camera.center.to(centers)).norm(dim=1).argmin()) for name, frame in others.items()
+    }

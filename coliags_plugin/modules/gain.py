@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, ClassVar, Literal
 
 import torch
+from jaxtyping import Float
+from pydantic import Field
 from torch import Tensor, nn
 from typing_extensions import Self
 
-from coliags_plugin.contracts import ViewModule
+from coliags_plugin.contracts import GainModule
+from coliags_plugin.core.photometry import fit_light
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Scene, View
 from coliags_plugin.core.settings import Settings
@@ -21,13 +26,21 @@ class FrameGainSettings(Settings):
 
     reference: str | None = None  # training frame whose gain is 1; None: the gains' geometric mean is 1
     untrained: Literal["interpolate", "mean"] = "interpolate"  # between the neighbours in time, or the mean gain
+    channels: Literal[1, 3] = 1  # one gain for all colours, or one each, for a white balance that drifts
+    initial: Literal["one", "points"] = (
+        "one"  # 1, or fitted to surface points where there is depth (docs/methods.md 4.8)
+    )
+    max_gain: float = Field(default=8.0, gt=1.0)  # gains are at least 1 / max_gain and at most max_gain
 
 
-class FrameGain(ViewModule):
+class FrameGain(GainModule):
     """Learned factor on the rendered colours for each training frame.
 
     Colours and gains are only known up to a common factor, which ``reference`` settles. Free cameras have the mean
-    gain.
+    gain; views of test sets beside the video have that of the training frame taken closest to them.
+
+    Attributes:
+        log_gain: Of every training frame, before the reference is subtracted. [F, C]
     """
 
     Settings: ClassVar[type[Settings]] = FrameGainSettings
@@ -37,7 +50,7 @@ class FrameGain(ViewModule):
         self.settings = settings
         self.frames = FrameRows(scene)
         self._reference = None if settings.reference is None else self.frames.require(settings.reference, "gain")
-        self.log_gain = nn.Parameter(torch.zeros(len(self.frames)))
+        self.log_gain = nn.Parameter(torch.zeros(len(self.frames), settings.channels))
 
     @classmethod
     def from_scene(cls, scene: Scene, settings: Any, generator: torch.Generator) -> Self:
@@ -48,37 +61,63 @@ class FrameGain(ViewModule):
         """
         return cls(settings, scene)
 
+    @torch.no_grad()
+    def prepare(self, scene: Scene) -> None:
+        """Start at the gains of the scene's surface points, if the settings say so."""
+        fitted = fit_light(scene) if self.settings.initial == "points" else None
+        if fitted is not None:
+            self.log_gain.copy_(fitted.log_gains[:, None].expand_as(self.log_gain))
+
     @property
     def untrained_views(self) -> str:
         """Gain of views that are not training frames."""
         if self.settings.untrained == "mean":
             return "views without training have the mean gain of the training frames"
-        return "views without training have a gain interpolated between the training frames before and after them"
+        return (
+            "views without training have a gain interpolated between the training frames before and after them; views "
+            "beside the video that of the nearest training camera"
+        )
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """The logarithms of the gains."""
         return {"gain": [self.log_gain]}
 
-    def log_gains(self) -> Tensor:
-        """Logarithm of every training frame's gain, relative to the reference. [F]"""
-        zero = self.log_gain.mean() if self._reference is None else self.log_gain[self._reference]
-        return self.log_gain - zero
+    @property
+    def times(self) -> Sequence[float]:
+        """Index in the video of every training frame."""
+        return self.frames.times
 
-    def gains(self) -> Tensor:
-        """The gain of every training frame, in their order. [F]"""
+    def log_gains(self) -> Float[Tensor, "F C"]:
+        """Logarithm of every training frame's gain, relative to the reference, within its bounds. [F, C]"""
+        zero = self.log_gain.mean(0) if self._reference is None else self.log_gain[self._reference]
+        limit = math.log(self.settings.max_gain)
+        return (self.log_gain - zero).clamp(-limit, limit)
+
+    def gains(self) -> Float[Tensor, "F C"]:
+        """The gain of every training frame, in their order. [F, C]"""
         return self.log_gains().exp()
 
-    def gain(self, view: View | None) -> Tensor:
-        """The gain of a view. []"""
+    def gain(self, view: View | None) -> Float[Tensor, "C"]:
+        """The gain of a view. [C]"""
         log_gains = self.log_gains()
         row = self.frames.row(view)
         if row is not None:
             return log_gains[row].exp()
         if view is None or self.settings.untrained == "mean":
-            return log_gains.mean().exp()
-        before, after, share = self.frames.neighbours(view.time)
+            return log_gains.mean(0).exp()
+        before, after, share = self.frames.neighbours(view)
         return ((1.0 - share) * log_gains[before] + share * log_gains[after]).exp()
 
     def shade(self, output: RenderOutput, view: View | None) -> RenderOutput:
         """Multiply the colours."""
         return replace(output, rgb=output.rgb * self.gain(view))
+
+    @property
+    def learned(self) -> dict[str, Any]:
+        """Gains by training frame, and the names of frames whose gain is at a bound."""
+        log_gains = self.log_gains().detach()
+        reached = (log_gains.abs() >= math.log(self.settings.max_gain)).any(dim=1).tolist()
+        return {
+            "gains": dict(zip(self.frames.rows, log_gains.exp().tolist(), strict=True)),
+            "at_bound": [name for name, row in self.frames.rows.items() if reached[row]],
+        }

@@ -25,7 +25,7 @@ def make(**options):
 def test_gains_of_other_views():
     module = make()  # frames 1 to 7
     with torch.no_grad():
-        module.log_gain.copy_(torch.tensor([0.1, 0.3, -0.2, 0.0, 0.4, -0.5, -0.1]))
+        module.log_gain.copy_(torch.tensor([0.1, 0.3, -0.2, 0.0, 0.4, -0.5, -0.1])[:, None])
     zero = module.log_gain.mean()
     trained = module.gain(View("0003", 3.0, True)).log().item()
     assert trained == pytest.approx((module.log_gain[2] - zero).item())
@@ -41,7 +41,7 @@ def test_gains_of_other_views():
 def test_options():
     module = make(untrained="mean", reference="0002")
     with torch.no_grad():
-        module.log_gain.copy_(torch.linspace(0.0, 0.6, 7))
+        module.log_gain.copy_(torch.linspace(0.0, 0.6, 7)[:, None])
     assert module.gain(View("0002", 2.0, True)).item() == 1.0
     assert module.gain(View("x", 6.0, False)).log().item() == pytest.approx(0.3 - 0.1)
     with pytest.raises(InputError, match="gain names frame 'nobody'"):
@@ -60,6 +60,36 @@ def test_shading_multiplies_the_colours_alone():
     shaded = module.shade(output, view)
     torch.testing.assert_close(shaded.rgb, output.rgb * module.gain(view))
     assert shaded.alpha is output.alpha and shaded.maps is output.maps
+
+
+def test_views_beside_the_video_have_the_gain_of_the_nearest_training_camera():
+    scene = wall_scene()
+    aside = replace(scene.train[4], name="turned-0", index=0)  # taken where the fifth training frame was
+    module = FrameGain.from_scene(
+        replace(scene, test_sets={**scene.test_sets, "rotation": [aside]}), FrameGainSettings(), torch.Generator()
+    )
+    with torch.no_grad():
+        module.log_gain.copy_(torch.tensor([0.1, 0.3, -0.2, 0.0, 0.4, -0.5, -0.1])[:, None])
+    assert module.gain(aside.view(trained=False)).item() == pytest.approx(module.gains()[4].item())
+
+
+def test_each_colour_has_its_own_gain():
+    module = make(channels=3)
+    with torch.no_grad():
+        module.log_gain.copy_(torch.linspace(-0.4, 0.4, 21).view(7, 3))
+    output = RenderOutput(torch.rand(2, 3, 3), torch.rand(2, 3), None, {})
+    view = View("0003", 3.0, True)
+    expected = output.rgb * (module.log_gain[2] - module.log_gain.mean(0)).exp()
+    torch.testing.assert_close(module.shade(output, view).rgb, expected)
+
+
+def test_gains_stay_within_their_bounds_and_frames_at_a_bound_are_named():
+    module = make(max_gain=2.0)
+    with torch.no_grad():
+        module.log_gain[3] = 70.0
+    assert module.gains().max().item() == pytest.approx(2.0) and module.gains().min().item() == pytest.approx(0.5)
+    assert "0004" in module.learned["at_bound"] and module.learned["gains"]["0004"] == pytest.approx([2.0])
+    assert make().learned["at_bound"] == []
 
 
 def test_known_gains_are_found(tmp_path):
@@ -81,6 +111,6 @@ def test_known_gains_are_found(tmp_path):
     trainer = Trainer(method, replace(scene, train=train), "wall", RunFolder(tmp_path / "run"), 0, torch.device("cpu"))
     for _ in range(400):
         trainer.take_step()
-    found = trainer.model.view_modules["exposure"].gains().detach()
+    found = trainer.model.view_modules["exposure"].gains().detach()[:, 0]
     expected = gains / math.exp(gains.log().mean().item())
     assert (found / expected - 1).abs().max() < 0.01

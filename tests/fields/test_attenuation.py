@@ -1,0 +1,114 @@
+"""The law of attenuation: closed forms, the lamp it finds, and that other heads are left as they are."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from coliags_plugin.config.components import make_component
+from coliags_plugin.core.lamps import FlattenedLight
+from coliags_plugin.fields.attenuation import MAX_OFFSET, AttenuatedAppearanceHead
+from tests.scenes import camera_at, wall_scene
+
+PLAIN = {"name": "anchors", "geometry_head": "plain", "appearance_head": "plain"}
+
+
+def make_head(**options) -> AttenuatedAppearanceHead:
+    head = make_component("appearance_heads", {"name": "attenuated", "head": "plain", "channels": 1, **options})
+    return head.target(head.settings, 4, 2, torch.Generator().manual_seed(0))
+
+
+def make_field(appearance):
+    component = make_component("fields", {**PLAIN, "appearance_head": appearance})
+    return component.target.from_scene(wall_scene(), component.settings, torch.Generator().manual_seed(0))
+
+
+def test_the_factor_is_the_law_about_the_median_distance():
+    head = make_head(distance_exponent=-0.8, cosine_exponent=1.5)
+    head.expect(torch.tensor([10.0, 20.0, 70.0]))
+    distances, cosines = torch.tensor([20.0, 40.0, 10.0]), torch.tensor([1.0, 0.9, 0.5])
+    expected = [1.0, 2.0**-0.8 * 0.9**1.5, 2.0**0.8 * 0.5**1.5]
+    torch.testing.assert_close(head.law(distances, cosines)[:, 0], torch.tensor(expected))
+
+
+def test_each_channel_has_its_own_exponents():
+    head = make_head(channels=3)
+    with torch.no_grad():
+        head.exponents.copy_(torch.tensor([[-0.5, 0.0], [-1.0, 0.0], [-1.0, 2.0]]))
+    factors = head.law(torch.tensor([4.0]), torch.tensor([0.5]))
+    torch.testing.assert_close(factors, torch.tensor([[0.5, 0.25, 0.0625]]))
+
+
+def test_the_distance_is_that_of_the_lamp_and_the_angle_that_of_the_camera():
+    """A lamp 3 mm behind the lens and 4 mm above it, in a camera that is turned and moved."""
+    head, camera = make_head(cosine_exponent=1.0), camera_at(1.0, 2.0, 3.0, yaw=0.4).to("cpu", torch.float32)
+    with torch.no_grad():
+        head.lamp_offset.copy_(MAX_OFFSET * torch.atanh(torch.tensor([0.0, -4.0, -3.0]) / MAX_OFFSET))
+    torch.testing.assert_close(head.offset, torch.tensor([0.0, -4.0, -3.0]))
+    local = torch.tensor([[0.0, 0.0, 9.0], [3.0, -4.0, 9.0]])  # the second is 3 mm beside the lamp's axis
+    points = camera.center + local @ camera.camera_to_world[:3, :3].T
+    lit = head.lit(torch.full((2, 3), 0.5), points, camera, None)
+    expected = [math.hypot(4, 12) ** -0.9, math.hypot(3, 12) ** -0.9 * 9 / math.sqrt(9 + 16 + 81)]
+    torch.testing.assert_close(lit[:, 0], 0.5 * torch.tensor(expected))
+
+
+def test_a_held_light_takes_the_place_of_the_lamp():
+    head = make_head(cosine_exponent=2.0)
+    lit = head.lit(torch.ones(3, 3), torch.rand(3, 3), camera_at(0, 0, 0), FlattenedLight(4.0, 0.5))
+    torch.testing.assert_close(lit, torch.full((3, 3), 4.0**-0.9 * 0.25))
+
+
+def test_the_lamp_stays_within_its_bounds_and_nothing_overflows():
+    head = make_head()
+    with torch.no_grad():
+        head.lamp_offset.fill_(1e6)
+    assert head.offset.abs().max() <= MAX_OFFSET
+    points = torch.tensor([[MAX_OFFSET, MAX_OFFSET, MAX_OFFSET], [0.0, 0.0, 0.0], [0.0, 0.0, -5.0]])
+    lit = head.lit(torch.ones(3, 3), points, camera_at(0, 0, 0).to("cpu", torch.float32), None)
+    lit.sum().backward()
+    assert lit.isfinite().all() and head.exponents.grad.isfinite().all() and head.lamp_offset.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("inner", ["plain", "imia"])
+def test_exponents_of_zero_are_the_head_alone(inner):
+    options = {"distance_exponent": 0.0, "cosine_exponent": 0.0}
+    plain, lit = make_field(inner), make_field({"name": "attenuated", "head": inner, **options})
+    camera = camera_at(0.5, 0.0, 1.0)
+    first, second = plain.gaussians(camera), lit.gaussians(camera)
+    assert torch.equal(first.colors, second.colors) and torch.equal(first.means, second.means)
+    assert plain.learned == {}
+    assert lit.learned["distance_exponent"] == [0.0] * 3 and lit.learned["lamp_offset"] == [0.0, 0.0, 0.0]
+
+
+def test_colors_do_not_move_gaussians():
+    field = make_field({"name": "attenuated", "head": "plain"})
+    field.gaussians(camera_at(0.0, 0.0, 0.0)).colors.sum().backward()
+    assert field.offsets.grad is None and field.appearance_head.exponents.grad.abs().max() > 0
+
+
+def test_the_law_of_a_lamp_is_found():
+    """Gaussians of one albedo under an inverse-square lamp 3.6 mm behind the lens, spread as cos^1.2, at gamma 2.2."""
+    generator = torch.Generator().manual_seed(0)
+    camera, head = camera_at(0, 0, 0).to("cpu", torch.float32), make_head(cosine_exponent=0.0)
+    points = torch.rand(2000, 3, generator=generator) * torch.tensor([16.0, 16.0, 40.0]) + torch.tensor([-8.0, -8, 5])
+    distances = (points - torch.tensor([0.0, 0.0, -3.6])).norm(dim=1)
+    true = 0.5 * (distances / 20.0) ** (-2 / 2.2) * (points[:, 2] / points.norm(dim=1)) ** (1.2 / 2.2)
+    head.expect(torch.tensor([20.0]))
+    albedo = torch.tensor(0.3, requires_grad=True)
+    fit = torch.optim.LBFGS([head.exponents, head.lamp_offset, albedo], max_iter=200, line_search_fn="strong_wolfe")
+
+    def error() -> torch.Tensor:
+        fit.zero_grad()
+        lit = head.lit(albedo.expand(2000, 3), points, camera, None)
+        value = (lit[:, 0].log() - true.log()).square().mean()
+        value.backward()
+        return value
+
+    for _ in range(3):
+        fit.step(error)
+    learned = head.learned
+    assert learned["distance_exponent"][0] == pytest.approx(-2 / 2.2, rel=0.02)
+    assert learned["cosine_exponent"][0] == pytest.approx(1.2 / 2.2, rel=0.05)
+    assert learned["lamp_offset"] == pytest.approx([0.0, 0.0, -3.6], abs=0.2)
