@@ -11,6 +11,8 @@ from coliags_plugin.pipeline.stages import duration
 
 #: Name of the file.
 PAGE_FILE = "index.html"
+#: Results are sentences.
+_STYLE = ":is(th, td):nth-child(2) { text-align: left; white-space: normal; }"
 
 
 def write_index(record: Record, title: str) -> None:
@@ -37,4 +39,5 @@ def write_index(record: Record, title: str) -> None:
             f"<section><h2>Files</h2><ul>{links}</ul></section>",
             f"<section><h2>Stages</h2>{table(('stage', 'result', 'time'), stages)}</section>",
         ],
+        _STYLE,
     )

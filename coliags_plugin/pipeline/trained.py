@@ -73,9 +73,10 @@ def mesh(place: Workplace) -> Outcome:
 
     trained = load_trained(place.run, place.device, place.scene)
     made = mesh_run(trained, place.run / "mesh", place.settings.mesh, overwrite=True)
-    unit = f" {trained.scene.length_unit}^2" if trained.scene.is_metric else " square units"
+    area = made.mesh.areas.sum()
+    shown = f"{area / 100.0:.1f} cm²" if trained.scene.is_metric else f"{area:,.0f} square units"
     files = {f"run/mesh/mesh.{kind}": f"the surface as {kind.upper()}" for kind in MESH_FORMATS}
-    return Outcome(f"{len(made.mesh):,} triangles, {made.mesh.areas.sum():.4g}{unit}", files)
+    return Outcome(f"{len(made.mesh):,} triangles, {shown}", files)
 
 
 def coverage(place: Workplace) -> Outcome:
