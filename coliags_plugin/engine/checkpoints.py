@@ -104,13 +104,16 @@ def save_checkpoint(
 
 
 def save_tensors(tensors: Mapping[str, Tensor], file: Path) -> None:
-    """Write named tensors as safetensors.
+    """Write named tensors as safetensors, with the permissions that the umask leaves.
 
     Raises:
         InputError: The file cannot be written.
     """
+    file.touch()
+    permissions = file.stat().st_mode & 0o777  # safetensors itself gives them to the owner only
     try:
         save_file({key: value.detach().contiguous() for key, value in tensors.items()}, file)
+        file.chmod(permissions)
     except SafetensorError as error:  # the only error it knows, of a full disk too
         raise InputError(
             f"cannot write to {final_place(file.parent)}: {error}",

@@ -73,6 +73,7 @@ def reconstruct(
     try:
         with locked(out / LOCK_FILE):
             record = Record.of(out)
+            record.write()  # so that the folder is known for one from now on, whatever happens in the first stage
             run_stages(stages, record, overwrite)
             write_index(record, f"Reconstruction of {source.resolve().name}")
     except LockedError as error:

@@ -65,7 +65,7 @@ class Record:
                 raise InputError(
                     f"cannot read {file}: {error}", "what `coliags reconstruct` wrote", "Choose another --out"
                 ) from error
-        if folder.exists() and (not folder.is_dir() or any(path.name != LOCK_FILE for path in folder.iterdir())):
+        if folder.exists() and (not folder.is_dir() or any(not _is_ours(path) for path in folder.iterdir())):
             raise InputError(
                 f"{folder} already exists and is no reconstruction",
                 "a new or empty folder, or one that `coliags reconstruct` made",
@@ -102,3 +102,8 @@ class Record:
         """
         stages = {name: asdict(stage) for name, stage in self.stages.items()}
         write_json(self.folder / RECORD_FILE, {"format": _FORMAT, "version": __version__, "stages": stages})
+
+
+def _is_ours(path: Path) -> bool:
+    """Whether a file is there before the record is: the lock, or what a kill has left of writing the record."""
+    return path.name == LOCK_FILE or path.name.startswith(f".{RECORD_FILE}.")

@@ -115,7 +115,9 @@ class Bench:
             broken = [
                 name
                 for name, data in now.items()
-                if name in self.new and not name.endswith((".jsonl", ".log", ".db")) and not is_whole(name, data, None)
+                if name in self.new
+                and not name.endswith((".jsonl", ".log", ".db"))
+                and not is_whole(name, data, self.new[name])
             ]
             verdict = f"broken {broken[:3]}" if broken else "part"
         else:

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.pipeline.record import RECORD_FILE, Record
+from coliags_plugin.pipeline.record import LOCK_FILE, RECORD_FILE, Record
 from coliags_plugin.pipeline.stages import Outcome, Stage, duration, run_stages
 
 
@@ -108,3 +108,11 @@ def test_the_record_is_json_with_version(tmp_path):
 
 def test_durations_in_words():
     assert [duration(seconds) for seconds in (0.4, 59.4, 60, 3725)] == ["0 s", "59 s", "1 min 0 s", "62 min 5 s"]
+
+
+def test_what_a_kill_leaves_before_the_record_is_no_hindrance(tmp_path):
+    (tmp_path / LOCK_FILE).write_text("")
+    (tmp_path / f".{RECORD_FILE}.0123abcd.partial").write_text("{")
+    Record.of(tmp_path).write()
+    assert Record.of(tmp_path).stages == {}
+    assert sorted(path.name for path in tmp_path.iterdir()) == [LOCK_FILE, RECORD_FILE]
