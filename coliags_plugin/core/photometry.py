@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from coliags_plugin.core.masked import zero_outside
 from coliags_plugin.core.scenes import Frame, Scene
 
 #: Approximate number of points, spread evenly over the scene's; fewest of these and of frames.
@@ -18,6 +19,8 @@ _DARKEST, _BRIGHTEST = 0.06, 0.72
 _SAME_SURFACE = 0.02
 #: Passes of reweighting by residuals, and the residual at which the weight is a half, in robust standard deviations.
 _PASSES, _HALF_WEIGHT = 5, 2.0
+#: Share of valid pixels among 3x3 above which all are.
+_ALL = 0.99
 #: Whose fit gives the gain of all: red is least like direct light, because the wall lights itself.
 _GREEN = 1
 #: Of encoded colours over the distance to the lamp: inverse square at gamma 2.2. Fitted, it would take up the gain of a
@@ -68,14 +71,22 @@ def _seen(
     inside = camera.sees(points)[1]
     limits = torch.tensor([camera.width - 1, camera.height - 1])
     column, row = pixels.nan_to_num(0.0).clamp(torch.zeros(2), limits).long().unbind(1)
-    blurred = torch.nn.functional.avg_pool2d(frame.rgb.cpu().permute(2, 0, 1)[None], 3, 1, 1, count_include_pad=False)
-    colors = blurred[0, :, row, column].T.double()
+    valid = frame.valid.cpu()
+    blurred = _mean_of_neighbours(zero_outside(frame.rgb.cpu(), valid))
+    whole = _mean_of_neighbours(valid[..., None].float())[..., 0] > _ALL
+    colors = blurred[row, column].double()
     same = inside & ((frame.depth.cpu()[row, column] - depths).abs() < _SAME_SURFACE * depths)
-    same = same & frame.valid.cpu()[row, column]
+    same = same & whole[row, column]
     usable = same[:, None] & (colors > _DARKEST) & (colors < _BRIGHTEST)
     distances = (points - camera.center).norm(dim=1).clamp_min(1e-9)
     logs = colors.clamp_min(1e-3).log() - _DISTANCE_EXPONENT * distances.log()[:, None]
     return logs, usable, (depths / distances).clamp(1e-3, 1.0)
+
+
+def _mean_of_neighbours(image: Float[Tensor, "H W C"]) -> Float[Tensor, "H W C"]:
+    """Mean over 3x3 pixels, over those that there are at the border. [H, W, C]"""
+    planes = image.permute(2, 0, 1)[None]
+    return torch.nn.functional.avg_pool2d(planes, 3, 1, 1, count_include_pad=False)[0].permute(1, 2, 0)
 
 
 def _fit(

@@ -52,6 +52,21 @@ def test_a_frame_that_shows_nothing_known_has_a_finite_gain():
     assert found.isfinite().all() and found.abs().max() < 1.0
 
 
+def test_masked_pixels_have_no_influence_to_the_bit():
+    scene = gained(GAINS)
+    mask = torch.ones(48, 64, dtype=torch.bool)
+    mask[10:30, 5:40] = False
+    masked = [replace(frame, mask=mask) for frame in scene.train]
+    painted = []
+    for frame in masked:
+        image, depth = frame.image.clone(), frame.depth.clone()
+        image[~mask], depth[~mask] = 200, torch.nan
+        painted.append(replace(frame, image=image, depth=depth))
+    first, second = (fit_light(replace(scene, train=frames)) for frames in (masked, painted))
+    assert torch.equal(first.log_gains, second.log_gains)
+    assert torch.equal(first.cosine_exponents, second.cosine_exponents)
+
+
 def test_nothing_but_masked_pixels_leave_gains_at_one():
     scene = gained(GAINS)
     hidden = [replace(frame, mask=torch.zeros(48, 64, dtype=torch.bool)) for frame in scene.train]

@@ -91,8 +91,10 @@ def test_another_seed_is_another_run(tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_an_interrupted_run_resumes_to_the_bit(tmp_path, number):
+def test_an_interrupted_run_resumes_to_the_bit(tmp_path, number, request):
     """Interrupted in the middle of a round, resumed by a fresh trainer: the same bits as never interrupted."""
+    before = signal.signal(number, signal.default_int_handler)  # nohup and background jobs ignore some of them
+    request.addfinalizer(lambda: signal.signal(number, before))
     whole = train(tmp_path / "whole", steps=16, overrides=EARLY_GROWTH)
     cut = make_trainer(tmp_path / "cut", steps=16, overrides=EARLY_GROWTH)
     cut.start()

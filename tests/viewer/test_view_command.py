@@ -16,7 +16,11 @@ pytest.importorskip("viser")
 def test_ctrl_c_ends_it_cleanly(anchors, number):
     command = [sys.executable, "-c", "from coliags_plugin.cli import main; main()", "view", str(anchors.path)]
     process = subprocess.Popen(
-        [*command, "--port", "0", "--no-open"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [*command, "--port", "0", "--no-open"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(number, signal.SIG_DFL),  # background jobs ignore it
     )
     line = process.stdout.readline()
     with urllib.request.urlopen(line.split()[0], timeout=20) as answer:
