@@ -13,14 +13,12 @@ pytest.importorskip("viser")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT])
-def test_ctrl_c_ends_it_cleanly(anchors, number):
+def test_ctrl_c_ends_it_cleanly(anchors, number, request):
+    before = signal.signal(number, signal.default_int_handler)  # a background job ignores it, and so would the process
+    request.addfinalizer(lambda: signal.signal(number, before))
     command = [sys.executable, "-c", "from coliags_plugin.cli import main; main()", "view", str(anchors.path)]
     process = subprocess.Popen(
-        [*command, "--port", "0", "--no-open"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=lambda: signal.signal(number, signal.SIG_DFL),  # background jobs ignore it
+        [*command, "--port", "0", "--no-open"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     line = process.stdout.readline()
     with urllib.request.urlopen(line.split()[0], timeout=20) as answer:
