@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,10 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from coliags_plugin.core.beams import SpreadLaw, beam
 from coliags_plugin.core.errors import InputError
-
-#: cos psi below which a phantom's beam fades to 0 at 90 degrees (docs/phantom.md 2).
-_EDGE_DEGREES = 72.0
+from coliags_plugin.core.json_files import read_json
 
 
 @dataclass(frozen=True)
@@ -34,7 +32,7 @@ class TrueLight:
 
     offset: tuple[float, float, float]
     axis: tuple[float, float, float]
-    spread_law: str
+    spread_law: SpreadLaw
     spread: float
     vignetting: float
     gamma: float
@@ -54,10 +52,9 @@ class TrueLight:
         sight = points - points.new_tensor(self.offset)
         distances = sight.norm(dim=1)
         psi = sight @ points.new_tensor(self.axis) / distances
-        beam = psi.clamp_min(0.0).pow(self.spread) if self.spread_law == "cosine" else (-self.spread * (1 - psi)).exp()
-        edge = (psi / torch.cos(torch.deg2rad(psi.new_tensor(_EDGE_DEGREES)))).clamp(0.0, 1.0)
+        emitted = torch.from_numpy(beam(psi.numpy(), self.spread_law, self.spread))
         theta = (points[:, 2] / points.norm(dim=1)).clamp_min(0.0)
-        linear = beam * edge * edge * (3.0 - 2.0 * edge) * theta.pow(self.vignetting) / distances.square()
+        linear = emitted * theta.pow(self.vignetting) / distances.square()
         return linear.pow(1.0 / self.gamma)
 
 
@@ -74,7 +71,7 @@ def find_true_light(scene: Path) -> TrueLight | None:
     if not file.is_file():
         return None
     try:
-        record: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        record: dict[str, Any] = read_json(file, "the light of a phantom")
         lamp = record["lamp"]
         with (file.parent / "gain.csv").open(newline="", encoding="utf-8") as rows:
             gains = {
@@ -84,7 +81,7 @@ def find_true_light(scene: Path) -> TrueLight | None:
         return TrueLight(
             offset=tuple(lamp["offset"]),
             axis=tuple(lamp["axis"]),
-            spread_law=str(lamp["spread_law"]),
+            spread_law=lamp["spread_law"],
             spread=float(lamp["spread"]),
             vignetting=float(record["vignetting"]),
             gamma=float(record["gamma"]),

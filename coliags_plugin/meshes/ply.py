@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Int
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.datamanagers.reading.ply_vertices import PlyElement, PlyFile, open_ply, read_vertices
+from coliags_plugin.datamanagers.reading.ply_vertices import PlyElement, PlyFile, open_ply, vertices_of
 from coliags_plugin.meshes.mesh import TriangleMesh
 
 _COLORS = ("red", "green", "blue")
@@ -30,7 +30,7 @@ def read_ply_mesh(path: Path) -> TriangleMesh:
         InputError: The file is damaged, or holds no faces behind its vertices.
     """
     file = open_ply(path)
-    columns = read_vertices(path)
+    columns = vertices_of(path, file)
     if len(file.elements) < 2 or file.elements[1].name != "face":
         raise InputError(f"{path} has no faces behind its vertices", "a mesh", "Check that it is no cloud of points")
     triangles = (_text_faces if file.form == "ascii" else _binary_faces)(path, file)

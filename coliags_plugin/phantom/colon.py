@@ -13,9 +13,10 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Int
 
+from coliags_plugin.core.beams import smoothstep
 from coliags_plugin.phantom.centreline import LENGTH, CentreLine, grow_centre_line
 from coliags_plugin.phantom.settings import PhantomSettings
-from coliags_plugin.phantom.streams import Purpose, SolidNoise, smoothstep, stream
+from coliags_plugin.phantom.streams import Purpose, SolidNoise, stream
 
 RADIUS = 20.0
 #: Length over which the far end rounds off into a closed dome.

@@ -16,13 +16,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from coliags_plugin.core.beams import beam
 from coliags_plugin.phantom.settings import PhantomSettings, SpreadLaw, value_or_default
-from coliags_plugin.phantom.streams import smoothstep
 
 #: Distance at which radiance is 1, mm.
 UNIT_DISTANCE = 20.0
-#: cos psi below which the beam fades to 0 at 90 degrees: light guides only emit forward. No pixel looks there.
-_EDGE = float(np.cos(np.radians(72.0)))
 
 
 @dataclass(frozen=True)
@@ -70,11 +68,7 @@ class Lamp:
         Args:
             cosine: cos psi. [N]
         """
-        if self.spread_law == "cosine":
-            shape = np.maximum(cosine, 0.0) ** self.spread
-        else:
-            shape = np.exp(-self.spread * (1.0 - cosine))
-        return np.asarray(shape * smoothstep(cosine / _EDGE), dtype=cosine.dtype)
+        return beam(cosine, self.spread_law, self.spread)
 
     def irradiance(
         self, points: Float[np.ndarray, "N 3"], camera_to_world: Float[np.ndarray, "4 4"]

@@ -93,7 +93,15 @@ def read_vertices(path: Path, needed: tuple[str, ...] = ("x", "y", "z")) -> dict
     Raises:
         InputError: The file is damaged or not a PLY file, or its vertices lack a property.
     """
-    file = open_ply(path)
+    return vertices_of(path, open_ply(path), needed)
+
+
+def vertices_of(path: Path, file: PlyFile, needed: tuple[str, ...] = ("x", "y", "z")) -> dict[str, np.ndarray]:
+    """:func:`read_vertices` of a file whose header is read.
+
+    Raises:
+        InputError: The file is damaged, or its vertices lack a property.
+    """
     elements = file.elements
     # Only files with the vertices first are supported: behind a list, their offset would be unknown.
     if not elements or elements[0].name != "vertex" or elements[0].has_lists:
@@ -105,17 +113,7 @@ def read_vertices(path: Path, needed: tuple[str, ...] = ("x", "y", "z")) -> dict
             f"{path}: vertices have {', '.join(names) or 'no properties'}, but no {', '.join(missing)}",
             f"vertices with {', '.join(needed)}",
         )
-    return vertex_columns(path, file)
-
-
-def vertex_columns(path: Path, file: PlyFile) -> dict[str, np.ndarray]:
-    """The properties of the first element of a PLY file, which has no lists. Each [N]
-
-    Raises:
-        InputError: The file is damaged.
-    """
-    vertex, body = file.elements[0], file.body
-    layout = vertex.layout(file.form)
+    layout, body = vertex.layout(file.form), file.body
     if file.form == "ascii":
         return _ascii(path, body, vertex, layout)
     if len(body) < vertex.count * layout.itemsize:
