@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -106,8 +107,10 @@ class RunFolder:
 
     @classmethod
     def default(cls, scene: str, method: str) -> RunFolder:
-        """``runs/<scene>/<method>/<stamp>`` under the working directory."""
-        return cls(Path("runs") / scene / method / datetime.now().strftime("%Y%m%d-%H%M%S"))
+        """A new ``runs/<scene>/<method>/<stamp>`` under the working directory; numbered after the first of a second."""
+        parent, stamp = Path("runs") / scene / method, datetime.now().strftime("%Y%m%d-%H%M%S")
+        names = itertools.chain([stamp], (f"{stamp}-{number:02d}" for number in itertools.count(2)))
+        return cls(next(parent / name for name in names if not (parent / name).exists()))
 
     @classmethod
     def newest(cls, scene: str, method: str) -> RunFolder:
