@@ -78,6 +78,11 @@ class GaussianField(Field):
         """Names of the feature channels of its Gaussians, each of which is an output."""
         return frozenset()
 
+    @property
+    def knows_lamp(self) -> bool:
+        """Whether colours depend on where the lamp is, so that :meth:`gaussians_in_light` changes them."""
+        return False
+
     @abstractmethod
     def gaussians(self, camera: Camera) -> Gaussians:
         """The Gaussians this camera sees, differentiable with respect to the field's parameters and the pose."""

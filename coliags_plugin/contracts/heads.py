@@ -52,6 +52,11 @@ class AppearanceHead(Head):
     Made by ``Head(settings, features, children, generator)``.
     """
 
+    @property
+    def knows_lamp(self) -> bool:
+        """Whether colours depend on distance or angle to the lamp."""
+        return True
+
     def expect(self, distances: Float[Tensor, "D"]) -> None:
         """Adapt the initial parameters to the distances of the scene, before training.
 

@@ -56,7 +56,7 @@ def export_run(
         trained: The run.
         output: The file.
         form: Name of its format.
-        light: Name of the light to bake in; of no effect on explicit fields.
+        light: Name of the light to bake in; of no effect where colours know no lamp.
         measure: Compare the file with the run on the held-out views, for the record.
         overwrite: Replace a file that is there.
 
@@ -75,9 +75,10 @@ def export_run(
     if isinstance(field, ExplicitGaussians):
         cloud = cloud_of_field(field)
     else:
-        held = held_light(light, trained.model, [frame.camera for frame in trained.scene.train])
-        cloud, facts = bake(trained, held)
-        baking = {"light": {"name": light, **held.described}, **facts}
+        baked_in = held_light(light, trained.model, [frame.camera for frame in trained.scene.train])
+        held = baked_in if field.knows_lamp else None
+        cloud, facts = bake(trained, baked_in)
+        baking = {"light": held and {"name": light, **held.described}, **facts}
     cloud = _checked(cloud.with_thickness(THICKNESS_SHARE), trained)
     unit = trained.scene.length_unit
     comment = f"{trained.method} on {trained.scene.name}, exported by coliags_plugin; lengths in {unit}"

@@ -141,6 +141,11 @@ class AnchorField(GaussianField):
         }
 
     @property
+    def knows_lamp(self) -> bool:
+        """Whether the appearance head does."""
+        return self.appearance_head.knows_lamp
+
+    @property
     def learned(self) -> dict[str, Any]:
         """The numbers of the appearance head."""
         return self.appearance_head.learned

@@ -56,6 +56,11 @@ class PlainAppearanceHead(AppearanceHead):
         """Whether the distance is among the inputs."""
         return bool(self.settings.distance)
 
+    @property
+    def knows_lamp(self) -> bool:
+        """Where the distance is an input."""
+        return self.sees_distance
+
     @torch.no_grad()
     def expect(self, distances: Float[Tensor, "D"]) -> None:
         """Initialise the biases so that each hidden unit's kink is at a distance of the scene (docs/methods.md 3.4).

@@ -155,6 +155,11 @@ class LitGaussians(ExplicitField, LitField):
     def _max_log_scale(self) -> Tensor:
         return (self.settings.max_scale_share * self.extent).log()
 
+    @property
+    def knows_lamp(self) -> bool:
+        """Always."""
+        return True
+
     def gaussians(self, camera: Camera) -> Gaussians:
         """The Gaussians in the camera's view with the light they reflect towards it."""
         return self._gaussians(camera, None)

@@ -19,7 +19,7 @@ from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.lamps import HeldLight
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.engine.held_light import flattened_light
+from coliags_plugin.engine.held_light import flattened_light, gaussians_of
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.outputs.image_files import as_array
 from coliags_plugin.viewer.baking import bake, baking_cameras
@@ -80,12 +80,18 @@ class Content:
         return cls(trained, trained.scene.video, baked, decoder, Pictures(trained), wire_unit(baked))
 
     def relit_evenly(self) -> Content:
-        """The same, its Gaussians baked under the flattened light."""
-        field = self.trained.model.field
-        if not isinstance(field, GaussianField):
+        """The same, its Gaussians baked under the flattened light, where their colours know a lamp."""
+        if not self.knows_lamp:
             return self
+        field = gaussians_of(self.trained.model)
         cameras = [frame.camera.to(self.trained.device) for frame in self.trained.scene.train]
         return replace(self, baked=Splats.of(bake(field, baking_cameras(cameras), self.flattened)))
+
+    @property
+    def knows_lamp(self) -> bool:
+        """Whether the light can be held."""
+        field = self.trained.model.field
+        return isinstance(field, GaussianField) and field.knows_lamp
 
     @property
     def title(self) -> str:

@@ -55,11 +55,12 @@ class Controls:
         self._frame.on_update(lambda _: self._frame_chosen())
         self._about_frame = gui.add_markdown(self._frame_text())
         self._light = self._threshold = None
-        if content.decoder is not None:
+        if content.knows_lamp:
             self._light = gui.add_dropdown("Light", (AT_CAMERA, FLATTENED))
+            self._light.on_update(lambda _: listener.options_changed())
+        if content.decoder is not None:
             self._threshold = gui.add_slider("Least opacity", 0.0, _LARGEST_THRESHOLD, 0.01, 0.0)
-            for handle in (self._light, self._threshold):
-                handle.on_update(lambda _: listener.options_changed())
+            self._threshold.on_update(lambda _: listener.options_changed())
         with gui.add_folder("Layers"):
             self._add_layers(gui)
         with gui.add_folder("Pictures of the frame"):

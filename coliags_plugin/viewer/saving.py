@@ -47,7 +47,7 @@ def save_page(trained: TrainedRun, output: Path, largest: int = LARGEST_PAGE) ->
 
 
 def scene_page(trained: TrainedRun, largest: int = LARGEST_PAGE) -> str:
-    """The Gaussians of a run, under the same light everywhere, as an HTML page.
+    """The Gaussians of a run as an HTML page; under the same light everywhere, where their colours know a lamp.
 
     Where the page would be too large, neighbouring Gaussians are merged.
 
@@ -111,7 +111,9 @@ def _page(content: Content, splats: Splats) -> str:
 
 def _caption(content: Content, splats: Splats) -> str:
     """What is seen, at the bottom of the page."""
-    text = f"{content.title}, step {content.trained.step}: flattened light"
+    text = f"{content.title}, step {content.trained.step}"
+    if content.knows_lamp:
+        text += "; flattened light"
     if len(splats) < len(content.baked):
         text += f"; {len(content.baked):,} Gaussians merged into {len(splats):,}"
     style = "position:fixed;left:0;bottom:0;padding:4px 8px;font:12px sans-serif;background:#fffc;pointer-events:none"

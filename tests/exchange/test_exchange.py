@@ -143,6 +143,19 @@ def test_the_lamp_of_the_camera_itself_changes_nothing(runs, method):
     torch.testing.assert_close(held.colors, own.colors, atol=1e-5, rtol=1e-4)
 
 
+@pytest.mark.parametrize(
+    "method", ["coliags", "coliags-plus", "scaffold-gs-distance", "scaffold-gs", "pr-endo", "3dgs"]
+)
+def test_fields_that_know_a_lamp_look_different_under_another(runs, method):
+    explicit = method in ("pr-endo", "3dgs")
+    trained = runs(method, settings=OTHERS if explicit else ANCHORS).load()
+    field, camera = trained.model.field, trained.scene.train[2].camera
+    assert field.knows_lamp == (method not in ("scaffold-gs", "3dgs"))
+    with torch.no_grad():
+        near, far = (field.gaussians_in_light(camera, FlattenedLight(length, 1.0)).colors for length in (10.0, 60.0))
+    assert torch.equal(near, far) != field.knows_lamp
+
+
 def test_flattened_light_is_even_over_a_wall(runs):
     """Gaussians of one albedo and one normal look the same everywhere, however far they are."""
     field = runs("pr-endo").load().model.field

@@ -14,7 +14,7 @@ from tests.commands import refused, run
 pytest.importorskip("viser")
 
 from coliags_plugin.viewer.content import Content
-from coliags_plugin.viewer.saving import LARGEST_PAGE, fitting_page, save_page
+from coliags_plugin.viewer.saving import LARGEST_PAGE, fitting_page, save_page, scene_page
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def test_the_command_writes_a_page_that_needs_no_network(anchors, tmp_path, caps
     assert capsys.readouterr().out.strip() == str(page)
     text = page.read_text(encoding="utf-8")
     assert len(text.encode()) < LARGEST_PAGE
-    assert "<title>coliags on wall</title>" in text and "step 2: flattened light" in text
+    assert "<title>coliags on wall</title>" in text and "step 2; flattened light" in text
     assert "__VISER_EMBED_DATA__" in text and "merged" not in text
     assert not re.search(r"""(?:src|href)\s*=\s*["']?(?:https?:)?//""", text)
     assert set(re.findall(r"https?://[\w./-]+", text)) <= {"http://www.w3.org/2000/svg"}
@@ -74,3 +74,8 @@ def test_a_report_embeds_a_scene(anchors, tmp_path):
     assert "__VISER_EMBED_DATA__" in embedded and "<title>coliags on wall</title>" in unescape(embedded)
     (plain,) = cp.report(anchors, tmp_path / "plain.html")
     assert "<iframe" not in plain.read_text(encoding="utf-8")
+
+
+def test_a_page_of_a_method_without_a_lamp_speaks_of_no_light(run_of):
+    text = scene_page(run_of("3dgs").load())
+    assert "step 2</div>" in text and "flattened" not in text
