@@ -37,13 +37,17 @@ class FrameRows:
         """The row of a training frame; None for other views."""
         return self.rows.get(view.name) if view is not None and view.trained else None
 
+    def is_beside(self, view: View) -> bool:
+        """Whether a view is of a test set beside the video."""
+        return view.name in self._nearest
+
     def neighbours(self, view: View) -> tuple[int, int, float]:
         """Rows of the training frames before and after a view, and its relative position between them, in [0, 1].
 
         Beyond the ends both are the nearest frame's. Indices of test sets beside the video are not times in it: for
         these both are those of the training frame with the nearest camera.
         """
-        if view.name in self._nearest:
+        if self.is_beside(view):
             row = self._nearest[view.name]
             return row, row, 0.0
         index = bisect_right(self._sorted_times, view.time)

@@ -19,13 +19,16 @@ from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Scene, View
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.modules.frame_rows import FrameRows
+from coliags_plugin.modules.metering import Metering
 
 
 class FrameGainSettings(Settings):
     """Options of the gain per frame."""
 
     reference: str | None = None  # training frame whose gain is 1; None: the gains' geometric mean is 1
-    untrained: Literal["interpolate", "mean"] = "interpolate"  # between the neighbours in time, or the mean gain
+    untrained: Literal["interpolate", "metered", "mean"] = (
+        "interpolate"  # between the neighbours in time, that corrected for brightness, or the mean gain
+    )
     channels: Literal[1, 3] = 1  # one gain for all colours, or one each, for a white balance that drifts
     initial: Literal["one", "points"] = (
         "one"  # 1, or fitted to surface points where there is depth (docs/methods.md 4.8)
@@ -50,6 +53,7 @@ class FrameGain(GainModule):
         self.settings = settings
         self.frames = FrameRows(scene)
         self._reference = None if settings.reference is None else self.frames.require(settings.reference, "gain")
+        self._metering = Metering(scene, self.frames) if settings.untrained == "metered" else None
         self.log_gain = nn.Parameter(torch.zeros(len(self.frames), settings.channels))
 
     @classmethod
@@ -73,9 +77,10 @@ class FrameGain(GainModule):
         """Gain of views that are not training frames."""
         if self.settings.untrained == "mean":
             return "views without training have the mean gain of the training frames"
+        corrected = "" if self._metering is None else " and corrected for their brightness, as automatic exposure does"
         return (
-            "views without training have a gain interpolated between the training frames before and after them; views "
-            "beside the video that of the nearest training camera"
+            f"views without training have a gain interpolated between the training frames before and after them"
+            f"{corrected}; views beside the video that of the nearest training camera"
         )
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
@@ -110,7 +115,14 @@ class FrameGain(GainModule):
 
     def shade(self, output: RenderOutput, view: View | None) -> RenderOutput:
         """Multiply the colours."""
-        return replace(output, rgb=output.rgb * self.gain(view))
+        return replace(output, rgb=output.rgb * self.gain(view) * self._metered(output.rgb, view))
+
+    @torch.no_grad()
+    def _metered(self, rgb: Float[Tensor, "H W 3"], view: View | None) -> float:
+        """Factor on the gain of a held-out frame of the video; 1 for all other views."""
+        if self._metering is None or view is None or self.frames.row(view) is not None or self.frames.is_beside(view):
+            return 1.0
+        return math.exp(self._metering.correction(self.log_gains(), rgb, *self.frames.neighbours(view)))
 
     @property
     def learned(self) -> dict[str, Any]:

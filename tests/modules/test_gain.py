@@ -114,3 +114,52 @@ def test_known_gains_are_found(tmp_path):
     found = trainer.model.view_modules["exposure"].gains().detach()[:, 0]
     expected = gains / math.exp(gains.log().mean().item())
     assert (found / expected - 1).abs().max() < 0.01
+
+
+def exposed(frames=33, answer=-0.6, gap=1):
+    """A module whose gains answer the brightness of training frames exactly, held-out views, and that answer's law."""
+    scene = wall_scene(frames)
+    scene = replace(
+        scene,
+        train=[
+            replace(frame, image=(frame.image * (0.5 + 0.2 * math.sin(0.9 * index))).to(torch.uint8))
+            for index, frame in enumerate(scene.train)
+            if index % gap == 0
+        ],
+    )
+    module = FrameGain.from_scene(scene, FrameGainSettings(untrained="metered"), torch.Generator())
+    recorded = torch.stack([frame.rgb.double().mean().log() for frame in scene.train])
+    # gain = answer * brightness + const, and recorded = brightness + gain.
+    gains = answer / (1.0 + answer) * (recorded - recorded.mean())
+    with torch.no_grad():
+        module.log_gain.copy_(gains[:, None])
+    return module, scene, float((gains - answer * (recorded - gains)).mean())
+
+
+@pytest.mark.parametrize(("answer", "gap"), [(-0.6, 1), (-0.3, 1), (-0.6, 2)])
+def test_held_out_frames_are_exposed_as_training_frames_of_their_brightness(answer, gap):
+    module, scene, constant = exposed(answer=answer, gap=gap)
+    for frame, level in zip(scene.test_sets["test"], (0.2, 0.4, 0.6, 0.3, 0.5), strict=True):
+        output = RenderOutput(torch.full((24, 32, 3), level), torch.ones(24, 32), None, {})
+        gain = float((module.shade(output, frame.view(trained=False)).rgb.detach() / output.rgb)[0, 0, 0])
+        assert math.log(gain) == pytest.approx(answer * math.log(level) + constant, abs=1e-4)
+
+
+def test_metering_leaves_other_views_alone():
+    module, scene, _ = exposed()
+    output = RenderOutput(torch.full((24, 32, 3), 0.3), torch.ones(24, 32), None, {})
+    plain = FrameGain.from_scene(scene, FrameGainSettings(), torch.Generator())
+    plain.load_state_dict(module.state_dict())
+    for view in (scene.train[3].view(trained=True), None):
+        assert torch.equal(module.shade(output, view).rgb, plain.shade(output, view).rgb)
+    fixed, scene, _ = exposed(answer=0.0)
+    held_out = scene.test_sets["test"][1].view(trained=False)
+    torch.testing.assert_close(fixed.shade(output, held_out).rgb, output.rgb)
+
+
+@pytest.mark.parametrize("frames", [3, 5])
+def test_videos_too_short_for_metering_are_interpolated(frames):
+    module, scene, _ = exposed(frames=frames)
+    output = RenderOutput(torch.full((24, 32, 3), 0.3), torch.ones(24, 32), None, {})
+    view = scene.test_sets["test"][0].view(trained=False)
+    torch.testing.assert_close(module.shade(output, view).rgb, output.rgb * module.gain(view).detach())
