@@ -57,6 +57,11 @@ class AppearanceHead(Head):
         """Whether colours depend on distance or angle to the lamp."""
         return True
 
+    @property
+    def uses_normals(self) -> bool:
+        """Whether :meth:`lit` is given the normals of the wall; default: not."""
+        return False
+
     def expect(self, distances: Float[Tensor, "D"]) -> None:
         """Adapt the initial parameters to the distances of the scene, before training.
 
@@ -91,6 +96,7 @@ class AppearanceHead(Head):
         self,
         colors: Float[Tensor, "N 3"],
         positions: Float[Tensor, "N 3"],
+        normals: Float[Tensor, "N 3"] | None,
         camera: Camera,
         light: HeldLight | None,
     ) -> Float[Tensor, "N 3"]:
@@ -99,6 +105,7 @@ class AppearanceHead(Head):
         Args:
             colors: Decoded. [N, 3]
             positions: Of the children, world frame, scene units. [N, 3]
+            normals: Unit normals of the wall there, world frame, of either sign; None for heads that use none. [N, 3]
             camera: From which they are seen.
             light: The lamp that lights them, if it does not move with the camera.
         """

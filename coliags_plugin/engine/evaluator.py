@@ -17,6 +17,7 @@ from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.engine.costs import RenderMeter
 from coliags_plugin.engine.depth_pictures import EXPECTED_DEPTH, write_depth_pictures
 from coliags_plugin.engine.evaluated_set import EvaluatedSet
+from coliags_plugin.engine.light_map import light_record
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.run_result import run_result
@@ -25,6 +26,7 @@ from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.engine.truth import match_truth
 from coliags_plugin.outputs.colormaps import DEPTH_ERROR_LIMIT_MM, colorize_depth_error
 from coliags_plugin.outputs.image_files import eight_bit, write_depth_tiff, write_png
+from coliags_plugin.outputs.light_charts import LIGHT_FILE
 from coliags_plugin.results.reading import RESULT_FILE, write_result
 from coliags_plugin.results.summaries import means_summary, per_frame_table
 
@@ -36,7 +38,8 @@ def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None
 
     Writes into ``eval/<protocol>/``: ``result.json``, the whole :class:`~coliags_plugin.results.record.Result`; and of
     it ``metrics.json`` (means per test set; the main set's also at the top; null where a metric is not available, with
-    the reason) and ``per_frame.csv``; and the images. An earlier evaluation under the same protocol is replaced once
+    the reason) and ``per_frame.csv``; ``light.json``, where the method has learned a law of the light or gains; and the
+    images. An earlier evaluation under the same protocol is replaced once
     the new one is complete.
 
     Args:
@@ -83,6 +86,8 @@ def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None
         write_result(scratch / RESULT_FILE, result)
         write_json(scratch / "metrics.json", means_summary(result))
         atomic_write(scratch / "per_frame.csv", per_frame_table(result))
+        if (light := light_record(trained)) is not None:
+            write_json(scratch / LIGHT_FILE, light)
     return target
 
 

@@ -17,6 +17,7 @@ from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.lamps import HeldLight
+from coliags_plugin.core.point_normals import point_normals
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.fields.anchor_points import initial_positions, neighbour_log_scales, voxelize
@@ -26,6 +27,8 @@ logger = logging.getLogger(__name__)
 
 #: Approximate number of training cameras, evenly spaced, that the range of distances is computed from.
 _DISTANCE_CAMERAS = 16
+#: Initial points that an anchor's normal is estimated from.
+_NORMAL_NEIGHBOURS = 50
 
 
 class AnchorFieldSettings(Settings):
@@ -54,6 +57,7 @@ class AnchorField(GaussianField):
         features: [M, F]
         scalings: Log scales: three for the offsets, three bases of the children's sizes. [M, 6]
         voxel_size: Scene units. []
+        normals: Unit normals of the wall at the anchors, of either sign, where the appearance head uses them. [M, 3]
         spacing: Of the anchors at the start: median root mean squared distance to the three nearest, scene units. []
     """
 
@@ -64,6 +68,7 @@ class AnchorField(GaussianField):
     anchor_parameters: ClassVar[tuple[str, ...]] = ("offsets", "features", "scalings")
 
     anchors: Tensor
+    normals: Tensor | None
     voxel_size: Tensor
     spacing: Tensor
 
@@ -80,6 +85,7 @@ class AnchorField(GaussianField):
         self.geometry_head, self.appearance_head = (
             head.target(head.settings, settings.features, settings.children, generator) for head in heads
         )
+        self.register_buffer("normals", torch.zeros(anchor_count, 3) if self.appearance_head.uses_normals else None)
 
     @classmethod
     def from_scene(cls, scene: Scene, settings: Any, generator: torch.Generator) -> Self:
@@ -102,6 +108,8 @@ class AnchorField(GaussianField):
             )
         field = cls(settings, len(anchors), generator)
         field.anchors.copy_(anchors)
+        if field.normals is not None:
+            field.normals.copy_(point_normals(positions, min(_NORMAL_NEIGHBOURS, len(positions)), anchors))
         field.voxel_size.fill_(size)
         log_scales = neighbour_log_scales(anchors)
         field.spacing.copy_(log_scales.exp().median())
@@ -203,12 +211,13 @@ class AnchorField(GaussianField):
         shifts = offsets.reshape(-1, 3).index_select(0, slots)
         means = anchors.index_select(0, parents) + shifts * scales[:, :3]
         drawn = colors.reshape(-1, 3).index_select(0, slots)
+        normals = None if self.normals is None else self.normals.index_select(0, visible).index_select(0, parents)
         return Gaussians(
             means=means,
             quats_wxyz=nn.functional.normalize(covariances[:, 3:], dim=1),
             scales=scales[:, 3:] * covariances[:, :3].sigmoid(),
             opacities=opacities.reshape(-1).index_select(0, slots),
-            colors=self.appearance_head.lit(drawn, means, camera, light),
+            colors=self.appearance_head.lit(drawn, means, normals, camera, light),
             source_index=(visible.index_select(0, parents) - parents) * self.settings.children + slots,
             visible_sources=visible,
         )

@@ -18,9 +18,10 @@ from coliags_plugin.core.settings import Settings
 
 #: Largest distance of the lamp from the optical centre along each camera axis, scene units (mm).
 MAX_OFFSET = 20.0
-#: Smallest distance to the lamp, as a share of the reference distance, and smallest cosine that the law is computed at.
-_MIN_DISTANCE, _MIN_COSINE = 0.02, 0.05
-#: Largest b that a fit may start with: cos^9 in linear light.
+#: Smallest distance to the lamp, as a share of the reference distance, and smallest cosines of the angles to the axis
+#: and to the wall's normal, that the law is computed at.
+_MIN_DISTANCE, _MIN_COSINE, _MIN_INCIDENCE = 0.02, 0.05, 0.1
+#: Largest b and c that a fit may start with: cos^9 in linear light.
 _LARGEST_EXPONENT = 4.0
 
 
@@ -30,20 +31,23 @@ class AttenuatedAppearanceSettings(Settings):
     head: AppearanceHeadNode  # decoder of the colours that are attenuated
     distance_exponent: float = -0.9  # initial a
     cosine_exponent: float = 0.3  # initial b where it is not fitted
-    initial: Literal["given", "points"] = "given"  # b: as above, or fitted to surface points (docs/methods.md 4.8)
+    incidence_exponent: float | None = None  # initial c where it is not fitted; null: incidence does not count
+    # b, c and the lamp's offset: as above and 0, or fitted to surface points (docs/methods.md 4.8)
+    initial: Literal["given", "points"] = "given"
     channels: Literal[1, 3] = (
         3  # exponents for each colour, or one pair for all: red falls off slower (docs/methods.md 3.7)
     )
 
 
 class AttenuatedAppearanceHead(AppearanceHead):
-    """The colours of another head times (d / d_0)^a cos(theta)^b, a law of all Gaussians (docs/methods.md 3.7).
+    """The colours of another head times (d / d_0)^a cos(psi)^b cos(i)^c, a law of all Gaussians (docs/methods.md 3.7).
 
-    d is the distance of a Gaussian, not of its anchor, to a lamp whose offset from the optical centre is learned;
-    theta is its angle to the optical axis. d_0, the median distance of the scene, fixes the unit of the colours.
+    d is the distance of a Gaussian, not of its anchor, to a lamp whose offset from the optical centre is learned, psi
+    its angle there to the optical axis, and i the angle of incidence on the wall. d_0, the median distance of the
+    scene, fixes the unit of the colours.
 
     Attributes:
-        exponents: a and b of each channel. [C, 2]
+        exponents: a, b and c of each channel; without c where incidence does not count. [C, 3] or [C, 2]
         lamp_offset: Of the lamp in camera axes, before it is bounded to +-:data:`MAX_OFFSET`, scene units. [3]
         reference: d_0, scene units. []
     """
@@ -56,10 +60,17 @@ class AttenuatedAppearanceHead(AppearanceHead):
         super().__init__()
         self.settings = settings
         self.head: AppearanceHead = settings.head.target(settings.head.settings, features, children, generator)
-        initial = torch.tensor([settings.distance_exponent, settings.cosine_exponent])
-        self.exponents = nn.Parameter(initial.repeat(settings.channels, 1))
+        initial = [settings.distance_exponent, settings.cosine_exponent]
+        if settings.incidence_exponent is not None:
+            initial.append(settings.incidence_exponent)
+        self.exponents = nn.Parameter(torch.tensor(initial).repeat(settings.channels, 1))
         self.lamp_offset = nn.Parameter(torch.zeros(3))
         self.register_buffer("reference", torch.ones(()))
+
+    @property
+    def uses_normals(self) -> bool:
+        """Where incidence counts."""
+        return self.settings.incidence_exponent is not None
 
     @torch.no_grad()
     def expect(self, distances: Float[Tensor, "D"]) -> None:
@@ -70,12 +81,15 @@ class AttenuatedAppearanceHead(AppearanceHead):
 
     @torch.no_grad()
     def prepare(self, scene: Scene) -> None:
-        """Start at the fall-off over the angle of the scene's surface points, if the settings say so."""
+        """Start at the light of the scene's surface points, if the settings say so."""
         self.head.prepare(scene)
         fitted = fit_light(scene) if self.settings.initial == "points" else None
-        if fitted is not None:
-            found = fitted.cosine_exponents.clamp(0.0, _LARGEST_EXPONENT)
-            self.exponents[:, 1] = found.mean() if self.settings.channels == 1 else found
+        if fitted is None:
+            return
+        for column, found in enumerate((fitted.cosine_exponents, fitted.incidence_exponents)[: self._angles], 1):
+            bounded = found.clamp(0.0, _LARGEST_EXPONENT)
+            self.exponents[:, column] = bounded.mean() if self.settings.channels == 1 else bounded
+        self.lamp_offset.copy_(MAX_OFFSET * torch.atanh((fitted.lamp_offset / MAX_OFFSET).clamp(-0.9, 0.9)))
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Those of the head, the exponents, and the offset of the lamp, which needs a rate in scene units."""
@@ -101,42 +115,65 @@ class AttenuatedAppearanceHead(AppearanceHead):
         """Position of the lamp in camera axes, scene units. [3]"""
         return MAX_OFFSET * torch.tanh(self.lamp_offset / MAX_OFFSET)
 
-    def law(self, distances: Float[Tensor, "N"], cosines: Float[Tensor, "N"]) -> Float[Tensor, "N C"]:
+    @property
+    def _angles(self) -> int:
+        """Number of angles that the law knows."""
+        return self.exponents.shape[1] - 1
+
+    def law(
+        self,
+        distances: Float[Tensor, "N"],
+        cosines: Float[Tensor, "N"],
+        incidences: Float[Tensor, "N"] | None = None,
+    ) -> Float[Tensor, "N C"]:
         """The law's factor. [N, C]
 
         Args:
             distances: To the lamp, scene units. [N]
-            cosines: Of the angle to the optical axis. [N]
+            cosines: Of the angle at the lamp to the optical axis. [N]
+            incidences: Cosines of the angle of incidence; None: 1. [N]
         """
         relative = (distances / self.reference).clamp_min(_MIN_DISTANCE)
-        logs = torch.stack([relative.log(), cosines.clamp_min(_MIN_COSINE).log()], dim=1)
-        return (logs @ self.exponents.T).exp()
+        logs = [relative.log(), cosines.clamp_min(_MIN_COSINE).log()]
+        if self.uses_normals:
+            facing = torch.ones_like(distances) if incidences is None else incidences.clamp_min(_MIN_INCIDENCE)
+            logs.append(facing.log())
+        return (torch.stack(logs, dim=1) @ self.exponents.T).exp()
 
     def attenuation(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N C"]:
-        """See :meth:`AppearanceHead.attenuation`."""
-        distances = (points - self.offset).norm(dim=1)
-        return self.law(distances, points[:, 2] / points.norm(dim=1).clamp_min(1e-9))
+        """That of a wall which faces the lamp; see :meth:`AppearanceHead.attenuation`."""
+        return self._of(points, None)
+
+    def _of(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"] | None) -> Float[Tensor, "N C"]:
+        """The law at points with normals in camera axes. [N, C]"""
+        rays = points - self.offset
+        distances = rays.norm(dim=1).clamp_min(1e-9)
+        incidences = None if normals is None else (normals * rays).sum(1).abs() / distances
+        return self.law(distances, rays[:, 2] / distances, incidences)
 
     def lit(
         self,
         colors: Float[Tensor, "N 3"],
         positions: Float[Tensor, "N 3"],
+        normals: Float[Tensor, "N 3"] | None,
         camera: Camera,
         light: HeldLight | None,
     ) -> Float[Tensor, "N 3"]:
         """The colours under the lamp, which does not move Gaussians: positions get no gradient from it."""
         positions = positions.detach()
         if light is not None:
-            return colors * self.law(*light.incidence(positions))
-        return colors * self.attenuation((positions - camera.center) @ camera.camera_to_world[:3, :3])
+            incidences = None if normals is None else (light.towards(positions, normals) * normals).sum(1).abs()
+            return colors * self.law(*light.incidence(positions), incidences)
+        axes = camera.camera_to_world[:3, :3]
+        turned = None if normals is None else normals @ axes
+        return colors * self._of((positions - camera.center) @ axes, turned)
 
     @property
     def learned(self) -> dict[str, Any]:
         """The law's numbers."""
-        distance, cosine = self.exponents.detach().T.tolist()
+        names = ("distance_exponent", "cosine_exponent", "incidence_exponent")
         return {
-            "distance_exponent": distance,
-            "cosine_exponent": cosine,
+            **dict(zip(names, self.exponents.detach().T.tolist(), strict=False)),
             "lamp_offset": self.offset.detach().tolist(),
             "reference_distance": float(self.reference),
         }

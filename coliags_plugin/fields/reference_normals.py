@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 from typing_extensions import Self
 
-from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.point_normals import point_normals
 
 
 class ReferenceNormals(nn.Module):
@@ -62,27 +62,3 @@ class ReferenceNormals(nn.Module):
     def keep(self, keep: Bool[Tensor, "N"]) -> None:
         """Keep the references of some Gaussians. [N]"""
         self.of_rows = self.of_rows[keep]
-
-
-def point_normals(points: Float[Tensor, "P 3"], neighbours: int) -> Float[Tensor, "P 3"]:
-    """Unit normals of points, of either sign: the direction in which each point's nearest neighbours vary least.
-
-    Args:
-        points: Scene units. [P, 3]
-        neighbours: Of each point, itself excluded.
-
-    Raises:
-        InputError: There are not enough points.
-    """
-    if len(points) <= neighbours:
-        raise InputError(
-            f"{len(points)} initial points for normals from {neighbours} neighbours",
-            f"at least {neighbours + 1}",
-            "Give the data manager more points, or lower field.normal_neighbours",
-        )
-    positions = points.detach().cpu().double().numpy()
-    _, nearest = cKDTree(positions).query(positions, k=neighbours + 1, workers=-1)
-    around = torch.from_numpy(positions[np.asarray(nearest)[:, 1:]])
-    around = around - around.mean(1, keepdim=True)
-    _, axes = torch.linalg.eigh(around.mT @ around)  # eigenvalues ascend
-    return axes[:, :, 0].to(points)

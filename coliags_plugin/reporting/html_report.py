@@ -12,6 +12,7 @@ from coliags_plugin.reporting.blocks import Content
 from coliags_plugin.reporting.content import Choices
 from coliags_plugin.reporting.frame_section import frame_section
 from coliags_plugin.reporting.html_blocks import html_block, html_header, html_section
+from coliags_plugin.reporting.light_section import light_section
 from coliags_plugin.reporting.pictures import Pictures
 from coliags_plugin.reporting.profile_charts import profile_section
 from coliags_plugin.reporting.provenance_section import provenance_section
@@ -47,6 +48,7 @@ def write_html(study: Study, content: Content, choices: Choices, views: Views, o
     after = [
         scene,
         profile_section(study),
+        light_section(study),
         "\n".join(
             ["<section><h2>Training</h2>", *map(html_block, content.costs.blocks), training_charts(study), "</section>"]
         ),

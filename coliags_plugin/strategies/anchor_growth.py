@@ -39,6 +39,7 @@ class Anchors(Protocol):
 
     Attributes:
         anchors: Positions, scene units. [M, 3]
+        normals: Of the wall at the anchors; None where none are used. [M, 3]
         offsets, features, scalings: One row per anchor, as in :class:`coliags_plugin.fields.anchors.AnchorField`.
             [M, K, 3], [M, F], [M, 6]
         spacing: Initial spacing of the anchors, scene units. []
@@ -47,6 +48,7 @@ class Anchors(Protocol):
     """
 
     anchors: Tensor
+    normals: Tensor | None
     offsets: Tensor
     features: Tensor
     scalings: Tensor
@@ -144,12 +146,14 @@ class AnchorGrowth(Strategy):
         return len(field.anchors) - first_count
 
     def _add(self, field: Anchors, rows: ParameterRows, births: Births, anchor_of: Tensor, cell: float) -> None:
-        """Append anchors with their parents' features and Adam second moments, at most the size of a cell."""
+        """Append anchors with their parents' features, normals and Adam second moments, at most the size of a cell."""
         if len(births) == 0:
             return
         parents = anchor_of[births.candidates]
         scalings = field.scalings[parents].clamp_max(math.log(cell))
         field.anchors = torch.cat([field.anchors, births.positions])
+        if field.normals is not None:
+            field.normals = torch.cat([field.normals, field.normals[parents]])
         born = {
             "offsets": field.offsets.new_zeros(len(births), *field.offsets.shape[1:]),
             "features": field.features[parents],
@@ -172,5 +176,7 @@ class AnchorGrowth(Strategy):
         self.opacity_sum, self.seen = self.opacity_sum[keep], self.seen[keep]
         self.gradient_sum, self.drawn = self.gradient_sum[keep_children], self.drawn[keep_children]
         field.anchors = field.anchors[keep]
+        if field.normals is not None:
+            field.normals = field.normals[keep]
         rows.keep_rows(field.anchor_parameters, keep)
         return int(faint.sum())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -9,8 +10,9 @@ import torch
 
 from coliags_plugin.config.components import make_component
 from coliags_plugin.core.photometry import fit_light
+from coliags_plugin.core.scenes import Frame
 from coliags_plugin.modules.gain import FrameGain
-from tests.scenes import wall_scene
+from tests.scenes import camera_at, wall_color, wall_scene
 
 
 def gained(gains, width=64, height=48, **options):
@@ -89,20 +91,48 @@ def test_the_module_starts_with_them_where_there_is_depth():
     assert fit_light(few) is None
 
 
+OFFSET = torch.tensor([1.0, -0.5, -2.5], dtype=torch.float64)
+EXPONENTS = {"cosine": [0.4, 0.8, 1.2], "incidence": [0.1, 0.3, 0.5]}
+
+
+def lit_wall(offset=OFFSET, frames=24):
+    """The wall, seen from 6 to 15 mm away at all angles, under a lamp beside the lens, with gains."""
+    scene = wall_scene(width=96, height=72)
+    exponents = {name: torch.tensor(values, dtype=torch.float64) for name, values in EXPONENTS.items()}
+    train, gains = [], 0.8 + 0.2 * torch.sin(torch.arange(frames, dtype=torch.float64))
+    for index, gain in enumerate(gains):
+        x, z, yaw = 5.0 * math.sin(0.7 * index), 9.5 + 4.5 * math.sin(1.1 * index), 0.6 * math.sin(1.9 * index)
+        camera = camera_at(x, 2.0 * math.cos(0.9 * index), z, 96, 72, yaw)
+        depth = (20.0 - z) / camera.rays()[..., 2]
+        points = camera.center + depth[..., None] * camera.rays()
+        rays = (points - camera.center) @ camera.camera_to_world[:3, :3] - offset
+        lengths = rays.norm(dim=-1, keepdim=True)
+        facing = (rays @ camera.camera_to_world[2, :3])[..., None] / lengths
+        light = (lengths / 14.0) ** (-2 / 2.2) * (rays[..., 2:] / lengths) ** exponents["cosine"]
+        rgb = 0.6 * gain * wall_color(points) * light * facing ** exponents["incidence"]
+        image = (rgb.clamp(0.0, 1.0) * 255).round().to(torch.uint8)
+        train.append(Frame(f"{index:04d}", index, image, camera, depth.float()))
+    return replace(scene, train=train), gains.log() - gains.log().mean()
+
+
+@pytest.mark.parametrize("offset", [OFFSET, torch.zeros(3, dtype=torch.float64)])
+def test_lamp_and_exponents_and_gains_are_found(offset):
+    scene, log_gains = lit_wall(offset)
+    found = fit_light(scene)
+    torch.testing.assert_close(found.lamp_offset.double(), offset, atol=0.1, rtol=0.0)
+    torch.testing.assert_close(found.cosine_exponents, torch.tensor(EXPONENTS["cosine"]), atol=0.06, rtol=0.0)
+    torch.testing.assert_close(found.incidence_exponents, torch.tensor(EXPONENTS["incidence"]), atol=0.06, rtol=0.0)
+    torch.testing.assert_close(found.log_gains.double(), log_gains, atol=0.01, rtol=0.0)
+
+
 @pytest.mark.parametrize("channels", [1, 3])
-def test_the_fall_off_over_the_angle_is_found_and_the_law_starts_with_it(channels):
-    scene = gained(GAINS, width=192, height=144)
-    exponents = torch.tensor([0.4, 0.8, 1.2])
-
-    def vignetted(frame):
-        cosines = frame.camera.rays().norm(dim=-1, keepdim=True).reciprocal().float()
-        return replace(frame, image=(0.8 * frame.rgb * cosines**exponents * 255).round().to(torch.uint8))
-
-    scene = replace(scene, train=[vignetted(frame) for frame in scene.train])
-    torch.testing.assert_close(fit_light(scene).cosine_exponents, exponents, atol=0.08, rtol=0.0)
+def test_a_law_starts_with_what_was_found(channels):
+    scene, _ = lit_wall()
     appearance = {"name": "attenuated", "head": "plain", "channels": channels, "initial": "points"}
-    node = {"name": "anchors", "geometry_head": "plain", "appearance_head": appearance}
+    node = {"name": "anchors", "geometry_head": "plain", "appearance_head": {**appearance, "incidence_exponent": 0.0}}
     component = make_component("fields", node)
-    field = component.target.from_scene(scene, component.settings, torch.Generator())
-    expected = exponents.tolist() if channels == 3 else [0.8]
-    assert field.learned["cosine_exponent"] == pytest.approx(expected, abs=0.08)
+    learned = component.target.from_scene(scene, component.settings, torch.Generator()).learned
+    for name, exponents in EXPONENTS.items():
+        expected = exponents if channels == 3 else [sum(exponents) / 3]
+        assert learned[f"{name}_exponent"] == pytest.approx(expected, abs=0.06)
+    assert learned["lamp_offset"] == pytest.approx(OFFSET.tolist(), abs=0.1)

@@ -63,6 +63,32 @@ def test_curves_and_numbers_beside_the_truth(trained):
     assert found.numbers["gain_error_rms"] == pytest.approx(errors.tolist())
 
 
+def test_reports_show_the_light_of_runs_that_learn_it(trained, tmp_path):
+    trained.evaluate()
+    file = trained.path / "eval" / "paper" / "light.json"
+    record = json.loads(file.read_text())
+    paper = coliags_plugin.load_run(trained.path.parent / "paper", device="cpu")
+    paper.evaluate()
+    assert not (paper.path / "eval" / "paper" / "light.json").exists()
+    run("report", str(trained.path), str(paper.path), "--output", str(tmp_path / "report.html"))
+    text = (tmp_path / "report.html").read_text()
+    assert text.count("Attenuation over distance") == 1 and "Learned light" in text
+    rms = ", ".join(f"{value:.1%}" for value in record["gain_error_rms"])
+    assert f"<dd>{rms}</dd>" in text and "(true: 0, 0, -3)" in text
+    run("report", str(paper.path), "--output", str(tmp_path / "other.html"))
+    assert "Learned light" not in (tmp_path / "other.html").read_text()
+
+
+def test_a_damaged_record_of_light_is_named(trained, tmp_path, capsys):
+    trained.evaluate()
+    file = trained.path / "eval" / "paper" / "light.json"
+    whole = file.read_text()
+    for damaged in ("{", "{}", json.dumps(json.loads(whole) | {"curves": {"by_distance": 3}})):
+        file.write_text(damaged)
+        assert "light.json" in refused(capsys, "report", str(trained.path), "--output", str(tmp_path / "report.html"))
+    file.write_text(whole)
+
+
 def test_learned_numbers_are_in_the_metrics(trained):
     result = trained.evaluate()
     learned = result.provenance["learned"]

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from coliags_plugin.config.components import make_component
-from coliags_plugin.core.lamps import FlattenedLight
+from coliags_plugin.core.lamps import FlattenedLight, LightOfCamera
 from coliags_plugin.fields.attenuation import MAX_OFFSET, AttenuatedAppearanceHead
 from tests.scenes import camera_at, wall_scene
 
@@ -18,6 +18,10 @@ PLAIN = {"name": "anchors", "geometry_head": "plain", "appearance_head": "plain"
 def make_head(**options) -> AttenuatedAppearanceHead:
     head = make_component("appearance_heads", {"name": "attenuated", "head": "plain", "channels": 1, **options})
     return head.target(head.settings, 4, 2, torch.Generator().manual_seed(0))
+
+
+def turned_camera():
+    return camera_at(1.0, 2.0, 3.0, yaw=0.4).to("cpu", torch.float32)
 
 
 def make_field(appearance):
@@ -41,23 +45,47 @@ def test_each_channel_has_its_own_exponents():
     torch.testing.assert_close(factors, torch.tensor([[0.5, 0.25, 0.0625]]))
 
 
-def test_the_distance_is_that_of_the_lamp_and_the_angle_that_of_the_camera():
+def test_distance_and_angle_are_those_at_the_lamp():
     """A lamp 3 mm behind the lens and 4 mm above it, in a camera that is turned and moved."""
-    head, camera = make_head(cosine_exponent=1.0), camera_at(1.0, 2.0, 3.0, yaw=0.4).to("cpu", torch.float32)
+    head, camera = make_head(cosine_exponent=1.0), turned_camera()
     with torch.no_grad():
         head.lamp_offset.copy_(MAX_OFFSET * torch.atanh(torch.tensor([0.0, -4.0, -3.0]) / MAX_OFFSET))
     torch.testing.assert_close(head.offset, torch.tensor([0.0, -4.0, -3.0]))
     local = torch.tensor([[0.0, 0.0, 9.0], [3.0, -4.0, 9.0]])  # the second is 3 mm beside the lamp's axis
     points = camera.center + local @ camera.camera_to_world[:3, :3].T
-    lit = head.lit(torch.full((2, 3), 0.5), points, camera, None)
-    expected = [math.hypot(4, 12) ** -0.9, math.hypot(3, 12) ** -0.9 * 9 / math.sqrt(9 + 16 + 81)]
+    lit = head.lit(torch.full((2, 3), 0.5), points, None, camera, None)
+    expected = [length**-0.9 * 12 / length for length in (math.hypot(4, 12), math.hypot(3, 12))]
     torch.testing.assert_close(lit[:, 0], 0.5 * torch.tensor(expected))
 
 
 def test_a_held_light_takes_the_place_of_the_lamp():
     head = make_head(cosine_exponent=2.0)
-    lit = head.lit(torch.ones(3, 3), torch.rand(3, 3), camera_at(0, 0, 0), FlattenedLight(4.0, 0.5))
+    lit = head.lit(torch.ones(3, 3), torch.rand(3, 3), None, camera_at(0, 0, 0), FlattenedLight(4.0, 0.5))
     torch.testing.assert_close(lit, torch.full((3, 3), 4.0**-0.9 * 0.25))
+
+
+def test_incidence_counts_on_either_side_of_the_wall_and_not_under_a_flattened_light():
+    head, camera = make_head(distance_exponent=0.0, cosine_exponent=0.0, incidence_exponent=0.5), turned_camera()
+    local = torch.tensor([[0.0, 0.0, 10.0], [3.0, 0.0, 4.0], [0.0, 0.0, 7.0]])
+    normals = torch.tensor([[0.6, 0.0, 0.8], [-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])  # the last at a right angle
+    axes = camera.camera_to_world[:3, :3]
+    points, turned = camera.center + local @ axes.T, normals @ axes.T
+    lit = head.lit(torch.ones(3, 3), points, turned, camera, None)
+    torch.testing.assert_close(lit[:, 0], torch.tensor([0.8, 0.6, 0.1]).sqrt())
+    torch.testing.assert_close(lit, head.lit(torch.ones(3, 3), points, -turned, camera, None))
+    flattened = head.lit(torch.ones(3, 3), points, turned, camera, FlattenedLight(4.0, 0.5))
+    torch.testing.assert_close(flattened, torch.ones(3, 3))
+    beside = head.lit(torch.ones(3, 3), points, turned, camera_at(0, 0, 0), LightOfCamera(camera))
+    torch.testing.assert_close(beside, lit)
+    torch.testing.assert_close(head.attenuation(local), torch.ones(3, 1))
+
+
+def test_normals_of_anchors_are_the_walls():
+    field = make_field({"name": "attenuated", "head": "plain", "incidence_exponent": 0.3})
+    torch.testing.assert_close(field.normals[:, 2].abs(), torch.ones(len(field.anchors)))
+    again = type(field).from_state(field.state_dict(), field.settings)
+    assert torch.equal(again.normals, field.normals)
+    assert make_field("plain").normals is None and "normals" not in make_field("plain").state_dict()
 
 
 def test_the_lamp_stays_within_its_bounds_and_nothing_overflows():
@@ -66,7 +94,7 @@ def test_the_lamp_stays_within_its_bounds_and_nothing_overflows():
         head.lamp_offset.fill_(1e6)
     assert head.offset.abs().max() <= MAX_OFFSET
     points = torch.tensor([[MAX_OFFSET, MAX_OFFSET, MAX_OFFSET], [0.0, 0.0, 0.0], [0.0, 0.0, -5.0]])
-    lit = head.lit(torch.ones(3, 3), points, camera_at(0, 0, 0).to("cpu", torch.float32), None)
+    lit = head.lit(torch.ones(3, 3), points, None, camera_at(0, 0, 0).to("cpu", torch.float32), None)
     lit.sum().backward()
     assert lit.isfinite().all() and head.exponents.grad.isfinite().all() and head.lamp_offset.grad.isfinite().all()
 
@@ -94,14 +122,14 @@ def test_the_law_of_a_lamp_is_found():
     camera, head = camera_at(0, 0, 0).to("cpu", torch.float32), make_head(cosine_exponent=0.0)
     points = torch.rand(2000, 3, generator=generator) * torch.tensor([16.0, 16.0, 40.0]) + torch.tensor([-8.0, -8, 5])
     distances = (points - torch.tensor([0.0, 0.0, -3.6])).norm(dim=1)
-    true = 0.5 * (distances / 20.0) ** (-2 / 2.2) * (points[:, 2] / points.norm(dim=1)) ** (1.2 / 2.2)
+    true = 0.5 * (distances / 20.0) ** (-2 / 2.2) * ((points[:, 2] + 3.6) / distances) ** (1.2 / 2.2)
     head.expect(torch.tensor([20.0]))
     albedo = torch.tensor(0.3, requires_grad=True)
     fit = torch.optim.LBFGS([head.exponents, head.lamp_offset, albedo], max_iter=200, line_search_fn="strong_wolfe")
 
     def error() -> torch.Tensor:
         fit.zero_grad()
-        lit = head.lit(albedo.expand(2000, 3), points, camera, None)
+        lit = head.lit(albedo.expand(2000, 3), points, None, camera, None)
         value = (lit[:, 0].log() - true.log()).square().mean()
         value.backward()
         return value

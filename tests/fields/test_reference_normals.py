@@ -9,7 +9,8 @@ import torch
 
 from coliags_plugin.config.components import make_component
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.fields.reference_normals import ReferenceNormals, point_normals
+from coliags_plugin.core.point_normals import point_normals
+from coliags_plugin.fields.reference_normals import ReferenceNormals
 from tests.scenes import wall_scene
 
 

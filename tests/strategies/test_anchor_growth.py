@@ -9,15 +9,15 @@ from coliags_plugin.config.components import make_component
 from coliags_plugin.contracts import Schedule
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput, Splats
-from coliags_plugin.strategies.births import one_per_free_cell
+from coliags_plugin.strategies.births import Births, one_per_free_cell
 from tests.scenes import wall_scene
 from tests.strategies.steps import after_backward, stepped_optimizers
 
 CHILDREN = 10
 
 
-def make_field(voxel=2.0):
-    node = {"name": "anchors", "geometry_head": "plain", "appearance_head": "plain", "voxel_size": voxel}
+def make_field(voxel=2.0, appearance="plain"):
+    node = {"name": "anchors", "geometry_head": "plain", "appearance_head": appearance, "voxel_size": voxel}
     component = make_component("fields", node)
     field = component.target.from_scene(wall_scene(), component.settings, torch.Generator().manual_seed(0))
     return field, stepped_optimizers(field, 0.01)
@@ -200,6 +200,24 @@ def test_strongest_candidate_of_each_free_cell_strongest_cells_first():
     assert torch.equal(births.positions, positions[[3, 4, 2]])
     assert one_per_free_cell(anchors, positions, gradients, 2.0, 2).candidates.tolist() == [3, 4]
     assert len(one_per_free_cell(anchors, positions[:0], gradients[:0], 2.0, 2)) == 0
+
+
+@torch.no_grad()
+def test_births_have_their_parents_normal_and_survivors_keep_theirs():
+    head = {"name": "attenuated", "head": "plain", "incidence_exponent": 0.3}
+    field, rows = make_field(appearance=head)
+    field.normals = torch.nn.functional.normalize(torch.rand(field.normals.shape), dim=1)
+    before = field.normals.clone()
+    strategy = make_strategy(statistics_from=0, growth_from=0)
+    far = torch.tensor([[0.0, 0.0, 200.0]])
+    strategy._add(field, rows, Births(far, torch.tensor([1])), torch.tensor([5, 3]), 1.0)
+    assert torch.equal(field.normals, torch.cat([before, before[3:4]]))
+    strategy._resize(len(field.anchors), CHILDREN, torch.device("cpu"))
+    strategy.seen.fill_(81.0)
+    strategy.opacity_sum.fill_(81.0)
+    strategy.opacity_sum[2] = 0.0
+    assert strategy._prune(field, rows, CHILDREN) == 1
+    assert torch.equal(field.normals, torch.cat([before[:2], before[3:], before[3:4]]))
 
 
 def test_base_scales_are_capped_in_spacings():
