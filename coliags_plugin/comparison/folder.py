@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -18,6 +17,7 @@ from coliags_plugin.comparison.scenes import SceneSource
 from coliags_plugin.config.assignments import parse_assignments
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import make_folder, write_json
+from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.locks import LockedError, locked
 from coliags_plugin.core.settings import first_error
 from coliags_plugin.engine.run_folder import RunFolder
@@ -205,7 +205,7 @@ class ComparisonFolder:
         if not self.plan_file.is_file():
             return PlanRecord()
         try:
-            content = json.loads(self.plan_file.read_text(encoding="utf-8"))
+            content = read_json(self.plan_file, "what `coliags compare` wrote")
             version = content.get("version") if isinstance(content, dict) else None
             if isinstance(version, int) and version > VERSION:
                 raise InputError(
@@ -217,8 +217,6 @@ class ComparisonFolder:
         except ValidationError as error:
             key, message, _ = first_error(error)
             raise InputError(f"{self.plan_file}: {key}: {message}", "what `coliags compare` wrote") from error
-        except (OSError, ValueError, RecursionError) as error:
-            raise InputError(f"{self.plan_file} cannot be read: {error}", "what `coliags compare` wrote") from error
 
     def check_extends(self, request: Request) -> None:
         """Refuse to mix runs of different length or with different changes.

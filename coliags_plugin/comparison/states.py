@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from typing import Any, Literal
 
 from coliags_plugin.comparison.cells import Cell
 from coliags_plugin.comparison.folder import ComparisonFolder
+from coliags_plugin.core.json_files import parse_json
 from coliags_plugin.engine.checkpoints import newest_checkpoint
 from coliags_plugin.engine.run_folder import RunFolder
 
@@ -124,8 +124,8 @@ def _last_rows(file: Path) -> list[dict[str, Any]]:
     rows = []
     for line in lines:
         try:
-            row = json.loads(line)
-        except (ValueError, RecursionError):
+            row = parse_json(line)
+        except ValueError:
             continue
         if isinstance(row, dict) and {"step", "seconds"} <= row.keys():
             rows.append(row)

@@ -1,4 +1,4 @@
-"""Reading JSON files of unknown origin."""
+"""Reading JSON of unknown origin."""
 
 from __future__ import annotations
 
@@ -25,6 +25,18 @@ def read_json(path: Path, expected: str, do: str = "") -> Any:
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot read {path}: {error}", expected, do) from error
     try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
+        return parse_json(text)
+    except ValueError as error:
         raise InputError(f"{path} is not JSON: {error}", expected, do) from error
+
+
+def parse_json(text: str | bytes) -> Any:
+    """The value of a JSON text.
+
+    Raises:
+        ValueError: It is not JSON, is nested too deeply, or has a number of thousands of digits.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import shutil
 import time
@@ -21,6 +20,7 @@ from coliags_plugin.contracts import Renderer, Sampler, Strategy
 from coliags_plugin.core.checksums import differing_files, write_checksums
 from coliags_plugin.core.errors import InputError, NotFiniteError
 from coliags_plugin.core.files import atomic_folder, write_json
+from coliags_plugin.core.json_files import parse_json
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.scratch import final_place
 from coliags_plugin.engine.costs import TrainingCost
@@ -195,11 +195,11 @@ def read_checkpoint(path: Path, method: str, device: torch.device) -> Checkpoint
     if differing:
         raise _damaged(path, f"{', '.join(differing)} is not what was written")
     try:
-        state = json.loads((path / "state.json").read_text(encoding="utf-8"))
+        state = parse_json((path / "state.json").read_text(encoding="utf-8"))
         tensors = load_file(path / "state.safetensors")
         step, owner, queue, version = (state[key] for key in ("step", "method", "frame_queue", "format"))
         cost = None if state.get("cost") is None else TrainingCost.model_validate(state["cost"])
-    except (OSError, ValueError, KeyError, TypeError, SafetensorError, RecursionError) as error:
+    except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
         raise _damaged(path, str(error)) from error
     if version not in READABLE:
         known = " or ".join(map(str, READABLE))

@@ -15,6 +15,7 @@ from typing import Any
 from coliags_plugin.config.method_config import LoadedMethod, load_method
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, atomic_write, not_writable, write_json
+from coliags_plugin.core.json_files import parse_json, read_json
 from coliags_plugin.core.locks import LockedError, locked
 from coliags_plugin.results.record import TRUTH_SUFFIX
 
@@ -183,10 +184,7 @@ class RunFolder:
         Raises:
             InputError: The file is damaged.
         """
-        try:
-            found: dict[str, Any] = json.loads(self.provenance_file.read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError) as error:
-            raise InputError(f"cannot read {self.provenance_file}: {error}", "what `coliags train` wrote") from error
+        found: dict[str, Any] = read_json(self.provenance_file, "what `coliags train` wrote")
         return found
 
     def identity(self) -> RunIdentity:
@@ -263,8 +261,8 @@ def checkpoint_step(checkpoint: Path) -> int:
 def _log_row(line: str) -> dict[str, Any] | None:
     """A row of the training log; None where the line is damaged."""
     try:
-        row = json.loads(line)
-    except (ValueError, RecursionError):
+        row = parse_json(line)
+    except ValueError:
         return None
     whole = isinstance(row, dict) and all(
         isinstance(row.get(name), (int, float)) for name in ("step", "psnr", "seconds")

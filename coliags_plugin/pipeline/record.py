@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -12,6 +11,7 @@ from typing import Any, Literal
 from coliags_plugin import __version__
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
+from coliags_plugin.core.json_files import parse_json
 
 #: Name of the file, and version of its schema.
 RECORD_FILE, _FORMAT = "reconstruction.json", 1
@@ -59,9 +59,9 @@ class Record:
         file = folder / RECORD_FILE
         if file.is_file():
             try:
-                found = json.loads(file.read_text(encoding="utf-8"))
+                found = parse_json(file.read_text(encoding="utf-8"))
                 return cls(folder, {name: StageRecord(**stage) for name, stage in found["stages"].items()})
-            except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
                 raise InputError(
                     f"cannot read {file}: {error}", "what `coliags reconstruct` wrote", "Choose another --out"
                 ) from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.json_files import read_json
+from coliags_plugin.core.json_files import parse_json, read_json
 from coliags_plugin.reporting.study import Cell, Failure
 from coliags_plugin.results.reading import RESULT_FILE, read_result
 
@@ -114,8 +113,8 @@ def _run_of(folder: Path, stem: str, key: str, protocol: str) -> Path | None:
     seed = stem.partition("-")[0]
     for run in sorted(folder.glob(f"{seed}-*")):
         try:
-            content = json.loads((run / "eval" / protocol / RESULT_FILE).read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError):
+            content = parse_json((run / "eval" / protocol / RESULT_FILE).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
             continue
         if isinstance(content, dict) and content.get("key") == key:
             return _with_images(run, protocol)

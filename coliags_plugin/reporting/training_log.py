@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.json_files import parse_json
 
 _COLUMNS = ("step", "loss", "psnr", "seconds")
 
@@ -38,8 +38,8 @@ def read_training_log(run: Path) -> dict[str, Float[np.ndarray, "L"]]:
         if not line.strip():
             continue
         try:
-            values = json.loads(line)
-        except (ValueError, RecursionError) as error:
+            values = parse_json(line)
+        except ValueError as error:
             raise InputError(f"{path}, line {number} is not JSON: {error}", "one JSON object per line") from error
         if not isinstance(values, dict):
             raise InputError(f"{path}, line {number} holds a {type(values).__name__}", "one JSON object per line")

@@ -10,6 +10,7 @@ from pydantic import ValidationError
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
+from coliags_plugin.core.json_files import parse_json
 from coliags_plugin.core.settings import first_error
 from coliags_plugin.results.hashing import metrics_sha256
 from coliags_plugin.results.record import FORMAT, VERSION, Result
@@ -65,8 +66,8 @@ def read_result(path: Path) -> Result:
 
 def _parsed(text: str, path: Path) -> dict[str, Any]:
     try:
-        content = json.loads(text)
-    except (ValueError, RecursionError) as error:
+        content = parse_json(text)
+    except ValueError as error:
         whole = text.rstrip()
         cut = whole.startswith("{") and not whole.endswith("}")
         cut |= isinstance(error, json.JSONDecodeError) and error.pos >= len(whole)

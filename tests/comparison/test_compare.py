@@ -290,7 +290,7 @@ def test_a_result_of_a_newer_version_is_refused_by_name(wall, folder):
     ("content", "told"),
     [
         ('{"format": "coliags-comparison", "version": 99}', "plan.json is from a newer version"),
-        ("{", "plan.json cannot be read"),
+        ("{", "plan.json is not JSON"),
         ('{"cells": 3}', "plan.json: cells"),
     ],
 )
