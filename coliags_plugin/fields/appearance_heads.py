@@ -52,6 +52,11 @@ class PlainAppearanceHead(AppearanceHead):
         return torch.cat([directions, distances], dim=1) if self.sees_distance else directions
 
     @property
+    def direction_channels(self) -> int:
+        """Inputs between the feature and the distance."""
+        return 3
+
+    @property
     def sees_distance(self) -> bool:
         """Whether the distance is among the inputs."""
         return bool(self.settings.distance)
@@ -77,7 +82,7 @@ class PlainAppearanceHead(AppearanceHead):
         units = first.out_features
         places = (torch.arange(units, device=distances.device) * 2 + 1) * len(distances) // (2 * units)
         kinks = distances.sort().values[places]
-        first.bias -= first.weight[:, self.features + 3] * kinks  # after the direction
+        first.bias -= first.weight[:, self.features + self.direction_channels] * kinks
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """The MLP."""
@@ -102,6 +107,7 @@ class IMIAAppearanceSettings(AppearanceSettings):
     """Options of IMIA."""
 
     frequencies: int = Field(default=5, ge=0)  # of gamma, for the cosine
+    direction_frequencies: int = Field(default=0, ge=0)  # of gamma, for v; 0: v alone, as in the paper
 
 
 class IMIAAppearanceHead(PlainAppearanceHead):
@@ -114,6 +120,11 @@ class IMIAAppearanceHead(PlainAppearanceHead):
     Settings: ClassVar[type[Settings]] = IMIAAppearanceSettings
 
     @property
+    def direction_channels(self) -> int:
+        """Those of gamma(v)."""
+        return 3 * (1 + 2 * int(self.settings.direction_frequencies))
+
+    @property
     def sees_distance(self) -> bool:
         """Always."""
         return True
@@ -121,5 +132,7 @@ class IMIAAppearanceHead(PlainAppearanceHead):
     def embed(
         self, directions: Float[Tensor, "V 3"], distances: Float[Tensor, "V 1"], cosines: Float[Tensor, "V 1"]
     ) -> Float[Tensor, "V E"]:
-        """v, d and gamma(cos theta): 3 + 1 + 11 numbers at five frequencies."""
-        return torch.cat([directions, distances, cosine_embedding(cosines, self.settings.frequencies)], dim=1)
+        """gamma(v), d and gamma(cos theta): 3 + 1 + 11 numbers with no frequencies for v and five for the cosine."""
+        settings = self.settings
+        seen = cosine_embedding(directions, settings.direction_frequencies)
+        return torch.cat([seen, distances, cosine_embedding(cosines, settings.frequencies)], dim=1)

@@ -242,8 +242,15 @@ def test_same_seed_same_field():
     assert not torch.equal(first.geometry_head.opacity_mlp[0].weight, other.geometry_head.opacity_mlp[0].weight)
 
 
-@pytest.mark.parametrize("head", [{"name": "imia"}, {"name": "plain", "distance": True}])
-def test_hidden_units_start_over_the_distances_that_occur(head):
+@pytest.mark.parametrize(
+    ("head", "column"),
+    [
+        ({"name": "imia"}, 32 + 3),
+        ({"name": "imia", "direction_frequencies": 6}, 32 + 39),
+        ({"name": "plain", "distance": True}, 32 + 3),
+    ],
+)
+def test_hidden_units_start_over_the_distances_that_occur(head, column):
     """Each unit's pre-activation at its own quantile of the distances is what the default start has at distance 0."""
     default = make_field(COLIAGS, appearance_head={**head, "bias_init": "pytorch"})
     spread = make_field(COLIAGS, appearance_head=head)
@@ -256,8 +263,17 @@ def test_hidden_units_start_over_the_distances_that_occur(head):
     kinks = distances[((np.arange(32) + 0.5) / 32 * len(distances)).astype(int)]
     before, after = default.appearance_head.color_mlp[0], spread.appearance_head.color_mlp[0]
     assert torch.equal(before.weight, after.weight)
-    on_kink = after.bias + after.weight[:, 32 + 3] * torch.from_numpy(kinks).float()
+    on_kink = after.bias + after.weight[:, column] * torch.from_numpy(kinks).float()
     torch.testing.assert_close(on_kink, before.bias, atol=1e-5, rtol=0.0)
+
+
+def test_frequencies_on_the_direction_are_further_inputs():
+    wide = make_field(COLIAGS, appearance_head={"name": "imia", "direction_frequencies": 6})
+    assert wide.appearance_head.color_mlp[0].weight.shape == (32, 32 + 39 + 1 + 11)
+    directions = torch.nn.functional.normalize(torch.randn(5, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    embedded = wide.appearance_head.embed(directions, torch.full((5, 1), 7.0), directions[:, 2:].abs())
+    torch.testing.assert_close(embedded[:, 3 + 6 * 5 : 3 + 6 * 5 + 3], (32 * directions).sin())
+    assert embedded[:, 39].tolist() == [7.0] * 5
 
 
 def test_few_units_start_dead():
