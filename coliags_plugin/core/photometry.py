@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from coliags_plugin.core.masked import zero_outside
-from coliags_plugin.core.point_normals import point_normals
+from coliags_plugin.core.point_normals import wall_normals
 from coliags_plugin.core.scenes import Frame, Scene
 
 #: Approximate number of points, spread evenly over the scene's; fewest of these and of frames.
@@ -30,8 +30,6 @@ _GREEN = 1
 _DISTANCE_EXPONENT = -2.0 / 2.2
 #: Smallest cosines that count, of the angles to the optical axis and to the wall's normal.
 _SMALLEST_COSINES = (0.05, 0.1)
-#: Points that a normal is estimated from.
-_NEIGHBOURS = 50
 #: Of the lamp's offset, as shares of the median distance: largest component, largest step of one iteration, step of the
 #: finite differences, step that ends the iterations; and most iterations.
 _LARGEST_OFFSET, _LARGEST_STEP, _DIFFERENCE, _CONVERGED, _ITERATIONS = 0.3, 0.08, 0.002, 0.0005, 12
@@ -94,10 +92,9 @@ def fit_light(scene: Scene) -> LightFit | None:
     """
     everything = scene.points.positions.double()
     points = everything[:: max(1, len(everything) // _POINTS)]
-    few = len(scene.train) < _FEWEST or len(everything) <= _NEIGHBOURS
-    if few or any(frame.depth is None for frame in scene.train):
+    if min(len(scene.train), len(points)) < _FEWEST or any(frame.depth is None for frame in scene.train):
         return None
-    normals = point_normals(everything, _NEIGHBOURS, points)
+    normals = wall_normals(everything, points)
     parts = zip(*(_seen(frame, points, normals) for frame in scene.train), strict=True)
     logs, usable, sights, turned = (torch.stack(maps, dim=1) for maps in parts)
     seen = _Observations(logs, usable & (usable.sum(1, keepdim=True) > 1), sights, turned)

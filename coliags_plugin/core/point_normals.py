@@ -10,6 +10,11 @@ from torch import Tensor
 
 from coliags_plugin.core.errors import InputError
 
+#: Positions whose neighbours are in memory at once.
+_CHUNK = 4096
+#: Of the points, the share that a wall's normal is estimated from, and the fewest.
+_SHARE, _FEWEST = 500, 20
+
 
 def point_normals(
     points: Float[Tensor, "P 3"], neighbours: int, at: Float[Tensor, "N 3"] | None = None
@@ -31,13 +36,26 @@ def point_normals(
             f"at least {least}",
             "Give the data manager more points, or lower field.normal_neighbours",
         )
-    positions = points.detach().cpu().double().numpy()
-    if at is None:
-        _, nearest = cKDTree(positions).query(positions, k=neighbours + 1, workers=-1)
-        nearest = np.asarray(nearest)[:, 1:]
-    else:
-        _, nearest = cKDTree(positions).query(at.detach().cpu().double().numpy(), k=neighbours, workers=-1)
-    around = torch.from_numpy(positions[np.asarray(nearest)].reshape(-1, neighbours, 3))
-    around = around - around.mean(1, keepdim=True)
-    _, axes = torch.linalg.eigh(around.mT @ around)  # eigenvalues ascend
-    return axes[:, :, 0].to(points)
+    positions, wanted = (values.detach().cpu().double().numpy() for values in (points, points if at is None else at))
+    tree = cKDTree(positions)
+    normals = torch.empty(len(wanted), 3, dtype=torch.float64)
+    for start in range(0, len(wanted), _CHUNK):
+        _, nearest = tree.query(wanted[start : start + _CHUNK], k=least, workers=-1)
+        around = torch.from_numpy(positions[np.asarray(nearest).reshape(-1, least)[:, least - neighbours :]])
+        around = around - around.mean(1, keepdim=True)
+        _, axes = torch.linalg.eigh(around.mT @ around)  # eigenvalues ascend
+        normals[start : start + _CHUNK] = axes[:, :, 0]
+    return normals.to(points)
+
+
+def wall_normals(points: Float[Tensor, "P 3"], at: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    """Unit normals, of either sign, of the smooth wall that noisy points lie on. [N, 3]
+
+    Each is that of the nearest five hundredth of the points, and of 20 at least: in a colon's section, of some
+    millimetres.
+
+    Args:
+        points: Scene units. [P, 3]
+        at: Positions, scene units. [N, 3]
+    """
+    return point_normals(points, min(len(points), max(_FEWEST, len(points) // _SHARE)), at)

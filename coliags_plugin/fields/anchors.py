@@ -17,7 +17,7 @@ from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.lamps import HeldLight
-from coliags_plugin.core.point_normals import point_normals
+from coliags_plugin.core.point_normals import wall_normals
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.fields.anchor_points import initial_positions, neighbour_log_scales, voxelize
@@ -27,8 +27,6 @@ logger = logging.getLogger(__name__)
 
 #: Approximate number of training cameras, evenly spaced, that the range of distances is computed from.
 _DISTANCE_CAMERAS = 16
-#: Initial points that an anchor's normal is estimated from.
-_NORMAL_NEIGHBOURS = 50
 
 
 class AnchorFieldSettings(Settings):
@@ -109,7 +107,7 @@ class AnchorField(GaussianField):
         field = cls(settings, len(anchors), generator)
         field.anchors.copy_(anchors)
         if field.normals is not None:
-            field.normals.copy_(point_normals(positions, min(_NORMAL_NEIGHBOURS, len(positions)), anchors))
+            field.normals.copy_(wall_normals(positions, anchors))
         field.voxel_size.fill_(size)
         log_scales = neighbour_log_scales(anchors)
         field.spacing.copy_(log_scales.exp().median())

@@ -9,7 +9,7 @@ import torch
 
 from coliags_plugin.config.components import make_component
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.point_normals import point_normals
+from coliags_plugin.core.point_normals import point_normals, wall_normals
 from coliags_plugin.fields.reference_normals import ReferenceNormals
 from tests.scenes import wall_scene
 
@@ -39,6 +39,17 @@ def test_normals_of_a_plane_do_not_depend_on_the_frame():
     turn, _ = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64))
     normals = point_normals(points @ turn.T + 1000.0, 10)
     torch.testing.assert_close((normals @ turn[:, 2]).abs(), torch.ones(300, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("count", [1, 2, 15, 3000, 40_000])
+def test_normals_of_a_noisy_wall(count):
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(count, 3, generator=generator, dtype=torch.float64) * torch.tensor([60.0, 40.0, 0.1])
+    at = torch.tensor([[30.0, 20.0, 0.0], [10.0, 10.0, 0.0]], dtype=torch.float64)
+    normals = wall_normals(points, at)
+    torch.testing.assert_close(normals.norm(dim=1), torch.ones(2, dtype=torch.float64))
+    if count > 10:
+        assert normals[:, 2].abs().min() > math.cos(math.radians(1.5))
 
 
 def test_too_few_points_are_refused():
