@@ -233,8 +233,6 @@ losses = Registry(
         "d-ssim": "coliags_plugin.losses.photometric:DSSIMLoss",
         "mse": "coliags_plugin.losses.photometric:MSELoss",
         "depth-l1": "coliags_plugin.losses.depth:DepthL1Loss",
-        "edge-aware-depth-l1": "coliags_plugin.losses.edge_aware_depth:EdgeAwareDepthL1Loss",
-        "depth-at-least": "coliags_plugin.losses.depth_at_least:DepthAtLeastLoss",
         "attribute-variance": "coliags_plugin.losses.attribute_variance:AttributeVarianceLoss",
         "diffuse-factor": "coliags_plugin.losses.diffuse_factor:DiffuseFactorLoss",
         "depth-huber": "coliags_plugin.losses.depth:DepthHuberLoss",

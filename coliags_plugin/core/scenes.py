@@ -82,7 +82,6 @@ class Target(_MaskedImage):
         index: Of a whole frame in the video.
         chosen: Identifiers of the pixels, if they are not those of a whole frame. [H, W]
         depth_confidence: How far ``depth`` can be trusted, see :class:`Frame`; None where it is true. [H, W]
-        depth_at_least: Where the depth sensor clipped, see :class:`Frame`; None where nothing is clipped. [H, W]
     """
 
     name: str
@@ -93,7 +92,6 @@ class Target(_MaskedImage):
     index: int = 0
     chosen: Int[Tensor, "H W"] | None = None
     depth_confidence: Float[Tensor, "H W"] | None = None
-    depth_at_least: Float[Tensor, "H W"] | None = None
 
     @property
     def ids(self) -> Int[Tensor, "H W"]:
@@ -145,7 +143,6 @@ class Frame(_MaskedImage):
             self.sparse_depth,
             self.index,
             depth_confidence=self.depth_confidence,
-            depth_at_least=self.depth_at_least,
         )
 
     def target_at(self, pixels: Int[Tensor, "P 2"]) -> Target:
@@ -167,7 +164,6 @@ class Frame(_MaskedImage):
             taken(self.depth),
             chosen=chosen[:, None],
             depth_confidence=taken(self.depth_confidence),
-            depth_at_least=taken(self.depth_at_least),
         )
 
     @property
@@ -288,7 +284,7 @@ class Scene:
 def concatenate_targets(parts: Sequence[Target]) -> Target:
     """Pixel batches of several frames as one.
 
-    A missing mask is all True; beside others, missing depth and bounds are all NaN and missing confidence all 1.
+    A missing mask is all True; beside others, missing depth is all NaN and missing confidence all 1.
 
     Args:
         parts: Of P_i rows and one column each.
@@ -298,10 +294,9 @@ def concatenate_targets(parts: Sequence[Target]) -> Target:
     masks = None if all(part.mask is None for part in parts) else torch.cat([part.valid for part in parts])
     depths = _joined(parts, [part.depth for part in parts], torch.nan)
     confidences = _joined(parts, [part.depth_confidence for part in parts], 1.0)
-    bounds = _joined(parts, [part.depth_at_least for part in parts], torch.nan)
     images, chosen = torch.cat([part.image for part in parts]), torch.cat([part.ids for part in parts])
     name = ", ".join(part.name for part in parts)
-    return Target(name, images, masks, depths, chosen=chosen, depth_confidence=confidences, depth_at_least=bounds)
+    return Target(name, images, masks, depths, chosen=chosen, depth_confidence=confidences)
 
 
 def _joined(parts: Sequence[Target], maps: Sequence[Tensor | None], instead: float) -> Tensor | None:

@@ -39,9 +39,7 @@ def depth(generator):
 # ---------------------------------------------------------------------------------------------------- all terms alike
 
 
-@pytest.mark.parametrize(
-    "name", ["l1", "mse", "d-ssim", "depth-l1", "edge-aware-depth-l1", "estimated-depth", "opacity", "scale-volume"]
-)
+@pytest.mark.parametrize("name", ["l1", "mse", "d-ssim", "depth-l1", "estimated-depth", "opacity", "scale-volume"])
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0, None])
 def test_a_finite_scalar_with_a_graph_whatever_the_mask(
     name, share, make_output, make_frame, generator, image, rgb, depth
