@@ -105,12 +105,12 @@ def light_map(trained: TrainedRun) -> LightMap:
 
 
 def light_record(trained: TrainedRun) -> dict[str, Any] | None:
-    """Plain values of :func:`light_map`, for ``light.json``; None where the method learns neither law nor gains."""
+    """Plain values of :func:`light_map`, for ``light.json``; None without law and gains, or points in view."""
     model = trained.model
     gains = any(isinstance(part, GainModule) for part in model.view_modules.values())
     point = torch.tensor([[0.0, 0.0, 1.0]], device=trained.device)
     law = isinstance(model.field, GaussianField) and model.field.attenuation(point) is not None
-    if not (gains or law):
+    if not (gains or law) or len(trained.scene.depths_in_view()) == 0:
         return None
     found = light_map(trained)
     curves = {name: getattr(found, name) for name in _CURVES}
@@ -122,13 +122,14 @@ def write_light_map(trained: TrainedRun, folder: Path) -> None:
     """Write ``light.json``, and ``light.html`` with charts of the law and the gains, into a folder.
 
     Raises:
-        InputError: The method has learned neither; or the files cannot be written.
+        InputError: The method has learned neither, no training frame sees a point, or the files cannot be written.
     """
     record = light_record(trained)
     if record is None:
         raise InputError(
-            f"a light map of method '{trained.method}', which has learned neither a law of attenuation nor gains",
-            "a method with appearance head 'attenuated' or module 'gain', such as coliags-plus",
+            f"a light map of method '{trained.method}', which has learned neither a law of attenuation nor gains, or "
+            "has no points in view",
+            "a method with appearance head 'attenuated' or module 'gain', such as coliags-plus, and initial points",
         )
     write_json(folder / LIGHT_FILE, record)
     facts = {"method": trained.method, "scene": trained.scene.name, "step": str(trained.step), **light_facts(record)}
