@@ -176,12 +176,12 @@ class ViewModule(nn.Module, ABC):
 
 
 class GainModule(ViewModule):
-    """View module that multiplies colours by a gain for every training frame."""
+    """Base class of view modules with an exposure gain per training frame, by which colours are multiplied."""
 
     @property
     @abstractmethod
     def times(self) -> Sequence[float]:
-        """Index in the video of every training frame."""
+        """Index in the video of every training frame, ascending."""
 
     @abstractmethod
     def log_gains(self) -> Float[Tensor, "F C"]:

@@ -104,8 +104,17 @@ class Camera(Intrinsics):
         Occlusion is not tested.
         """
         pixels, depth = self.project(points)
+        return depth, self.is_inside(pixels, depth)
+
+    def is_inside(self, pixels: Float[Tensor, "N 2"], depth: Float[Tensor, "N"]) -> Bool[Tensor, "N"]:
+        """Which projected points are in front of the camera and inside its image. [N]
+
+        Args:
+            pixels: Column and row. [N, 2]
+            depth: z-depths. [N]
+        """
         inside = ((pixels >= 0) & (pixels < pixels.new_tensor([self.width, self.height]))).all(dim=-1)
-        return depth, inside & (depth > 0)
+        return inside & (depth > 0)
 
     def unproject(self, depth: Float[Tensor, "H W"]) -> Float[Tensor, "H W 3"]:
         """World position of every pixel at its z-depth (NaN where the depth is NaN). [H, W, 3]"""

@@ -108,18 +108,17 @@ def fit_light(scene: Scene) -> LightFit | None:
 def _seen(
     frame: Frame, points: Float[Tensor, "P 3"], normals: Float[Tensor, "P 3"]
 ) -> tuple[Float[Tensor, "P 3"], Bool[Tensor, "P 3"], Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:
-    """What :class:`_Observations` holds of one frame."""
+    """Log colours, where they count, positions and normals in camera axes of the points in one frame."""
     assert frame.depth is not None
     camera = frame.camera.to("cpu", torch.float64)
     pixels, depths = camera.project(points)
     limits = torch.tensor([camera.width - 1, camera.height - 1])
-    inside = (depths > 0) & (pixels >= 0).all(1) & (pixels < limits + 1).all(1)
     column, row = pixels.nan_to_num(0.0).clamp(torch.zeros(2), limits).long().unbind(1)
     valid = frame.valid.cpu()
     blurred = _mean_of_neighbours(zero_outside(frame.rgb.cpu(), valid))
     whole = _mean_of_neighbours(valid[..., None].float())[..., 0] > _ALL
     colors = blurred[row, column].double()
-    same = inside & ((frame.depth.cpu()[row, column] - depths).abs() < _SAME_SURFACE * depths)
+    same = camera.is_inside(pixels, depths) & ((frame.depth.cpu()[row, column] - depths).abs() < _SAME_SURFACE * depths)
     usable = (same & whole[row, column])[:, None] & (colors > _DARKEST) & (colors < _BRIGHTEST)
     axes = camera.camera_to_world[:3, :3]
     return colors.clamp_min(1e-3).log(), usable, (points - camera.center) @ axes, normals @ axes
@@ -132,7 +131,7 @@ def _mean_of_neighbours(image: Float[Tensor, "H W C"]) -> Float[Tensor, "H W C"]
 
 
 def _lamp_offset(seen: _Observations) -> Float[Tensor, "3"]:
-    """Offset of the lamp from the optical centre that explains green best; 0 where that explains little more. [3]"""
+    """Lamp's offset from the optical centre by Gauss-Newton steps on green; 0 where residuals hardly fall. [3]"""
     logs, usable = seen.logs[..., _GREEN], seen.usable[..., _GREEN]
     offset = logs.new_zeros(3)
     if not usable.any():

@@ -17,7 +17,7 @@ from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.engine.costs import RenderMeter
 from coliags_plugin.engine.depth_pictures import EXPECTED_DEPTH, write_depth_pictures
 from coliags_plugin.engine.evaluated_set import EvaluatedSet
-from coliags_plugin.engine.light_map import light_record
+from coliags_plugin.engine.light_map import light_map
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.run_result import run_result
@@ -39,8 +39,7 @@ def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None
     Writes into ``eval/<protocol>/``: ``result.json``, the whole :class:`~coliags_plugin.results.record.Result`; and of
     it ``metrics.json`` (means per test set; the main set's also at the top; null where a metric is not available, with
     the reason) and ``per_frame.csv``; ``light.json``, where the method has learned a law of the light or gains; and the
-    images. An earlier evaluation under the same protocol is replaced once
-    the new one is complete.
+    images. An earlier evaluation under the same protocol is replaced once the new one is complete.
 
     Args:
         trained: The run.
@@ -86,13 +85,13 @@ def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None
         write_result(scratch / RESULT_FILE, result)
         write_json(scratch / "metrics.json", means_summary(result))
         atomic_write(scratch / "per_frame.csv", per_frame_table(result))
-        if (light := light_record(trained)) is not None:
-            write_json(scratch / LIGHT_FILE, light)
+        if (light := light_map(trained)) is not None:
+            write_json(scratch / LIGHT_FILE, light.record)
     return target
 
 
 def _warn_of_bounds(learned: Mapping[str, Any]) -> None:
-    """Say which frames' learned numbers are at a bound, and so not what the images ask for."""
+    """Warn of frames whose learned numbers, such as gains, are at their bounds."""
     for name, numbers in learned.items():
         frames = numbers.get("at_bound", ())
         if frames:

@@ -23,11 +23,6 @@ from coliags_plugin.outputs.page import fact_list, write_page
 
 #: Largest angle to the optical axis that is shown, degrees, and number of points of a curve.
 _MAX_ANGLE, _POINTS = 60.0, 61
-#: Curves of a :class:`LightMap` that its record has.
-_CURVES = (
-    *("distances", "angles", "by_distance", "by_angle", "true_by_distance", "true_by_angle"),
-    *("gains", "true_gains"),
-)
 
 
 @dataclass(frozen=True)
@@ -57,14 +52,23 @@ class LightMap:
     true_gains: Float[Tensor, "F 3"] | None
     numbers: dict[str, Any]
 
+    @property
+    def record(self) -> dict[str, Any]:
+        """Plain values, for ``light.json``."""
+        curves = {name: value for name, value in vars(self).items() if name not in ("times", "numbers")}
+        plain = {name: None if values is None else values.tolist() for name, values in curves.items()}
+        return self.numbers | {"times": list(self.times), "curves": plain}
+
 
 @torch.no_grad()
-def light_map(trained: TrainedRun) -> LightMap:
-    """The law and the gains of a run, where it has learned any, beside those of a phantom."""
+def light_map(trained: TrainedRun) -> LightMap | None:
+    """Attenuation law and gains that a run has learned, and a phantom's; None without either, or points in view."""
     model, scene = trained.model, trained.scene
     gain = next((part for part in model.view_modules.values() if isinstance(part, GainModule)), None)
     field = model.field if isinstance(model.field, GaussianField) else None
     depths = scene.depths_in_view().double()
+    if len(depths) == 0:
+        return None
     low, middle, high = (float(depths.quantile(share)) for share in (0.02, 0.5, 0.98))
     distances = torch.linspace(low, high, _POINTS, dtype=torch.float64)
     angles = torch.linspace(0.0, _MAX_ANGLE, _POINTS, dtype=torch.float64)
@@ -73,6 +77,8 @@ def light_map(trained: TrainedRun) -> LightMap:
     around = middle * torch.stack([radians.sin(), torch.zeros_like(radians), radians.cos()], dim=1)
     rays = (distances[:, None] * axis, around, middle * axis[None])
     learned = None if field is None else _relative(field.attenuation, rays, trained.device)
+    if learned is None and gain is None:
+        return None
     truth = find_true_light(Path(scene.provenance.get("path", "")))
     true = None if truth is None else _relative(truth.attenuation, rays, torch.device("cpu"))
     gains = None if gain is None else _centred(gain.log_gains().cpu().double()).exp()
@@ -104,33 +110,20 @@ def light_map(trained: TrainedRun) -> LightMap:
     )
 
 
-def light_record(trained: TrainedRun) -> dict[str, Any] | None:
-    """Plain values of :func:`light_map`, for ``light.json``; None without law and gains, or points in view."""
-    model = trained.model
-    gains = any(isinstance(part, GainModule) for part in model.view_modules.values())
-    point = torch.tensor([[0.0, 0.0, 1.0]], device=trained.device)
-    law = isinstance(model.field, GaussianField) and model.field.attenuation(point) is not None
-    if not (gains or law) or len(trained.scene.depths_in_view()) == 0:
-        return None
-    found = light_map(trained)
-    curves = {name: getattr(found, name) for name in _CURVES}
-    plain = {name: None if values is None else values.tolist() for name, values in curves.items()}
-    return found.numbers | {"times": list(found.times), "curves": plain}
-
-
 def write_light_map(trained: TrainedRun, folder: Path) -> None:
     """Write ``light.json``, and ``light.html`` with charts of the law and the gains, into a folder.
 
     Raises:
         InputError: The method has learned neither, no training frame sees a point, or the files cannot be written.
     """
-    record = light_record(trained)
-    if record is None:
+    found = light_map(trained)
+    if found is None:
         raise InputError(
             f"a light map of method '{trained.method}', which has learned neither a law of attenuation nor gains, or "
             "has no points in view",
             "a method with appearance head 'attenuated' or module 'gain', such as coliags-plus, and initial points",
         )
+    record = found.record
     write_json(folder / LIGHT_FILE, record)
     facts = {"method": trained.method, "scene": trained.scene.name, "step": str(trained.step), **light_facts(record)}
     header = f"<h1>Light of {trained.method} on {trained.scene.name}</h1>{fact_list(facts)}"
@@ -141,7 +134,7 @@ def write_light_map(trained: TrainedRun, folder: Path) -> None:
 def _relative(
     law: Any, rays: tuple[Tensor, Tensor, Tensor], device: torch.device
 ) -> tuple[Float[Tensor, "P C"], Float[Tensor, "P C"]] | None:
-    """A law along two curves, relative to its value at a third point; None where there is no law."""
+    """Attenuation over distance and over angle, relative to the axis at the median distance; None without a law."""
     values = [law(points.float().to(device)) for points in rays]
     if values[0] is None:
         return None

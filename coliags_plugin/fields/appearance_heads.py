@@ -63,7 +63,7 @@ class PlainAppearanceHead(AppearanceHead):
 
     @property
     def knows_lamp(self) -> bool:
-        """Where the distance is an input."""
+        """True where the distance to the lamp is an input of the MLP."""
         return self.sees_distance
 
     @torch.no_grad()

@@ -69,7 +69,7 @@ class AttenuatedAppearanceHead(AppearanceHead):
 
     @property
     def uses_normals(self) -> bool:
-        """Where incidence counts."""
+        """True where the law has an exponent of incidence."""
         return self.settings.incidence_exponent is not None
 
     @torch.no_grad()

@@ -26,13 +26,11 @@ class FrameGainSettings(Settings):
     """Options of the gain per frame."""
 
     reference: str | None = None  # training frame whose gain is 1; None: the gains' geometric mean is 1
-    untrained: Literal["interpolate", "metered", "mean"] = (
-        "interpolate"  # between the neighbours in time, that corrected for brightness, or the mean gain
-    )
+    # between the neighbours in time, that corrected for brightness, or the mean gain
+    untrained: Literal["interpolate", "metered", "mean"] = "interpolate"
     channels: Literal[1, 3] = 1  # one gain for all colours, or one each, for a white balance that drifts
-    initial: Literal["one", "points"] = (
-        "one"  # 1, or fitted to surface points where there is depth (docs/methods.md 4.8)
-    )
+    # 1, or fitted to surface points where there is depth (docs/methods.md 4.8)
+    initial: Literal["one", "points"] = "one"
     max_gain: float = Field(default=8.0, gt=1.0)  # gains are at least 1 / max_gain and at most max_gain
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -24,9 +26,16 @@ class Metering:
     """
 
     def __init__(self, scene: Scene, frames: FrameRows) -> None:
-        self._frames = frames
-        self._valid = _common_valid(scene)
-        self._recorded = torch.stack([self.log_brightness(frame.rgb.cpu()) for frame in scene.train])
+        self._scene, self._frames = scene, frames
+
+    @cached_property
+    def _valid(self) -> Bool[Tensor, "H W"] | None:
+        return _common_valid(self._scene)
+
+    @cached_property
+    def _recorded(self) -> Float[Tensor, "F"]:
+        """Log brightness of the training frames, whose images are read when a held-out view first asks. [F]"""
+        return torch.stack([self.log_brightness(frame.rgb) for frame in self._scene.train])
 
     def log_brightness(self, rgb: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
         """Logarithm of the mean colour, where all training frames are valid. []"""
@@ -66,8 +75,7 @@ class Metering:
         """
         times = torch.tensor(self._frames.times, dtype=torch.float64)
         gap = float(times[after] - times[before])
-        order = times.argsort()
-        times, levels = times[order], torch.stack([gains, self._recorded - gains])[:, order]
+        levels = torch.stack([gains, self._recorded - gains])
         most = (len(times) - _FEWEST) // 2
         if most < 1:
             return 0.0

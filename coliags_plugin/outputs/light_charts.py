@@ -42,14 +42,9 @@ def light_charts(record: Mapping[str, Any]) -> dict[str, str]:
             beside = None if true is None else [[value] for value in true]
             charts[title] = _chart(curves[x], curves[y], beside, label, "factor on encoded colours")
     if curves["gains"] is not None:
-        order = sorted(range(len(record["times"])), key=lambda index: record["times"][index])
-        times = [record["times"][index] for index in order]
-        gains, true = (
-            None if curves[name] is None else [curves[name][index] for index in order]
-            for name in ("gains", "true_gains")
+        charts["Gain"] = _chart(
+            record["times"], curves["gains"], curves["true_gains"], "frame", "gain on encoded colours"
         )
-        assert gains is not None
-        charts["Gain"] = _chart(times, gains, true, "frame", "gain on encoded colours")
     return charts
 
 

@@ -42,7 +42,7 @@ def _light(cell: Cell) -> str:
     record = read_json(file, "the light that a run has learned")
     try:
         facts, charts = light_facts(record), light_charts(record)
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError, AssertionError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise InputError(
             f"{file}: {error!r}", "what `coliags eval` writes", "Run `coliags eval` on that run again"
         ) from error

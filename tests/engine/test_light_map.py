@@ -12,7 +12,7 @@ import torch
 import coliags_plugin
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud
-from coliags_plugin.engine.light_map import light_map, light_record
+from coliags_plugin.engine.light_map import light_map
 from coliags_plugin.engine.true_light import TrueLight, find_true_light
 from tests.commands import refused, run
 from tests.scenes import write_wall
@@ -83,9 +83,9 @@ def test_reports_show_the_light_of_runs_that_learn_it(trained, tmp_path):
 
 def test_without_points_in_view_there_is_no_record(trained):
     loaded = trained.load()
-    assert light_record(loaded) is not None
+    assert light_map(loaded) is not None
     blind = replace(loaded.scene, points=PointCloud(torch.zeros(0, 3, dtype=torch.float64)))
-    assert light_record(replace(loaded, scene=blind)) is None
+    assert light_map(replace(loaded, scene=blind)) is None
 
 
 def test_a_damaged_record_of_light_is_named(trained, tmp_path, capsys):
