@@ -27,8 +27,10 @@ ROOT = Path(__file__).resolve().parents[2]
 CORPUS = Path(__file__).parent / "corpus"
 #: Seconds of processor time of one case.
 LIMIT = 10.0
-#: Seconds of the clock, on a machine that others use too.
-_PATIENCE = 60.0
+#: Seconds of processor time of the undamaged files, which compile what is compiled.
+_FIRST_LIMIT = 300.0
+#: Seconds of the clock for a second of processor time, on a machine that others use too.
+_PATIENCE = 6.0
 FINE = ("fine", "message")
 OUTCOMES = (*FINE, "traceback", "hang", "memory", "absurd", "crash")
 
@@ -132,15 +134,25 @@ class Worker:
     def __init__(self, seeds: Path) -> None:
         self.seeds = seeds
         self._process: subprocess.Popen[str] | None = None
+        self._known: set[str] = set()
 
     def run(self, case: Case) -> dict[str, Any]:
         """What became of a case (:meth:`tests.fuzz.worker.Runner.run`), ``hang`` and ``crash`` among it."""
+        name = case["target"]
+        if name not in self._known:
+            untouched = self._answer({"measure": name}, _FIRST_LIMIT)
+            if untouched["outcome"] != "fine":
+                return {**untouched, "outcome": "crash", "detail": f"the seed itself: {untouched['detail']}"}
+            self._known.add(name)
+        return self._answer(case, LIMIT)
+
+    def _answer(self, question: Case, limit: float) -> dict[str, Any]:
         process = self._running()
         assert process.stdin is not None
         began = _processor_time(process.pid)
-        process.stdin.write(json.dumps(case) + "\n")
+        process.stdin.write(json.dumps(question) + "\n")
         process.stdin.flush()
-        until = time.monotonic() + _PATIENCE
+        until = time.monotonic() + _PATIENCE * limit
         while True:
             line = _line(process, 0.5)
             if line:
@@ -149,7 +161,7 @@ class Worker:
                 self.stop()
                 return {"outcome": "crash", "detail": f"ended with {process.returncode}", "memory": 0}
             used = _processor_time(process.pid) - began
-            if used > LIMIT or time.monotonic() > until:
+            if used > limit or time.monotonic() > until:
                 self.stop()
                 return {"outcome": "hang", "detail": f"{used:.1f} s of processor time", "memory": 0}
 
@@ -170,6 +182,7 @@ class Worker:
             self._process.kill()
             self._process.communicate()
             self._process = None
+            self._known.clear()
 
 
 def _line(process: subprocess.Popen[str], seconds: float) -> str | None:

@@ -37,7 +37,9 @@ def main() -> None:
     runner = Runner(seeds)
     print("ready", file=answers, flush=True)
     for line in sys.stdin:
-        print(json.dumps(runner.run(json.loads(line))), file=answers, flush=True)
+        asked = json.loads(line)
+        found = runner.measure(asked["measure"]) if "measure" in asked else runner.run(asked)
+        print(json.dumps(found), file=answers, flush=True)
 
 
 class Runner:
@@ -51,14 +53,18 @@ class Runner:
         self.seeds = seeds
         self._needs: dict[str, int] = {}
 
+    def measure(self, name: str) -> dict[str, Any]:
+        """What becomes of the undamaged files of a target; the memory that they need limits its cases."""
+        found = self._once({"target": name, "edits": []}, None)
+        self._needs[name] = found["memory"]
+        return found
+
     def run(self, case: dict[str, Any]) -> dict[str, Any]:
-        """What became of a case: ``outcome``, ``detail``, and for a traceback its ``place``."""
+        """What became of a case: ``outcome``, ``detail``, and for a traceback its ``place``.
+
+        Its target is to be measured before.
+        """
         name = case["target"]
-        if name not in self._needs:
-            untouched = self._once({"target": name, "edits": []}, None)
-            if untouched["outcome"] != "fine":
-                return {**untouched, "outcome": "crash", "detail": f"the seed itself: {untouched['detail']}"}
-            self._needs[name] = untouched["memory"]
         found = self._once(case, self._needs[name] + MEMORY)
         if found["memory"] > self._needs[name] + MEMORY and found["outcome"] != "traceback":
             found.update(outcome="memory", detail=f"{found['memory'] - self._needs[name]:,} bytes beyond the need")
