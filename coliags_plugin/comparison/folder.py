@@ -205,7 +205,7 @@ class ComparisonFolder:
         if not self.plan_file.is_file():
             return PlanRecord()
         try:
-            content = read_json(self.plan_file, "what `coliags compare` wrote")
+            content = read_json(self.plan_file, "what `coliags compare` wrote", finite=True)
             version = content.get("version") if isinstance(content, dict) else None
             if isinstance(version, int) and version > VERSION:
                 raise InputError(

@@ -52,7 +52,23 @@ _MOST_VALUES = 10_000
 
 
 class _Loader(yaml.SafeLoader):
-    """Safe loader in which ``1e-5`` is a number and ``on`` is a word, as YAML 1.2 has it."""
+    """Safe loader in which ``1e-5`` is a number and ``on`` is a word, as YAML 1.2 has it; text can be encoded."""
+
+    def construct_scalar(self, node: yaml.ScalarNode | yaml.MappingNode) -> Any:
+        """The scalar; a YAMLError where it has half of a surrogate pair."""
+        value = super().construct_scalar(node)
+        if isinstance(value, str) and not _is_text(value):
+            raise yaml.constructor.ConstructorError(None, None, f"{value!a} is not text in Unicode", node.start_mark)
+        return value
+
+
+def _is_text(value: str) -> bool:
+    """Whether it can be encoded: half of a surrogate pair, such as an argument that is not UTF-8 has, cannot."""
+    try:
+        value.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 _Loader.yaml_implicit_resolvers = {
@@ -201,8 +217,10 @@ def override(tree: Node, assignment: str) -> Node:
     """Apply one ``key.path=value``; a key with a dot is put in double quotes.
 
     Raises:
-        InputError: It has no ``=`` or an empty key.
+        InputError: It has no ``=``, an empty key, or bytes that are not UTF-8.
     """
+    if not _is_text(assignment):
+        raise InputError(f"--set {assignment!a}", "text in UTF-8")
     path, equals, text = assignment.partition("=")
     keys = _KEY.findall(path.strip())
     if not equals or ".".join(keys) != path.strip():

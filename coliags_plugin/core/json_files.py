@@ -3,40 +3,58 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from coliags_plugin.core.errors import InputError
 
 
-def read_json(path: Path, expected: str, do: str = "") -> Any:
+def read_json(path: Path, expected: str, do: str = "", finite: bool = False) -> Any:
     """The value of a JSON file in UTF-8, with or without a byte order mark.
 
     Args:
         path: The file.
         expected: What it should be, for messages.
         do: What the user can do about it.
+        finite: See :func:`parse_json`.
 
     Raises:
-        InputError: The file cannot be read, is not JSON, is nested too deeply, or has a number of thousands of digits.
+        InputError: The file cannot be read, or is refused by :func:`parse_json`.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot read {path}: {error}", expected, do) from error
     try:
-        return parse_json(text)
+        return parse_json(text, finite)
     except ValueError as error:
         raise InputError(f"{path} is not JSON: {error}", expected, do) from error
 
 
-def parse_json(text: str | bytes) -> Any:
+def parse_json(text: str | bytes, finite: bool = False) -> Any:
     """The value of a JSON text.
 
+    Args:
+        text: The text.
+        finite: Refuse infinity and NaN, which Python reads and the standard does not have: they cannot be written again.
+
     Raises:
-        ValueError: It is not JSON, is nested too deeply, or has a number of thousands of digits.
+        ValueError: It is not JSON, is nested too deeply, or has a number of thousands of digits; or see ``finite``.
     """
     try:
-        return json.loads(text)
+        return json.loads(text, **(_FINITE if finite else {}))
     except RecursionError as error:
         raise ValueError("nested too deeply") from error
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    return value if math.isfinite(value) else _refuse(text)
+
+
+def _refuse(text: str) -> NoReturn:
+    raise ValueError(f"{text} is not a finite number")
+
+
+_FINITE: dict[str, Any] = {"parse_float": _finite, "parse_constant": _refuse}

@@ -195,7 +195,7 @@ def read_checkpoint(path: Path, method: str, device: torch.device) -> Checkpoint
     if differing:
         raise _damaged(path, f"{', '.join(differing)} is not what was written")
     try:
-        state = parse_json((path / "state.json").read_text(encoding="utf-8"))
+        state = parse_json((path / "state.json").read_text(encoding="utf-8"), finite=True)
         tensors = load_file(path / "state.safetensors")
         step, owner, queue, version = (state[key] for key in ("step", "method", "frame_queue", "format"))
         cost = None if state.get("cost") is None else TrainingCost.model_validate(state["cost"])

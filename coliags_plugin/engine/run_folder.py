@@ -184,7 +184,7 @@ class RunFolder:
         Raises:
             InputError: The file is damaged.
         """
-        found: dict[str, Any] = read_json(self.provenance_file, "what `coliags train` wrote")
+        found: dict[str, Any] = read_json(self.provenance_file, "what `coliags train` wrote", finite=True)
         return found
 
     def identity(self) -> RunIdentity:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from coliags_plugin.config.yaml_tree import parse_tree
+from coliags_plugin.config.yaml_tree import override, parse_tree
 from coliags_plugin.core.errors import InputError
 
 
@@ -32,3 +32,11 @@ def test_nesting(text):
 def test_numbers_of_thousands_of_digits():
     with pytest.raises(InputError, match="4300 digits"):
         parse_tree(f"a: {'9' * 5000}", "x")
+
+
+def test_text_that_cannot_be_encoded():
+    for text in (r'a: "\ud800"', r'"\ud800": 1', r'a: ["x", "\ud800"]'):
+        with pytest.raises(InputError, match="x:1: .*ud800.* is not text"):
+            parse_tree(text, "x")
+    with pytest.raises(InputError, match="--set .*udcff.* UTF-8"):
+        override(parse_tree("", "x"), "a=\udcff")

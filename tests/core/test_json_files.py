@@ -34,3 +34,11 @@ def test_links_that_lead_nowhere(tmp_path):
     for name in ("loop", "missing"):
         with pytest.raises(InputError, match="cannot read"):
             read_json(tmp_path / name, "x")
+
+
+@pytest.mark.parametrize("number", ["NaN", "-Infinity", "1e999"])
+def test_numbers_that_cannot_be_written_again(tmp_path, number):
+    (tmp_path / "a.json").write_text(f'{{"a": [{number}]}}')
+    assert set(read_json(tmp_path / "a.json", "x")) == {"a"}
+    with pytest.raises(InputError, match=f"{number} is not a finite number"):
+        read_json(tmp_path / "a.json", "x", finite=True)
