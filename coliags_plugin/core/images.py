@@ -1,14 +1,88 @@
-"""Encoding of images as PNG, JPEG and TIFF."""
+"""Decoding of image files of unknown origin, and encoding of images as PNG, JPEG and TIFF."""
 
 from __future__ import annotations
 
+import io
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Shaped
 
+from coliags_plugin.core import bounds
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+#: Bytes of a chunk of a PNG besides its data: length, type and checksum.
+_CHUNK = 12
+
+
+def decode_image(path: Path, flags: int | None = None) -> Shaped[np.ndarray, "H W *C"]:
+    """Pixels of an image file, in OpenCV's order of channels.
+
+    What would fill the memory is refused before anything is decoded.
+
+    Args:
+        path: The file.
+        flags: OpenCV's; by default ``IMREAD_UNCHANGED``.
+
+    Raises:
+        InputError: It cannot be read, is damaged or cut short, or has more pixels than a frame of a video.
+    """
+    import cv2
+
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}", "a readable image") from error
+    _check_size(path, data)
+    image = None
+    if data and (not data.startswith(_PNG[:4]) or _is_whole_png(data)):
+        try:
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED if flags is None else flags)
+        except cv2.error:  # of more than 2^30 pixels, for instance
+            image = None
+    if image is None:
+        raise InputError(
+            f"{path} ({len(data)} bytes) cannot be decoded",
+            "a complete image",
+            "It is damaged or cut short: fetch it again",
+        )
+    return np.asarray(image)
+
+
+def _check_size(path: Path, data: bytes) -> None:
+    """Refuse what its header says would fill the memory, before anything is decoded."""
+    import PIL.Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the decoder says what is wrong with a damaged file
+            with PIL.Image.open(io.BytesIO(data)) as header:
+                width, height = header.size
+    except PIL.Image.DecompressionBombError as error:
+        raise InputError(f"{path}: {error}", f"an image of at most {bounds.IMAGE_PIXELS:,} pixels") from error
+    except Exception:  # of a kind that Pillow does not know, or damaged: the decoder sees that
+        return
+    if width * height > bounds.IMAGE_PIXELS or max(width, height) > bounds.IMAGE_SIDE:
+        raise InputError(
+            f"{path} says that it has {width} x {height} pixels",
+            f"at most {bounds.IMAGE_PIXELS:,} pixels, and {bounds.IMAGE_SIDE} a side",
+            "It is damaged, or not a frame of a video",
+        )
+
+
+def _is_whole_png(data: bytes) -> bool:
+    """Whether its chunks follow each other to the last: decoders accept cut files, and allocate what a length says."""
+    place = len(_PNG)
+    while place + _CHUNK <= len(data):
+        length, kind = int.from_bytes(data[place : place + 4], "big"), data[place + 4 : place + 8]
+        place += _CHUNK + length
+        if kind == b"IEND":
+            return place <= len(data)
+    return False
 
 
 def encode_image(pixels: np.ndarray, suffix: str = ".png", options: Sequence[int] = ()) -> bytes:

@@ -37,7 +37,7 @@ def parse_json(text: str | bytes, finite: bool = False) -> Any:
 
     Args:
         text: The text.
-        finite: Refuse infinity and NaN, which Python reads and the standard does not have: they cannot be written again.
+        finite: Refuse infinity and NaN, which the standard does not have, so that they cannot be written again.
 
     Raises:
         ValueError: It is not JSON, is nested too deeply, or has a number of thousands of digits; or see ``finite``.

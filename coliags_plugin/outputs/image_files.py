@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -11,7 +11,7 @@ from jaxtyping import Float32, UInt8
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
-from coliags_plugin.core.images import encode_image
+from coliags_plugin.core.images import decode_image, encode_image
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -93,7 +93,7 @@ def read_rgb(path: Path) -> UInt8[np.ndarray, "H W 3"]:
     Raises:
         InputError: Missing, unreadable, or of another depth or channel count.
     """
-    pixels = _decode(path)
+    pixels = decode_image(path)
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
         raise InputError(f"{path} holds {_kind(pixels)}", "an 8-bit RGB image")
     return np.ascontiguousarray(pixels[:, :, ::-1])
@@ -123,7 +123,7 @@ def read_depth_tiff(path: Path) -> Float32[np.ndarray, "H W"]:
     Raises:
         InputError: Missing, unreadable, or not one channel of float32.
     """
-    depth = _decode(path)
+    depth = decode_image(path)
     if depth.dtype != np.float32 or depth.ndim != 2:
         raise InputError(f"{path} holds {_kind(depth)}", "one channel of float32, mm")
     return depth
@@ -138,17 +138,3 @@ def _checked(rgb: np.ndarray | Tensor) -> np.ndarray:
 
 def _kind(pixels: np.ndarray) -> str:
     return f"{pixels.dtype} {list(pixels.shape)}"
-
-
-def _decode(path: Path) -> Any:
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or error}", "an image") from error
-    try:
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
-    except cv2.error as error:
-        raise InputError(f"{path} cannot be decoded: {error}", "an image") from error
-    if pixels is None:
-        raise InputError(f"{path} cannot be decoded ({len(data)} bytes)", "a complete PNG, JPEG or TIFF image")
-    return pixels

@@ -36,7 +36,7 @@ def test_numbers_of_thousands_of_digits():
 
 def test_text_that_cannot_be_encoded():
     for text in (r'a: "\ud800"', r'"\ud800": 1', r'a: ["x", "\ud800"]'):
-        with pytest.raises(InputError, match="x:1: .*ud800.* is not text"):
+        with pytest.raises(InputError, match=r"x:1: .*ud800.* is not text"):
             parse_tree(text, "x")
-    with pytest.raises(InputError, match="--set .*udcff.* UTF-8"):
+    with pytest.raises(InputError, match=r"--set .*udcff.* UTF-8"):
         override(parse_tree("", "x"), "a=\udcff")

@@ -1,13 +1,16 @@
-"""Encoding of images."""
+"""Encoding and decoding of images."""
 
 from __future__ import annotations
+
+import resource
+import zlib
 
 import cv2
 import numpy as np
 import pytest
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.images import encode_image, write_image, write_mask
+from coliags_plugin.core.images import decode_image, encode_image, write_image, write_mask
 
 
 def read(path):
@@ -34,3 +37,44 @@ def test_what_a_format_cannot_hold_is_refused():
         encode_image(np.zeros((0, 4), np.uint8))
     with pytest.raises(InputError, match=r"cannot be written as \.nothing"):
         encode_image(np.zeros((2, 2), np.uint8), ".nothing")
+
+
+def chunk(kind, data, length=None):
+    length = len(data) if length is None else length
+    return length.to_bytes(4, "big") + kind + data + zlib.crc32(kind + data).to_bytes(4, "big")
+
+
+def test_images_are_decoded_as_stored(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 255, (5, 7, 3)).astype(np.uint8)
+    for suffix in (".png", ".tiff", ".bmp"):
+        write_image(tmp_path / f"a{suffix}", pixels)
+        np.testing.assert_array_equal(decode_image(tmp_path / f"a{suffix}")[..., ::-1], pixels)
+    assert decode_image(tmp_path / "a.png", cv2.IMREAD_GRAYSCALE).shape == (5, 7)
+    whole = (tmp_path / "a.png").read_bytes()
+    (tmp_path / "a.png").write_bytes(whole + b"behind the end")
+    np.testing.assert_array_equal(decode_image(tmp_path / "a.png")[..., ::-1], pixels)
+
+
+def test_damaged_images_are_refused_before_memory_is_asked_for(tmp_path):
+    whole = encode_image(np.zeros((5, 7), np.uint8))
+    start, rest = whole[:33], whole[33:]
+    # OpenCV would allocate what the length of a chunk says.
+    long = start + chunk(b"IDAT", b"x" * 20, 1 << 30) + rest
+    large = start[:8] + chunk(b"IHDR", (60_000).to_bytes(4, "big") * 2 + start[24:29]) + rest
+    damaged = {
+        "cut": (whole[:-13], "cannot be decoded"),
+        "cut in the last chunk": (whole[:-1], "cannot be decoded"),
+        "empty": (b"", "cannot be decoded"),
+        "long": (long, "cannot be decoded"),
+        "large": (large, "60000 x 60000 pixels|decompression bomb"),
+        "text": (b"no image at all", "cannot be decoded"),
+    }
+    for name, (data, message) in damaged.items():
+        path = tmp_path / f"{name}.png"
+        path.write_bytes(data)
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        with pytest.raises(InputError, match=message):
+            decode_image(path)
+        assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000, name  # KiB
+    with pytest.raises(InputError, match="cannot read"):
+        decode_image(tmp_path / "missing.png")

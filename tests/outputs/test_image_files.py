@@ -73,11 +73,11 @@ def test_what_is_no_depth_is_refused(tmp_path, wrong):
 
 
 def test_reading_names_the_file(tmp_path, rgb):
-    with pytest.raises(InputError, match=r"none\.png cannot be read"):
+    with pytest.raises(InputError, match=r"cannot read .*none\.png"):
         read_rgb(tmp_path / "none.png")
     for name, data in (("empty.png", b""), ("torn.png", encode_png(rgb)[:20]), ("text.png", b"hello")):
         (tmp_path / name).write_bytes(data)
-        with pytest.raises(InputError, match=f"{name} cannot be decoded"):
+        with pytest.raises(InputError, match=rf"{name} .*cannot be decoded"):
             read_rgb(tmp_path / name)
 
 

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import io
-import warnings
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 from jaxtyping import Shaped, UInt8
 
-from coliags_plugin.core import bounds
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import decode_image
 
 
 def read_rgb(path: Path) -> UInt8[np.ndarray, "H W 3"]:
@@ -20,7 +17,7 @@ def read_rgb(path: Path) -> UInt8[np.ndarray, "H W 3"]:
     Raises:
         InputError: The file is damaged or has another format.
     """
-    image = _read(path)
+    image = decode_image(path)
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] not in (3, 4):
         raise InputError(f"{path} is {_kind(image)}", "an 8-bit RGB image", "Convert it")
     return np.ascontiguousarray(image[..., 2::-1])
@@ -37,7 +34,7 @@ def read_gray(path: Path, bits: int, expected: str) -> Shaped[np.ndarray, "H W"]
     Raises:
         InputError: The file is damaged or has another format.
     """
-    image = _read(path)
+    image = decode_image(path)
     _check_gray(path, image, bits, expected)
     return image
 
@@ -58,7 +55,7 @@ def bits_of(path: Path) -> int:
     Raises:
         InputError: The image cannot be read completely.
     """
-    return 8 * _read(path).itemsize
+    return 8 * decode_image(path).itemsize
 
 
 def size_of(path: Path) -> tuple[int, int]:
@@ -67,29 +64,8 @@ def size_of(path: Path) -> tuple[int, int]:
     Raises:
         InputError: The image cannot be read completely.
     """
-    height, width = _read(path).shape[:2]
+    height, width = decode_image(path).shape[:2]
     return width, height
-
-
-def _check_size(path: Path, data: bytes) -> None:
-    """Refuse what its header says would fill the memory, before anything is decoded."""
-    import PIL.Image
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the decoder says what is wrong with a damaged file
-            with PIL.Image.open(io.BytesIO(data)) as header:
-                width, height = header.size
-    except PIL.Image.DecompressionBombError as error:
-        raise InputError(f"{path}: {error}", f"an image of at most {bounds.IMAGE_PIXELS:,} pixels") from error
-    except Exception:  # of a kind that Pillow does not know, or damaged: the decoder sees that
-        return
-    if width * height > bounds.IMAGE_PIXELS or max(width, height) > bounds.IMAGE_SIDE:
-        raise InputError(
-            f"{path} says that it has {width} x {height} pixels",
-            f"at most {bounds.IMAGE_PIXELS:,} pixels, and {bounds.IMAGE_SIDE} a side",
-            "It is damaged, or not a frame of a video",
-        )
 
 
 def read_mask(path: Path) -> Shaped[np.ndarray, "H W"]:
@@ -98,7 +74,7 @@ def read_mask(path: Path) -> Shaped[np.ndarray, "H W"]:
     Raises:
         InputError: The file is damaged or has another format.
     """
-    image = _read(path)
+    image = decode_image(path)
     if image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8:
         if not (image == image[..., :1]).all():
             raise InputError(
@@ -128,29 +104,6 @@ def resize_nearest(values: Shaped[np.ndarray, "H W"], width: int, height: int) -
     row = ((np.arange(height) + 0.5) * rows / height).astype(np.int64)
     column = ((np.arange(width) + 0.5) * columns / width).astype(np.int64)
     return np.ascontiguousarray(values[row[:, None], column[None, :]])
-
-
-def _read(path: Path) -> np.ndarray:
-    import cv2
-
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}", "a readable image") from error
-    # Decoders accept truncated PNGs to different degrees, so the last chunk is checked.
-    complete = bool(data) and (not data.startswith(b"\x89PNG") or b"IEND" in data[-64:])
-    _check_size(path, data)
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if complete else None
-    except cv2.error:  # of more than 2^30 pixels, for instance
-        image = None
-    if image is None:
-        raise InputError(
-            f"{path} ({len(data)} bytes) cannot be decoded",
-            "a complete image",
-            "It is damaged or cut short: fetch it again",
-        )
-    return cast(np.ndarray, image)
 
 
 def _kind(image: np.ndarray) -> str:

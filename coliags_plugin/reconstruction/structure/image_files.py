@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import decode_image
 from coliags_plugin.poses.trajectory import natural_order
 
 #: Suffixes of image files, in lower case.
@@ -48,15 +49,8 @@ def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
     """
     import cv2
 
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}", "a readable image") from error
     # Ignore the EXIF orientation, as COLMAP's cameras do.
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
-    if image is None:
-        raise InputError(f"{path} ({len(data)} bytes) cannot be decoded", "a complete image", "Fetch it again")
+    image = decode_image(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     return np.ascontiguousarray(image[..., ::-1])
 
 
