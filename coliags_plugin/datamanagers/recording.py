@@ -72,6 +72,10 @@ class Recording:
     points_source: Path | None = None
 
 
+#: Bytes read at once.
+_BLOCK = 1 << 20
+
+
 def fingerprint(folder: Path, large: Iterable[Path | None], small: Iterable[Path | None]) -> str:
     """SHA-256 of the names and sizes of large files and the contents of small ones.
 
@@ -85,8 +89,9 @@ def fingerprint(folder: Path, large: Iterable[Path | None], small: Iterable[Path
             size = path.stat().st_size
         digest.update(f"{Path(name).as_posix()} {size}\n".encode("utf-8", "surrogateescape"))
     for path in filter(None, small):
-        with _readable(path):
-            digest.update(path.read_bytes())
+        with _readable(path), path.open("rb") as file:
+            while block := file.read(_BLOCK):
+                digest.update(block)
     return digest.hexdigest()
 
 

@@ -27,6 +27,19 @@ def read_text(path: Path, expected: str = "a text file of poses") -> str:
         raise InputError(f"cannot read {path}: {error}", expected) from error
 
 
+def text_lines(path: Path, expected: str = "a text file of poses") -> Iterator[tuple[int, str]]:
+    """The lines of a UTF-8 text file with their numbers, from 1, one after the other: files may be large.
+
+    Raises:
+        InputError: The file cannot be read, or is not text.
+    """
+    try:
+        with path.open(encoding="utf-8-sig") as file:
+            yield from enumerate(file, start=1)
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read {path}: {error}", expected) from error
+
+
 def read_numbers(
     path: Path, count: int, expected: str, do: str, *, comments: bool = False
 ) -> list[tuple[int, list[float]]]:
@@ -43,7 +56,7 @@ def read_numbers(
         InputError: The file cannot be read or holds no rows, or a line is invalid; the message names the line.
     """
     rows: list[tuple[int, list[float]]] = []
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
+    for number, line in text_lines(path):
         words = _words(line)
         if not words or (comments and words[0].startswith("#")):
             continue

@@ -19,7 +19,7 @@ from coliags_plugin.datamanagers.reading.frame_files import DEPTH_SUFFIXES, IMAG
 from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.poses import tum
 from coliags_plugin.poses.colmap import read_text_cameras
-from coliags_plugin.poses.text import read_text, shortened
+from coliags_plugin.poses.text import read_text, shortened, text_lines
 
 IMAGE_FOLDERS = ("rgb", "color", "images")
 DEPTH_FOLDERS = ("depth", "depths")
@@ -202,7 +202,7 @@ def read_obj_points(path: Path) -> PointCloud:
         InputError: The file cannot be read, or a vertex line does not hold three or six numbers.
     """
     rows: list[list[float]] = []
-    for number, line in enumerate(read_text(path, "an OBJ file").splitlines(), start=1):
+    for number, line in text_lines(path, "an OBJ file"):
         if not line.startswith("v "):
             continue
         try:
