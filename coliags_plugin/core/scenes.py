@@ -199,9 +199,9 @@ class PointCloud:
         return len(self.positions)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scene:
-    """A dataset with its split and initial points.
+    """A dataset with its split and initial points; equal to itself alone.
 
     Attributes:
         name: Short name for folders and tables.
