@@ -344,6 +344,13 @@ class TestDepthScale:
         with pytest.raises(InputError, match=r"depth_scale|nothing says"):
             load(mine)
 
+    @pytest.mark.parametrize("scale", [1e-7, 1e-320])
+    def test_that_makes_depth_absurd(self, mine, scale):
+        camera = json.loads((mine / "camera.json").read_text())
+        (mine / "camera.json").write_text(json.dumps({**camera, "depth_scale": scale}))
+        with pytest.raises(InputError, match="scene units a step reach to"):
+            load(mine)
+
     def test_zero_is_unknown(self, mine):
         path = mine / "depth" / f"{stamps(9)[1]}.png"
         steps = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
