@@ -10,6 +10,8 @@ import torch
 from jaxtyping import Bool, Float, Shaped, UInt8
 from torch import Tensor
 
+from coliags_plugin.core import bounds
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.reading.images import read_gray, read_mask, read_rgb
@@ -130,7 +132,16 @@ class StoredFrame(Frame):
 
     def _z_depth(self, stored: Shaped[np.ndarray, "H W"] | None) -> Float[Tensor, "H W"] | None:
         form = self._shot.depth_format
-        return None if stored is None or form is None else torch.from_numpy(form.z_depth(stored))
+        if stored is None or form is None:
+            return None
+        depth = form.z_depth(stored)
+        if (depth > bounds.LENGTH).any():  # NaN is unknown
+            raise InputError(
+                f"{self._shot.depth}: depth reaches to {np.nanmax(depth):g} scene units",
+                f"at most {bounds.LENGTH:g}",
+                "Correct the scale of depth",
+            )
+        return torch.from_numpy(depth)
 
     def _bound(self, stored: Shaped[np.ndarray, "H W"] | None) -> Float[Tensor, "H W"] | None:
         form = self._shot.depth_format

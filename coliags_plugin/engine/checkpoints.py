@@ -198,6 +198,8 @@ def read_checkpoint(path: Path, method: str, device: torch.device) -> Checkpoint
         state = parse_json((path / "state.json").read_text(encoding="utf-8"), finite=True)
         tensors = load_file(path / "state.safetensors")
         step, owner, queue, version = (state[key] for key in ("step", "method", "frame_queue", "format"))
+        if type(step) is not int or step < 0:
+            raise ValueError(f"step is {step!r:.50}")
         cost = None if state.get("cost") is None else TrainingCost.model_validate(state["cost"])
     except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
         raise _damaged(path, str(error)) from error

@@ -9,8 +9,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Shaped
 
-from coliags_plugin.core import bounds
-from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.reading.images import read_gray
 
 
@@ -42,23 +40,11 @@ class DepthSteps(DepthFormat):
         size: Scene units per step.
         bits: 8 or 16.
         far: Stored value of depths clipped to the range; None where there is none.
-
-    Raises:
-        InputError: The largest stored value is no depth.
     """
 
     size: float
     bits: int = 16
     far: int | None = None
-
-    def __post_init__(self) -> None:
-        farthest = (2**self.bits - 1) * self.size
-        if not 0.0 < farthest <= bounds.LENGTH:
-            raise InputError(
-                f"depth files of {self.bits} bits with {self.size:g} scene units a step reach to {farthest:g}",
-                f"at most {bounds.LENGTH:g} scene units",
-                "Correct the scale of depth",
-            )
 
     def read(self, path: Path) -> Shaped[np.ndarray, "H W"]:
         """See :class:`DepthFormat`; an image of one channel."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import posixpath
 from pathlib import Path
 
@@ -18,7 +19,7 @@ def named_file(folder: Path, name: str, said: str, outside: bool) -> Path:
         outside: Whether it may lie outside of the folder. Links within the folder may always lead anywhere.
 
     Raises:
-        InputError: It lies outside, and must not.
+        InputError: It lies outside, and must not; or the name is too long for a file.
     """
     path = folder / name
     within = Path(posixpath.normpath(folder.absolute()))
@@ -28,4 +29,9 @@ def named_file(folder: Path, name: str, said: str, outside: bool) -> Path:
             "files in the scene's own folder",
             "If you trust it, set datamanager.outside_files=true (in other commands --set outside_files=true)",
         )
+    try:
+        path.lstat()
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            raise InputError(f"{said} names {name[:200]}..., {len(name):,} letters", "the name of a file") from error
     return path
