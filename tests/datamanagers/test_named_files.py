@@ -25,6 +25,12 @@ def test_names_outside(tmp_path, name):
     assert named_file(tmp_path, name, "x.json", outside=True) == tmp_path / name
 
 
+@pytest.mark.parametrize("name", ["a\0b", "a" * 300, "a/" * 3000])
+def test_names_that_no_file_can_have(tmp_path, name):
+    with pytest.raises(InputError, match=r"x\.json names a.*Expected the name of a file"):
+        named_file(tmp_path, name, "x.json", outside=False)
+
+
 def test_an_absolute_path_into_the_folder(tmp_path):
     assert named_file(tmp_path, str(tmp_path / "a.png"), "x.json", outside=False) == tmp_path / "a.png"
 

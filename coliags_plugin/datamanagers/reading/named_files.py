@@ -19,7 +19,7 @@ def named_file(folder: Path, name: str, said: str, outside: bool) -> Path:
         outside: Whether it may lie outside of the folder. Links within the folder may always lead anywhere.
 
     Raises:
-        InputError: It lies outside, and must not; or the name is too long for a file.
+        InputError: It lies outside, and must not; or no file can have this name.
     """
     path = folder / name
     within = Path(posixpath.normpath(folder.absolute()))
@@ -31,6 +31,8 @@ def named_file(folder: Path, name: str, said: str, outside: bool) -> Path:
         )
     try:
         path.lstat()
+    except ValueError as error:  # it has a zero
+        raise InputError(f"{said} names {name[:200]!r}", "the name of a file") from error
     except OSError as error:
         if error.errno == errno.ENAMETOOLONG:
             raise InputError(f"{said} names {name[:200]}..., {len(name):,} letters", "the name of a file") from error
