@@ -31,6 +31,7 @@ class FrameGainSettings(Settings):
     channels: Literal[1, 3] = 1  # one gain for all colours, or one each, for a white balance that drifts
     # 1, or fitted to surface points where there is depth (docs/methods.md 4.8)
     initial: Literal["one", "points"] = "one"
+    fitted_rate: float = Field(default=0.1, gt=0.0, le=1.0)  # share of the learning rate that fitted gains have
     max_gain: float = Field(default=8.0, gt=1.0)  # gains are at least 1 / max_gain and at most max_gain
 
 
@@ -41,10 +42,16 @@ class FrameGain(GainModule):
     gain; views of test sets beside the video have that of the training frame taken closest to them.
 
     Attributes:
-        log_gain: Of every training frame, before the reference is subtracted. [F, C]
+        log_gain: Logarithm for every training frame, before the reference is subtracted: all of it, or, over ``rate``,
+            what is added to the fitted one. [F, C]
+        fitted: Fitted logarithm; 0 where none is. [F, C]
+        rate: Share of the learning rate. []
     """
 
     Settings: ClassVar[type[Settings]] = FrameGainSettings
+
+    fitted: Tensor
+    rate: Tensor
 
     def __init__(self, settings: Any, scene: Scene) -> None:
         super().__init__()
@@ -53,6 +60,8 @@ class FrameGain(GainModule):
         self._reference = None if settings.reference is None else self.frames.require(settings.reference, "gain")
         self._metering = Metering(scene, self.frames) if settings.untrained == "metered" else None
         self.log_gain = nn.Parameter(torch.zeros(len(self.frames), settings.channels))
+        self.register_buffer("fitted", torch.zeros_like(self.log_gain))
+        self.register_buffer("rate", torch.ones(()))
 
     @classmethod
     def from_scene(cls, scene: Scene, settings: Any, generator: torch.Generator) -> Self:
@@ -68,7 +77,8 @@ class FrameGain(GainModule):
         """Start at the gains of the scene's surface points, if the settings say so."""
         fitted = fit_light(scene) if self.settings.initial == "points" else None
         if fitted is not None:
-            self.log_gain.copy_(fitted.log_gains[:, None].expand_as(self.log_gain))
+            self.fitted.copy_(fitted.log_gains[:, None].expand_as(self.fitted))
+            self.rate.fill_(self.settings.fitted_rate)
 
     @property
     def untrained_views(self) -> str:
@@ -92,9 +102,10 @@ class FrameGain(GainModule):
 
     def log_gains(self) -> Float[Tensor, "F C"]:
         """Logarithm of every training frame's gain, relative to the reference, within its bounds. [F, C]"""
-        zero = self.log_gain.mean(0) if self._reference is None else self.log_gain[self._reference]
+        logs = self.fitted + self.rate * self.log_gain
+        zero = logs.mean(0) if self._reference is None else logs[self._reference]
         limit = math.log(self.settings.max_gain)
-        return (self.log_gain - zero).clamp(-limit, limit)
+        return (logs - zero).clamp(-limit, limit)
 
     def gains(self) -> Float[Tensor, "F C"]:
         """The gain of every training frame, in their order. [F, C]"""

@@ -88,6 +88,13 @@ def test_the_module_starts_with_them_where_there_is_depth():
     expected = (GAINS.log() - GAINS.log().mean()).exp()
     for channel in module.gains().detach().T:
         assert channel.tolist() == pytest.approx(expected.tolist(), rel=0.015)
+    before = module.gains().detach().log()
+    optimizer = torch.optim.SGD(module.parameters(), lr=1.0)
+    module.log_gains()[2].sum().backward()
+    optimizer.step()
+    # The sum of three logarithms, relative to their mean over seven frames: both factors are a tenth.
+    moved = (module.gains().detach().log() - before).abs().max()
+    assert moved.item() == pytest.approx(0.1 * 0.1 * 6 / 7, rel=1e-3)
     without = FrameGain.from_scene(gained(GAINS, depth=False), settings, torch.Generator())
     without.prepare(gained(GAINS, depth=False))
     assert without.gains().tolist() == [[1.0] * 3] * 7
