@@ -56,6 +56,10 @@ def differing_files(folder: Path) -> list[str]:
         digest, _, name = line.partition("  ")
         if not name or "/" in name:
             return [CHECKSUMS]
-        if not (folder / name).is_file() or file_sha256(folder / name) != digest:
+        try:
+            is_there = (folder / name).is_file()
+        except OSError:  # the name is too long
+            return [CHECKSUMS]
+        if not is_there or file_sha256(folder / name) != digest:
             differing.append(name)
     return differing

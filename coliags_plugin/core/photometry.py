@@ -165,7 +165,7 @@ def _fit_scene(scene: Scene) -> LightFit | None:
 def _observe(scene: Scene, points: Float[Tensor, "P 3"], normals: Float[Tensor, "P 3"]) -> _Observations:
     """Points with normals of either sign in the training frames."""
     views = [_seen(frame, points) for frame in scene.train]
-    logs, usable, same, inside = (torch.stack(maps, dim=1) for maps in zip(*views, strict=True))
+    logs, usable, same, hidden = (torch.stack(maps, dim=1) for maps in zip(*views, strict=True))
     cameras = [frame.camera.to("cpu", torch.float64) for frame in scene.train]
     centers = torch.stack([camera.center for camera in cameras])
     towards = torch.einsum("pfc,pc->pf", centers - points[:, None], normals)
@@ -177,7 +177,7 @@ def _observe(scene: Scene, points: Float[Tensor, "P 3"], normals: Float[Tensor, 
         usable & (usable.sum(1, keepdim=True) > 1),
         sights,
         torch.einsum("pc,fcd->pfd", normals, axes),
-        same | ~inside,
+        ~hidden,
         Cavity.of(points, normals),
     )
 
@@ -185,7 +185,7 @@ def _observe(scene: Scene, points: Float[Tensor, "P 3"], normals: Float[Tensor, 
 def _seen(
     frame: Frame, points: Float[Tensor, "P 3"]
 ) -> tuple[Float[Tensor, "P 3"], Bool[Tensor, "P 3"], Bool[Tensor, "P"], Bool[Tensor, "P"]]:
-    """Log colours of the points in one frame, where they count, where they are seen, and where in its frustum."""
+    """Log colours of the points in one frame, where they count, where they are seen, and where another depth is."""
     assert frame.depth is not None
     camera = frame.camera.to("cpu", torch.float64)
     pixels, depths = camera.project(points)
@@ -195,10 +195,11 @@ def _seen(
     blurred = _mean_of_neighbours(zero_outside(frame.rgb.cpu(), valid))
     whole = _mean_of_neighbours(valid[..., None].float())[..., 0] > _ALL
     colors = blurred[row, column].double()
-    inside = camera.is_inside(pixels, depths)
-    same = inside & ((frame.depth.cpu()[row, column] - depths).abs() < _SAME_SURFACE * depths)
+    found = torch.where(valid, frame.depth.cpu(), math.nan)[row, column]
+    known = camera.is_inside(pixels, depths) & found.isfinite()
+    same = known & ((found - depths).abs() < _SAME_SURFACE * depths)
     usable = (same & whole[row, column])[:, None] & (colors > _DARKEST) & (colors < _BRIGHTEST)
-    return colors.clamp_min(1e-3).log(), usable, same, inside
+    return colors.clamp_min(1e-3).log(), usable, same, known & ~same
 
 
 def _mean_of_neighbours(image: Float[Tensor, "H W C"]) -> Float[Tensor, "H W C"]:
