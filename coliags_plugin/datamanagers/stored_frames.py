@@ -135,10 +135,10 @@ class StoredFrame(Frame):
         if stored is None or form is None:
             return None
         depth = form.z_depth(stored)
-        if (depth > bounds.LENGTH).any():  # NaN is unknown
+        if ((depth <= 0.0) | (depth > bounds.LENGTH)).any():  # NaN is unknown
             raise InputError(
-                f"{self._shot.depth}: depth reaches to {np.nanmax(depth):g} scene units",
-                f"at most {bounds.LENGTH:g}",
+                f"{self._shot.depth}: depth reaches from {np.nanmin(depth):g} to {np.nanmax(depth):g} scene units",
+                f"above 0, and at most {bounds.LENGTH:g}",
                 "Correct the scale of depth",
             )
         return torch.from_numpy(depth)

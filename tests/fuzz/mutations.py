@@ -238,10 +238,23 @@ def _png_size(data: bytes, width: int, height: int) -> bytes:
     return data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:]
 
 
+def _decoded(data: bytes) -> Any:
+    """Pixels of an image; None where it is damaged."""
+    import cv2
+    import PIL.Image
+
+    if data.startswith(b"\x89PNG"):
+        try:  # OpenCV allocates what a damaged length says
+            PIL.Image.open(io.BytesIO(data)).load()
+        except Exception:
+            return None
+    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+
+
 def _image(data: bytes, how: str) -> bytes:
     import cv2
 
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    pixels = _decoded(data)
     if pixels is None:
         return data
     suffix, floats = ".tiff" if data[:2] in (b"II", b"MM") else ".png", pixels.astype(np.float32)
