@@ -109,7 +109,7 @@ def test_learned_numbers_are_in_the_metrics(trained):
 def test_gains_at_a_bound_are_said(trained, caplog):
     loaded = coliags_plugin.load_run(trained.path, device="cpu")
     with torch.no_grad():
-        loaded.load().model.view_modules["exposure"].log_gain[3] = 9.0
+        loaded.load().model.view_modules["exposure"].log_gain[3] = 90.0
     loaded.evaluate()
     name = loaded.load().scene.train[3].name
     assert f"module 'exposure' is at a bound in 1 frames: {name}" in caplog.text

@@ -394,8 +394,8 @@ def test_what_is_missing_is_refused(tmp_path, two_runs):
         ("metrics.jsonl", '{"step": 1}\n{"step": ', r"metrics\.jsonl, line 2 is not JSON"),
         ("metrics.jsonl", "3\n", "line 1 holds a int"),
         ("eval/paper/result.json", "{", r"result\.json is cut off"),
-        ("eval/paper/truth/test/0004.png", "x", r"truth/test/0004\.png cannot be decoded"),
-        ("eval/paper/depth/test/0004.tiff", "x", r"depth/test/0004\.tiff cannot be decoded"),
+        ("eval/paper/truth/test/0004.png", "x", r"truth/test/0004\.png .*cannot be decoded"),
+        ("eval/paper/depth/test/0004.tiff", "x", r"depth/test/0004\.tiff .*cannot be decoded"),
     ],
 )
 def test_what_is_damaged_is_refused(tmp_path, file, content, match):
