@@ -55,7 +55,7 @@ class _Loader(yaml.SafeLoader):
     """Safe loader in which ``1e-5`` is a number and ``on`` is a word, as YAML 1.2 has it; text can be encoded."""
 
     def construct_scalar(self, node: yaml.ScalarNode | yaml.MappingNode) -> Any:
-        """The scalar; a YAMLError where it has half of a surrogate pair."""
+        """The value of a scalar node; raises ConstructorError for text that cannot be encoded as UTF-8."""
         value = super().construct_scalar(node)
         if isinstance(value, str) and not _is_text(value):
             raise yaml.constructor.ConstructorError(None, None, f"{value!a} is not text in Unicode", node.start_mark)
@@ -63,7 +63,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def _is_text(value: str) -> bool:
-    """Whether it can be encoded: half of a surrogate pair, such as an argument that is not UTF-8 has, cannot."""
+    """Whether a string can be encoded as UTF-8; one with a lone surrogate, as of an undecodable argument, cannot."""
     try:
         value.encode()
     except UnicodeEncodeError:

@@ -54,7 +54,7 @@ def decode_image(path: Path, flags: int | None = None) -> Shaped[np.ndarray, "H 
 
 
 def _check_size(path: Path, data: bytes) -> None:
-    """Refuse what its header says would fill the memory, before anything is decoded."""
+    """Raise InputError if the image's header states more pixels than :mod:`coliags_plugin.core.bounds` allows."""
     import PIL.Image
 
     try:
@@ -75,7 +75,10 @@ def _check_size(path: Path, data: bytes) -> None:
 
 
 def _is_whole_png(data: bytes) -> bool:
-    """Whether its chunks follow each other to the last: decoders accept cut files, and allocate what a length says."""
+    """Whether all chunks of a PNG, up to IEND, lie within the file.
+
+    OpenCV accepts truncated files, and allocates whatever length a chunk states.
+    """
     place = len(_PNG)
     while place + _CHUNK <= len(data):
         length, kind = int.from_bytes(data[place : place + 4], "big"), data[place + 4 : place + 8]

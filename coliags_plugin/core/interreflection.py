@@ -17,12 +17,14 @@ _BOUNCES = 5
 
 @dataclass(frozen=True)
 class Cavity:
-    """A Lambertian wall in patches of equal albedo, of which all in front of another see it: folds hide nothing.
+    """Radiosity model of a Lambertian wall: patches of one albedo and the form factors between them.
+
+    Occlusion is neglected: patches that face each other see each other.
 
     Attributes:
-        every: Each of these points is the centre of a patch.
-        between: Share of a patch's surroundings that each patch fills, its form factor. [K, K]
-        onto_points: The same of each point's surroundings. [P, K]
+        every: Stride over the points at which patches are centred.
+        between: Form factors from each patch to every patch. [K, K]
+        onto_points: Form factors from each point to every patch. [P, K]
     """
 
     every: int

@@ -185,7 +185,7 @@ def _observe(scene: Scene, points: Float[Tensor, "P 3"], normals: Float[Tensor, 
 def _seen(
     frame: Frame, points: Float[Tensor, "P 3"]
 ) -> tuple[Float[Tensor, "P 3"], Bool[Tensor, "P 3"], Bool[Tensor, "P"], Bool[Tensor, "P"]]:
-    """Log colours of the points in one frame, where they count, where they are seen, and where another depth is."""
+    """Log colours of the points in one frame, and masks: usable, visible, and occluded according to the depth map."""
     assert frame.depth is not None
     camera = frame.camera.to("cpu", torch.float64)
     pixels, depths = camera.project(points)
@@ -209,7 +209,7 @@ def _mean_of_neighbours(image: Float[Tensor, "H W C"]) -> Float[Tensor, "H W C"]
 
 
 def _lamp(seen: _Observations) -> tuple[Float[Tensor, "6"], Float[Tensor, "F"]]:
-    """Offset of the lamp, exponents and albedo, and log gains; the lamp is at the lens where residuals hardly fall."""
+    """Fitted parameters (lamp offset, exponents, albedo) and log gains; the offset is 0 unless it lowers residuals."""
     usable = seen.usable[..., _GREEN]
     if not usable.any():
         return seen.logs.new_tensor([0.0, 0.0, 0.0, *_START]), seen.logs.new_zeros(seen.logs.shape[1])

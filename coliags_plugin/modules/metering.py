@@ -34,7 +34,7 @@ class Metering:
 
     @cached_property
     def _recorded(self) -> Float[Tensor, "F"]:
-        """Log brightness of the training frames, whose images are read when a held-out view first asks. [F]"""
+        """Log brightness of the training frames' images, computed on first use. [F]"""
         return torch.stack([self.log_brightness(frame.rgb) for frame in self._scene.train])
 
     def log_brightness(self, rgb: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
