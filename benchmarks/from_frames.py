@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
+from coliags_plugin.core.images import read_rgb
 from coliags_plugin.meshes.comparison import compare_meshes
 from coliags_plugin.meshes.files import read_mesh
 from coliags_plugin.meshes.truth import read_true_surface
-from coliags_plugin.outputs.image_files import read_rgb
 from coliags_plugin.outputs.video import write_video
 from coliags_plugin.poses import colmap
 from coliags_plugin.poses.alignment import align

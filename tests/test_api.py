@@ -17,7 +17,8 @@ import torch
 import coliags_plugin as cp
 from coliags_plugin.config.assignments import parse_assignments
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.outputs.image_files import read_depth_tiff, read_rgb
+from coliags_plugin.core.images import read_rgb
+from coliags_plugin.outputs.image_files import read_depth_tiff
 from tests.commands import run
 from tests.comparison.small import InlineExecutor
 from tests.scenes import SMALL, write_wall

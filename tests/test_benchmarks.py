@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from coliags_plugin.outputs.image_files import read_rgb
+from coliags_plugin.core.images import read_rgb
 from tests.scenes import write_wall
 
 ROOT = Path(__file__).parents[1]

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Shaped
+from jaxtyping import Shaped, UInt8
 
 from coliags_plugin.core import bounds
 from coliags_plugin.core.errors import InputError
@@ -51,6 +51,24 @@ def decode_image(path: Path, flags: int | None = None) -> Shaped[np.ndarray, "H 
             "It is damaged or cut short: fetch it again",
         )
     return np.asarray(image)
+
+
+def read_rgb(path: Path) -> UInt8[np.ndarray, "H W 3"]:
+    """Read an 8-bit colour image, without its alpha channel. [H, W, 3]
+
+    Raises:
+        InputError: It cannot be read, is damaged, or is of another depth or number of channels.
+    """
+    image = decode_image(path)
+    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] not in (3, 4):
+        raise InputError(f"{path} is {kind_of(image)}", "an 8-bit RGB image", "Convert it")
+    return np.ascontiguousarray(image[..., 2::-1])
+
+
+def kind_of(image: np.ndarray) -> str:
+    """Words for the channels and the type of decoded pixels, for errors."""
+    channels = 1 if image.ndim == 2 else image.shape[2]
+    return f"an image of {channels} channel{'s' * (channels > 1)} of {image.dtype}"
 
 
 def _check_size(path: Path, data: bytes) -> None:

@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.coverage.views import CoverageView
-from coliags_plugin.datamanagers.reading.images import read_mask, read_rgb
+from coliags_plugin.datamanagers.reading.images import read_mask
 from coliags_plugin.datamanagers.recording import Shot
 from coliags_plugin.datamanagers.stored_frames import StoredFrame
 from coliags_plugin.lenses.pinhole import PinholeLens

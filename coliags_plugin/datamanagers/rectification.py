@@ -12,8 +12,9 @@ from jaxtyping import Bool, Float, Shaped, UInt8
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.intrinsics import Intrinsics
-from coliags_plugin.datamanagers.reading.images import read_rgb, resize_nearest, resize_rgb
+from coliags_plugin.datamanagers.reading.images import resize_nearest, resize_rgb
 from coliags_plugin.lenses.models import Lens
 from coliags_plugin.lenses.pinhole import PinholeLens
 from coliags_plugin.lenses.undistortion import Undistortion

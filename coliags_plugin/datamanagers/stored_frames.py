@@ -12,9 +12,10 @@ from torch import Tensor
 
 from coliags_plugin.core import bounds
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.datamanagers.reading.images import read_gray, read_mask, read_rgb
+from coliags_plugin.datamanagers.reading.images import read_gray, read_mask
 from coliags_plugin.datamanagers.reading.parallel import parallel_map
 from coliags_plugin.datamanagers.recording import Shot
 

@@ -1,4 +1,4 @@
-"""Reading and writing of PNG, JPEG, WebP and float32 TIFF images, without silent conversions."""
+"""Images as PNG, JPEG and WebP, and depth maps as float32 TIFF, without silent conversions."""
 
 from __future__ import annotations
 
@@ -85,18 +85,6 @@ def write_png(path: Path, rgb: UInt8[np.ndarray, "H W 3"] | Tensor) -> None:
         InputError: Not an 8-bit RGB image, or the folder cannot be written.
     """
     atomic_write(path, encode_png(rgb))
-
-
-def read_rgb(path: Path) -> UInt8[np.ndarray, "H W 3"]:
-    """Read an 8-bit RGB image. [H, W, 3]
-
-    Raises:
-        InputError: Missing, unreadable, or of another depth or channel count.
-    """
-    pixels = decode_image(path)
-    if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
-        raise InputError(f"{path} holds {_kind(pixels)}", "an 8-bit RGB image")
-    return np.ascontiguousarray(pixels[:, :, ::-1])
 
 
 def write_depth_tiff(path: Path, depth_mm: Float32[np.ndarray, "H W"] | Tensor) -> None:

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.outputs.image_files import read_depth_tiff, read_rgb
+from coliags_plugin.core.images import read_rgb
+from coliags_plugin.outputs.image_files import read_depth_tiff
 from coliags_plugin.reporting.study import Cell
 from coliags_plugin.reporting.view_selection import ChosenFrame
 

@@ -10,7 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.config.registry import pose_formats
-from coliags_plugin.outputs.image_files import read_rgb, write_png
+from coliags_plugin.core.images import read_rgb
+from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.poses.formats import format_named, format_of, write_trajectory
 from coliags_plugin.poses.trajectory import Trajectory
 from tests.commands import refused, run

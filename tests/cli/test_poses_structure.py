@@ -13,10 +13,10 @@ import torch
 
 from coliags_plugin.cli.poses.triangulate import _held_out
 from coliags_plugin.config.assigned_settings import settings_of
+from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.scenes import PointCloud, Scene
 from coliags_plugin.datamanagers.units import read_unit
 from coliags_plugin.engine.data_formats import open_scene
-from coliags_plugin.outputs.image_files import read_rgb
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 from coliags_plugin.reconstruction.structure.triangulation import TriangulationSettings, triangulate
 from tests import commands

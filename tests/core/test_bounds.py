@@ -11,10 +11,10 @@ import torch
 
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.fusion import subsampled
-from coliags_plugin.datamanagers.reading.images import read_rgb
 from coliags_plugin.lenses.models import FisheyeLens
 from coliags_plugin.lenses.opencv import OpenCVLens
 from coliags_plugin.poses.trajectory import Trajectory

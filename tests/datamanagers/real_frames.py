@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
-from coliags_plugin.datamanagers.reading.images import read_rgb
 from coliags_plugin.lenses.models import FisheyeLens, Lens
 from coliags_plugin.lenses.undistortion import Undistortion
 

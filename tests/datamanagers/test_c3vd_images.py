@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import read_rgb
 from coliags_plugin.datamanagers.c3vd.writer import depth_steps
 from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH
-from coliags_plugin.datamanagers.reading.images import read_mask, read_rgb, resize_nearest, resize_rgb
+from coliags_plugin.datamanagers.reading.images import read_mask, resize_nearest, resize_rgb
 from coliags_plugin.datamanagers.rectification import PAPER_SIZE, fitted
 
 

@@ -14,10 +14,10 @@ import pytest
 import torch
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.nerfstudio.reader import NerfstudioDataManager, NerfstudioSettings
-from coliags_plugin.datamanagers.reading.images import read_rgb
 from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.lenses.models import FisheyeLens, Lens
 from coliags_plugin.lenses.opencv import OpenCVLens

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from coliags_plugin.core.images import read_rgb
 from coliags_plugin.datamanagers.c3vd.reader import C3VDDataManager, C3VDSettings
-from coliags_plugin.datamanagers.reading.images import read_rgb
 from coliags_plugin.lenses.models import LENSES
 from tests.datamanagers.real_frames import real_lens, undistort_real_frames
 

@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import SparseDepth
 from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
@@ -26,7 +27,7 @@ from coliags_plugin.depth_check.pairing import Samples
 from coliags_plugin.depth_check.sources import DepthMap, DepthSource, open_depth
 from coliags_plugin.depth_check.text import lines
 from coliags_plugin.outputs.colormaps import UNKNOWN_GREY, color_table
-from coliags_plugin.outputs.image_files import read_rgb, write_depth_tiff
+from coliags_plugin.outputs.image_files import write_depth_tiff
 from tests.commands import refused, run
 from tests.scenes import wall_scene
 

@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import read_rgb
 from coliags_plugin.meshes.files import read_mesh, write_mesh
 from coliags_plugin.meshes.mesh import TriangleMesh
 from coliags_plugin.meshing.seen import first_hits
 from coliags_plugin.meshing.settings import MeshSettings
 from coliags_plugin.meshing.text import comparison_text
 from coliags_plugin.meshing.writing import mesh_run
-from coliags_plugin.outputs.image_files import read_rgb
 from tests.meshing.exact import exact_run, with_provenance
 from tests.scenes import wall_scene, write_wall
 

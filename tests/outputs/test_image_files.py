@@ -8,12 +8,12 @@ import tifffile
 import torch
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import read_rgb
 from coliags_plugin.outputs.image_files import (
     encode_jpeg,
     encode_png,
     encode_webp,
     read_depth_tiff,
-    read_rgb,
     write_depth_tiff,
     write_png,
 )

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.images import write_mask
-from coliags_plugin.outputs.image_files import read_rgb
+from coliags_plugin.core.images import read_rgb, write_mask
 from coliags_plugin.pipeline.frame_sources import frame_source
 from coliags_plugin.pipeline.frames import read_lens_mask, write_frames
 from coliags_plugin.pipeline.settings import FrameSettings

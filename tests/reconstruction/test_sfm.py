@@ -11,8 +11,9 @@ import pycolmap
 import pytest
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import read_rgb
 from coliags_plugin.engine.data_formats import open_scene
-from coliags_plugin.outputs.image_files import read_rgb, write_png
+from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.poses import colmap
 from coliags_plugin.poses.alignment import align
 from coliags_plugin.poses.association import associate

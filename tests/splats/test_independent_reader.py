@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coliags_plugin.outputs.image_files import read_rgb
+from coliags_plugin.core.images import read_rgb
 from coliags_plugin.splats.cloud import SplatCloud, harmonics_of_colors
 from coliags_plugin.splats.files import write_splats
 from tests.browser import SOFTWARE_WEBGL, Browser, find_chromium

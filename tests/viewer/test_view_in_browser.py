@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import coliags_plugin as cp
-from coliags_plugin.outputs.image_files import read_rgb
+from coliags_plugin.core.images import read_rgb
 from tests.browser import SOFTWARE_WEBGL, Browser, find_chromium
 
 pytest.importorskip("viser")

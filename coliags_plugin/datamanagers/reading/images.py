@@ -8,19 +8,7 @@ import numpy as np
 from jaxtyping import Shaped, UInt8
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.images import decode_image
-
-
-def read_rgb(path: Path) -> UInt8[np.ndarray, "H W 3"]:
-    """Read an 8-bit colour image, without its alpha channel.
-
-    Raises:
-        InputError: The file is damaged or has another format.
-    """
-    image = decode_image(path)
-    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] not in (3, 4):
-        raise InputError(f"{path} is {_kind(image)}", "an 8-bit RGB image", "Convert it")
-    return np.ascontiguousarray(image[..., 2::-1])
+from coliags_plugin.core.images import decode_image, kind_of
 
 
 def read_gray(path: Path, bits: int, expected: str) -> Shaped[np.ndarray, "H W"]:
@@ -43,7 +31,7 @@ def _check_gray(path: Path, image: np.ndarray, bits: int, expected: str) -> None
     if image.dtype != np.dtype(f"uint{bits}") or image.ndim != 2:
         lost = image.dtype == np.uint8 and bits == 16
         raise InputError(
-            f"{path} is {_kind(image)}",
+            f"{path} is {kind_of(image)}",
             expected,
             "Use the original file: depth converted to 8 bits has lost 0.4 mm" if lost else "Convert it",
         )
@@ -104,8 +92,3 @@ def resize_nearest(values: Shaped[np.ndarray, "H W"], width: int, height: int) -
     row = ((np.arange(height) + 0.5) * rows / height).astype(np.int64)
     column = ((np.arange(width) + 0.5) * columns / width).astype(np.int64)
     return np.ascontiguousarray(values[row[:, None], column[None, :]])
-
-
-def _kind(image: np.ndarray) -> str:
-    channels = 1 if image.ndim == 2 else image.shape[2]
-    return f"an image of {channels} channel{'s' * (channels > 1)} of {image.dtype}"
