@@ -205,6 +205,7 @@ modules = Registry(
     "modules",
     {
         "gain": "coliags_plugin.modules.gain:FrameGain",
+        "response": "coliags_plugin.modules.response:CameraResponse",
         "pose-correction": "coliags_plugin.modules.pose_correction:PoseCorrection",
     },
     noun="view module",

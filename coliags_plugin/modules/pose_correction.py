@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -24,6 +25,8 @@ class PoseCorrectionSettings(Settings):
     """Options of the pose correction."""
 
     fixed: tuple[str, ...] = ()  # training frames whose poses are right; none: corrections average to zero
+    # held-out frames: corrections interpolated in time between those of the training frames, or poses as given
+    untrained: Literal["interpolate", "given"] = "interpolate"
 
 
 class PoseCorrection(ViewModule):
@@ -35,6 +38,10 @@ class PoseCorrection(ViewModule):
 
     All poses and the field could move together without any image changing. The ``fixed`` frames hold them; without any,
     the mean rotation and translation are subtracted.
+
+    Held-out frames of the video are corrected as the training frames around them are, since errors of tracked poses
+    change slowly; no pixel of theirs is used. Views beside the video take the correction of the nearest training
+    camera. Free cameras stay.
     """
 
     Settings: ClassVar[type[Settings]] = PoseCorrectionSettings
@@ -60,26 +67,53 @@ class PoseCorrection(ViewModule):
     @property
     def untrained_views(self) -> str:
         """Treatment of views that are not training frames."""
-        return "views without training keep their poses as given"
+        if self.settings.untrained == "given":
+            return "views without training keep their poses as given"
+        return (
+            "views without training have their poses corrected by what is interpolated between the corrections of the "
+            "training frames before and after them; views beside the video by that of the nearest training camera"
+        )
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Rotation vectors in radians and translations in scene units, which need rates of their own."""
         return {"rotation": [self.rotation], "translation": [self.translation]}
 
     def adjust_camera(self, camera: Camera, view: View | None) -> Camera:
-        """The camera with its frame's correction."""
+        """The camera with the correction of its frame, or of the training frames around it."""
         row = self.frames.row(view)
-        if row is None or row in self._fixed:
+        if row is not None:
+            return camera if row in self._fixed else self._moved(camera, row, row, 0.0)
+        if view is None or self.settings.untrained == "given":
             return camera
+        return self._moved(camera, *self.frames.neighbours(view))
+
+    def _moved(self, camera: Camera, before: int, after: int, share: float) -> Camera:
+        """The camera with the correction at a place in [0, 1] between two training frames."""
         pose = camera.camera_to_world
         rotation, translation = (
-            (values[row] if self._fixed else values[row] - values.mean(0)).to(pose)
-            for values in (self.rotation, self.translation)
+            torch.lerp(values[before], values[after], share).to(pose) for values in self.corrections()
         )
-        turn, arm = rotation_matrix(rotation), self._pivot_depths[row] * pose[:3, 2]
+        depth = (1.0 - share) * self._pivot_depths[before] + share * self._pivot_depths[after]
+        turn, arm = rotation_matrix(rotation), depth * pose[:3, 2]
         center = pose[:3, 3] + translation + arm - turn @ arm
         upper = torch.cat([turn @ pose[:3, :3], center[:, None]], dim=1)
         return replace(camera, camera_to_world=torch.cat([upper, pose[3:]]))
+
+    def corrections(self) -> tuple[Float[Tensor, "F 3"], Float[Tensor, "F 3"]]:
+        """Rotation vectors (radians) and translations (scene units) of the training frames, in their order.
+
+        0 for the ``fixed`` frames; without any, they are zero on average. [F, 3], [F, 3]
+        """
+        if self._fixed:
+            free = self.rotation.new_tensor([[row not in self._fixed] for row in range(len(self.frames))])
+            return self.rotation * free, self.translation * free
+        return self.rotation - self.rotation.mean(0), self.translation - self.translation.mean(0)
+
+    @property
+    def learned(self) -> dict[str, Any]:
+        """Root mean square of the corrections over the training frames."""
+        rotation, translation = (values.detach().square().sum(1).mean().sqrt() for values in self.corrections())
+        return {"rotation_degrees": math.degrees(rotation), "translation": float(translation)}
 
 
 def _median_depth(camera: Camera, scene: Scene) -> float:

@@ -106,7 +106,13 @@ def _first_difference(one: Mapping[str, Sequence[str]], two: Mapping[str, Sequen
 def cautions(study: Study) -> list[str]:
     """Differences between the results that limit their comparison, and scenes that methods lack."""
     results = [cell.result for cell in study.cells]
-    found = [*_missing_scenes(study), *_unpaired_seeds(study), *_steps(study), *_transparent(study)]
+    found = [
+        *_missing_scenes(study),
+        *_unpaired_seeds(study),
+        *_steps(study),
+        *_untrained_views(study),
+        *_transparent(study),
+    ]
     for key, what in (("package_version", "versions of the package"), ("git", "states of the source")):
         if len({str(result.software[key]) for result in results if result.software.get(key) is not None}) > 1:
             found.append(f"The runs come from different {what}.")
@@ -159,6 +165,15 @@ def _steps(study: Study) -> list[str]:
         return []
     each = ", ".join(f"{method} {' or '.join(f'{count:,}' for count in own)}" for method, own in steps.items())
     return [f"The runs were trained for different numbers of steps: {each}."]
+
+
+def _untrained_views(study: Study) -> list[str]:
+    """What view modules make of held-out views, such as corrections of their poses, where methods differ in it."""
+    by_method = {method: cells[0].result.provenance.get("untrained_views") for method, cells in study.by_method.items()}
+    treated = {method: dict(own) if isinstance(own, Mapping) else {} for method, own in by_method.items()}
+    if all(own == treated[study.methods[0]] for own in treated.values()):
+        return []
+    return [f"{method}, {name}: {what}." for method, own in treated.items() for name, what in own.items()]
 
 
 def _transparent(study: Study) -> list[str]:

@@ -258,6 +258,9 @@ def test_folders_of_depth_maps(wall, tmp_path, capsys):
     (folder / "0.npy").unlink()
     (folder / "0.tiff").write_bytes(b"II*")
     assert "0.tiff" in refused(capsys, "depth", "check", folder, tmp_path / "true")
+    for empty in (TRUE[:0], TRUE[:, :0]):
+        np.save(tmp_path / "true" / "0.npy", empty)
+        assert "0.npy is an array" in refused(capsys, "depth", "check", tmp_path / "true", tmp_path / "true")
 
 
 def test_results_hold_no_nan(wall):

@@ -42,8 +42,8 @@ def test_rotation_matrix_is_scipys():
         torch.testing.assert_close(rotation_matrix(vector), expected)
 
 
-def make(**options):
-    scene = wall_scene()
+def make(frames=9, **options):
+    scene = wall_scene(frames)
     return scene, PoseCorrection.from_scene(scene, PoseCorrectionSettings(**options), torch.Generator())
 
 
@@ -64,7 +64,7 @@ def test_corrections_turn_about_what_is_in_view():
 
 
 def test_fixed_frames_and_other_views_stay():
-    scene, module = make(fixed=("0001", "0004"))
+    scene, module = make(fixed=("0001", "0004"), untrained="given")
     with torch.no_grad():
         module.translation.fill_(1.0)
     camera = scene.train[0].camera
@@ -74,6 +74,64 @@ def test_fixed_frames_and_other_views_stay():
     assert module.adjust_camera(camera, View("0003", 3.0, True)) is not camera
     with pytest.raises(InputError, match="pose-correction names frame '0000'"):
         make(fixed=("0000",))  # a held-out frame
+    assert "as given" in module.untrained_views
+
+
+def test_held_out_frames_follow_the_frames_around_them():
+    """Errors linear in time are corrected in a held-out frame exactly as in the training frames beside it."""
+    scene, module = make(frames=17, fixed=("0001",))
+    turns, shifts = (
+        torch.outer(torch.tensor(module.frames.times) - 1.0, torch.tensor(way))
+        for way in (
+            (0.001, -0.002, 0.003),
+            (0.02, 0.05, -0.03),
+        )
+    )
+    with torch.no_grad():
+        module.rotation.copy_(turns)
+        module.translation.copy_(shifts)
+    middle, last = scene.test_sets["test"][1:]
+    assert (middle.name, last.name) == ("0008", "0016")
+    moved = module.adjust_camera(middle.camera, middle.view(trained=False)).camera_to_world
+    pose, depth = middle.camera.camera_to_world, 20.0 - middle.camera.center[2]
+    turn = rotation_matrix(7.0 * torch.tensor([0.001, -0.002, 0.003], dtype=torch.float64))
+    torch.testing.assert_close(moved[:3, :3], turn @ pose[:3, :3], rtol=0, atol=1e-7)
+    pivots = [p[:3, 3] + depth * p[:3, 2] for p in (pose, moved)]
+    expected = 7.0 * torch.tensor([0.02, 0.05, -0.03], dtype=torch.float64)
+    torch.testing.assert_close(pivots[1] - pivots[0], expected, rtol=0, atol=1e-4)
+    # beyond the last training frame: its own correction
+    ends = [
+        module.adjust_camera(last.camera, View(name, time, trained))
+        for name, time, trained in (
+            ("0016", 16.0, False),
+            ("0015", 15.0, True),
+        )
+    ]
+    torch.testing.assert_close(ends[0].camera_to_world, ends[1].camera_to_world)
+    assert module.adjust_camera(last.camera, None) is last.camera
+
+
+def test_views_beside_the_video_have_the_correction_of_the_nearest_training_camera():
+    scene = wall_scene()
+    aside = replace(scene.train[4], name="turned-0", index=0)  # taken where the fifth training frame was
+    scene = replace(scene, test_sets={**scene.test_sets, "rotation": [aside]})
+    module = PoseCorrection.from_scene(scene, PoseCorrectionSettings(), torch.Generator())
+    with torch.no_grad():
+        module.translation.copy_(torch.randn(7, 3, generator=torch.Generator().manual_seed(0)))
+    moved, same = (
+        module.adjust_camera(aside.camera, view)
+        for view in (aside.view(trained=False), scene.train[4].view(trained=True))
+    )
+    torch.testing.assert_close(moved.camera_to_world, same.camera_to_world)
+
+
+def test_what_was_learned_is_the_root_mean_square_of_the_corrections():
+    _, module = make()
+    with torch.no_grad():
+        module.rotation[2, 0] = math.radians(7.0)
+        module.translation[:, 1] = torch.tensor([1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 0.0])
+    assert module.learned["rotation_degrees"] == pytest.approx(math.sqrt((36 + 6) / 7), rel=1e-5)
+    assert module.learned["translation"] == pytest.approx(math.sqrt(6 / 7), rel=1e-5)
 
 
 def test_without_fixed_frames_the_mean_correction_is_none():

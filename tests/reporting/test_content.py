@@ -293,6 +293,13 @@ def test_scenes_of_different_sizes_are_said(study_of):
     assert of(study_of, results).cautions == ["The scenes have images of different sizes: 16 x 12, 32 x 24 px."]
 
 
+def test_what_modules_make_of_held_out_views_is_said_where_methods_differ(study_of):
+    ours = result_of("coliags")
+    ours = ours.model_copy(update={"provenance": {**ours.provenance, "untrained_views": {"poses": "poses are moved"}}})
+    assert of(study_of, [ours, result_of("3dgs")]).cautions == ["coliags, poses: poses are moved."]
+    assert of(study_of, [ours]).cautions == []
+
+
 def test_failed_cells_are_listed(tmp_path):
     failed = [("cecum", "3dgs", 0, "ran out of memory"), ("sigmoid", "3dgs", 1, "")]
     content = make_content(read_study([write_comparison(tmp_path, [result_of("coliags")], failed)]), Choices())

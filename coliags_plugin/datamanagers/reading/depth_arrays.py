@@ -29,7 +29,8 @@ class DepthArray(DepthFormat):
         array = read_array(path, expected)
         if array.ndim == 3 and array.shape[2] == 1:
             array = array[..., 0]
-        if array.ndim != 2 or not (np.issubdtype(array.dtype, np.floating) or np.issubdtype(array.dtype, np.integer)):
+        real = np.issubdtype(array.dtype, np.floating) or np.issubdtype(array.dtype, np.integer)
+        if array.ndim != 2 or not array.size or not real:
             raise InputError(f"{path} is an array {list(array.shape)} of {array.dtype}", expected)
         return np.asarray(array)
 
