@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from pydantic import BaseModel, ConfigDict, NonNegativeInt
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
@@ -37,6 +38,17 @@ READABLE = (2, 3, FORMAT)
 
 class DamagedCheckpointError(InputError):
     """A file of a checkpoint is missing or is not what was written."""
+
+
+class _State(BaseModel):
+    """Content of ``state.json`` besides the format; see :class:`Checkpoint`."""
+
+    model_config = ConfigDict(strict=True)
+
+    step: NonNegativeInt
+    method: str
+    frame_queue: list[NonNegativeInt]
+    cost: TrainingCost | None = None
 
 
 @dataclass(frozen=True)
@@ -195,23 +207,22 @@ def read_checkpoint(path: Path, method: str, device: torch.device) -> Checkpoint
     if differing:
         raise _damaged(path, f"{', '.join(differing)} is not what was written")
     try:
-        state = parse_json((path / "state.json").read_text(encoding="utf-8"), finite=True)
+        content = parse_json((path / "state.json").read_text(encoding="utf-8"), finite=True)
+        if (version := content["format"]) not in READABLE:
+            known = " or ".join(map(str, READABLE))
+            raise InputError(
+                f"checkpoint {path} has format {version}", f"format {known}", "Train again with this version"
+            )
+        state = _State.model_validate(content)
         tensors = load_file(path / "state.safetensors")
-        step, owner, queue, version = (state[key] for key in ("step", "method", "frame_queue", "format"))
-        if type(step) is not int or step < 0:
-            raise ValueError(f"step is {step!r:.50}")
-        cost = None if state.get("cost") is None else TrainingCost.model_validate(state["cost"])
     except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
         raise _damaged(path, str(error)) from error
-    if version not in READABLE:
-        known = " or ".join(map(str, READABLE))
-        raise InputError(f"checkpoint {path} has format {version}", f"format {known}", "Train again with this version")
-    if owner != method:
+    if state.method != method:
         raise InputError(
-            f"checkpoint {path} is of method '{owner}'", f"one of method '{method}'", "Name its own method"
+            f"checkpoint {path} is of method '{state.method}'", f"one of method '{method}'", "Name its own method"
         )
     placed = {key: value if key.startswith("generator/") else value.to(device) for key, value in tensors.items()}
-    return Checkpoint(step, owner, placed, queue, cost)
+    return Checkpoint(state.step, state.method, placed, state.frame_queue, state.cost)
 
 
 def restore_model(checkpoint: Checkpoint, config: MethodConfig, scene: Scene, renderer: Renderer) -> Model:
@@ -258,17 +269,34 @@ def restore_strategy(checkpoint: Checkpoint, strategy: Strategy, name: str) -> N
 
 
 def restore_optimizers(checkpoint: Checkpoint, optimizers: Optimizers) -> None:
-    """Load Adam's moments."""
-    for key, value in checkpoint.part("optimizer").items():
-        group, index, name = key.split("/")
-        adam = optimizers.adam[group]
-        adam.state[adam.param_groups[0]["params"][int(index)]][name] = value
+    """Load Adam's moments.
+
+    Raises:
+        InputError: They are of other parameters.
+    """
+    try:
+        for key, value in checkpoint.part("optimizer").items():
+            group, index, name = key.split("/")
+            adam = optimizers.adam[group]
+            adam.state[adam.param_groups[0]["params"][int(index)]][name] = value
+    except (KeyError, ValueError, IndexError) as error:
+        raise InputError(f"the checkpoint's moments are of another optimizer: {error}", "one of this run") from error
 
 
-def restore_generators(checkpoint: Checkpoint, generators: Mapping[str, torch.Generator]) -> None:
-    """Load the states of the random generators."""
-    for name, state in checkpoint.part("generator").items():
-        generators[name].set_state(state)
+def restore_sampling(checkpoint: Checkpoint, sampler: Sampler, generators: Mapping[str, torch.Generator]) -> None:
+    """Load the frames that were planned, and the states of the random generators.
+
+    Raises:
+        InputError: Frames or states are none of this run.
+    """
+    if any(frame >= len(sampler.sizes) for frame in checkpoint.queue):
+        raise InputError(f"the checkpoint plans frame {max(checkpoint.queue)}", f"one of {len(sampler.sizes)} frames")
+    sampler.queue = list(checkpoint.queue)
+    try:
+        for name, state in checkpoint.part("generator").items():
+            generators[name].set_state(state)
+    except (KeyError, RuntimeError, TypeError) as error:
+        raise InputError(f"the checkpoint's random state does not fit: {error}", "one of this run") from error
 
 
 def _damaged(path: Path, reason: str) -> DamagedCheckpointError:

@@ -120,9 +120,8 @@ class Trainer:
         self.model.to(self.device)
         self.optimizers = self._optimizers()
         checkpoints.restore_optimizers(saved, self.optimizers)
-        checkpoints.restore_generators(saved, self.generators)
+        checkpoints.restore_sampling(saved, self.sampler, self.generators)
         checkpoints.restore_strategy(saved, self.strategy, self.method.config.strategy.name)
-        self.sampler.queue = list(saved.queue)
         self.step = saved.step
         return saved.cost
 

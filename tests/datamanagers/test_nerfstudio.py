@@ -292,6 +292,7 @@ def test_the_fingerprint_sees_the_file(folder):
     [
         ({"camera_model": "EQUIRECTANGULAR"}, r"frame_00001\.png: camera_model is EQUIRECTANGULAR"),
         ({"camera_model": "SIMPLE_RADIAL"}, "camera_model is SIMPLE_RADIAL"),
+        ({"camera_model": ["PINHOLE"]}, "camera_model is .'PINHOLE'."),
         ({"camera_model": "PINHOLE", "k1": 0.1}, "PINHOLE with k1 = 0.1"),
         ({"k4": 0.1}, "nerfstudio and OpenCV mean different things by k4"),
         ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, "OPENCV_FISHEYE with p1 = 0.1"),

@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -319,6 +320,33 @@ def test_damaged_checkpoints_are_set_aside_for_the_one_before(tmp_path, caplog):
         "damaged-step-000006",
     ]
     assert take_newest(tmp_path / "none", "coliags", CPU) is None
+
+
+@pytest.mark.parametrize(
+    ("frames", "message"),
+    [
+        ([{}], "step-000002 is damaged: 1 validation error"),
+        ([-1], "step-000002 is damaged: 1 validation error"),
+        ([True], "step-000002 is damaged: 1 validation error"),
+        ([3, 7], "plans frame 7"),
+    ],
+)
+def test_planned_frames_that_are_none_are_refused(tmp_path, frames, message):
+    trainer = train(tmp_path / "run", steps=2)
+    checkpoint = latest_checkpoint(trainer.run.checkpoints)
+    state = json.loads((checkpoint / "state.json").read_text())
+    (checkpoint / "state.json").write_text(json.dumps({**state, "frame_queue": frames}))
+    write_checksums(checkpoint)
+    with pytest.raises(InputError, match=message):
+        trainer._restore(read_checkpoint(checkpoint, "coliags", CPU))
+
+
+def test_moments_and_random_states_of_another_run_are_refused(tmp_path):
+    trainer = train(tmp_path / "run", steps=2)
+    whole = read_checkpoint(latest_checkpoint(trainer.run.checkpoints), "coliags", CPU)
+    for name in ("optimizer/none/0/exp_avg", "optimizer/anchors", "generator/none", "generator/frame_order"):
+        with pytest.raises(InputError, match=r"moments are of another optimizer|random state does not fit"):
+            trainer._restore(replace(whole, tensors={**whole.tensors, name: torch.zeros(3)}))
 
 
 def test_every_flipped_byte_of_a_checkpoint_is_noticed(tmp_path):

@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from itertools import takewhile
 from pathlib import Path
 
-from tests.fuzz.campaign import FINE, Tally, cases, run_all, save, shortened
+from tests.fuzz.campaign import FINE, Tally, cases, run_all, save, shortened, single_cases
 from tests.fuzz.seeds import make_seeds
 from tests.fuzz.targets import TARGETS
 
@@ -20,6 +20,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=1000, help="cases")
     parser.add_argument("--first", type=int, default=0, help="number of the first; the same numbers, the same cases")
+    parser.add_argument("--single", action="store_true", help="each value of each kind of file in turn; all such cases")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after these, and say how many")
     parser.add_argument("--targets", nargs="*", default=[], choices=list(TARGETS), metavar="NAME", help="only these")
@@ -32,9 +33,9 @@ def main() -> None:
             make_seeds(seeds)
         began = time.monotonic()
         until = began + 60.0 * options.minutes
-        chosen = takewhile(
-            lambda case: time.monotonic() < until, cases(seeds, options.first, options.count, options.targets)
-        )
+        drawn = cases(seeds, options.first, options.count, options.targets)
+        every = single_cases(seeds, options.targets) if options.single else drawn
+        chosen = takewhile(lambda case: time.monotonic() < until, every)
         tally = run_all(seeds, chosen, options.jobs, _Teller(began).tell)
         print(tally.table(), flush=True)
         print(f"\n{tally.count:,} cases in {time.monotonic() - began:.0f} s")

@@ -18,7 +18,7 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-from tests.fuzz.mutations import draw
+from tests.fuzz.mutations import draw, single
 from tests.fuzz.targets import TARGETS, files_of
 
 Case = dict[str, Any]
@@ -80,6 +80,19 @@ def cases(seeds: Path, first: int, count: int, names: Iterable[str] = ()) -> Ite
         random = Random(number)
         name = random.choices(chosen, weights)[0]
         yield {"target": name, "edits": draw(files[name], seeds / TARGETS[name].seeds, random)}
+
+
+def single_cases(seeds: Path, names: Iterable[str] = ()) -> Iterator[Case]:
+    """Cases of one edit each, of every value of one file of every kind that a target reads."""
+    for name in list(names) or list(TARGETS):
+        kinds: dict[tuple[str, str], str] = {}
+        for file in files_of(TARGETS[name], seeds):
+            path = Path(file)
+            of_many = path.suffix in (".png", ".jpg", ".tiff", ".npy")
+            kinds.setdefault((str(path.parent), path.suffix if of_many else path.name), file)
+        for file in kinds.values():
+            for edit in single(file, (seeds / TARGETS[name].seeds / file).read_bytes()):
+                yield {"target": name, "edits": [edit]}
 
 
 def run_all(seeds: Path, chosen: Iterable[Case], jobs: int = 1, tell: Any = None) -> Tally:

@@ -14,7 +14,7 @@ import shutil
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from random import Random
@@ -63,6 +63,8 @@ IMAGES = (
 #: What becomes of a file as a whole.
 NODES = ("missing", "folder", "loop", "dangling", "empty", "unreadable")
 
+#: Words of a text that :func:`single` replaces.
+_WORDS = 40
 _TOKEN = re.compile(rb'[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|"[^"\n]*"|[A-Za-z_][\w.-]*')
 _TEXT = frozenset({".txt", ".json", ".yaml", ".yml", ".obj", ".csv", ".jsonl", ".freiburg", ""})
 _IMAGE = frozenset({".png", ".tiff", ".tif", ".jpg"})
@@ -375,6 +377,42 @@ def _drawn(name: str, data: bytes, random: Random) -> Edit:
     if suffix in _HEADERS:
         kinds += [_random_header] * 2
     return {"file": name, **random.choice(kinds)(data, random)}
+
+
+def single(name: str, data: bytes) -> Iterator[Edit]:
+    """Every edit of one value of a file: of JSON every key (of lists the first and the last entry), of other texts some
+    words from the first to the last, of archives every array, of images every kind; and every edit of the file as such.
+
+    Args:
+        name: Of the file.
+        data: Its content.
+    """
+    suffix, edits = Path(name).suffix.lower(), list[Edit]()
+    texts = [{"text": text} for text in HOSTILE] + [{"text": text, "times": times} for text, times in REPEATED]
+    with suppress(ValueError):
+        if suffix == ".json" or (suffix == "" and data[:1] == b"{"):
+            paths = _json_paths(json.loads(data))
+            edits += [{"op": "json", "path": path, **text} for path in paths for text in (*texts, {"text": None})]
+    if suffix in _TEXT and not edits:
+        words = len(_TOKEN.findall(data))
+        chosen = sorted({index * (words - 1) // (_WORDS - 1) for index in range(_WORDS)}) if words else []
+        edits += [{"op": "token", "index": index, **text} for index in chosen for text in texts]
+    if suffix in (".npz", ".npy"):
+        count = len(zipfile.ZipFile(io.BytesIO(data)).namelist()) if suffix == ".npz" else 1
+        edits += [{"op": "npz", "index": index, "how": how} for index in range(count) for how in (*ARRAYS, "missing")]
+    if suffix in _IMAGE:
+        edits += [{"op": "image", "how": how} for how in IMAGES]
+    for edit in (*edits, *({"op": "node", "how": how} for how in NODES)):
+        yield {"file": name, **edit}
+
+
+def _json_paths(value: Any) -> list[list[Any]]:
+    """Where every value of a JSON file lies; of lists of the first and the last entry."""
+    if isinstance(value, dict):
+        keys: list[Any] = sorted(value)
+    else:
+        keys = sorted({0, len(value) - 1}) if isinstance(value, list) and value else []
+    return [path for key in keys for path in ([key], *([key, *rest] for rest in _json_paths(value[key])))]
 
 
 def _random_bytes(data: bytes, random: Random) -> Edit:

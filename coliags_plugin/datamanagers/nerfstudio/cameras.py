@@ -38,7 +38,7 @@ def camera_of(
         InputError: The model is unknown, or a value is missing, not a number, or not a parameter of the model.
     """
     model = values.get("camera_model") or ("OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")
-    if model not in _MODELS:
+    if not isinstance(model, str) or model not in _MODELS:
         raise InputError(f"{place}: camera_model is {model}", f"one of {', '.join(_MODELS)}")
     width, height = _size(values, place) if "w" in values or "h" in values else image_size()
     fx, fy = _focal_lengths(values, place, width, height)
