@@ -30,6 +30,8 @@ _LIMITS = dict.fromkeys(("fx", "fy", "cx", "cy", "stretch", "origin"), bounds.PI
 _LIMITS |= dict.fromkeys(("width", "height"), float(bounds.IMAGE_SIDE))
 #: Where :func:`undistortion_map` sends pixels that no source pixel shows: outside any image, whatever the border.
 NOWHERE = -10.0
+#: Terms of a polynomial up to this change nothing at any radius of an image, but overflow where one is divided by.
+_NEGLIGIBLE = 1e-100
 
 
 class Lens(ABC):
@@ -408,7 +410,8 @@ def _along(direction: Array, length: Array, new_length: Array, ratio_at_zero: fl
 
 def _first_root(coefficients: list[float]) -> float:
     """The smallest positive real root of a polynomial, constant term first; infinite where there is none."""
-    roots = np.polynomial.Polynomial(coefficients).roots()
+    kept = np.polynomial.polyutils.trimcoef(coefficients, _NEGLIGIBLE)
+    roots = np.polynomial.Polynomial(kept).roots()
     positive = roots.real[(np.abs(roots.imag) < 1e-9 * (1.0 + np.abs(roots.real))) & (roots.real > 0.0)]
     return float(positive.min(initial=np.inf))
 

@@ -197,6 +197,13 @@ def test_models_end_where_they_turn_back():
     assert np.isfinite(turning.project([[1.0, 0, 1]])).all()
 
 
+def test_negligible_terms_change_nothing():
+    pixels = np.array([[300.0, 400.0], [900.0, 200.0]])
+    for name, term in (("omnidirectional", "a4"), ("legacy-pinhole", "k2"), ("fisheye", "k4")):
+        tiny, without = (replace(LENSES[name], **{term: value}).unproject(pixels) for value in (1e-320, 0.0))
+        np.testing.assert_array_equal(tiny, without)
+
+
 def test_undistortion_map_marks_what_the_lens_does_not_reach():
     columns, rows = undistortion_map(FISHEYE, replace(FISHEYE.pinhole, fx=60.0, fy=60.0))
     assert columns.dtype == rows.dtype == np.float32
