@@ -40,6 +40,10 @@ class InputError(ReportedError):
         super().__init__(text if text.endswith("?") else f"{text}.")
 
 
+class NotWritableError(InputError):
+    """A folder that cannot be written: a full disk, or no permission."""
+
+
 class InterruptedRunError(ReportedError):
     """Training was interrupted by the user, after its state was saved."""
 

@@ -15,7 +15,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.errors import InputError, NotWritableError
 from coliags_plugin.core.scratch import (
     final_place,
     is_in_scratch,
@@ -177,9 +177,9 @@ def make_folder(folder: Path) -> None:
         raise not_writable(folder, error) from error
 
 
-def not_writable(folder: Path, error: OSError) -> InputError:
+def not_writable(folder: Path, error: OSError) -> NotWritableError:
     """The error for a folder that cannot be written."""
     seen = f"cannot write to {final_place(folder)}: {error.strerror or error}"
     if error.errno in _FULL:
-        return InputError(seen, "a disk with space left", "Free some, or choose another output")
-    return InputError(seen, "a writable folder", "Choose another output")
+        return NotWritableError(seen, "a disk with space left", "Free some, or choose another output")
+    return NotWritableError(seen, "a writable folder", "Choose another output")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 
 from coliags_plugin.config.method_config import method_name
-from coliags_plugin.core.errors import InputError, InterruptedRunError
+from coliags_plugin.core.errors import InputError, InterruptedRunError, NotWritableError
 from coliags_plugin.meshes.files import MESH_FORMATS
 from coliags_plugin.pipeline.stages import Outcome
 from coliags_plugin.pipeline.workplace import Workplace
@@ -80,7 +80,11 @@ def mesh(place: Workplace) -> Outcome:
 
 
 def coverage(place: Workplace) -> Outcome:
-    """Measure what the video shows of the wall, through the lens that filmed it; left out where that is impossible."""
+    """Measure what the video shows of the wall, through the lens that filmed it; left out where that is impossible.
+
+    Raises:
+        NotWritableError: It could be measured, but not written.
+    """
     from coliags_plugin.coverage.text import summary
     from coliags_plugin.coverage.writing import measure_scene
     from coliags_plugin.meshes.files import read_mesh
@@ -93,6 +97,8 @@ def coverage(place: Workplace) -> Outcome:
         made = measure_scene(
             scene, read_mesh(place.run / "mesh" / "mesh.ply"), folder, place.settings.coverage, overwrite=True
         )
+    except NotWritableError:
+        raise
     except InputError as error:
         log.warning("no coverage: %s", error)
         return Outcome(f"left out: {error}")

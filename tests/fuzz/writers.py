@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import sys
+import tempfile
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 
 #: Exit status that stands for an exception that no message was made of.
 TRACEBACK = 99
+#: Where what is made of a fused mesh lies.
+_FUSED = ("mesh/mesh", "coverage/")
 _TEXTS = frozenset({".json", ".jsonl", ".html", ".yaml", ".csv", ".md", ".log"})
 
 
@@ -281,8 +284,24 @@ def is_whole(name: str, data: bytes, reference: bytes | None) -> bool:
         return data.endswith(b"\n") or suffix in (".safetensors", ".log", "") or not data
     if suffix in (".npz", ".npy", ".db"):
         return len(data) > 0
-    # open3d's triangles come in any order
-    return len(data) == len(reference) if "mesh/mesh." in name else data == reference
+    # open3d's triangles come in any order, and what is made of them differs a little
+    return _is_readable(name, data) if any(part in name for part in _FUSED) else data == reference
+
+
+def _is_readable(name: str, data: bytes) -> bool:
+    """Whether a mesh or an image can be read to its end."""
+    from coliags_plugin.core.errors import InputError
+    from coliags_plugin.core.images import decode_image
+    from coliags_plugin.meshes.files import read_mesh
+
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / Path(name).name
+        file.write_bytes(data)
+        try:
+            decode_image(file) if file.suffix == ".png" else read_mesh(file)
+        except InputError:
+            return False
+    return file.suffix != ".obj" or data.endswith(b"\n")
 
 
 def units(found: dict[str, bytes]) -> set[str]:

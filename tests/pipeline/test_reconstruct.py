@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 
 import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import not_writable
 from coliags_plugin.datamanagers.units import read_unit
 from coliags_plugin.meshes.files import read_mesh
 from coliags_plugin.outputs.video import write_video
@@ -24,6 +26,8 @@ from tests.pipeline.films import blurred, film, write_images
 from tests.textured_tube import INTRINSICS, tube_frames, write_tube
 
 FILMED, TRAINED = ("make_poses", "check_data", "estimate_depth"), ("train", "evaluate", "mesh", "coverage", "report")
+
+_COVERAGE = trained.coverage
 
 
 class Killed(BaseException):
@@ -109,6 +113,29 @@ def test_a_scene_with_poses_needs_neither_frames_nor_poses(done, tmp_path):
     assert done == ["check_data", *([] if with_depth else ["estimate_depth"]), *TRAINED]
     with pytest.raises(InputError, match=r"tube has poses, and settings of diameter, frames are given"):
         cp.reconstruct(scene, tmp_path / "other", settings={"diameter": 40.0, "frames.every": 2})
+
+
+def test_coverage_is_left_out_where_it_cannot_be_measured_but_not_where_it_cannot_be_written(
+    done, tmp_path, monkeypatch, caplog
+):
+    scene = write_tube(tmp_path / "tube", 6, 3.0)
+    monkeypatch.setattr(trained, "coverage", _COVERAGE)
+    monkeypatch.setattr("coliags_plugin.meshes.files.read_mesh", lambda path: None)
+
+    def failing(error):
+        def measure_scene(*args, **options):
+            raise error
+
+        monkeypatch.setattr("coliags_plugin.coverage.writing.measure_scene", measure_scene)
+
+    full = not_writable(tmp_path, OSError(errno.ENOSPC, "No space left on device"))
+    failing(full)
+    with pytest.raises(InputError, match=r"stage coverage: .*No space left"):
+        cp.reconstruct(scene, tmp_path / "out")
+    assert json.loads((tmp_path / "out" / "reconstruction.json").read_text())["stages"]["coverage"]["state"] == "failed"
+    failing(InputError("too few triangles"))
+    cp.reconstruct(scene, tmp_path / "out")
+    assert "no coverage: too few triangles" in caplog.text
 
 
 @pytest.mark.parametrize(
