@@ -12,6 +12,9 @@ from coliags_plugin.core.errors import InputError, did_you_mean
 
 Model = TypeVar("Model", bound=BaseModel)
 
+#: Of the largest integers of arrays and tensors, besides the sign.
+_INTEGER_BITS = 63
+
 
 class Settings(BaseModel):
     """Frozen, strictly typed options; an unknown key is an error that names the nearest known one.
@@ -22,6 +25,17 @@ class Settings(BaseModel):
     model_config = ConfigDict(
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False, arbitrary_types_allowed=True
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_huge_integers(cls, data: Any) -> Any:
+        huge = [key for key, value in data.items() if _is_huge(value)] if isinstance(data, dict) else []
+        if huge:
+            problem = PydanticCustomError("huge_integer", "an integer of more than 64 bits")
+            raise ValidationError.from_exception_data(
+                cls.__name__, [InitErrorDetails(type=problem, loc=(key,), input=data[key]) for key in huge]
+            )
+        return data
 
     @model_validator(mode="before")
     @classmethod
@@ -51,6 +65,13 @@ class Settings(BaseModel):
                 ],
             )
         return data
+
+
+def _is_huge(value: Any) -> bool:
+    """Whether a value is, or has, an integer that no array can hold."""
+    if isinstance(value, (tuple, list)):
+        return any(map(_is_huge, value))
+    return isinstance(value, int) and value.bit_length() > _INTEGER_BITS
 
 
 def validated(kind: type[Model], values: Mapping[str, Any], what: str) -> Model:

@@ -162,6 +162,10 @@ def test_bases_may_be_paths_beside_the_file(method_file):
     ("text", "parts"),
     [
         ("base: coliags\nfield:\n  geometry_head: {frequences: 4}\n", ["mine.yaml:3", "frequences", "'frequencies'"]),
+        (
+            "base: coliags\nfield:\n  features: 99999999999999999999\n",
+            ["mine.yaml:3", "field.features", "an integer of more than 64 bits"],
+        ),
         ("base: coliags\nfeild: {}\n", ["mine.yaml:2", "unknown key 'feild'", "Did you mean 'field'"]),
         ("base: coliags\nrenderer: {name: cpu, near: 1.0}\n", ["unknown key 'near'", "Did you mean 'near_plane'"]),
         ("base: coliags\nrenderer: {name: cpu, low_pass: 1.0}\n", ["unknown key 'low_pass'", "Did you mean 'eps2d'"]),
