@@ -65,11 +65,14 @@ class CameraResponse(ViewModule):
         """Pixel values of colours, both relative to full scale: piecewise linear and increasing. [*S]"""
         knee, segments = self.settings.knee, self.settings.segments
         length = (_TOP - knee) / segments
-        values = colors.clamp_max(knee)
-        for index, slope in enumerate(self._slopes().unbind()):
-            above = (colors - (knee + index * length)).clamp_min(0.0)
-            values = values + slope * (above if index == segments - 1 else above.clamp_max(length))
-        return values
+        slopes = self.log_slope.exp().clamp(_LEAST_SLOPE, 1.0 / _LEAST_SLOPE)
+        rises = knee + length * slopes.cumsum(0)
+        starts = torch.cat([slopes.new_tensor([0.0, knee]), rises[:-1]])  # of the part below the knee first
+        slopes = torch.cat([slopes.new_ones(1), slopes])
+        with torch.no_grad():
+            segment = ((colors - knee) / length).floor().clamp(-1, segments - 1).long()
+            origins = torch.where(segment < 0, 0.0, knee + length * segment)
+        return starts[segment + 1] + slopes[segment + 1] * (colors - origins)
 
     def shade(self, output: RenderOutput, view: View | None) -> RenderOutput:
         """Apply the curve to the colours."""
@@ -81,6 +84,3 @@ class CameraResponse(ViewModule):
         colors = torch.linspace(self.settings.knee, _TOP, self.settings.segments + 1)
         values = self.curve(colors.to(self.log_slope)).detach()
         return {"colors": colors.tolist(), "values": values.tolist()}
-
-    def _slopes(self) -> Float[Tensor, "K"]:
-        return self.log_slope.exp().clamp(_LEAST_SLOPE, 1.0 / _LEAST_SLOPE)

@@ -101,7 +101,7 @@ def test_a_damaged_record_of_light_is_named(trained, tmp_path, capsys):
 def test_learned_numbers_are_in_the_metrics(trained):
     result = trained.evaluate()
     learned = result.provenance["learned"]
-    assert set(learned) == {"field", "exposure"} and len(learned["field"]["distance_exponent"]) == 3
+    assert set(learned) == {"field", "exposure", "response"} and len(learned["field"]["distance_exponent"]) == 3
     summary = json.loads((trained.path / "eval" / "paper" / "metrics.json").read_text())
     assert summary["learned"] == learned
 
