@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from jaxtyping import Bool, Shaped, UInt8
 
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.morphology import eroded
 from coliags_plugin.lenses.models import Lens, undistortion_map
+
+#: Bilinear samples per source pixel along each side, at most: half the focal length takes two, and lenses that are no
+#: lenses any number.
+_MOST_SAMPLES = 2.0
 
 
 class Undistortion:
@@ -40,7 +46,9 @@ class Undistortion:
         self.source_mask = source_mask
         self.width, self.height = width, height = pinhole.width, pinhole.height
         self._columns, self._rows = undistortion_map(lens, pinhole)
-        self.supersampling = s = max(1, round(_longest_step(self._columns, self._rows)))
+        step = _longest_step(self._columns, self._rows)
+        most = math.ceil(_MOST_SAMPLES * max(lens.width / width, lens.height / height))
+        self.supersampling = s = max(1, min(round(step), most))
         self._fine_columns, self._fine_rows = self._columns, self._rows
         if s > 1:
             fine = pinhole.resized(width * s, height * s)

@@ -62,6 +62,14 @@ def test_shrinking_by_a_whole_number_is_the_mean_of_blocks():
     np.testing.assert_allclose(undistortion.image(image), blocks, atol=0.51)
 
 
+def test_a_lens_that_is_none_takes_no_more_samples_than_half_the_focal_length():
+    lens = STRAIGHT.resized(240, 192)
+    nominal = lens.resized(60, 48).pinhole
+    halved = Undistortion(lens, replace(nominal, fx=0.5 * nominal.fx, fy=0.5 * nominal.fy))
+    assert halved.supersampling == 8
+    assert Undistortion(lens, replace(nominal, fx=1.0, fy=1.0)).supersampling == 8
+
+
 def test_same_size_without_distortion_changes_nothing():
     lens = STRAIGHT.resized(240, 192)
     image = np.random.default_rng(0).integers(0, 256, (192, 240, 3), dtype=np.uint8)
