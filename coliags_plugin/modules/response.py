@@ -70,7 +70,7 @@ class CameraResponse(ViewModule):
         starts = torch.cat([slopes.new_tensor([0.0, knee]), rises[:-1]])  # of the part below the knee first
         slopes = torch.cat([slopes.new_ones(1), slopes])
         with torch.no_grad():
-            segment = ((colors - knee) / length).floor().clamp(-1, segments - 1).long()
+            segment = ((colors - knee) / length).floor().clamp(-1, segments - 1).nan_to_num(-1).long()
             origins = torch.where(segment < 0, 0.0, knee + length * segment)
         return starts[segment + 1] + slopes[segment + 1] * (colors - origins)
 

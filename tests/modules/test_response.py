@@ -38,6 +38,12 @@ def test_it_is_numpys_interpolation_of_its_points():
     assert module.curve(torch.tensor(2.5)).item() == pytest.approx(values[-1] + np.exp(-0.5), abs=1e-6)  # goes on
 
 
+def test_colours_that_are_not_finite_stay_so():
+    values = make().curve(torch.tensor([float("nan"), float("inf"), 0.25]))
+    assert values.isnan().tolist() == [True, False, False]
+    assert values[1].isinf() and values[2] == 0.25
+
+
 @given(st.lists(st.floats(-50.0, 50.0), min_size=3, max_size=3), st.floats(0.0, 3.0), st.floats(1e-3, 3.0))
 def test_it_increases(slopes, color, more):
     module = CameraResponse(ResponseSettings(segments=3))
