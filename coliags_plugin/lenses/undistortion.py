@@ -11,8 +11,8 @@ from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.morphology import eroded
 from coliags_plugin.lenses.models import Lens, undistortion_map
 
-#: Bilinear samples per source pixel along each side, at most. Half the nominal focal length takes two; more would only be
-#: taken where the lens is described wrongly, and fill the memory.
+#: Bilinear samples per source pixel along each side, at most. Half the nominal focal length takes two; more would be
+#: taken only where the lens is described wrongly, and fill the memory.
 _MOST_SAMPLES = 2.0
 
 
