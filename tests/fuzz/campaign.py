@@ -30,7 +30,7 @@ LIMIT = 10.0
 #: Seconds of processor time of the undamaged files, which compile what is compiled.
 _FIRST_LIMIT = 300.0
 #: Seconds of the clock for a second of processor time, on a machine that others use too.
-_PATIENCE = 6.0
+_PATIENCE = 30.0
 FINE = ("fine", "message")
 OUTCOMES = (*FINE, "traceback", "hang", "memory", "absurd", "crash")
 
