@@ -49,7 +49,7 @@ class CameraResponse(ViewModule):
 
     @classmethod
     def from_scene(cls, scene: Scene, settings: Any, generator: torch.Generator) -> Self:
-        """Module whose curve is the identity."""
+        """A response module that starts as the identity curve."""
         return cls(settings)
 
     @property

@@ -80,7 +80,7 @@ def mesh(place: Workplace) -> Outcome:
 
 
 def coverage(place: Workplace) -> Outcome:
-    """Measure what the video shows of the wall, through the lens that filmed it; left out where that is impossible.
+    """Coverage stage: measure the share of the wall seen in the video; skipped where it cannot be measured.
 
     Raises:
         NotWritableError: It could be measured, but not written.

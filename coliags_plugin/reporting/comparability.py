@@ -168,7 +168,7 @@ def _steps(study: Study) -> list[str]:
 
 
 def _untrained_views(study: Study) -> list[str]:
-    """What view modules make of held-out views, such as corrections of their poses, where methods differ in it."""
+    """Cautions on how view modules treat held-out views (gains, pose corrections), if the methods differ in it."""
     by_method = {method: cells[0].result.provenance.get("untrained_views") for method, cells in study.by_method.items()}
     treated = {method: dict(own) if isinstance(own, Mapping) else {} for method, own in by_method.items()}
     if all(own == treated[study.methods[0]] for own in treated.values()):
