@@ -12,7 +12,7 @@ from coliags_plugin.contracts.fields import (
 )
 from coliags_plugin.contracts.heads import AppearanceHead, GeometryHead, Head
 from coliags_plugin.contracts.losses import Loss, LossSettings
-from coliags_plugin.contracts.rendering import Availability, GainModule, Renderer, ViewModule
+from coliags_plugin.contracts.rendering import Availability, GainModule, Renderer, ResponseModule, ViewModule
 from coliags_plugin.contracts.schedule import Schedule, log_linear
 from coliags_plugin.contracts.training import (
     Draw,
@@ -44,6 +44,7 @@ __all__ = [
     "RadianceLevel",
     "RadianceSamples",
     "Renderer",
+    "ResponseModule",
     "Sampler",
     "Schedule",
     "Strategy",

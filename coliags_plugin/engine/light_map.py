@@ -1,4 +1,4 @@
-"""The light that a run has learned: its law and gains, beside a phantom's true ones."""
+"""The light that a run has learned: its law, gains and camera response, beside a phantom's true ones."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from coliags_plugin.contracts import GainModule, GaussianField
+from coliags_plugin.contracts import GainModule, GaussianField, ResponseModule
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.scenes import Scene
@@ -23,6 +23,8 @@ from coliags_plugin.outputs.page import fact_list, write_page
 
 #: Largest angle to the optical axis that is shown, degrees, and number of points of a curve.
 _MAX_ANGLE, _POINTS = 60.0, 61
+#: Largest colour before the response curve that is shown.
+_MAX_COLOR = 1.5
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,9 @@ class LightMap:
         times: Indices of the training frames, in order; empty without gains.
         gains: Encoded, with a geometric mean of 1. [F, C]
         true_gains: Of a phantom, likewise. [F, 3]
+        colors: Before the response curve. [P]
+        response: Pixel values of ``colors``; None without a curve. [P]
+        true_response: Of a phantom, likewise. [P]
         numbers: What was learned, and how far it is from the truth.
     """
 
@@ -50,6 +55,9 @@ class LightMap:
     times: Sequence[float]
     gains: Float[Tensor, "F C"] | None
     true_gains: Float[Tensor, "F 3"] | None
+    colors: Float[Tensor, "P"]
+    response: Float[Tensor, "P"] | None
+    true_response: Float[Tensor, "P"] | None
     numbers: dict[str, Any]
 
     @property
@@ -62,9 +70,11 @@ class LightMap:
 
 @torch.no_grad()
 def light_map(trained: TrainedRun) -> LightMap | None:
-    """Attenuation law and gains that a run has learned, and a phantom's; None without either, or points in view."""
+    """Light that a run has learned, beside a phantom's; None where it has learned none, or no points are in view."""
     model, scene = trained.model, trained.scene
-    gain = next((part for part in model.view_modules.values() if isinstance(part, GainModule)), None)
+    parts = model.view_modules.values()
+    gain = next((part for part in parts if isinstance(part, GainModule)), None)
+    curve = next((part for part in parts if isinstance(part, ResponseModule)), None)
     field = model.field if isinstance(model.field, GaussianField) else None
     depths = scene.depths_in_view().double()
     if len(depths) == 0:
@@ -77,12 +87,13 @@ def light_map(trained: TrainedRun) -> LightMap | None:
     around = middle * torch.stack([radians.sin(), torch.zeros_like(radians), radians.cos()], dim=1)
     rays = (distances[:, None] * axis, around, middle * axis[None])
     learned = None if field is None else _relative(field.attenuation, rays, trained.device)
-    if learned is None and gain is None:
+    if learned is None and gain is None and curve is None:
         return None
     truth = find_true_light(Path(scene.provenance.get("path", "")))
     true = None if truth is None else _relative(truth.attenuation, rays, torch.device("cpu"))
     gains = None if gain is None else _centred(gain.log_gains().cpu().double()).exp()
     true_gains = None if truth is None or gains is None else _true_gains(truth, scene)
+    colors = torch.linspace(0.0, _MAX_COLOR, _POINTS, dtype=torch.float64)
     numbers: dict[str, Any] = {"learned": model.learned, "reference_distance": middle, "unit": scene.length_unit}
     if truth is not None:
         numbers["truth"] = {
@@ -106,22 +117,26 @@ def light_map(trained: TrainedRun) -> LightMap | None:
         times=() if gain is None else gain.times,
         gains=gains,
         true_gains=true_gains,
+        colors=colors,
+        response=None if curve is None else curve.curve(colors.float().to(trained.device)).cpu().double(),
+        true_response=None if truth is None or curve is None else truth.response(colors),
         numbers=numbers,
     )
 
 
 def write_light_map(trained: TrainedRun, folder: Path) -> None:
-    """Write ``light.json``, and ``light.html`` with charts of the law and the gains, into a folder.
+    """Write ``light.json``, and ``light.html`` with charts of law, gains and response, into a folder.
 
     Raises:
-        InputError: The method has learned neither, no training frame sees a point, or the files cannot be written.
+        InputError: The method has learned none of them, no training frame sees a point, or the files cannot be written.
     """
     found = light_map(trained)
     if found is None:
         raise InputError(
-            f"a light map of method '{trained.method}', which has learned neither a law of attenuation nor gains, or "
-            "has no points in view",
-            "a method with appearance head 'attenuated' or module 'gain', such as coliags-plus, and initial points",
+            f"a light map of method '{trained.method}', which has learned no law of attenuation, gains or "
+            "response curve, or has no points in view",
+            "a method with appearance head 'attenuated', or with module 'gain' or 'response', such as coliags-plus, "
+            "and initial points",
         )
     record = found.record
     write_json(folder / LIGHT_FILE, record)

@@ -15,18 +15,19 @@ from torch import Tensor
 from coliags_plugin.core.beams import SpreadLaw, beam
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import read_json
+from coliags_plugin.core.tone_curve import encode
 
 
 @dataclass(frozen=True)
 class TrueLight:
-    """Lamp, vignetting and gains of a phantom.
+    """Lamp, vignetting, camera response and gains of a phantom.
 
     Attributes:
         offset: Of the lamp in camera axes, mm.
         axis: Unit direction of the beam in camera axes.
         spread_law, spread: Angular fall-off of the beam (docs/phantom.md 2).
         vignetting: Exponent of cos theta at the lens, in linear light.
-        gamma: Of the camera's response.
+        gamma, knee: Of the camera's response; a soft shoulder bends what is above the knee, in linear light.
         gains: Red, green and blue gain in linear light by the frame's index in the video.
     """
 
@@ -36,12 +37,17 @@ class TrueLight:
     spread: float
     vignetting: float
     gamma: float
+    knee: float
     gains: Mapping[int, tuple[float, float, float]]
 
     @property
     def distance_exponent(self) -> float:
         """Of encoded colours over the distance to the lamp: -2 / gamma."""
         return -2.0 / self.gamma
+
+    def response(self, colors: Float[Tensor, "P"]) -> Float[Tensor, "P"]:
+        """Pixel values of encoded colours that had no shoulder: the identity below the shoulder. [P]"""
+        return torch.from_numpy(encode(colors.numpy() ** self.gamma, self.gamma, self.knee))
 
     def attenuation(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
         """Factor of the lamp's direct light on encoded colours, up to a constant. [N]
@@ -85,6 +91,7 @@ def find_true_light(scene: Path) -> TrueLight | None:
             spread=float(lamp["spread"]),
             vignetting=float(record["vignetting"]),
             gamma=float(record["gamma"]),
+            knee=float(record["shoulder_knee"]),
             gains=gains,
         )
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -30,7 +30,7 @@ def light_facts(record: Mapping[str, Any]) -> dict[str, str]:
 
 
 def light_charts(record: Mapping[str, Any]) -> dict[str, str]:
-    """HTML of the charts of law and gains by their titles: learned curves for each colour, and true ones."""
+    """HTML of the charts of law, gains and response by their titles: learned curves, and true ones beside them."""
     curves, unit, middle = record["curves"], record["unit"], record["reference_distance"]
     charts = {}
     if curves["by_distance"] is not None:
@@ -38,14 +38,22 @@ def light_charts(record: Mapping[str, Any]) -> dict[str, str]:
             ("Attenuation over distance", "distances", "by_distance", f"distance on the optical axis [{unit}]"),
             ("Attenuation over angle", "angles", "by_angle", f"angle to the axis at {middle:.3g} {unit} [degrees]"),
         ):
-            true = curves[f"true_{y}"]
-            beside = None if true is None else [[value] for value in true]
-            charts[title] = _chart(curves[x], curves[y], beside, label, "factor on encoded colours")
+            true = _rows(curves[f"true_{y}"])
+            charts[title] = _chart(curves[x], curves[y], true, label, "factor on encoded colours")
     if curves["gains"] is not None:
         charts["Gain"] = _chart(
             record["times"], curves["gains"], curves["true_gains"], "frame", "gain on encoded colours"
         )
+    learned = _rows(curves["response"])
+    if learned is not None:
+        true = _rows(curves["true_response"])
+        charts["Camera response"] = _chart(curves["colors"], learned, true, "colour before the response", "pixel value")
     return charts
+
+
+def _rows(curve: Sequence[float] | None) -> list[list[float]] | None:
+    """A curve that all colours share."""
+    return None if curve is None else [[value] for value in curve]
 
 
 def _numbers(values: Any) -> str:

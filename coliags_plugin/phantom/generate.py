@@ -18,6 +18,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, write_arrays
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.tone_curve import KNEE
 from coliags_plugin.phantom.colon import ColonSurface, build_surface, grow_anatomy
 from coliags_plugin.phantom.imaging import Exposure, Sensor, World, expose, meter
 from coliags_plugin.phantom.interreflection import IndirectLight, indirect_lights
@@ -25,7 +26,7 @@ from coliags_plugin.phantom.layouts import meshes
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints
 from coliags_plugin.phantom.light import Lamp
 from coliags_plugin.phantom.mucosa import Mucosa, paint_mucosa
-from coliags_plugin.phantom.response import KNEE, develop, exposure_for, exposures, white_balances
+from coliags_plugin.phantom.response import develop, exposure_for, exposures, white_balances
 from coliags_plugin.phantom.settings import PhantomSettings, value_or_default
 from coliags_plugin.phantom.streams import Purpose, stream
 from coliags_plugin.phantom.tracing import Tracer

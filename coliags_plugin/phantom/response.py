@@ -8,21 +8,12 @@ import numpy as np
 import scipy.ndimage
 from jaxtyping import Float, UInt8
 
+from coliags_plugin.core.tone_curve import encode
 from coliags_plugin.phantom.settings import PhantomSettings, value_or_default
 from coliags_plugin.phantom.streams import Purpose, stream
 
-#: Linear level above which the soft shoulder approaches 1.
-KNEE = 0.7
 #: Correlation length of the white balance's drift, frames.
 _DRIFT_LENGTH = 20.0
-
-
-def encode(linear: Float[np.ndarray, "..."], gamma: float) -> Float[np.ndarray, "..."]:
-    """Linear light to pixel values in [0, 1): a power law with a soft shoulder above :data:`KNEE`."""
-    linear = np.maximum(linear, 0.0)
-    room = 1.0 - KNEE
-    bent = np.where(linear > KNEE, 1.0 - room * np.exp(np.minimum(KNEE - linear, 0.0) / room), linear)
-    return np.asarray(bent ** (1.0 / gamma))
 
 
 def exposure_for(radiance: Float[np.ndarray, "N 3"], target: float, gamma: float) -> float:

@@ -13,8 +13,8 @@ from coliags_plugin.reporting.study import Cell, Study
 
 _HOW = (
     "What a learned law makes of the light over distance and angle, relative to the optical axis at the median "
-    "distance, and the gain of every training frame, with a geometric mean of 1. True curves are those of a phantom's "
-    "direct light."
+    "distance, the gain of every training frame, with a geometric mean of 1, and the camera's response curve. True "
+    "curves are those of a phantom: of its direct light, its gains and its camera."
 )
 
 

@@ -21,6 +21,7 @@ LIGHT = {
     "lamp": {"offset": [0.0, 0.0, -3.0], "axis": [0.0, 0.0, 1.0], "spread_law": "cosine", "spread": 1.5},
     "vignetting": 0.5,
     "gamma": 2.0,
+    "shoulder_knee": 0.64,
 }
 
 
@@ -39,13 +40,13 @@ def trained(tmp_path_factory):
 
 
 def test_the_true_law_is_encoded_inverse_square_with_spread_and_vignetting():
-    law = TrueLight((0.0, 0.0, -3.0), (0.0, 0.0, 1.0), "cosine", 1.5, 0.5, 2.0, {})
+    law = TrueLight((0.0, 0.0, -3.0), (0.0, 0.0, 1.0), "cosine", 1.5, 0.5, 2.0, 0.7, {})
     points = torch.tensor([[0.0, 0.0, 7.0], [0.0, 0.0, 17.0], [0.0, 3.0, 6.0]], dtype=torch.float64)
     near, far, aside = law.attenuation(points).tolist()
     assert near / far == pytest.approx(2.0) and law.distance_exponent == -1.0
     psi, theta = 9 / math.sqrt(90), 6 / math.sqrt(45)
     assert aside == pytest.approx(math.sqrt(psi**1.5 * theta**0.5 / 90))
-    flat = TrueLight((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), "exponential", 2.0, 0.0, 1.0, {})
+    flat = TrueLight((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), "exponential", 2.0, 0.0, 1.0, 0.7, {})
     one, other = flat.attenuation(torch.tensor([[0.0, 0.0, 5.0], [4.0, 0.0, 3.0]], dtype=torch.float64)).tolist()
     assert other / one == pytest.approx(math.exp(-2.0 * 0.4))
 
@@ -63,6 +64,13 @@ def test_curves_and_numbers_beside_the_truth(trained):
     torch.testing.assert_close(found.true_gains[:, 0].log(), truth - truth.mean())
     errors = (found.gains.log() - found.true_gains.log()).square().mean(0).sqrt()
     assert found.numbers["gain_error_rms"] == pytest.approx(errors.tolist())
+    low = found.colors <= 0.5
+    torch.testing.assert_close(found.response[low], found.colors[low])
+    assert float((found.response - found.colors)[~low].abs().max()) > 0
+    expected = torch.where(
+        found.colors < 0.8, found.colors, (1 - 0.36 * ((0.64 - found.colors**2) / 0.36).exp()).sqrt()
+    )
+    torch.testing.assert_close(found.true_response, expected)
 
 
 def test_reports_show_the_light_of_runs_that_learn_it(trained, tmp_path):
@@ -74,7 +82,7 @@ def test_reports_show_the_light_of_runs_that_learn_it(trained, tmp_path):
     assert not (paper.path / "eval" / "paper" / "light.json").exists()
     run("report", str(trained.path), str(paper.path), "--output", str(tmp_path / "report.html"))
     text = (tmp_path / "report.html").read_text()
-    assert text.count("Attenuation over distance") == 1 and "Learned light" in text
+    assert text.count("Camera response") == text.count("Attenuation over distance") == 1 and "Learned light" in text
     rms = ", ".join(f"{value:.1%}" for value in record["gain_error_rms"])
     assert f"<dd>{rms}</dd>" in text and "(true: 0, 0, -3)" in text
     run("report", str(paper.path), "--output", str(tmp_path / "other.html"))
@@ -130,7 +138,7 @@ def test_the_command_writes_the_light_and_flattened_views(trained, capsys):
 
 def test_what_cannot_be_shown_is_refused(trained, capsys, tmp_path):
     paper = trained.path.parent / "paper"
-    assert "learned neither" in refused(capsys, "render", str(paper), "--no-video", "--light-map", "--output", "x")
+    assert "learned no law" in refused(capsys, "render", str(paper), "--no-video", "--light-map", "--output", "x")
     assert "one of them" in refused(capsys, "render", str(paper), "--flatten", "--light", "power=2")
     (tmp_path / "truth").mkdir()
     assert find_true_light(tmp_path) is None

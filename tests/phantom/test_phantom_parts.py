@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.tone_curve import encode
 from coliags_plugin.lenses.pinhole import PinholeLens
 from coliags_plugin.phantom.colon import ColonSurface, build_surface, grow_anatomy
 from coliags_plugin.phantom.imaging import Sensor, World, expose
@@ -15,7 +16,7 @@ from coliags_plugin.phantom.interreflection import form_factors, make_patches, s
 from coliags_plugin.phantom.light import UNIT_DISTANCE, Lamp
 from coliags_plugin.phantom.motion import NEAREST, rotation, rotation_about
 from coliags_plugin.phantom.mucosa import Mucosa, paint_mucosa
-from coliags_plugin.phantom.response import develop, encode, exposure_for, exposures, white_balances
+from coliags_plugin.phantom.response import develop, exposure_for, exposures, white_balances
 from coliags_plugin.phantom.settings import PRESETS, PhantomSettings, phantom_settings
 from coliags_plugin.phantom.streams import Purpose, SolidNoise, stream
 from coliags_plugin.phantom.tracing import Tracer
