@@ -15,7 +15,7 @@ from coliags_plugin.comparison.benchmarks import Benchmark, load_benchmark
 from coliags_plugin.comparison.named_files import is_path, shipped
 from coliags_plugin.config.registry import phantom_layouts
 from coliags_plugin.core.errors import InputError, did_you_mean
-from coliags_plugin.core.json_files import parse_json
+from coliags_plugin.core.json_files import json_text, parse_json
 from coliags_plugin.core.locks import locked
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.phantom.generate import generate, resolve
@@ -171,7 +171,7 @@ def _check_same_phantom(source: SceneSource) -> None:
     """Refuse a folder with another phantom than the benchmark's."""
     file = source.path / "phantom.json"
     try:
-        settings = dict(parse_json(file.read_text(encoding="utf-8"))["settings"])
+        settings = dict(parse_json(json_text(file))["settings"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
             f"{source.path} is not a phantom: {file.name} cannot be read", "the benchmark's phantom, or no folder"

@@ -12,6 +12,7 @@ from typing import Any
 import yaml
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.text_files import whole_text
 
 
 @dataclass(frozen=True)
@@ -106,11 +107,13 @@ def read_tree(path: Path) -> Node:
         InputError: The file is missing, is not YAML, repeats a key, or is no mapping.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = whole_text(path)
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}", "a YAML file") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not UTF-8 text", "a YAML file") from error
+    except ValueError as error:
+        raise InputError(f"cannot read {path}: {error}", "a YAML file") from error
     return parse_tree(text, path.name)
 
 

@@ -7,11 +7,15 @@ import zipfile
 import zlib
 from collections.abc import Collection
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
 
 from coliags_plugin.core.errors import InputError
 
+#: NumPy reads headers as Python literals, and CPython 3.11 fails now and then ("AST constructor recursion depth
+#: mismatch") where two threads do so at once.
+_HEADERS = Lock()
 #: What an archive may always expand to, bytes.
 _SMALL = 64 << 20
 #: How many times its size a larger one may. Depth and points compress to a half or a tenth.
@@ -53,7 +57,7 @@ def read_arrays(
             unpacked = sum(entry.file_size for entry in archive.infolist())
         if unpacked > max(_SMALL, _RATIO * packed):
             raise InputError(f"{path} has {packed:,} bytes and expands to {unpacked:,}", expected, "It is no such data")
-        with np.load(path, allow_pickle=False) as archive:
+        with _HEADERS, np.load(path, allow_pickle=False) as archive:
             wanted = archive.files if optional is None else {*needed, *optional}
             arrays = {name: archive[name] for name in archive.files if name in wanted}
     except _DAMAGED as error:
@@ -75,6 +79,8 @@ def read_array(path: Path, expected: str) -> np.ndarray:
     """
     try:
         # Mapped first: numpy would reserve what the header says, whatever follows.
-        return np.array(np.load(path, mmap_mode="r", allow_pickle=False))
+        with _HEADERS:
+            mapped = np.load(path, mmap_mode="r", allow_pickle=False)
+        return np.array(mapped)
     except _DAMAGED as error:
         raise InputError(f"cannot read {path}: {error}", expected, "Write it again") from error

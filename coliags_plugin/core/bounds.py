@@ -1,4 +1,4 @@
-"""Largest magnitudes that are accepted from files, so that everything computed from them stays finite in float32."""
+"""Largest magnitudes that are accepted from files, so that what is computed from them is finite and fits in memory."""
 
 from __future__ import annotations
 
@@ -15,3 +15,7 @@ IMAGE_SIDE = 32767
 IMAGE_PIXELS = 100_000_000
 #: Of a coefficient of lens distortion. Real ones are below 100, even of rational models.
 DISTORTION = 1e4
+#: Of a text file of settings or of few numbers, bytes. YAML is parsed slowly.
+TEXT_BYTES = 1_000_000
+#: Of a JSON file, bytes: its values take up to ten times as much memory. Cameras take about 1 kB per frame.
+JSON_BYTES = 100_000_000

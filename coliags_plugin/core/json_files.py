@@ -7,7 +7,9 @@ import math
 from pathlib import Path
 from typing import Any, NoReturn
 
+from coliags_plugin.core import bounds
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.text_files import whole_text
 
 
 def read_json(path: Path, expected: str, do: str = "", finite: bool = False) -> Any:
@@ -20,16 +22,26 @@ def read_json(path: Path, expected: str, do: str = "", finite: bool = False) -> 
         finite: See :func:`parse_json`.
 
     Raises:
-        InputError: The file cannot be read, or is refused by :func:`parse_json`.
+        InputError: The file is refused by :func:`json_text` or :func:`parse_json`.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
+        text = json_text(path)
+    except (OSError, ValueError) as error:
         raise InputError(f"cannot read {path}: {error}", expected, do) from error
     try:
         return parse_json(text, finite)
     except ValueError as error:
         raise InputError(f"{path} is not JSON: {error}", expected, do) from error
+
+
+def json_text(path: Path) -> str:
+    """The text of a JSON file.
+
+    Raises:
+        OSError: The file cannot be read.
+        ValueError: It is larger than :data:`coliags_plugin.core.bounds.JSON_BYTES`, or is not UTF-8.
+    """
+    return whole_text(path, bounds.JSON_BYTES)
 
 
 def parse_json(text: str | bytes, finite: bool = False) -> Any:

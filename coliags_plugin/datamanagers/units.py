@@ -7,7 +7,8 @@ from typing import Literal, cast, get_args
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
-from coliags_plugin.poses.text import read_text, shortened
+from coliags_plugin.core.text_files import read_text
+from coliags_plugin.poses.text import shortened
 
 Unit = Literal["mm", "unknown"]
 

@@ -21,7 +21,7 @@ from coliags_plugin.contracts import Renderer, Sampler, Strategy
 from coliags_plugin.core.checksums import differing_files, write_checksums
 from coliags_plugin.core.errors import InputError, NotFiniteError
 from coliags_plugin.core.files import atomic_folder, write_json
-from coliags_plugin.core.json_files import parse_json
+from coliags_plugin.core.json_files import json_text, parse_json
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.scratch import final_place
 from coliags_plugin.engine.costs import TrainingCost
@@ -207,7 +207,7 @@ def read_checkpoint(path: Path, method: str, device: torch.device) -> Checkpoint
     if differing:
         raise _damaged(path, f"{', '.join(differing)} is not what was written")
     try:
-        content = parse_json((path / "state.json").read_text(encoding="utf-8"), finite=True)
+        content = parse_json(json_text(path / "state.json"), finite=True)
         if (version := content["format"]) not in READABLE:
             known = " or ".join(map(str, READABLE))
             raise InputError(
@@ -279,6 +279,7 @@ def restore_optimizers(checkpoint: Checkpoint, optimizers: Optimizers) -> None:
             group, index, name = key.split("/")
             adam = optimizers.adam[group]
             adam.state[adam.param_groups[0]["params"][int(index)]][name] = value
+        optimizers.check_moments()
     except (KeyError, ValueError, IndexError) as error:
         raise InputError(f"the checkpoint's moments are of another optimizer: {error}", "one of this run") from error
 

@@ -14,6 +14,8 @@ from coliags_plugin.engine.model import Model
 
 #: What belongs to a row beside its value.
 _GRADIENT, _MOMENTUM, _MEAN_SQUARE = "grad", "exp_avg", "exp_avg_sq"
+#: Of a parameter in the state of Adam, beside its moments.
+_COUNT = "step"
 
 
 class Optimizers:
@@ -57,6 +59,20 @@ class Optimizers:
                 group["lr"] = self.rate(name, step)
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
+
+    def check_moments(self) -> None:
+        """Refuse a state of Adam that it cannot go on from.
+
+        Raises:
+            ValueError: A parameter has moments of another shape or type, or lacks some of several.
+        """
+        for name, adam in self.adam.items():
+            for parameter, state in adam.state.items():
+                moment = (tuple(parameter.shape), parameter.dtype)
+                wanted = {_COUNT: ((), torch.float32), _MOMENTUM: moment, _MEAN_SQUARE: moment}
+                found = {key: (tuple(value.shape), value.dtype) for key, value in state.items()}
+                if found != wanted:
+                    raise ValueError(f"group {name} has {found}, expected {wanted}")
 
     def add_rows(self, rows: Mapping[str, Tensor], parents: Tensor | None = None) -> None:
         """Append rows, which have no gradient and no momentum.

@@ -240,12 +240,12 @@ class RunFolder:
             InputError: The log cannot be read.
         """
         try:
-            lines = self.log_file.read_text(encoding="utf-8").splitlines()
+            with self.log_file.open(encoding="utf-8") as lines:
+                return [row for row in map(_log_row, lines) if row and row["step"] <= until]
         except FileNotFoundError:
             return []
         except (OSError, ValueError) as error:
             raise InputError(f"cannot read {self.log_file}: {error}", "what `coliags train` wrote") from error
-        return [row for row in map(_log_row, lines) if row and row["step"] <= until]
 
 
 def checkpoints_in_order(folder: Path) -> list[Path]:

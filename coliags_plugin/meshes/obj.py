@@ -12,6 +12,11 @@ from jaxtyping import Int
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.meshes.mesh import TriangleMesh
 
+#: Numbers of a vertex at most: position, w, colour. What follows them is not read one by one.
+_MOST_NUMBERS = 7
+#: Characters of a line of a triangle at most; polygons may have more.
+_LONGEST_TRIANGLE = 200
+
 
 def decode_obj(path: Path) -> tuple[TriangleMesh, Int[np.ndarray, "F"] | None]:
     """Read the triangles of an OBJ file; polygons are split into fans.
@@ -26,12 +31,15 @@ def decode_obj(path: Path) -> tuple[TriangleMesh, Int[np.ndarray, "F"] | None]:
     Raises:
         InputError: It cannot be read, or a line of a vertex or a face is damaged.
     """
+    found: dict[str, list[str]] = {"v ": [], "f ": []}
     try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        with path.open(encoding="utf-8", errors="replace") as lines:
+            for line in lines:
+                if line[:2] in found:
+                    found[line[:2]].append(line[2:])
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}", "an OBJ file") from error
-    vertices = _numbers(path, [line[2:] for line in lines if line.startswith("v ")])
-    faces = [line[2:] for line in lines if line.startswith("f ")]
+    vertices, faces = _numbers(path, found["v "]), found["f "]
     corners, textures = _corners(path, faces)
     corners = np.where(corners < 0, corners + len(vertices), corners - 1)
     if corners.size and (corners.min() < 0 or corners.max() >= len(vertices)):
@@ -55,7 +63,7 @@ def encode_obj(mesh: TriangleMesh) -> bytes:
 
 def _numbers(path: Path, rows: list[str]) -> np.ndarray:
     try:
-        values = np.array([row.split() for row in rows], np.float64).reshape(len(rows), -1)
+        values = np.array([row.split(maxsplit=_MOST_NUMBERS) for row in rows], np.float64).reshape(len(rows), -1)
     except ValueError as error:
         raise InputError(f"{path} has vertices that are not rows of numbers", "an OBJ file") from error
     if len(rows) and values.shape[1] < 3:
@@ -84,6 +92,8 @@ def _corners(path: Path, faces: list[str]) -> tuple[np.ndarray, np.ndarray | Non
 
 def _triangles_alike(faces: list[str]) -> tuple[np.ndarray, np.ndarray | None] | None:
     """The same of faces that are all triangles of the form ``v`` or ``v/vt``, much faster; None of others."""
+    if max(map(len, faces), default=0) > _LONGEST_TRIANGLE:
+        return None
     text = "\n".join(faces)
     slashes = text.count("/")
     if not faces or slashes not in (0, 3 * len(faces)) or "//" in text:

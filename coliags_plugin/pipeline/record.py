@@ -11,7 +11,7 @@ from typing import Any, Literal
 from coliags_plugin import __version__
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
-from coliags_plugin.core.json_files import parse_json
+from coliags_plugin.core.json_files import json_text, parse_json
 
 #: Name of the file, and version of its schema.
 RECORD_FILE, _FORMAT = "reconstruction.json", 1
@@ -59,7 +59,7 @@ class Record:
         file = folder / RECORD_FILE
         if file.is_file():
             try:
-                found = parse_json(file.read_text(encoding="utf-8"))
+                found = parse_json(json_text(file))
                 return cls(folder, {name: StageRecord(**stage) for name, stage in found["stages"].items()})
             except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
                 raise InputError(

@@ -19,9 +19,10 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, make_folder
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scratch import final_place
+from coliags_plugin.core.text_files import text_lines
 from coliags_plugin.poses.format import Format
 from coliags_plugin.poses.rigid import inverse, rigid, rotations_from_wxyz, wxyz_from_rotations
-from coliags_plugin.poses.text import prefixed_errors, shortened, text_lines
+from coliags_plugin.poses.text import EXPECTED, prefixed_errors, shortened
 from coliags_plugin.poses.trajectory import Trajectory, natural_order, refuse_repeated
 
 if TYPE_CHECKING:
@@ -205,7 +206,7 @@ def _incomplete(folder: Path) -> InputError:
 
 
 def _text_images(path: Path) -> Iterator[_Image]:
-    lines = text_lines(path)
+    lines = text_lines(path, EXPECTED)
     for number, line in lines:
         if not line.strip() or line.lstrip().startswith("#"):
             continue
@@ -233,7 +234,7 @@ def read_text_cameras(path: Path) -> dict[int, Intrinsics | str]:
         InputError: The file cannot be read, or a line is not a camera; the message names the line.
     """
     cameras: dict[int, Intrinsics | str] = {}
-    for number, line in text_lines(path):
+    for number, line in text_lines(path, EXPECTED):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue

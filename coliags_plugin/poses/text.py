@@ -10,34 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.text_files import text_lines
 
+#: What readers of poses expect.
+EXPECTED = "a text file of poses"
 #: Bytes of a file read to recognise it.
 _HEAD_BYTES = 65_536
-
-
-def read_text(path: Path, expected: str = "a text file of poses") -> str:
-    """Read a UTF-8 text file with or without a byte order mark.
-
-    Raises:
-        InputError: The file cannot be read, or is not text.
-    """
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read {path}: {error}", expected) from error
-
-
-def text_lines(path: Path, expected: str = "a text file of poses") -> Iterator[tuple[int, str]]:
-    """The lines of a UTF-8 text file with their numbers, from 1, one after the other: files may be large.
-
-    Raises:
-        InputError: The file cannot be read, or is not text.
-    """
-    try:
-        with path.open(encoding="utf-8-sig") as file:
-            yield from enumerate(file, start=1)
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read {path}: {error}", expected) from error
 
 
 def read_numbers(
@@ -56,7 +34,7 @@ def read_numbers(
         InputError: The file cannot be read or holds no rows, or a line is invalid; the message names the line.
     """
     rows: list[tuple[int, list[float]]] = []
-    for number, line in text_lines(path):
+    for number, line in text_lines(path, EXPECTED):
         words = _words(line)
         if not words or (comments and words[0].startswith("#")):
             continue

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.json_files import parse_json, read_json
+from coliags_plugin.core.json_files import json_text, parse_json, read_json
 from coliags_plugin.reporting.study import Cell, Failure
 from coliags_plugin.results.reading import RESULT_FILE, read_result
 
@@ -113,7 +113,7 @@ def _run_of(folder: Path, stem: str, key: str, protocol: str) -> Path | None:
     seed = stem.partition("-")[0]
     for run in sorted(folder.glob(f"{seed}-*")):
         try:
-            content = parse_json((run / "eval" / protocol / RESULT_FILE).read_text(encoding="utf-8"))
+            content = parse_json(json_text(run / "eval" / protocol / RESULT_FILE))
         except (OSError, ValueError):
             continue
         if isinstance(content, dict) and content.get("key") == key:

@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import parse_json
+from coliags_plugin.core.text_files import text_lines
 
 _COLUMNS = ("step", "loss", "psnr", "seconds")
 
@@ -29,23 +30,19 @@ def read_training_log(run: Path) -> dict[str, Float[np.ndarray, "L"]]:
     path = run / "metrics.jsonl"
     if not path.is_file():
         return {}
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be read: {error}", "the training log") from error
-    lines = []
-    for number, line in enumerate(text.splitlines(), start=1):
-        if not line.strip():
-            continue
-        try:
-            values = parse_json(line)
-        except ValueError as error:
-            raise InputError(f"{path}, line {number} is not JSON: {error}", "one JSON object per line") from error
-        if not isinstance(values, dict):
-            raise InputError(f"{path}, line {number} holds a {type(values).__name__}", "one JSON object per line")
-        lines.append(values)
-    table = {name: np.array([_number(values.get(name)) for values in lines], dtype=np.float64) for name in _COLUMNS}
+    rows = [_row(path, number, line) for number, line in text_lines(path, "the training log") if line.strip()]
+    table = {name: np.array([_number(values.get(name)) for values in rows], dtype=np.float64) for name in _COLUMNS}
     return {name: values for name, values in table.items() if np.isfinite(values).any()}
+
+
+def _row(path: Path, number: int, line: str) -> dict[str, Any]:
+    try:
+        values = parse_json(line)
+    except ValueError as error:
+        raise InputError(f"{path}, line {number} is not JSON: {error}", "one JSON object per line") from error
+    if not isinstance(values, dict):
+        raise InputError(f"{path}, line {number} holds a {type(values).__name__}", "one JSON object per line")
+    return values
 
 
 def _number(value: Any) -> float:

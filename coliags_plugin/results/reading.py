@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
-from coliags_plugin.core.json_files import parse_json
+from coliags_plugin.core.json_files import json_text, parse_json
 from coliags_plugin.core.settings import first_error
 from coliags_plugin.results.hashing import metrics_sha256
 from coliags_plugin.results.record import FORMAT, VERSION, Result
@@ -44,7 +44,7 @@ def read_result(path: Path) -> Result:
             wrong type, or its values are not those that were written.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = json_text(path)
     except FileNotFoundError as error:
         raise InputError(f"there is no file {path}", _EXPECTED) from error
     except (OSError, ValueError) as error:

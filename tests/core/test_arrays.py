@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import io
+import sys
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -86,3 +89,39 @@ def test_any_damage_is_an_input_error(data, tmp_path_factory):
 def test_arrays_survive_a_round_trip(tmp_path):
     np.save(tmp_path / "a.npy", np.arange(5))
     assert read_array(tmp_path / "a.npy", EXPECTED).tolist() == [0, 1, 2, 3, 4]
+
+
+class _Collected:
+    """Garbage whose collection lets other threads run."""
+
+    def __init__(self):
+        self.me = self
+
+    def __del__(self):
+        for _ in range(20):
+            pass
+
+
+@pytest.fixture
+def restless_threads():
+    """Threads that take turns as often as they can, while garbage is collected all the time."""
+    interval, threshold = sys.getswitchinterval(), gc.get_threshold()
+    sys.setswitchinterval(1e-6)
+    gc.set_threshold(50)
+    yield
+    sys.setswitchinterval(interval)
+    gc.set_threshold(*threshold)
+
+
+@pytest.mark.usefixtures("restless_threads")
+def test_threads_read_at_once(tmp_path):
+    np.save(tmp_path / "a.npy", np.arange(12.0))
+    np.savez(tmp_path / "a.npz", one=np.arange(12.0))
+
+    def read(_):
+        _Collected()
+        array = read_array(tmp_path / "a.npy", EXPECTED)
+        return float(array.sum() + read_arrays(tmp_path / "a.npz", EXPECTED, ["one"])["one"].sum())
+
+    with ThreadPoolExecutor(8) as pool:
+        assert set(pool.map(read, range(1500))) == {132.0}

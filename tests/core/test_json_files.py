@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import pytest
 
+from coliags_plugin.core.bounds import JSON_BYTES
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import read_json
 
@@ -20,6 +21,7 @@ def test_values_with_and_without_a_byte_order_mark(tmp_path, content):
         (b"\xff\xfe", "cannot read"),
         (b"[" * 100_000, "is not JSON"),
         (b"9" * 5000, "is not JSON"),
+        (b" " * (JSON_BYTES + 1), "it has 100,000,001 bytes"),
     ],
 )
 def test_anything_else_is_a_message(tmp_path, content, message):

@@ -347,6 +347,13 @@ def test_moments_and_random_states_of_another_run_are_refused(tmp_path):
     for name in ("optimizer/none/0/exp_avg", "optimizer/anchors", "generator/none", "generator/frame_order"):
         with pytest.raises(InputError, match=r"moments are of another optimizer|random state does not fit"):
             trainer._restore(replace(whole, tensors={**whole.tensors, name: torch.zeros(3)}))
+    moments = [name for name in whole.tensors if name.startswith("optimizer/") and not name.endswith("/step")]
+    for name in moments:
+        for spoiled in ({}, {name: whole.tensors[name][:-1]}, {name: whole.tensors[name].double()}):
+            others = {key: value for key, value in whole.tensors.items() if key != name}
+            with pytest.raises(InputError, match="moments are of another optimizer"):
+                trainer._restore(replace(whole, tensors=others | spoiled))
+    trainer._restore(whole)
 
 
 def test_every_flipped_byte_of_a_checkpoint_is_noticed(tmp_path):

@@ -123,7 +123,7 @@ def _header_token(data: bytes, index: int, text: str, times: int = 1) -> bytes:
     """Replace a token of the text that a binary file begins with; lengths that follow from it are made right."""
     new = (text * times).encode("utf-8", "surrogatepass")
     if data[:4] == b"glTF":
-        length = struct.unpack_from("<I", data, 12)[0]
+        length = min(struct.unpack_from("<I", data, 12)[0], len(data))
         header = _token(data[20 : 20 + length], index, text, times).ljust(-(-length // 4) * 4)
         header += b" " * (-len(header) % 4)
         rest = data[20 + length :]

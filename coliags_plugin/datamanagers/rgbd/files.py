@@ -14,12 +14,13 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.scenes import PointCloud
+from coliags_plugin.core.text_files import read_text, text_lines
 from coliags_plugin.datamanagers.reading.camera_json import read_intrinsics
 from coliags_plugin.datamanagers.reading.frame_files import DEPTH_SUFFIXES, IMAGE_SUFFIXES, inventory
 from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.poses import tum
 from coliags_plugin.poses.colmap import read_text_cameras
-from coliags_plugin.poses.text import read_text, shortened, text_lines
+from coliags_plugin.poses.text import shortened
 
 IMAGE_FOLDERS = ("rgb", "color", "images")
 DEPTH_FOLDERS = ("depth", "depths")

@@ -1,0 +1,51 @@
+"""Reading text of unknown origin."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from coliags_plugin.core import bounds
+from coliags_plugin.core.errors import InputError
+
+
+def whole_text(path: Path, most: int = bounds.TEXT_BYTES) -> str:
+    """The content of a file in UTF-8, with or without a byte order mark.
+
+    Args:
+        path: The file.
+        most: Bytes that it may have.
+
+    Raises:
+        OSError: The file cannot be read.
+        ValueError: It is larger, or is not UTF-8.
+    """
+    size = path.stat().st_size
+    if size > most:
+        raise ValueError(f"it has {size:,} bytes, and at most {most:,} are read")
+    return path.read_text(encoding="utf-8-sig")
+
+
+def read_text(path: Path, expected: str) -> str:
+    """The content of a file, as :func:`whole_text`, for readers of what users wrote.
+
+    Raises:
+        InputError: The file cannot be read, is not text, or is too large.
+    """
+    try:
+        return whole_text(path)
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot read {path}: {error}", expected) from error
+
+
+def text_lines(path: Path, expected: str) -> Iterator[tuple[int, str]]:
+    """The lines of a UTF-8 text file with their numbers, from 1, one after the other: files may be large.
+
+    Raises:
+        InputError: The file cannot be read, or is not text.
+    """
+    try:
+        with path.open(encoding="utf-8-sig") as file:
+            yield from enumerate(file, start=1)
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read {path}: {error}", expected) from error
