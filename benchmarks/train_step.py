@@ -4,7 +4,8 @@
 
 Methods take turns step by step, and a ratio is the median over the turns of a method's time over that of the first
 method in the same turn, so that what else the machine does cancels. Every method is at the same share of its own run,
-where terms that begin late are active. ``train_stages.py`` splits the step of one method into stages.
+where terms that begin late are active. ``train_stages.py`` splits the step of one method into stages. On a machine that
+is busy with other work, --threads 1 --clock processor counts only the time that it gave to this.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 import tyro
@@ -46,6 +47,10 @@ class Options:
     """Image size WxH, pixels."""
     device: str = "cpu"
     """Where to compute."""
+    threads: int | None = None
+    """Of torch and of the kernels; torch's own choice where left out."""
+    clock: Literal["wall", "processor"] = "wall"
+    """Time passed, or what this process got of it, all its threads together."""
     json: Path | None = None
     """Also write the rows here."""
 
@@ -82,6 +87,9 @@ def matched_trainer(name: str, options: Options) -> Trainer:
 
 def main(options: Options) -> None:
     """Run, print a table, and write JSON where asked."""
+    if options.threads is not None:
+        torch.set_num_threads(options.threads)
+    clock = time.perf_counter if options.clock == "wall" else time.process_time
     names = options.methods.split(",")
     if options.methods == "all":
         names = sorted((name for name in method_files() if "/" not in name), key=lambda name: (name != "coliags", name))
@@ -91,11 +99,11 @@ def main(options: Options) -> None:
     for turn in range(options.steps + 3):
         for name, trainer in trainers.items():
             _wait(trainer)
-            began = time.perf_counter()
+            began = clock()
             trainer.take_step()
             _wait(trainer)
             if turn >= 3:
-                times[name].append(1e3 * (time.perf_counter() - began))
+                times[name].append(1e3 * (clock() - began))
     rows: list[dict[str, Any]] = []
     for name in names:
         shares = [own / first for own, first in zip(times[name], times[names[0]], strict=True)]

@@ -186,6 +186,7 @@ appearance_heads = Registry(
     {
         "plain": "coliags_plugin.fields.appearance_heads:PlainAppearanceHead",
         "imia": "coliags_plugin.fields.appearance_heads:IMIAAppearanceHead",
+        "imia-glints": "coliags_plugin.fields.glints:GlintAppearanceHead",
         "attenuated": "coliags_plugin.fields.attenuation:AttenuatedAppearanceHead",
     },
     noun="appearance head",

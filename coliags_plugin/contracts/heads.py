@@ -59,7 +59,7 @@ class AppearanceHead(Head):
 
     @property
     def uses_normals(self) -> bool:
-        """Whether :meth:`lit` is given the normals of the wall; default: not."""
+        """Whether :meth:`forward` and :meth:`lit` are given the normals of the wall; default: not."""
         return False
 
     def expect(self, distances: Float[Tensor, "D"]) -> None:
@@ -79,6 +79,7 @@ class AppearanceHead(Head):
         directions: Float[Tensor, "V 3"],
         distances: Float[Tensor, "V 1"],
         cosines: Float[Tensor, "V 1"],
+        normals: Float[Tensor, "V 3"] | None,
     ) -> Float[Tensor, "V K 3"]:
         """Decode the children's colours.
 
@@ -87,6 +88,8 @@ class AppearanceHead(Head):
             directions: Unit vectors from the camera (and lamp) to the anchors, world frame. [V, 3]
             distances: Camera to anchor, scene units (mm), not normalised. [V, 1]
             cosines: Of the angle between optical axis and direction, in [0, 1]. [V, 1]
+            normals: Unit normals of the wall at the anchors, world frame, of either sign; None for heads that use
+                none. [V, 3]
 
         Returns:
             RGB in (0, 1). [V, K, 3]

@@ -200,7 +200,8 @@ class AnchorField(GaussianField):
             distances, cosines = (values[:, None] for values in light.incidence(anchors))
 
         opacities, covariances = self.geometry_head(features, directions)
-        colors = self.appearance_head(features, directions, distances, cosines)
+        normals = None if self.normals is None else self.normals.index_select(0, visible)
+        colors = self.appearance_head(features, directions, distances, cosines, normals)
 
         slots = (opacities.reshape(-1) > 0.0).nonzero().squeeze(1)
         parents = slots // self.settings.children
@@ -209,7 +210,8 @@ class AnchorField(GaussianField):
         shifts = offsets.reshape(-1, 3).index_select(0, slots)
         means = anchors.index_select(0, parents) + shifts * scales[:, :3]
         drawn = colors.reshape(-1, 3).index_select(0, slots)
-        normals = None if self.normals is None else self.normals.index_select(0, visible).index_select(0, parents)
+        if normals is not None:
+            normals = normals.index_select(0, parents)
         return Gaussians(
             means=means,
             quats_wxyz=nn.functional.normalize(covariances[:, 3:], dim=1),

@@ -42,14 +42,23 @@ class PlainAppearanceHead(AppearanceHead):
         self.settings = settings
         self.children_per_anchor = children
         self.features = features
-        embedded = self.embed(torch.zeros(1, 3), torch.zeros(1, 1), torch.zeros(1, 1)).shape[1]
-        self.color_mlp = mlp(features + embedded, settings.hidden, 3 * children, generator)
+        self.color_mlp = mlp(features + self.embedded_channels, settings.hidden, 3 * children, generator)
 
     def embed(
-        self, directions: Float[Tensor, "V 3"], distances: Float[Tensor, "V 1"], cosines: Float[Tensor, "V 1"]
+        self,
+        features: Float[Tensor, "V F"],
+        directions: Float[Tensor, "V 3"],
+        distances: Float[Tensor, "V 1"],
+        cosines: Float[Tensor, "V 1"],
+        normals: Float[Tensor, "V 3"] | None,
     ) -> Float[Tensor, "V E"]:
-        """Inputs of the MLP besides the feature."""
+        """Inputs of the MLP besides the feature; arguments as of :meth:`forward`."""
         return torch.cat([directions, distances], dim=1) if self.sees_distance else directions
+
+    @property
+    def embedded_channels(self) -> int:
+        """Number of inputs besides the feature."""
+        return self.direction_channels + self.sees_distance
 
     @property
     def direction_channels(self) -> int:
@@ -94,11 +103,12 @@ class PlainAppearanceHead(AppearanceHead):
         directions: Float[Tensor, "V 3"],
         distances: Float[Tensor, "V 1"],
         cosines: Float[Tensor, "V 1"],
+        normals: Float[Tensor, "V 3"] | None,
     ) -> Float[Tensor, "V K 3"]:
         """Decode the children's colours."""
         layers: list[Any] = list(self.color_mlp)
         first, activation, last = layers
-        embedded = self.embed(directions, distances, cosines)
+        embedded = self.embed(features, directions, distances, cosines, normals)
         hidden = activation(first_layer(features, embedded, first.weight, first.bias))
         return last(hidden).view(len(features), self.children_per_anchor, 3).sigmoid()
 
@@ -107,7 +117,6 @@ class IMIAAppearanceSettings(AppearanceSettings):
     """Options of IMIA."""
 
     frequencies: int = Field(default=5, ge=0)  # of gamma, for the cosine
-    direction_frequencies: int = Field(default=0, ge=0)  # of gamma, for v; 0: v alone, as in the paper
 
 
 class IMIAAppearanceHead(PlainAppearanceHead):
@@ -120,19 +129,22 @@ class IMIAAppearanceHead(PlainAppearanceHead):
     Settings: ClassVar[type[Settings]] = IMIAAppearanceSettings
 
     @property
-    def direction_channels(self) -> int:
-        """Those of gamma(v)."""
-        return 3 * (1 + 2 * int(self.settings.direction_frequencies))
-
-    @property
     def sees_distance(self) -> bool:
         """Always."""
         return True
 
+    @property
+    def embedded_channels(self) -> int:
+        """Those of v and d, and of gamma(cos theta)."""
+        return super().embedded_channels + 1 + 2 * int(self.settings.frequencies)
+
     def embed(
-        self, directions: Float[Tensor, "V 3"], distances: Float[Tensor, "V 1"], cosines: Float[Tensor, "V 1"]
+        self,
+        features: Float[Tensor, "V F"],
+        directions: Float[Tensor, "V 3"],
+        distances: Float[Tensor, "V 1"],
+        cosines: Float[Tensor, "V 1"],
+        normals: Float[Tensor, "V 3"] | None,
     ) -> Float[Tensor, "V E"]:
-        """gamma(v), d and gamma(cos theta): 3 + 1 + 11 numbers with no frequencies for v and five for the cosine."""
-        settings = self.settings
-        seen = cosine_embedding(directions, settings.direction_frequencies)
-        return torch.cat([seen, distances, cosine_embedding(cosines, settings.frequencies)], dim=1)
+        """v, d and gamma(cos theta): 3 + 1 + 11 numbers with five frequencies."""
+        return torch.cat([directions, distances, cosine_embedding(cosines, self.settings.frequencies)], dim=1)

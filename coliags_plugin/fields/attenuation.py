@@ -69,8 +69,8 @@ class AttenuatedAppearanceHead(AppearanceHead):
 
     @property
     def uses_normals(self) -> bool:
-        """True where the law has an exponent of incidence."""
-        return self.settings.incidence_exponent is not None
+        """Whether the law has an exponent of incidence, or the head below uses them."""
+        return self._knows_incidence or self.head.uses_normals
 
     @torch.no_grad()
     def expect(self, distances: Float[Tensor, "D"]) -> None:
@@ -105,15 +105,21 @@ class AttenuatedAppearanceHead(AppearanceHead):
         directions: Float[Tensor, "V 3"],
         distances: Float[Tensor, "V 1"],
         cosines: Float[Tensor, "V 1"],
+        normals: Float[Tensor, "V 3"] | None,
     ) -> Float[Tensor, "V K 3"]:
         """The colours before attenuation."""
-        colors: Tensor = self.head(features, directions, distances, cosines)
+        colors: Tensor = self.head(features, directions, distances, cosines, normals)
         return colors
 
     @property
     def offset(self) -> Float[Tensor, "3"]:
         """Position of the lamp in camera axes, scene units. [3]"""
         return MAX_OFFSET * torch.tanh(self.lamp_offset / MAX_OFFSET)
+
+    @property
+    def _knows_incidence(self) -> bool:
+        """Whether the law has an exponent of incidence."""
+        return self.settings.incidence_exponent is not None
 
     @property
     def _angles(self) -> int:
@@ -135,21 +141,16 @@ class AttenuatedAppearanceHead(AppearanceHead):
         """
         relative = (distances / self.reference).clamp_min(_MIN_DISTANCE)
         logs = [relative.log(), cosines.clamp_min(_MIN_COSINE).log()]
-        if self.uses_normals:
+        if self._knows_incidence:
             facing = torch.ones_like(distances) if incidences is None else incidences.clamp_min(_MIN_INCIDENCE)
             logs.append(facing.log())
         return (torch.stack(logs, dim=1) @ self.exponents.T).exp()
 
     def attenuation(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N C"]:
         """That of a wall which faces the lamp; see :meth:`AppearanceHead.attenuation`."""
-        return self._of(points, None)
-
-    def _of(self, points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"] | None) -> Float[Tensor, "N C"]:
-        """The law at points with normals in camera axes. [N, C]"""
         rays = points - self.offset
         distances = rays.norm(dim=1).clamp_min(1e-9)
-        incidences = None if normals is None else (normals * rays).sum(1).abs() / distances
-        return self.law(distances, rays[:, 2] / distances, incidences)
+        return self.law(distances, rays[:, 2] / distances)
 
     def lit(
         self,
@@ -161,12 +162,14 @@ class AttenuatedAppearanceHead(AppearanceHead):
     ) -> Float[Tensor, "N 3"]:
         """The colours under the lamp, which does not move Gaussians: positions get no gradient from it."""
         positions = positions.detach()
+        facing = normals if self._knows_incidence else None
         if light is not None:
-            incidences = None if normals is None else (light.towards(positions, normals) * normals).sum(1).abs()
+            incidences = None if facing is None else (light.towards(positions, facing) * facing).sum(1).abs()
             return colors * self.law(*light.incidence(positions), incidences)
-        axes = camera.camera_to_world[:3, :3]
-        turned = None if normals is None else normals @ axes
-        return colors * self._of((positions - camera.center) @ axes, turned)
+        rays = positions - (camera.center + camera.camera_to_world[:3, :3] @ self.offset)
+        distances = rays.norm(dim=1).clamp_min(1e-9)
+        incidences = None if facing is None else (facing * rays).sum(1).abs() / distances
+        return colors * self.law(distances, (rays @ camera.optical_axis) / distances, incidences)
 
     @property
     def learned(self) -> dict[str, Any]:

@@ -66,13 +66,15 @@ class CameraResponse(ResponseModule):
         knee, segments = self.settings.knee, self.settings.segments
         length = (_TOP - knee) / segments
         slopes = self.log_slope.exp().clamp(_LEAST_SLOPE, 1.0 / _LEAST_SLOPE)
-        rises = knee + length * slopes.cumsum(0)
-        starts = torch.cat([slopes.new_tensor([0.0, knee]), rises[:-1]])  # of the part below the knee first
-        slopes = torch.cat([slopes.new_ones(1), slopes])
+        starts = torch.cat([slopes.new_tensor([knee]), (knee + length * slopes.cumsum(0))[:-1]])
+        flat = colors.reshape(-1)
+        bent = (flat > knee).nonzero().squeeze(1)
+        bright = flat.index_select(0, bent)
         with torch.no_grad():
-            segment = ((colors - knee) / length).floor().clamp(-1, segments - 1).nan_to_num(-1).long()
-            origins = torch.where(segment < 0, 0.0, knee + length * segment)
-        return starts[segment + 1] + slopes[segment + 1] * (colors - origins)
+            segment = ((bright - knee) / length).clamp(0, segments - 1).long()
+            origins = knee + length * segment
+        values = starts.index_select(0, segment) + slopes.index_select(0, segment) * (bright - origins)
+        return flat.index_copy(0, bent, values).view_as(colors)
 
     def shade(self, output: RenderOutput, view: View | None) -> RenderOutput:
         """Apply the curve to the colours."""

@@ -42,7 +42,6 @@ def test_scaffold_and_coliags_differ_in_heads_only():
     assert ours["field"].pop("appearance_head") == {
         "name": "imia",
         "frequencies": 5,
-        "direction_frequencies": 0,
         **appearance,
     }
     assert rival["field"].pop("geometry_head") == {"name": "plain", "hidden": 32}

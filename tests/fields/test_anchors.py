@@ -205,7 +205,7 @@ def test_anchors_behind_the_camera_have_cosine_zero():
     seen = {}
     head = field.appearance_head
     embed = head.embed
-    head.embed = lambda v, d, c: seen.setdefault("cosines", c) is None or embed(v, d, c)
+    head.embed = lambda f, v, d, c, n: seen.setdefault("cosines", c) is None or embed(f, v, d, c, n)
     with torch.no_grad():
         field.anchors[:, 2] = 0.05  # abeam, some of them behind, but large enough to reach the image
         field.scalings.fill_(3.0)
@@ -246,7 +246,7 @@ def test_same_seed_same_field():
     ("head", "column"),
     [
         ({"name": "imia"}, 32 + 3),
-        ({"name": "imia", "direction_frequencies": 6}, 32 + 39),
+        ({"name": "imia-glints"}, 32 + 11),
         ({"name": "plain", "distance": True}, 32 + 3),
     ],
 )
@@ -267,15 +267,6 @@ def test_hidden_units_start_over_the_distances_that_occur(head, column):
     torch.testing.assert_close(on_kink, before.bias, atol=1e-5, rtol=0.0)
 
 
-def test_frequencies_on_the_direction_are_further_inputs():
-    wide = make_field(COLIAGS, appearance_head={"name": "imia", "direction_frequencies": 6})
-    assert wide.appearance_head.color_mlp[0].weight.shape == (32, 32 + 39 + 1 + 11)
-    directions = torch.nn.functional.normalize(torch.randn(5, 3, generator=torch.Generator().manual_seed(0)), dim=1)
-    embedded = wide.appearance_head.embed(directions, torch.full((5, 1), 7.0), directions[:, 2:].abs())
-    torch.testing.assert_close(embedded[:, 3 + 6 * 5 : 3 + 6 * 5 + 3], (32 * directions).sin())
-    assert embedded[:, 39].tolist() == [7.0] * 5
-
-
 def test_few_units_start_dead():
     """Over a colon's distances in mm, features 0; by default more than a third of the units are never active."""
     distances = torch.linspace(5.0, 100.0, 500)
@@ -285,9 +276,9 @@ def test_few_units_start_dead():
     for start in ("scene_distances", "pytorch"):
         head = IMIAAppearanceHead(IMIAAppearanceSettings(bias_init=start), 32, 10, generator.manual_seed(1))
         head.expect(distances)
-        inputs = torch.cat(
-            [torch.zeros(500, 32), head.embed(directions, distances[:, None], directions[:, 2:].abs())], dim=1
-        )
+        features = torch.zeros(500, 32)
+        embedded = head.embed(features, directions, distances[:, None], directions[:, 2:].abs(), None)
+        inputs = torch.cat([features, embedded], dim=1)
         dead[start] = int((head.color_mlp[0](inputs) <= 0).all(dim=0).sum())
     assert dead["scene_distances"] <= 2
     assert dead["pytorch"] >= 11
