@@ -95,7 +95,8 @@ def render_run(
                 write_png(folder / channel / f"{frame.name}.png", eight_bit(_as_rgb(view[channel])))
             progress.update(count)
         write_png(folder / "depth_scale.png", color_bar(limits, unit, "depth"))
-        write_png(folder / "depth_error_scale.png", color_bar((0.0, DEPTH_ERROR_LIMIT_MM), unit, "error"))
+        if (folder / "depth_error").exists():  # some frame has true depth
+            write_png(folder / "depth_error_scale.png", color_bar((0.0, DEPTH_ERROR_LIMIT_MM), unit, "error"))
         if not trained.relit:
             write_png(folder / "rgb_error_scale.png", color_bar((0.0, RGB_ERROR_LIMIT), "of full scale", "error"))
         for light in (trained.lamp, trained.held):

@@ -18,6 +18,7 @@ import pytest
 
 from coliags_plugin import load_run
 from coliags_plugin.core.images import read_rgb
+from coliags_plugin.core.scenes import Frame
 from coliags_plugin.outputs.colormaps import hatch
 from coliags_plugin.outputs.image_files import read_depth_tiff
 from tests.commands import refused, run
@@ -96,7 +97,15 @@ def test_render_writes_images_scales_and_a_video(trained, tmp_path):
         assert [path.name for path in images] == ["0000_color.png", "0008_color.png", "0016_color.png"]
         assert read_rgb(images[0]).shape == (24, 32, 3)
     assert (tmp_path / "out" / "trajectory.mp4").stat().st_size > 0
-    assert (tmp_path / "out" / "depth_scale.png").is_file()
+    for scale in ("depth_scale", "rgb_error_scale", "depth_error_scale"):
+        assert (tmp_path / "out" / f"{scale}.png").is_file()
+
+
+def test_render_without_true_depth_has_no_scale_of_its_errors(trained, tmp_path, monkeypatch):
+    monkeypatch.setattr(Frame, "true_depth", None)
+    assert run("render", trained, "--no-video", "--output", tmp_path / "out") == 0
+    written = {path.name for path in (tmp_path / "out").iterdir()}
+    assert written == {"rgb", "depth", "rgb_error", "depth_scale.png", "rgb_error_scale.png"}
 
 
 @pytest.mark.parametrize("kind", ["accumulated", "expected", "median"])
