@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from coliags_plugin.reporting.study import Cell
+from coliags_plugin.results.identity import training_config
 
 
 def told_apart(cells: Sequence[Cell]) -> list[Cell]:
@@ -69,5 +70,5 @@ def _config(cell: Cell) -> str:
 
 
 def _config_hash(cell: Cell) -> str:
-    text = json.dumps([cell.result.config, cell.result.steps], sort_keys=True)
+    text = json.dumps([training_config(cell.result.config), cell.result.steps], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()

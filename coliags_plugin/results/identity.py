@@ -23,6 +23,18 @@ def plain_config(config: Mapping[str, Any]) -> dict[str, Any]:
     return plain
 
 
+def training_config(config: Mapping[str, Any]) -> dict[str, Any]:
+    """What of a resolved method config determines a trained model, as data of standard JSON."""
+    relevant = {name: value for name, value in plain_config(config).items() if name not in _IGNORED}
+    data = relevant.get("datamanager")
+    if isinstance(data, Mapping):
+        relevant["datamanager"] = {name: value for name, value in data.items() if name not in _IGNORED_OF_DATA}
+    schedule = relevant.get("schedule")
+    if isinstance(schedule, Mapping):
+        relevant["schedule"] = {name: value for name, value in schedule.items() if name not in _IGNORED_OF_SCHEDULE}
+    return relevant
+
+
 def training_key(config: Mapping[str, Any], fingerprint: str, seed: int, package_version: str) -> str:
     """Key of a trained model, 16 hexadecimal digits; how often is logged and saved does not count.
 
@@ -32,14 +44,7 @@ def training_key(config: Mapping[str, Any], fingerprint: str, seed: int, package
         seed: Of the run.
         package_version: Of this package.
     """
-    relevant = {name: value for name, value in plain_config(config).items() if name not in _IGNORED}
-    data = relevant.get("datamanager")
-    if isinstance(data, Mapping):
-        relevant["datamanager"] = {name: value for name, value in data.items() if name not in _IGNORED_OF_DATA}
-    schedule = relevant.get("schedule")
-    if isinstance(schedule, Mapping):
-        relevant["schedule"] = {name: value for name, value in schedule.items() if name not in _IGNORED_OF_SCHEDULE}
-    return _digest([relevant, fingerprint, seed, package_version])
+    return _digest([training_config(config), fingerprint, seed, package_version])
 
 
 def result_key(

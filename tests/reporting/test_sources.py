@@ -240,6 +240,13 @@ def test_seeds_of_one_config_are_one_method(study_of):
     assert labels(study_of(made_scenes({"a": 0, "b": 0}, scenes=2, seeds=2))) == ["a"] * 4 + ["b"] * 4
 
 
+def test_what_does_not_change_a_model_makes_no_other_method(study_of):
+    """A cell taken from an ablation keeps the description of its row."""
+    configs = [{"x": 1, "description": text, "schedule": {"log_every": seed}} for seed, text in enumerate("pq")]
+    study = study_of([result_of("a", seed=seed, config=config) for seed, config in enumerate(configs)])
+    assert labels(study) == ["a", "a"]
+
+
 def test_runs_of_one_method_are_told_apart(tmp_path, study_of):
     steps = study_of([result_of("a"), result_of("a", seed=1), result_of("a", steps=2000), result_of("b")])
     assert labels(steps) == ["a · 40 steps", "a · 40 steps", "a · 2,000 steps", "b"]
