@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from coliags_plugin.fields.appearance_heads import IMIAAppearanceHead
+from coliags_plugin.fields.embedding import cosine_embedding
 
 #: Widths of the lobes: sines of the angle at which each has fallen to 1 / e. The first is narrower than the lobe of a
 #: wet film, the last knows no more than the side from which the wall is seen.
@@ -55,13 +56,12 @@ class GlintAppearanceHead(IMIAAppearanceHead):
     ) -> Float[Tensor, "V E"]:
         """v, the facets' components and lobes, d and gamma(cos theta)."""
         assert normals is not None, "the field keeps normals, as uses_normals says"
-        along = tangent_components(directions, normals)
         tilts = MAX_TILT * self.tilt_layer(features).tanh()
-        across = along - tilts
+        across = tangent_components(directions, normals) - tilts
         squares = across.square().sum(1, keepdim=True)
         lobes = [torch.exp(squares * -(width**-2)) for width in WIDTHS]
-        rest = super().embed(features, directions, distances, cosines, normals)
-        return torch.cat([rest[:, :3], across, *lobes, rest[:, 3:]], dim=1)
+        angles = cosine_embedding(cosines, self.settings.frequencies)
+        return torch.cat([directions, across, *lobes, distances, angles], dim=1)
 
 
 def tangent_components(directions: Float[Tensor, "V 3"], normals: Float[Tensor, "V 3"]) -> Float[Tensor, "V 2"]:
