@@ -1,10 +1,11 @@
-"""What a benchmark prints about where it ran, and how it prints numbers."""
+"""What benchmarks share: clocks, the description of the machine, and how numbers are printed."""
 
 from __future__ import annotations
 
 import json
 import os
 import platform
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,9 @@ from typing import Any
 import torch
 
 from coliags_plugin.engine.devices import device_name
+
+#: Clocks in seconds, by the name that ``--clock`` takes: elapsed time, and processor time of this process.
+CLOCKS = {"wall": time.perf_counter, "processor": time.process_time}
 
 
 def describe_machine() -> dict[str, Any]:

@@ -17,7 +17,6 @@ from __future__ import annotations
 import math
 import os
 import statistics
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -27,7 +26,7 @@ os.environ.setdefault("GOMP_SPINCOUNT", "10000")
 
 import torch
 import tyro
-from machine import describe_machine, markdown_table, write_results
+from machine import CLOCKS, describe_machine, markdown_table, write_results
 from train_stages import Handed
 from workload import camera, lining, wall
 
@@ -62,9 +61,9 @@ class Options:
     repeats: int = 25
     """Timed turns; two more come first to warm up."""
     threads: int | None = None
-    """Of torch and of the kernels; torch's own choice where left out."""
+    """CPU threads of torch and of the numba kernels; default: as many as torch chooses."""
     clock: Literal["wall", "processor"] = "wall"
-    """Time passed, or what this process got of it, all its threads together."""
+    """Measure elapsed time, or the processor time of this process, summed over its threads."""
     patience: float = 15.0
     """Seconds that one renderer may take for one count before it skips turns."""
     json: Path | None = None
@@ -80,7 +79,7 @@ class Case:
         self.renderer = renderer
         self.primitive = primitive
         self.device = device
-        self.clock = time.perf_counter if clock == "wall" else time.process_time
+        self.clock = CLOCKS[clock]
         moved = {name: getattr(gaussians, name).to(device).requires_grad_() for name in INPUTS}
         self.gaussians = replace(gaussians, **moved)
         self.camera = camera().to(device)

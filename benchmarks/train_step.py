@@ -12,14 +12,13 @@ from __future__ import annotations
 
 import statistics
 import tempfile
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 import tyro
-from machine import describe_machine, markdown_table, write_results
+from machine import CLOCKS, describe_machine, markdown_table, write_results
 from tube import tube_scene
 
 from coliags_plugin.config.method_config import LoadedMethod, load_method
@@ -48,9 +47,9 @@ class Options:
     device: str = "cpu"
     """Where to compute."""
     threads: int | None = None
-    """Of torch and of the kernels; torch's own choice where left out."""
+    """CPU threads of torch and of the numba kernels; default: as many as torch chooses."""
     clock: Literal["wall", "processor"] = "wall"
-    """Time passed, or what this process got of it, all its threads together."""
+    """Measure elapsed time, or the processor time of this process, summed over its threads."""
     json: Path | None = None
     """Also write the rows here."""
 
@@ -89,7 +88,7 @@ def main(options: Options) -> None:
     """Run, print a table, and write JSON where asked."""
     if options.threads is not None:
         torch.set_num_threads(options.threads)
-    clock = time.perf_counter if options.clock == "wall" else time.process_time
+    clock = CLOCKS[options.clock]
     names = options.methods.split(",")
     if options.methods == "all":
         names = sorted((name for name in method_files() if "/" not in name), key=lambda name: (name != "coliags", name))

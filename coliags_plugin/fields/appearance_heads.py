@@ -42,28 +42,29 @@ class PlainAppearanceHead(AppearanceHead):
         self.settings = settings
         self.children_per_anchor = children
         self.features = features
-        self.color_mlp = mlp(features + self.embedded_channels, settings.hidden, 3 * children, generator)
+        seen = torch.zeros(1, self.direction_channels)
+        embedded = self.embed(seen, torch.zeros(1, 1), torch.zeros(1, 1)).shape[1]
+        self.color_mlp = mlp(features + embedded, settings.hidden, 3 * children, generator)
 
-    def embed(
+    def embed_direction(
         self,
         features: Float[Tensor, "V F"],
         directions: Float[Tensor, "V 3"],
-        distances: Float[Tensor, "V 1"],
-        cosines: Float[Tensor, "V 1"],
         normals: Float[Tensor, "V 3"] | None,
-    ) -> Float[Tensor, "V E"]:
-        """Inputs of the MLP besides the feature; arguments as of :meth:`forward`."""
-        return torch.cat([directions, distances], dim=1) if self.sees_distance else directions
-
-    @property
-    def embedded_channels(self) -> int:
-        """Number of inputs besides the feature."""
-        return self.direction_channels + self.sees_distance
+    ) -> Float[Tensor, "V D"]:
+        """What the MLP sees of the viewing direction; arguments as of :meth:`forward`."""
+        return directions
 
     @property
     def direction_channels(self) -> int:
-        """Inputs between the feature and the distance."""
+        """Channels of :meth:`embed_direction`, which lie between the feature and the distance."""
         return 3
+
+    def embed(
+        self, seen: Float[Tensor, "V D"], distances: Float[Tensor, "V 1"], cosines: Float[Tensor, "V 1"]
+    ) -> Float[Tensor, "V E"]:
+        """Inputs of the MLP besides the feature, of which the embedded direction comes first."""
+        return torch.cat([seen, distances], dim=1) if self.sees_distance else seen
 
     @property
     def sees_distance(self) -> bool:
@@ -108,7 +109,7 @@ class PlainAppearanceHead(AppearanceHead):
         """Decode the children's colours."""
         layers: list[Any] = list(self.color_mlp)
         first, activation, last = layers
-        embedded = self.embed(features, directions, distances, cosines, normals)
+        embedded = self.embed(self.embed_direction(features, directions, normals), distances, cosines)
         hidden = activation(first_layer(features, embedded, first.weight, first.bias))
         return last(hidden).view(len(features), self.children_per_anchor, 3).sigmoid()
 
@@ -133,18 +134,8 @@ class IMIAAppearanceHead(PlainAppearanceHead):
         """Always."""
         return True
 
-    @property
-    def embedded_channels(self) -> int:
-        """Those of v and d, and of gamma(cos theta)."""
-        return super().embedded_channels + 1 + 2 * int(self.settings.frequencies)
-
     def embed(
-        self,
-        features: Float[Tensor, "V F"],
-        directions: Float[Tensor, "V 3"],
-        distances: Float[Tensor, "V 1"],
-        cosines: Float[Tensor, "V 1"],
-        normals: Float[Tensor, "V 3"] | None,
+        self, seen: Float[Tensor, "V D"], distances: Float[Tensor, "V 1"], cosines: Float[Tensor, "V 1"]
     ) -> Float[Tensor, "V E"]:
         """v, d and gamma(cos theta): 3 + 1 + 11 numbers with five frequencies."""
-        return torch.cat([directions, distances, cosine_embedding(cosines, self.settings.frequencies)], dim=1)
+        return torch.cat([seen, distances, cosine_embedding(cosines, self.settings.frequencies)], dim=1)

@@ -149,8 +149,21 @@ class AttenuatedAppearanceHead(AppearanceHead):
     def attenuation(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N C"]:
         """That of a wall which faces the lamp; see :meth:`AppearanceHead.attenuation`."""
         rays = points - self.offset
+        return self._along(rays, rays[:, 2], None)
+
+    def _along(
+        self, rays: Float[Tensor, "N 3"], depths: Float[Tensor, "N"], normals: Float[Tensor, "N 3"] | None
+    ) -> Float[Tensor, "N C"]:
+        """The law at the ends of rays from the lamp, in any axes. [N, C]
+
+        Args:
+            rays: Scene units. [N, 3]
+            depths: Their components along the optical axis. [N]
+            normals: Of the wall at the ends, in the axes of the rays; None: it faces the lamp. [N, 3]
+        """
         distances = rays.norm(dim=1).clamp_min(1e-9)
-        return self.law(distances, rays[:, 2] / distances)
+        incidences = None if normals is None else (normals * rays).sum(1).abs() / distances
+        return self.law(distances, depths / distances, incidences)
 
     def lit(
         self,
@@ -167,9 +180,7 @@ class AttenuatedAppearanceHead(AppearanceHead):
             incidences = None if facing is None else (light.towards(positions, facing) * facing).sum(1).abs()
             return colors * self.law(*light.incidence(positions), incidences)
         rays = positions - (camera.center + camera.camera_to_world[:3, :3] @ self.offset)
-        distances = rays.norm(dim=1).clamp_min(1e-9)
-        incidences = None if facing is None else (facing * rays).sum(1).abs() / distances
-        return colors * self.law(distances, (rays @ camera.optical_axis) / distances, incidences)
+        return colors * self._along(rays, rays @ camera.optical_axis, facing)
 
     @property
     def learned(self) -> dict[str, Any]:

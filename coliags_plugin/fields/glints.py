@@ -9,7 +9,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from coliags_plugin.fields.appearance_heads import IMIAAppearanceHead
-from coliags_plugin.fields.embedding import cosine_embedding
 
 #: Widths of the lobes: sines of the angle at which each has fallen to 1 / e. The first is narrower than the lobe of a
 #: wet film, the last knows no more than the side from which the wall is seen.
@@ -46,22 +45,18 @@ class GlintAppearanceHead(IMIAAppearanceHead):
         """The MLP with the layer of the tilts."""
         return {"color_mlp": [*self.color_mlp.parameters(), *self.tilt_layer.parameters()]}
 
-    def embed(
+    def embed_direction(
         self,
         features: Float[Tensor, "V F"],
         directions: Float[Tensor, "V 3"],
-        distances: Float[Tensor, "V 1"],
-        cosines: Float[Tensor, "V 1"],
         normals: Float[Tensor, "V 3"] | None,
-    ) -> Float[Tensor, "V E"]:
-        """v, the facets' components and lobes, d and gamma(cos theta)."""
+    ) -> Float[Tensor, "V D"]:
+        """v, and the facets' components and lobes."""
         assert normals is not None, "the field keeps normals, as uses_normals says"
         tilts = MAX_TILT * self.tilt_layer(features).tanh()
         across = tangent_components(directions, normals) - tilts
         squares = across.square().sum(1, keepdim=True)
-        lobes = [torch.exp(squares * -(width**-2)) for width in WIDTHS]
-        angles = cosine_embedding(cosines, self.settings.frequencies)
-        return torch.cat([directions, across, *lobes, distances, angles], dim=1)
+        return torch.cat([directions, across, *(torch.exp(squares * -(width**-2)) for width in WIDTHS)], dim=1)
 
 
 def tangent_components(directions: Float[Tensor, "V 3"], normals: Float[Tensor, "V 3"]) -> Float[Tensor, "V 2"]:

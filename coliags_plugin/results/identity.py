@@ -24,7 +24,7 @@ def plain_config(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def training_config(config: Mapping[str, Any]) -> dict[str, Any]:
-    """What of a resolved method config determines a trained model, as data of standard JSON."""
+    """The settings of a resolved method config that determine the trained model, as data of standard JSON."""
     relevant = {name: value for name, value in plain_config(config).items() if name not in _IGNORED}
     data = relevant.get("datamanager")
     if isinstance(data, Mapping):

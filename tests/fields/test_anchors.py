@@ -205,7 +205,7 @@ def test_anchors_behind_the_camera_have_cosine_zero():
     seen = {}
     head = field.appearance_head
     embed = head.embed
-    head.embed = lambda f, v, d, c, n: seen.setdefault("cosines", c) is None or embed(f, v, d, c, n)
+    head.embed = lambda v, d, c: seen.setdefault("cosines", c) is None or embed(v, d, c)
     with torch.no_grad():
         field.anchors[:, 2] = 0.05  # abeam, some of them behind, but large enough to reach the image
         field.scalings.fill_(3.0)
@@ -276,9 +276,9 @@ def test_few_units_start_dead():
     for start in ("scene_distances", "pytorch"):
         head = IMIAAppearanceHead(IMIAAppearanceSettings(bias_init=start), 32, 10, generator.manual_seed(1))
         head.expect(distances)
-        features = torch.zeros(500, 32)
-        embedded = head.embed(features, directions, distances[:, None], directions[:, 2:].abs(), None)
-        inputs = torch.cat([features, embedded], dim=1)
+        inputs = torch.cat(
+            [torch.zeros(500, 32), head.embed(directions, distances[:, None], directions[:, 2:].abs())], dim=1
+        )
         dead[start] = int((head.color_mlp[0](inputs) <= 0).all(dim=0).sum())
     assert dead["scene_distances"] <= 2
     assert dead["pytorch"] >= 11

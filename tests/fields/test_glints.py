@@ -27,7 +27,8 @@ def unit(*vectors: tuple[float, float, float]) -> torch.Tensor:
 
 def embedded(head: GlintAppearanceHead, directions: torch.Tensor, normals: torch.Tensor) -> torch.Tensor:
     count = len(directions)
-    return head.embed(torch.ones(count, 4), directions, torch.full((count, 1), 7.0), torch.ones(count, 1), normals)
+    seen = head.embed_direction(torch.ones(count, 4), directions, normals)
+    return head.embed(seen, torch.full((count, 1), 7.0), torch.ones(count, 1))
 
 
 @settings(deadline=None)
@@ -54,7 +55,7 @@ def test_a_facet_without_tilt_glints_where_it_is_seen_along_the_normal():
     for index, width in enumerate(WIDTHS):
         aside = torch.tensor([[width, 0.0, math.sqrt(1.0 - width**2)]])
         torch.testing.assert_close(embedded(head, aside, normal)[0, 5 + index].item(), math.exp(-1.0))
-    assert embedded(head, unit((0.0, 0.0, 1.0)), normal).shape == (1, head.embedded_channels)
+    assert embedded(head, unit((0.0, 0.0, 1.0)), normal).shape == (1, head.color_mlp[0].in_features - 4)
     assert embedded(head, unit((0.0, 0.0, 1.0)), normal)[0, 5 + len(WIDTHS)] == 7.0
 
 
