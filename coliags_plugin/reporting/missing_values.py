@@ -74,19 +74,18 @@ def not_shown_notes(study: Study, part: Part, columns: Sequence[Column]) -> list
 
 
 def left_out_notes(study: Study, part: Part, columns: Sequence[Column]) -> list[str]:
-    """Which scenes the means leave out, once where all columns leave out the same."""
+    """Which scenes the means leave out, together for the columns that leave out the same."""
     scenes = study.scenes(part)
-    left_out: dict[str, tuple[str, ...]] = {}
+    titles: dict[tuple[str, ...], list[str]] = {}
     for column in columns:
         values = study.values(part, column.key)
         shared = shared_scenes(values)
         if any(values.values()):
-            left_out[column.title] = tuple(scene for scene in scenes if scene not in shared)
-    if len(set(left_out.values())) == 1:
-        left_out = {"": next(iter(left_out.values()))}
+            titles.setdefault(tuple(scene for scene in scenes if scene not in shared), []).append(column.title)
     return [
-        f"{f'{title}: m' if title else 'M'}eans over {len(scenes) - len(missing)} of {len(scenes)} scenes, without "
-        f"{', '.join(missing)}, which not every method has"
-        for title, missing in left_out.items()
+        ("Means" if len(titles) == 1 else f"{'; '.join(columns_of)}: means")
+        + f" over {len(scenes) - len(missing)} of {len(scenes)} scenes, without {', '.join(missing)}, "
+        "which not every method has"
+        for missing, columns_of in titles.items()
         if missing
     ]
