@@ -58,7 +58,7 @@ class FrameGain(GainModule):
         self.settings = settings
         self.frames = FrameRows(scene)
         self._reference = None if settings.reference is None else self.frames.require(settings.reference, "gain")
-        self._metering = Metering(scene, self.frames) if settings.untrained == "metered" else None
+        self.metering = Metering(scene, self.frames) if settings.untrained == "metered" else None
         self.log_gain = nn.Parameter(torch.zeros(len(self.frames), settings.channels))
         self.register_buffer("fitted", torch.zeros_like(self.log_gain))
         self.register_buffer("rate", torch.ones(()))
@@ -85,7 +85,7 @@ class FrameGain(GainModule):
         """Gain of views that are not training frames."""
         if self.settings.untrained == "mean":
             return "views without training have the mean gain of the training frames"
-        corrected = "" if self._metering is None else " and corrected for their brightness, as automatic exposure does"
+        corrected = "" if self.metering is None else " and corrected for their brightness, as automatic exposure does"
         return (
             f"views without training have a gain interpolated between the training frames before and after them"
             f"{corrected}; views beside the video that of the nearest training camera"
@@ -124,14 +124,17 @@ class FrameGain(GainModule):
 
     def shade(self, output: RenderOutput, view: View | None) -> RenderOutput:
         """Multiply the colours."""
+        row = self.frames.row(view)
+        if self.metering is not None and row is not None and self.training and output.rgb.requires_grad:
+            self.metering.remember(row, output.rgb)
         return replace(output, rgb=output.rgb * self.gain(view) * self._metered(output.rgb, view))
 
     @torch.no_grad()
     def _metered(self, rgb: Float[Tensor, "H W 3"], view: View | None) -> float:
         """Factor on the gain of a held-out frame of the video; 1 for all other views."""
-        if self._metering is None or view is None or self.frames.row(view) is not None or self.frames.is_beside(view):
+        if self.metering is None or view is None or self.frames.row(view) is not None or self.frames.is_beside(view):
             return 1.0
-        return math.exp(self._metering.correction(self.log_gains(), rgb, *self.frames.neighbours(view)))
+        return math.exp(self.metering.correction(self.log_gains(), rgb, *self.frames.neighbours(view)))
 
     @property
     def learned(self) -> dict[str, Any]:

@@ -6,46 +6,62 @@ from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.modules.frame_rows import FrameRows
 
 #: Frames on either side of those that the response is fitted on, at least.
 _FEWEST = 3
-#: Least brightness, of encoded colours in [0, 1].
+#: Least brightness, of encoded colours in [0, 1]; more than 0, which stands for none.
 _DARKEST = 1e-3
 
 
-class Metering:
+class Metering(nn.Module):
     """Correction of gains interpolated in time, from the brightness of a rendered view (docs/methods.md 4.7).
 
+    Brightness is that of renderings before gain and response curve, of training frames too: what these recorded is
+    compressed where it is bright, and clipped.
+
     Args:
-        scene: The scene, of whose training frames the brightness is measured, where all of their masks are True.
+        scene: The scene; brightness is measured where all masks of its training frames are True.
         frames: Rows of the training frames.
+
+    Attributes:
+        brightness: Mean colour of every training frame when it was last rendered in training; 0 before that. [F]
     """
 
+    brightness: Tensor
+
     def __init__(self, scene: Scene, frames: FrameRows) -> None:
+        super().__init__()
         self._scene, self._frames = scene, frames
+        self.register_buffer("brightness", torch.zeros(len(frames)))
 
     @cached_property
     def _valid(self) -> Bool[Tensor, "H W"] | None:
         return _common_valid(self._scene)
 
-    @cached_property
-    def _recorded(self) -> Float[Tensor, "F"]:
-        """Log brightness of the training frames' images, computed on first use. [F]"""
-        return torch.stack([self.log_brightness(frame.rgb) for frame in self._scene.train])
+    @torch.no_grad()
+    def remember(self, row: int, rgb: Float[Tensor, "H W 3"]) -> None:
+        """Keep the brightness of a training frame.
 
-    def log_brightness(self, rgb: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
-        """Logarithm of the mean colour, where all training frames are valid. []"""
-        colors = rgb.cpu() if self._valid is None or self._valid.shape != rgb.shape[:2] else rgb.cpu()[self._valid]
-        return colors.double().mean().clamp_min(_DARKEST).log()
+        Args:
+            row: Of the frame.
+            rgb: Its rendering before its gain.
+        """
+        self.brightness[row] = self._measure(rgb)
+
+    def _measure(self, rgb: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
+        """Mean colour where all training frames are valid. []"""
+        valid = self._valid
+        colors = rgb if valid is None or valid.shape != rgb.shape[:2] else rgb[valid.to(rgb.device)]
+        return colors.mean().clamp_min(_DARKEST)
 
     def correction(
         self, log_gains: Float[Tensor, "F C"], rgb: Float[Tensor, "H W 3"], before: int, after: int, share: float
     ) -> float:
-        """What to add to log gains interpolated between two training frames.
+        """What to add to log gains interpolated between two training frames; 0 before all have been rendered.
 
         A view that is brighter than interpolation between the two frames would make it has a smaller gain, by as much
         as training frames had that lie as far from others.
@@ -57,10 +73,17 @@ class Metering:
             after: Row of the frame after.
             share: Place of the view between them, in [0, 1].
         """
-        gains = log_gains.detach().cpu().double().mean(1)
-        seen = self._recorded - gains
+        if not self.brightness.all():
+            return 0.0
+        seen = self._logs
         expected = torch.lerp(seen[before], seen[after], share)
-        return float(self.response(gains, before, after) * (self.log_brightness(rgb) - expected))
+        gains = log_gains.detach().cpu().double().mean(1)
+        return self.response(gains, before, after) * float(self._measure(rgb).cpu().double().log() - expected)
+
+    @property
+    def _logs(self) -> Float[Tensor, "F"]:
+        """Logarithm of the brightness of the training frames. [F]"""
+        return self.brightness.cpu().double().log()
 
     def response(self, gains: Float[Tensor, "F"], before: int, after: int) -> float:
         """Change of the log gain per change of log brightness over a gap in time, from -1 to 0.
@@ -75,7 +98,7 @@ class Metering:
         """
         times = torch.tensor(self._frames.times, dtype=torch.float64)
         gap = float(times[after] - times[before])
-        levels = torch.stack([gains, self._recorded - gains])
+        levels = torch.stack([gains, self._logs])
         most = (len(times) - _FEWEST) // 2
         if most < 1:
             return 0.0

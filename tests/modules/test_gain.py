@@ -116,40 +116,41 @@ def test_known_gains_are_found(tmp_path):
     assert (found / expected - 1).abs().max() < 0.01
 
 
+def rendering(level, *, in_training=False):
+    """A rendering of one grey level."""
+    return RenderOutput(torch.full((24, 32, 3), level, requires_grad=in_training), torch.ones(24, 32), None, {})
+
+
 def exposed(frames=33, answer=-0.6, gap=1):
-    """A module whose gains answer the brightness of training frames exactly, held-out views, and that answer's law."""
+    """A module whose gains answer the brightness of training frames exactly, its scene, and that law's constant."""
     scene = wall_scene(frames)
-    scene = replace(
-        scene,
-        train=[
-            replace(frame, image=(frame.image * (0.5 + 0.2 * math.sin(0.9 * index))).to(torch.uint8))
-            for index, frame in enumerate(scene.train)
-            if index % gap == 0
-        ],
-    )
+    kept = range(0, len(scene.train), gap)
+    scene = replace(scene, train=[scene.train[index] for index in kept])
     module = FrameGain.from_scene(scene, FrameGainSettings(untrained="metered"), torch.Generator())
-    recorded = torch.stack([frame.rgb.double().mean().log() for frame in scene.train])
-    # gain = answer * brightness + const, and recorded = brightness + gain.
-    gains = answer / (1.0 + answer) * (recorded - recorded.mean())
+    levels = torch.tensor([0.5 + 0.2 * math.sin(0.9 * index) for index in kept])
+    for frame, level in zip(scene.train, levels, strict=True):
+        module.shade(rendering(float(level), in_training=True), frame.view(trained=True))
+    brightness = levels.double().log()
+    gains = answer * (brightness - brightness.mean())
     with torch.no_grad():
         module.log_gain.copy_(gains[:, None])
-    return module, scene, float((gains - answer * (recorded - gains)).mean())
+    return module, scene, float((gains - answer * brightness).mean())
 
 
 @pytest.mark.parametrize(("answer", "gap"), [(-0.6, 1), (-0.3, 1), (-0.6, 2)])
 def test_held_out_frames_are_exposed_as_training_frames_of_their_brightness(answer, gap):
     module, scene, constant = exposed(answer=answer, gap=gap)
     for frame, level in zip(scene.test_sets["test"], (0.2, 0.4, 0.6, 0.3, 0.5), strict=True):
-        output = RenderOutput(torch.full((24, 32, 3), level), torch.ones(24, 32), None, {})
+        output = rendering(level)
         gain = float((module.shade(output, frame.view(trained=False)).rgb.detach() / output.rgb)[0, 0, 0])
         assert math.log(gain) == pytest.approx(answer * math.log(level) + constant, abs=1e-4)
 
 
 def test_metering_leaves_other_views_alone():
     module, scene, _ = exposed()
-    output = RenderOutput(torch.full((24, 32, 3), 0.3), torch.ones(24, 32), None, {})
+    output = rendering(0.3)
     plain = FrameGain.from_scene(scene, FrameGainSettings(), torch.Generator())
-    plain.load_state_dict(module.state_dict())
+    plain.load_state_dict(module.state_dict(), strict=False)
     for view in (scene.train[3].view(trained=True), None):
         assert torch.equal(module.shade(output, view).rgb, plain.shade(output, view).rgb)
     fixed, scene, _ = exposed(answer=0.0)
@@ -160,6 +161,26 @@ def test_metering_leaves_other_views_alone():
 @pytest.mark.parametrize("frames", [3, 5])
 def test_videos_too_short_for_metering_are_interpolated(frames):
     module, scene, _ = exposed(frames=frames)
-    output = RenderOutput(torch.full((24, 32, 3), 0.3), torch.ones(24, 32), None, {})
+    output = rendering(0.3)
     view = scene.test_sets["test"][0].view(trained=False)
+    torch.testing.assert_close(module.shade(output, view).rgb, output.rgb * module.gain(view).detach())
+
+
+def test_brightness_is_kept_from_training_alone():
+    module, scene, _ = exposed()
+    before = module.metering.brightness.clone()
+    train, held_out = scene.train[3].view(trained=True), scene.test_sets["test"][0].view(trained=False)
+    module.shade(rendering(0.9), train)
+    module.shade(rendering(0.9, in_training=True), held_out)
+    module.eval().shade(rendering(0.9, in_training=True), train)
+    assert torch.equal(module.metering.brightness, before)
+    module.train().shade(rendering(0.9, in_training=True), train)
+    before[3] = 0.9
+    torch.testing.assert_close(module.metering.brightness, before)
+
+
+def test_views_are_interpolated_until_all_training_frames_were_rendered():
+    module, scene, _ = exposed()
+    module.metering.brightness[7] = 0.0
+    output, view = rendering(0.3), scene.test_sets["test"][0].view(trained=False)
     torch.testing.assert_close(module.shade(output, view).rgb, output.rgb * module.gain(view).detach())
