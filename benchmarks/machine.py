@@ -1,4 +1,4 @@
-"""What benchmarks share: clocks, the description of the machine, and how numbers are printed."""
+"""Clocks, description of the machine and printing of results, shared by the benchmarks."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ class PlainAppearanceHead(AppearanceHead):
         directions: Float[Tensor, "V 3"],
         normals: Float[Tensor, "V 3"] | None,
     ) -> Float[Tensor, "V D"]:
-        """What the MLP sees of the viewing direction; arguments as of :meth:`forward`."""
+        """Encoding of the viewing direction that the MLP gets; arguments as of :meth:`forward`."""
         return directions
 
     @property

@@ -53,7 +53,7 @@ class Metering(nn.Module):
         self.brightness[row] = self._measure(rgb)
 
     def _measure(self, rgb: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
-        """Mean colour where all training frames are valid. []"""
+        """Mean colour over the pixels that are valid in every training frame. []"""
         valid = self._valid
         colors = rgb if valid is None or valid.shape != rgb.shape[:2] else rgb[valid.to(rgb.device)]
         return colors.mean().clamp_min(_DARKEST)
@@ -61,10 +61,10 @@ class Metering(nn.Module):
     def correction(
         self, log_gains: Float[Tensor, "F C"], rgb: Float[Tensor, "H W 3"], before: int, after: int, share: float
     ) -> float:
-        """What to add to log gains interpolated between two training frames; 0 before all have been rendered.
+        """Correction of the log gain of a held-out view, to add to the one interpolated in time.
 
         A view that is brighter than interpolation between the two frames would make it has a smaller gain, by as much
-        as training frames had that lie as far from others.
+        as training frames had that lie as far from others. 0 until every training frame has been rendered in training.
 
         Args:
             log_gains: Of the training frames. [F, C]
@@ -75,13 +75,13 @@ class Metering(nn.Module):
         """
         if not self.brightness.all():
             return 0.0
-        seen = self._logs
-        expected = torch.lerp(seen[before], seen[after], share)
+        brightness = self._log_brightness
+        expected = torch.lerp(brightness[before], brightness[after], share)
         gains = log_gains.detach().cpu().double().mean(1)
         return self.response(gains, before, after) * float(self._measure(rgb).cpu().double().log() - expected)
 
     @property
-    def _logs(self) -> Float[Tensor, "F"]:
+    def _log_brightness(self) -> Float[Tensor, "F"]:
         """Logarithm of the brightness of the training frames. [F]"""
         return self.brightness.cpu().double().log()
 
@@ -98,7 +98,7 @@ class Metering(nn.Module):
         """
         times = torch.tensor(self._frames.times, dtype=torch.float64)
         gap = float(times[after] - times[before])
-        levels = torch.stack([gains, self._logs])
+        levels = torch.stack([gains, self._log_brightness])
         most = (len(times) - _FEWEST) // 2
         if most < 1:
             return 0.0
