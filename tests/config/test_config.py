@@ -59,25 +59,27 @@ def test_the_rival_that_sees_the_distance_differs_from_the_closest_in_that_only(
 
 
 @pytest.mark.parametrize(
-    ("method", "loss", "elsewhere"),
+    ("method", "base", "loss", "elsewhere"),
     [
         (
             "coliags-estimated-depth",
+            "coliags",
             "estimated-depth",
             {"datamanager.initial_points": "data", "field.voxel_pixels": 1.4},
         ),
-        ("coliags-sparse-depth", "sparse-depth", {}),
+        ("coliags-sparse-depth", "coliags", "sparse-depth", {}),
+        ("coliags-plus-sparse-depth", "coliags-plus", "sparse-depth", {}),
     ],
 )
-def test_methods_for_scenes_without_true_depth_differ_in_what_they_need_for_that(method, loss, elsewhere):
-    own, full = (load_method(name).config for name in (method, "coliags"))
+def test_methods_for_scenes_without_true_depth_differ_in_what_they_need_for_that(method, base, loss, elsewhere):
+    own, full = (load_method(name).config for name in (method, base))
     assert own.losses.keys() - full.losses.keys() == {"opacity"}
     assert own.losses["depth"].name == loss
-    assert own.losses["depth"].settings.weight_at(1, 2) == pytest.approx(
-        30 * full.losses["depth"].settings.weight_at(1, 2)
+    assert own.losses["depth"].settings.weight_at(0, 2) == pytest.approx(
+        30 * full.losses["depth"].settings.weight_at(0, 2)
     )  # relative to a depth of 30 mm
     changes = [*(f"{key}={value}" for key, value in elsewhere.items()), "losses.opacity=null"]
-    same = load_method("coliags", changes[:-1]).config.model_dump()
+    same = load_method(base, changes[:-1]).config.model_dump()
     mine = load_method(method, changes).config.model_dump()
     for each in (same, mine):
         each.pop("description"), each["losses"].pop("depth")
