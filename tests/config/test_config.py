@@ -75,9 +75,9 @@ def test_methods_for_scenes_without_true_depth_differ_in_what_they_need_for_that
     own, full = (load_method(name).config for name in (method, base))
     assert own.losses.keys() - full.losses.keys() == {"opacity"}
     assert own.losses["depth"].name == loss
-    assert own.losses["depth"].settings.weight_at(0, 2) == pytest.approx(
-        30 * full.losses["depth"].settings.weight_at(0, 2)
-    )  # relative to a depth of 30 mm
+    paper = load_method("coliags").config.losses["depth"].settings
+    for step in (0, 1, 2):  # relative to a depth of 30 mm
+        assert own.losses["depth"].settings.weight_at(step, 2) == pytest.approx(30 * paper.weight_at(step, 2))
     changes = [*(f"{key}={value}" for key, value in elsewhere.items()), "losses.opacity=null"]
     same = load_method(base, changes[:-1]).config.model_dump()
     mine = load_method(method, changes).config.model_dump()
