@@ -16,14 +16,14 @@ from pathlib import Path
 import numpy as np
 
 from coliags_plugin.core.images import read_rgb
-from coliags_plugin.meshes.comparison import compare_meshes
-from coliags_plugin.meshes.files import read_mesh
-from coliags_plugin.meshes.truth import read_true_surface
+from coliags_plugin.geometry.meshes.comparison import compare_meshes
+from coliags_plugin.geometry.meshes.files import read_mesh
+from coliags_plugin.geometry.meshes.truth import read_true_surface
+from coliags_plugin.geometry.poses import colmap
+from coliags_plugin.geometry.poses.alignment import align
+from coliags_plugin.geometry.poses.association import Matches
+from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.outputs.video import write_video
-from coliags_plugin.poses import colmap
-from coliags_plugin.poses.alignment import align
-from coliags_plugin.poses.association import Matches
-from coliags_plugin.poses.trajectory import Trajectory
 from coliags_plugin.reconstruction.structure.image_files import list_images
 
 

@@ -21,8 +21,8 @@ from machine import markdown_table, write_results
 from scipy.optimize import least_squares
 
 from coliags_plugin.core.images import read_rgb
-from coliags_plugin.lenses.models import LENSES, CalibratedLens, OmnidirectionalLens
-from coliags_plugin.poses.c3vd import read_poses
+from coliags_plugin.geometry.lenses.models import LENSES, CalibratedLens, OmnidirectionalLens
+from coliags_plugin.geometry.poses.c3vd import read_poses
 
 #: Features alive at a time, least frames of a track, its observations used, and its least parallax, degrees.
 FEATURES, SHORTEST, OBSERVATIONS, PARALLAX = 500, 12, 12, 1.0

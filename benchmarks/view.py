@@ -22,10 +22,10 @@ from websockets.typing import Subprotocol
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.viewer.baking import bake, baking_cameras
-from coliags_plugin.viewer.decoding import ViewDecoder
-from coliags_plugin.viewer.library import import_viser, start_server, stop_server
-from coliags_plugin.viewer.splats import BYTES_PER_SPLAT, Splats, on_wire, wire_unit
+from coliags_plugin.export.viewer.baking import bake, baking_cameras
+from coliags_plugin.export.viewer.decoding import ViewDecoder
+from coliags_plugin.export.viewer.library import import_viser, start_server, stop_server
+from coliags_plugin.export.viewer.splats import BYTES_PER_SPLAT, Splats, on_wire, wire_unit
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,8 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from coliags_plugin._version import __version__
+
 if TYPE_CHECKING:
     from coliags_plugin.api.comparing import ablate, compare, variant
     from coliags_plugin.api.exchange import import_splats
@@ -12,9 +14,9 @@ if TYPE_CHECKING:
     from coliags_plugin.api.scenes import load_scene, make_phantom
     from coliags_plugin.api.training import train
 
-__version__ = "0.1.0"
 __all__ = [
     "Run",
+    "__version__",
     "ablate",
     "compare",
     "import_splats",

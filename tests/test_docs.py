@@ -16,6 +16,7 @@ import pytest
 import yaml
 
 from coliags_plugin import cli
+from coliags_plugin.checks.method.check import CHECKS
 from coliags_plugin.cli.check import Check
 from coliags_plugin.cli.config import Config
 from coliags_plugin.cli.phantom import Phantom
@@ -24,14 +25,13 @@ from coliags_plugin.config.method_config import MethodConfig, OptimizerSettings,
 from coliags_plugin.config.registry import REGISTRIES, datamanagers
 from coliags_plugin.core.render_output import OUTPUTS
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.coverage.settings import CoverageSettings
 from coliags_plugin.datamanagers.recognition import formats
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
 from coliags_plugin.datamanagers.splits import held_out
 from coliags_plugin.engine.randomness import PURPOSES
-from coliags_plugin.method_check.check import CHECKS
 from coliags_plugin.phantom.settings import PRESETS, PhantomSettings
 from coliags_plugin.pipeline.settings import FrameSettings
+from coliags_plugin.surface.coverage.settings import CoverageSettings
 from tests.scenes import SMALL, write_wall
 
 ROOT = Path(__file__).parents[1]

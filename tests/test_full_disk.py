@@ -17,9 +17,9 @@ from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.datamanagers.rotatecolon.writer import write_view
 from coliags_plugin.engine.checkpoints import save_tensors
 from coliags_plugin.engine.run_folder import RunFolder
+from coliags_plugin.geometry.poses import colmap
+from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.outputs.video import write_video
-from coliags_plugin.poses import colmap
-from coliags_plugin.poses.trajectory import Trajectory
 from tests.faults import content
 
 FRAMES = np.random.default_rng(0).integers(0, 255, (12, 48, 64, 3)).astype(np.uint8)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
+from coliags_plugin.checks.method.check import CHECKS, check_method
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.config.method_files import method_files, method_folder
-from coliags_plugin.method_check.check import CHECKS, check_method
 
 FOLDER = method_folder()
 METHODS = sorted(name for name, path in method_files().items() if path.is_relative_to(FOLDER))

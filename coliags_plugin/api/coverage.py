@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from coliags_plugin.coverage.writing import MeasuredCoverage
+    from coliags_plugin.surface.coverage.writing import MeasuredCoverage
 
 
 def measure_scene_coverage(
@@ -34,9 +34,9 @@ def measure_scene_coverage(
             together, or are not in mm; or the folder exists or cannot be written.
     """
     from coliags_plugin.core.settings import validated
-    from coliags_plugin.coverage.settings import CoverageSettings
-    from coliags_plugin.coverage.writing import check_free, measure_scene, open_recording
-    from coliags_plugin.meshes.files import read_mesh
+    from coliags_plugin.geometry.meshes.files import read_mesh
+    from coliags_plugin.surface.coverage.settings import CoverageSettings
+    from coliags_plugin.surface.coverage.writing import check_free, measure_scene, open_recording
 
     chosen, folder = validated(CoverageSettings, settings or {}, "coverage option"), Path(output)
     check_free(folder, overwrite)

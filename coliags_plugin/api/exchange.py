@@ -34,7 +34,7 @@ def import_splats(
     """
     from coliags_plugin.engine.devices import choose_device
     from coliags_plugin.engine.run_folder import RunFolder
-    from coliags_plugin.exchange.importing import import_run
+    from coliags_plugin.export.baking.importing import import_run
 
     scene = Path(data)
     folder = RunFolder.default(scene.resolve().name, "imported") if output is None else RunFolder(Path(output))

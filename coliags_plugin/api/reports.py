@@ -74,8 +74,8 @@ def report(
 
 
 def _scene_section(of: Run | str | Path) -> str:
+    from coliags_plugin.export.viewer.saving import scene_page
     from coliags_plugin.reporting.scene_section import scene_section
-    from coliags_plugin.viewer.saving import scene_page
 
     run = of if isinstance(of, Run) else Run(of)
     return scene_section(scene_page(run.load()), f"{run.method} on {run.scene_name}, seed {run.seed}")

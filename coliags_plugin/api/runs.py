@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from coliags_plugin.config.method_config import MethodConfig
     from coliags_plugin.core.cameras import Camera
     from coliags_plugin.core.scenes import Scene
-    from coliags_plugin.coverage.writing import MeasuredCoverage
     from coliags_plugin.engine.rendering import DepthKind
     from coliags_plugin.engine.trained import TrainedRun
-    from coliags_plugin.exchange.exporting import Exported
-    from coliags_plugin.meshing.writing import MeshedRun
+    from coliags_plugin.export.baking.exporting import Exported
+    from coliags_plugin.export.viewer.serving import Viewer
     from coliags_plugin.results.record import Result
-    from coliags_plugin.viewer.serving import Viewer
+    from coliags_plugin.surface.coverage.writing import MeasuredCoverage
+    from coliags_plugin.surface.meshing.writing import MeshedRun
 
 
 class Run:
@@ -233,8 +233,8 @@ class Run:
                 surface, the truth is of another world or unit, or the folder exists or cannot be written.
         """
         from coliags_plugin.core.settings import validated
-        from coliags_plugin.meshing.settings import MeshSettings
-        from coliags_plugin.meshing.writing import mesh_run
+        from coliags_plugin.surface.meshing.settings import MeshSettings
+        from coliags_plugin.surface.meshing.writing import mesh_run
 
         chosen = validated(MeshSettings, settings or {}, "mesh option")
         folder = Path(output) if output is not None else self.path / "mesh"
@@ -263,7 +263,7 @@ class Run:
             InputError: See :meth:`load`; the method has no Gaussians, the run was relit, there is no such format or
                 light, or the file exists or cannot be written.
         """
-        from coliags_plugin.exchange.exporting import export_run
+        from coliags_plugin.export.baking.exporting import export_run
 
         trained = self.load()
         file = Path(output) if output is not None else self.path / "export" / f"{self.scene_name}.{form}"
@@ -295,9 +295,9 @@ class Run:
                 be written.
         """
         from coliags_plugin.core.settings import validated
-        from coliags_plugin.coverage.settings import CoverageSettings
-        from coliags_plugin.coverage.writing import check_free, measure_scene, open_recording
-        from coliags_plugin.meshes.files import read_mesh
+        from coliags_plugin.geometry.meshes.files import read_mesh
+        from coliags_plugin.surface.coverage.settings import CoverageSettings
+        from coliags_plugin.surface.coverage.writing import check_free, measure_scene, open_recording
 
         chosen = validated(CoverageSettings, settings or {}, "coverage option")
         folder = Path(output) if output is not None else self.path / "coverage"
@@ -306,7 +306,7 @@ class Run:
         if mesh is not None or file.is_file():
             wall, scene = read_mesh(file), open_recording(self.data or self.folder.identity().scene_path)
         else:
-            from coliags_plugin.meshing.fusion import fuse_run
+            from coliags_plugin.surface.meshing.fusion import fuse_run
 
             trained = self.load()
             wall, scene = fuse_run(trained), trained.scene
@@ -323,7 +323,7 @@ class Run:
             InputError: See :meth:`load`; viser is not installed, the port is in use or not allowed, or the host is not
                 of this machine.
         """
-        from coliags_plugin.viewer.serving import Viewer
+        from coliags_plugin.export.viewer.serving import Viewer
 
         return Viewer(self.load(), host, port)
 
@@ -337,7 +337,7 @@ class Run:
             InputError: See :meth:`load`; viser is not installed, the method has no Gaussians, or the file cannot be
                 written.
         """
-        from coliags_plugin.viewer.saving import save_page
+        from coliags_plugin.export.viewer.saving import save_page
 
         return save_page(self.load(), Path(output))
 
@@ -345,14 +345,14 @@ class Run:
         """The run under another lamp, for rendering; it shares the parameters.
 
         Args:
-            lamp: Options of :class:`~coliags_plugin.core.lamps.Lamp`, for instance ``offset=(5.0, 0.0, 0.0)`` (mm).
+            lamp: Options of :class:`~coliags_plugin.lighting.lamps.Lamp`, for instance ``offset=(5.0, 0.0, 0.0)`` (mm).
 
         Raises:
             InputError: See :meth:`load`; an option is unknown or invalid, or the field does not model the lamp.
         """
-        from coliags_plugin.core.lamps import Lamp
         from coliags_plugin.core.settings import validated
         from coliags_plugin.engine.relighting import relight
+        from coliags_plugin.lighting.lamps import Lamp
 
         made = validated(Lamp, lamp, "lamp option")
         relit = Run(self.path, data=self.data, device=self.device)

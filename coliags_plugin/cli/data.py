@@ -34,10 +34,10 @@ class Data:
 
     def run(self) -> None:
         """Run the checks and print the results."""
+        from coliags_plugin.checks.data.check import check_scene
+        from coliags_plugin.checks.data.page import write_check_page
+        from coliags_plugin.checks.data.text import lines
         from coliags_plugin.core.files import write_json
-        from coliags_plugin.data_check.check import check_scene
-        from coliags_plugin.data_check.page import write_check_page
-        from coliags_plugin.data_check.text import lines
         from coliags_plugin.engine.data_formats import open_scene
         from coliags_plugin.engine.progress import progress_callback
 

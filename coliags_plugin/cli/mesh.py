@@ -42,7 +42,7 @@ class Mesh:
         """Make the mesh, print the comparison, and print the folder."""
         from coliags_plugin.api.runs import load_run
         from coliags_plugin.config.assignments import parse_assignments
-        from coliags_plugin.meshing.text import comparison_text
+        from coliags_plugin.surface.meshing.text import comparison_text
 
         settings = parse_assignments(self.set, "--set", "KEY=VALUE, for instance depth=median")
         settings.setdefault("color", self.color)

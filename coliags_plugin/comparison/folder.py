@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from coliags_plugin import __version__
+from coliags_plugin._version import __version__
 from coliags_plugin.comparison.cells import Cell
 from coliags_plugin.comparison.plan import Request
 from coliags_plugin.comparison.scenes import SceneSource

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from coliags_plugin import __version__
+from coliags_plugin._version import __version__
 from coliags_plugin.comparison.cells import Cell, CellKeys, Variant
 from coliags_plugin.comparison.scenes import SceneSource
 from coliags_plugin.config import registry

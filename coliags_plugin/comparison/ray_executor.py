@@ -17,7 +17,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from coliags_plugin import __version__
+from coliags_plugin._version import __version__
 from coliags_plugin.comparison.executors import STOPPING, Executor, LocalWorker
 from coliags_plugin.comparison.tasks import Outcome, Task
 from coliags_plugin.core.errors import InputError

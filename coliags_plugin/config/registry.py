@@ -277,13 +277,13 @@ protocols = Registry(
 pose_formats = Registry(
     "pose_formats",
     {
-        "c3vd": "coliags_plugin.poses.c3vd:FORMAT",
-        "colmap": "coliags_plugin.poses.colmap:FORMAT",
-        "colmap-text": "coliags_plugin.poses.colmap:TEXT_FORMAT",
-        "endogslam": "coliags_plugin.poses.endogslam:FORMAT",
-        "endogslam-truth": "coliags_plugin.poses.endogslam:TRUTH_FORMAT",
-        "nerfstudio": "coliags_plugin.poses.nerfstudio:FORMAT",
-        "tum": "coliags_plugin.poses.tum:FORMAT",
+        "c3vd": "coliags_plugin.geometry.poses.c3vd:FORMAT",
+        "colmap": "coliags_plugin.geometry.poses.colmap:FORMAT",
+        "colmap-text": "coliags_plugin.geometry.poses.colmap:TEXT_FORMAT",
+        "endogslam": "coliags_plugin.geometry.poses.endogslam:FORMAT",
+        "endogslam-truth": "coliags_plugin.geometry.poses.endogslam:TRUTH_FORMAT",
+        "nerfstudio": "coliags_plugin.geometry.poses.nerfstudio:FORMAT",
+        "tum": "coliags_plugin.geometry.poses.tum:FORMAT",
     },
     noun="pose format",
 )

@@ -9,9 +9,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.lamps import HeldLight
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.lighting.lamps import HeldLight
 
 
 class Head(nn.Module, ABC):

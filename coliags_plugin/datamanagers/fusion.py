@@ -13,10 +13,10 @@ from torch import Tensor
 from coliags_plugin.core import bounds
 from coliags_plugin.core.arrays import read_arrays
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.ply_vertices import read_vertices
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame, PointCloud
 from coliags_plugin.datamanagers.reading.parallel import parallel_map
-from coliags_plugin.datamanagers.reading.ply_vertices import read_vertices
 
 log = logging.getLogger(__name__)
 

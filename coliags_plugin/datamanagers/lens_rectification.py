@@ -16,8 +16,8 @@ from jaxtyping import Bool, Shaped, UInt8
 
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.datamanagers.rectification import Rectification, undistorted_camera
-from coliags_plugin.lenses.models import Lens
-from coliags_plugin.lenses.undistortion import Undistortion
+from coliags_plugin.geometry.lenses.models import Lens
+from coliags_plugin.geometry.lenses.undistortion import Undistortion
 
 #: Undistortions kept at a time: as many as images are read in parallel.
 _KEPT = 8

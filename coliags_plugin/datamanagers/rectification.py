@@ -15,9 +15,9 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.datamanagers.reading.images import resize_nearest, resize_rgb
-from coliags_plugin.lenses.models import Lens
-from coliags_plugin.lenses.pinhole import PinholeLens
-from coliags_plugin.lenses.undistortion import Undistortion
+from coliags_plugin.geometry.lenses.models import Lens
+from coliags_plugin.geometry.lenses.pinhole import PinholeLens
+from coliags_plugin.geometry.lenses.undistortion import Undistortion
 
 #: How far a raw frame's aspect ratio may be from the lens's: rounding to whole pixels, but no cropping.
 ASPECT_TOLERANCE = 0.02

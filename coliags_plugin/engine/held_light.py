@@ -10,9 +10,9 @@ import torch
 from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError, did_you_mean
-from coliags_plugin.core.lamps import FlattenedLight, HeldLight, LightOfCamera
 from coliags_plugin.core.render_output import OPAQUE_ALPHA, RenderOutput
 from coliags_plugin.engine.model import Model
+from coliags_plugin.lighting.lamps import FlattenedLight, HeldLight, LightOfCamera
 from coliags_plugin.renderers.splatting import SplattingRenderer
 
 #: Approximate number of training cameras, evenly spaced, that the flattened light is the median of.

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-import coliags_plugin
+from coliags_plugin._version import __version__
 from coliags_plugin.config.method_config import LoadedMethod
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.model import Model
@@ -61,7 +61,7 @@ def run_provenance(
 def software() -> dict[str, Any]:
     """Versions, and the git state where the package runs from a checkout."""
     return {
-        "package_version": coliags_plugin.__version__,
+        "package_version": __version__,
         "git": _git_state(),
         "python": platform.python_version(),
         "torch": torch.__version__,
@@ -70,7 +70,7 @@ def software() -> dict[str, Any]:
 
 
 def _git_state() -> str | None:
-    root = Path(coliags_plugin.__file__).resolve().parents[1]
+    root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return None
     command = ["git", "-C", str(root), "describe", "--always", "--dirty"]

@@ -7,10 +7,10 @@ from dataclasses import replace
 from coliags_plugin.config.registry import fields
 from coliags_plugin.contracts import LitField
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.lamps import Lamp
 from coliags_plugin.engine.held_light import gaussians_of, held_light, splatting_of
 from coliags_plugin.engine.model import Model
 from coliags_plugin.engine.trained import TrainedRun
+from coliags_plugin.lighting.lamps import Lamp
 
 
 def relight(trained: TrainedRun, lamp: Lamp) -> TrainedRun:

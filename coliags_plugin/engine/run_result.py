@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from coliags_plugin import __version__
+from coliags_plugin._version import __version__
 from coliags_plugin.contracts import Metric
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.checkpoints import checkpoint_folder

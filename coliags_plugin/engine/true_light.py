@@ -12,10 +12,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from coliags_plugin.core.beams import SpreadLaw, beam
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import read_json
-from coliags_plugin.core.tone_curve import encode
+from coliags_plugin.lighting.beams import SpreadLaw, beam
+from coliags_plugin.lighting.tone_curve import encode
 
 
 @dataclass(frozen=True)

@@ -16,12 +16,12 @@ from coliags_plugin.config.components import AppearanceHeadNode, GeometryHeadNod
 from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
-from coliags_plugin.core.lamps import HeldLight
 from coliags_plugin.core.point_normals import wall_normals
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.fields.anchor_points import initial_positions, neighbour_log_scales, voxelize
 from coliags_plugin.fields.frustum import DRAWN_SIGMAS, spheres_in_frustum
+from coliags_plugin.lighting.lamps import HeldLight
 
 logger = logging.getLogger(__name__)
 

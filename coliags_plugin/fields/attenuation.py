@@ -11,10 +11,10 @@ from torch import Tensor, nn
 from coliags_plugin.config.components import AppearanceHeadNode
 from coliags_plugin.contracts import AppearanceHead
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.lamps import HeldLight
-from coliags_plugin.core.photometry import fit_light
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.lighting.lamps import HeldLight
+from coliags_plugin.lighting.photometry import fit_light
 
 #: Largest distance of the lamp from the optical centre along each camera axis, scene units (mm).
 MAX_OFFSET = 20.0

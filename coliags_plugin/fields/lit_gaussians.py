@@ -17,13 +17,13 @@ from coliags_plugin.contracts import LitField, Schedule
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
-from coliags_plugin.core.lamps import HeldLight, Lamp
 from coliags_plugin.core.rotations import third_axes
 from coliags_plugin.core.scenes import PointCloud, Scene
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.fields.cook_torrance import Cosines, fresnel, lambert, specular
 from coliags_plugin.fields.diffuse_network import DiffuseNetwork, Precision
 from coliags_plugin.fields.explicit_field import ExplicitField, ExplicitFieldSettings
+from coliags_plugin.lighting.lamps import HeldLight, Lamp
 
 logger = logging.getLogger(__name__)
 

@@ -14,10 +14,10 @@ from torch import Tensor, nn
 from typing_extensions import Self
 
 from coliags_plugin.contracts import GainModule
-from coliags_plugin.core.photometry import fit_light
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Scene, View
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.lighting.photometry import fit_light
 from coliags_plugin.modules.frame_rows import FrameRows
 from coliags_plugin.modules.metering import Metering
 

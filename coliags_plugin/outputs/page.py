@@ -10,7 +10,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from coliags_plugin import __version__
+from coliags_plugin._version import __version__
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.outputs.axis_ticks import tick_label

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from coliags_plugin.geometry.poses.alignment import Alignment
 from coliags_plugin.outputs.axis_ticks import linear_ticks, tick_label
-from coliags_plugin.poses.alignment import Alignment
 
 #: Colours distinguishable with any colour vision, and in greyscale.
 REFERENCE_RGB = (86, 160, 211)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from coliags_plugin.core.beams import smoothstep
+from coliags_plugin.lighting.beams import smoothstep
 
 #: Length of the segment, mm.
 LENGTH = 232.0

@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Int
 
-from coliags_plugin.core.beams import smoothstep
+from coliags_plugin.lighting.beams import smoothstep
 from coliags_plugin.phantom.centreline import LENGTH, CentreLine, grow_centre_line
 from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.phantom.streams import Purpose, SolidNoise, stream

@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from coliags_plugin import __version__
+from coliags_plugin._version import __version__
 from coliags_plugin.config.registry import phantom_layouts
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, write_arrays
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.progress import Progress
-from coliags_plugin.core.tone_curve import KNEE
+from coliags_plugin.lighting.tone_curve import KNEE
 from coliags_plugin.phantom.colon import ColonSurface, build_surface, grow_anatomy
 from coliags_plugin.phantom.imaging import Exposure, Sensor, World, expose, meter
 from coliags_plugin.phantom.interreflection import IndirectLight, indirect_lights

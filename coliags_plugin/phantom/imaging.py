@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from coliags_plugin.lenses.models import Lens
+from coliags_plugin.geometry.lenses.models import Lens
 from coliags_plugin.phantom.colon import ColonSurface
 from coliags_plugin.phantom.interreflection import IndirectLight
 from coliags_plugin.phantom.light import Lamp

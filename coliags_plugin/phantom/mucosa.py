@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from coliags_plugin.core.beams import smoothstep
+from coliags_plugin.lighting.beams import smoothstep
 from coliags_plugin.phantom.colon import RADIUS, Anatomy, ColonSurface
 from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.phantom.streams import Purpose, SolidNoise, stream

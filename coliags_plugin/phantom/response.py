@@ -8,7 +8,7 @@ import numpy as np
 import scipy.ndimage
 from jaxtyping import Float, UInt8
 
-from coliags_plugin.core.tone_curve import encode
+from coliags_plugin.lighting.tone_curve import encode
 from coliags_plugin.phantom.settings import PhantomSettings, value_or_default
 from coliags_plugin.phantom.streams import Purpose, stream
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from coliags_plugin.lenses.models import Lens
+from coliags_plugin.geometry.lenses.models import Lens
 from coliags_plugin.phantom.tracing import Tracer
 
 

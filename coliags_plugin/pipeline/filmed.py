@@ -62,8 +62,8 @@ def make_poses(place: Workplace) -> Outcome:
 
 def check_data(place: Workplace) -> Outcome:
     """Check that images, poses and calibration agree. What is suspect is said, and does not stop."""
-    from coliags_plugin.data_check.check import check_scene
-    from coliags_plugin.data_check.page import write_check_page
+    from coliags_plugin.checks.data.check import check_scene
+    from coliags_plugin.checks.data.page import write_check_page
 
     scene = place.open_posed()
     check = check_scene(

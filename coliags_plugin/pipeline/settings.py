@@ -7,10 +7,10 @@ from typing import Annotated
 from pydantic import Field
 
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.coverage.settings import CoverageSettings
-from coliags_plugin.meshing.settings import MeshSettings
 from coliags_plugin.reconstruction.depth.settings import DepthSettings
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
+from coliags_plugin.surface.coverage.settings import CoverageSettings
+from coliags_plugin.surface.meshing.settings import MeshSettings
 
 Pixels = Annotated[int, Field(gt=0)]
 

@@ -6,7 +6,7 @@ import logging
 
 from coliags_plugin.config.method_config import method_name
 from coliags_plugin.core.errors import InputError, InterruptedRunError, NotWritableError
-from coliags_plugin.meshes.files import MESH_FORMATS
+from coliags_plugin.geometry.meshes.files import MESH_FORMATS
 from coliags_plugin.pipeline.stages import Outcome
 from coliags_plugin.pipeline.workplace import Workplace
 
@@ -69,7 +69,7 @@ def evaluate(place: Workplace) -> Outcome:
 def mesh(place: Workplace) -> Outcome:
     """Fuse the rendered depth into a mesh."""
     from coliags_plugin.engine.trained import load_trained
-    from coliags_plugin.meshing.writing import mesh_run
+    from coliags_plugin.surface.meshing.writing import mesh_run
 
     trained = load_trained(place.run, place.device, place.scene)
     made = mesh_run(trained, place.run / "mesh", place.settings.mesh, overwrite=True)
@@ -85,9 +85,9 @@ def coverage(place: Workplace) -> Outcome:
     Raises:
         NotWritableError: It could be measured, but not written.
     """
-    from coliags_plugin.coverage.text import summary
-    from coliags_plugin.coverage.writing import measure_scene
-    from coliags_plugin.meshes.files import read_mesh
+    from coliags_plugin.geometry.meshes.files import read_mesh
+    from coliags_plugin.surface.coverage.text import summary
+    from coliags_plugin.surface.coverage.writing import measure_scene
 
     scene = place.open_posed()
     if not scene.is_metric:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from coliags_plugin.reporting.metric_columns import empty_metrics
 from coliags_plugin.reporting.study import MetricValues, Part, Study
 from coliags_plugin.reporting.tables import Column
-from coliags_plugin.statistics.spread import common_scenes
+from coliags_plugin.results.spread import common_scenes
 
 
 def shared_scenes(values: MetricValues) -> list[str]:

@@ -13,7 +13,7 @@ def scene_section(page: str, name: str) -> str:
     """HTML of the section; the scene is loaded when it is opened.
 
     Args:
-        page: Self-contained HTML page of the scene (:func:`coliags_plugin.viewer.saving.scene_page`).
+        page: Self-contained HTML page of the scene (:func:`coliags_plugin.export.viewer.saving.scene_page`).
         name: What it shows, plain text.
     """
     frame = f'<iframe title="{escape(name)}" style="{_STYLE}" data-page="{escape(page)}"></iframe>'

@@ -9,7 +9,7 @@ from coliags_plugin.reporting.metric_columns import part_name, part_title
 from coliags_plugin.reporting.missing_values import scene_note, shared_scenes
 from coliags_plugin.reporting.study import Part, Study
 from coliags_plugin.reporting.tables import Column, Entry, Row, Table, counted, numeric_entries
-from coliags_plugin.statistics.spread import spread
+from coliags_plugin.results.spread import spread
 
 
 def scene_table(study: Study, part: Part, columns: Sequence[Column], scene: str) -> Table:

@@ -10,9 +10,9 @@ from coliags_plugin.reporting.missing_values import shared_scenes
 from coliags_plugin.reporting.statistics_text import p_text, smallest_p_text
 from coliags_plugin.reporting.study import Part, Study
 from coliags_plugin.reporting.tables import Column, Entry, Row, Table, column_decimals, number_text, unit_text
-from coliags_plugin.statistics.comparison import RivalComparison, compare_with_rivals
-from coliags_plugin.statistics.paired import FEWEST_SCENES, smallest_p
-from coliags_plugin.statistics.spread import spread
+from coliags_plugin.results.comparisons import RivalComparison, compare_with_rivals
+from coliags_plugin.results.paired import FEWEST_SCENES, smallest_p
+from coliags_plugin.results.spread import spread
 
 #: The reference where it is among the methods.
 PREFERRED = "coliags"

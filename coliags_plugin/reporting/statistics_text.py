@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from coliags_plugin.reporting.tables import counted
-from coliags_plugin.statistics.comparison import LEVELS, RivalComparison
-from coliags_plugin.statistics.paired import FEWEST_SCENES, RESAMPLES, smallest_p
+from coliags_plugin.results.comparisons import LEVELS, RivalComparison
+from coliags_plugin.results.paired import FEWEST_SCENES, RESAMPLES, smallest_p
 
 _SMALLEST_PRINTED = 1e-4
 

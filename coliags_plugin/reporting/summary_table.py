@@ -10,8 +10,8 @@ from coliags_plugin.reporting.missing_values import left_out_notes, not_shown_no
 from coliags_plugin.reporting.published import PublishedBenchmark
 from coliags_plugin.reporting.study import Part, Study
 from coliags_plugin.reporting.tables import Column, Entry, Row, Table, counted, numeric_entries
-from coliags_plugin.statistics.comparison import LEVELS, RivalComparison
-from coliags_plugin.statistics.spread import Spread, spread
+from coliags_plugin.results.comparisons import LEVELS, RivalComparison
+from coliags_plugin.results.spread import Spread, spread
 
 #: Comparisons by metric.
 Comparisons = Mapping[str, Sequence[RivalComparison]]

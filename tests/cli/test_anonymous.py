@@ -7,10 +7,10 @@ import json
 import numpy as np
 import pytest
 
-from coliags_plugin.splats.files import write_splats
+from coliags_plugin.export.splats.files import write_splats
 from tests.commands import run
+from tests.export.splats.clouds import random_cloud
 from tests.scenes import SMALL, write_wall
-from tests.splats.clouds import random_cloud
 
 
 @pytest.fixture

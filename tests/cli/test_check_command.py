@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from coliags_plugin.checks.method.check import CHECKS
+from coliags_plugin.checks.method.results import Result
+from coliags_plugin.checks.method.text import line, summary
 from coliags_plugin.config import registry
-from coliags_plugin.method_check.check import CHECKS
-from coliags_plugin.method_check.results import Result
-from coliags_plugin.method_check.text import line, summary
 from tests.commands import refused, run
 from tests.scenes import write_wall
 

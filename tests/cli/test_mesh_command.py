@@ -8,9 +8,9 @@ import pytest
 
 from coliags_plugin.api.runs import Run
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.meshing.writing import mesh_run
+from coliags_plugin.surface.meshing.writing import mesh_run
 from tests.commands import refused, run
-from tests.meshing.exact import exact_run
+from tests.surface.meshing.exact import exact_run
 
 
 @pytest.fixture
@@ -46,7 +46,7 @@ def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch):
     def full(path: Path, mesh) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("coliags_plugin.meshing.writing.write_mesh", full)
+    monkeypatch.setattr("coliags_plugin.surface.meshing.writing.write_mesh", full)
     with pytest.raises(InputError, match="No space"):
         mesh_run(exact_run(frames=9), tmp_path / "mesh")
     assert not any(tmp_path.iterdir())

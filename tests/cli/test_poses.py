@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.config.registry import pose_formats
 from coliags_plugin.core.images import read_rgb
+from coliags_plugin.geometry.poses.formats import format_named, format_of, write_trajectory
+from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.outputs.image_files import write_png
-from coliags_plugin.poses.formats import format_named, format_of, write_trajectory
-from coliags_plugin.poses.trajectory import Trajectory
 from tests.commands import refused, run
 
 PINHOLE = ("--intrinsics", "61,55,33.5,21.5", "--size", "64x48")

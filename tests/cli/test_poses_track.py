@@ -14,8 +14,8 @@ import torch
 from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.datamanagers.rgbd.writer import write_rgbd_scene
 from coliags_plugin.engine.data_formats import open_scene
-from coliags_plugin.poses import tum
-from coliags_plugin.poses.trajectory import Trajectory
+from coliags_plugin.geometry.poses import tum
+from coliags_plugin.geometry.poses.trajectory import Trajectory
 from tests import commands
 from tests.commands import run
 from tests.scenes import SMALL

@@ -15,9 +15,9 @@ from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.fusion import subsampled
-from coliags_plugin.lenses.models import FisheyeLens
-from coliags_plugin.lenses.opencv import OpenCVLens
-from coliags_plugin.poses.trajectory import Trajectory
+from coliags_plugin.geometry.lenses.models import FisheyeLens
+from coliags_plugin.geometry.lenses.opencv import OpenCVLens
+from coliags_plugin.geometry.poses.trajectory import Trajectory
 
 
 @pytest.mark.parametrize("far", [1e7, 1e38, 1e308, np.inf, np.nan])

@@ -12,8 +12,8 @@ from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
-from coliags_plugin.lenses.models import FisheyeLens, Lens
-from coliags_plugin.lenses.undistortion import Undistortion
+from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens
+from coliags_plugin.geometry.lenses.undistortion import Undistortion
 
 
 def real_lens(shared_data: Path) -> FisheyeLens:

@@ -18,10 +18,10 @@ import numpy as np
 import pycolmap
 import pytest
 
+from coliags_plugin.checks.data.check import check_scene
 from coliags_plugin.config.registry import datamanagers
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Scene
-from coliags_plugin.data_check.check import check_scene
 from coliags_plugin.datamanagers.recognition import find_format, formats
 from tests.datamanagers.spoiling import (
     FRAMES,

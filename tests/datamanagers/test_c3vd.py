@@ -18,7 +18,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame, PointCloud, Scene
 from coliags_plugin.datamanagers.c3vd.reader import C3VDDataManager, C3VDSettings
 from coliags_plugin.datamanagers.reading.camera_json import read_intrinsics
-from coliags_plugin.lenses.models import LENSES
+from coliags_plugin.geometry.lenses.models import LENSES
 from tests.datamanagers.wall_scenes import PINHOLE, colors, off_wall, poses, write_raw, write_undistorted
 
 LENS_NAMES = sorted(LENSES)

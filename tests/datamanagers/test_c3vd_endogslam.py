@@ -22,10 +22,10 @@ from coliags_plugin.datamanagers.c3vd_endogslam.reader import (
     C3VDEndoGSLAMDataManager,
     C3VDEndoGSLAMSettings,
 )
+from coliags_plugin.geometry.poses import endogslam
+from coliags_plugin.geometry.poses.rigid import inverse, rigid, wxyz_from_rotations
+from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.phantom.layouts.c3vd_raw import write_poses
-from coliags_plugin.poses import endogslam
-from coliags_plugin.poses.rigid import inverse, rigid, wxyz_from_rotations
-from coliags_plugin.poses.trajectory import Trajectory
 from tests.datamanagers.wall_scenes import PINHOLE, look, off_wall, poses, rays
 from tests.phantom.phantom_layouts import depth_gap, distance_from_wall, in_video_order, read, true_poses, write_phantom
 

@@ -16,7 +16,7 @@ from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.datamanagers.c3vd_v2.lens import CANDIDATE_LENS, ORDER, read_camera_intrinsics
 from coliags_plugin.datamanagers.c3vd_v2.reader import C3VDv2DataManager, C3VDv2Settings
-from coliags_plugin.lenses.models import LENSES, Lens
+from coliags_plugin.geometry.lenses.models import LENSES, Lens
 from tests.datamanagers.wall_scenes import off_wall, poses, write_raw
 from tests.phantom.phantom_layouts import depth_gap, in_video_order, read, true_poses, write_phantom
 

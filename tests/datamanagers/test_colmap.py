@@ -16,7 +16,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.colmap.files import find_models, read_model
 from coliags_plugin.datamanagers.colmap.reader import ColmapDataManager, ColmapSettings
 from coliags_plugin.datamanagers.recognition import find_format
-from coliags_plugin.poses import colmap as colmap_poses
+from coliags_plugin.geometry.poses import colmap as colmap_poses
 from tests.datamanagers.colmap_scenes import CAMERAS, HEIGHT, POINTS, WIDTH, camera, taken, wall_model, write_colmap
 from tests.datamanagers.wall_scenes import look, off_wall, poses
 from tests.phantom.phantom_layouts import distance_from_wall, in_video_order, read, true_poses, write_phantom

@@ -17,9 +17,9 @@ from coliags_plugin.datamanagers.nerfstudio.reader import NerfstudioDataManager,
 from coliags_plugin.datamanagers.reading.images import resize_nearest
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.rgbd.reader import RGBDDataManager, RGBDSettings
-from coliags_plugin.poses import tum
-from coliags_plugin.poses.rigid import FLIP_Y_AND_Z
-from coliags_plugin.poses.trajectory import Trajectory
+from coliags_plugin.geometry.poses import tum
+from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
+from coliags_plugin.geometry.poses.trajectory import Trajectory
 from tests.datamanagers.wall_scenes import PINHOLE, look, poses, rays
 from tests.scenes import camera_at
 

@@ -19,10 +19,10 @@ from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.nerfstudio.reader import NerfstudioDataManager, NerfstudioSettings
 from coliags_plugin.datamanagers.recognition import find_format
-from coliags_plugin.lenses.models import FisheyeLens, Lens
-from coliags_plugin.lenses.opencv import OpenCVLens
-from coliags_plugin.lenses.undistortion import Undistortion
-from coliags_plugin.poses.rigid import FLIP_Y_AND_Z
+from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens
+from coliags_plugin.geometry.lenses.opencv import OpenCVLens
+from coliags_plugin.geometry.lenses.undistortion import Undistortion
+from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
 from tests.datamanagers.real_frames import real_lens
 from tests.datamanagers.wall_scenes import PINHOLE, look, off_wall, poses, rays
 from tests.phantom.phantom_layouts import depth_gap, distance_from_wall, in_video_order, read, true_poses, write_phantom

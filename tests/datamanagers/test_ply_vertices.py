@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.ply_vertices import read_vertices
 from coliags_plugin.datamanagers.fusion import load_points
-from coliags_plugin.datamanagers.reading.ply_vertices import read_vertices
 
 FIELDS = [("x", "f4"), ("y", "f4"), ("z", "f8"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("label", "i2")]
 WORDS = {"f4": "float", "f8": "double", "u1": "uchar", "i2": "short"}

@@ -9,7 +9,7 @@ import torch
 
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.datamanagers.c3vd.reader import C3VDDataManager, C3VDSettings
-from coliags_plugin.lenses.models import LENSES
+from coliags_plugin.geometry.lenses.models import LENSES
 from tests.datamanagers.real_frames import real_lens, undistort_real_frames
 
 

@@ -16,7 +16,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.datamanagers.reim_nerf.files import ray_cosines, read_sequence
 from coliags_plugin.datamanagers.reim_nerf.reader import ReimNerfDataManager, ReimNerfSettings
-from coliags_plugin.lenses.models import LENSES, undistortion_map
+from coliags_plugin.geometry.lenses.models import LENSES, undistortion_map
 from coliags_plugin.phantom.layouts.reim_nerf import SCENE_SCALE
 from tests.phantom.phantom_layouts import depth_gap, distance_from_wall, in_video_order, read, true_poses, write_phantom
 

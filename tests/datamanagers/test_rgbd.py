@@ -18,10 +18,10 @@ from coliags_plugin.core.scenes import Scene
 from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.datamanagers.rgbd.association import nearest_in_time
 from coliags_plugin.datamanagers.rgbd.reader import RGBDDataManager, RGBDSettings
+from coliags_plugin.geometry.poses import tum
+from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.phantom.generate import generate
 from coliags_plugin.phantom.settings import PhantomSettings
-from coliags_plugin.poses import tum
-from coliags_plugin.poses.trajectory import Trajectory
 from tests.datamanagers.wall_scenes import PINHOLE, colors, look, off_wall, poses, rays
 
 WIDTH, HEIGHT = 64, 48

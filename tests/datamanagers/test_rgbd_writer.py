@@ -15,7 +15,7 @@ from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.datamanagers.rgbd.files import lacks_trajectory
 from coliags_plugin.datamanagers.rgbd.reader import RGBDDataManager, RGBDSettings, UnposedRGBDDataManager
 from coliags_plugin.datamanagers.rgbd.writer import depth_scale, depth_steps, write_rgbd_scene
-from coliags_plugin.poses import tum
+from coliags_plugin.geometry.poses import tum
 from tests.scenes import wall_scene, write_wall
 
 SETTINGS = RGBDSettings(split="all-train", initial_points="none")

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from coliags_plugin.config.components import make_component
-from coliags_plugin.core.lamps import FlattenedLight, LightOfCamera
 from coliags_plugin.fields.attenuation import MAX_OFFSET, AttenuatedAppearanceHead
+from coliags_plugin.lighting.lamps import FlattenedLight, LightOfCamera
 from tests.scenes import camera_at, wall_scene
 
 PLAIN = {"name": "anchors", "geometry_head": "plain", "appearance_head": "plain"}

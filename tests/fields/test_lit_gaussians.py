@@ -13,11 +13,11 @@ from pydantic import ValidationError
 from coliags_plugin.config.components import make_component
 from coliags_plugin.contracts import Schedule
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.lamps import Lamp
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.fields import lit_gaussians
 from coliags_plugin.fields.diffuse_network import _ROWS, DiffuseNetwork
 from coliags_plugin.fields.lit_gaussians import GAMMA, PINK, THICKNESS
+from coliags_plugin.lighting.lamps import Lamp
 from coliags_plugin.renderers.torch_renderer import render_gaussians
 from tests.fields.test_cook_torrance import by_hand
 from tests.scenes import camera_at, wall_scene

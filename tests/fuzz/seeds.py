@@ -15,15 +15,15 @@ from coliags_plugin.api.exchange import import_splats
 from coliags_plugin.api.training import train
 from coliags_plugin.config.registry import pose_formats
 from coliags_plugin.core.intrinsics import Intrinsics
-from coliags_plugin.meshes.files import read_mesh, write_mesh
-from coliags_plugin.meshes.mesh import TriangleMesh
+from coliags_plugin.export.splats.files import write_splats
+from coliags_plugin.geometry.meshes.files import read_mesh, write_mesh
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+from coliags_plugin.geometry.poses.formats import format_named, write_trajectory
+from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.outputs.video import write_video
-from coliags_plugin.poses.formats import format_named, write_trajectory
-from coliags_plugin.poses.trajectory import Trajectory
-from coliags_plugin.splats.files import write_splats
 from tests.comparison.small import TINY
 from tests.datamanagers.spoiling import KINDS, write_all
-from tests.splats.clouds import random_cloud
+from tests.export.splats.clouds import random_cloud
 
 FRAMES = 9
 METHOD = "coliags"

@@ -80,7 +80,7 @@ def _command(*argv: object) -> None:
 
 def _poses(name: str) -> Callable[[Path], None]:
     def read(folder: Path) -> None:
-        from coliags_plugin.poses.formats import format_of
+        from coliags_plugin.geometry.poses.formats import format_of
 
         found = folder / (name if name in ("colmap", "colmap-text", "nerfstudio", "endogslam") else f"{name}.txt")
         if name in ("nerfstudio", "endogslam"):
@@ -97,9 +97,9 @@ def _poses(name: str) -> Callable[[Path], None]:
 
 def _mesh(name: str) -> Callable[[Path], None]:
     def read(folder: Path) -> None:
-        from coliags_plugin.meshes.comparison import compare_meshes
-        from coliags_plugin.meshes.files import read_mesh
-        from coliags_plugin.meshes.truth import read_true_surface
+        from coliags_plugin.geometry.meshes.comparison import compare_meshes
+        from coliags_plugin.geometry.meshes.files import read_mesh
+        from coliags_plugin.geometry.meshes.truth import read_true_surface
 
         surface = read_true_surface(folder / name)
         if not np.abs(surface.mesh.vertices).max() <= 2e6:
@@ -112,7 +112,7 @@ def _mesh(name: str) -> Callable[[Path], None]:
 
 def _splats(name: str) -> Callable[[Path], None]:
     def read(folder: Path) -> None:
-        from coliags_plugin.splats.files import read_splats
+        from coliags_plugin.export.splats.files import read_splats
 
         cloud = read_splats(folder / f"cloud.{name}")
         for what in ("means", "quats_wxyz", "scales", "opacities", "harmonics"):

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from coliags_plugin.splats.cloud import SplatCloud
+    from coliags_plugin.export.splats.cloud import SplatCloud
 
 #: Exit status that stands for an exception that no message was made of.
 TRACEBACK = 99
@@ -140,8 +140,8 @@ def make_inputs(folder: Path) -> None:
     import torch
 
     from coliags_plugin.datamanagers.rgbd.writer import write_rgbd_scene
-    from coliags_plugin.splats.files import write_splats
-    from tests.splats.clouds import random_cloud
+    from coliags_plugin.export.splats.files import write_splats
+    from tests.export.splats.clouds import random_cloud
     from tests.textured_tube import INTRINSICS, tube_frames, write_tube
 
     folder.mkdir(parents=True)
@@ -178,7 +178,7 @@ def _wall(scene: Path) -> SplatCloud:
     import numpy as np
 
     from coliags_plugin.api.scenes import load_scene
-    from coliags_plugin.splats.cloud import SplatCloud
+    from coliags_plugin.export.splats.cloud import SplatCloud
 
     means = load_scene(scene, settings={"points_count": 3000}).points.positions.numpy()
     count = len(means)
@@ -292,7 +292,7 @@ def _is_readable(name: str, data: bytes) -> bool:
     """Whether a mesh or an image can be read to its end."""
     from coliags_plugin.core.errors import InputError
     from coliags_plugin.core.images import decode_image
-    from coliags_plugin.meshes.files import read_mesh
+    from coliags_plugin.geometry.meshes.files import read_mesh
 
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / Path(name).name

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import View
-from coliags_plugin.core.tone_curve import encode
+from coliags_plugin.lighting.tone_curve import encode
 from coliags_plugin.modules.response import CameraResponse, ResponseSettings
 from tests.scenes import wall_scene
 

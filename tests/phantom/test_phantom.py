@@ -16,7 +16,7 @@ import torch
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.lenses.models import LENSES, octagon_mask
+from coliags_plugin.geometry.lenses.models import LENSES, octagon_mask
 from coliags_plugin.phantom.generate import generate
 from coliags_plugin.phantom.settings import PhantomSettings
 

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.tone_curve import encode
-from coliags_plugin.lenses.pinhole import PinholeLens
+from coliags_plugin.geometry.lenses.pinhole import PinholeLens
+from coliags_plugin.lighting.tone_curve import encode
 from coliags_plugin.phantom.colon import ColonSurface, build_surface, grow_anatomy
 from coliags_plugin.phantom.imaging import Sensor, World, expose
 from coliags_plugin.phantom.interreflection import form_factors, make_patches, solve

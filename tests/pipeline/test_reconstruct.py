@@ -13,14 +13,14 @@ import coliags_plugin as cp
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import not_writable
 from coliags_plugin.datamanagers.units import read_unit
-from coliags_plugin.meshes.files import read_mesh
+from coliags_plugin.geometry.meshes.files import read_mesh
+from coliags_plugin.geometry.poses import colmap
+from coliags_plugin.geometry.poses.alignment import align
+from coliags_plugin.geometry.poses.association import associate
+from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.outputs.video import write_video
 from coliags_plugin.pipeline import filmed, trained
 from coliags_plugin.pipeline.stages import Outcome
-from coliags_plugin.poses import colmap
-from coliags_plugin.poses.alignment import align
-from coliags_plugin.poses.association import associate
-from coliags_plugin.poses.trajectory import Trajectory
 from tests import commands
 from tests.pipeline.films import blurred, film, write_images
 from tests.textured_tube import INTRINSICS, tube_frames, write_tube
@@ -120,13 +120,13 @@ def test_coverage_is_left_out_where_it_cannot_be_measured_but_not_where_it_canno
 ):
     scene = write_tube(tmp_path / "tube", 6, 3.0)
     monkeypatch.setattr(trained, "coverage", _COVERAGE)
-    monkeypatch.setattr("coliags_plugin.meshes.files.read_mesh", lambda path: None)
+    monkeypatch.setattr("coliags_plugin.geometry.meshes.files.read_mesh", lambda path: None)
 
     def failing(error):
         def measure_scene(*args, **options):
             raise error
 
-        monkeypatch.setattr("coliags_plugin.coverage.writing.measure_scene", measure_scene)
+        monkeypatch.setattr("coliags_plugin.surface.coverage.writing.measure_scene", measure_scene)
 
     full = not_writable(tmp_path, OSError(errno.ENOSPC, "No space left on device"))
     failing(full)

@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.poses.rigid import rigid
+from coliags_plugin.geometry.poses.rigid import rigid
 from coliags_plugin.reconstruction.structure.model_scale import distances_beside, from_diameter, from_distance, scaled
 from coliags_plugin.reconstruction.structure.sfm import Reconstruction
 

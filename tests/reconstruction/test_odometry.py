@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.data_formats import open_video
-from coliags_plugin.poses.alignment import align
-from coliags_plugin.poses.association import associate
-from coliags_plugin.poses.rigid import inverse, rotation_angles_deg
-from coliags_plugin.poses.trajectory import Trajectory
+from coliags_plugin.geometry.poses.alignment import align
+from coliags_plugin.geometry.poses.association import associate
+from coliags_plugin.geometry.poses.rigid import inverse, rotation_angles_deg
+from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.reconstruction.odometry.chain import Bridge, chain, fill_gaps, power
 from coliags_plugin.reconstruction.odometry.features import motion_by_features
 from coliags_plugin.reconstruction.odometry.frames import PreparedFrame, PreparedVideo, Video, prepare, typical_depth
@@ -25,7 +25,7 @@ from coliags_plugin.reconstruction.odometry.pose_graph import optimise, revisit_
 from coliags_plugin.reconstruction.odometry.registration import Edge, agreement
 from coliags_plugin.reconstruction.odometry.settings import TrackingSettings
 from coliags_plugin.reconstruction.odometry.tracking import track
-from tests.poses.winding import some_transform, winding
+from tests.geometry.poses.winding import some_transform, winding
 from tests.reconstruction.filmed import PINHOLE, filmed_wall, swaying
 from tests.textured_tube import tube_frames
 

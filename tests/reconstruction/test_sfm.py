@@ -13,11 +13,11 @@ import pytest
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.engine.data_formats import open_scene
+from coliags_plugin.geometry.poses import colmap
+from coliags_plugin.geometry.poses.alignment import align
+from coliags_plugin.geometry.poses.association import associate
+from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.outputs.image_files import write_png
-from coliags_plugin.poses import colmap
-from coliags_plugin.poses.alignment import align
-from coliags_plugin.poses.association import associate
-from coliags_plugin.poses.trajectory import Trajectory
 from coliags_plugin.reconstruction.structure.features import FeatureSettings
 from coliags_plugin.reconstruction.structure.image_files import file_names, list_images, masks_for
 from coliags_plugin.reconstruction.structure.sfm import reconstruct

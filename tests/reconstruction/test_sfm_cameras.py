@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.lenses.models import LENSES
+from coliags_plugin.geometry.lenses.models import LENSES
 from coliags_plugin.reconstruction.structure.sfm_cameras import (
     CALIBRATED,
     Start,

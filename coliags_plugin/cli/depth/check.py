@@ -40,13 +40,13 @@ class CheckDepth:
 
     def run(self) -> None:
         """Compare, and print the results."""
+        from coliags_plugin.checks.depth.check import check_depth
+        from coliags_plugin.checks.depth.error_maps import write_error_maps
+        from coliags_plugin.checks.depth.page import write_depth_page
+        from coliags_plugin.checks.depth.sources import open_depth
+        from coliags_plugin.checks.depth.text import lines
         from coliags_plugin.core.anonymity import without_places
         from coliags_plugin.core.files import write_json
-        from coliags_plugin.depth_check.check import check_depth
-        from coliags_plugin.depth_check.error_maps import write_error_maps
-        from coliags_plugin.depth_check.page import write_depth_page
-        from coliags_plugin.depth_check.sources import open_depth
-        from coliags_plugin.depth_check.text import lines
         from coliags_plugin.engine.progress import progress_callback
 
         with progress_callback() as progress:

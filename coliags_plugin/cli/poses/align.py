@@ -14,7 +14,7 @@ from coliags_plugin.cli.poses.arguments import OptionalFormat, read_and_log
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from coliags_plugin.poses.alignment import Alignment
+    from coliags_plugin.geometry.poses.alignment import Alignment
 
 
 @dataclass(frozen=True)
@@ -54,8 +54,8 @@ class Align:
 
         from coliags_plugin.core.errors import InputError
         from coliags_plugin.core.files import write_json
-        from coliags_plugin.poses.alignment import align
-        from coliags_plugin.poses.association import associate
+        from coliags_plugin.geometry.poses.alignment import align
+        from coliags_plugin.geometry.poses.association import associate
 
         log = logging.getLogger(__name__)
         if self.plot is not None and self.plot.suffix.lower() != ".png":
@@ -94,7 +94,7 @@ class Align:
 
 
 def _described(result: Alignment, unit: str) -> str:
-    from coliags_plugin.poses.rigid import rotation_angles_deg
+    from coliags_plugin.geometry.poses.rigid import rotation_angles_deg
 
     angle = float(rotation_angles_deg(result.transform.rotation[None])[0])
     x, y, z = result.transform.translation

@@ -12,8 +12,8 @@ from coliags_plugin.core.errors import InputError
 
 if TYPE_CHECKING:
     from coliags_plugin.core.intrinsics import Intrinsics
-    from coliags_plugin.poses.format import Format
-    from coliags_plugin.poses.trajectory import Trajectory
+    from coliags_plugin.geometry.poses.format import Format
+    from coliags_plugin.geometry.poses.trajectory import Trajectory
 
 OptionalFormat = Annotated[str | None, tyro.conf.arg(metavar="FORMAT")]
 
@@ -22,7 +22,7 @@ def read_and_log(path: Path, name: str | None) -> tuple[Format, Trajectory]:
     """Read poses and log format, path length and direction, which reveal a wrong convention."""
     import logging
 
-    from coliags_plugin.poses.formats import format_of
+    from coliags_plugin.geometry.poses.formats import format_of
 
     log = logging.getLogger(__name__)
     kind = format_of(path, name)
@@ -40,7 +40,7 @@ def parse_intrinsics(intrinsics: str | None, size: str | None) -> Intrinsics | N
         InputError: Only one is given, or one has another form.
     """
     from coliags_plugin.core.intrinsics import Intrinsics
-    from coliags_plugin.poses.text import prefixed_errors
+    from coliags_plugin.geometry.poses.text import prefixed_errors
 
     if intrinsics is None and size is None:
         return None

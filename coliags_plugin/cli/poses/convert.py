@@ -39,7 +39,7 @@ class Convert:
         from dataclasses import replace
 
         from coliags_plugin.core.errors import InputError
-        from coliags_plugin.poses.formats import format_named, write_trajectory
+        from coliags_plugin.geometry.poses.formats import format_named, write_trajectory
 
         log = logging.getLogger(__name__)
         target = format_named(self.to)
@@ -69,7 +69,7 @@ class Convert:
 def _image_names(folder: Path, count: int) -> tuple[str, ...]:
     """Names of a folder's images in natural order, one per pose."""
     from coliags_plugin.core.errors import InputError
-    from coliags_plugin.poses.trajectory import natural_order
+    from coliags_plugin.geometry.poses.trajectory import natural_order
 
     if not folder.is_dir():
         raise InputError(f"--images {folder}", "a folder of images")

@@ -97,9 +97,9 @@ def _errors(found: Tracking, scene: Scene) -> str:
     """Trajectory errors against the scene's own poses, which the tracking did not use."""
     import numpy as np
 
-    from coliags_plugin.poses.alignment import align
-    from coliags_plugin.poses.association import FEWEST_MATCHES, associate
-    from coliags_plugin.poses.trajectory import Trajectory
+    from coliags_plugin.geometry.poses.alignment import align
+    from coliags_plugin.geometry.poses.association import FEWEST_MATCHES, associate
+    from coliags_plugin.geometry.poses.trajectory import Trajectory
 
     if len(scene.train) < FEWEST_MATCHES:
         return f"against the scene's own poses: no errors for fewer than {FEWEST_MATCHES} frames"

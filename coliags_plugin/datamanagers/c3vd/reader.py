@@ -12,7 +12,7 @@ from coliags_plugin.datamanagers.c3vd.sequences import SequenceDataManager, Sequ
 from coliags_plugin.datamanagers.reading.camera_json import read_intrinsics
 from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
-from coliags_plugin.lenses.models import LENSES
+from coliags_plugin.geometry.lenses.models import LENSES
 
 
 class C3VDSettings(SceneSettings):

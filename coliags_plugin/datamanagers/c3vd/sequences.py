@@ -15,8 +15,8 @@ from coliags_plugin.datamanagers.recording import Recording, Shot, check_pose_co
 from coliags_plugin.datamanagers.rectification import Rectification, whole_frame
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE
 from coliags_plugin.datamanagers.seen import ROTATION, find_seen_masks
-from coliags_plugin.lenses.models import Lens, octagon_mask
-from coliags_plugin.poses.c3vd import read_poses
+from coliags_plugin.geometry.lenses.models import Lens, octagon_mask
+from coliags_plugin.geometry.poses.c3vd import read_poses
 
 
 @dataclass(frozen=True)

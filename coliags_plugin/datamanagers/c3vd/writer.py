@@ -17,7 +17,7 @@ from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.reading.camera_json import write_camera_json
 from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE
-from coliags_plugin.poses.c3vd import matrix_lines
+from coliags_plugin.geometry.poses.c3vd import matrix_lines
 
 POSES, CAMERA = "camera_pose.txt", "camera.json"
 #: 100 mm in 16 bits.

@@ -9,7 +9,7 @@ from pathlib import Path
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.reading.frame_files import TIFF_SUFFIXES, inventory, numbered, paired
 from coliags_plugin.datamanagers.recording import fingerprint
-from coliags_plugin.poses.c3vd import recognise as has_matrices
+from coliags_plugin.geometry.poses.c3vd import recognise as has_matrices
 
 LAYOUT = (
     "EndoGSLAM's C3VD: color/NNNN_color.png and depth/NNNN_depth.tiff with pose.txt, params.npz or both; "

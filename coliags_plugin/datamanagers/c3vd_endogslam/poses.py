@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.c3vd_endogslam.files import PARAMS, PreparedFiles
 from coliags_plugin.datamanagers.recording import check_pose_count
-from coliags_plugin.poses.c3vd import Poses, read_poses
-from coliags_plugin.poses.endogslam import EndoGslamParams, image_indices
-from coliags_plugin.poses.rigid import inverse, rigid, rotation_angles_deg
+from coliags_plugin.geometry.poses.c3vd import Poses, read_poses
+from coliags_plugin.geometry.poses.endogslam import EndoGslamParams, image_indices
+from coliags_plugin.geometry.poses.rigid import inverse, rigid, rotation_angles_deg
 
 log = logging.getLogger(__name__)
 

@@ -13,6 +13,7 @@ from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.core.ply_vertices import read_vertices
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.c3vd_endogslam.files import (
     PARAMS,
@@ -24,15 +25,14 @@ from coliags_plugin.datamanagers.c3vd_endogslam.files import (
 from coliags_plugin.datamanagers.c3vd_endogslam.poses import PoseSource, SequencePoses, load_poses
 from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH, DepthFormat, DepthSteps
 from coliags_plugin.datamanagers.reading.images import bits_of, size_of
-from coliags_plugin.datamanagers.reading.ply_vertices import read_vertices
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, check_pose_count
 from coliags_plugin.datamanagers.rectification import ASPECT_TOLERANCE, Rectification
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
 from coliags_plugin.datamanagers.seen import ROTATION, find_seen_masks
 from coliags_plugin.datamanagers.splits import Split
-from coliags_plugin.poses.c3vd import read_poses
-from coliags_plugin.poses.endogslam import EndoGslamParams, read_params
+from coliags_plugin.geometry.poses.c3vd import read_poses
+from coliags_plugin.geometry.poses.endogslam import EndoGslamParams, read_params
 
 #: K of the prepared images, half of the calibration behind them (docs/layouts/c3vd.md 2), as EndoGSLAM has it, with
 #: pixel centres at integers: hence + 0.5.

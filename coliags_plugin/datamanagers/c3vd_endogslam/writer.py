@@ -12,9 +12,9 @@ from coliags_plugin.core.files import write_arrays
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.datamanagers.c3vd_endogslam.reader import PREPARED_DEPTH, SH0
-from coliags_plugin.poses import endogslam
-from coliags_plugin.poses.rigid import inverse
-from coliags_plugin.poses.trajectory import Trajectory
+from coliags_plugin.geometry.poses import endogslam
+from coliags_plugin.geometry.poses.rigid import inverse
+from coliags_plugin.geometry.poses.trajectory import Trajectory
 
 #: Standard deviation of the map's Gaussians, scene units (mm).
 _SIZE = 0.3

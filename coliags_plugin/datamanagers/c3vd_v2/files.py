@@ -8,7 +8,7 @@ from pathlib import Path
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.c3vd.sequences import SequenceFiles
 from coliags_plugin.datamanagers.reading.frame_files import TIFF_SUFFIXES, inventory, numbered, paired
-from coliags_plugin.poses.c3vd import recognise as has_matrices
+from coliags_plugin.geometry.poses.c3vd import recognise as has_matrices
 
 LAYOUT = "rgb/NNNN.png and pose.txt, for registered videos also depth/NNNN_depth.tiff"
 #: Announced for the release; its location and format are not documented.

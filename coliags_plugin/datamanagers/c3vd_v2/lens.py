@@ -8,7 +8,7 @@ from pathlib import Path
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.text_files import read_text
-from coliags_plugin.lenses.models import OmnidirectionalLens
+from coliags_plugin.geometry.lenses.models import OmnidirectionalLens
 
 #: From the configuration of the same group's later renderer (C3VDv3). C3VDv2's own page gives no numbers, so this is
 #: what v2 was probably rendered with, and unverified (docs/layouts/c3vd-v2.md 2). It counts pixel centres at integers:

@@ -14,7 +14,7 @@ from coliags_plugin.datamanagers.c3vd_v2.lens import CANDIDATE_LENS, read_camera
 from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
 from coliags_plugin.datamanagers.seen import ROTATION
-from coliags_plugin.lenses.models import LENSES, Lens
+from coliags_plugin.geometry.lenses.models import LENSES, Lens
 
 log = logging.getLogger(__name__)
 

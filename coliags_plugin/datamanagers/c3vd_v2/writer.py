@@ -12,7 +12,7 @@ from coliags_plugin.core.images import write_image
 from coliags_plugin.datamanagers.c3vd.writer import depth_steps, normal_steps
 from coliags_plugin.datamanagers.c3vd_v2.files import INTRINSICS
 from coliags_plugin.datamanagers.c3vd_v2.lens import ORDER
-from coliags_plugin.lenses.models import OmnidirectionalLens
+from coliags_plugin.geometry.lenses.models import OmnidirectionalLens
 
 
 def write_frame(

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int, UInt8
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.colmap.binary import check_complete
 from coliags_plugin.datamanagers.colmap.lens import ColmapLens
-from coliags_plugin.poses import colmap as colmap_poses
+from coliags_plugin.geometry.poses import colmap as colmap_poses
 
 if TYPE_CHECKING:
     import pycolmap
@@ -89,7 +89,7 @@ def read_model(folder: Path) -> Model:
 
     Raises:
         InputError: The folder holds none; a file is damaged; poses are invalid (see
-            :func:`coliags_plugin.poses.colmap.read`); or a camera cannot be undistorted to a pinhole.
+            :func:`coliags_plugin.geometry.poses.colmap.read`); or a camera cannot be undistorted to a pinhole.
     """
     suffix = _suffix(folder)
     if suffix is None:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from coliags_plugin.lenses.models import Array
-from coliags_plugin.lenses.tabulated import MappedLens
+from coliags_plugin.geometry.lenses.models import Array
+from coliags_plugin.geometry.lenses.tabulated import MappedLens
 
 if TYPE_CHECKING:
     import pycolmap

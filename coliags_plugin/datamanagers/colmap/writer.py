@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from coliags_plugin.core.images import write_image, write_mask
-from coliags_plugin.poses.colmap import write_reconstruction
+from coliags_plugin.geometry.poses.colmap import write_reconstruction
 
 if TYPE_CHECKING:
     import pycolmap

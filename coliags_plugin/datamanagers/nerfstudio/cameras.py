@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.lenses.models import FisheyeLens, Lens
-from coliags_plugin.lenses.opencv import OpenCVLens
-from coliags_plugin.lenses.pinhole import PinholeLens
+from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens
+from coliags_plugin.geometry.lenses.opencv import OpenCVLens
+from coliags_plugin.geometry.lenses.pinhole import PinholeLens
 
 PixelCenters = Literal["half", "integer"]
 

@@ -17,7 +17,7 @@ from coliags_plugin.datamanagers.nerfstudio.cameras import PixelCenters, camera_
 from coliags_plugin.datamanagers.reading.image_names import first_few
 from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.reading.named_files import named_file
-from coliags_plugin.lenses.models import Lens
+from coliags_plugin.geometry.lenses.models import Lens
 
 FILE = "transforms.json"
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
@@ -98,7 +98,7 @@ class Transforms:
         return path
 
     def undo_applied_transform(self, positions: np.ndarray) -> np.ndarray:
-        """Transform points of the file's world into the poses' world (:mod:`coliags_plugin.poses.nerfstudio`)."""
+        """Transform points of the file into the world of its poses, :mod:`coliags_plugin.geometry.poses.nerfstudio`."""
         applied = np.array(self.content.get("applied_transform", np.eye(4)), np.float64)[:3]
         unscaled = positions / float(self.content.get("applied_scale", 1.0)) - applied[:, 3]
         return np.asarray(unscaled @ applied[:, :3])

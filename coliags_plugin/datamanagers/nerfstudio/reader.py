@@ -23,9 +23,9 @@ from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
 from coliags_plugin.datamanagers.seen import find_seen_masks
 from coliags_plugin.datamanagers.units import printed_unit
-from coliags_plugin.lenses.models import Lens
-from coliags_plugin.lenses.pinhole import PinholeLens
-from coliags_plugin.poses import nerfstudio as nerfstudio_poses
+from coliags_plugin.geometry.lenses.models import Lens
+from coliags_plugin.geometry.lenses.pinhole import PinholeLens
+from coliags_plugin.geometry.poses import nerfstudio as nerfstudio_poses
 
 #: Files that identify RotateColon instead, whose images are named by number and whose depth is scaled.
 _ROTATECOLON = ("train_views", "transforms_test.json")

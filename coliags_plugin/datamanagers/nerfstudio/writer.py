@@ -9,8 +9,8 @@ from jaxtyping import Float, UInt8
 
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.images import write_image
-from coliags_plugin.lenses.opencv import OpenCVLens
-from coliags_plugin.poses.rigid import FLIP_Y_AND_Z
+from coliags_plugin.geometry.lenses.opencv import OpenCVLens
+from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
 
 
 def write_frame(

@@ -18,9 +18,9 @@ from coliags_plugin.datamanagers.reading.depth_formats import DepthFormat
 from coliags_plugin.datamanagers.reading.frame_files import inventory
 from coliags_plugin.datamanagers.reading.images import read_gray
 from coliags_plugin.datamanagers.reading.named_files import named_file
-from coliags_plugin.lenses.models import FisheyeLens, Lens
-from coliags_plugin.poses.rigid import FLIP_Y_AND_Z, check_rigid
-from coliags_plugin.poses.trajectory import natural_order, refuse_repeated
+from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens
+from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z, check_rigid
+from coliags_plugin.geometry.poses.trajectory import natural_order, refuse_repeated
 
 #: Parts of a sequence; ``test`` is all frames, ``true_test`` those in neither training nor validation.
 PARTS = ("train", "val", "test", "true_test")

@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float, UInt8
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.images import write_image
 from coliags_plugin.datamanagers.reim_nerf.files import C3VD_RANGE, ray_cosines
-from coliags_plugin.lenses.models import FisheyeLens
-from coliags_plugin.poses.rigid import FLIP_Y_AND_Z
+from coliags_plugin.geometry.lenses.models import FisheyeLens
+from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
 
 MASK = "rgb_mask.png"
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.poses.trajectory import natural_order
+from coliags_plugin.geometry.poses.trajectory import natural_order
 
 #: A file stem that is a timestamp in seconds with a fraction, as TUM's, with an optional suffix.
 _TIME = re.compile(r"(\d+\.\d+)(?:_[a-z]+)?", re.IGNORECASE)

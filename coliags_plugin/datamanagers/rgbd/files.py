@@ -18,9 +18,9 @@ from coliags_plugin.core.text_files import read_text, text_lines
 from coliags_plugin.datamanagers.reading.camera_json import read_intrinsics
 from coliags_plugin.datamanagers.reading.frame_files import DEPTH_SUFFIXES, IMAGE_SUFFIXES, inventory
 from coliags_plugin.datamanagers.reading.images import size_of
-from coliags_plugin.poses import tum
-from coliags_plugin.poses.colmap import read_text_cameras
-from coliags_plugin.poses.text import shortened
+from coliags_plugin.geometry.poses import tum
+from coliags_plugin.geometry.poses.colmap import read_text_cameras
+from coliags_plugin.geometry.poses.text import shortened
 
 IMAGE_FOLDERS = ("rgb", "color", "images")
 DEPTH_FOLDERS = ("depth", "depths")

@@ -36,8 +36,8 @@ from coliags_plugin.datamanagers.rgbd.files import (
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
 from coliags_plugin.datamanagers.seen import find_seen_masks
 from coliags_plugin.datamanagers.units import printed_unit
-from coliags_plugin.poses import tum
-from coliags_plugin.poses.trajectory import Trajectory
+from coliags_plugin.geometry.poses import tum
+from coliags_plugin.geometry.poses.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
 

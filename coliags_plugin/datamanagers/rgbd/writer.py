@@ -15,8 +15,8 @@ from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.reading.camera_json import write_camera_json
 from coliags_plugin.datamanagers.rgbd.association import is_time, times
-from coliags_plugin.poses import tum
-from coliags_plugin.poses.trajectory import Trajectory
+from coliags_plugin.geometry.poses import tum
+from coliags_plugin.geometry.poses.trajectory import Trajectory
 
 #: Largest 16-bit value.
 _LARGEST = 65_535

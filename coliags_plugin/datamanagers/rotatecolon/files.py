@@ -14,7 +14,7 @@ from jaxtyping import Float
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import read_json
 from coliags_plugin.datamanagers.reading.frame_files import inventory, numbered
-from coliags_plugin.poses.nerfstudio import read as read_transforms
+from coliags_plugin.geometry.poses.nerfstudio import read as read_transforms
 
 log = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ from coliags_plugin.core.files import make_folder, write_json
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.datamanagers.rotatecolon.files import POINTS, TEST, TRAIN, TRAIN_DEPTH, TRAIN_VIEWS
-from coliags_plugin.poses.rigid import FLIP_Y_AND_Z
+from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
 
 TEST_VIEWS = "test_views_1"
 #: Stored depth per mm, as in the dataset, and Blender's depth of the background.

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from coliags_plugin.datamanagers.c3vd.writer import CAMERA, POSES, write_frame, write_poses
 from coliags_plugin.datamanagers.reading.camera_json import write_camera_json
-from coliags_plugin.lenses.models import Lens
+from coliags_plugin.geometry.lenses.models import Lens
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, part_folder
 
 

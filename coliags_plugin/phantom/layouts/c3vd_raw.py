@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from coliags_plugin.datamanagers.c3vd.writer import write_poses, write_raw_frame
-from coliags_plugin.lenses.models import LENSES, Lens, octagon_mask
+from coliags_plugin.geometry.lenses.models import LENSES, Lens, octagon_mask
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, part_folder
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from coliags_plugin.datamanagers.c3vd.writer import write_poses
 from coliags_plugin.datamanagers.c3vd_v2.lens import CANDIDATE_LENS
 from coliags_plugin.datamanagers.c3vd_v2.writer import write_frame, write_lens
-from coliags_plugin.lenses.models import Lens, octagon_mask
+from coliags_plugin.geometry.lenses.models import Lens, octagon_mask
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, part_folder
 
 

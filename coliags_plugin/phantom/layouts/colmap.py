@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Float
 
 from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points, write_image_and_mask, write_model
-from coliags_plugin.lenses.models import Lens
+from coliags_plugin.geometry.lenses.models import Lens
+from coliags_plugin.geometry.poses.colmap import colmap_poses, posed_model
+from coliags_plugin.geometry.poses.rigid import inverse
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints, pinhole_of
-from coliags_plugin.poses.colmap import colmap_poses, posed_model
-from coliags_plugin.poses.rigid import inverse
 
 #: A point is observed in one of this many images that show it, like a detected feature.
 _FOUND_IN_ONE_OF = 3

@@ -12,11 +12,11 @@ from coliags_plugin.datamanagers.c3vd.writer import write_poses
 from coliags_plugin.datamanagers.c3vd_endogslam.files import PARAMS
 from coliags_plugin.datamanagers.c3vd_endogslam.reader import PREPARED_PINHOLE
 from coliags_plugin.datamanagers.c3vd_endogslam.writer import write_frame, write_params
-from coliags_plugin.lenses.models import Lens
-from coliags_plugin.lenses.pinhole import PinholeLens
+from coliags_plugin.geometry.lenses.models import Lens
+from coliags_plugin.geometry.lenses.pinhole import PinholeLens
+from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints, part_folder, pinhole_of
 from coliags_plugin.phantom.trajectory import TEST_EVERY
-from coliags_plugin.poses.trajectory import Trajectory
 
 
 class EndoGSLAMLayout(Layout):

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from coliags_plugin.datamanagers.nerfstudio.writer import write_frame, write_transforms
-from coliags_plugin.lenses.models import Lens
-from coliags_plugin.lenses.opencv import OpenCVLens
+from coliags_plugin.geometry.lenses.models import Lens
+from coliags_plugin.geometry.lenses.opencv import OpenCVLens
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame
 
 #: Millimetres per depth step: up to 655 mm.

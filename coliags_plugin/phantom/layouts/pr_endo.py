@@ -10,10 +10,10 @@ from jaxtyping import Bool, Float
 
 from coliags_plugin.datamanagers.c3vd_endogslam.files import OPTIMIZED, PARAMS
 from coliags_plugin.datamanagers.c3vd_endogslam.writer import write_frame, write_gaussians, write_params
-from coliags_plugin.lenses.models import Lens
+from coliags_plugin.geometry.lenses.models import Lens
+from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints, pinhole_of
 from coliags_plugin.phantom.layouts.endogslam import EndoGSLAMLayout
-from coliags_plugin.poses.trajectory import Trajectory
 
 _DATA, _SCENE, _ITERATION = "C3VD", "phantom", 30_000
 

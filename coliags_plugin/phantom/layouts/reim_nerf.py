@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from coliags_plugin.datamanagers.reim_nerf.writer import ReimNerfWriter
-from coliags_plugin.lenses.models import LENSES, FisheyeLens, Lens
+from coliags_plugin.geometry.lenses.models import LENSES, FisheyeLens, Lens
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame
 
 #: Normalised units per mm. REIM-NeRF's own are 0.0092 to 0.0229, so that a scene lies between -1 and 1.

@@ -10,10 +10,10 @@ from jaxtyping import Float
 
 from coliags_plugin.datamanagers.reading.camera_json import write_camera_json
 from coliags_plugin.datamanagers.rgbd.writer import CAMERA, write_frame, write_lists
-from coliags_plugin.lenses.models import Lens
+from coliags_plugin.geometry.lenses.models import Lens
+from coliags_plugin.geometry.poses import tum
+from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame
-from coliags_plugin.poses import tum
-from coliags_plugin.poses.trajectory import Trajectory
 
 #: Depth steps per mm: 0.002 mm each, up to 131 mm; farther is unknown, as for TUM's sensor.
 DEPTH_SCALE = 500.0

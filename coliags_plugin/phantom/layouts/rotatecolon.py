@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from coliags_plugin.datamanagers.rotatecolon.writer import write_points, write_test_view, write_transforms, write_view
-from coliags_plugin.lenses.models import Lens
-from coliags_plugin.lenses.pinhole import PinholeLens
+from coliags_plugin.geometry.lenses.models import Lens
+from coliags_plugin.geometry.lenses.pinhole import PinholeLens
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints
 
 #: Horizontal field of view, radians: that of C3VD's undistorted frames.

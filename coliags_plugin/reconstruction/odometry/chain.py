@@ -11,7 +11,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.progress import Progress
-from coliags_plugin.poses.rigid import inverse, rigid
+from coliags_plugin.geometry.poses.rigid import inverse, rigid
 from coliags_plugin.reconstruction.odometry.registration import Edge
 
 #: (source, target, guess) -> a verified edge, or None.

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from coliags_plugin.core.intrinsics import Intrinsics
-from coliags_plugin.poses.rigid import rigid
+from coliags_plugin.geometry.poses.rigid import rigid
 from coliags_plugin.reconstruction.odometry.frames import PreparedFrame
 
 #: The contrast threshold is low because the images are normalised to uniform contrast.

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from coliags_plugin.poses.rigid import inverse
+from coliags_plugin.geometry.poses.rigid import inverse
 from coliags_plugin.reconstruction.odometry.chain import Bridge
 from coliags_plugin.reconstruction.odometry.registration import DEPTH_TRUNCATION, Edge
 

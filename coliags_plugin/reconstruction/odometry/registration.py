@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from coliags_plugin.core.intrinsics import Intrinsics
-from coliags_plugin.poses.rigid import RIGID_TOLERANCE, rigid
+from coliags_plugin.geometry.poses.rigid import RIGID_TOLERANCE, rigid
 from coliags_plugin.reconstruction.odometry.frames import PreparedFrame
 
 Term = Literal["hybrid", "point-to-plane", "intensity"]

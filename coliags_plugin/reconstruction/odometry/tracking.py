@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.progress import Progress
-from coliags_plugin.poses.rigid import inverse
+from coliags_plugin.geometry.poses.rigid import inverse
 from coliags_plugin.reconstruction.odometry.chain import Chain, chain, fill_gaps
 from coliags_plugin.reconstruction.odometry.features import motion_by_features
 from coliags_plugin.reconstruction.odometry.frames import PreparedVideo, RgbdFrame, typical_depth

@@ -9,8 +9,8 @@ import numpy as np
 
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.poses.colmap import posed_model
-from coliags_plugin.poses.rigid import inverse
+from coliags_plugin.geometry.poses.colmap import posed_model
+from coliags_plugin.geometry.poses.rigid import inverse
 
 if TYPE_CHECKING:
     import pycolmap

@@ -10,7 +10,7 @@ from jaxtyping import Bool, UInt8
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import decode_image
-from coliags_plugin.poses.trajectory import natural_order
+from coliags_plugin.geometry.poses.trajectory import natural_order
 
 #: Suffixes of image files, in lower case.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")

@@ -13,8 +13,8 @@ from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress
-from coliags_plugin.poses.rigid import inverse
-from coliags_plugin.poses.trajectory import Trajectory
+from coliags_plugin.geometry.poses.rigid import inverse
+from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.reconstruction.structure.camera_search import both_signs, find_start
 from coliags_plugin.reconstruction.structure.hypotheses import Hypothesis, choose
 from coliags_plugin.reconstruction.structure.image_files import Masks, read_image

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.lenses.models import LENSES, FisheyeLens
+from coliags_plugin.geometry.lenses.models import LENSES, FisheyeLens
 from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings
 
 if TYPE_CHECKING:

@@ -1,0 +1,1 @@
+"""Checks of datasets, estimated depth and methods."""

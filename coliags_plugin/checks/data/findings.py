@@ -1,0 +1,286 @@
+"""Rules that turn the measured statistics into suspected problems, with evidence and advice."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from coliags_plugin.checks.data.facts import DepthFacts, ImageFacts, PathFacts
+from coliags_plugin.checks.data.hypotheses import ADVICE, GIVEN, NO_MOTION
+from coliags_plugin.checks.data.lamp import LampFacts
+from coliags_plugin.checks.data.matches import EpipolarAgreement
+from coliags_plugin.checks.data.reprojection import Agreement, BestScale
+from coliags_plugin.core.scenes import Frame
+
+#: Largest median depth difference of agreeing frames, relative to the depth.
+DEPTH_AGREES = 0.02
+#: The same under another reading of the poses, for it to be named.
+READING_AGREES = 0.04
+#: Depth differences below this share are limited by the sampling of depth, and raise no doubt.
+DEPTH_SURE = 0.005
+#: A pose hypothesis is reported when it reduces the error by this factor.
+CLEARLY_BETTER = 2.0
+#: Factors on depth closer to 1 than this (in the logarithm) are ignored.
+SCALE_TOLERANCE = 0.1
+#: Smallest share of pixels that must project into the other image.
+SHARE_LANDS = 0.3
+#: Epipolar distances below this are limited by image sharpness, px.
+EPIPOLAR_SURE = 0.5
+#: Smallest share of good matches in front of both cameras.
+IN_FRONT = 0.6
+#: Steps longer than this many typical steps of the moving camera are jumps.
+JUMP = 10.0
+#: Rank correlation of brightness and distance, and share of the frames where it is positive, above which depth is taken
+#: to be reversed.
+REVERSED, REVERSED_SHARE = 0.3, 0.75
+#: Fewest frames to tell.
+REVERSED_FRAMES = 4
+#: The renderers' default near plane, scene units.
+NEAR = 0.2
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One suspected problem.
+
+    Attributes:
+        what: Short description.
+        evidence: The numbers behind it.
+        do: What the user can do about it.
+    """
+
+    what: str
+    evidence: str
+    do: str
+
+
+def depth_findings(depth: DepthFacts | None, metric: bool) -> Iterator[Finding]:
+    """Implausible depth: mostly unknown, constant, or in another unit.
+
+    Args:
+        depth: Its statistics.
+        metric: Whether lengths are stated to be in mm; False where their unit is unknown.
+    """
+    if depth is None:
+        return
+    if depth.invalid_share > 0.5:
+        yield Finding(
+            "most of the depth is unknown",
+            f"{depth.invalid_share:.0%} of the unmasked pixels",
+            "Check that the depth files belong to these images and are read with the right number of bits",
+        )
+    if math.isnan(depth.median):
+        return
+    if _is_flat(depth):
+        yield Finding(
+            "depth is the same everywhere",
+            f"{depth.nearest:.4g} to {depth.farthest:.4g}",
+            "Check the depth files: a failed export can leave images of one value",
+        )
+    if depth.median < 1.0 and not metric:
+        yield Finding(
+            "depth is beside the near plane",
+            f"median {depth.median:.4g}; renderers clip at {NEAR:g}",
+            "Multiply poses and depth by one factor, for instance 10: their unit is unknown anyway",
+        )
+    elif depth.median < 1.0:
+        yield Finding(
+            "depth looks like metres",
+            f"median {depth.median:.4g}; this package expects millimetres, and renderers clip at a near plane of "
+            f"{NEAR:g}",
+            "Give lengths in mm: poses and depth times 1000, or the format's unit option",
+        )
+    elif depth.median > 1000.0 and metric:
+        yield Finding(
+            "depth is too far for an endoscope",
+            f"median {depth.median:.4g} mm",
+            "Check the unit of the depth files",
+        )
+
+
+def lamp_findings(lamp: LampFacts | None) -> Iterator[Finding]:
+    """Brightness that rises with distance, as of depth that is reversed."""
+    if lamp is None or lamp.frames < REVERSED_FRAMES:
+        return
+    if lamp.correlation > REVERSED and lamp.rising_share > REVERSED_SHARE:
+        yield Finding(
+            "the far is brighter than the near",
+            f"brightness rises with distance (rank correlation {lamp.correlation:.2f}, the median of {lamp.frames} "
+            "frames), though the lamp is at the camera",
+            "Check whether the depth is reversed: a disparity, inverse or inverted depth, or one of other images",
+        )
+
+
+def agreement_findings(
+    readings: Mapping[str, Agreement], scale: BestScale | None, path: PathFacts | None, depth: DepthFacts | None
+) -> Iterator[Finding]:
+    """Contradictions of poses and depth, and the pose convention or unit that would resolve them."""
+    given = readings.get(GIVEN)
+    if given is None or path is None or path.length == 0.0 or depth is None or _is_flat(depth):
+        return
+    error = math.inf if given.depth_error is None or given.share < SHARE_LANDS else given.depth_error
+    errors = (
+        f"surfaces differ by {_percent(given.depth_error)} of the depth, {given.share:.0%} of the pixels project into "
+        "the other image"
+    )
+    better = {
+        name: reading
+        for name, reading in readings.items()
+        if name in ADVICE and reading.depth_error is not None and reading.share >= SHARE_LANDS
+    }
+    best = min(better, key=lambda name: better[name].depth_error or 0.0, default=None)
+    least = math.inf if best is None else better[best].depth_error or 0.0
+    by_scale = math.inf
+    if scale is not None and error > DEPTH_SURE and abs(math.log(scale.factor)) >= SCALE_TOLERANCE:
+        # With dummy depth any factor does that makes the motion negligible.
+        by_scale = scale.depth_error if scale.depth_error * CLEARLY_BETTER < scale.beside else math.inf
+    if scale is not None and by_scale * CLEARLY_BETTER < min(error, least * CLEARLY_BETTER):
+        yield Finding(
+            "depth and poses are in different units",
+            f"as given, {errors}; with depth times {scale.factor:.3g}, {_percent(by_scale)}",
+            f"Check the units: depth seems to be {1.0 / scale.factor:.3g} times what the poses expect",
+        )
+    elif best is not None and error > DEPTH_SURE and least * CLEARLY_BETTER < error and least < READING_AGREES:
+        yield Finding(
+            f"poses agree with depth when read as: {best}",
+            f"as given, {errors}; read this way, {_percent(least)}",
+            ADVICE[best],
+        )
+    elif error > DEPTH_AGREES:
+        still = readings[NO_MOTION].depth_error
+        yield Finding(
+            "frames do not agree on the surface",
+            f"{errors}; without motion, {_percent(still)}",
+            "Check that images, depth and poses match frame by frame, and the calibration",
+        )
+
+
+def match_findings(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Finding]:
+    """Contradictions of poses and matched features."""
+    given = readings.get(GIVEN)
+    if given is None:
+        return
+    errors = f"{given.count} matches lie {given.error:.2g} px from their epipolar lines (median), " + (
+        f"with a parallax of {given.parallax:.2g} px"
+        if given.in_front is None
+        else f"{given.in_front:.0%} in front of both cameras"
+    )
+    in_front = given.in_front is None or given.in_front >= IN_FRONT
+    right = [
+        name
+        for name, reading in readings.items()
+        if name in ADVICE
+        and (reading.in_front or 0.0) >= IN_FRONT
+        and (
+            (given.error > EPIPOLAR_SURE and reading.error * CLEARLY_BETTER < given.error)
+            or (not in_front and reading.error <= max(EPIPOLAR_SURE, given.error))
+        )
+    ]
+    best = min(right, key=lambda name: readings[name].error, default=None)
+    if best is not None:
+        reading = readings[best]
+        yield Finding(
+            f"poses agree with the images when read as: {best}",
+            f"as given, {errors}; read this way, {reading.error:.2g} px, {_percent(reading.in_front)} in front",
+            ADVICE[best],
+        )
+    elif not given.agrees or not in_front:
+        yield Finding(
+            "images do not agree with the poses",
+            errors,
+            "Check that images and poses match frame by frame, and the calibration",
+        )
+
+
+def undecided(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Finding]:
+    """Poses that matched features can neither confirm nor refute, for lack of parallax."""
+    given = readings.get(GIVEN)
+    if given is not None and given.in_front is None and given.agrees:
+        yield Finding(
+            "poses may be right or wrong",
+            f"{given.count} matches lie {given.error:.2g} px from their epipolar lines, but the camera moves them by "
+            f"{given.parallax:.2g} px only (median), beside its rotation",
+            "Look at frames further apart, --set frame_step=N, or at a part of the video with more motion",
+        )
+
+
+def path_findings(path: PathFacts | None) -> Iterator[Finding]:
+    """Jumps of the camera, or a static camera."""
+    if path is None:
+        return
+    if path.length == 0.0:
+        yield Finding("the camera does not move", "all poses have one centre", "Check the pose file")
+    elif path.largest_step > JUMP * max(path.moving_step, 1e-3 * path.mean_step):
+        yield Finding(
+            "the camera jumps",
+            f"{path.largest_step:.4g} to {path.largest_step_at}, {path.moving_step:.4g} typically while it moves",
+            "Check the poses around that frame: a cut in the video, or lines missing",
+        )
+
+
+def calibration_findings(frames: Sequence[Frame]) -> Iterator[Finding]:
+    """Implausible intrinsics, mostly those of another image size."""
+    seen: set[tuple[float, ...]] = set()
+    for frame in frames:
+        camera = frame.camera
+        key = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+        if key in seen:
+            continue
+        seen.add(key)
+        off = max(abs(camera.cx / camera.width - 0.5), abs(camera.cy / camera.height - 0.5))
+        if off > 0.2:
+            yield Finding(
+                "the principal point is far from the middle",
+                f"{frame.name}: ({camera.cx:.4g}, {camera.cy:.4g}) of {camera.width} x {camera.height} px",
+                "Check that the intrinsics are for images of this size",
+            )
+        ratio = camera.fx / camera.fy
+        if not 1 / 1.15 < ratio < 1.15:
+            yield Finding(
+                "pixels are far from square",
+                f"{frame.name}: fx / fy = {ratio:.3g}",
+                "Check the intrinsics, or the working width and height",
+            )
+        angle = 2.0 * math.degrees(math.atan(0.5 * camera.width / camera.fx))
+        if not 25.0 < angle < 160.0:
+            yield Finding(
+                "the field of view is implausible for an endoscope",
+                f"{frame.name}: {angle:.3g} degrees across",
+                "Check the focal length and the image size it is for",
+            )
+
+
+def image_findings(images: ImageFacts) -> Iterator[Finding]:
+    """Black, overexposed, mostly masked or repeated images."""
+    if images.darkest_frame < 4.0:
+        yield Finding(
+            "an image is black", f"{images.darkest_at}: mean {images.darkest_frame:.2g} of 255", "Leave it out"
+        )
+    if images.overexposed_share > 0.25:
+        yield Finding("images are overexposed", f"{images.overexposed_share:.0%} of the pixels are white", "")
+    if images.masked_share > 0.75:
+        yield Finding(
+            "most pixels are masked",
+            f"{images.masked_share:.0%} of the pixels are ignored",
+            "Check the meaning of the mask: black is ignored here",
+        )
+    if images.repeated:
+        count = len(images.repeated)
+        yield Finding(
+            "images repeat",
+            f"{images.repeated[0]}"
+            + (f" and {count - 1} more equal" if count > 1 else " equals")
+            + " the image before",
+            "Leave repeated images and their poses out: the video was captured at a higher frame rate than the "
+            "endoscope's",
+        )
+
+
+def _is_flat(depth: DepthFacts) -> bool:
+    """Whether depth is the same everywhere; False where it is unknown."""
+    return depth.farthest - depth.nearest < 1e-3 * depth.median
+
+
+def _percent(value: float | None) -> str:
+    return "an unknown part" if value is None else f"{value:.2%}"

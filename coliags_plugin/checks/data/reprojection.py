@@ -1,0 +1,197 @@
+"""Reprojection check: the back-projected surface of one frame must lie on the surface seen in another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from coliags_plugin.checks.data.hypotheses import CHANGES, GIVEN, Change
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.scenes import Frame
+
+#: Largest number of pixels reprojected per frame.
+_PIXELS = 4000
+#: Factors on depth of the coarse search.
+_SCALES = np.logspace(-4.0, 4.0, 65)
+#: Stride of the pixels used in that search.
+_THINNED = 8
+#: Smallest share of pixels that project into the other image for a factor to count.
+_LAND = 0.2
+
+
+@dataclass(frozen=True)
+class ReprojectedPixels:
+    """Pixels of a source frame reprojected into a target frame.
+
+    Attributes:
+        share: Share of the pixels that project into the target image, in front of its camera.
+        depth_errors: |z - z_target| / z_target, of those that hit known depth. [K]
+        depth_errors_mm: |z - z_target|, scene units. [K]
+        color_errors: Mean absolute difference of the channels, grey levels, brightness matched. [K]
+    """
+
+    share: float
+    depth_errors: Float[Tensor, "K"]
+    depth_errors_mm: Float[Tensor, "K"]
+    color_errors: Float[Tensor, "K"]
+
+
+class Pair:
+    """Two frames with depth, the first of which is reprojected into the second under several pose hypotheses.
+
+    Args:
+        source: The frame whose pixels are back-projected.
+        target: The frame that they are projected into.
+    """
+
+    def __init__(self, source: Frame, target: Frame) -> None:
+        depth, there = _known_depth(source), _known_depth(target)
+        chosen = _some(torch.isfinite(depth))
+        own_axes = replace(source.camera, camera_to_world=torch.eye(4, dtype=torch.float64))
+        self._source, self._target = source.camera, target.camera
+        #: Points in the source camera's axes. [K, 3]
+        self._points = own_axes.unproject(depth).reshape(-1, 3)[chosen]
+        self._depth_there = there.reshape(-1)
+        self._colors = source.image.reshape(-1, 3)[chosen].double()
+        self._colors_there = target.image.reshape(-1, 3).double()
+
+    def reproject(self, change: Change, scale: float = 1.0, every: int = 1) -> ReprojectedPixels:
+        """Reproject the source's pixels.
+
+        Args:
+            change: Transform of both poses.
+            scale: Factor on both depths.
+            every: Stride of the pixels used.
+        """
+        points = self._points[::every] * scale
+        if not len(points):
+            nothing = torch.zeros(0, dtype=torch.float64)
+            return ReprojectedPixels(0.0, nothing, nothing, nothing)
+        pose = change(self._source.camera_to_world.double())
+        camera = _changed(self._target, change)
+        pixels, z = camera.project(points @ pose[:3, :3].T + pose[:3, 3])
+        column, row = pixels.floor().nan_to_num(-1.0).clamp(-1, 1 << 20).long().unbind(-1)
+        lands = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        place = row[lands] * camera.width + column[lands]
+        there = self._depth_there[place] * scale
+        difference = (z[lands] - there).abs()
+        known = torch.isfinite(difference)
+        return ReprojectedPixels(
+            float(lands.double().mean()),
+            (difference / there)[known],
+            difference[known],
+            _color_difference(self._colors[::every][lands], self._colors_there[place]),
+        )
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Agreement of frames under one pose hypothesis: medians over the pixels of all pairs.
+
+    Attributes:
+        depth_error: Relative error of z-depth; None where no pixel hits known depth.
+        depth_error_mm: The same in scene units.
+        color_error: Grey levels.
+        share: Share of pixels that project into the target image.
+    """
+
+    depth_error: float | None
+    depth_error_mm: float | None
+    color_error: float | None
+    share: float
+
+
+def agreement(pairs: Sequence[Pair], change: str = GIVEN, scale: float = 1.0, every: int = 1) -> Agreement:
+    """Reproject the first frame of every pair into the second; arguments as in :meth:`Pair.reproject`."""
+    reprojected = [pair.reproject(CHANGES[change], scale, every) for pair in pairs]
+    return Agreement(
+        _median([landing.depth_errors for landing in reprojected]),
+        _median([landing.depth_errors_mm for landing in reprojected]),
+        _median([landing.color_errors for landing in reprojected]),
+        float(np.mean([landing.share for landing in reprojected])) if reprojected else 0.0,
+    )
+
+
+@dataclass(frozen=True)
+class BestScale:
+    """The factor on depth with the smallest reprojection error.
+
+    Attributes:
+        factor: On depth.
+        depth_error: Relative error of z-depth with it.
+        beside: The smaller of the errors with half and with twice the factor; infinite where nothing overlaps.
+    """
+
+    factor: float
+    depth_error: float
+    beside: float
+
+
+def best_scale(pairs: Sequence[Pair]) -> BestScale | None:
+    """The factor on depth with the smallest reprojection error; None if none fits."""
+
+    def error(scale: float) -> float:
+        found = agreement(pairs, scale=float(scale), every=_THINNED)
+        return np.inf if found.depth_error is None or found.share < _LAND else found.depth_error
+
+    errors = [error(scale) for scale in _SCALES]
+    least = int(np.argmin(errors))
+    if not np.isfinite(errors[least]):
+        return None
+    step = _SCALES[1] / _SCALES[0]
+    fine = _SCALES[least] * step ** np.linspace(-1.0, 1.0, 17)
+    fine_errors = [error(scale) for scale in fine]
+    best = float(fine[int(np.argmin(fine_errors))])
+    return BestScale(best, float(min(fine_errors)), float(min(error(0.5 * best), error(2.0 * best))))
+
+
+def warp_image(source: Frame, target: Frame) -> tuple[Float[Tensor, "H W 3"], Bool[Tensor, "H W"]]:
+    """The source image warped into the target view by the target's depth, and the mask of warped pixels."""
+    depth = _known_depth(target)
+    pixels, z = _changed(source.camera).project(_changed(target.camera).unproject(depth).reshape(-1, 3))
+    camera = source.camera
+    grid = (pixels / pixels.new_tensor([camera.width, camera.height]) * 2 - 1).reshape(1, *depth.shape, 2)
+    image = source.image.permute(2, 0, 1)[None].double()
+    painted = torch.nn.functional.grid_sample(image, grid.nan_to_num(2.0), align_corners=False)[0].permute(1, 2, 0)
+    z_there = torch.nn.functional.grid_sample(
+        _known_depth(source)[None, None].nan_to_num(0.0), grid.nan_to_num(2.0), mode="nearest", align_corners=False
+    )[0, 0]
+    z = z.reshape(depth.shape)
+    # Points occluded in the source image are left out.
+    shown = (grid[0].abs() <= 1).all(-1) & (z > 0) & ((z_there - z).abs() < 0.05 * z)
+    return painted / 255.0, shown
+
+
+def _known_depth(frame: Frame) -> Float[Tensor, "H W"]:
+    depth = frame.depth
+    if depth is None:
+        return torch.full(frame.image.shape[:2], torch.nan, dtype=torch.float64)
+    return torch.where(frame.valid, depth.double(), torch.nan)
+
+
+def _changed(camera: Camera, change: Change = CHANGES[GIVEN]) -> Camera:
+    return replace(camera, camera_to_world=change(camera.camera_to_world.double()))
+
+
+def _some(known: Bool[Tensor, "H W"]) -> Tensor:
+    """Flat indices of an even sample of the known pixels. [K]"""
+    places = known.reshape(-1).nonzero()[:, 0]
+    return places[:: max(1, len(places) // _PIXELS)]
+
+
+def _color_difference(colors: Tensor, colors_there: Tensor) -> Tensor:
+    """Mean absolute colour difference after matching the channels' medians, as lamp and gain change. [K]"""
+    if not len(colors):
+        return torch.zeros(0, dtype=torch.float64)
+    factor = (colors_there.median(dim=0).values + 1.0) / (colors.median(dim=0).values + 1.0)
+    return (colors * factor - colors_there).abs().mean(dim=1)
+
+
+def _median(parts: Sequence[Tensor]) -> float | None:
+    values = torch.cat(list(parts)) if parts else torch.zeros(0)
+    return float(values.median()) if len(values) else None

@@ -1,0 +1,145 @@
+"""Comparison of estimated with true depth, frame by frame and over all pixels."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from coliags_plugin.checks.depth.measures import Errors, Measures, measure, median_scale, pooled
+from coliags_plugin.checks.depth.pairing import (
+    FramePairs,
+    Samples,
+    check_same_view,
+    dense_samples,
+    match_frames,
+    sparse_samples,
+    true_depth_at,
+)
+from coliags_plugin.checks.depth.sources import DepthSource
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.progress import Progress
+
+
+@dataclass(frozen=True)
+class FrameErrors:
+    """Errors of one frame; None where the truth has no depth of that kind.
+
+    Attributes:
+        name: Of the estimate's frame.
+        dense, sparse: Against dense depth and against single points.
+    """
+
+    name: str
+    dense: Errors | None
+    sparse: Errors | None
+
+
+@dataclass(frozen=True)
+class DepthCheck:
+    """Result of the comparison.
+
+    Attributes:
+        estimate, truth: What was compared.
+        pairs: The frames in both.
+        unit: Of lengths: ``"mm"``, or ``"units of the truth"``.
+        scale: Factor that the estimate was multiplied by; None: not aligned.
+        dense, sparse: Statistics over all pixels and points of all frames; None where the truth has no such depth.
+        frames: Errors of every frame.
+    """
+
+    estimate: DepthSource
+    truth: DepthSource
+    pairs: FramePairs
+    unit: str
+    scale: float | None
+    dense: Measures | None
+    sparse: Measures | None
+    frames: list[FrameErrors]
+
+    def as_json(self) -> dict[str, Any]:
+        """The same as JSON values; unavailable ones are null."""
+        return {
+            "estimate": str(self.estimate.path),
+            "truth": str(self.truth.path),
+            "unit": self.unit,
+            "aligned_by_factor": self.scale,
+            "frames_matched_by": self.pairs.by,
+            "frames_left_out": dict(zip(("estimate", "truth"), self.pairs.left_out, strict=True)),
+            "dense": None if self.dense is None else asdict(self.dense),
+            "sparse": None if self.sparse is None else asdict(self.sparse),
+            "frames": [asdict(frame) for frame in self.frames],
+        }
+
+
+def check_depth(
+    estimate: DepthSource, truth: DepthSource, align_scale: bool = False, progress: Progress | None = None
+) -> DepthCheck:
+    """Compare estimated with true depth.
+
+    Args:
+        estimate: The depth to judge.
+        truth: The depth to judge it by: dense, at single points, or both.
+        align_scale: Multiply the estimate by the median of true / estimated depth over all pixels.
+        progress: Called after every frame.
+
+    Raises:
+        InputError: The truth is an estimate itself; the views differ; no frame or no pixel is common; or a unit is
+            unknown without ``align_scale``.
+    """
+    _check_units(estimate, truth, align_scale)
+    pairs = match_frames(estimate, truth)
+    dense: list[Samples | None] = []
+    sparse: list[Samples | None] = []
+    for done, (here, there) in enumerate(pairs.places, start=1):
+        estimated, true = estimate.read(here), truth.read(there)
+        if true.confidence is not None:
+            raise InputError(
+                f"{truth.path} holds estimated depth: frame {truth.names[there]} has a confidence",
+                "true depth",
+                "Name the estimate first and the truth second",
+            )
+        check_same_view(estimate.names[here], estimated, true)
+        surface = true_depth_at(estimated, true)
+        dense.append(None if surface is None else dense_samples(estimated, surface))
+        sparse.append(sparse_samples(estimated, true))
+        if progress is not None:
+            progress("compare depth", done, len(pairs.places))
+    of_all = [_pooled(dense), _pooled(sparse)]
+    counted = [samples for samples in of_all if samples is not None and np.isfinite(samples.estimated).any()]
+    if not counted:
+        raise InputError(
+            f"{estimate.path} has no estimate at any of the {sum(len(s.true) for s in of_all if s is not None)} pixels "
+            f"of {len(pairs.places)} frames whose depth {truth.path} knows",
+            "an estimate and a truth that overlap",
+            "Check that both have depth, and which of the two paths is the estimate",
+        )
+    scale = median_scale(counted[0]) if align_scale else None
+    factor = 1.0 if scale is None else scale
+    measured = [None if samples is None else measure(samples, factor) for samples in of_all]
+    frames = [
+        FrameErrors(estimate.names[here], _frame_errors(surface, factor), _frame_errors(points, factor))
+        for (here, _), surface, points in zip(pairs.places, dense, sparse, strict=True)
+    ]
+    unit = "mm" if truth.metric else "units of the truth"
+    return DepthCheck(estimate, truth, pairs, unit, scale, measured[0], measured[1], frames)
+
+
+def _check_units(estimate: DepthSource, truth: DepthSource, align_scale: bool) -> None:
+    unknown = [str(source.path) for source in (estimate, truth) if not source.metric]
+    if unknown and not align_scale:
+        raise InputError(
+            f"the unit of length of {' and of '.join(unknown)} is unknown",
+            "lengths in mm",
+            "Pass --align-scale to compare up to one factor, the median of true / estimated depth",
+        )
+
+
+def _pooled(parts: list[Samples | None]) -> Samples | None:
+    there = [part for part in parts if part is not None and len(part.true)]
+    return pooled(there) if there else None
+
+
+def _frame_errors(samples: Samples | None, scale: float) -> Errors | None:
+    return None if samples is None else measure(samples, scale).errors

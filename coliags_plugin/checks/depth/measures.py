@@ -1,0 +1,178 @@
+"""Statistics of relative depth errors: over all pixels, by distance, and by stated confidence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from coliags_plugin.checks.depth.pairing import Samples
+
+#: Errors below this share of the depth are good, as in the definition of the confidence.
+WITHIN = 0.05
+#: Confidence from which an estimate is rather good than not.
+SURE = 0.5
+#: Lower edge of a band of distances, scene units; every band is twice as far as the one before.
+_BAND_EDGE = 5.0
+#: Number of bins of confidence.
+_BINS = 10
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of the pixels that have both an estimate and a truth; None where there are none.
+
+    Attributes:
+        pixels: Their number.
+        coverage: Share of the truth's pixels that have an estimate.
+        median: Median of |dz| / z.
+        p90: 90th percentile of |dz| / z.
+        within: Share with |dz| / z below 5 %.
+        bias: Median of dz / z; positive where the estimate is too far.
+        median_length, p90_length: Median and 90th percentile of |dz|, units of the truth.
+    """
+
+    pixels: int
+    coverage: float
+    median: float | None
+    p90: float | None
+    within: float | None
+    bias: float | None
+    median_length: float | None
+    p90_length: float | None
+
+
+@dataclass(frozen=True)
+class Band:
+    """Errors of the pixels whose true depth is in [low, high), units of the truth."""
+
+    low: float
+    high: float
+    errors: Errors
+
+
+@dataclass(frozen=True)
+class ConfidenceBin:
+    """Pixels whose confidence is in [low, high), the last bin with its upper end; [0, 0] where it is 0.
+
+    Attributes:
+        low, high: Ends of the bin.
+        pixels: Their number.
+        stated: Mean confidence.
+        observed: Share of them with |dz| / z below 5 %.
+    """
+
+    low: float
+    high: float
+    pixels: int
+    stated: float
+    observed: float
+
+
+@dataclass(frozen=True)
+class Measures:
+    """Statistics of a set of samples.
+
+    Attributes:
+        errors: Over all of them.
+        sure: The same with only the estimates of a confidence of 0.5 or more; None where there is no confidence.
+        bands: By distance, the nearest first; those without a pixel of known truth are left out.
+        bins: By confidence; empty where there is none.
+        calibration_error: Expected calibration error: mean of |stated - observed| over the bins of confidence above 0,
+            weighted by their pixels; None without such pixels.
+    """
+
+    errors: Errors
+    sure: Errors | None
+    bands: list[Band]
+    bins: list[ConfidenceBin]
+    calibration_error: float | None
+
+
+def measure(samples: Samples, scale: float = 1.0) -> Measures:
+    """All statistics of samples.
+
+    Args:
+        samples: Of one frame or of several.
+        scale: Factor on the estimate.
+    """
+    true = samples.true.astype(np.float64)
+    relative = samples.estimated.astype(np.float64) * scale / true - 1.0
+    bins = _bins(samples.confidence, relative)
+    stated = [found for found in bins if found.high > 0.0]
+    total = sum(found.pixels for found in stated)
+    gap = sum(found.pixels * abs(found.stated - found.observed) for found in stated)
+    sure = None
+    if samples.confidence is not None:
+        sure = _errors(np.where(samples.confidence >= SURE, relative, np.nan), true)
+    return Measures(_errors(relative, true), sure, _bands(relative, true), bins, gap / total if total else None)
+
+
+def median_scale(samples: Samples) -> float | None:
+    """Median of true / estimated depth; None where no pixel has both."""
+    known = np.isfinite(samples.estimated)
+    if not known.any():
+        return None
+    return float(np.median(samples.true[known].astype(np.float64) / samples.estimated[known]))
+
+
+def pooled(parts: Sequence[Samples]) -> Samples:
+    """Samples of several frames as one; where only some have confidence, that of the others is 0."""
+    confidence = None
+    if any(part.confidence is not None for part in parts):
+        confidence = np.concatenate(
+            [np.zeros(len(part.true), np.float32) if part.confidence is None else part.confidence for part in parts]
+        )
+    return Samples(
+        np.concatenate([part.estimated for part in parts]), np.concatenate([part.true for part in parts]), confidence
+    )
+
+
+def _errors(relative: Float[np.ndarray, "N"], true: Float[np.ndarray, "N"]) -> Errors:
+    known = np.isfinite(relative)
+    signed = relative[known]
+    coverage = float(known.mean()) if len(known) else 0.0
+    if not len(signed):
+        return Errors(0, coverage, None, None, None, None, None, None)
+    size = np.abs(signed)
+    median, p90 = (float(value) for value in np.quantile(size, (0.5, 0.9)))
+    median_length, p90_length = (float(value) for value in np.quantile(size * true[known], (0.5, 0.9)))
+    return Errors(
+        len(signed),
+        coverage,
+        median,
+        p90,
+        float((size < WITHIN).mean()),
+        float(np.median(signed)),
+        median_length,
+        p90_length,
+    )
+
+
+def _bands(relative: Float[np.ndarray, "N"], true: Float[np.ndarray, "N"]) -> list[Band]:
+    if not len(true):
+        return []
+    octave = np.maximum(np.floor(np.log2(true / _BAND_EDGE)), -1.0)
+    bands = []
+    for place in np.unique(octave):
+        inside = octave == place
+        low = 0.0 if place < 0 else _BAND_EDGE * 2.0**place
+        bands.append(Band(low, float(_BAND_EDGE * 2.0 ** (place + 1)), _errors(relative[inside], true[inside])))
+    return bands
+
+
+def _bins(confidence: Float[np.ndarray, "N"] | None, relative: Float[np.ndarray, "N"]) -> list[ConfidenceBin]:
+    if confidence is None:
+        return []
+    known = np.isfinite(relative)
+    stated, good = confidence[known].astype(np.float64), np.abs(relative[known]) < WITHIN
+    place = np.minimum((stated * _BINS).astype(np.int64), _BINS - 1)
+    ends = [(0.0, 0.0, stated == 0.0)]
+    ends += [(k / _BINS, (k + 1) / _BINS, (place == k) & (stated > 0.0)) for k in range(_BINS)]
+    return [_bin(low, high, stated[inside], good[inside]) for low, high, inside in ends if inside.any()]
+
+
+def _bin(low: float, high: float, stated: Float[np.ndarray, "K"], good: Bool[np.ndarray, "K"]) -> ConfidenceBin:
+    return ConfidenceBin(low, high, len(stated), float(stated.mean()), float(good.mean()))

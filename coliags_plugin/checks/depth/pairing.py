@@ -1,0 +1,137 @@
+"""Frames of an estimate and of the truth, matched, and their depth at the same places."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from coliags_plugin.checks.depth.sources import DepthMap, DepthSource, known_depth
+from coliags_plugin.core.errors import InputError
+
+#: Largest difference of the relative intrinsics (focal length and centre over the image size) of one view.
+_SAME_CAMERA = 0.01
+#: Largest relative difference of aspect ratios, for rounding to whole pixels.
+_SAME_ASPECT = 0.02
+
+
+@dataclass(frozen=True)
+class FramePairs:
+    """Frames in both sources.
+
+    Attributes:
+        by: ``"name"`` or ``"index"``.
+        places: Places of each frame in the estimate and in the truth.
+        left_out: Number of frames of the estimate, and of the truth, without a partner.
+    """
+
+    by: str
+    places: list[tuple[int, int]]
+    left_out: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Estimated and true depth at the places of known truth, N of them.
+
+    Attributes:
+        estimated: Scene units of the estimate; NaN where there is no estimate. [N]
+        true: Positive. [N]
+        confidence: 0 where unknown; None where the estimate has none. [N]
+    """
+
+    estimated: Float[np.ndarray, "N"]
+    true: Float[np.ndarray, "N"]
+    confidence: Float[np.ndarray, "N"] | None
+
+
+def match_frames(estimate: DepthSource, truth: DepthSource) -> FramePairs:
+    """Match frames by name; if no name is common, by index, provided that the counts agree.
+
+    Raises:
+        InputError: No name is common, and the counts differ.
+    """
+    there = {name: place for place, name in enumerate(truth.names)}
+    places = [(place, there[name]) for place, name in enumerate(estimate.names) if name in there]
+    if places:
+        return FramePairs("name", places, (len(estimate.names) - len(places), len(truth.names) - len(places)))
+    if len(estimate.names) == len(truth.names):
+        return FramePairs("index", [(place, place) for place in range(len(truth.names))], (0, 0))
+    raise InputError(
+        f"{estimate.path} ({len(estimate.names)} frames with depth, the first {estimate.names[0]}) and {truth.path} "
+        f"({len(truth.names)}, the first {truth.names[0]}) have no frame in common",
+        "frames of equal names, or as many of them, in the same order",
+        "Rename the files, or choose frames by --set frame_step=N and max_frames=N",
+    )
+
+
+def true_depth_at(estimate: DepthMap, truth: DepthMap) -> Float[np.ndarray, "H W"] | None:
+    """Dense true depth at the estimate's pixel centres, nearest neighbour; NaN where unknown. [H, W]"""
+    if truth.depth is None:
+        return None
+    width, height = estimate.size
+    row = ((np.arange(height) + 0.5) * truth.depth.shape[0] / height).astype(np.int64)
+    column = ((np.arange(width) + 0.5) * truth.depth.shape[1] / width).astype(np.int64)
+    sampled = truth.depth[row[:, None], column[None, :]]
+    return np.where(known_depth(sampled), sampled, np.float32(np.nan))
+
+
+def dense_samples(estimate: DepthMap, true: Float[np.ndarray, "H W"]) -> Samples:
+    """Samples at the estimate's pixels.
+
+    Args:
+        estimate: Of the frame.
+        true: As from :func:`true_depth_at`. [H, W]
+    """
+    known = np.isfinite(true)
+    return Samples(_estimated(estimate)[known], true[known], _confidence(estimate, known))
+
+
+def sparse_samples(estimate: DepthMap, truth: DepthMap) -> Samples | None:
+    """Samples at the points of the truth, from the estimate's pixels that hold them; None without points."""
+    if truth.sparse is None or not len(truth.sparse.depth):
+        return None
+    width, height = estimate.size
+    pixels, true = truth.sparse.pixels.double().numpy(), truth.sparse.depth.float().numpy()
+    column = np.floor(pixels[:, 0] * width / truth.size[0]).astype(np.int64).clip(0, width - 1)
+    row = np.floor(pixels[:, 1] * height / truth.size[1]).astype(np.int64).clip(0, height - 1)
+    known = known_depth(true)
+    place = row[known], column[known]
+    return Samples(_estimated(estimate)[place], true[known], _confidence(estimate, place))
+
+
+def check_same_view(name: str, estimate: DepthMap, truth: DepthMap) -> None:
+    """Check that two maps of one frame show the same view, if at different sizes.
+
+    Raises:
+        InputError: Their aspect ratios or cameras differ.
+    """
+    (width, height), (true_width, true_height) = estimate.size, truth.size
+    if abs(width * true_height / (height * true_width) - 1.0) > _SAME_ASPECT:
+        raise InputError(
+            f"frame {name}: the estimate is {width} x {height}, the truth {true_width} x {true_height} px",
+            "images of one shape",
+            "Set both to the same size by --set width=W and --set height=H, or estimate from the images of the truth",
+        )
+    if estimate.intrinsics is None or truth.intrinsics is None:
+        return
+    a, b = estimate.intrinsics, truth.intrinsics.resized(width, height)
+    off = max(abs(a.fx - b.fx) / width, abs(a.fy - b.fy) / height, abs(a.cx - b.cx) / width, abs(a.cy - b.cy) / height)
+    if off > _SAME_CAMERA:
+        raise InputError(
+            f"frame {name}: the estimate's camera (f {a.fx:.4g}, {a.fy:.4g}, centre {a.cx:.4g}, {a.cy:.4g} px) is "
+            f"another than the truth's (f {b.fx:.4g}, {b.fy:.4g}, centre {b.cx:.4g}, {b.cy:.4g} px at this size)",
+            "the same undistorted images",
+            "Estimate from the images of the truth, with the same lens and focal_scale",
+        )
+
+
+def _estimated(estimate: DepthMap) -> Float[np.ndarray, "H W"]:
+    if estimate.depth is None:
+        return np.full(estimate.size[::-1], np.nan, np.float32)
+    return np.where(known_depth(estimate.depth), estimate.depth, np.float32(np.nan))
+
+
+def _confidence(estimate: DepthMap, chosen: np.ndarray | tuple[np.ndarray, ...]) -> Float[np.ndarray, "N"] | None:
+    return None if estimate.confidence is None else np.asarray(estimate.confidence[chosen])

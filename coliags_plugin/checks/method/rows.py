@@ -1,0 +1,124 @@
+"""Check of a strategy: parameters, Adam's moments, buffers and counters change their rows together."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from itertools import pairwise
+
+from torch import nn
+
+from coliags_plugin.checks.method.bench import Bench, as_in_new_process
+from coliags_plugin.checks.method.results import CheckFailedError, CheckSkippedError
+from coliags_plugin.checks.method.storage import continues_alike
+from coliags_plugin.core.settings import Settings
+from coliags_plugin.engine.trainer import Trainer
+
+
+def keeps_rows_together(bench: Bench) -> str:
+    """Rows change together at every event, and a run resumed right after one ends in the same bits."""
+    node = bench.loaded.config.strategy
+    if node.target.serves is None:
+        raise CheckSkippedError(f"strategy '{node.name}' changes no rows")
+    method = bench.load(_hastened(node.settings, bench.steps))
+    with as_in_new_process():
+        trainer = bench.build("events", method=method)
+        trainer.start()
+        before = start = _Census(trainer)
+        if not start.count:
+            raise CheckFailedError(f"element_count of field '{bench.loaded.config.field.name}' is 0: override it")
+        counts = [start.count]
+        while trainer.step < trainer.steps and start.count == before.count:
+            before = _stepped(trainer, start, before)
+            counts.append(before.count)
+        if start.count == before.count:
+            raise CheckSkippedError(f"no row came or went in {trainer.steps} steps ({trainer.strategy.plan()})")
+        changed_at = trainer.step
+        trainer.save()
+        copy = bench.folder / "events-resumed"
+        shutil.copytree(trainer.run.path, copy, dirs_exist_ok=True)
+        while trainer.step < trainer.steps:
+            before = _stepped(trainer, start, before)
+            counts.append(before.count)
+    with as_in_new_process():
+        resumed = bench.build(copy.name, method=method)
+        resumed.resume()
+        apart = continues_alike(trainer, resumed, bench)
+    if apart:
+        raise CheckFailedError(f"resumed after the event of step {changed_at}: {apart}")
+    events = sum(a != b for a, b in pairwise(counts))
+    return f"{start.count} to {before.count} rows in {events} events; resumed after step {changed_at} to the same bits"
+
+
+def _hastened(settings: Settings, steps: int) -> list[str]:
+    """Overrides that make a strategy's intervals, which do not scale with a run, short enough for ``steps``.
+
+    Intervals are the whole numbers among its options that are called ``every`` or ``..._every``.
+    """
+    names = [name for name in type(settings).model_fields if name == "every" or name.endswith("_every")]
+    given = {name: getattr(settings, name) for name in names if isinstance(getattr(settings, name), int)}
+    shortest = min(given.values(), default=0)
+    short = max(1, steps // 5)
+    return [f"strategy.{name}={short if every == shortest else 2 * short}" for name, every in given.items()]
+
+
+@dataclass
+class _Census:
+    """Numbers of rows at one time.
+
+    Attributes:
+        count: Elements of the field.
+        parameters: Rows of the groups of one parameter.
+        buffers: Rows of the field's own buffers; those of its parts may be of another kind.
+        counters: Rows of the strategy's counters.
+    """
+
+    count: int
+    parameters: dict[str, int]
+    buffers: dict[str, int]
+    counters: dict[str, int]
+
+    def __init__(self, trainer: Trainer) -> None:
+        model = trainer.model
+        self.count = model.field.element_count
+        groups = {name: group for name, group in model.field.parameter_groups().items() if len(group) == 1}
+        self.parameters = {name: len(group[0]) for name, group in groups.items() if group[0].ndim}
+        self.buffers = {name: len(value) for name, value in model.field.named_buffers(recurse=False) if value.ndim}
+        self.counters = {name: len(value) for name, value in trainer.strategy.state_dict().items() if value.ndim}
+
+
+def _stepped(trainer: Trainer, start: _Census, before: _Census) -> _Census:
+    """The numbers after one more step, having been compared."""
+    done = trainer.take_step()
+    now = _Census(trainer)
+    said = f"step {done['step']}, {before.count} to {now.count} rows: "
+    for group, parameters in trainer.model.parameter_groups().items():
+        adam = trainer.optimizers.adam[group]
+        _check_adam(group, adam.param_groups[0]["params"], parameters, said)
+        for parameter in parameters:
+            for key, value in adam.state.get(parameter, {}).items():
+                if key.startswith("exp_avg") and value.shape != parameter.shape:
+                    raise CheckFailedError(
+                        f"{said}{key} of group '{group}' has shape {list(value.shape)}, its parameter "
+                        f"{list(parameter.shape)}; change rows by ParameterRows alone"
+                    )
+    for kind, then, after in (
+        ("parameter group", start.parameters, now.parameters),
+        ("buffer", start.buffers, now.buffers),
+    ):
+        for name, length in then.items():
+            if length == start.count and after[name] != now.count:
+                raise CheckFailedError(f"{said}{kind} '{name}' has {after[name]}")
+    for name, length in now.counters.items():
+        per_row, rest = divmod(before.counters.get(name, 0), before.count)
+        if per_row and not rest and length not in (0, per_row * now.count):
+            raise CheckFailedError(f"{said}counter '{name}' of the strategy has {length}")
+    return now
+
+
+def _check_adam(group: str, trained: list[nn.Parameter], there: list[nn.Parameter], said: str) -> None:
+    if [id(parameter) for parameter in trained] != [id(parameter) for parameter in there]:
+        raise CheckFailedError(
+            f"{said}the optimizer of group '{group}' trains what is no longer the field's; change rows by "
+            "ParameterRows alone"
+        )

@@ -1,0 +1,107 @@
+"""Files of Gaussians as runs on a scene, which everything that takes a run takes."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import torch
+
+from coliags_plugin.contracts import Schedule
+from coliags_plugin.core.anonymity import without_places
+from coliags_plugin.core.files import atomic_folder
+from coliags_plugin.core.scenes import Scene
+from coliags_plugin.engine.checkpoints import save_checkpoint
+from coliags_plugin.engine.data_formats import load_method_for, load_scene
+from coliags_plugin.engine.model import Model, make_view_modules
+from coliags_plugin.engine.optimizers import Optimizers
+from coliags_plugin.engine.provenance import run_provenance
+from coliags_plugin.engine.randomness import generators
+from coliags_plugin.engine.run_folder import RunFolder
+from coliags_plugin.export.baking.explicit import load_cloud
+from coliags_plugin.export.splats.cloud import SplatCloud
+from coliags_plugin.export.splats.files import read_splats
+from coliags_plugin.renderers.choice import choose_renderer
+
+log = logging.getLogger(__name__)
+
+#: Methods of imported Gaussians, by the number of their scales.
+_METHODS = {3: "3dgs", 2: "2dgs"}
+#: Training cameras, approximately, that are asked what they see of a file; and the share of it that is too few.
+_CAMERAS, _FEW = 16, 0.01
+
+
+def import_run(
+    file: Path,
+    data: Path,
+    output: RunFolder,
+    device: torch.device,
+    data_format: str | None = None,
+    overwrite: bool = False,
+    anonymous: bool = False,
+) -> None:
+    """Make a run of a file of Gaussians: a run folder at step 0, to evaluate, render and report like any other.
+
+    Args:
+        file: PLY, SPZ or splat, in the frame and unit of the scene.
+        data: The scene's folder.
+        output: The run folder to make.
+        device: What the run is recorded to compute on.
+        data_format: Name of a data manager; None: the one that recognises the folder.
+        overwrite: Replace an existing run folder.
+        anonymous: Keep absolute paths out of the run.
+
+    Raises:
+        InputError: The file or the scene cannot be read, or the folder exists or cannot be written.
+    """
+    output.check_free(overwrite)
+    cloud = read_splats(file)
+    method = load_method_for(data, _METHODS[cloud.scales.shape[1]], data_format=data_format)
+    config = method.config
+    scene = load_scene(config, data)
+    _warn_of_another_frame(scene, cloud, file)
+    chosen = choose_renderer(config.renderer, config.field.target.primitive, device)
+    field = config.field.target(config.field.settings, len(cloud))
+    load_cloud(field, cloud)
+    streams = generators(0)
+    modules = make_view_modules(config, scene, streams["initialisation"])
+    model = Model(field, chosen.renderer, modules)
+    schedule = Schedule(config.schedule.steps, config.schedule.written_for)
+    sizes = [(frame.camera.width, frame.camera.height) for frame in scene.train]
+    provenance = {
+        **run_provenance(method, scene, str(data.resolve()), 0, device, chosen, model),
+        "imported": {"file": str(file.resolve()), "gaussians": len(cloud), "sh_degree": cloud.degree},
+    }
+    if anonymous:
+        provenance = without_places(provenance)
+    with atomic_folder(output.path, overwrite=True) as scratch:
+        run = RunFolder(scratch)
+        run.rewrite(config.to_yaml(), provenance)
+        save_checkpoint(
+            run.checkpoints,
+            0,
+            method.name,
+            model,
+            Optimizers(model, config.optimizers, schedule.steps, scene.extent),
+            config.strategy.target(config.strategy.settings, streams["densification"], schedule, scene.extent),
+            streams,
+            config.sampler.target(config.sampler.settings, sizes, streams["frame_order"]),
+        )
+
+
+def _warn_of_another_frame(scene: Scene, cloud: SplatCloud, file: Path) -> None:
+    """Say so where the training cameras have hardly any Gaussian in their images."""
+    means = torch.from_numpy(cloud.means).double()
+    seen = torch.zeros(len(means), dtype=torch.bool)
+    for frame in scene.train[:: max(1, len(scene.train) // _CAMERAS)]:
+        seen |= frame.camera.to(dtype=torch.float64).sees(means)[1]
+    share = float(seen.float().mean())
+    if share < _FEW:
+        log.warning(
+            "%s: %.2g %% of the Gaussians lie in the view of a training camera; is it in the world frame and unit (%s) "
+            "of scene '%s'?",
+            file,
+            100.0 * share,
+            scene.length_unit,
+            scene.name,
+        )

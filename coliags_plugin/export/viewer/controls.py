@@ -1,0 +1,163 @@
+"""Controls of the browser view, in viser's panel."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+from jaxtyping import Float
+
+from coliags_plugin.export.viewer.content import Content, mesh_files
+from coliags_plugin.export.viewer.layers import add_cameras, add_mesh
+from coliags_plugin.export.viewer.pictures import Picture
+from coliags_plugin.geometry.meshes.files import read_mesh
+from coliags_plugin.outputs.image_files import as_array
+
+#: Where the light comes from.
+AT_CAMERA, FLATTENED = "follows the camera", "flattened"
+#: Largest value of the opacity threshold.
+_LARGEST_THRESHOLD = 0.9
+#: Frusta within so many of their sizes of the browser's camera are hidden.
+_HIDING_SIZES = 3.0
+
+
+class Listener(Protocol):
+    """What the controls tell of changes."""
+
+    def options_changed(self) -> None:
+        """Light, threshold or kind of picture has changed."""
+
+    def go_to(self, index: int) -> None:
+        """Another frame was chosen."""
+
+
+class Controls:
+    """Slider through the video, light, threshold, layers and pictures.
+
+    Args:
+        client: viser's handle of the browser.
+        content: What is shown.
+        listener: Told of changes.
+    """
+
+    def __init__(self, client: Any, content: Content, listener: Listener) -> None:
+        self._content = content
+        self._client = client
+        self._listener = listener
+        self._layers: dict[str, list[Any]] = {}
+        gui, trained = client.gui, content.trained
+        held_out = len(content.frames) - len(trained.scene.train)
+        gui.add_markdown(
+            f"**{content.title}**, step {trained.step}; {len(content.frames)} frames, {held_out} held out; "
+            f"lengths in {trained.scene.length_unit}"
+        )
+        self._frame = gui.add_slider("Frame", 0, max(1, len(content.frames) - 1), 1, 0)
+        self._frame.on_update(lambda _: self._frame_chosen())
+        self._about_frame = gui.add_markdown(self._frame_text())
+        self._light = self._threshold = None
+        if content.knows_lamp:
+            self._light = gui.add_dropdown("Light", (AT_CAMERA, FLATTENED))
+            self._light.on_update(lambda _: listener.options_changed())
+        if content.decoder is not None:
+            self._threshold = gui.add_slider("Least opacity", 0.0, _LARGEST_THRESHOLD, 0.01, 0.0)
+            self._threshold.on_update(lambda _: listener.options_changed())
+        with gui.add_folder("Layers"):
+            self._add_layers(gui)
+        with gui.add_folder("Pictures of the frame"):
+            self._recorded = gui.add_image(as_array(content.frames[0].image), label="recorded")
+            self._picture = gui.add_dropdown("Beside it", content.pictures.kinds)
+            self._picture.on_update(lambda _: listener.options_changed())
+            self._rendered = gui.add_image(as_array(content.frames[0].image) // 4, label="is being rendered")
+        self._status = gui.add_markdown("")
+
+    @property
+    def frame(self) -> int:
+        """Index of the chosen frame in the video."""
+        return min(int(self._frame.value), len(self._content.frames) - 1)
+
+    @property
+    def picture(self) -> str:
+        """Kind of picture beside the recorded one."""
+        return str(self._picture.value)
+
+    @property
+    def light(self) -> str:
+        """Where the light comes from."""
+        return AT_CAMERA if self._light is None else str(self._light.value)
+
+    @property
+    def least_opacity(self) -> float:
+        """Opacity below which Gaussians are not drawn."""
+        return 0.0 if self._threshold is None else float(self._threshold.value)
+
+    @property
+    def status(self) -> str:
+        """Line at the bottom."""
+        return str(self._status.content)
+
+    @status.setter
+    def status(self, text: str) -> None:
+        self._status.content = text
+
+    def show_picture(self, picture: Picture) -> None:
+        """Show a picture beside the recorded one."""
+        self._rendered.image = picture.image
+        self._rendered.label = picture.caption
+
+    def choose(self, index: int) -> None:
+        """Choose a frame, as the slider does.
+
+        Args:
+            index: Of the frame in the video.
+        """
+        self._frame.value = index
+        self._frame_chosen()
+
+    def _frame_chosen(self) -> None:
+        self._about_frame.content = self._frame_text()
+        self._recorded.image = as_array(self._content.frames[self.frame].image)
+        self._listener.go_to(self.frame)
+
+    def _frame_text(self) -> str:
+        frame = self._content.frames[self.frame]
+        kind = "training" if frame.name in self._content.trained.training_frames else "held out"
+        return f"`{frame.name}`, {kind}"
+
+    def _add_layers(self, gui: Any) -> None:
+        if self._content.decoder is not None:
+            splats = gui.add_checkbox("Gaussians", True)
+            splats.on_update(lambda _: self._show_splats(splats.value))
+        self._cameras = gui.add_checkbox("Cameras", False)
+        self._cameras.on_update(lambda _: self._show("cameras", self._cameras.value))
+        for name in mesh_files(self._content.trained.run.path):
+            box = gui.add_checkbox(name.capitalize(), False)
+            box.on_update(lambda _, name=name, box=box: self._show(name, box.value))
+
+    def _show_splats(self, visible: bool) -> None:
+        node = self._client.scene.get_handle_by_name("/splats")
+        if node is not None:
+            node.visible = visible
+
+    def _show(self, layer: str, visible: bool) -> None:
+        """Show or hide a layer; it is sent when it is first shown."""
+        if layer not in self._layers:
+            self._layers[layer] = self._made(layer)
+        for handle in self._layers[layer]:
+            handle.visible = visible
+        self.camera_rests(self._client.camera.position)
+
+    def camera_rests(self, position: Float[np.ndarray, "3"]) -> None:
+        """Hide the frusta that the browser's camera is in or behind, whose pictures would fill the view.
+
+        Args:
+            position: Of the browser's camera, world frame. [3]
+        """
+        for handle in self._layers.get("cameras", ()):
+            near = np.linalg.norm(np.asarray(handle.position) - position) < _HIDING_SIZES * handle.scale
+            handle.visible = self._cameras.value and not near
+
+    def _made(self, layer: str) -> list[Any]:
+        if layer == "cameras":
+            return add_cameras(self._client.scene, self._content, self.choose)
+        mesh = read_mesh(mesh_files(self._content.trained.run.path)[layer])
+        return [add_mesh(self._client.scene, layer, mesh)]

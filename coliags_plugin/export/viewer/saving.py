@@ -1,0 +1,120 @@
+"""A scene as one HTML page that needs neither a server nor a network."""
+
+from __future__ import annotations
+
+import logging
+from html import escape
+from pathlib import Path
+
+import numpy as np
+
+from coliags_plugin.contracts import GaussianField
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import atomic_write
+from coliags_plugin.engine.trained import TrainedRun
+from coliags_plugin.export.viewer.content import Content
+from coliags_plugin.export.viewer.layers import add_cameras
+from coliags_plugin.export.viewer.library import import_viser, start_server, stop_server
+from coliags_plugin.export.viewer.merging import merged_to
+from coliags_plugin.export.viewer.serving import set_start
+from coliags_plugin.export.viewer.splats import Splats, on_wire
+from coliags_plugin.outputs.page import refuse_folder
+
+logger = logging.getLogger(__name__)
+
+#: Largest page, bytes.
+LARGEST_PAGE = 5_000_000
+#: How much of the room found in one attempt the next one uses.
+_CAUTION = 0.98
+#: Bytes of a page that a Gaussian takes at least: 32, compressed and in base 64.
+_FEWEST_BYTES = 30
+
+
+def save_page(trained: TrainedRun, output: Path, largest: int = LARGEST_PAGE) -> Path:
+    """Write :func:`scene_page` to a file.
+
+    Args:
+        trained: The run.
+        output: The file; an existing one is replaced.
+        largest: Size of the page, bytes.
+
+    Raises:
+        InputError: See :func:`scene_page`; or the file cannot be written.
+    """
+    refuse_folder(output)
+    atomic_write(output, scene_page(trained, largest))
+    return output
+
+
+def scene_page(trained: TrainedRun, largest: int = LARGEST_PAGE) -> str:
+    """The Gaussians of a run as an HTML page; under the same light everywhere, where their colours know a lamp.
+
+    Where the page would be too large, neighbouring Gaussians are merged.
+
+    Args:
+        trained: The run.
+        largest: Size of the page, bytes.
+
+    Raises:
+        InputError: viser cannot be imported, the method has no Gaussians, or not even a few fit.
+    """
+    if not isinstance(trained.model.field, GaussianField):
+        raise InputError(
+            f"method '{trained.method}' has no Gaussians to draw in a browser",
+            "a method of Gaussians",
+            "Write pictures with `coliags render`, or a mesh with `coliags mesh`",
+        )
+    import_viser()
+    content = Content.of(trained).relit_evenly()
+    splats, page = fitting_page(content, largest)
+    if len(splats) < len(content.baked):
+        logger.warning(
+            "%d Gaussians are merged into %d, for a page of at most %.1f MB",
+            *(len(content.baked), len(splats), largest / 1e6),
+        )
+    return page
+
+
+def fitting_page(content: Content, largest: int) -> tuple[Splats, str]:
+    """The Gaussians of a run, merged into fewer where their page would be too large, and the page.
+
+    Raises:
+        InputError: Not even a few fit.
+    """
+    nothing = content.baked.part(np.zeros(len(content.baked), bool))
+    empty = len(_page(content, nothing).encode())
+    count = min(len(content.baked), max(0, largest - empty) // _FEWEST_BYTES)
+    while count > 0:
+        splats = merged_to(content.baked, count, content.distances)
+        page = _page(content, splats)
+        size = len(page.encode())
+        if size <= largest:
+            return splats, page
+        count = min(count - 1, int(_CAUTION * len(splats) * (largest - empty) / (size - empty)))
+    raise InputError(f"a page of {largest} bytes", f"more than {empty} bytes, what an empty one takes")
+
+
+def _page(content: Content, splats: Splats) -> str:
+    server = start_server("127.0.0.1", 0)
+    try:
+        set_start(server, content)
+        server.scene.add_gaussian_splats("/splats", **on_wire(splats, content.unit), scale=content.unit)
+        for handle in add_cameras(server.scene, content):
+            handle.visible = False
+        page: str = server.get_scene_serializer().as_html()
+    finally:
+        stop_server(server)
+    return page.replace("<title>Viser</title>", f"<title>{escape(content.title)}</title>").replace(
+        "</body>", f"{_caption(content, splats)}</body>"
+    )
+
+
+def _caption(content: Content, splats: Splats) -> str:
+    """What is seen, at the bottom of the page."""
+    text = f"{content.title}, step {content.trained.step}"
+    if content.knows_lamp:
+        text += "; flattened light"
+    if len(splats) < len(content.baked):
+        text += f"; {len(content.baked):,} Gaussians merged into {len(splats):,}"
+    style = "position:fixed;left:0;bottom:0;padding:4px 8px;font:12px sans-serif;background:#fffc;pointer-events:none"
+    return f'<div style="{style}">{escape(text)}</div>'

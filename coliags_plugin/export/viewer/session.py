@@ -1,0 +1,189 @@
+"""One browser that looks at a run: what it shows follows its camera and controls."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.rotations import rotation_matrices
+from coliags_plugin.export.viewer.content import Content, vertical_fov
+from coliags_plugin.export.viewer.controls import FLATTENED, Controls
+from coliags_plugin.export.viewer.layers import add_headlight, pose
+from coliags_plugin.export.viewer.pacing import Pace
+from coliags_plugin.export.viewer.splats import BYTES_PER_SPLAT, Splats, on_wire
+
+logger = logging.getLogger(__name__)
+
+#: Seconds without a movement after which the camera rests.
+REST = 0.2
+#: Seconds between two decodings, at least.
+EVERY = 0.5
+
+
+@dataclass
+class Update:
+    """What the last decoding and sending of splats cost.
+
+    Attributes:
+        count: Of splats.
+        decoding: Seconds.
+        sending: Seconds until they were handed to the connection.
+    """
+
+    count: int
+    decoding: float
+    sending: float
+
+    def __str__(self) -> str:
+        """For the panel."""
+        size = self.count * BYTES_PER_SPLAT / 1e6
+        return (
+            f"{self.count:,} Gaussians, {size:.1f} MB; decoded in {self.decoding:.2f} s, sent in {self.sending:.2f} s"
+        )
+
+
+class Session:
+    """A browser's splats, controls and pictures, kept up to date by a thread of its own.
+
+    Callbacks only note what has changed; the thread computes it, the newest state only.
+
+    Args:
+        client: viser's handle of the browser.
+        content: What is shown.
+    """
+
+    def __init__(self, client: Any, content: Content) -> None:
+        self._client = client
+        self._content = content
+        self._pace = Pace(REST, EVERY)
+        self._wake = threading.Event()
+        self._closed = False
+        self._picture_of: tuple[int, str] | None = None
+        self._splats: Any = None
+        self._headlight = add_headlight(client.scene, tuple(client.camera.position))
+        self.last_update: Update | None = None
+        self.controls = Controls(client, content, self)
+        client.camera.on_update(lambda _: self.camera_moved())
+        if content.decoder is not None:
+            self._send(content.decoder.beside, 0.0)
+            self._pace.want()
+
+    # ---- What has changed
+
+    def camera_moved(self) -> None:
+        """The camera of the browser has moved."""
+        self._pace.moved()
+        self._headlight.position = tuple(self._client.camera.position)
+        self._wake.set()
+
+    def options_changed(self) -> None:
+        """Light, threshold or kind of picture has changed."""
+        self._pace.want()
+        self._wake.set()
+
+    def go_to(self, index: int) -> None:
+        """Move the browser's camera to the pose of a frame of the video.
+
+        Args:
+            index: Of the frame in the video.
+        """
+        camera = self._content.frames[index].camera
+        wxyz, position = pose(camera)
+        axes = camera.camera_to_world[:3, :3].double().cpu().numpy()
+        theirs = self._client.camera
+        with self._client.atomic():
+            theirs.up_direction = -axes[:, 1]
+            theirs.position = position
+            theirs.look_at = position + self._content.look_distance * axes[:, 2]
+            theirs.wxyz = wxyz
+            theirs.fov = vertical_fov(camera)
+        self.camera_moved()
+
+    def close(self) -> None:
+        """The browser has gone."""
+        self._closed = True
+        self._wake.set()
+
+    # ---- Work
+
+    def run(self) -> None:
+        """Keep the browser up to date until it has gone."""
+        while not self._closed:
+            try:
+                wait = self.step()
+            except Exception:
+                if self._closed:
+                    return
+                logger.exception("the view could not be brought up to date")
+                self.controls.status = "The last update failed; see the terminal."
+                wait = None
+            self._wake.wait(wait)
+            self._wake.clear()
+
+    def step(self) -> float | None:
+        """Do what is due.
+
+        Returns:
+            Seconds until more is due; None until something changes.
+        """
+        wanted = (self.controls.frame, self.controls.picture)
+        if self._pace.wait() == 0.0:
+            self._pace.begin()
+            self.controls.camera_rests(self._client.camera.position)
+            self._update_splats()
+            self._pace.end()
+        elif wanted != self._picture_of:
+            self._update_picture(*wanted)
+        else:
+            return self._pace.wait()
+        return 0.0
+
+    def _update_splats(self) -> None:
+        decoder = self._content.decoder
+        if decoder is None:
+            return
+        began = time.perf_counter()
+        with self._content.lock:
+            light = self._content.flattened if self.controls.light == FLATTENED else None
+            splats = decoder.of(self._camera(), light)
+        self._send(splats.part(splats.opacities >= self.controls.least_opacity), time.perf_counter() - began)
+
+    def _send(self, splats: Splats, decoding: float) -> None:
+        began = time.perf_counter()
+        arguments, unit = on_wire(splats, self._content.unit), self._content.unit
+        if self._splats is None:
+            self._splats = self._client.scene.add_gaussian_splats("/splats", **arguments, scale=unit)
+        else:
+            self._splats.set_gaussians(**arguments)
+        self._client.flush()
+        self.last_update = Update(len(splats), decoding, time.perf_counter() - began)
+        self.controls.status = str(self.last_update)
+
+    def _update_picture(self, index: int, kind: str) -> None:
+        with self._content.lock:
+            picture = self._content.pictures.of(self._content.frames[index], kind)
+        self.controls.show_picture(picture)
+        self._picture_of = (index, kind)
+
+    def _camera(self) -> Camera:
+        """The browser's camera as one of ours."""
+        theirs = self._client.camera
+        height, width = theirs.image_height, theirs.image_width
+        focal = 0.5 * height / float(torch.tan(torch.tensor(0.5 * theirs.fov)))
+        return Camera(focal, focal, 0.5 * width, 0.5 * height, width, height, _matrix(theirs))
+
+
+def _matrix(theirs: Any) -> Float[Tensor, "4 4"]:
+    """Pose of viser's camera. [4, 4]"""
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3] = rotation_matrices(torch.as_tensor(theirs.wxyz, dtype=torch.float64)[None])[0]
+    matrix[:3, 3] = torch.as_tensor(theirs.position, dtype=torch.float64)
+    return matrix

@@ -1,0 +1,1 @@
+"""Lenses, trajectories and triangle meshes."""

@@ -1,0 +1,141 @@
+"""Files of triangle meshes: PLY, OBJ and GLB."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from coliags_plugin.core import bounds
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import atomic_write
+from coliags_plugin.core.glb import GlbArray, encode_glb
+from coliags_plugin.core.open3d_library import import_open3d
+from coliags_plugin.core.ply import point_properties, write_ply
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+from coliags_plugin.geometry.meshes.obj import decode_obj, encode_obj
+from coliags_plugin.geometry.meshes.ply import read_ply_mesh
+
+#: Suffixes of the formats.
+MESH_FORMATS = ("ply", "obj", "glb")
+
+#: glTF's number of a primitive of triangles.
+_TRIANGLES = 4
+
+
+def read_mesh(path: Path) -> TriangleMesh:
+    """Read a mesh from a PLY, OBJ or GLB file, told apart by their suffix; polygons are split into triangles.
+
+    Lengths stay those of the file.
+
+    Raises:
+        InputError: No such file, another suffix, a damaged file, or one without triangles.
+    """
+    return read_flagged_mesh(path)[0]
+
+
+def read_flagged_mesh(path: Path) -> tuple[TriangleMesh, Int[np.ndarray, "F"] | None]:
+    """A mesh as :func:`read_mesh` reads it, with the texture index of each triangle where it is an OBJ file with such.
+
+    Returns:
+        The mesh; and the texture index (``vt``, counted from 1) of the first corner of each triangle. [F]
+
+    Raises:
+        InputError: See there.
+    """
+    if not path.is_file():
+        raise InputError(f"no file {path}", "a mesh as PLY, OBJ or GLB file", "Check the path")
+    suffix, textures = _suffix(path), None
+    if suffix == "obj":
+        mesh, textures = decode_obj(path)
+    else:
+        mesh = read_ply_mesh(path) if suffix == "ply" else _through_open3d(path)
+    if not len(mesh):
+        raise InputError(f"{path} has no triangles", "a mesh", "Check that it is a mesh, not a cloud of points")
+    if not (np.abs(mesh.vertices) <= bounds.LENGTH).all():  # neither NaN
+        raise InputError(f"{path} has vertices that are not finite or beyond {bounds.LENGTH:g}", "coordinates in mm")
+    return mesh, textures
+
+
+def write_mesh(path: Path, mesh: TriangleMesh) -> None:
+    """Write a mesh as PLY, OBJ or GLB, told apart by the suffix, atomically; the folder is made.
+
+    Vertex colours are written as they are: in PLY as uchar, in OBJ as three numbers in [0, 1] behind the position (an
+    extension that MeshLab, Blender and open3d read), in GLB as linear light, as glTF demands. GLB has the same axes and
+    lengths as the mesh; glTF's own are y up, metres.
+
+    Raises:
+        InputError: Another suffix, or the folder cannot be written.
+    """
+    writers: dict[str, Callable[[Path, TriangleMesh], None]] = {"ply": _write_ply, "obj": _write_obj, "glb": _write_glb}
+    writers[_suffix(path)](path, mesh)
+
+
+def _suffix(path: Path) -> str:
+    suffix = path.suffix.lower().removeprefix(".")
+    if suffix not in MESH_FORMATS:
+        raise InputError(f"{path.name} is no mesh file by its name", f"one of {', '.join(MESH_FORMATS)}")
+    return suffix
+
+
+def _through_open3d(path: Path) -> TriangleMesh:
+    open3d = import_open3d("reads meshes")
+    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
+        read = open3d.io.read_triangle_mesh(str(path))
+    triangles = np.asarray(read.triangles)
+    vertices = np.asarray(read.vertices).astype(np.float32)
+    if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(vertices)):
+        raise InputError(f"{path} has triangles of vertices that are not there", "a mesh", "Fetch it again")
+    colors = np.rint(np.asarray(read.vertex_colors) * 255.0).clip(0, 255).astype(np.uint8)
+    if len(colors):
+        colors = _encoded(colors / 255.0)
+    return TriangleMesh(vertices, triangles.astype(np.int64), colors if len(colors) else None)
+
+
+def _write_ply(path: Path, mesh: TriangleMesh) -> None:
+    write_ply(path, point_properties(mesh.vertices, mesh.colors), mesh.triangles)
+
+
+def _write_obj(path: Path, mesh: TriangleMesh) -> None:
+    atomic_write(path, encode_obj(mesh))
+
+
+def _write_glb(path: Path, mesh: TriangleMesh) -> None:
+    atomic_write(path, encode_mesh(mesh))
+
+
+def encode_mesh(mesh: TriangleMesh) -> bytes:
+    """Bytes of a GLB file: one primitive with 32-bit indices, float positions and 8-bit colours."""
+    arrays = [
+        GlbArray(mesh.triangles.astype(np.uint32).reshape(-1, 1), indices=True),
+        GlbArray(mesh.vertices.astype(np.float32), bounds=True),
+    ]
+    attributes = {"POSITION": 1}
+    if mesh.colors is not None:
+        attributes["COLOR_0"] = 2
+        # Of four bytes each, as glTF aligns the elements of a vertex attribute.
+        rgba = np.full((len(mesh.vertices), 4), 255, np.uint8)
+        rgba[:, :3] = np.rint(_linear(mesh.colors) * 255.0)
+        arrays.append(GlbArray(rgba, normalized=True))
+    document = {
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": 0, "material": 0, "mode": _TRIANGLES}]}],
+        "materials": [{"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}],
+    }
+    return encode_glb(document, arrays)
+
+
+def _linear(colors: UInt8[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
+    """Linear light of sRGB colours, in [0, 1]. [V, 3]"""
+    encoded = colors / 255.0
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+def _encoded(light: Float[np.ndarray, "V 3"]) -> UInt8[np.ndarray, "V 3"]:
+    """SRGB colours of linear light in [0, 1]. [V, 3]"""
+    encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    return np.rint(encoded * 255.0).astype(np.uint8)

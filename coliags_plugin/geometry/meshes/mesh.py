@@ -1,0 +1,87 @@
+"""Triangle meshes as plain arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from coliags_plugin.core.open3d_library import import_open3d
+from coliags_plugin.geometry.meshes.ray_scene import RayScene
+
+
+@dataclass(frozen=True, eq=False)
+class TriangleMesh:
+    """A triangle mesh in the world frame, scene units (mm for C3VD).
+
+    Attributes:
+        vertices: [V, 3]
+        triangles: Vertex indices, counter-clockwise seen from the side that the camera was on. [F, 3]
+        colors: RGB of the vertices; None where there are none. [V, 3]
+    """
+
+    vertices: Float[np.ndarray, "V 3"]
+    triangles: Int[np.ndarray, "F 3"]
+    colors: UInt8[np.ndarray, "V 3"] | None = None
+
+    def __len__(self) -> int:
+        """Number of triangles."""
+        return len(self.triangles)
+
+    @cached_property
+    def _crosses(self) -> Float[np.ndarray, "F 3"]:
+        """Cross products of two edges: normal times twice the area. [F, 3]"""
+        first, second, third = (self.vertices[self.triangles[:, corner]].astype(np.float64) for corner in range(3))
+        return np.cross(second - first, third - first)
+
+    @cached_property
+    def areas(self) -> Float[np.ndarray, "F"]:
+        """Area of each triangle. [F]"""
+        return 0.5 * np.linalg.norm(self._crosses, axis=1)
+
+    @cached_property
+    def normals(self) -> Float[np.ndarray, "F 3"]:
+        """Unit normal of each triangle; zero where it has no area. [F, 3]"""
+        return self._crosses / np.maximum(2.0 * self.areas, np.finfo(np.float64).tiny)[:, None]
+
+    @cached_property
+    def centers(self) -> Float[np.ndarray, "F 3"]:
+        """Centroid of each triangle. [F, 3]"""
+        return self.vertices[self.triangles].mean(axis=1, dtype=np.float64)
+
+    @cached_property
+    def rays(self) -> RayScene:
+        """Casts rays at the mesh and measures distances to it; made once.
+
+        Raises:
+            InputError: open3d cannot be imported.
+        """
+        return RayScene(self.to_open3d())
+
+    def part(self, kept: Bool[np.ndarray, "F"]) -> TriangleMesh:
+        """The mesh of some triangles, without the vertices that no longer belong to any.
+
+        Args:
+            kept: True for triangles to keep. [F]
+        """
+        used, corners = np.unique(self.triangles[kept], return_inverse=True)
+        colors = None if self.colors is None else self.colors[used]
+        return TriangleMesh(self.vertices[used], corners.reshape(-1, 3), colors)
+
+    def to_open3d(self) -> Any:
+        """The mesh as an ``open3d.t.geometry.TriangleMesh``, for ray casting and measures.
+
+        Raises:
+            InputError: open3d cannot be imported.
+        """
+        open3d = import_open3d("casts rays at meshes")
+        made = open3d.t.geometry.TriangleMesh(
+            open3d.core.Tensor(np.ascontiguousarray(self.vertices, np.float32)),
+            open3d.core.Tensor(np.ascontiguousarray(self.triangles, np.int32)),
+        )
+        if self.colors is not None:
+            made.vertex.colors = open3d.core.Tensor(np.ascontiguousarray(self.colors))
+        return made

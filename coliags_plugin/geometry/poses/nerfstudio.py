@@ -1,0 +1,166 @@
+"""Reads and writes poses in ``transforms.json`` of nerfstudio, instant-ngp and Blender's NeRF scenes.
+
+Poses are camera-to-world with OpenGL axes.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import write_json
+from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.core.json_files import read_json
+from coliags_plugin.geometry.poses.format import Format
+from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z, check_rigid
+from coliags_plugin.geometry.poses.text import head, prefixed_errors
+from coliags_plugin.geometry.poses.trajectory import Trajectory, natural_order, refuse_repeated
+
+_PINHOLE = ("fl_x", "fl_y", "cx", "cy", "w", "h")
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_UNDISTORTED = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "PERSPECTIVE")
+
+
+def read(path: Path) -> Trajectory:
+    """Read ``frames[].transform_matrix``, ordered by ``file_path``, 2 before 10.
+
+    nerfstudio's conversion transforms the world and stores that in ``applied_transform`` (and ``applied_scale``); it is
+    undone, so that poses are in their original world.
+
+    Raises:
+        InputError: The file is not such a JSON, or holds no frames; a frame has no file_path or no finite, rigid 4x4 or
+            3x4 matrix (the message names it); an image is repeated; or the applied transform is not rigid with a
+            positive scale.
+    """
+    content = _json(path)
+    frames = content.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise InputError(f"{path} has no frames", "'frames': [{'file_path': ..., 'transform_matrix': ...}, ...]")
+    names, matrices = [], []
+    for index, frame in enumerate(frames):
+        name = frame.get("file_path") if isinstance(frame, dict) else None
+        if not isinstance(name, str) or not name:
+            raise InputError(f"{path}, frame {index}: no file_path", "the name of the frame's image")
+        names.append(name)
+        matrices.append(_matrix(frame.get("transform_matrix"), f"{path}, frame {index} ({name}): transform_matrix"))
+    refuse_repeated(names, str(path))
+    remarks = []
+    camera_to_world = np.array(matrices)
+    check_rigid(camera_to_world, lambda index: f"{path}, frame {index} ({names[index]})")
+    if "applied_transform" in content or "applied_scale" in content:
+        camera_to_world = _undo_applied_transform(path, content, camera_to_world)
+        remarks.append("nerfstudio's change of the world (applied_transform) is undone")
+    order = natural_order(names)
+    if order != list(range(len(order))):
+        remarks.append("frames are put in the order of their names")
+    intrinsics, remark = _intrinsics(path, content, frames)
+    return Trajectory(
+        (camera_to_world @ FLIP_Y_AND_Z)[order],
+        names=tuple(names[index] for index in order),
+        intrinsics=intrinsics,
+        stored_as="camera-to-world matrices, OpenGL axes",
+        remarks=(*remarks, *([remark] if remark else [])),
+    )
+
+
+def write(path: Path, trajectory: Trajectory) -> None:
+    """Write a ``transforms.json``, with intrinsics if known.
+
+    Raises:
+        InputError: A name is repeated, or the folder cannot be written.
+    """
+    names = trajectory.names_or_numbers()
+    refuse_repeated(names, str(path))
+    content: dict[str, Any] = {}
+    if (pinhole := trajectory.intrinsics) is not None:
+        numbers = (pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, pinhole.width, pinhole.height)
+        content = {"camera_model": "PINHOLE", **dict(zip(_PINHOLE, numbers, strict=True))}
+    opengl = trajectory.camera_to_world @ FLIP_Y_AND_Z
+    content["frames"] = [
+        {"file_path": name, "transform_matrix": matrix.tolist()} for name, matrix in zip(names, opengl, strict=True)
+    ]
+    write_json(path, content)
+
+
+def recognise(path: Path) -> bool:
+    """Whether a file begins like a JSON object."""
+    return head(path).removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{")
+
+
+def _json(path: Path) -> dict[str, Any]:
+    content = read_json(path, "a transforms.json")
+    if not isinstance(content, dict):
+        raise InputError(f"{path} holds a JSON {type(content).__name__}", "a JSON object with 'frames'")
+    return content
+
+
+def _matrix(value: Any, place: str) -> np.ndarray:
+    """Finite matrix from nested lists of four or three rows. [4, 4]"""
+    try:
+        matrix = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        matrix = np.empty(0)
+    if matrix.shape == (3, 4):
+        matrix = np.vstack([matrix, (0.0, 0.0, 0.0, 1.0)])
+    expected = "4 (or 3) rows of 4 finite numbers"
+    if matrix.shape != (4, 4):
+        raise InputError(f"{place} is {'missing' if value is None else 'not a matrix'}", expected)
+    if not np.all(np.isfinite(matrix)):
+        row, column = np.argwhere(~np.isfinite(matrix))[0]
+        raise InputError(f"{place} is {matrix[row, column]} in row {row}, column {column}", expected)
+    return matrix
+
+
+def _undo_applied_transform(path: Path, content: dict[str, Any], camera_to_world: np.ndarray) -> np.ndarray:
+    """Poses before nerfstudio's applied_transform and applied_scale."""
+    applied = _matrix(content.get("applied_transform", np.eye(4)), f"{path}: applied_transform")
+    check_rigid(applied[None], lambda _: f"{path}: applied_transform")
+    scale = content.get("applied_scale", 1.0)
+    if isinstance(scale, bool) or not isinstance(scale, int | float) or not (math.isfinite(scale) and scale > 0.0):
+        raise InputError(f"{path}: applied_scale is {scale!r}", "a positive number")
+    before = camera_to_world.copy()
+    before[:, :3, 3] /= scale
+    return np.asarray(np.linalg.inv(applied) @ before)
+
+
+def _intrinsics(path: Path, content: dict[str, Any], frames: list[dict[str, Any]]) -> tuple[Intrinsics | None, str]:
+    """The pinhole shared by all images; or None, and the reason."""
+    found: set[Intrinsics] = set()
+    for frame in frames:
+        # A frame's value overrides the file's.
+        values = {
+            key: frame.get(key, content.get(key)) for key in (*_PINHOLE, *_DISTORTION, "camera_model", "camera_angle_x")
+        }
+        model = values.pop("camera_model")
+        if model not in (None, *_UNDISTORTED) or any(values[key] for key in _DISTORTION):
+            return None, f"no intrinsics: the camera ({model or 'OPENCV'}) is distorted"
+        if values["fl_x"] is None and values["camera_angle_x"] is not None and values["w"] and values["h"]:
+            # Blender's form: square pixels, the principal point in the middle.
+            half_width, half_height = (0.5 * _number(path, values, key) for key in ("w", "h"))
+            focal_length = half_width / math.tan(0.5 * _number(path, values, "camera_angle_x"))
+            values |= {"fl_x": focal_length, "fl_y": focal_length, "cx": half_width, "cy": half_height}
+        missing = [key for key in _PINHOLE if values[key] is None]
+        if missing:
+            return None, f"no intrinsics: the file has no {', '.join(missing)}"
+        fx, fy, cx, cy, width, height = (_number(path, values, key) for key in _PINHOLE)
+        with prefixed_errors(str(path)):
+            found.add(Intrinsics(fx, fy, cx, cy, round(width), round(height)))
+    if len(found) > 1:
+        return None, f"no intrinsics: the images have {len(found)} different cameras"
+    return found.pop(), ""
+
+
+def _number(path: Path, values: dict[str, Any], key: str) -> float:
+    value = values[key]
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(f"{path}: {key} is {value!r}", "a number")
+    if not math.isfinite(value):
+        raise InputError(f"{path}: {key} is {value}", "a finite number")
+    return float(value)
+
+
+FORMAT = Format("nerfstudio", read, write, recognise, keeps=frozenset({"names", "intrinsics"}))

@@ -1,0 +1,1 @@
+"""Light and reflectance: lamps, beams, photometry, interreflection and tone curves."""

@@ -1,0 +1,129 @@
+"""Comparison of a reference method with each of its rivals over their common scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from coliags_plugin.results.paired import (
+    FEWEST_SCENES,
+    bootstrap_interval,
+    cohen_dz,
+    holm,
+    rank_biserial,
+    smallest_p,
+    t_test_p,
+    wilcoxon_p,
+)
+from coliags_plugin.results.spread import BySeed, common_scenes, scene_means
+
+#: Significance levels of one, two and three stars.
+LEVELS = (0.05, 0.01, 0.001)
+
+
+@dataclass(frozen=True)
+class PairedTests:
+    """Tests and effect sizes of a lead; positive effects speak for the reference.
+
+    Attributes:
+        wilcoxon: Two-sided p of the Wilcoxon signed-rank test.
+        wilcoxon_holm: The same, adjusted for the number of rivals.
+        t_test: Two-sided p of the paired t-test; None where all leads are equal.
+        t_test_holm: The same, adjusted for the number of rivals that have one.
+        interval: 95 % percentile bootstrap interval of the mean lead.
+        cohen_dz: None where all leads are equal.
+        rank_biserial: Matched-pairs rank-biserial correlation.
+    """
+
+    wilcoxon: float
+    wilcoxon_holm: float
+    t_test: float | None
+    t_test_holm: float | None
+    interval: tuple[float, float]
+    cohen_dz: float | None
+    rank_biserial: float
+
+
+@dataclass(frozen=True)
+class RivalComparison:
+    """By how much a reference leads over a rival.
+
+    Attributes:
+        rival: The method.
+        scenes: Scenes that both have.
+        lead: Mean over the scenes, positive where the reference is better; None without a common scene.
+        better_on: Number of scenes on which the reference is better.
+        tests: None with fewer than six common scenes.
+    """
+
+    rival: str
+    scenes: tuple[str, ...]
+    lead: float | None
+    better_on: int
+    tests: PairedTests | None
+
+    @property
+    def stars(self) -> str:
+        """One star for each level that the adjusted Wilcoxon p stays below, as far as so many scenes can give it."""
+        if self.tests is None:
+            return ""
+        possible = [level for level in LEVELS if smallest_p(len(self.scenes)) < level]
+        return "*" * sum(self.tests.wilcoxon_holm < level for level in possible)
+
+
+def compare_with_rivals(
+    values: Mapping[str, BySeed], reference: str, higher_is_better: bool, seed: int = 0
+) -> list[RivalComparison]:
+    """Compare a reference with every other method, each pair on the scenes that both have.
+
+    Args:
+        values: By method, scene and seed; seeds are averaged per scene.
+        reference: One of the methods.
+        higher_is_better: Whether larger values are better.
+        seed: Of the bootstrap.
+    """
+    leads = {
+        rival: _leads(values[reference], by_seed, 1.0 if higher_is_better else -1.0)
+        for rival, by_seed in values.items()
+        if rival != reference
+    }
+    tests = _adjusted({rival: _tested(own, seed) for rival, own in leads.items() if len(own) >= FEWEST_SCENES})
+    return [
+        RivalComparison(
+            rival=rival,
+            scenes=tuple(own),
+            lead=float(np.mean([*own.values()])) if own else None,
+            better_on=sum(lead > 0.0 for lead in own.values()),
+            tests=tests.get(rival),
+        )
+        for rival, own in leads.items()
+    ]
+
+
+def _leads(reference: BySeed, rival: BySeed, sign: float) -> dict[str, float]:
+    """Lead of the reference on each common scene."""
+    one, other = scene_means(reference), scene_means(rival)
+    return {scene: sign * (one[scene] - other[scene]) for scene in common_scenes([reference, rival])}
+
+
+def _tested(leads: Mapping[str, float], seed: int) -> PairedTests:
+    sample = np.array([*leads.values()])
+    wilcoxon, t_test = wilcoxon_p(sample), t_test_p(sample)
+    interval = bootstrap_interval(sample, seed)
+    return PairedTests(wilcoxon, wilcoxon, t_test, t_test, interval, cohen_dz(sample), rank_biserial(sample))
+
+
+def _adjusted(tests: Mapping[str, PairedTests]) -> dict[str, PairedTests]:
+    """The tests with p-values adjusted for the number of rivals tested."""
+    wilcoxon = _holm_by_name({rival: test.wilcoxon for rival, test in tests.items()})
+    t_test = _holm_by_name({rival: test.t_test for rival, test in tests.items() if test.t_test is not None})
+    return {
+        rival: replace(test, wilcoxon_holm=wilcoxon[rival], t_test_holm=t_test.get(rival))
+        for rival, test in tests.items()
+    }
+
+
+def _holm_by_name(p_values: Mapping[str, float]) -> dict[str, float]:
+    return dict(zip(p_values, holm([*p_values.values()]), strict=True))

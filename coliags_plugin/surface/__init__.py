@@ -1,0 +1,1 @@
+"""Surfaces of runs: triangle meshes, and what a camera saw of them."""

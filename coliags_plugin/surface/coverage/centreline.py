@@ -1,0 +1,214 @@
+"""Centreline of a tube's surface, followed from a camera inside it, and cylinder coordinates about it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float64
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial import cKDTree
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+from coliags_plugin.surface.coverage.visibility import RayCaster
+
+#: Spacing of the centreline's points, mm.
+STEP = 1.0
+#: Steps of the search, mm, and how far it goes on without enough wall around it.
+_STRIDE, _PATIENCE = 2.0, 24.0
+#: Farthest end from the start, mm.
+_LONGEST = 600.0
+#: Rays of a ring, the share of them that must hit, and the largest radius of a lumen, mm.
+_RING, _SHARE, _WIDEST = 72, 0.5, 60.0
+#: Standard deviation of the final smoothing, mm.
+_SMOOTHING = 8.0
+#: Share of the way to a ring's middle, and to the direction of the last stride, that the search takes at once.
+_TOWARDS_MIDDLE, _TOWARDS_STRIDE = 0.4, 0.25
+
+Array = Float64[np.ndarray, "..."]
+
+
+@dataclass(frozen=True)
+class Centreline:
+    """A curve through the lumen with frames that do not turn about it.
+
+    Attributes:
+        points: World, mm, ``STEP`` apart. [M, 3]
+        frames: Columns: the direction of clock 0, that of clock 90 degrees, and the tangent. [M, 3, 3]
+        arc: Place along the curve, mm; 0 where it passes the shallowest camera. [M]
+    """
+
+    points: Float[np.ndarray, "M 3"]
+    frames: Float[np.ndarray, "M 3 3"]
+    arc: Float[np.ndarray, "M"]
+
+    def unroll(
+        self, points: Float[np.ndarray, "N 3"]
+    ) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
+        """Place along the curve (mm), clock angle (degrees, 0 to 360) and distance from it (mm). [N] each
+
+        Points beyond an end are on the plane of that end or behind it: their place is extrapolated along the tangent.
+        """
+        _, nearest = cKDTree(self.points).query(points)
+        offset = points - self.points[nearest]
+        local = np.einsum("nc,nck->nk", offset, self.frames[nearest])
+        half = 0.5 * STEP
+        inner = (nearest > 0) & (nearest < len(self.points) - 1)
+        ahead = np.where(inner, np.clip(local[:, 2], -half, half), local[:, 2])
+        clock = np.degrees(np.arctan2(local[:, 1], local[:, 0])) % 360.0
+        return self.arc[nearest] + ahead, clock, np.hypot(local[:, 0], local[:, 1])
+
+    def directions(self, place: int, clock: Float[np.ndarray, "C"]) -> Float[np.ndarray, "C 3"]:
+        """Unit directions across the curve at one of its points.
+
+        Args:
+            place: Index of the point.
+            clock: Angles, degrees. [C]
+        """
+        angle = np.radians(clock)[:, None]
+        frame = self.frames[place]
+        return np.asarray(np.cos(angle) * frame[:, 0] + np.sin(angle) * frame[:, 1])
+
+
+def find_centreline(
+    mesh: TriangleMesh, cameras_to_world: Float[np.ndarray, "T 4 4"], caster: RayCaster | None = None
+) -> Centreline:
+    """Follow the lumen both ways from the middle of the camera's path, as far as there is wall around it.
+
+    In strides of 2 mm, the curve is drawn to the middle of the ring of wall around it; it goes straight on where less
+    than half of a ring is there, for at most 24 mm. Places increase in the mean viewing direction of the cameras.
+    Clock 0 (12 o'clock) is the mean upward direction of the images, and the clock runs as a viewer sees it who looks
+    in that direction.
+
+    Args:
+        mesh: The wall, world frame, mm; holes do not matter.
+        cameras_to_world: Poses inside the tube, OpenCV axes. [T, 4, 4]
+        caster: Of the mesh, where there is one already.
+
+    Raises:
+        InputError: There is not enough wall around the cameras to be a tube.
+    """
+    caster = caster or RayCaster(mesh)
+    poses = np.asarray(cameras_to_world, np.float64)
+    centers = poses[:, :3, 3]
+    axis = _unit(poses[:, :3, 2].mean(axis=0))
+    start = centers[np.argmin(np.linalg.norm(centers - np.median(centers, axis=0), axis=1))]
+    start, direction = _settled(caster, start, axis)
+    ahead = _followed(caster, start, direction)
+    behind = _followed(caster, start, -direction)
+    if len(ahead) + len(behind) < 5:
+        raise InputError(
+            "there is not enough wall around the cameras to find the lumen's centreline",
+            "the surface of a tube, around the camera's path",
+            "Check that the mesh is the wall that the camera filmed, in the world of its poses",
+        )
+    return _curve(np.concatenate([behind[::-1], start[None], ahead]), poses)
+
+
+def _settled(caster: RayCaster, start: Array, axis: Array) -> tuple[Array, Array]:
+    """A place in the middle of the lumen near a camera, and the lumen's direction there.
+
+    The direction goes from the middle of the wall that lies 30 degrees behind to the middle of that 30 degrees ahead.
+    """
+    direction = axis
+    for _ in range(4):
+        _, hits = _ring(caster, start, direction, tilts=(-30.0, 30.0))
+        behind, ahead = hits.reshape(2, _RING, 3)
+        both = np.isfinite(behind).all(axis=1) & np.isfinite(ahead).all(axis=1)
+        if both.mean() >= _SHARE:
+            direction = _unit(direction + 0.5 * _unit((ahead[both] - behind[both]).mean(axis=0)))
+        share, middle = _middle(caster, start, direction)
+        if share >= _SHARE:
+            start = start + _TOWARDS_MIDDLE * (middle - start)
+    return start, direction
+
+
+def _followed(caster: RayCaster, start: Array, direction: Array) -> Array:
+    """Points from a start, without it, as far as the wall reaches. [K, 3]"""
+    points, last_good = [start], 0
+    while len(points) * _STRIDE < _LONGEST:
+        here = points[-1] + _STRIDE * direction
+        share, middle = _middle(caster, here, direction)
+        if share >= _SHARE:
+            here = here + _TOWARDS_MIDDLE * (middle - here)
+            last_good = len(points)
+        elif (len(points) - last_good) * _STRIDE > _PATIENCE:
+            break
+        # A wall ahead ends the lumen: the dome of a closed end.
+        _, reach = caster.cast(here, direction[None])
+        if reach[0] < _STRIDE:
+            break
+        stride = here - points[max(0, len(points) - 4)]
+        direction = _unit((1.0 - _TOWARDS_STRIDE) * direction + _TOWARDS_STRIDE * _unit(stride))
+        points.append(here)
+    return np.asarray(points[1 : last_good + 1]).reshape(-1, 3)
+
+
+def _middle(caster: RayCaster, place: Array, direction: Array) -> tuple[float, Array]:
+    """Share of a ring around a place that is wall, and the ring's middle; gaps are bridged."""
+    radius, _ = _ring(caster, place, direction)
+    there = np.isfinite(radius)
+    if not there.any():
+        return 0.0, place
+    angle = np.arange(_RING) * (2.0 * np.pi / _RING)
+    filled = np.interp(angle, angle[there], radius[there], period=2.0 * np.pi)
+    # Centroid of the polygon, from equal sectors.
+    weight = filled**2
+    across, other = _across(direction)
+    offset = (2.0 / 3.0) * (weight * filled * np.cos(angle)).sum() * across
+    offset = offset + (2.0 / 3.0) * (weight * filled * np.sin(angle)).sum() * other
+    return float(there.mean()), place + offset / weight.sum()
+
+
+def _ring(caster: RayCaster, place: Array, direction: Array, tilts: tuple[float, ...] = (0.0,)) -> tuple[Array, Array]:
+    """Distances to the wall and hits all round, at each tilt towards the direction; NaN where there is none."""
+    across, other = _across(direction)
+    angle = np.arange(_RING)[:, None] * (2.0 * np.pi / _RING)
+    outward = np.cos(angle) * across + np.sin(angle) * other
+    rays = np.concatenate([np.cos(np.radians(tilt)) * outward + np.sin(np.radians(tilt)) * direction for tilt in tilts])
+    _, distance = caster.cast(place, rays)
+    distance = np.where(distance <= _WIDEST, distance, np.nan).astype(np.float64)
+    return distance, place + distance[:, None] * rays
+
+
+def _across(direction: Array) -> tuple[Array, Array]:
+    """Two unit vectors that complete a direction to a right-handed frame."""
+    helper = np.eye(3)[np.argmin(np.abs(direction))]
+    across = _unit(np.cross(helper, direction))
+    return across, np.cross(direction, across)
+
+
+def _curve(points: Array, poses: Array) -> Centreline:
+    """Smooth, evenly spaced curve with frames, from points of the search."""
+    smooth = gaussian_filter1d(points, _SMOOTHING / _STRIDE, axis=0, mode="nearest")
+    # The filter pulls the ends inwards: keep the ends themselves.
+    weight = np.minimum(np.arange(len(points)), np.arange(len(points))[::-1]) * _STRIDE / (2.0 * _SMOOTHING)
+    smooth += (points - smooth) * np.clip(1.0 - weight, 0.0, 1.0)[:, None]
+    walked = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(smooth, axis=0), axis=1))])
+    arc = np.arange(0.0, walked[-1], STEP)
+    line = np.stack([np.interp(arc, walked, smooth[:, axis]) for axis in range(3)], axis=1)
+    tangents = np.gradient(line, axis=0)
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    places = cKDTree(line).query(poses[:, :3, 3])[1]
+    middle = int(np.median(places))
+    frames = _frames(tangents, middle, -poses[:, :3, 1].mean(axis=0))
+    along, _, _ = Centreline(line, frames, arc).unroll(poses[:, :3, 3])
+    return Centreline(line, frames, arc - along.min())
+
+
+def _frames(tangents: Array, start: int, up: Array) -> Array:
+    """Frames carried along the curve without turning, from ``up`` at a start. [M, 3, 3]"""
+    frames = np.empty((len(tangents), 3, 3))
+    for order in (range(start, len(tangents)), range(start, -1, -1)):
+        across = up
+        for index in order:
+            across = across - (across @ tangents[index]) * tangents[index]
+            across = _unit(across) if np.linalg.norm(across) > 1e-9 else _across(tangents[index])[0]
+            # Looking along the tangent with clock 0 up, clock 90 degrees is to the right.
+            frames[index] = np.stack([across, np.cross(tangents[index], across), tangents[index]], axis=-1)
+    return frames
+
+
+def _unit(vector: Array) -> Array:
+    return np.asarray(vector / np.linalg.norm(vector))

@@ -1,0 +1,156 @@
+"""Evaluation of measured coverage against the truth, beside baselines that know nothing of the scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
+
+from coliags_plugin.geometry.meshes.truth import TrueSurface
+from coliags_plugin.surface.coverage.centreline import find_centreline
+from coliags_plugin.surface.coverage.levels import Level
+from coliags_plugin.surface.coverage.measure import Coverage
+from coliags_plugin.surface.coverage.regions import neighbours
+from coliags_plugin.surface.coverage.scores import CoverageScores, score_unseen
+from coliags_plugin.surface.coverage.section import Section, find_section
+from coliags_plugin.surface.coverage.views import CoverageView
+from coliags_plugin.surface.coverage.visibility import RayCaster, RayGrids, facing_cameras, see_faces
+
+#: Farthest that a triangle of the measured wall may be from the true one that it stands for, mm: the tolerance of
+#: the F-score of meshes.
+_REACH = 1.0
+#: What the difference of two unit normals adds to their distance, mm: the front of a fold does not stand for its back.
+_NORMAL_WEIGHT = 2.0
+#: Relative error of the distance along a viewing ray up to which the ray confirms the surface that it truly hits.
+_SAME_DISTANCE = 0.25
+#: Cells of the random baseline: along, mm, and around, degrees; and the number of draws that are averaged.
+_CELL, _SECTOR, _DRAWS = 10.0, 30.0, 10
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Scores on the true surface, within the true section.
+
+    Attributes:
+        surface: Of the measured levels: true surface is called seen where the nearest reconstructed wall is, and lies
+            within 1 mm.
+        rays: Of the rule that a true triangle was seen where the measured wall is within 25 % of the distance along a
+            viewing ray that hits it.
+        all_unseen: Of calling everything unseen.
+        random: Of calling random cells unseen, of the same area as is truly unseen.
+        section: The true section.
+        unseen_share: Share of it that is truly unseen.
+    """
+
+    surface: CoverageScores
+    rays: CoverageScores
+    all_unseen: CoverageScores
+    random: CoverageScores
+    section: Section
+    unseen_share: float
+
+    def as_json(self) -> dict[str, Any]:
+        """Scores by name."""
+        return {
+            "section_mm": [round(self.section.start, 2), round(self.section.end, 2)],
+            "unseen_share": self.unseen_share,
+            "surface": self.surface.as_json(),
+            "rays": self.rays.as_json(),
+            "all_unseen": self.all_unseen.as_json(),
+            "random": self.random.as_json(),
+        }
+
+
+def evaluate_coverage(coverage: Coverage, truth: TrueSurface, views: Sequence[CoverageView]) -> Evaluation:
+    """Compare measured coverage with the truth.
+
+    Args:
+        coverage: The measured coverage.
+        truth: True surface, in the same world. Where it does not tell what was seen, its own coverage is measured.
+        views: The frames that it was measured from.
+
+    Raises:
+        InputError: The truth is not the wall around the cameras.
+    """
+    mesh = facing_cameras(truth.mesh, views, coverage.settings)
+    seen = truth.seen if truth.seen_by else see_faces(mesh, views, coverage.settings).seen
+    poses = np.stack([np.asarray(view.camera_to_world, np.float64) for view in views])
+    caster = RayCaster(mesh)
+    line = find_centreline(mesh, poses, caster)
+    arc, clock, _ = line.unroll(mesh.centers)
+    along = (arc >= line.arc[0]) & (arc <= line.arc[-1])
+    section = find_section(arc[along], mesh.areas[along], seen[along])
+    areas = mesh.areas * section.holds(arc)
+    unseen, pairs = ~seen, neighbours(mesh)
+
+    def scored(called: Bool[np.ndarray, "F"]) -> CoverageScores:
+        return score_unseen(called, unseen, areas, pairs, coverage.settings.region_area)
+
+    share = float(areas[unseen].sum() / areas.sum())
+    generator = np.random.default_rng(0)
+    draws = [scored(_random_cells(arc, clock, share, generator)) for _ in range(_DRAWS)]
+    return Evaluation(
+        surface=scored(~_carried_over(coverage, mesh.centers, mesh.normals)),
+        rays=scored(~_confirmed(coverage, caster, views, len(mesh))),
+        all_unseen=scored(np.ones(len(mesh), bool)),
+        random=_mean(draws),
+        section=section,
+        unseen_share=share,
+    )
+
+
+def _carried_over(
+    coverage: Coverage, centers: Float[np.ndarray, "F 3"], normals: Float[np.ndarray, "F 3"]
+) -> Bool[np.ndarray, "F"]:
+    """Whether the nearest reconstructed triangle of a like normal was seen; False where none is within reach. [F]"""
+    seen = (coverage.level != Level.UNSEEN)[~coverage.guessed]
+    own = coverage.mesh.part(~coverage.guessed)
+    tree = cKDTree(np.concatenate([own.centers, _NORMAL_WEIGHT * own.normals], axis=1))
+    places = np.concatenate([centers, _NORMAL_WEIGHT * normals], axis=1)
+    distance, nearest = tree.query(places, distance_upper_bound=_REACH)
+    found = np.isfinite(distance)
+    called = np.zeros(len(centers), bool)
+    called[found] = seen[np.asarray(nearest)[found]]
+    return called
+
+
+def _confirmed(
+    coverage: Coverage, caster: RayCaster, views: Sequence[CoverageView], count: int
+) -> Bool[np.ndarray, "F"]:
+    """Whether a viewing ray that hits a true triangle meets the reconstructed wall at about the same distance. [F]"""
+    own = RayCaster(coverage.mesh.part(~coverage.guessed))
+    grids, farthest = RayGrids(coverage.settings.rays), coverage.settings.max_distance
+    seen = np.zeros(count, bool)
+    for view in views:
+        grid = grids.of(view)
+        rays = np.einsum("nc,dc->nd", grid.directions, view.camera_to_world[:3, :3].astype(np.float32))
+        triangle, true = caster.cast(view.center, rays)
+        hit = np.flatnonzero((triangle >= 0) & (true <= farthest))
+        _, measured = own.cast(view.center, rays[hit])
+        close = np.abs(measured - true[hit]) < _SAME_DISTANCE * true[hit]
+        seen[triangle[hit[close]]] = True
+    return seen
+
+
+def _random_cells(
+    arc: Float[np.ndarray, "F"], clock: Float[np.ndarray, "F"], share: float, generator: np.random.Generator
+) -> Bool[np.ndarray, "F"]:
+    """Cells of the wall, each chosen with the same probability. [F]"""
+    sectors = int(360.0 / _SECTOR)
+    cell = ((arc - arc.min()) / _CELL).astype(int) * sectors + (clock / _SECTOR).astype(int) % sectors
+    return np.asarray((generator.random(cell.max() + 1) < share)[cell])
+
+
+def _mean(draws: Sequence[CoverageScores]) -> CoverageScores:
+    """Means of the scores of several draws; numbers of regions are rounded."""
+    rows = [draw.as_json() for draw in draws]
+    means: dict[str, Any] = {}
+    for name in rows[0]:
+        values = [row[name] for row in rows if row[name] is not None]
+        means[name] = float(np.mean([float(value) for value in values if value is not None])) if values else None
+    counts = {name: round(means[name]) for name in ("true_regions", "predicted_regions")}
+    return CoverageScores(**{**means, **counts})

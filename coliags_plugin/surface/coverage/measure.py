@@ -1,0 +1,217 @@
+"""Coverage of a recording: how each piece of the wall was seen, and the regions that were missed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+
+from coliags_plugin.core.progress import Progress
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+from coliags_plugin.surface.coverage.centreline import STEP, Centreline, find_centreline
+from coliags_plugin.surface.coverage.levels import Level, classify
+from coliags_plugin.surface.coverage.regions import large_regions, near_pairs, neighbours
+from coliags_plugin.surface.coverage.section import Section, find_section
+from coliags_plugin.surface.coverage.settings import CoverageSettings
+from coliags_plugin.surface.coverage.tube import TubeGrid, guessed_wall, wall_around
+from coliags_plugin.surface.coverage.views import CoverageView
+from coliags_plugin.surface.coverage.visibility import FaceViews, RayCaster, facing_cameras, see_faces
+
+#: Guessed wall continues a region of reconstructed wall whose centroids are as near as this, mm.
+_TOUCHING = 2.0
+#: Points of a region that choose its picture, and a distance within which views are alike for that, mm.
+_PROBED, _NEAR = 200, 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class MissedRegion:
+    """A connected piece of the section that no frame shows.
+
+    Attributes:
+        triangles: Indices in :attr:`Coverage.mesh`. [K]
+        area: mm^2.
+        guessed_area: Area of it whose place is a guess, mm^2.
+        centroid: World, mm. [3]
+        arc: Place of the centroid along the centreline, mm.
+        clock: Its clock angle, degrees; 0 is up.
+        reach: From where to where along the centreline, mm.
+        at_end: Whether it reaches an end of the section, beyond which nothing is counted.
+        nearest: Index of the frame that looks where it is from nearest, whether it is hidden there or not.
+    """
+
+    triangles: Int[np.ndarray, "K"]
+    area: float
+    guessed_area: float
+    centroid: Float[np.ndarray, "3"]
+    arc: float
+    clock: float
+    reach: tuple[float, float]
+    at_end: bool
+    nearest: int
+
+    @property
+    def diameter(self) -> float:
+        """Of the circle of the same area, mm."""
+        return float(2.0 * np.sqrt(self.area / np.pi))
+
+
+@dataclass(frozen=True, eq=False)
+class Coverage:
+    """What a recording shows of a lumen's wall, F triangles.
+
+    Attributes:
+        mesh: The reconstructed wall and, behind it in the order of triangles, the guessed wall.
+        guessed: Triangles whose place is a guess, because nothing was reconstructed there. [F]
+        views: How the frames saw each triangle; guessed ones are unseen.
+        level: The values of :class:`Level`. [F]
+        line: Centreline of the lumen.
+        arc, clock: Place along it, mm, and clock angle, degrees, of each triangle. [F], [F]
+        section: What part of the lumen is measured.
+        grid: The wall, guessed or not, around the centreline.
+        regions: Missed regions of the section, the largest first.
+        names: Of the frames.
+        settings: What counts as seen.
+    """
+
+    mesh: TriangleMesh
+    guessed: Bool[np.ndarray, "F"]
+    views: FaceViews
+    level: UInt8[np.ndarray, "F"]
+    line: Centreline
+    arc: Float[np.ndarray, "F"]
+    clock: Float[np.ndarray, "F"]
+    section: Section
+    grid: TubeGrid
+    regions: list[MissedRegion]
+    names: list[str]
+    settings: CoverageSettings
+
+    @property
+    def inside(self) -> Bool[np.ndarray, "F"]:
+        """Triangles of the section. [F]"""
+        return self.section.holds(self.arc)
+
+    def area(self, chosen: Bool[np.ndarray, "F"]) -> float:
+        """Area of some triangles of the section, mm^2."""
+        return float(self.mesh.areas[chosen & self.inside].sum())
+
+
+def measure_coverage(
+    mesh: TriangleMesh,
+    views: Sequence[CoverageView],
+    settings: CoverageSettings | None = None,
+    progress: Progress | None = None,
+) -> Coverage:
+    """Measure what a recording shows of the wall of a lumen, and what it misses.
+
+    Where the mesh has no wall, a guess of it closes the lumen (:func:`guessed_wall`), since only surface that is there
+    can be called unseen; guessed wall always is.
+
+    Args:
+        mesh: The reconstructed wall, world frame, mm.
+        views: The frames of the recording.
+        settings: What counts as seen; None: the defaults.
+        progress: Called after every frame.
+
+    Raises:
+        InputError: There is no frame, the mesh is empty, is not where the cameras look or is no tube around them, or
+            open3d cannot be imported.
+    """
+    settings = settings or CoverageSettings()
+    mesh = facing_cameras(mesh, views, settings)
+    views_of_wall = see_faces(mesh, views, settings, progress)
+    poses = np.stack([np.asarray(view.camera_to_world, np.float64) for view in views])
+    caster = RayCaster(mesh)
+    line = find_centreline(mesh, poses, caster)
+    guess = guessed_wall(wall_around(caster, line))
+    whole, guessed = _joined(mesh, guess)
+    seen = _extended(views_of_wall, len(guess))
+    level = classify(seen, settings)
+    arc, clock, _ = line.unroll(whole.centers)
+    # Beyond the ends of the centreline nothing was guessed, so that the share of wall seen there says nothing.
+    along = (arc >= line.arc[0]) & (arc <= line.arc[-1])
+    section = find_section(arc[along], whole.areas[along], seen.seen[along])
+    grid = wall_around(RayCaster(whole), line)
+    missed = (level == Level.UNSEEN) & section.holds(arc)
+    pairs = np.concatenate(
+        [neighbours(whole), near_pairs(whole.centers, missed & guessed, missed & ~guessed, _TOUCHING)]
+    )
+    found = large_regions(missed, pairs, whole.areas, settings.region_area)
+    regions = [_described(chosen, whole, guessed, line, arc, section, views) for chosen in found]
+    names = [view.name for view in views]
+    return Coverage(whole, guessed, seen, level, line, arc, clock, section, grid, regions, names, settings)
+
+
+def _joined(mesh: TriangleMesh, guess: TriangleMesh) -> tuple[TriangleMesh, Bool[np.ndarray, "F"]]:
+    """Both meshes as one without colours, and which triangles are the second's."""
+    vertices = np.concatenate([mesh.vertices, guess.vertices.astype(mesh.vertices.dtype)])
+    triangles = np.concatenate([mesh.triangles, guess.triangles + len(mesh.vertices)])
+    return TriangleMesh(vertices, triangles), np.arange(len(triangles)) >= len(mesh)
+
+
+def _extended(views: FaceViews, more: int) -> FaceViews:
+    """The same with unseen triangles behind."""
+
+    def counted(values: Int[np.ndarray, "F"], value: int = 0) -> Int[np.ndarray, "G"]:
+        return np.concatenate([values, np.full(more, value, values.dtype)])
+
+    def measured(values: Float32[np.ndarray, "F"]) -> Float32[np.ndarray, "G"]:
+        return np.concatenate([values, np.full(more, np.nan, np.float32)])
+
+    return FaceViews(
+        counted(views.frames),
+        counted(views.clear_frames),
+        counted(views.good_frames),
+        measured(views.distance),
+        measured(views.incidence),
+        measured(views.pixels_per_mm),
+        measured(views.brightness),
+        counted(views.best_frame, -1),
+    )
+
+
+def _described(
+    triangles: Int[np.ndarray, "K"],
+    mesh: TriangleMesh,
+    guessed: Bool[np.ndarray, "F"],
+    line: Centreline,
+    arc: Float[np.ndarray, "F"],
+    section: Section,
+    views: Sequence[CoverageView],
+) -> MissedRegion:
+    areas, centers = mesh.areas[triangles], mesh.centers[triangles]
+    area = float(areas.sum())
+    centroid = (centers * areas[:, None]).sum(axis=0) / area
+    # On the wall, not inside the lumen, where the centroid of a ring would be.
+    middle = centers[np.argmin(np.linalg.norm(centers - centroid, axis=1))]
+    place, clock, _ = line.unroll(middle[None])
+    start, end = float(arc[triangles].min()), float(arc[triangles].max())
+    return MissedRegion(
+        triangles,
+        area,
+        float(areas[guessed[triangles]].sum()),
+        middle,
+        float(place[0]),
+        float(clock[0]),
+        (start, end),
+        start < section.start + STEP or end > section.end - STEP,
+        _nearest_view(centers[:: max(1, len(centers) // _PROBED)], views),
+    )
+
+
+def _nearest_view(points: Float[np.ndarray, "N 3"], views: Sequence[CoverageView]) -> int:
+    """Index of the view that has most of the points in its image, whether hidden or not, for their distance."""
+    merits = []
+    for view in views:
+        local = (points - view.center) @ view.camera_to_world[:3, :3]
+        pixels = view.lens.project(local)
+        with np.errstate(invalid="ignore"):
+            framed = (pixels >= 0.0) & (pixels < np.array([view.lens.width, view.lens.height]))
+        inside = np.asarray(framed.all(axis=1))
+        if view.mask is not None:
+            column, row = np.where(inside[:, None], pixels, 0.0).astype(int).T
+            inside = inside & view.mask[row, column]
+        merits.append(inside.mean() / (_NEAR + np.linalg.norm(local, axis=1).mean()))
+    return int(np.argmax(merits))

@@ -1,0 +1,120 @@
+"""What a camera recorded, for the measurement of coverage: poses, lens, mask and brightness."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+
+from coliags_plugin.geometry.lenses.models import Lens
+
+
+@dataclass(frozen=True)
+class CoverageView:
+    """One recorded frame.
+
+    Attributes:
+        name: Of the frame.
+        camera_to_world: Pose, OpenCV axes, mm. [4, 4]
+        lens: The lens it was taken through, at the size of the image.
+        mask: Pixels with image content; None for all. [H, W]
+        read_image: Reads the image through that lens; None where there is none. [H, W, 3]
+    """
+
+    name: str
+    camera_to_world: Float[np.ndarray, "4 4"]
+    lens: Lens
+    mask: Bool[np.ndarray, "H W"] | None = None
+    read_image: Callable[[], UInt8[np.ndarray, "H W 3"]] | None = field(default=None, repr=False)
+
+    @property
+    def center(self) -> Float[np.ndarray, "3"]:
+        """Optical centre, world, mm. [3]"""
+        return np.asarray(self.camera_to_world[:3, 3], np.float64)
+
+
+@dataclass(frozen=True)
+class RayGrid:
+    """Viewing rays on an even grid over the image of a lens, R of them where the image has content.
+
+    Attributes:
+        size: Width and height of the grid.
+        cells: Places in the grid, row by row. [R]
+        directions: Camera axes, z = 1. [R, 3]
+        pixel_angles: Solid angle of one pixel of the image along each ray, steradians. [R]
+    """
+
+    size: tuple[int, int]
+    cells: Int[np.ndarray, "R"]
+    directions: Float32[np.ndarray, "R 3"]
+    pixel_angles: Float32[np.ndarray, "R"]
+
+    @classmethod
+    def of(cls, lens: Lens, mask: Bool[np.ndarray, "H W"] | None, most: int) -> RayGrid:
+        """The grid of a lens, with at most about ``most`` rays and no more than 2 x 2 in a pixel.
+
+        Args:
+            lens: Of the image.
+            mask: Pixels with image content; None for all. [H, W]
+            most: Number of rays.
+        """
+        scale = min(2.0, (most / (lens.width * lens.height)) ** 0.5)
+        # Whole rays per pixel where there is one or more, so that every pixel is sampled alike.
+        scale = scale if scale < 1.0 else float(int(scale))
+        width, height = max(1, round(lens.width * scale)), max(1, round(lens.height * scale))
+        column, row = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        stretch = np.array([lens.width / width, lens.height / height])
+        pixels = np.stack([column.ravel(), row.ravel()], axis=1) * stretch
+        inside = np.ones(len(pixels), bool)
+        if mask is not None:
+            inside = mask[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
+        directions = np.full((len(pixels), 3), np.nan)
+        directions[inside] = lens.unproject(pixels[inside])
+        cells = np.flatnonzero(np.isfinite(directions).all(axis=1))
+        directions = directions[cells]
+        angles = _pixel_angles(lens, pixels[cells], directions)
+        return cls((width, height), cells, directions.astype(np.float32), angles.astype(np.float32))
+
+    @cached_property
+    def narrowest_cosine(self) -> float:
+        """Cosine of the widest angle of a ray to the optical axis."""
+        return float(1.0 / np.linalg.norm(self.directions, axis=1).max()) if len(self.cells) else 1.0
+
+    @cached_property
+    def _ray_of_cell(self) -> Int[np.ndarray, "G"]:
+        rays = np.full(self.size[0] * self.size[1], -1)
+        rays[self.cells] = np.arange(len(self.cells))
+        return rays
+
+    def nearest(self, lens: Lens, pixels: Float[np.ndarray, "N 2"]) -> Int[np.ndarray, "N"]:
+        """The ray nearest to each pixel of the lens; -1 outside the image and its content. [N]"""
+        width, height = self.size
+        with np.errstate(invalid="ignore"):
+            place = pixels * (width / lens.width, height / lens.height)
+            inside = np.all((place >= 0.0) & (place < (width, height)), axis=1)
+        column, row = np.where(inside[:, None], place, 0.0).astype(int).T
+        return np.asarray(np.where(inside, self._ray_of_cell[row * width + column], -1))
+
+    def brightness(self, image: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "R"]:
+        """Grey value of the image, 0 to 1, along each ray. [R]"""
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        width, height = self.size
+        smaller = width < grey.shape[1]
+        grey = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_NEAREST)
+        return np.asarray(grey.reshape(-1)[self.cells].astype(np.float32) / np.float32(255.0))
+
+
+def _pixel_angles(
+    lens: Lens, pixels: Float[np.ndarray, "R 2"], directions: Float[np.ndarray, "R 3"]
+) -> Float[np.ndarray, "R"]:
+    """Solid angles of pixels, from directions half a pixel aside; 0 where the lens ends there. [R]"""
+    step = 0.5
+    right = lens.unproject(pixels + np.array([step, 0.0])) - lens.unproject(pixels - np.array([step, 0.0]))
+    down = lens.unproject(pixels + np.array([0.0, step])) - lens.unproject(pixels - np.array([0.0, step]))
+    area = np.abs(right[:, 0] * down[:, 1] - right[:, 1] * down[:, 0])
+    angles = area / np.linalg.norm(directions, axis=1) ** 3
+    return np.asarray(np.nan_to_num(angles))

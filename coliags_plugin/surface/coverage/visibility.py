@@ -1,0 +1,289 @@
+"""Which triangles of a mesh a camera saw, how often and how well, by casting the viewing rays of every frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.progress import Progress
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+from coliags_plugin.surface.coverage.settings import CoverageSettings
+from coliags_plugin.surface.coverage.views import CoverageView, RayGrid
+
+#: Frames that decide which side of a mesh the cameras are on, and rays of each.
+_PROBED, _PROBING_RAYS = 8, 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class FaceViews:
+    """How the frames of a recording saw each triangle of a mesh. All [F].
+
+    Attributes:
+        frames: Number of frames that saw it at all.
+        clear_frames: Those that saw it near enough and bright enough.
+        good_frames: Those of the latter that saw it under a steep enough angle.
+        distance: Smallest distance to a camera that saw it, mm; NaN where unseen, here and below.
+        incidence: Smallest angle between viewing ray and normal, degrees.
+        pixels_per_mm: Finest sampling of the surface by the pixels of an image, pixels per mm.
+        brightness: Highest grey value, 0 to 1; NaN also without images.
+        best_frame: Index of the frame that sampled it most finely; -1 where unseen.
+    """
+
+    frames: Int[np.ndarray, "F"]
+    clear_frames: Int[np.ndarray, "F"]
+    good_frames: Int[np.ndarray, "F"]
+    distance: Float32[np.ndarray, "F"]
+    incidence: Float32[np.ndarray, "F"]
+    pixels_per_mm: Float32[np.ndarray, "F"]
+    brightness: Float32[np.ndarray, "F"]
+    best_frame: Int[np.ndarray, "F"]
+
+    @property
+    def seen(self) -> Bool[np.ndarray, "F"]:
+        """Whether any frame saw it. [F]"""
+        return np.asarray(self.frames > 0)
+
+
+@dataclass(frozen=True)
+class _Hits:
+    """Rays of one frame that hit a triangle within the range.
+
+    Attributes:
+        triangle: What they hit. [N]
+        ray: Their places among the rays of the grid. [N]
+        distance: mm. [N]
+        cosine: Of the angle between ray and normal, 1 where perpendicular to the surface. [N]
+    """
+
+    triangle: Int[np.ndarray, "N"]
+    ray: Int[np.ndarray, "N"]
+    distance: Float32[np.ndarray, "N"]
+    cosine: Float32[np.ndarray, "N"]
+
+
+class RayCaster:
+    """First hits of rays on a mesh.
+
+    Args:
+        mesh: At least one triangle.
+
+    Raises:
+        InputError: The mesh is empty, or open3d cannot be imported.
+    """
+
+    def __init__(self, mesh: TriangleMesh) -> None:
+        if not len(mesh):
+            raise InputError("a mesh without triangles", "the surface that the camera filmed")
+        self._rays = mesh.rays
+        self._normals, self._centers = mesh.normals.astype(np.float32), mesh.centers
+
+    def cast(
+        self, origins: Float[np.ndarray, "N 3"] | Float[np.ndarray, "3"], directions: Float[np.ndarray, "N 3"]
+    ) -> tuple[Int[np.ndarray, "N"], Float32[np.ndarray, "N"]]:
+        """Triangle that each ray hits first, -1 without a hit, and how many lengths of the ray it is away. [N], [N]"""
+        return self._rays.cast(origins, directions)
+
+    def distance(self, points: Float[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N"]:
+        """Distance of points to the surface, mm. [N]"""
+        return self._rays.distance(points)
+
+    def seen_by(self, view: CoverageView, grid: RayGrid, farthest: float, both_sides: bool = False) -> _Hits:
+        """What a view sees.
+
+        Args:
+            view: The frame.
+            grid: Rays of its lens.
+            farthest: z-depth at which surface still counts as seen, mm.
+            both_sides: Also triangles seen from behind; their cosines are negative.
+        """
+        rotation = view.camera_to_world[:3, :3].astype(np.float32)
+        rays = np.einsum("nc,dc->nd", grid.directions, rotation)
+        triangle, z_depth = self.cast(view.center, rays)
+        hit = np.flatnonzero((triangle >= 0) & (z_depth <= farthest))
+        length = np.linalg.norm(grid.directions[hit], axis=1)
+        found = triangle[hit]
+        cosine = -np.einsum("nc,nc->n", rays[hit], self._normals[found]) / length
+        kept = np.flatnonzero(cosine > -np.inf if both_sides else cosine > 0.0)
+        hit, found = hit[kept], found[kept]
+        return _Hits(found, hit, (z_depth[hit] * length[kept]).astype(np.float32), cosine[kept])
+
+    def centroids_seen_by(
+        self, view: CoverageView, grid: RayGrid, triangles: Int[np.ndarray, "K"], farthest: float
+    ) -> _Hits:
+        """Which of some triangles a view sees by their centroids.
+
+        Args:
+            view: The frame.
+            grid: Rays of its lens, of which the nearest stands for each centroid.
+            triangles: The triangles. [K]
+            farthest: z-depth at which surface still counts as seen, mm.
+        """
+        offset = self._centers[triangles] - view.center
+        local = offset @ view.camera_to_world[:3, :3]
+        distance = np.linalg.norm(offset, axis=1)
+        cosine = -np.einsum("nc,nc->n", offset, self._normals[triangles]) / np.maximum(distance, 1e-9)
+        ahead = (local[:, 2] > grid.narrowest_cosine * distance) & (local[:, 2] <= farthest) & (cosine > 0.0)
+        kept = np.flatnonzero(ahead)
+        rays = grid.nearest(view.lens, view.lens.project(local[kept]))
+        kept, rays = kept[rays >= 0], rays[rays >= 0]
+        blocked = self._rays.blocked(view.center, offset[kept])
+        kept, rays = kept[~blocked], rays[~blocked]
+        return _Hits(triangles[kept], rays, distance[kept].astype(np.float32), cosine[kept].astype(np.float32))
+
+
+def facing_cameras(
+    mesh: TriangleMesh, views: Sequence[CoverageView], settings: CoverageSettings | None = None
+) -> TriangleMesh:
+    """The mesh with its triangles counter-clockwise from the side of the cameras, as most rays of a few frames see it.
+
+    Args:
+        mesh: Of one orientation, whichever it is.
+        views: The frames.
+        settings: See :func:`see_faces`.
+
+    Raises:
+        InputError: There is no frame, the mesh is empty, no ray hits it, or open3d cannot be imported.
+    """
+    settings = settings or CoverageSettings()
+    if not views:
+        raise InputError("a recording without frames", "one frame or more")
+    caster, grids = RayCaster(mesh), RayGrids(_PROBING_RAYS)
+    probed = views[:: max(1, len(views) // _PROBED)]
+    hits = [caster.seen_by(view, grids.of(view), settings.max_distance, both_sides=True) for view in probed]
+    cosines = np.concatenate([found.cosine for found in hits])
+    if not len(cosines):
+        raise InputError(
+            f"no viewing ray of {len(probed)} frames hits the mesh within {settings.max_distance:g} mm",
+            "a mesh in the world and unit of the poses",
+            "Check that the mesh belongs to this scene",
+        )
+    if 2 * np.count_nonzero(cosines > 0.0) >= len(cosines):
+        return mesh
+    return TriangleMesh(mesh.vertices, mesh.triangles[:, ::-1], mesh.colors)
+
+
+def see_faces(
+    mesh: TriangleMesh,
+    views: Sequence[CoverageView],
+    settings: CoverageSettings | None = None,
+    progress: Progress | None = None,
+) -> FaceViews:
+    """Find which triangles the frames of a recording see.
+
+    A frame sees a triangle if one of its viewing rays hits that first, from the front, within
+    ``settings.max_distance``. Of triangles that no ray of any frame hits, because they lie between the rays, those
+    whose centroid is in view count as seen.
+
+    Args:
+        mesh: The surface, world frame, mm; triangles counter-clockwise from the side that is seen.
+        views: The frames.
+        settings: What counts as seen; None: the defaults.
+        progress: Called after every frame.
+
+    Raises:
+        InputError: The mesh is empty, or open3d cannot be imported.
+    """
+    settings = settings or CoverageSettings()
+    caster, grids, tally = RayCaster(mesh), RayGrids(settings.rays), _Tally(len(mesh))
+    for number, view in enumerate(views):
+        grid = grids.of(view)
+        tally.add(number, caster.seen_by(view, grid, settings.max_distance), grid, view, settings)
+        if progress is not None:
+            progress("cast viewing rays", number + 1, len(views))
+    between = np.flatnonzero(~tally.seen)
+    for number, view in enumerate(views):
+        grid = grids.of(view)
+        tally.add(number, caster.centroids_seen_by(view, grid, between, settings.max_distance), grid, view, settings)
+    return tally.result()
+
+
+class RayGrids:
+    """The ray grid of the last lens asked for, as frames of one lens usually follow each other.
+
+    Args:
+        most: See :meth:`RayGrid.of`.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._last: tuple[CoverageView, RayGrid] | None = None
+
+    def of(self, view: CoverageView) -> RayGrid:
+        """The grid of a view's lens and mask."""
+        if self._last is not None:
+            other, grid = self._last
+            if other.lens == view.lens and (other.mask is view.mask or _same(other.mask, view.mask)):
+                return grid
+        grid = RayGrid.of(view.lens, view.mask, self._most)
+        self._last = view, grid
+        return grid
+
+
+def _same(one: Bool[np.ndarray, "H W"] | None, other: Bool[np.ndarray, "H W"] | None) -> bool:
+    return one is not None and other is not None and np.array_equal(one, other)
+
+
+class _Tally:
+    """Sums and extremes over frames."""
+
+    def __init__(self, faces: int) -> None:
+        self._counts = np.zeros((3, faces), np.int32)
+        self._distance = np.full(faces, np.inf, np.float32)
+        self._cosine = np.full(faces, -1.0, np.float32)
+        self._fineness = np.full(faces, -1.0, np.float32)
+        self._brightness = np.full(faces, -1.0, np.float32)
+        self._best = np.full(faces, -1, np.int32)
+
+    def add(
+        self,
+        number: int,
+        hits: _Hits,
+        grid: RayGrid,
+        view: CoverageView,
+        settings: CoverageSettings,
+    ) -> None:
+        face = hits.triangle
+        if not len(face):
+            return
+        clear = hits.distance <= settings.far
+        if view.read_image is not None:
+            brightness = grid.brightness(view.read_image())[hits.ray]
+            clear &= brightness >= settings.dark
+            np.maximum.at(self._brightness, face, brightness)
+        good = clear & (hits.cosine >= np.cos(np.radians(settings.grazing)))
+        for count, chosen in zip(self._counts, (face, face[clear], face[good]), strict=True):
+            count[np.unique(chosen)] += 1
+        np.minimum.at(self._distance, face, hits.distance)
+        np.maximum.at(self._cosine, face, hits.cosine)
+        # A pixel covers solid angle * distance^2 / cosine of the surface.
+        patch = grid.pixel_angles[hits.ray] * hits.distance**2
+        fineness = np.sqrt(hits.cosine / np.maximum(patch, np.finfo(np.float32).tiny))
+        before = self._fineness.copy()
+        np.maximum.at(self._fineness, face, fineness)
+        self._best[self._fineness > before] = number
+
+    @property
+    def seen(self) -> Bool[np.ndarray, "F"]:
+        return np.asarray(self._counts[0] > 0)
+
+    def result(self) -> FaceViews:
+        seen = self.seen
+
+        def known(values: np.ndarray, there: np.ndarray) -> Float32[np.ndarray, "F"]:
+            return np.where(there, values, np.nan).astype(np.float32)
+
+        incidence = np.degrees(np.arccos(np.clip(self._cosine, -1.0, 1.0)))
+        return FaceViews(
+            self._counts[0],
+            self._counts[1],
+            self._counts[2],
+            known(self._distance, seen),
+            known(incidence, seen),
+            known(self._fineness, seen),
+            known(self._brightness, self._brightness >= 0.0),
+            self._best,
+        )

@@ -1,0 +1,159 @@
+"""The mesh of a run as files, compared with the true surface where there is one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import atomic_folder, write_json
+from coliags_plugin.core.scenes import Scene
+from coliags_plugin.engine.data_formats import open_scene
+from coliags_plugin.engine.trained import TrainedRun
+from coliags_plugin.engine.truth import match_truth
+from coliags_plugin.geometry.meshes.comparison import SurfaceComparison, compare_meshes
+from coliags_plugin.geometry.meshes.files import MESH_FORMATS, write_mesh
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+from coliags_plugin.geometry.meshes.truth import TrueSurface, find_true_surface, read_true_surface
+from coliags_plugin.outputs.image_files import write_png
+from coliags_plugin.surface.meshing.fusion import fuse_run
+from coliags_plugin.surface.meshing.pictures import comparison_picture, distance_colors
+from coliags_plugin.surface.meshing.seen import first_hits
+from coliags_plugin.surface.meshing.settings import MeshSettings, max_depth_of, voxel_size_of
+
+#: Version of mesh.json.
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class MeshedRun:
+    """The mesh of a run and the folder it was written to.
+
+    Attributes:
+        folder: With ``mesh.ply`` and so on, and ``mesh.json``.
+        mesh: World of the poses, scene units.
+        comparison: With the true surface; None where there is none.
+    """
+
+    folder: Path
+    mesh: TriangleMesh
+    comparison: SurfaceComparison | None
+
+
+def mesh_run(
+    trained: TrainedRun,
+    output: Path,
+    settings: MeshSettings | None = None,
+    formats: Sequence[str] = MESH_FORMATS,
+    truth: Path | None = None,
+    overwrite: bool = False,
+) -> MeshedRun:
+    """Fuse a run into a mesh and write it, with a comparison where there is a true surface.
+
+    The folder gets the mesh in each format; ``mesh.json`` with settings, counts and figures; and, with a true surface,
+    ``comparison.png``, ``mesh_error.ply`` and ``truth_error.ply``, coloured by distance.
+
+    Args:
+        trained: The run.
+        output: The folder to make.
+        settings: Options; None: the defaults.
+        formats: Of the files, see :data:`~coliags_plugin.geometry.meshes.files.MESH_FORMATS`.
+        truth: The true surface: a mesh in the world of the scene in mm, or the folder of a scene with one. None: that
+            of the run's own scene, where there is one.
+        overwrite: Replace ``output`` where it exists.
+
+    Raises:
+        InputError: See :func:`~coliags_plugin.surface.meshing.fusion.fuse_run` and
+            :func:`~coliags_plugin.geometry.meshes.comparison.compare_meshes`; the truth cannot be read; its unit is not
+            the scene's; or the folder exists or cannot be written.
+    """
+    scene = trained.scene
+    settings = settings or MeshSettings()
+    with atomic_folder(output, overwrite) as folder:
+        surface = _true_surface(scene, truth)
+        mesh = fuse_run(trained, settings)
+        compared = None if surface is None else compare_meshes(mesh, surface)
+        for name in formats:
+            write_mesh(folder / f"mesh.{name}", mesh)
+        if surface is not None:
+            _write_comparison(folder, mesh, surface, scene)
+        write_json(folder / "mesh.json", _summary(trained, mesh, settings, surface, compared))
+    return MeshedRun(output, mesh, compared)
+
+
+def _true_surface(scene: Scene, given: Path | None) -> TrueSurface | None:
+    path = given or find_true_surface(Path(scene.provenance.get("path", "")))
+    if path is None or (given is None and not scene.is_metric):
+        return None
+    if not scene.is_metric:
+        _check_same_world(scene, path)
+    surface = read_true_surface(path)
+    if surface.seen_by:
+        return surface
+    seen = first_hits(surface.mesh, scene.train)
+    if not seen.any():
+        raise InputError(
+            f"no training view of scene '{scene.name}' sees any of {path}",
+            "the true surface of this scene, in mm and in the world of its poses",
+        )
+    return replace(surface, seen=seen, seen_by="first hit of a pixel of a training frame, cast at the mesh")
+
+
+def _check_same_world(scene: Scene, truth: Path) -> None:
+    """Of a scene of unknown scale, accept the truth of a scene with the same poses only, whose scale it then shares."""
+    if not truth.is_dir():
+        raise InputError(
+            f"scene '{scene.name}' is of unknown scale, {truth} in mm",
+            "the folder of a scene with the same poses, and with a true surface",
+            "Pass --truth SCENE, or give the scene its scale first (docs/poses.md)",
+        )
+    match_truth(scene, open_scene(truth))
+
+
+def _write_comparison(folder: Path, mesh: TriangleMesh, truth: TrueSurface, scene: Scene) -> None:
+    frames = scene.train
+    cameras = [frames[index].camera for index in sorted({0, len(frames) // 2, len(frames) - 1})]
+    write_png(folder / "comparison.png", comparison_picture(mesh, truth, cameras))
+    errors = distance_colors(truth.mesh.rays.nearest(mesh.vertices)[0])
+    write_mesh(folder / "mesh_error.ply", replace(mesh, colors=errors))
+    seen = np.zeros(len(truth.mesh.vertices), bool)
+    seen[truth.mesh.triangles[truth.seen]] = True
+    gaps = distance_colors(mesh.rays.nearest(truth.mesh.vertices)[0], seen)
+    write_mesh(folder / "truth_error.ply", replace(truth.mesh, colors=gaps))
+
+
+def _summary(
+    trained: TrainedRun,
+    mesh: TriangleMesh,
+    settings: MeshSettings,
+    truth: TrueSurface | None,
+    compared: SurfaceComparison | None,
+) -> dict[str, Any]:
+    """Contents of mesh.json."""
+    scene, reach = trained.scene, max_depth_of(settings, trained.scene)
+    used = {"voxel_size": voxel_size_of(settings, scene), "max_depth": reach if np.isfinite(reach) else None}
+    return {
+        "format": FORMAT,
+        "method": trained.method,
+        "scene": scene.name,
+        "step": trained.step,
+        "views": len(scene.train),
+        "unit": scene.provenance.get("unit", "mm") if scene.is_metric else "unknown",
+        "settings": settings.model_dump() | used,
+        "vertices": len(mesh.vertices),
+        "triangles": len(mesh),
+        "area": float(mesh.areas.sum()),
+        "bounds": [mesh.vertices.min(axis=0).tolist(), mesh.vertices.max(axis=0).tolist()],
+        "truth": None if truth is None else _place_of(truth.path, scene),
+        "comparison": None if compared is None else compared.as_json(),
+    }
+
+
+def _place_of(path: Path, scene: Scene) -> str:
+    """The path of a file in the scene's folder, or the name of another."""
+    folder, file = Path(scene.provenance.get("path", "")).resolve(), path.resolve()
+    return file.relative_to(folder).as_posix() if file.is_relative_to(folder) else file.name

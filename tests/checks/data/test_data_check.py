@@ -1,0 +1,334 @@
+"""A check that finds what is wrong: sound scenes pass, spoilt ones are called by name."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from coliags_plugin.checks.data.check import check_scene
+from coliags_plugin.checks.data.facts import image_facts, moving_step, path_facts
+from coliags_plugin.checks.data.findings import image_findings, path_findings
+from coliags_plugin.checks.data.hypotheses import CHANGES
+from coliags_plugin.checks.data.lamp import lamp_facts
+from coliags_plugin.checks.data.matches import epipolar_agreement, match
+from coliags_plugin.checks.data.page import write_check_page
+from coliags_plugin.checks.data.pairs import video_pairs
+from coliags_plugin.checks.data.reprojection import Pair, agreement, best_scale
+from coliags_plugin.checks.data.text import lines
+from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.core.scenes import Frame, PointCloud, Scene, SparseDepth
+from coliags_plugin.datamanagers.c3vd.reader import C3VDDataManager, C3VDSettings
+from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
+from tests.commands import run
+from tests.textured_tube import tube_frames
+
+
+@pytest.fixture(scope="module")
+def frames():
+    """A tube that a camera goes into, swaying and turning; 32 mm in 24 frames."""
+    return tube_frames(24, 0.6)
+
+
+def write_frames(path: Path, frames: list[Frame], depth: bool = True) -> Path:
+    """Frames in C3VD's undistorted layout."""
+    write_c3vd_scene(
+        path,
+        [frame.image.numpy() for frame in frames],
+        np.stack([frame.camera.camera_to_world.double().numpy() for frame in frames]),
+        frames[0].camera.intrinsics,
+        depths=[frame.depth.numpy() for frame in frames] if depth else None,
+    )
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(frames, tmp_path_factory):
+    return write_frames(tmp_path_factory.mktemp("check") / "tube", frames)
+
+
+@pytest.fixture(scope="module")
+def scene(folder):
+    return C3VDDataManager(C3VDSettings()).load(folder)
+
+
+def changed(scene: Scene, pose=None, depth=None, camera=None, image=None) -> Scene:
+    """The scene with every frame's pose, depth, camera or image put through a function of it and its place."""
+
+    def of(frame: Frame) -> Frame:
+        whole = frame.to("cpu")
+        if pose is not None:
+            whole = replace(whole, camera=replace(whole.camera, camera_to_world=pose(whole.camera.camera_to_world)))
+        if camera is not None:
+            whole = replace(whole, camera=camera(whole.camera))
+        if depth is not None:
+            whole = replace(whole, depth=depth(whole.depth))
+        if image is not None:
+            whole = replace(whole, image=image(whole.image, whole.index))
+        return whole
+
+    sets = {name: [of(frame) for frame in frames] for name, frames in scene.test_sets.items()}
+    return replace(scene, train=[of(frame) for frame in scene.train], test_sets=sets)
+
+
+def whats(scene: Scene) -> str:
+    return "; ".join(finding.what + ": " + finding.do for finding in check_scene(scene).findings)
+
+
+def scaled_translation(pose, factor):
+    moved = pose.clone()
+    moved[:3, 3] *= factor
+    return moved
+
+
+def test_a_sound_scene_is_not_suspected(scene):
+    check = check_scene(scene)
+    assert check.findings == []
+    # Depth is stored in steps of 0.0015 mm and sampled at pixel centres: surfaces agree far below a percent.
+    assert check.agreement["given"].depth_error < 0.005
+    assert check.scale.factor == pytest.approx(1.0, abs=0.02)
+    assert check.depth.nearest < check.depth.median < check.depth.farthest <= 100.0
+
+
+@pytest.mark.parametrize(
+    "reading",
+    ["world-to-camera", "rotation transposed", "translation of opposite sign", "camera axes y up, z backward"],
+)
+def test_poses_in_another_convention_are_called_by_it(scene, reading):
+    # Each of these changes undoes itself.
+    wrong = changed(scene, pose=CHANGES[reading])
+    assert f"read as: {reading}" in whats(wrong)
+
+
+@pytest.mark.parametrize("reading", ["world-to-camera", "rotation transposed", "translation of opposite sign"])
+def test_so_they_are_without_depth(scene, reading):
+    sound, wrong = (
+        changed(scene, pose=lambda pose, name=name: CHANGES[name](pose), depth=lambda depth: None)
+        for name in ("given", reading)
+    )
+    assert whats(sound) == ""
+    assert "poses agree with the images when read as" in whats(wrong)
+
+
+@pytest.mark.parametrize(("factor", "told"), [(0.001, "0.001 times"), (0.5, "0.5 times"), (25.4, "25.4 times")])
+def test_depth_in_another_unit_than_poses(scene, factor, told):
+    wrong = changed(scene, depth=lambda depth: depth * factor)
+    found = whats(wrong)
+    assert "depth and poses are in different units" in found
+    measured = float(found.split("depth seems to be ")[1].split(" times")[0])
+    assert measured == pytest.approx(factor, rel=0.1), told
+
+
+def test_everything_in_metres(scene):
+    metres = changed(scene, pose=lambda pose: scaled_translation(pose, 1e-3), depth=lambda depth: depth * 1e-3)
+    found = whats(metres)
+    assert "depth looks like metres" in found
+    assert "different units" not in found
+    unknown = replace(metres, provenance={**metres.provenance, "unit": "unknown"})
+    assert [finding.what for finding in check_scene(unknown).findings] == ["depth is beside the near plane"]
+
+
+def test_depth_of_other_frames(frames):
+    mixed = [replace(frame, depth=frames[7 * frame.index % len(frames)].depth) for frame in frames]
+    assert "frames do not agree on the surface" in whats(Scene("mixed", mixed, {}, PointCloud(torch.zeros(0, 3)), {}))
+
+
+def test_intrinsics_of_another_size(scene):
+    doubled = changed(scene, camera=lambda c: replace(c, fx=2 * c.fx, fy=2 * c.fy, cx=2 * c.cx, cy=2 * c.cy))
+    assert "principal point is far from the middle" in whats(doubled)
+
+
+def test_a_jump_a_standstill_black_and_repeated_images(scene):
+    middle = torch.stack([frame.camera.center for frame in scene.train])[:, 2].median()
+
+    def jumping(pose):
+        moved = pose.clone()
+        moved[0, 3] += 500.0 * (pose[2, 3] > middle)
+        return moved
+
+    def of_path(wrong: Scene) -> str:
+        return next(path_findings(path_facts(wrong.video))).what
+
+    def of_images(wrong: Scene) -> str:
+        return next(image_findings(image_facts(wrong.video))).what
+
+    assert "the camera jumps" in whats(changed(scene, pose=jumping))
+    assert of_path(changed(scene, pose=lambda pose: torch.eye(4))) == "the camera does not move"
+    assert of_images(changed(scene, image=lambda image, index: image * (index != 5))) == "an image is black"
+    first = scene.train[0].image
+    repeated = changed(scene, image=lambda image, index: first if index in (1, 2, 3) else image)
+    assert of_images(repeated) == "images repeat"
+
+
+def test_constant_and_unknown_depth(scene):
+    flat = changed(scene, depth=lambda depth: torch.full_like(depth, 30.0))
+    found = whats(flat)
+    assert found.startswith("depth is the same everywhere: ")
+    assert "; " not in found
+    noise = torch.rand(128, 160, generator=torch.Generator().manual_seed(0))
+    dummy = changed(scene, depth=lambda depth: 30.0 + 0.1 * noise)
+    assert "different units" not in whats(dummy)
+    unknown = changed(scene, depth=lambda depth: torch.full_like(depth, torch.nan))
+    assert "most of the depth is unknown" in whats(unknown)
+
+
+def test_carrying_a_plane_is_exact(tmp_path):
+    """Two cameras before a plane: depth there is known in closed form."""
+    pinhole, size = Intrinsics(60.0, 60.0, 40.0, 30.0, 80, 60), (60, 80)
+    poses = np.stack([np.eye(4)] * 3)
+    poses[:, 2, 3] = 0.0, 2.0, 4.0
+    depths = [np.full(size, 20.0 - z) for z in poses[:, 2, 3]]
+    images = [np.full((*size, 3), 90, np.uint8)] * 3
+    write_c3vd_scene(tmp_path / "plane", images, poses, pinhole, depths=depths)
+    plane = C3VDDataManager(C3VDSettings(split="all-train")).load(tmp_path / "plane")
+    pairs = [Pair(a, b) for a, b in video_pairs(plane.train)]
+    assert agreement(pairs).depth_error < 1e-4
+    assert agreement(pairs, "no motion").depth_error == pytest.approx(np.median([2 / 18, 2 / 16]), rel=0.07)
+    assert best_scale(pairs).factor == pytest.approx(1.0, abs=0.02)
+    # The image of a camera 2 ahead holds the middle 18 / 20 of the first one's, each way.
+    assert agreement(pairs[:1]).share == pytest.approx(0.9**2, abs=0.03)
+
+
+def paused(frames: list[Frame], pauses=(6, 15), length=40, jitter=0.002) -> Scene:
+    """The frames with long pauses, in which the poses waver by ``jitter`` mm, without depth."""
+    counts = [1 + length * (frame.index in pauses) for frame in frames]
+    rng = np.random.default_rng(0)
+    video = []
+    for frame in [frame for frame, count in zip(frames, counts, strict=True) for _ in range(count)]:
+        pose = frame.camera.camera_to_world.clone()
+        pose[:3, 3] += torch.from_numpy(rng.normal(size=3) * jitter)
+        noise = torch.from_numpy(rng.integers(0, 2, frame.image.shape, dtype=np.uint8))
+        camera = replace(frame.camera, camera_to_world=pose)
+        video.append(
+            replace(
+                frame, name=f"{len(video):04d}", index=len(video), camera=camera, depth=None, image=frame.image + noise
+            )
+        )
+    return Scene("paused", video, {}, PointCloud(torch.zeros(0, 3)), {})
+
+
+def test_a_camera_that_pauses_is_not_suspected_and_its_pauses_are_not_compared(frames):
+    sound = paused(frames)
+    check = check_scene(sound)
+    assert (check.findings, check.undecided) == ([], [])
+    assert check.path.moving_step > 1.0
+    ways = [(b.camera.center - a.camera.center).norm().item() for a, b in check.pairs]
+    assert min(ways) > 2.0
+    assert "world-to-camera" in whats(changed(sound, pose=CHANGES["world-to-camera"]))
+
+    def jumping(pose):
+        moved = pose.clone()
+        moved[0, 3] += 100.0 * (pose[2, 3] > 7.0)
+        return moved
+
+    assert "the camera jumps" in whats(changed(sound, pose=jumping))
+
+
+def test_a_camera_that_hardly_moves_is_undecided(frames):
+    still = paused(frames[:1], pauses=(0,), length=20)
+    check = check_scene(still)
+    assert [doubt.what for doubt in check.undecided] == ["poses may be right or wrong"]
+    assert check.matches["given"].in_front is None
+    assert not any("poses" in finding.what for finding in check.findings)
+    assert "UNDECIDED poses may be right or wrong: " in "\n".join(lines(check))
+
+
+def lit(frames: list[Frame]) -> list[Frame]:
+    """The frames under a lamp at the camera: brightness falls with the square of the depth."""
+    factors = [(18.0 / frame.depth.clamp(min=18.0)).square()[..., None] for frame in frames]
+    return [replace(frame, image=(frame.image * factor).byte()) for frame, factor in zip(frames, factors, strict=True)]
+
+
+def test_reversed_depth_contradicts_the_lamp(frames):
+    def scene_of(frames):
+        return Scene("lit", frames, {}, PointCloud(torch.zeros(0, 3)), {})
+
+    def only_points(frame):
+        pixels = torch.rand(200, 2, generator=torch.Generator().manual_seed(frame.index)) * torch.tensor([160, 128])
+        column, row = pixels.long().unbind(1)
+        return replace(frame, depth=None, sparse_depth=SparseDepth(pixels, frame.depth[row, column]))
+
+    sound = lit(frames)
+    reverse = [replace(frame, depth=600.0 / frame.depth) for frame in sound]
+    assert lamp_facts(sound).correlation < -0.5
+    assert lamp_facts(reverse).correlation > 0.5
+    assert lamp_facts([only_points(frame) for frame in sound]).correlation < -0.5
+    assert "the far is brighter" not in whats(scene_of(sound))
+    assert "the far is brighter" in whats(scene_of(reverse))
+    assert "the far is brighter" in whats(scene_of([only_points(frame) for frame in reverse]))
+    assert lamp_facts([replace(frame, depth=None) for frame in sound]) is None
+    assert "rank correlation -" in "\n".join(lines(check_scene(scene_of(sound))))
+
+
+def test_the_moving_step_leaves_out_pauses_and_jumps():
+    assert moving_step(np.array([0.0] * 90 + [1.0] * 20 + [500.0])) == 1.0
+    assert moving_step(np.array([2.0, 2.0, 900.0])) == 2.0
+    assert moving_step(np.array([3.0])) == 3.0
+    assert moving_step(np.zeros(5)) == 0.0
+
+
+def test_features_are_matched_at_the_stored_size(frames, tmp_path, capsys):
+    """At a quarter of the size, the texture is too fine for features."""
+    write_frames(tmp_path / "tube", frames[:12], depth=False)
+    status = run("data", "check", tmp_path / "tube", "--set", "width=40", "--set", "height=32")
+    told = capsys.readouterr().out
+    assert status == 0
+    assert "40 x 32 px, stored 160 x 128" in told
+    given = next(line for line in told.splitlines() if line.startswith("given"))
+    assert int(given.split()[-1]) > 500
+
+
+@pytest.mark.parametrize(("name", "step"), [("colmap_23img", 1), ("c3vd_cecum_t1_a", 16)])
+def test_real_scenes_are_not_suspected(shared_data, capsys, name, step):
+    assert run("data", "check", shared_data / name, "--set", "max_frames=8", "--set", f"frame_step={step}") == 0
+    assert "nothing suspect" in capsys.readouterr().out
+
+
+def test_matches_lie_on_their_lines(scene):
+    matches = match(video_pairs(scene.train))
+    assert epipolar_agreement(matches).error < 1.0
+    assert epipolar_agreement(matches, "no motion") is None
+
+
+def test_command_says_it_all(folder, scene, tmp_path, capsys):
+    status = run("data", "check", folder, "--html", tmp_path / "check.html", "--json", tmp_path / "check.json")
+    told = capsys.readouterr().out
+    assert status == 0
+    assert "nothing suspect" in told
+    assert "c3vd (undistorted layout)" in told
+    facts = json.loads((tmp_path / "check.json").read_text())
+    assert facts["suspect"] is False
+    assert facts["data"]["frames"]["train"] == 21
+    page = (tmp_path / "check.html").read_text()
+    assert page.count("<img ") == 18
+    assert "z, scene units" in page
+
+
+def test_command_fails_on_what_is_suspect(scene, tmp_path, capsys):
+    inverted = changed(scene, pose=torch.linalg.inv)
+    write_frames(tmp_path / "inverted", inverted.video)
+    status = run("data", "check", tmp_path / "inverted", "--json", tmp_path / "check.json")
+    assert status == 1
+    assert "SUSPECT poses agree with depth when read as: world-to-camera" in capsys.readouterr().out
+    assert json.loads((tmp_path / "check.json").read_text())["suspect"] is True
+
+
+def test_bad_input_of_the_command(folder, tmp_path, capsys):
+    for words, told in [
+        (["data", "check", tmp_path / "gone"], "no folder"),
+        (["data", "check", tmp_path], "none of the formats"),
+        (["data", "check", folder, "--format", "c3vb"], "Did you mean 'c3vd'"),
+        (["data", "check", folder, "--set", "lenz=x"], "lenz"),
+    ]:
+        assert run(*words) == 2
+        assert told in capsys.readouterr().err
+
+
+def test_the_page_escapes_names(scene, tmp_path):
+    write_check_page(check_scene(replace(scene, name="<b>")), tmp_path / "page.html")
+    assert "<b>" not in (tmp_path / "page.html").read_text()
+    assert list(lines(check_scene(scene)))[-1] == "nothing suspect"

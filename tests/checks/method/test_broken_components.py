@@ -1,0 +1,132 @@
+"""Every check can fail: what breaks the contract in one way fails the check about it, and no other."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+import torch
+
+from coliags_plugin.checks.method.check import CHECKS, check_method
+from coliags_plugin.config import registry
+from tests.checks.method import parts
+
+SPLATS = """
+datamanager: auto
+field: Balls
+renderer: auto
+strategy: {name: Division}
+losses: {colour: {name: Colour, weight: 1.0}}
+optimizers: {means: {lr: 0.01}, logits: {lr: 0.05}}
+"""
+FOG = """
+datamanager: auto
+field: Fog
+renderer: {name: volume, samples: 16}
+strategy: none
+losses: {colour: {name: Colour, weight: 1.0}}
+optimizers: {near: {lr: 0.05}, far: {lr: 0.05}}
+"""
+#: What is changed, by overrides; the only check that fails; and what its line says.
+BROKEN = [
+    (["field=DoublesItsSize"], "resolves", "read again, it has another field"),
+    (["losses.colour={name: AcceptsAnyOption, weight: 1.0}"], "options", "losses.colour.no_such_option=1"),
+    (["field=CrashesWhenMade"], "builds", r"ZeroDivisionError: division by zero \(tests/checks/method/parts.py:\d+\)"),
+    (["optimizers.means=null"], "builds", "optimizers lacks the parameter groups means"),
+    (["optimizers.mirrors={lr: 0.1}"], "builds", "optimizers names mirrors"),
+    (["field=HasAnUngroupedParameter"], "groups", "never trained: field.forgotten"),
+    (["field=SharesAParameter", "strategy=none"], "groups", "in more than one parameter group: field.means"),
+    (["losses.colour={name: TurnsNaN, weight: 1.0}"], "trains", "step 5, .*'colour' is nan"),
+    (["field=CrashesInALibrary"], "trains", r"RuntimeError: .*\(tests/checks/method/parts.py:\d+\)"),
+    (["losses.late={name: Colour, weight: 1.0, from_step: 29990}"], "terms", r"'late' \(after step 29990 of 30000\)"),
+    (["losses.colour={name: Maximised, weight: 1.0}"], "learns", "it should fall"),
+    (["field=HasADetachedGroup"], "gradients", "no gradient but 0 in 20 steps: means;"),
+    (["renderer=LacksNormals"], "renders", "normals is promised"),
+    (["renderer=DepthInMetres"], "renders", "depth_median is between 0.0"),
+    (["renderer=FlatNormals"], "renders", r"normals has shape \[32, 40\], not \[32, 40, 3\]"),
+    (["renderer=AlphaAboveOne"], "renders", "alpha is between"),
+    (["field=NaNFeature"], "renders", "albedo has 1.* numbers that are not finite"),
+    (["renderer=FixedSize"], "renders", "another size of 29 x 23 pixels"),
+    (["modules.free=CrashesForFreeCameras"], "renders", "AttributeError: 'NoneType'"),
+    (["field=RendersWithChance"], "renders again", "two renderings of frame .* differs in"),
+    (["renderer=IgnoresUnknownOutputs"], "requests", "output 'no_such_output': not refused by IgnoresUnknownOutputs"),
+    (["renderer=CrashesForUnknownOutputs"], "requests", "KeyError instead of InputError"),
+    (["renderer=IgnoresPixels"], "requests", "single pixels: not refused"),
+    (["field=ForgetsABuffer"], "loads", "must be a parameter or a buffer"),
+    (["losses.colour={name: DiffersFromRunToRun, weight: 1.0}"], "repeats", "two runs of 10 steps"),
+    (["losses.colour={name: TakesGlobalRandomNumbers, weight: 1.0}"], "resumes", "resumed for 10: field/.* differs in"),
+    (["sampler=ForgetsItsPlace"], "resumes", "resumed for 10"),
+    (["strategy=HasAHiddenCounter"], "resumes", "field/logits differs"),
+    (["field=ReadsWhatIsThere"], "checkpoints", "without the field's 'means' was read"),
+    (["strategy=ForgetsAGroup"], "rows", "492 to 495 rows: parameter group 'logits' has 494"),
+    (["strategy=ForgetsTheBuffer"], "rows", "492 to 495 rows: buffer 'ages' has 492"),
+    (["strategy=ForgetsTheCounter"], "rows", "492 to 495 rows: counter 'steps' of the strategy has 492"),
+    (["strategy=GoesPastAdam"], "rows", "the optimizer of group 'means' trains what is no longer the field's"),
+    (["strategy=ForgetsAfterAnEvent"], "rows", "resumed after the event of step 4"),
+    (["protocol=wants-albedo"], "evaluates", "outputs needed by protocol 'wants-albedo': albedo"),
+    (["renderer=HasNoExpectedDepth"], "images", "depth_expected"),
+    (["losses.colour={name: AssumesDepth, weight: 1.0}"], "other data", "without depth: AttributeError: .*parts"),
+    (["sampler=CrashesAlone"], "other data", "with one frame: RuntimeError: .*parts"),
+    (["losses.colour={name: CountsMaskedPixels, weight: 1.0}"], "ignored pixels", "masked pixels: colour"),
+    (["renderer={name: SwapsPixels, samples: 16}"], "pixels", "rgb of single pixels"),
+]  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def one_thread(two_threads):
+    """On so few pixels a second thread costs more than it gains."""
+    torch.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True)
+def registered(monkeypatch):
+    """The components of parts.py under the names of their classes, the protocol under its own."""
+    kinds = {
+        parts.GaussianField: registry.fields,
+        parts.RadianceField: registry.fields,
+        parts.Loss: registry.losses,
+        parts.Strategy: registry.strategies,
+        parts.Sampler: registry.samplers,
+        parts.ViewModule: registry.modules,
+        parts.CpuRenderer: registry.renderers,
+        parts.VolumeRenderer: registry.renderers,
+        parts.Protocol: registry.protocols,
+    }
+    for name, found in vars(parts).items():
+        for base, kind in kinds.items():
+            if isinstance(found, type) and issubclass(found, base) and found.__module__ == parts.__name__:
+                kind.names()  # so that nothing is discovered later
+                known = found.name if kind is registry.protocols else name
+                monkeypatch.setitem(kind._targets, known, found)
+                monkeypatch.setitem(kind._sources, known, "a test")
+
+
+def check(tmp_path, text, overrides=()):
+    (tmp_path / "made-up.yaml").write_text(text)
+    results = list(check_method(str(tmp_path / "made-up.yaml"), tmp_path, overrides))
+    assert [result.name for result in results] == [check.name for check in CHECKS]
+    return results
+
+
+def failed(results):
+    return {result.name: result.detail for result in results if result.status == "failed"}
+
+
+@pytest.mark.parametrize(("text", "skipped"), [(SPLATS, {"pixels"}), (FOG, {"rows"})], ids=["splats", "fog"])
+def test_sound_components_pass(tmp_path, text, skipped):
+    results = check(tmp_path, text)
+    assert failed(results) == {}
+    assert {result.name for result in results if result.status == "skipped"} == skipped
+
+
+@pytest.mark.parametrize(("overrides", "name", "line"), BROKEN, ids=str)
+def test_a_broken_component_fails_the_check_that_is_about_it(tmp_path, overrides, name, line):
+    text = FOG if name == "pixels" else SPLATS
+    found = failed(check(tmp_path, text, overrides))
+    assert found.keys() == {name}, found
+    assert re.search(line, found[name]), found[name]
+    assert "\n" not in found[name]
+
+
+def test_every_check_has_a_component_that_fails_it():
+    assert {name for _, name, _ in BROKEN} == {check.name for check in CHECKS}

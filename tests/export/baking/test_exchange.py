@@ -1,0 +1,222 @@
+"""Runs to files of Gaussians and back."""
+
+from __future__ import annotations
+
+import json
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import coliags_plugin as cp
+from coliags_plugin.config.assignments import parse_assignments
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.engine.held_light import flattened_light
+from coliags_plugin.export.baking import refinement
+from coliags_plugin.export.baking.baking import bake
+from coliags_plugin.export.baking.explicit import field_of_cloud
+from coliags_plugin.export.splats.files import read_splats, write_splats
+from coliags_plugin.export.splats.ply import write_splat_ply
+from coliags_plugin.lighting.lamps import FlattenedLight, LightOfCamera
+from tests.commands import refused, run
+from tests.export.splats.clouds import random_cloud
+from tests.scenes import SMALL, write_wall
+
+ANCHORS, OTHERS = parse_assignments(SMALL), parse_assignments([SMALL[0], SMALL[2]])
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_wall(tmp_path_factory.mktemp("data") / "wall")
+
+
+@pytest.fixture(scope="module")
+def runs(scene, tmp_path_factory):
+    """Runs by method, trained for a few steps when first asked for."""
+    folder, made = tmp_path_factory.mktemp("runs"), {}
+
+    def trained(method, steps=3, settings=OTHERS):
+        if method not in made:
+            made[method] = cp.train(method, scene, folder / method, steps=steps, settings=settings)
+        return made[method]
+
+    return trained
+
+
+@pytest.fixture
+def few_steps(monkeypatch):
+    monkeypatch.setattr(refinement, "STEPS", 3)
+    monkeypatch.setattr(refinement, "_MUCH", 0.0)
+
+
+def test_an_imported_export_renders_what_the_run_renders(runs, scene, tmp_path):
+    trained = runs("3dgs")
+    exported = trained.export(tmp_path / "wall.ply")
+    again = cp.import_splats(exported.file, scene, tmp_path / "imported")
+    assert again.method == "3dgs" and again.step == 0
+    name = trained.frame_names()[0]
+    ours, theirs = trained.render(name), again.render(name)
+    assert np.abs(ours.rgb.astype(int) - theirs.rgb).max() <= 1
+    np.testing.assert_allclose(theirs.depth, ours.depth, atol=1e-3)
+    record = json.loads((tmp_path / "wall.ply.json").read_text())
+    assert record["baking"] is None and record["unit"] == "mm" and record["run"]["method"] == "3dgs"
+    assert record["gaussians"] == len(read_splats(exported.file))
+    assert abs(record["cost"]["test"]["cost"]["psnr"]) < 1e-3
+    psnr = trained.evaluate().mean("psnr")
+    assert record["cost"]["test"]["run"]["psnr"] == pytest.approx(psnr, abs=1e-6)
+    assert again.evaluate().mean("psnr") == pytest.approx(psnr, abs=1e-3)
+    assert again.load().provenance["imported"]["gaussians"] == record["gaussians"]
+
+
+def test_anchors_are_baked(runs, scene, tmp_path, few_steps, capsys):
+    trained = runs("coliags", settings=ANCHORS)
+    file = tmp_path / "wall.spz"
+    assert run("export", trained.path, "--format", "spz", "--output", file, "--light", "flattened") == 0
+    assert str(file) in capsys.readouterr().out
+    record = json.loads((tmp_path / "wall.spz.json").read_text())
+    assert record["baking"]["light"]["name"] == "flattened" and record["baking"]["refinement_steps"] == 3
+    assert 0.9 < record["baking"]["light"]["cosine"] <= 1.0
+    cost = record["cost"]["test"]
+    assert cost["cost"]["psnr"] == pytest.approx(cost["run"]["psnr"] - cost["export"]["psnr"])
+    assert cost["psnr_between"] > 20
+    assert record["sh_degree"] == 3 and record["gaussians"] == len(read_splats(file))
+    assert run("import", file, "--data", scene, "--output", tmp_path / "imported") == 0
+    imported = cp.load_run(tmp_path / "imported")
+    assert imported.render(imported.frame_names()[0]).rgb.std() > 5
+
+
+def test_refinement_comes_nearer_to_the_frames(runs, monkeypatch):
+    """The run was hardly trained, and is no better than its averages; frames in its own light are the frames."""
+    trained = runs("coliags", settings=ANCHORS).load()
+    frame = trained.scene.train[0]
+    light = LightOfCamera(frame.camera)
+    baked = field_of_cloud(bake(trained, light)[0])
+    camera = replace(frame.camera, camera_to_world=frame.camera.camera_to_world.float())
+
+    def error() -> float:
+        with torch.no_grad():
+            shown = trained.model.renderer.draw(baked.gaussians(camera), camera, ("rgb", "alpha")).rgb
+        return float((shown - frame.rgb).square().mean())
+
+    assert not refinement.loses_much(baked, trained, light)
+    before = error()
+    monkeypatch.setattr(refinement, "STEPS", 40)
+    assert refinement.refine(baked, trained, light) == 40
+    assert error() < 0.9 * before
+    with torch.no_grad():
+        baked.sh0 += 1.0
+    assert refinement.loses_much(baked, trained, light)
+
+
+def test_surfels_are_exported_thin_and_come_back_as_surfels(runs, scene, tmp_path):
+    trained = runs("2dgs")
+    cost = trained.export(tmp_path / "wall.ply").record["cost"]["test"]
+    assert cost["psnr_between"] > 25
+    thinnest = read_splats(tmp_path / "wall.ply").scales.min(axis=1)
+    assert thinnest.min() > 0
+    # A file of 2DGS has two scales: its import is a run of surfels.
+    field = trained.load().model.field
+    scales, count = field.scales.detach().numpy(), len(field.means)
+    data = (tmp_path / "wall.ply").read_bytes()
+    header, _, body = data.partition(b"end_header\n")
+    names = [line.split()[-1] for line in header.split(b"\n") if line.startswith(b"property")]
+    rows = np.frombuffer(body, "<f4").reshape(count, len(names))
+    kept = [index for index, name in enumerate(names) if name != b"scale_2"]
+    header = header.replace(b"property float scale_2\n", b"")
+    (tmp_path / "discs.ply").write_bytes(header + b"end_header\n" + rows[:, kept].tobytes())
+    again = cp.import_splats(tmp_path / "discs.ply", scene, tmp_path / "discs")
+    assert again.method == "2dgs"
+    np.testing.assert_allclose(again.load().model.field.scales.detach().numpy(), scales, atol=1e-5)
+
+
+@pytest.mark.parametrize("method", ["coliags", "pr-endo"])
+def test_the_lamp_of_the_camera_itself_changes_nothing(runs, method):
+    trained = runs(method, settings=ANCHORS if method == "coliags" else OTHERS).load()
+    camera = trained.scene.train[2].camera
+    camera = replace(camera, camera_to_world=camera.camera_to_world.float())
+    field = trained.model.field
+    with torch.no_grad():
+        own, held = field.gaussians(camera), field.gaussians_in_light(camera, LightOfCamera(camera))
+    assert torch.equal(own.means, held.means) and torch.equal(own.opacities, held.opacities)
+    torch.testing.assert_close(held.colors, own.colors, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "method", ["coliags", "coliags-plus", "scaffold-gs-distance", "scaffold-gs", "pr-endo", "3dgs"]
+)
+def test_fields_that_know_a_lamp_look_different_under_another(runs, method):
+    explicit = method in ("pr-endo", "3dgs")
+    trained = runs(method, settings=OTHERS if explicit else ANCHORS).load()
+    field, camera = trained.model.field, trained.scene.train[2].camera
+    assert field.knows_lamp == (method not in ("scaffold-gs", "3dgs"))
+    with torch.no_grad():
+        near, far = (field.gaussians_in_light(camera, FlattenedLight(length, 1.0)).colors for length in (10.0, 60.0))
+    assert torch.equal(near, far) != field.knows_lamp
+
+
+def test_flattened_light_is_even_over_a_wall(runs):
+    """Gaussians of one albedo and one normal look the same everywhere, however far they are."""
+    field = runs("pr-endo").load().model.field
+    light = FlattenedLight(20.0, 1.0)
+    cameras = [frame.camera for frame in runs("pr-endo").load().scene.train]
+    with torch.no_grad():
+        near, far = (
+            field.gaussians_in_light(replace(camera, camera_to_world=camera.camera_to_world.float()), light)
+            for camera in (cameras[0], cameras[-1])
+        )
+    common = set(near.source_index.tolist()) & set(far.source_index.tolist())
+    rows = [torch.tensor([g.source_index.tolist().index(slot) for slot in sorted(common)]) for g in (near, far)]
+    difference = (near.colors[rows[0]] - far.colors[rows[1]]).abs()
+    assert float(difference.max()) < 0.05  # the mirrored part alone depends on the view
+
+
+def test_flattened_light_is_the_median_of_what_cameras_see(runs):
+    trained = runs("3dgs").load()
+    light = flattened_light(trained.model, [frame.camera for frame in trained.scene.train])
+    assert 15.0 < light.distance < 22.0 and 0.8 < light.cosine < 1.0
+
+
+def test_exports_that_cannot_be(runs, tmp_path, capsys, few_steps):
+    trained = runs("3dgs")
+    (tmp_path / "there.ply").write_text("mine")
+    assert "already exists" in refused(capsys, "export", trained.path, "--output", tmp_path / "there.ply")
+    assert (tmp_path / "there.ply").read_text() == "mine"
+    with pytest.raises(InputError, match="no format 'sog'"):
+        trained.export(tmp_path / "a.sog", "sog")
+    with pytest.raises(InputError, match="no light 'men'"):
+        runs("coliags", settings=ANCHORS).export(tmp_path / "a.ply", light="men")
+    with pytest.raises(InputError, match="relit"):
+        runs("pr-endo").relight(power=2.0).export(tmp_path / "a.ply")
+    radiance = runs("reim-nerf-small", 1, {})
+    assert "has no Gaussians" in refused(capsys, "export", radiance.path, "--output", tmp_path / "a.ply")
+    assert "not a run folder" in refused(capsys, "export", tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["there.ply"]
+
+
+def test_imports_that_cannot_be(runs, scene, tmp_path, capsys):
+    good, output = tmp_path / "good.ply", tmp_path / "run"
+    write_splats(good, random_cloud(5), "ply")
+    (tmp_path / "bad.ply").write_bytes(
+        b"ply\nformat binary_little_endian 1.0\nelement chunk 1\nproperty float min_x\n"
+        b"element vertex 1\nproperty uint packed_position\nend_header\n" + bytes(8)
+    )
+    assert "compressed PLY" in refused(capsys, "import", tmp_path / "bad.ply", "--data", scene, "--output", output)
+    assert "no reader" in refused(capsys, "import", tmp_path / "a.glb", "--data", scene, "--output", output)
+    assert "cannot read" in refused(capsys, "import", tmp_path / "a.ply", "--data", scene, "--output", output)
+    refused(capsys, "import", good, "--data", tmp_path / "nowhere", "--output", output)
+    assert not output.exists()
+    output.mkdir()
+    (output / "mine.txt").write_text("mine")
+    assert "already exists" in refused(capsys, "import", good, "--data", scene, "--output", output)
+    assert "not a run folder" in refused(capsys, "import", good, "--data", scene, "--output", output, "--overwrite")
+    assert (output / "mine.txt").read_text() == "mine"
+
+
+def test_a_file_of_another_world_is_imported_with_a_warning(scene, tmp_path, caplog):
+    cloud = random_cloud(20)
+    write_splat_ply(tmp_path / "far.ply", replace(cloud, means=cloud.means - np.float32(5000)))
+    with caplog.at_level(logging.WARNING):
+        cp.import_splats(tmp_path / "far.ply", scene, tmp_path / "run")
+    assert "world frame and unit" in caplog.text

@@ -1,0 +1,36 @@
+"""Random clouds of Gaussians."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from coliags_plugin.export.splats.cloud import SplatCloud
+
+
+def random_cloud(count: int = 50, degree: int = 3, scales: int = 3, seed: int = 0) -> SplatCloud:
+    """Gaussians within 50 units of (20, -30, 60), of 0.05 to 2 units, with unit quaternions and colours about 0.5."""
+    random = np.random.default_rng(seed)
+    quats = random.normal(size=(count, 4))
+    values = {
+        "means": random.uniform(-50, 50, (count, 3)) + np.array([20.0, -30.0, 60.0]),
+        "quats_wxyz": quats / np.linalg.norm(quats, axis=1, keepdims=True),
+        "scales": np.exp(random.uniform(-3, 0.7, (count, scales))),
+        "opacities": random.uniform(0.02, 0.98, count),
+        "harmonics": random.normal(0, 0.2, (count, (degree + 1) ** 2, 3)),
+    }
+    return SplatCloud(**{name: value.astype(np.float32) for name, value in values.items()})
+
+
+def covariances(cloud: SplatCloud) -> np.ndarray:
+    """Covariance of each Gaussian. [N, 3, 3]"""
+    w, x, y, z = (cloud.quats_wxyz / np.linalg.norm(cloud.quats_wxyz, axis=1, keepdims=True)).astype(np.float64).T
+    rotations = np.stack(
+        [
+            *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+            *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+            *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+        ],
+        axis=1,
+    ).reshape(-1, 3, 3)
+    stretched = rotations * cloud.scales[:, None].astype(np.float64)
+    return stretched @ stretched.transpose(0, 2, 1)

@@ -1,0 +1,281 @@
+from __future__ import annotations
+
+import gzip
+import json
+import logging
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.ply import write_ply
+from coliags_plugin.export.splats import spz
+from coliags_plugin.export.splats.cloud import SplatCloud
+from coliags_plugin.export.splats.files import FORMATS, THICKNESS_SHARE, read_splats, write_splats
+from coliags_plugin.export.splats.ply import read_splat_ply, write_splat_ply
+from coliags_plugin.fields import spherical_harmonics
+from tests.export.splats.clouds import covariances, random_cloud
+
+PARTS = ("means", "quats_wxyz", "scales", "opacities", "harmonics")
+
+
+def written(tmp_path, cloud: SplatCloud, name: str):
+    path = tmp_path / f"cloud.{name}"
+    write_splats(path, cloud, name)
+    return path
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    count=st.integers(1, 40),
+    degree=st.integers(0, 3),
+    exponent=st.floats(-20, 12),
+    opacity=st.floats(0, 1, width=32),
+    seed=st.integers(0, 999),
+)
+def test_ply_round_trip(tmp_path_factory, count, degree, exponent, opacity, seed):
+    cloud = random_cloud(count, degree, seed=seed)
+    cloud = replace(
+        cloud,
+        scales=cloud.scales * np.float32(np.exp(exponent)),
+        opacities=np.full_like(cloud.opacities, opacity),
+    )
+    again = read_splats(written(tmp_path_factory.mktemp("ply"), cloud, "ply"))
+    assert again.degree == degree
+    np.testing.assert_array_equal(again.means, cloud.means)
+    np.testing.assert_array_equal(again.harmonics, cloud.harmonics)
+    np.testing.assert_allclose(again.quats_wxyz, cloud.quats_wxyz, atol=2e-7)
+    np.testing.assert_allclose(again.scales, cloud.scales, rtol=2e-5)
+    np.testing.assert_allclose(again.opacities, cloud.opacities, atol=2e-6)
+
+
+def test_attributes_of_ply_stand_in_the_order_of_3dgs(tmp_path):
+    cloud = random_cloud(3)
+    data = written(tmp_path, cloud, "ply").read_bytes()
+    header, _, body = data.partition(b"end_header\n")
+    names = [line.split()[-1] for line in header.decode().splitlines() if line.startswith("property")]
+    rest = [f"f_rest_{index}" for index in range(45)]
+    scales, rotations = [f"scale_{index}" for index in range(3)], [f"rot_{index}" for index in range(4)]
+    assert names == [*"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *rest, "opacity", *scales, *rotations]
+    rows = np.frombuffer(body, "<f4").reshape(3, 62)
+    # Channel by channel: the 15 coefficients of red come first.
+    np.testing.assert_array_equal(rows[:, 9:24], cloud.harmonics[:, 1:, 0])
+    np.testing.assert_array_equal(rows[:, 3:6], 0.0)
+    opacity = cloud.opacities.astype(np.float64)
+    np.testing.assert_allclose(rows[:, 54], np.log(opacity / (1 - opacity)), rtol=1e-5)
+    np.testing.assert_allclose(rows[:, 55:58], np.log(cloud.scales), rtol=1e-5, atol=1e-6)
+
+
+def test_another_library_reads_the_ply(tmp_path):
+    gsply = pytest.importorskip("gsply")
+    cloud = random_cloud(20)
+    found = gsply.plyread(str(written(tmp_path, cloud, "ply")))
+    np.testing.assert_array_equal(found.means, cloud.means)
+    np.testing.assert_allclose(found.quats, cloud.quats_wxyz, atol=2e-7)
+    np.testing.assert_allclose(np.exp(found.scales), cloud.scales, rtol=1e-5)
+    np.testing.assert_array_equal(found.sh0, cloud.harmonics[:, 0])
+    np.testing.assert_array_equal(found.shN.reshape(20, 15, 3), cloud.harmonics[:, 1:])
+
+
+def test_surfels_get_a_third_scale_that_is_finite(tmp_path):
+    cloud = random_cloud(scales=2)
+    for name in ("ply", "splat", "spz"):
+        again = read_splats(written(tmp_path, cloud, name))
+        assert again.scales.shape == (50, 3)
+    thinnest = np.sort(read_splats(tmp_path / "cloud.ply").scales, axis=1)[:, 0]
+    np.testing.assert_allclose(thinnest, THICKNESS_SHARE * cloud.scales.min(axis=1), rtol=1e-4)
+
+
+def test_files_of_surfels_and_without_normals_are_read(tmp_path):
+    cloud = random_cloud(5, scales=2)
+    path = tmp_path / "surfels.ply"
+    logs = cloud.log_scales.T
+    write_ply(
+        path,
+        {
+            **dict(zip("xyz", cloud.means.T, strict=True)),
+            **{f"f_dc_{index}": cloud.harmonics[:, 0, index] for index in range(3)},
+            "opacity": cloud.logits,
+            "scale_0": logs[0],
+            "scale_1": logs[1],
+            **{f"rot_{index}": cloud.quats_wxyz[:, index] for index in range(4)},
+        },
+    )
+    again = read_splats(path)
+    assert again.degree == 0
+    np.testing.assert_allclose(again.scales, cloud.scales, rtol=1e-5)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_spz_round_trip_to_its_quantisation(tmp_path, degree):
+    cloud = random_cloud(300, degree)
+    path = written(tmp_path, cloud, "spz")
+    again = read_splats(path)
+    assert again.degree == degree
+    np.testing.assert_allclose(again.means, cloud.means, atol=0.5 / 4096 + 1e-5)
+    np.testing.assert_allclose(np.log(again.scales), np.log(cloud.scales), atol=0.5 / 16 + 1e-5)
+    np.testing.assert_allclose(again.opacities, cloud.opacities, atol=0.5 / 255 + 1e-5)
+    np.testing.assert_allclose(again.harmonics[:, 0], cloud.harmonics[:, 0], atol=0.5 / (255 * 0.15) + 1e-5)
+    np.testing.assert_allclose(again.harmonics[:, 1:], cloud.harmonics[:, 1:], atol=0.5 / 128 + 1e-5)
+    aligned = np.abs((again.quats_wxyz * cloud.quats_wxyz).sum(axis=1))
+    assert np.degrees(2 * np.arccos(np.minimum(aligned, 1.0))).max() < 0.3
+
+
+def test_spz_is_turned_to_its_own_axes(tmp_path):
+    """y up and z backwards: positions, covariances and colours seen along turned directions."""
+    gsply = pytest.importorskip("gsply")
+    cloud = random_cloud(40)
+    path = written(tmp_path, cloud, "spz")
+    assert struct.unpack("<II", gzip.decompress(path.read_bytes())[:8]) == (0x5053474E, 3)
+    np.testing.assert_allclose(gsply.read_spz(path).means, cloud.means * [1, -1, -1], atol=2e-4)
+    turned, turn = spz._half_turn(cloud), np.diag([1.0, -1.0, -1.0])
+    np.testing.assert_allclose(covariances(turned), turn @ covariances(cloud) @ turn, atol=1e-5)
+    directions = torch.nn.functional.normalize(torch.randn(40, 3, generator=torch.Generator().manual_seed(1)), dim=1)
+    seen = [
+        spherical_harmonics.colors(torch.from_numpy(part.harmonics), along, 3)
+        for part, along in ((cloud, directions), (turned, directions * torch.tensor([1.0, -1.0, -1.0])))
+    ]
+    torch.testing.assert_close(*seen)
+
+
+def test_spz_of_far_gaussians_is_coarser_and_says_when_it_cannot(tmp_path):
+    cloud = random_cloud(10)
+    far = replace(cloud, means=cloud.means + np.float32(3000.0))
+    again = read_splats(written(tmp_path, far, "spz"))
+    np.testing.assert_allclose(again.means, far.means, atol=0.5 / 2048 + 1e-4)
+    with pytest.raises(InputError, match="SPZ's range"):
+        write_splats(tmp_path / "far.spz", replace(cloud, means=cloud.means + np.float32(1e9)), "spz")
+
+
+def test_dot_splat_round_trip(tmp_path):
+    cloud = random_cloud(100, 0)
+    path = written(tmp_path, cloud, "splat")
+    assert path.stat().st_size == 3200
+    again = read_splats(path)
+    order = np.argsort(-cloud.opacities * cloud.scales.prod(axis=1), kind="stable")
+    sorted_cloud = SplatCloud(*(getattr(cloud, name)[order] for name in PARTS))
+    np.testing.assert_array_equal(again.means, sorted_cloud.means)
+    np.testing.assert_array_equal(again.scales, sorted_cloud.scales)
+    np.testing.assert_allclose(again.opacities, sorted_cloud.opacities, atol=0.51 / 255)
+    np.testing.assert_allclose(again.colors, sorted_cloud.colors, atol=0.51 / 255)
+    np.testing.assert_allclose(again.quats_wxyz, sorted_cloud.quats_wxyz, atol=1.01 / 128)
+
+
+def test_glb_follows_the_extension(tmp_path):
+    cloud = random_cloud(7, 2)
+    data = written(tmp_path, cloud, "glb").read_bytes()
+    magic, version, length = struct.unpack_from("<III", data)
+    assert (magic, version, length) == (0x46546C67, 2, len(data))
+    size, kind = struct.unpack_from("<II", data, 12)
+    assert kind == 0x4E4F534A and size % 4 == 0
+    document, body = json.loads(data[20 : 20 + size]), data[28 + size :]
+    assert len(body) % 4 == 0
+    primitive = document["meshes"][0]["primitives"][0]
+    assert primitive["mode"] == 0 and document["extensionsUsed"] == ["KHR_gaussian_splatting"]
+    extension = primitive["extensions"]["KHR_gaussian_splatting"]
+    assert extension == {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+
+    def values(name):
+        accessor = document["accessors"][primitive["attributes"][name]]
+        view = document["bufferViews"][accessor["bufferView"]]
+        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+        assert accessor["count"] == 7 and view["byteLength"] == 4 * width * 7
+        return np.frombuffer(body, "<f4", 7 * width, view["byteOffset"]).reshape(7, width)
+
+    np.testing.assert_array_equal(values("POSITION"), cloud.means)
+    np.testing.assert_allclose(values("KHR_gaussian_splatting:ROTATION"), cloud.quats_wxyz[:, [1, 2, 3, 0]], atol=1e-6)
+    np.testing.assert_array_equal(values("KHR_gaussian_splatting:SCALE"), cloud.scales)
+    np.testing.assert_array_equal(values("KHR_gaussian_splatting:OPACITY")[:, 0], cloud.opacities)
+    found = [
+        values(f"KHR_gaussian_splatting:SH_DEGREE_{degree}_COEF_{order}")
+        for degree in range(3)
+        for order in range(2 * degree + 1)
+    ]
+    np.testing.assert_array_equal(np.stack(found, axis=1), cloud.harmonics)
+    assert not any("SH_DEGREE_3" in name for name in primitive["attributes"])
+    bounds = document["accessors"][primitive["attributes"]["POSITION"]]
+    np.testing.assert_allclose(bounds["min"], cloud.means.min(axis=0))
+    np.testing.assert_allclose(bounds["max"], cloud.means.max(axis=0))
+
+
+def test_another_library_reads_the_points_of_the_glb(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    cloud = random_cloud(9)
+    scene = trimesh.load(written(tmp_path, cloud, "glb"))
+    np.testing.assert_allclose(scene.bounds[0], (cloud.means * [1, -1, -1]).min(axis=0), rtol=1e-5)
+    (points,) = scene.geometry.values()
+    np.testing.assert_allclose(points.vertices, cloud.means, rtol=1e-6)
+
+
+def test_rows_that_are_not_finite_are_dropped_with_their_number(tmp_path, caplog):
+    cloud = random_cloud(6)
+    cloud.means[1, 2], cloud.quats_wxyz[4] = np.nan, 0.0
+    write_splat_ply(tmp_path / "holes.ply", replace(cloud, quats_wxyz=cloud.quats_wxyz))
+    with caplog.at_level(logging.WARNING):
+        again = read_splats(tmp_path / "holes.ply")
+    assert len(again) == 4 and "dropped 2 of 6" in caplog.text
+    np.testing.assert_array_equal(again.means, cloud.means[[0, 2, 3, 5]])
+
+
+def test_a_file_of_nothing_usable_is_refused(tmp_path):
+    cloud = random_cloud(2)
+    cloud.means[:] = np.inf
+    write_splat_ply(tmp_path / "bad.ply", cloud)
+    with pytest.raises(InputError, match="none of which is usable"):
+        read_splats(tmp_path / "bad.ply")
+
+
+def header(*lines: str) -> bytes:
+    return "\n".join(["ply", "format binary_little_endian 1.0", *lines, "end_header\n"]).encode()
+
+
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [
+        (("element chunk 1", "property float min_x", "element vertex 256", "property uint packed_position"), "compres"),
+        (("element vertex 1", "property float x", "property float f_offset_0"), "anchors"),
+        (("element vertex 1", "property float x", "property float filter_3D"), "Mip-Splatting"),
+        (("element vertex 1", "property float x", "property uchar red"), "point cloud"),
+        (("element vertex 1", "property float x", "property float y"), "f_dc_0"),
+    ],
+)
+def test_files_of_other_lineage_are_refused_by_name(tmp_path, lines, said):
+    path = tmp_path / "other.ply"
+    path.write_bytes(header(*lines) + bytes(64))
+    with pytest.raises(InputError, match=said):
+        read_splats(path)
+
+
+def test_an_incomplete_set_of_harmonics_is_refused(tmp_path):
+    path = tmp_path / "odd.ply"
+    write_splat_ply(path, random_cloud(2))
+    path.write_bytes(path.read_bytes().replace(b"f_rest_44", b"g_rest_44"))
+    with pytest.raises(InputError, match="44 properties f_rest"):
+        read_splat_ply(path)
+
+
+@pytest.mark.parametrize("name", ["ply", "spz", "splat"])
+def test_damaged_and_missing_files_are_clear_errors(tmp_path, name):
+    path = written(tmp_path, random_cloud(30), name)
+    path.write_bytes(path.read_bytes()[:-7])
+    with pytest.raises(InputError):
+        read_splats(path)
+    path.unlink()
+    with pytest.raises(InputError, match="cannot read"):
+        read_splats(path)
+
+
+def test_unknown_formats_and_nothing_to_write_are_refused(tmp_path):
+    with pytest.raises(InputError, match="one of ply, spz, splat, glb"):
+        write_splats(tmp_path / "a", random_cloud(1), "sog")
+    with pytest.raises(InputError, match="no Gaussian"):
+        write_splats(tmp_path / "a", random_cloud(0), "ply")
+    with pytest.raises(InputError, match="no reader"):
+        read_splats(tmp_path / "a.glb")
+    assert not list(tmp_path.iterdir())
+    assert set(FORMATS) == {"ply", "spz", "splat", "glb"}

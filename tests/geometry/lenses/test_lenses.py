@@ -1,0 +1,295 @@
+"""Lens models against OpenCV, against one another and against the real data."""
+
+from __future__ import annotations
+
+from dataclasses import astuple, replace
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.geometry.lenses.models import LENSES, NOWHERE, octagon_mask, undistortion_map
+
+NAMES = sorted(LENSES)
+FISHEYE = LENSES["fisheye"]
+BROWN = LENSES["legacy-pinhole"]
+OMNI = LENSES["omnidirectional"]
+#: The reading of the affine part in C3VD's example loader.
+OMNI_TRANSPOSED = replace(OMNI, d=OMNI.e, e=OMNI.d)
+
+
+def angle(directions: np.ndarray) -> np.ndarray:
+    return np.degrees(np.arctan(np.linalg.norm(directions[:, :2], axis=1)))
+
+
+def grid(width: int, height: int, step: int) -> np.ndarray:
+    """Centres of every ``step``-th pixel. [N, 2]"""
+    columns, rows = np.meshgrid(np.arange(0, width, step), np.arange(0, height, step))
+    return np.stack([columns.ravel(), rows.ravel()], axis=1) + 0.5
+
+
+@pytest.mark.parametrize("name", NAMES)
+@settings(max_examples=25, deadline=None)
+@given(
+    x=st.floats(-1.5, 1.5), y=st.floats(-1.5, 1.5), z=st.floats(0.01, 200.0), width=st.sampled_from([1350, 338, 500])
+)
+def test_projecting_and_unprojecting_are_inverse(name, x, y, z, width):
+    lens = LENSES[name].resized(width, 270).cropped(7, -3, width - 20, 200)
+    pixel = lens.project([[x * z, y * z, z]])
+    direction = lens.unproject(pixel)
+    assert direction[0, 2] == 1.0
+    np.testing.assert_allclose(direction[0], [x, y, 1.0], rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_round_trip_over_the_octagon(name):
+    lens = LENSES[name]
+    pixels = grid(1350, 1080, 9)
+    pixels = pixels[octagon_mask(1350, 1080)[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]]
+    directions = lens.unproject(pixels)
+    reached = np.isfinite(directions[:, 0])
+    assert reached.mean() > 0.95
+    np.testing.assert_allclose(lens.project(directions[reached]), pixels[reached], rtol=0, atol=1e-9)
+
+
+def test_fisheye_is_opencvs():
+    matrix = FISHEYE.pinhole.opencv_matrix()
+    bending = np.array([FISHEYE.k1, FISHEYE.k2, FISHEYE.k3, FISHEYE.k4])
+    points = np.random.default_rng(0).uniform([-40, -30, 20], [40, 30, 60], (500, 3))
+    reference, _ = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), matrix, bending)
+    np.testing.assert_allclose(FISHEYE.project(points), reference[:, 0] + 0.5, rtol=0, atol=1e-8)
+    pixels = reference[:, 0]
+    back = cv2.fisheye.undistortPoints(pixels[:, None], matrix, bending)[:, 0]
+    np.testing.assert_allclose(FISHEYE.unproject(pixels + 0.5)[:, :2], back, rtol=0, atol=1e-7)
+
+
+def test_legacy_pinhole_is_opencvs():
+    matrix = BROWN.pinhole.opencv_matrix()
+    bending = np.array([BROWN.k1, BROWN.k2, 0.0, 0.0])
+    points = np.random.default_rng(0).uniform([-30, -20, 30], [30, 20, 60], (500, 3))
+    reference, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, bending)
+    np.testing.assert_allclose(BROWN.project(points), reference[:, 0] + 0.5, rtol=0, atol=1e-8)
+    columns, rows = undistortion_map(BROWN, BROWN.pinhole)
+    map_columns, map_rows = cv2.initUndistortRectifyMap(matrix, bending, None, matrix, (1350, 1080), cv2.CV_32FC1)
+    np.testing.assert_allclose(columns, map_columns, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(rows, map_rows, rtol=0, atol=1e-3)
+
+
+def test_omnidirectional_follows_its_written_definition():
+    u, v = 200.0, 900.0
+    q = np.linalg.solve([[OMNI.c, OMNI.e], [OMNI.d, 1.0]], [u - OMNI.cx, v - OMNI.cy])
+    rho = np.hypot(*q)
+    ray = [q[0], q[1], OMNI.a0 + OMNI.a2 * rho**2 + OMNI.a3 * rho**3 + OMNI.a4 * rho**4]
+    np.testing.assert_allclose(OMNI.unproject([[u, v]])[0], np.array(ray) / ray[2], rtol=1e-13)
+    np.testing.assert_array_equal(OMNI.unproject([[OMNI.cx, OMNI.cy]]), [[0.0, 0.0, 1.0]])
+    np.testing.assert_allclose(OMNI.project([[0.0, 0.0, 5.0]]), [[OMNI.cx, OMNI.cy]], rtol=0, atol=1e-12)
+
+
+def test_agreement_of_the_three_lenses_is_the_one_on_record():
+    # docs/layouts/c3vd.md 2: undistorted radius, source radius, angle by legacy pinhole, omnidirectional and fisheye
+    table = [
+        (200, 194.8, 14.00, 14.73, 14.73),
+        (400, 360.6, 26.50, 28.20, 28.21),
+        (600, 478.3, 36.79, 39.07, 39.08),
+        (675, 509.2, 40.07, 42.25, 42.24),
+        (864, 564.6, 47.12, 48.41, 48.39),
+    ]
+    for undistorted, source, by_brown, by_omni, by_fisheye in table:
+        x = undistorted / BROWN.fx
+        assert BROWN.project([[x, 0, 1]])[0, 0] - BROWN.cx == pytest.approx(source, abs=0.06)
+        for lens, expected in ((BROWN, by_brown), (OMNI, by_omni), (FISHEYE, by_fisheye)):
+            exact = BROWN.project([[x, 0, 1]])[0, 0] - BROWN.cx
+            # The table's angles are radial: the small affine part of the omnidirectional lens is not in them.
+            assert angle(lens.unproject([[lens.cx + exact, lens.cy]]))[0] == pytest.approx(expected, abs=0.012)
+
+
+def test_how_far_the_lenses_are_from_the_one_that_rendered_the_truth():
+    pixels = grid(1350, 1080, 30)
+    near = pixels[np.linalg.norm(pixels - (OMNI.cx, OMNI.cy), axis=1) < 560]
+    rays = [lens.unproject(near) for lens in (OMNI, FISHEYE, BROWN)]
+    omni, fisheye, brown = (ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays)
+    assert np.degrees(np.linalg.norm(omni - fisheye, axis=1)).max() < 0.2
+    assert 3.3 < np.degrees(np.linalg.norm(omni - brown, axis=1)).max() < 3.5
+
+
+def test_the_two_readings_of_the_affine_part_differ_by_a_third_of_a_degree():
+    a, b = (lens.unproject([[1349.5, OMNI.cy], [OMNI.cx, 1079.5]]) for lens in (OMNI, OMNI_TRANSPOSED))
+    turn = np.degrees(np.arctan2(a[:, 1], a[:, 0]) - np.arctan2(b[:, 1], b[:, 0]))
+    np.testing.assert_allclose(np.abs(turn), 0.335, atol=0.005)
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "scaled"),
+    # docs/data.md 2: pure scaling, K of the legacy pinhole
+    [
+        (1350, 1080, (802.319, 801.885, 668.286, 547.733)),
+        (675, 540, (401.1595, 400.9425, 334.1430, 273.8665)),
+        (338, 270, (200.8769, 200.4713, 167.3190, 136.9333)),
+        (270, 216, (160.4638, 160.3770, 133.6572, 109.5466)),
+    ],
+)
+def test_scaled_pinhole_is_the_table_moved_by_half_a_pixel(width, height, scaled):
+    x, y = width / 1350, height / 1080
+    k = BROWN.resized(width, height).pinhole
+    np.testing.assert_allclose([k.fx, k.fy], scaled[:2], atol=6e-5)
+    # The table counts from integers and scales the centre as if these were pixel edges; here edges stay in place.
+    np.testing.assert_allclose([k.cx - 0.5 * x, k.cy - 0.5 * y], scaled[2:], atol=6e-5)
+
+
+def test_half_pixel_correct_centres_on_record():
+    for size, center in (((338, 270), (166.944, 136.558)), ((675, 540), (333.893, 273.617))):
+        k = BROWN.resized(*size).pinhole
+        assert (k.cx - 0.5, k.cy - 0.5) == pytest.approx(center, abs=6e-4)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_scaling_keeps_what_a_place_in_the_image_sees(name):
+    lens = LENSES[name]
+    quarter = lens.resized(338, 270)
+    pixels = grid(338, 270, 20)
+    same_place = pixels * (1350 / 338, 1080 / 270)
+    np.testing.assert_allclose(quarter.unproject(pixels), lens.unproject(same_place), rtol=0, atol=1e-12)
+    back = quarter.resized(1350, 1080)
+    np.testing.assert_allclose(back.unproject(same_place), lens.unproject(same_place), rtol=0, atol=1e-12)
+
+
+def test_scaling_a_pinhole_agrees_with_resizing_a_camera():
+    import torch
+
+    camera = Camera.of(BROWN.pinhole, torch.eye(4)).resized(338, 270)
+    assert camera.intrinsics == BROWN.pinhole.resized(338, 270)
+    assert astuple(BROWN.resized(338, 270).pinhole) == pytest.approx(astuple(camera.intrinsics))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_cropping_moves_pixels(name):
+    lens = LENSES[name].resized(675, 540)
+    crop = lens.cropped(30, 40, 300, 200)
+    assert (crop.width, crop.height) == (300, 200)
+    np.testing.assert_allclose(crop.unproject([[0, 0], [5, 6]]), lens.unproject([[30, 40], [35, 46]]), atol=1e-12)
+    k = lens.pinhole
+    moved = replace(k, cx=k.cx - 30, cy=k.cy - 40, width=300, height=200)
+    assert astuple(crop.pinhole) == pytest.approx(astuple(moved))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_cannot_be_seen_is_nan(name):
+    lens = LENSES[name]
+    points = [[0, 0, -1], [1, 1, 0], [np.nan, 0, 1]]
+    assert np.isnan(lens.project(points)).all()
+    assert np.isnan(lens.unproject([[np.nan, 3.0]])).all()
+
+
+def test_models_end_where_they_turn_back():
+    # The fisheye polynomial turns at 76 degrees; the omnidirectional one reaches 90 degrees at radius 837.
+    assert np.isnan(FISHEYE.project([[np.tan(np.radians(80)), 0, 1]])).all()
+    assert np.isfinite(FISHEYE.project([[np.tan(np.radians(75)), 0, 1]])).all()
+    assert np.isnan(FISHEYE.unproject([[0.0, 0.0]])).all()
+    assert np.isnan(OMNI.unproject([[OMNI.cx + 850, OMNI.cy]])).all()
+    assert np.isfinite(OMNI.project([[np.tan(np.radians(89.9)), 0, 1]])).all()
+    assert np.isfinite(BROWN.project([[50.0, 0, 1]])).all()
+    turning = replace(BROWN, k1=-0.3, k2=0.0)
+    assert np.isnan(turning.project([[1.1, 0, 1]])).all()
+    assert np.isfinite(turning.project([[1.0, 0, 1]])).all()
+
+
+def test_negligible_terms_change_nothing():
+    pixels = np.array([[300.0, 400.0], [900.0, 200.0]])
+    for name, term in (("omnidirectional", "a4"), ("legacy-pinhole", "k2"), ("fisheye", "k4")):
+        tiny, without = (replace(LENSES[name], **{term: value}).unproject(pixels) for value in (1e-320, 0.0))
+        np.testing.assert_array_equal(tiny, without)
+
+
+def test_undistortion_map_marks_what_the_lens_does_not_reach():
+    columns, rows = undistortion_map(FISHEYE, replace(FISHEYE.pinhole, fx=60.0, fy=60.0))
+    assert columns.dtype == rows.dtype == np.float32
+    assert columns[0, 0] == NOWHERE
+    assert np.isfinite(columns).all()
+    assert np.isfinite(rows).all()
+
+
+def test_undistorting_with_no_lens_is_the_identity():
+    plain = replace(BROWN, k1=0.0, k2=0.0).resized(90, 72)
+    columns, rows = undistortion_map(plain, plain.pinhole)
+    np.testing.assert_allclose(columns, np.arange(90)[None].repeat(72, 0), atol=1e-4)
+    np.testing.assert_allclose(rows, np.arange(72)[:, None].repeat(90, 1), atol=1e-4)
+
+
+def test_pinhole_scaling_is_its_own_inverse():
+    k = Intrinsics(100.0, 90.0, 40.5, 31.5, 80, 60)
+    assert astuple(k.resized(40, 15).resized(80, 60)) == pytest.approx(astuple(k))
+
+
+def test_octagon_is_symmetric_and_scales():
+    mask = octagon_mask(1350, 1080)
+    np.testing.assert_array_equal(mask, mask[::-1, ::-1])
+    np.testing.assert_array_equal(mask, mask[:, ::-1])
+    assert not mask[0, 0]
+    assert mask[540].all()
+    assert mask.mean() == pytest.approx(0.93, abs=2e-4)
+    assert octagon_mask(338, 270).mean() == pytest.approx(0.93, abs=2e-3)
+
+
+def test_octagon_is_c3vds(shared_data):
+    """Differing pixels lie within one pixel of the oblique edges: 253 of 1,458,000."""
+    published = cv2.imread(str(shared_data / "c3vdv3_mask" / "mask.png"), cv2.IMREAD_UNCHANGED) > 0
+    mask = octagon_mask(1350, 1080)
+    assert (mask != published).sum() < 300
+    kernel = np.ones((3, 3), np.uint8)
+    grown, shrunk = cv2.dilate(mask.astype(np.uint8), kernel), cv2.erode(mask.astype(np.uint8), kernel)
+    assert not (published & (grown == 0)).any()
+    assert not (~published & (shrunk == 1)).any()
+
+
+def test_official_frame_is_dark_outside_the_octagon_and_lit_inside(shared_data):
+    frame = cv2.imread(str(shared_data / "c3vd_official_frame" / "color.png")).max(axis=2)
+    normals = cv2.imread(str(shared_data / "c3vd_official_frame" / "normals.png")).max(axis=2)
+    mask = octagon_mask(1350, 1080)
+    kernel = np.ones((3, 3), np.uint8)
+    inside = cv2.erode(mask.astype(np.uint8), kernel) == 1
+    outside = cv2.dilate(mask.astype(np.uint8), kernel) == 0
+    assert frame[inside].min() >= 15
+    assert (frame[outside] > 40).mean() < 0.01  # a recorder's mark in the lower right corner
+    assert ((normals > 0) == mask).mean() > 0.9998
+
+
+@pytest.fixture
+def sparse_depth(shared_data):
+    """Points in camera axes, mm, and their pixels, of frames 0 and 1 of three sequences.
+
+    The pixels come from REIM-NeRF's fisheye calibration, and so do the points (they fill its pinhole image to the
+    edge); so this tells how far two lenses are from each other on real geometry, not which of them is right.
+    """
+    points, pixels = [], []
+    for path in sorted((shared_data / "c3vd_sparse_depth").glob("*.npz")):
+        data = np.load(path)
+        camera_to_world = data["c2w"]
+        local = (data["points_world_mm"].astype(float) - camera_to_world[:3, 3]) @ camera_to_world[:3, :3]
+        np.testing.assert_allclose(local[:, 2], data["depth_mm"], atol=1e-4)
+        points.append(local)
+        pixels.append(data["uv_raw1350x1080"].astype(float) + 0.5)  # the file counts from integers
+    return np.concatenate(points), np.concatenate(pixels)
+
+
+@pytest.mark.parametrize(
+    ("lens", "pixel_error", "mm_error"),
+    [
+        (FISHEYE, (0.0001, 0.0002), (0.0002, 0.0003)),
+        (OMNI, (1.35, 2.2), (0.12, 0.22)),
+        (OMNI_TRANSPOSED, (1.25, 2.2), (0.11, 0.18)),
+        (BROWN, (21.0, 35.0), (1.9, 4.0)),
+    ],
+    ids=["fisheye", "omnidirectional", "omnidirectional transposed", "legacy-pinhole"],
+)
+def test_lenses_on_real_geometry(sparse_depth, lens, pixel_error, mm_error):
+    points, pixels = sparse_depth
+    off = np.linalg.norm(lens.project(points) - pixels, axis=1)
+    wrong = np.linalg.norm(lens.unproject(pixels) * points[:, 2:] - points, axis=1)
+    assert np.median(off) < pixel_error[0]
+    assert np.quantile(off, 0.95) < pixel_error[1]
+    assert np.median(wrong) < mm_error[0]
+    assert np.quantile(wrong, 0.95) < mm_error[1]

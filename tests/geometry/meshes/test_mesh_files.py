@@ -1,0 +1,127 @@
+"""Files of meshes: what is written is read again, by this package and by others; damaged files are refused."""
+
+from __future__ import annotations
+
+import json
+import struct
+
+import numpy as np
+import pytest
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.geometry.meshes.files import MESH_FORMATS, read_mesh, write_mesh
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+
+
+@pytest.fixture(params=[True, False], ids=["coloured", "plain"])
+def mesh(request):
+    generator = np.random.default_rng(3)
+    vertices = generator.uniform(-50, 50, (40, 3)).astype(np.float32)
+    colors = generator.integers(0, 256, (40, 3)).astype(np.uint8) if request.param else None
+    triangles = np.concatenate([[[0, 1, 2]], generator.permutation(39).reshape(13, 3), [[37, 38, 39]]])
+    return TriangleMesh(vertices, triangles, colors)
+
+
+@pytest.mark.parametrize("suffix", MESH_FORMATS)
+def test_a_mesh_is_read_as_it_was_written(mesh, suffix, tmp_path):
+    path = tmp_path / "new" / f"mesh.{suffix}"
+    write_mesh(path, mesh)
+    read = read_mesh(path)
+    assert read.vertices[read.triangles] == pytest.approx(mesh.vertices[mesh.triangles], abs=1e-5)
+    if mesh.colors is None:
+        assert read.colors is None
+    else:
+        # Eight bits of linear light hold less of the dark colours.
+        apart = np.abs(read.colors[read.triangles].astype(int) - mesh.colors[mesh.triangles])
+        assert apart.max() <= (13 if suffix == "glb" else 0)
+    assert [file.name for file in path.parent.iterdir()] == [path.name]
+
+
+def test_glb_is_gltf_2(mesh, tmp_path):
+    write_mesh(tmp_path / "mesh.glb", mesh)
+    data = (tmp_path / "mesh.glb").read_bytes()
+    magic, version, length = struct.unpack("<4sII", data[:12])
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    size, kind = struct.unpack("<I4s", data[12:20])
+    assert kind == b"JSON" and size % 4 == 0
+    document = json.loads(data[20 : 20 + size])
+    positions = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]
+    assert positions["min"] == pytest.approx(mesh.vertices.min(axis=0))
+    assert positions["count"] == 40
+    rest, kind = struct.unpack("<I4s", data[20 + size : 28 + size])
+    assert kind == b"BIN\0" and 28 + size + rest == len(data)
+    assert document["buffers"][0]["byteLength"] <= rest
+
+
+def test_obj_polygons_and_negative_indices(tmp_path):
+    path = tmp_path / "quad.obj"
+    path.write_text("# a square\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvn 0 0 1\nf -4//1 -3//1 -2//1 -1//1\n")
+    mesh = read_mesh(path)
+    assert mesh.triangles.tolist() == [[0, 1, 2], [0, 2, 3]]
+    assert mesh.areas.sum() == 1.0
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("m.stl", "solid", "no mesh file by its name"),
+        ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n", "vertices that are not there"),
+        ("m.obj", "v 0 0 0\nv 1 0\n", "not rows of numbers"),
+        ("m.obj", "v 0 0 0\nf a b c\n", "not indices"),
+        ("m.obj", "v 0 0 0\n", "no triangles"),
+        ("m.obj", "v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "not finite"),
+        ("m.ply", "", "no PLY header"),
+        ("m.ply", "ply\nformat ascii 1.0\nelement vertex 9\n", "no PLY header"),
+        ("m.obj", "v 1e30 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "beyond 1e"),
+        ("m.glb", "glTF", "no triangles"),
+    ],
+)
+def test_damaged_files_are_refused(name, content, message, tmp_path):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(InputError, match=message):
+        read_mesh(tmp_path / name)
+
+
+HEADER = """ply
+format {} 1.0
+element vertex 5
+property float x
+property float y
+property float z
+element face 2
+property uchar kind
+property list uchar int vertex_indices
+property list uchar float texcoord
+end_header
+"""
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize("corners", [([0, 1, 2], [2, 3, 4]), ([0, 1, 2, 3], [2, 3, 4])])
+def test_ply_of_any_form_with_other_lists_and_polygons(tmp_path, form, corners):
+    positions = np.arange(15.0).reshape(5, 3)
+    order = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}[form]
+    if order:
+        body = positions.astype(f"{order}f4").tobytes()
+        for face in corners:
+            body += struct.pack("BB", 7, len(face)) + np.array(face, f"{order}i4").tobytes()
+            body += struct.pack("B", 3) + np.zeros(3, "f4").tobytes()
+    else:
+        rows = [" ".join(map(str, row)) for row in positions]
+        rows += [f"7 {len(face)} {' '.join(map(str, face))} 3 0 0 0" for face in corners]
+        body = "\n".join([*rows, ""]).encode()
+    (tmp_path / "m.ply").write_bytes(HEADER.format(form).encode() + body)
+    mesh = read_mesh(tmp_path / "m.ply")
+    assert mesh.vertices.tolist() == positions.tolist()
+    expected = [[0, 1, 2], [2, 3, 4]] if len(corners[0]) == 3 else [[0, 1, 2], [0, 2, 3], [2, 3, 4]]
+    assert mesh.triangles.tolist() == expected
+    for cut in range(1, 40):
+        (tmp_path / "m.ply").write_bytes((HEADER.format(form).encode() + body)[:-cut])
+        if order or cut > 2:
+            with pytest.raises(InputError):
+                read_mesh(tmp_path / "m.ply")
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    with pytest.raises(InputError, match="no file"):
+        read_mesh(tmp_path / "gone.ply")

@@ -1,0 +1,441 @@
+"""Alignment and errors against independent solvers, brute force and invariances."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.geometry.poses import c3vd, nerfstudio
+from coliags_plugin.geometry.poses.alignment import ErrorStatistics, align
+from coliags_plugin.geometry.poses.association import Matches, associate
+from coliags_plugin.geometry.poses.rigid import rigid
+from coliags_plugin.geometry.poses.similarity import Similarity, umeyama
+from coliags_plugin.geometry.poses.trajectory import Trajectory
+from coliags_plugin.geometry.poses.world_rotation import world_rotation
+from tests.geometry.poses.winding import some_transform, trajectories, winding
+
+SEEDS = st.integers(0, 10_000)
+SCALES = st.floats(0.01, 100.0)
+
+
+def moved(trajectory, transform, scale=1.0):
+    """The same cameras in another world."""
+    poses = transform @ trajectory.camera_to_world
+    poses[:, :3, 3] = scale * (transform[:3, :3] @ trajectory.centers.T).T + transform[:3, 3]
+    return Trajectory(poses)
+
+
+def shaken(trajectory, seed, size=0.5):
+    """The same cameras, each a little off."""
+    rng = np.random.default_rng(seed)
+    poses = trajectory.camera_to_world.copy()
+    poses[:, :3, 3] += rng.normal(0.0, size, (len(poses), 3))
+    poses[:, :3, :3] = Rotation.from_rotvec(rng.normal(0.0, 0.05, (len(poses), 3))).as_matrix() @ poses[:, :3, :3]
+    return Trajectory(poses)
+
+
+def aligned(estimate, reference, **options):
+    return align(estimate, reference, associate(estimate, reference), **options)
+
+
+# Umeyama
+
+
+@given(trajectory=trajectories(), seed=SEEDS, scale=SCALES, with_scale=st.booleans())
+@settings(max_examples=40, deadline=None)
+def test_a_known_motion_is_recovered(trajectory, seed, scale, with_scale):
+    transform, scale = some_transform(seed), scale if with_scale else 1.0
+    target = scale * trajectory.centers @ transform[:3, :3].T + transform[:3, 3]
+    found = umeyama(trajectory.centers, target, with_scale)
+    size = max(1.0, float(np.abs(target).max()))
+    np.testing.assert_allclose(found.points(trajectory.centers), target, rtol=0, atol=1e-9 * size)
+    if not found.undetermined:
+        assert found.scale == pytest.approx(scale, rel=1e-7)
+        np.testing.assert_allclose(found.rotation, transform[:3, :3], atol=1e-6)
+
+
+@given(seed=SEEDS, count=st.integers(4, 20))
+@settings(max_examples=20, deadline=None)
+def test_rotation_is_scipys(seed, count):
+    rng = np.random.default_rng(seed)
+    source, target = rng.normal(size=(2, count, 3))
+    found = umeyama(source, target)
+    expected, _ = Rotation.align_vectors(target - target.mean(axis=0), source - source.mean(axis=0))
+    np.testing.assert_allclose(found.rotation, expected.as_matrix(), atol=1e-6)
+    assert np.linalg.det(found.rotation) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("with_scale", [False, True])
+def test_transform_is_open3ds(with_scale):
+    import open3d as o3d
+
+    rng = np.random.default_rng(5)
+    source, target = rng.normal(size=(2, 30, 3))
+    clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)) for points in (source, target)]
+    pairs = o3d.utility.Vector2iVector(np.repeat(np.arange(30)[:, None], 2, axis=1))
+    solver = o3d.pipelines.registration.TransformationEstimationPointToPoint(with_scaling=with_scale)
+    matrix = solver.compute_transformation(*clouds, pairs)
+    found = umeyama(source, target, with_scale)
+    np.testing.assert_allclose(found.scale * found.rotation, matrix[:3, :3], atol=1e-10)
+    np.testing.assert_allclose(found.translation, matrix[:3, 3], atol=1e-10)
+
+
+@pytest.mark.parametrize("with_scale", [False, True])
+def test_nothing_nearby_is_closer(with_scale):
+    rng = np.random.default_rng(6)
+    source, target = rng.normal(size=(2, 8, 3))
+    found = umeyama(source, target, with_scale)
+
+    def misfit(change):
+        rotation = Rotation.from_rotvec(change[:3]).as_matrix() @ found.rotation
+        scale = found.scale * np.exp(change[6]) if with_scale else 1.0
+        return ((scale * source @ rotation.T + found.translation + change[3:6] - target) ** 2).sum()
+
+    best = minimize(misfit, np.zeros(7), method="BFGS")
+    assert misfit(np.zeros(7)) == pytest.approx(best.fun, rel=1e-9)
+
+
+def test_a_mirror_image_is_not_met_by_a_reflection():
+    source = winding(10).centers
+    assert np.linalg.det(umeyama(source, source * (1, 1, -1)).rotation) == pytest.approx(1.0)
+
+
+def line(count=10, direction=(1.0, 2.0, -0.5), off_line=0.0):
+    poses = winding(count, 4).camera_to_world.copy()
+    rng = np.random.default_rng(1)
+    along = np.linspace(0.0, 30.0, count)[:, None] * np.array(direction) / np.linalg.norm(direction)
+    poses[:, :3, 3] = along + off_line * rng.normal(size=(count, 3))
+    return Trajectory(poses)
+
+
+@pytest.mark.parametrize("with_scale", [False, True])
+@pytest.mark.parametrize("off_line", [0.0, 0.1])
+def test_on_a_nearly_straight_path_orientations_determine_the_rotation_about_it(with_scale, off_line):
+    reference = line(off_line=off_line)
+    transform = some_transform(3)
+    result = aligned(moved(reference, transform, 2.5 if with_scale else 1.0), reference, with_scale=with_scale)
+    assert result.world_rotation.by == "orientations about the path"
+    assert ("lie on a line" if off_line < 0.1 else "nearly straight") in result.world_rotation.reason
+    assert result.ate.max < 1e-10
+    assert result.rotation_deg.max < 1e-4
+    np.testing.assert_allclose(result.world_rotation.rotation, transform[:3, :3].T, atol=1e-6)
+    assert result.transform.scale == pytest.approx(0.4 if with_scale else 1.0)
+    assert json.loads(json.dumps(result.to_json("mm")))["world_rotation"]["by"] == "orientations about the path"
+
+
+def test_errors_of_positions_do_not_turn_a_nearly_straight_path():
+    """Positions alone give tens of degrees about the path, orientations agree exactly."""
+    reference = line(20, off_line=0.05)
+    poses = reference.camera_to_world.copy()
+    poses[:, :3, 3] += np.random.default_rng(3).normal(0.0, 0.1, (20, 3))
+    result = aligned(moved(Trajectory(poses), some_transform(4)), reference)
+    turned = result.transform.rotation @ some_transform(4)[:3, :3]
+    assert np.rad2deg(Rotation.from_matrix(turned).magnitude()) > 10.0
+    assert result.rotation_deg.rmse < 0.5
+    # The ATE is the usual one, by positions alone.
+    expected = umeyama(moved(Trajectory(poses), some_transform(4)).centers, reference.centers)
+    centers = moved(Trajectory(poses), some_transform(4)).centers
+    np.testing.assert_allclose(
+        result.position_errors, np.linalg.norm(expected.points(centers) - reference.centers, axis=1)
+    )
+
+
+@given(seed=SEEDS)
+@settings(max_examples=20, deadline=None)
+def test_the_rotation_about_the_path_is_that_of_least_chordal_distance(seed):
+    rng = np.random.default_rng(seed)
+    axis = some_transform(seed)[:3, 0]
+    estimated, true = Rotation.random(2 * 7, rng=rng).as_matrix().reshape(2, 7, 3, 3)
+    transform = Similarity(1.0, some_transform(seed + 1)[:3, :3], np.zeros(3), "", axis, 0.01)
+
+    def distance(angle):
+        about = Rotation.from_rotvec(angle * axis).as_matrix() @ transform.rotation
+        return ((about @ estimated - true) ** 2).sum()
+
+    found = world_rotation(estimated, true, transform).rotation
+    assert ((found @ estimated - true) ** 2).sum() <= min(map(distance, np.linspace(0, 2 * np.pi, 400))) + 1e-9
+    np.testing.assert_allclose(found @ transform.rotation.T @ axis, axis, atol=1e-12)
+
+
+@given(seed=SEEDS)
+@settings(max_examples=20, deadline=None)
+def test_without_a_path_the_rotation_is_scipys_mean_of_the_relative_ones(seed):
+    reference = winding(6, seed)
+    poses = shaken(reference, seed, 0.0).camera_to_world
+    poses[:, :3, 3] = 0.0
+    result = aligned(Trajectory(poses), reference)
+    relative = reference.rotations @ poses[:, :3, :3].transpose(0, 2, 1)
+    assert result.world_rotation.by == "orientations"
+    np.testing.assert_allclose(
+        result.world_rotation.rotation, Rotation.from_matrix(relative).mean().as_matrix(), atol=1e-6
+    )
+    assert result.ate_share is not None
+
+
+def test_on_a_line_the_smallest_rotation_is_taken():
+    reference = line(direction=(1, 0, 0))
+    turned = moved(reference, rigid(Rotation.from_euler("z", [40], degrees=True).as_matrix(), np.zeros((1, 3)))[0])
+    rolled = moved(turned, rigid(Rotation.from_euler("x", [70], degrees=True).as_matrix(), np.zeros((1, 3)))[0])
+    rotation = aligned(turned, reference).transform.rotation
+    assert np.rad2deg(Rotation.from_matrix(rotation).magnitude()) == pytest.approx(40.0)
+    direction = rolled.centers[-1] - rolled.centers[0]
+    expected = np.rad2deg(np.arccos(direction[0] / np.linalg.norm(direction)))
+    rotation = aligned(rolled, reference).transform.rotation
+    assert np.rad2deg(Rotation.from_matrix(rotation).magnitude()) == pytest.approx(expected)
+
+
+@given(seed=SEEDS, angle=st.sampled_from([0.0, 1e-9, 1e-4, 1.0, 3.1, 3.14159, np.pi - 1e-9, np.pi]))
+@settings(max_examples=30, deadline=None)
+def test_the_smallest_rotation_at_any_angle(seed, angle):
+    axes = some_transform(seed)[:3, :3]
+    turned = Rotation.from_rotvec(angle * axes[:, 1]).as_matrix() @ axes[:, 0]
+    steps = np.linspace(-1.0, 1.0, 5)[:, None]
+    found = umeyama(steps * axes[:, 0], steps * turned)
+    np.testing.assert_allclose(found.points(steps * axes[:, 0]), steps * turned, atol=1e-12)
+    assert np.linalg.det(found.rotation) == pytest.approx(1.0)
+    assert Rotation.from_matrix(found.rotation).magnitude() == pytest.approx(angle, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("off_line", "undetermined", "by"),
+    [
+        (0.001, True, "orientations about the path"),
+        (0.1, False, "orientations about the path"),
+        (3.0, False, "positions"),
+    ],
+)
+def test_how_far_off_a_line_is_enough(off_line, undetermined, by):
+    result = aligned(line(off_line=off_line), line(off_line=off_line))
+    assert bool(result.transform.undetermined) == undetermined
+    assert result.world_rotation.by == by
+    values = np.linalg.svd(line(off_line=off_line).centers - line(off_line=off_line).centers.mean(axis=0))[1]
+    assert result.transform.spread == pytest.approx(np.hypot(values[1], values[2]) / values[0], abs=1e-9)
+
+
+def test_a_line_run_backwards_is_turned_round():
+    poses = line().camera_to_world.copy()
+    poses[:, :3, 3] *= -1.0
+    result = aligned(Trajectory(poses), line())
+    assert result.ate.max < 1e-10
+    assert result.transform.undetermined
+
+
+@pytest.mark.parametrize("away", [0.0, 100.0])
+def test_a_camera_that_stays_in_place(away):
+    poses = winding(6, 2).camera_to_world.copy()
+    poses[:, :3, 3] = away
+    still = Trajectory(poses)
+    result = aligned(still, winding(6))
+    assert "the camera does not move" in result.transform.undetermined
+    np.testing.assert_array_equal(result.transform.rotation, np.eye(3))
+    for pair in ((still, winding(6)), (winding(6), still), (still, still)):
+        with pytest.raises(InputError, match="a scale cannot be estimated"):
+            aligned(*pair, with_scale=True)
+
+
+def test_a_mirror_image_that_several_rotations_fit_is_told():
+    corners = np.array([[2, 0, 0], [-2, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
+    result = umeyama(corners, corners * (1, 1, -1) + 0.0)
+    assert "mirror image" in result.undetermined or np.abs(result.points(corners) - corners * (1, 1, -1)).max() < 1e-9
+
+
+# Errors
+
+
+@given(trajectory=trajectories(), seed=SEEDS, scale=SCALES)
+@settings(max_examples=20, deadline=None)
+def test_a_moved_copy_has_no_error(trajectory, seed, scale):
+    estimate = moved(trajectory, some_transform(seed), scale)
+    result = aligned(estimate, trajectory, with_scale=True)
+    size = max(1.0, float(np.abs(trajectory.centers).max()), float(np.abs(estimate.centers).max()) / scale)
+    assert result.ate.max < 1e-8 * size
+    assert result.rpe_translation.max < 1e-8 * size
+    assert result.rpe_rotation_deg.max < 1e-5
+    assert result.rotation_deg.max < 1e-4
+
+
+@given(seed=SEEDS, delta=st.integers(1, 5))
+@settings(max_examples=15, deadline=None)
+def test_errors_do_not_depend_on_the_worlds(seed, delta):
+    reference = winding(12, seed)
+    estimate = shaken(reference, seed)
+    before = aligned(estimate, reference, delta=delta)
+    after = aligned(moved(estimate, some_transform(seed + 1)), moved(reference, some_transform(seed + 2)), delta=delta)
+    for name in ("position_errors", "relative_translation_errors"):
+        np.testing.assert_allclose(getattr(after, name), getattr(before, name), atol=1e-8)
+    for name in ("rotation_errors_deg", "relative_rotation_errors_deg"):
+        np.testing.assert_allclose(getattr(after, name), getattr(before, name), atol=1e-5)
+
+
+def test_sim3_never_has_a_larger_ate_than_se3():
+    reference = winding(20)
+    estimate = moved(shaken(reference, 1), np.eye(4), 1.3)
+    rigidly, scaled = (aligned(estimate, reference, with_scale=flag) for flag in (False, True))
+    assert scaled.ate.rmse < rigidly.ate.rmse
+
+
+@pytest.mark.parametrize("delta", [1, 3])
+def test_errors_by_their_definitions(delta):
+    """Sturm et al., equations 1 to 5, frame by frame."""
+    reference = winding(12, 1)
+    estimate = shaken(reference, 2)
+    result = aligned(estimate, reference, delta=delta)
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = result.transform.rotation, result.transform.translation
+    translations, angles, positions = [], [], []
+    for index in range(12):
+        true, found = reference.camera_to_world[index], estimate.camera_to_world[index]
+        absolute = np.linalg.inv(true) @ transform @ found
+        positions.append(np.linalg.norm(absolute[:3, 3]))
+        if index + delta < 12:
+            after, found_after = reference.camera_to_world[index + delta], estimate.camera_to_world[index + delta]
+            error = np.linalg.inv(np.linalg.inv(true) @ after) @ (np.linalg.inv(found) @ found_after)
+            translations.append(np.linalg.norm(error[:3, 3]))
+            angles.append(np.rad2deg(np.arccos((np.trace(error[:3, :3]) - 1) / 2)))
+    np.testing.assert_allclose(result.position_errors, positions)
+    np.testing.assert_allclose(result.relative_translation_errors, translations)
+    np.testing.assert_allclose(result.relative_rotation_errors_deg, angles, rtol=1e-6)
+    assert result.ate.rmse == pytest.approx(np.sqrt(np.mean(np.square(positions))))
+
+
+def test_a_constant_turn_of_every_camera_is_a_rotation_error_alone():
+    reference = winding(10)
+    turn = Rotation.from_euler("y", 7, degrees=True).as_matrix()
+    poses = reference.camera_to_world.copy()
+    poses[:, :3, :3] = poses[:, :3, :3] @ turn
+    result = aligned(Trajectory(poses), reference)
+    assert result.ate.max < 1e-10
+    assert (result.rotation_deg.mean, result.rotation_deg.max) == pytest.approx((7.0, 7.0))
+
+
+def test_spread():
+    assert ErrorStatistics.of(np.array([1.0, 2.0, 6.0])) == ErrorStatistics(np.sqrt(41 / 3), 3.0, 2.0, 6.0)
+
+
+@pytest.mark.parametrize("delta", [0, -1, 12, 100])
+def test_a_step_that_is_not_there(delta):
+    with pytest.raises(InputError, match=f"over {delta} frames, and 12 matched frames.*1 to 11"):
+        aligned(winding(12), winding(12), delta=delta)
+
+
+def test_figures_are_json():
+    result = aligned(shaken(winding(), 1), winding(), with_scale=True)
+    told = json.loads(json.dumps(result.to_json("mm"), allow_nan=False))
+    assert told["ate"]["rmse"] == result.ate.rmse
+    assert told["alignment"] == "Sim(3)"
+    assert told["frames"]["position_error"] == result.position_errors.tolist()
+    assert told["world_rotation"]["by"] == "positions"
+    assert told["ate_share_of_path"] == pytest.approx(told["ate"]["rmse"] / winding().steps.sum())
+
+
+# Association
+
+
+def named(names, **options):
+    return winding(len(names), names=tuple(names), **options)
+
+
+def pairs(matches):
+    return list(zip(matches.first.tolist(), matches.second.tolist(), strict=True))
+
+
+def test_by_name_first():
+    matches = associate(named(["c", "a", "x", "b"]), named(["a", "b", "c", "d", "e"]))
+    assert (matches.by, pairs(matches)) == ("name", [(0, 2), (1, 0), (3, 1)])
+
+
+def test_by_the_last_part_of_the_name_where_folders_and_suffixes_differ():
+    matches = associate(named(["images/a.png", "images/b.png", "images/c.png"]), named(["c.jpg", "b.jpg", "a.jpg"]))
+    assert (matches.by, pairs(matches)) == ("name", [(0, 2), (1, 1), (2, 0)])
+
+
+def test_a_last_part_that_several_frames_share_serves_nobody():
+    first = named(["left/a.png", "right/a.png", "left/b.png"])
+    matches = associate(first, named(["a.jpg", "b.jpg", "c.jpg"]))
+    assert matches.by == "index"
+    assert matches.skipped == ("by name: 'a' names several frames",)
+    assert associate(first, first).by == "name"
+
+
+def test_by_time_each_frame_once_and_the_nearest_first():
+    first = winding(4, timestamps=np.array([0.0, 0.1, 0.2, 0.3]))
+    second = winding(5, timestamps=np.array([0.305, 0.099, 0.11, 0.211, 9.0]))
+    matches = associate(first, second)
+    assert (matches.by, pairs(matches)) == ("time", [(1, 1), (2, 3), (3, 0)])
+    with pytest.raises(InputError, match=r"by time: 2 within 0.006 s"):
+        associate(first, second, tolerance=0.006)
+
+
+@given(seed=SEEDS)
+@settings(max_examples=20, deadline=None)
+def test_by_time_is_greedy_over_all_pairs(seed):
+    rng = np.random.default_rng(seed)
+    times = [np.unique(rng.uniform(0, 1, 12)), rng.permutation(np.unique(rng.uniform(0, 1, 15)))]
+    first, second = (winding(len(side), timestamps=side) for side in times)
+    gaps = np.abs(times[0][:, None] - times[1])
+    expected = []
+    while gaps.min() <= 0.05:
+        i, j = np.unravel_index(np.argmin(gaps), gaps.shape)
+        expected.append((int(i), int(j)))
+        gaps[i], gaps[:, j] = np.inf, np.inf
+    if len(expected) < 3:
+        return
+    assert pairs(associate(first, second, "time", 0.05)) == sorted(expected)
+
+
+def test_by_index_where_counts_agree():
+    matches = associate(winding(5), winding(5, timestamps=np.arange(5.0)))
+    assert (matches.by, pairs(matches)) == ("index", [(k, k) for k in range(5)])
+    assert matches.skipped == ()
+
+
+def test_repeated_times_are_passed_over():
+    trajectory = winding(5, timestamps=np.zeros(5))
+    assert associate(trajectory, trajectory).skipped == ("by time: timestamps are repeated",)
+
+
+def test_endogslams_training_frames():
+    reference, estimate = winding(20), winding(18)
+    with pytest.raises(InputError, match=r"18 and 20 poses.*pass --match endogslam-train"):
+        associate(estimate, reference)
+    matches = associate(estimate, reference, "endogslam-train")
+    assert matches.second.tolist() == [k for k in range(20) if k not in (7, 15)]
+    with pytest.raises(InputError, match="17 poses are not the training frames of 20"):
+        associate(winding(17), reference, "endogslam-train")
+
+
+def test_what_cannot_be_matched_says_what_was_tried():
+    with pytest.raises(InputError, match=r"by name: no name in common; by index: 3 and 4 poses"):
+        associate(named("abc"), named("wxyz"))
+    with pytest.raises(InputError, match="by name: not both have names"):
+        associate(named("abc"), winding(3), "name")
+    with pytest.raises(InputError, match="by index: 2 frames match"):
+        associate(winding(2), winding(2))
+
+
+def test_matched_frames_alone_are_aligned():
+    reference = winding(10)
+    estimate = Trajectory(moved(reference, some_transform(1)).camera_to_world[[7, 2, 5, 0]])
+    matches = Matches(np.arange(4), np.array([7, 2, 5, 0]), "index")
+    assert align(estimate, reference, matches).ate.max < 1e-9
+
+
+# Real data
+
+
+def test_two_files_of_one_real_trajectory(shared_data):
+    estimate = nerfstudio.read(shared_data / "c3vd_cecum_t1_a" / "transforms.json")
+    reference = c3vd.read(shared_data / "c3vd_pose_cecum_t1_a" / "pose.txt")
+    result = aligned(estimate, reference)
+    assert len(result.matches) == 276
+    assert result.ate.rmse == pytest.approx(5.95e-5, rel=0.01)  # mm: the digits of the files
+    assert result.rotation_deg.max < 1e-4
+    np.testing.assert_allclose(result.transform.rotation, np.eye(3), atol=1e-5)
+    np.testing.assert_allclose(result.transform.translation, 0.0, atol=2e-4)

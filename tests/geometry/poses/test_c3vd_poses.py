@@ -1,0 +1,119 @@
+"""Pose files: which order, and what is refused."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.geometry.poses.c3vd import read_poses
+from tests.datamanagers.wall_scenes import poses
+
+
+def write(path, matrices, separator=","):
+    path.write_text("\n".join(separator.join(f"{n:.9g}" for n in np.ravel(m)) for m in matrices) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("separator", [",", " ", ", ", "\t"])
+@pytest.mark.parametrize("order", ["column-major", "row-major"])
+def test_order_is_found(tmp_path, order, separator):
+    expected = poses(5)
+    stored = expected.transpose(0, 2, 1) if order == "column-major" else expected
+    read = read_poses(write(tmp_path / "pose.txt", stored, separator))
+    assert read.convention == order
+    np.testing.assert_allclose(read.camera_to_world, expected, atol=1e-8)
+    assert json.dumps(read.evidence, allow_nan=False)
+    larger, smaller = ("last_row", "last_column") if order == "column-major" else ("last_column", "last_row")
+    assert read.evidence[f"largest_number_in_{larger}"] > 1.0
+    assert read.evidence[f"largest_number_in_{smaller}"] == 0.0
+
+
+def test_trajectory_is_described(tmp_path):
+    centers = poses(5)[:, :3, 3]
+    evidence = read_poses(write(tmp_path / "pose.txt", poses(5))).evidence
+    assert evidence["trajectory_length_mm"] == pytest.approx(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum())
+    assert evidence["mean_step_mm"] == pytest.approx(evidence["trajectory_length_mm"] / 4)
+
+
+def test_a_first_pose_at_the_origin_is_no_obstacle(tmp_path):
+    expected = np.linalg.inv(poses(4)[0]) @ poses(4)
+    read = read_poses(write(tmp_path / "pose.txt", expected.transpose(0, 2, 1)))
+    assert read.convention == "column-major"
+    np.testing.assert_allclose(read.camera_to_world, expected, atol=1e-7)
+
+
+def test_without_translation_only_symmetric_rotations_can_be_read(tmp_path):
+    still = poses(3)
+    still[:, :3, 3] = 0.0
+    with pytest.raises(InputError, match="row-major and column-major order cannot be distinguished"):
+        read_poses(write(tmp_path / "pose.txt", still))
+    np.testing.assert_array_equal(read_poses(write(tmp_path / "one.txt", [np.eye(4)])).camera_to_world, [np.eye(4)])
+
+
+def spoilt(line, value):
+    def change(matrices):
+        matrices[line].flat[line] = value
+        return matrices
+
+    return change
+
+
+def left_handed(matrices):
+    matrices[2, :, 1] *= -1.0
+    return matrices
+
+
+def stretched(matrices):
+    matrices[1, :3, :3] *= 1.01
+    return matrices
+
+
+def one_line_in_the_other_order(matrices):
+    matrices[3] = matrices[3].T
+    return matrices
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (spoilt(1, np.nan), "line 2: .*nan.*16 finite numbers"),
+        (spoilt(1, np.inf), "line 2: .*16 finite numbers"),
+        (left_handed, "line 3: a left-handed transform"),
+        (stretched, "line 2: not a rigid transform"),
+        (one_line_in_the_other_order, "line 4: not a rigid transform"),
+        (lambda matrices: matrices[:0], "holds no poses"),
+        (lambda matrices: [m[:3] for m in matrices], "line 1: .*16 finite numbers"),
+    ],
+)
+def test_bad_poses_are_refused_by_line(tmp_path, change, message):
+    path = write(tmp_path / "pose.txt", change(poses(5)))
+    with pytest.raises(InputError, match=message) as caught:
+        read_poses(path)
+    assert str(path) in str(caught.value)
+
+
+def test_words_are_refused_by_line(tmp_path):
+    (tmp_path / "pose.txt").write_text("# camera to world\n")
+    with pytest.raises(InputError, match="line 1: '# camera to world'"):
+        read_poses(tmp_path / "pose.txt")
+
+
+def test_missing_and_binary_files(tmp_path):
+    with pytest.raises(InputError, match="cannot read"):
+        read_poses(tmp_path / "none.txt")
+    (tmp_path / "pose.txt").write_bytes(b"\xff\xfe\x00\x81")
+    with pytest.raises(InputError, match="cannot read"):
+        read_poses(tmp_path / "pose.txt")
+
+
+def test_the_real_file_is_column_major_and_equals_reim_nerfs_poses(shared_data):
+    read = read_poses(shared_data / "c3vd_pose_cecum_t1_a" / "pose.txt")
+    frames = json.loads((shared_data / "c3vd_cecum_t1_a" / "frames.json").read_text())["frames"]
+    assert read.convention == "column-major"
+    # Both files carry six digits, rounded on their own.
+    np.testing.assert_allclose(read.camera_to_world, [frame["c2w"] for frame in frames], rtol=0, atol=2e-3)
+    assert len(read.camera_to_world) == 276
+    assert read.evidence["largest_rotation_error"] < 5e-6

@@ -1,0 +1,196 @@
+"""COLMAP models against pycolmap, which reads and writes them independently."""
+
+from __future__ import annotations
+
+import shutil
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.geometry.poses import colmap
+from tests.geometry.poses.winding import PINHOLE, winding
+
+NAMES = ("10.png", "2.png", "frame.png", "sub/1.png")
+#: As they come back: numbers before words, 2 before 10.
+ORDER = [1, 0, 2, 3]
+
+
+@pytest.fixture(params=["binary", "text"])
+def model(request, tmp_path):
+    """A written model of four poses, and what was written."""
+    trajectory = winding(4, names=NAMES, intrinsics=PINHOLE)
+    (colmap.write if request.param == "binary" else colmap.write_text)(tmp_path / "model", trajectory)
+    return tmp_path / "model", trajectory
+
+
+def by_pycolmap(path):
+    """Name -> camera-to-world, as pycolmap reads it."""
+    import pycolmap
+
+    result = {}
+    for image in pycolmap.Reconstruction(str(path)).images.values():
+        world_to_camera = np.eye(4)
+        world_to_camera[:3] = image.cam_from_world().matrix()
+        result[image.name] = np.linalg.inv(world_to_camera)
+    return result
+
+
+def test_pycolmap_reads_what_is_written(model):
+    import pycolmap
+
+    path, trajectory = model
+    found = by_pycolmap(path)
+    assert set(found) == set(NAMES)
+    for name, expected in zip(NAMES, trajectory.camera_to_world, strict=True):
+        np.testing.assert_allclose(found[name], expected, atol=1e-10)
+    (camera,) = pycolmap.Reconstruction(str(path)).cameras.values()
+    assert (camera.model_name, camera.width, camera.height) == ("PINHOLE", 64, 48)
+    np.testing.assert_array_equal(camera.params, [61.0, 55.0, 33.5, 21.5])
+
+
+def test_images_come_in_the_order_of_their_numbers(model):
+    path, trajectory = model
+    read = colmap.read(path)
+    assert read.names == tuple(NAMES[index] for index in ORDER)
+    np.testing.assert_allclose(read.camera_to_world, trajectory.camera_to_world[ORDER], atol=1e-10)
+    assert read.intrinsics == PINHOLE
+
+
+def test_points_in_images_txt_may_be_missing_or_blank_but_keep_their_line(tmp_path):
+    rows = ["1 1 0 0 0 5 6 7 1 b.png", "10.5 11 -1 3 4 17", "", "2 0.5 0.5 0.5 0.5 1 2 3 1 a.png", "", "# end"]
+    (tmp_path / "images.txt").write_text("# comment\n" + "\n".join(rows))
+    (tmp_path / "cameras.txt").write_text("1 SIMPLE_PINHOLE 64 48 70 32 24\n")
+    read = colmap.read(tmp_path)
+    assert read.names == ("a.png", "b.png")
+    np.testing.assert_allclose(read.camera_to_world[1], [[1, 0, 0, -5], [0, 1, 0, -6], [0, 0, 1, -7], [0, 0, 0, 1]])
+    assert (read.intrinsics.fx, read.intrinsics.fy) == (70.0, 70.0)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("1 1 0 0 0 5 6 1 b.png", "line 2: '1 1 0 0 0 5 6 1 b.png'. Expected IMAGE_ID QW"),
+        ("1 2 0 0 0 5 6 7 1 b.png", "line 2: a quaternion of length 2"),
+        ("1 0 0 0 0 5 6 7 1 b.png", "line 2: the quaternion .* is not a rotation"),
+        ("1 1 0 0 0 nan 6 7 1 b.png", "line 2: .*nan"),
+    ],
+)
+def test_lines_that_are_none(tmp_path, line, message):
+    (tmp_path / "images.txt").write_text(f"# comment\n{line}\n\n")
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 64 48 70 71 32 24\n")
+    with pytest.raises(InputError, match=message):
+        colmap.read(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("cameras", "remark"),
+    [
+        ("1 OPENCV 64 48 70 71 32 24 0 0 0 0\n", "the camera is OPENCV"),
+        ("1 PINHOLE 64 48 70 71 32 24\n2 PINHOLE 64 48 70 72 32 24\n", "2 different cameras"),
+        ("1 PINHOLE 64 48 70 71 32 24\n", "lacks a camera"),
+    ],
+)
+def test_no_common_pinhole(tmp_path, cameras, remark):
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 5 6 7 1 a.png\n\n2 1 0 0 0 5 6 7 2 b.png\n\n")
+    (tmp_path / "cameras.txt").write_text(cameras)
+    read = colmap.read(tmp_path)
+    assert read.intrinsics is None
+    assert remark in read.remarks[0]
+
+
+def test_equal_cameras_are_one(tmp_path):
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 5 6 7 1 a.png\n\n2 1 0 0 0 5 6 7 2 b.png\n\n")
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 64 48 70 71 32 24\n2 PINHOLE 64 48 70 71 32 24\n")
+    assert colmap.read(tmp_path).intrinsics.fy == 71.0
+
+
+@pytest.mark.parametrize("cameras", ["1 PINHOLE 64 48 70\n", "1 PINHOLE 64\n", "x\n", "1 PINHOLE 64 48 0 71 32 24\n"])
+def test_cameras_that_are_none(tmp_path, cameras):
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 5 6 7 1 a.png\n\n")
+    (tmp_path / "cameras.txt").write_text(cameras)
+    with pytest.raises(InputError, match=r"cameras\.txt, line 1"):
+        colmap.read(tmp_path)
+
+
+def test_models_that_are_none(tmp_path):
+    with pytest.raises(InputError, match="holds no COLMAP model"):
+        colmap.read(tmp_path)
+    (tmp_path / "images.txt").write_text("# nothing\n")
+    (tmp_path / "cameras.txt").write_text("")
+    with pytest.raises(InputError, match="holds no poses"):
+        colmap.read(tmp_path)
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 5 6 7 1 a.png\n\n2 1 0 0 0 5 6 7 1 a.png\n\n")
+    with pytest.raises(InputError, match=r"'a.png' is repeated"):
+        colmap.read(tmp_path)
+
+
+def test_names_with_blanks_are_for_binary_models(tmp_path):
+    trajectory = winding(1, names=("with blank.png",), intrinsics=PINHOLE)
+    with pytest.raises(InputError, match=r"'with blank.png'. Expected no blanks"):
+        colmap.write_text(tmp_path / "text", trajectory)
+    colmap.write(tmp_path / "binary", trajectory)
+    assert colmap.read(tmp_path / "binary").names == trajectory.names == tuple(by_pycolmap(tmp_path / "binary"))
+
+
+@given(data=st.data())
+@settings(max_examples=30, deadline=None)
+def test_binary_files_cut_anywhere_are_refused(tmp_path_factory, data):
+    path = tmp_path_factory.mktemp("model")
+    colmap.write(path, winding(4, names=NAMES, intrinsics=PINHOLE))
+    name = data.draw(st.sampled_from(["images.bin", "cameras.bin"]))
+    content = (path / name).read_bytes()
+    (path / name).write_bytes(content[: data.draw(st.integers(0, len(content) - 1))])
+    with pytest.raises(InputError, match="damaged or cut short"):
+        colmap.read(path)
+
+
+def test_binary_numbers_that_cannot_be(tmp_path):
+    colmap.write(tmp_path / "model", winding(2, intrinsics=PINHOLE))
+    content = bytearray((tmp_path / "model" / "images.bin").read_bytes())
+    content[12:20] = struct.pack("<d", 3.0)
+    (tmp_path / "model" / "images.bin").write_bytes(content)
+    with pytest.raises(InputError, match=r"images\.bin, image 1 \(0000\.png\): a quaternion of length"):
+        colmap.read(tmp_path / "model")
+    content[12:20] = struct.pack("<d", np.nan)
+    (tmp_path / "model" / "images.bin").write_bytes(content)
+    with pytest.raises(InputError, match=r"image 1 \(0000\.png\): its pose is nan"):
+        colmap.read(tmp_path / "model")
+
+
+@pytest.mark.parametrize("folder", ["sparse", "distorted_sparse"])
+def test_a_real_model_read_as_pycolmap_reads_it(shared_data, tmp_path, folder):
+    import pycolmap
+
+    source = shared_data / "colmap_23img" / folder
+    read = colmap.read(source)
+    found = by_pycolmap(source)
+    assert read.names == tuple(sorted(found))
+    assert len(read) == 23
+    np.testing.assert_allclose(read.camera_to_world, [found[name] for name in read.names], atol=1e-12)
+    assert "no intrinsics" in read.remarks[0]
+    # The same model as text, observations and all.
+    pycolmap.Reconstruction(str(source)).write_text(str(tmp_path))
+    text = colmap.read(tmp_path)
+    assert text.names == read.names
+    np.testing.assert_allclose(text.camera_to_world, read.camera_to_world, atol=1e-12)
+
+
+def test_a_real_model_to_text_and_back(shared_data, tmp_path):
+    from dataclasses import replace
+
+    read = colmap.read(shared_data / "colmap_23img" / "sparse")
+    colmap.write_text(tmp_path / "text", replace(read, intrinsics=PINHOLE))
+    colmap.write(tmp_path / "binary", colmap.read(tmp_path / "text"))
+    back = colmap.read(tmp_path / "binary")
+    assert back.names == read.names
+    np.testing.assert_allclose(back.camera_to_world, read.camera_to_world, atol=1e-12)
+
+
+def test_a_model_without_points_will_do(shared_data, tmp_path):
+    for part in ("images.bin", "cameras.bin"):
+        shutil.copy(shared_data / "colmap_23img" / "sparse" / part, tmp_path)
+    assert len(colmap.read(tmp_path)) == 23

@@ -1,0 +1,198 @@
+"""EndoGSLAM's params.npz."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.geometry.poses import endogslam
+from coliags_plugin.geometry.poses.rigid import inverse
+from tests.geometry.poses.winding import PINHOLE, winding
+
+FRAMES, GAUSSIANS = 5, 7
+
+
+def params(**changes):
+    """What EndoGSLAM writes, with other values or without some keys (None)."""
+    rng = np.random.default_rng(3)
+    arrays = {
+        "means3D": rng.normal(size=(GAUSSIANS, 3)),
+        "rgb_colors": rng.uniform(size=(GAUSSIANS, 3)),
+        "unnorm_rotations": rng.normal(size=(GAUSSIANS, 4)),
+        "logit_opacities": rng.normal(size=(GAUSSIANS, 1)),
+        "log_scales": rng.normal(size=(GAUSSIANS, 1)),
+        "cam_unnorm_rots": rng.normal(size=(1, 4, FRAMES)),
+        "cam_trans": rng.normal(size=(1, 3, FRAMES)),
+        "timestep": np.zeros(GAUSSIANS),
+        "intrinsics": np.array([[400.0, 0, 334.1], [0, 401.0, 273.9], [0, 0, 1]]),
+        "w2c": np.eye(4),
+        "org_width": np.array(675),
+        "org_height": np.array(540),
+        "gt_w2c_all_frames": winding(FRAMES).camera_to_world,
+        "keyframe_time_indices": np.array([0, 3]),
+        **changes,
+    }
+    return {key: array for key, array in arrays.items() if array is not None}
+
+
+def saved(path, **changes):
+    np.savez(path, **params(**changes))
+    return path
+
+
+def test_poses_are_inverted_and_quaternions_normalised(tmp_path):
+    arrays = params()
+    read = endogslam.read_params(saved(tmp_path / "params.npz"))
+    for frame in range(FRAMES):
+        w, x, y, z = arrays["cam_unnorm_rots"][0, :, frame]
+        world_to_camera = Rotation.from_quat([x, y, z, w])
+        point = np.array([0.3, -0.2, 0.9])
+        there = world_to_camera.apply(point) + arrays["cam_trans"][0, :, frame]
+        back = read.camera_to_world[frame] @ [*there, 1.0]
+        np.testing.assert_allclose(back, [*point, 1.0], atol=1e-12)
+    truth = arrays["gt_w2c_all_frames"] @ read.true_camera_to_world
+    np.testing.assert_allclose(truth, np.tile(np.eye(4), (FRAMES, 1, 1)), atol=1e-12)
+
+
+def test_all_of_it_is_read(tmp_path):
+    arrays = params()
+    read = endogslam.read_params(saved(tmp_path / "params.npz"))
+    np.testing.assert_array_equal(read.means, arrays["means3D"])
+    np.testing.assert_array_equal(read.rgb_colors, arrays["rgb_colors"])
+    np.testing.assert_array_equal(read.log_scales, arrays["log_scales"])
+    assert read.keyframes.tolist() == [0, 3]
+    # Pixel centres at integers become integers + 0.5.
+    assert read.intrinsics == Intrinsics(400.0, 401.0, 334.1 + 0.5, 273.9 + 0.5, 675, 540)
+    np.testing.assert_allclose(read.intrinsics.opencv_matrix(), arrays["intrinsics"], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "missing", [("log_scales",), ("keyframe_time_indices",), ("log_scales", "keyframe_time_indices")]
+)
+def test_what_nothing_is_made_from_may_be_missing(tmp_path, missing):
+    arrays = params()
+    read = endogslam.read_params(saved(tmp_path / "params.npz", **dict.fromkeys(missing)))
+    assert (read.log_scales is None) == ("log_scales" in missing)
+    assert (read.keyframes is None) == ("keyframe_time_indices" in missing)
+    np.testing.assert_array_equal(read.means, arrays["means3D"])
+    assert len(read.camera_to_world) == FRAMES
+
+
+def test_estimate_and_truth_as_trajectories(tmp_path):
+    path = saved(tmp_path / "params.npz")
+    whole = endogslam.read_params(path)
+    np.testing.assert_array_equal(endogslam.read(path).camera_to_world, whole.camera_to_world)
+    np.testing.assert_array_equal(endogslam.read_truth(path).camera_to_world, whole.true_camera_to_world)
+    assert endogslam.read(path).intrinsics == whole.intrinsics
+
+
+def test_poses_alone_can_be_read(tmp_path):
+    only = {key: None for key in params() if key not in ("cam_unnorm_rots", "cam_trans")}
+    read = endogslam.read(saved(tmp_path / "params.npz", **only))
+    assert len(read) == FRAMES
+    assert read.intrinsics is None
+    assert read.remarks == ("no intrinsics: the file has no intrinsics, org_width, org_height",)
+
+
+def test_one_message_names_every_fault(tmp_path):
+    path = saved(
+        tmp_path / "params.npz",
+        cam_trans=np.zeros((1, 3, 4)),
+        means3D=None,
+        rgb_colors=np.zeros((GAUSSIANS, 4)),
+        log_scales=np.full((GAUSSIANS, 1), np.nan),
+        org_width=np.array("wide"),
+    )
+    with pytest.raises(InputError) as caught:
+        endogslam.read_params(path)
+    for fault in (
+        str(path),
+        "cam_trans has the shape [1, 3, 4], not [1, 3, 5]",
+        "no means3D",
+        "rgb_colors has the shape [7, 4], not [N, 3]",
+        "log_scales holds numbers that are not finite",
+        "org_width holds <U4, not numbers",
+    ):
+        assert fault in str(caught.value)
+
+
+def test_objects_are_refused(tmp_path):
+    path = saved(tmp_path / "params.npz", keyframe_time_indices=np.array([{}], dtype=object))
+    with pytest.raises(InputError, match=r"cannot read .*params\.npz: Object arrays"):
+        endogslam.read_params(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"cam_unnorm_rots": np.zeros((1, 4, FRAMES))}, "cam_unnorm_rots, frame 0: the quaternion .* not a rotation"),
+        ({"gt_w2c_all_frames": 2.0 * winding(FRAMES).camera_to_world}, "gt_w2c_all_frames, frame 0: not a rigid"),
+        ({"cam_unnorm_rots": np.ones((1, 4, 0)), "cam_trans": np.ones((1, 3, 0)),
+          "gt_w2c_all_frames": np.ones((0, 4, 4))}, "no frames"),
+    ],
+)  # fmt: skip
+def test_poses_that_are_none(tmp_path, changes, message):
+    with pytest.raises(InputError, match=message):
+        endogslam.read_params(saved(tmp_path / "params.npz", **changes))
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 nonsense", b"text", b"\x80\x04N."])
+def test_what_is_no_npz(tmp_path, content):
+    (tmp_path / "params.npz").write_bytes(content)
+    with pytest.raises(InputError, match="cannot read"):
+        endogslam.read(tmp_path / "params.npz")
+
+
+def test_a_single_array_and_a_missing_file(tmp_path):
+    np.save(tmp_path / "params.npy", np.eye(4))
+    for name in ("params.npy", "none.npz"):
+        with pytest.raises(InputError, match="cannot read"):
+            endogslam.read(tmp_path / name)
+
+
+@given(size=st.integers(0, 3000))
+@settings(max_examples=15, deadline=None)
+def test_a_file_cut_short_is_refused(tmp_path_factory, size):
+    path = saved(tmp_path_factory.mktemp("cut") / "params.npz")
+    path.write_bytes(path.read_bytes()[:size])
+    with pytest.raises(InputError):
+        endogslam.read_params(path)
+
+
+def test_an_unfinished_run_is_remarked_upon(tmp_path):
+    quats, translations = params()["cam_unnorm_rots"], params()["cam_trans"]
+    quats[0, :, -2:] = np.array([[1.0, 0, 0, 0]]).T
+    translations[0, :, -2:] = 0.0
+    read = endogslam.read(saved(tmp_path / "params.npz", cam_unnorm_rots=quats, cam_trans=translations))
+    assert read.remarks == ("the last 2 poses are the identity: was the run stopped early?",)
+
+
+def test_written_files_hold_the_formats_keys_and_the_first_camera_is_the_world(tmp_path):
+    trajectory = winding(6, intrinsics=PINHOLE)
+    endogslam.write(tmp_path / "params.npz", trajectory)
+    with np.load(tmp_path / "params.npz", allow_pickle=False) as archive:
+        assert set(archive.files) == set(params())
+        assert archive["cam_unnorm_rots"].shape == (1, 4, 6)
+        np.testing.assert_allclose(archive["cam_trans"][0, :, 0], 0.0)
+        np.testing.assert_allclose(archive["cam_unnorm_rots"][0, :, 0], [1, 0, 0, 0])
+        assert archive["intrinsics"][0, 2] == PINHOLE.cx - 0.5
+    read = endogslam.read_params(tmp_path / "params.npz")
+    relative = inverse(trajectory.camera_to_world[:1]) @ trajectory.camera_to_world
+    np.testing.assert_allclose(read.camera_to_world, relative, atol=1e-4)
+    np.testing.assert_allclose(read.true_camera_to_world, relative, atol=1e-4)
+    assert read.means.shape == (0, 3)
+
+
+@given(images=st.integers(8, 1200))
+@settings(max_examples=30)
+def test_images_of_the_poses(images):
+    np.testing.assert_array_equal(endogslam.image_indices(images, images), np.arange(images))
+    training = [index for index in range(images) if index % 8 != 7]
+    np.testing.assert_array_equal(endogslam.image_indices(images - images // 8, images), training)
+    assert endogslam.image_indices(images - images // 8 - 1, images) is None
+    assert endogslam.image_indices(images + 1, images) is None

@@ -1,0 +1,226 @@
+"""Every pose format: what comes back, how files are told apart, and what is never replaced."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from coliags_plugin.config.registry import pose_formats
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.geometry.poses.formats import format_named, format_of, write_trajectory
+from coliags_plugin.geometry.poses.rigid import inverse
+from coliags_plugin.geometry.poses.trajectory import Trajectory
+from tests.geometry.poses.winding import PINHOLE, as_text, trajectories, winding
+
+WRITABLE = [name for name in pose_formats if format_named(name).write is not None]
+#: EndoGSLAM's files are float32.
+TOLERANCE = {"endogslam": 1e-5}
+
+
+def same_poses(read: Trajectory, wrote: Trajectory, *formats: str) -> None:
+    """Equal up to what the formats on the way lose: digits, and EndoGSLAM's the world."""
+    expected, found = wrote.camera_to_world, read.camera_to_world
+    if "endogslam" in formats:
+        expected, found = (inverse(side[:1]) @ side for side in (expected, found))
+    scale = max(1.0, float(np.abs(expected).max()))
+    tolerance = max(TOLERANCE.get(name, 1e-10) for name in formats)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance * scale)
+
+
+@pytest.mark.parametrize("name", WRITABLE)
+@given(trajectory=trajectories(intrinsics=PINHOLE))
+@settings(max_examples=6, deadline=None)
+def test_what_is_written_is_read(tmp_path_factory, name, trajectory):
+    path = tmp_path_factory.mktemp("poses") / "out"
+    write_trajectory(path, trajectory, name)
+    read = format_named(name).read(path)
+    same_poses(read, trajectory, name)
+    if "intrinsics" in format_named(name).keeps:
+        assert read.intrinsics == PINHOLE
+    else:
+        assert read.intrinsics is None
+
+
+@given(
+    trajectory=trajectories(intrinsics=PINHOLE),
+    way=st.lists(st.sampled_from(WRITABLE), min_size=2, max_size=5),
+)
+@settings(max_examples=25, deadline=None)
+def test_any_way_through_the_formats_ends_where_it_began(tmp_path_factory, trajectory, way):
+    folder = tmp_path_factory.mktemp("poses")
+    now = trajectory
+    for step, name in enumerate(way):
+        write_trajectory(folder / str(step), replace(now, intrinsics=PINHOLE), name)
+        now = format_named(name).read(folder / str(step))
+    same_poses(now, trajectory, *way)
+
+
+@pytest.mark.parametrize("name", WRITABLE)
+def test_names_and_times_are_kept_where_the_format_says_so(tmp_path, name):
+    names = tuple(f"{10 * index}_color.png" for index in range(12))
+    times = 1305031102.175304 + np.arange(12) / 30.0
+    trajectory = winding(12, names=names, timestamps=times, intrinsics=PINHOLE)
+    write_trajectory(tmp_path / "out", trajectory, name)
+    read = format_named(name).read(tmp_path / "out")
+    assert read.names == (names if "names" in format_named(name).keeps else None)
+    if "timestamps" in format_named(name).keeps:
+        np.testing.assert_array_equal(read.timestamps, times)
+    else:
+        assert read.timestamps is None
+
+
+@pytest.mark.parametrize("name", WRITABLE)
+def test_content_tells_the_format(tmp_path, name):
+    write_trajectory(tmp_path / "out.whatever", winding(intrinsics=PINHOLE), name)
+    assert format_of(tmp_path / "out.whatever").name == name.removesuffix("-text")
+
+
+@pytest.mark.parametrize("name", WRITABLE)
+def test_writing_is_the_same_every_time(tmp_path, name):
+    trajectory = winding(intrinsics=PINHOLE)
+    contents = []
+    for attempt in ("first", "second"):
+        write_trajectory(tmp_path / attempt, trajectory, name)
+        files = sorted((tmp_path / attempt).rglob("*")) if format_named(name).folder else [tmp_path / attempt]
+        contents.append([path.read_bytes() for path in files])
+    assert contents[0] == contents[1]
+
+
+@pytest.mark.parametrize("name", WRITABLE)
+def test_nothing_is_replaced_unasked(tmp_path, name):
+    path = tmp_path / "out"
+    write_trajectory(path, winding(12, intrinsics=PINHOLE), name)
+    with pytest.raises(InputError, match="already exists"):
+        write_trajectory(path, winding(5, intrinsics=PINHOLE), name)
+    assert len(format_named(name).read(path)) == 12
+    write_trajectory(path, winding(5, intrinsics=PINHOLE), name, overwrite=True)
+    assert len(format_named(name).read(path)) == 5
+    assert [found.name for found in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_folder_of_other_things_is_never_replaced(tmp_path):
+    (tmp_path / "project").mkdir()
+    (tmp_path / "project" / "thesis.tex").write_text("everything")
+    with pytest.raises(InputError, match=r"thesis\.tex, which is not part of a COLMAP model"):
+        write_trajectory(tmp_path / "project", winding(intrinsics=PINHOLE), "colmap", overwrite=True)
+    with pytest.raises(InputError, match="project is a folder"):
+        write_trajectory(tmp_path / "project", winding(), "tum", overwrite=True)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="file is a file"):
+        write_trajectory(tmp_path / "file", winding(intrinsics=PINHOLE), "colmap", overwrite=True)
+    assert (tmp_path / "project" / "thesis.tex").read_text() == "everything"
+
+
+@pytest.mark.parametrize("name", ["colmap", "colmap-text", "endogslam"])
+def test_formats_that_need_intrinsics_say_so(tmp_path, name):
+    with pytest.raises(InputError, match=r"no intrinsics.*--intrinsics fx,fy,cx,cy --size"):
+        write_trajectory(tmp_path / "out", winding(), name)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["colmap", "colmap-text", "nerfstudio"])
+def test_a_repeated_name_is_not_written(tmp_path, name):
+    trajectory = winding(3, names=("a.png", "b.png", "a.png"), intrinsics=PINHOLE)
+    with pytest.raises(InputError, match=r"'a\.png' is repeated \(poses 0 and 2\)"):
+        write_trajectory(tmp_path / "out", trajectory, name)
+
+
+def test_what_is_no_pose_file_is_told(tmp_path):
+    with pytest.raises(InputError, match="no file or folder"):
+        format_of(tmp_path / "none")
+    (tmp_path / "kitti.txt").write_text(as_text(np.ones((2, 12))))
+    with pytest.raises(InputError, match="its first line holds 12 numbers"):
+        format_of(tmp_path / "kitti.txt")
+    (tmp_path / "letter.txt").write_text("Dear all,\n")
+    with pytest.raises(InputError, match="its first line holds no row of numbers"):
+        format_of(tmp_path / "letter.txt")
+    (tmp_path / "empty").write_text("")
+    with pytest.raises(InputError, match="no row of numbers"):
+        format_of(tmp_path / "empty")
+    with pytest.raises(InputError, match=r"holds empty, kitti\.txt, letter\.txt\. Expected the folder of a COLMAP"):
+        format_of(tmp_path)
+
+
+def test_names_of_formats(tmp_path):
+    (tmp_path / "a").write_text("")
+    with pytest.raises(InputError, match=r"no pose format 'colmab'.*Did you mean 'colmap'"):
+        format_of(tmp_path / "a", "colmab")
+    with pytest.raises(InputError, match="is a folder"):
+        format_of(tmp_path, "tum")
+    with pytest.raises(InputError, match="format 'endogslam-truth' is read-only"):
+        write_trajectory(tmp_path / "out", winding(), "endogslam-truth")
+
+
+def test_byte_order_mark_line_ends_and_blank_lines_do_no_harm(tmp_path):
+    trajectory = winding(intrinsics=PINHOLE)
+    for name in ("c3vd", "tum", "nerfstudio"):
+        write_trajectory(tmp_path / name, trajectory, name)
+        text = (tmp_path / name).read_text().replace("\n", "\r\n\r\n")
+        (tmp_path / name).write_bytes(b"\xef\xbb\xbf" + text.encode())
+        assert format_of(tmp_path / name).name == name
+        same_poses(format_named(name).read(tmp_path / name), trajectory, name)
+    write_trajectory(tmp_path / "colmap", trajectory, "colmap-text")
+    for part in ("images.txt", "cameras.txt"):
+        text = (tmp_path / "colmap" / part).read_text().replace("\n", "\r\n")
+        (tmp_path / "colmap" / part).write_bytes(b"\xef\xbb\xbf" + text.encode())
+    same_poses(format_named("colmap").read(tmp_path / "colmap"), trajectory, "colmap")
+
+
+def test_trajectories_are_checked(tmp_path):
+    poses = winding(3).camera_to_world
+    with pytest.raises(InputError, match=r"poses of the shape \[0, 4, 4\]"):
+        Trajectory(poses[:0])
+    with pytest.raises(InputError, match=r"\[3, 3, 4\]"):
+        Trajectory(poses[:, :3])
+    with pytest.raises(InputError, match="pose 1: a left-handed transform"):
+        Trajectory(poses * np.where(np.arange(3) == 1, -1.0, 1.0)[:, None, None] @ np.diag([1, 1, 1, 1.0]) * _border(1))
+    broken = poses.copy()
+    broken[2, 0, 3] = np.nan
+    with pytest.raises(InputError, match="pose 2: a transform that is not finite"):
+        Trajectory(broken)
+    with pytest.raises(InputError, match="2 names for 3 poses"):
+        Trajectory(poses, names=("a", "b"))
+    with pytest.raises(InputError, match="timestamps"):
+        Trajectory(poses, timestamps=np.array([0.0, 1.0, np.inf]))
+    with pytest.raises(InputError, match="focal lengths and size positive"):
+        Intrinsics(0.0, 1.0, 1.0, 1.0, 4, 4)
+
+
+def _border(index: int) -> np.ndarray:
+    """Undoes the sign in the last row of one pose. [3, 4, 4]"""
+    signs = np.ones((3, 4, 4))
+    signs[index, 3] = -1.0
+    return signs
+
+
+def test_summary_counts_and_measures():
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, 2, 3] = [0.0, 1.0, 3.0, 4.0, 6.0]
+    text = Trajectory(poses).summary("mm")
+    assert text == "5 poses, path 6 mm, mean step 1.5 mm, mean looking direction (0.00, 0.00, 1.00)"
+
+
+def test_transforms_json_is_json(tmp_path):
+    write_trajectory(tmp_path / "t.json", winding(3, intrinsics=PINHOLE), "nerfstudio")
+    content = json.loads((tmp_path / "t.json").read_text())
+    assert content["camera_model"] == "PINHOLE"
+    assert (content["fl_x"], content["cy"], content["w"]) == (61.0, 21.5, 64)
+    assert [frame["file_path"] for frame in content["frames"]] == ["0000.png", "0001.png", "0002.png"]
+
+
+def test_every_format_is_in_the_documentation():
+    page = Path(__file__).parents[3].joinpath("docs/poses.md").read_text()
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in page.splitlines() if "| `" in f" {line}"]
+    told = {row[0].strip("`"): row for row in rows if row[0].strip("`") in pose_formats and len(row) > 5}
+    assert sorted(told) == list(pose_formats)
+    for name, row in told.items():
+        assert ("mm" == row[4]) == (format_named(name).unit == "mm")
+        assert {word for word in row[5].split(", ") if word} == format_named(name).keeps
+        assert ("only read" in row[2]) == (format_named(name).write is None)

@@ -1,0 +1,282 @@
+"""Readers against hand-made files: axes, directions and orders by definition, and refusals that name the place."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.geometry.poses import c3vd, nerfstudio, tum
+from coliags_plugin.geometry.poses.rigid import rotation_angles_deg, rotations_from_wxyz, wxyz_from_rotations
+from coliags_plugin.geometry.poses.trajectory import natural_order
+from tests.geometry.poses.winding import as_text, some_transform, winding
+
+#: A quarter turn about z: x to the right becomes y. Written out, so that no library decides what is right.
+QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+HALF = np.sqrt(0.5)
+
+
+# Quaternions
+
+
+def test_quaternions_are_w_first():
+    np.testing.assert_allclose(
+        rotations_from_wxyz(np.array([[HALF, 0, 0, HALF]]), str, unit=True)[0], QUARTER, atol=1e-15
+    )
+    np.testing.assert_allclose(wxyz_from_rotations(QUARTER[None]), [[HALF, 0, 0, HALF]], atol=1e-15)
+
+
+@given(st.lists(st.floats(-10, 10), min_size=4, max_size=4))
+@settings(max_examples=50)
+def test_quaternions_by_the_formula(numbers):
+    quat = np.array(numbers)
+    if np.linalg.norm(quat) < 1e-3:
+        return
+    w, x, y, z = quat / np.linalg.norm(quat)
+    formula = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    rotation = rotations_from_wxyz(quat[None], str, unit=False)
+    np.testing.assert_allclose(rotation[0], formula, atol=1e-12)
+    back = wxyz_from_rotations(rotation)[0]
+    assert back[0] >= 0.0
+    assert min(np.abs(back - sign * quat / np.linalg.norm(quat)).max() for sign in (1, -1)) < 1e-7
+
+
+@pytest.mark.parametrize("quat", [[0, 0, 0, 0], [1e-12, 0, 0, 0], [np.nan, 0, 0, 1], [np.inf, 0, 0, 0]])
+def test_what_is_no_rotation_is_refused(quat):
+    with pytest.raises(InputError, match=r"frame 1: the quaternion .* is not a rotation"):
+        rotations_from_wxyz(np.array([[1, 0, 0, 0], quat], float), lambda index: f"frame {index}", unit=False)
+
+
+def test_small_angles_are_exact():
+    turn = Rotation.from_rotvec([[1e-7, 0, 0], [0, np.pi, 0]]).as_matrix()
+    np.testing.assert_allclose(rotation_angles_deg(turn), np.rad2deg([1e-7, np.pi]), rtol=1e-6)
+
+
+# TUM
+
+
+def tum_file(path, rows):
+    path.write_text("# a comment\n\n" + as_text(rows))
+    return path
+
+
+def test_tum_is_camera_to_world_with_w_last(tmp_path):
+    read = tum.read(tum_file(tmp_path / "poses", [[3.5, 1, 2, 3, 0, 0, HALF, HALF]]))
+    np.testing.assert_allclose(read.rotations[0], QUARTER, atol=1e-15)
+    np.testing.assert_array_equal(read.centers[0], [1, 2, 3])
+    assert read.timestamps.tolist() == [3.5]
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ([1, 1, 2, 3, 0, 0, 0, 0], "line 4: the quaternion .* is not a rotation"),
+        ([1, 1, 2, 3, 0, 0, 0, 1.01], "line 4: a quaternion of length 1.01. Expected length 1 within 0.001"),
+        ([1, 1, 2, 3, 0, 0, 1], "line 4: '1.0 1.0 2.0 3.0 0.0 0.0 1.0'. Expected 8 finite numbers"),
+        ([1, np.nan, 2, 3, 0, 0, 0, 1], "line 4: .*nan"),
+    ],
+)
+def test_tum_refusals_name_the_line(tmp_path, row, message):
+    path = tum_file(tmp_path / "poses", [[0, 1, 2, 3, 0, 0, 0, 1.0005], row])
+    with pytest.raises(InputError, match=f"{re.escape(str(path))}, {message}"):
+        tum.read(path)
+
+
+def test_tum_of_comments_alone_holds_no_poses(tmp_path):
+    with pytest.raises(InputError, match="holds no poses"):
+        tum.read(tum_file(tmp_path / "poses", []).rename(tmp_path / "empty"))
+
+
+# C3VD
+
+
+@pytest.mark.parametrize("order", ["column-major", "row-major"])
+def test_c3vd_in_both_orders(tmp_path, order):
+    trajectory = winding(5)
+    stored = trajectory.camera_to_world
+    stored = stored.transpose(0, 2, 1) if order == "column-major" else stored
+    (tmp_path / "pose.txt").write_text(as_text(stored.reshape(-1, 16), ","))
+    read = c3vd.read(tmp_path / "pose.txt")
+    np.testing.assert_array_equal(read.camera_to_world, trajectory.camera_to_world)
+    assert order in read.stored_as
+
+
+def test_c3vd_is_written_column_by_column(tmp_path):
+    trajectory = winding(4)
+    c3vd.write(tmp_path / "pose.txt", trajectory)
+    numbers = np.loadtxt(tmp_path / "pose.txt", delimiter=",")
+    np.testing.assert_array_equal(numbers[:, 12:15], trajectory.centers)
+    np.testing.assert_array_equal(numbers[:, :3], trajectory.camera_to_world[:, :3, 0])
+
+
+# nerfstudio
+
+
+def transforms(path, matrices, names=None, frame=None, **content):
+    names = names or [f"{index}.png" for index in range(len(matrices))]
+    frames = [
+        {"file_path": name, "transform_matrix": np.asarray(matrix).tolist(), **(frame or {})}
+        for name, matrix in zip(names, matrices, strict=True)
+    ]
+    path.write_text(json.dumps({**content, "frames": frames}))
+    return path
+
+
+def test_opengl_cameras_look_along_minus_z_and_hold_y_up(tmp_path):
+    read = nerfstudio.read(transforms(tmp_path / "t.json", [some_transform(1)]))
+    opengl = some_transform(1)
+    np.testing.assert_array_equal(read.camera_to_world[0, :3, 2], -opengl[:3, 2])
+    np.testing.assert_array_equal(read.camera_to_world[0, :3, 1], -opengl[:3, 1])
+    np.testing.assert_array_equal(read.camera_to_world[0, :3, [0, 3]], opengl[:3, [0, 3]].T)
+
+
+def test_frames_are_ordered_as_people_count(tmp_path):
+    matrices = [some_transform(seed) for seed in range(3)]
+    read = nerfstudio.read(transforms(tmp_path / "t.json", matrices, ["i/10.png", "i/9.png", "i/1.png"]))
+    assert read.names == ("i/1.png", "i/9.png", "i/10.png")
+    np.testing.assert_array_equal(read.centers, [matrices[index][:3, 3] for index in (2, 1, 0)])
+    assert any("order of their names" in remark for remark in read.remarks)
+
+
+@given(seed=st.integers(0, 1000), scale=st.floats(0.01, 100))
+@settings(max_examples=10, deadline=None)
+def test_nerfstudios_change_of_the_world_is_undone(tmp_path_factory, seed, scale):
+    applied = some_transform(seed)
+    matrices = [some_transform(seed + 1), some_transform(seed + 2)]
+    stored = [applied @ matrix for matrix in matrices]
+    for matrix in stored:
+        matrix[:3, 3] *= scale
+    path = tmp_path_factory.mktemp("nerf") / "t.json"
+    transforms(path, stored, applied_transform=applied[:3].tolist(), applied_scale=scale)
+    changed, plain = (
+        nerfstudio.read(path),
+        nerfstudio.read(transforms(path.with_name("plain.json"), matrices)),
+    )
+    np.testing.assert_allclose(changed.camera_to_world, plain.camera_to_world, atol=1e-9)
+    assert any("applied_transform" in remark for remark in changed.remarks)
+    assert not plain.remarks[:-1]
+
+
+def test_three_rows_are_enough(tmp_path):
+    matrix = some_transform(2)
+    read = nerfstudio.read(transforms(tmp_path / "t.json", [matrix[:3]]))
+    np.testing.assert_array_equal(read.centers[0], matrix[:3, 3])
+
+
+PINHOLE = {"fl_x": 100.0, "fl_y": 90.0, "cx": 31.0, "cy": 25.0, "w": 64, "h": 48}
+
+
+@pytest.mark.parametrize(
+    ("content", "frame", "expected", "remark"),
+    [
+        (PINHOLE, {}, (100, 90, 31, 25, 64, 48), None),
+        (PINHOLE, {"fl_x": 50.0}, (50, 90, 31, 25, 64, 48), None),
+        ({**PINHOLE, "camera_model": "OPENCV", "k1": 0.0}, {}, (100, 90, 31, 25, 64, 48), None),
+        ({"camera_angle_x": np.pi / 2, "w": 64, "h": 48}, {}, (32, 32, 32, 24, 64, 48), None),
+        ({**PINHOLE, "k1": 0.1}, {}, None, "distorted"),
+        ({**PINHOLE, "camera_model": "OPENCV_FISHEYE"}, {}, None, "OPENCV_FISHEYE"),
+        ({"fl_x": 100.0, "w": 64}, {}, None, "no fl_y, cx, cy, h"),
+    ],
+)
+def test_intrinsics(tmp_path, content, frame, expected, remark):
+    read = nerfstudio.read(transforms(tmp_path / "t.json", [some_transform(0)] * 2, frame=frame, **content))
+    if expected is None:
+        assert read.intrinsics is None
+        assert remark in read.remarks[-1]
+    else:
+        found = read.intrinsics
+        numbers = (found.fx, found.fy, found.cx, found.cy, found.width, found.height)
+        np.testing.assert_allclose(numbers, expected)
+        assert not read.remarks
+
+
+def test_different_cameras_are_no_common_intrinsics(tmp_path):
+    path = transforms(tmp_path / "t.json", [some_transform(0)] * 2, **PINHOLE)
+    content = json.loads(path.read_text())
+    content["frames"][1]["fl_x"] = 99.0
+    path.write_text(json.dumps(content))
+    assert nerfstudio.read(path).remarks == ("no intrinsics: the images have 2 different cameras",)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "is not JSON"),
+        ("[1]", "holds a JSON list"),
+        ("{}", "has no frames"),
+        ('{"frames": []}', "has no frames"),
+        ('{"frames": [3]}', "frame 0: no file_path"),
+        ('{"frames": [{"file_path": "a"}]}', r"frame 0 \(a\): transform_matrix is missing"),
+        ('{"frames": [{"file_path": "a", "transform_matrix": [[1, 2], [3]]}]}', "4 .or 3. rows of 4 finite numbers"),
+        (
+            '{"frames": [{"file_path": "a", "transform_matrix": [[NaN,0,0,0],[0,1,0,0],[0,0,1,0]]}]}',
+            "is nan in row 0, column 0",
+        ),
+    ],
+)
+def test_broken_transforms_are_refused(tmp_path, text, message):
+    (tmp_path / "t.json").write_text(text)
+    with pytest.raises(InputError, match=message):
+        nerfstudio.read(tmp_path / "t.json")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"applied_transform": [[1, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 0]]}, "applied_transform: not a rigid transform"),
+        ({"applied_transform": "x"}, "applied_transform is not a matrix"),
+        ({"applied_scale": 0}, "applied_scale is 0"),
+        ({"applied_scale": True}, "applied_scale is True"),
+        ({**PINHOLE, "fl_x": "long"}, "fl_x is 'long'"),
+        ({**PINHOLE, "w": 0}, "t.json: intrinsics .* image 0 x 48"),
+    ],
+)
+def test_broken_values_of_transforms_are_refused(tmp_path, content, message):
+    with pytest.raises(InputError, match=message):
+        nerfstudio.read(transforms(tmp_path / "t.json", [some_transform(0)], **content))
+
+
+def test_frames_of_transforms_are_checked(tmp_path):
+    stretched = some_transform(0) @ np.diag([1.1, 1, 1, 1])
+    with pytest.raises(InputError, match=r"frame 1 \(1\.png\): not a rigid transform"):
+        nerfstudio.read(transforms(tmp_path / "t.json", [some_transform(0), stretched]))
+    with pytest.raises(InputError, match=r"'a' is repeated \(poses 0 and 1\)"):
+        nerfstudio.read(transforms(tmp_path / "t.json", [some_transform(0)] * 2, ["a", "a"]))
+
+
+# Order
+
+
+def test_natural_order():
+    names = ["10.png", "9.png", "frame2", "frame10", "1.png", "01.png", "frame"]
+    assert [names[index] for index in natural_order(names)] == [
+        "01.png", "1.png", "9.png", "10.png", "frame", "frame2", "frame10"
+    ]  # fmt: skip
+
+
+# Real data
+
+
+def test_three_files_of_one_real_trajectory_agree(shared_data):
+    poses = c3vd.read(shared_data / "c3vd_pose_cecum_t1_a" / "pose.txt")
+    opengl = nerfstudio.read(shared_data / "c3vd_cecum_t1_a" / "transforms.json")
+    frames = json.loads((shared_data / "c3vd_cecum_t1_a" / "frames.json").read_text())["frames"]
+    assert len(poses) == len(opengl) == len(frames) == 276
+    opencv = np.array([frame["c2w"] for frame in frames])
+    # The same numbers, written twice.
+    np.testing.assert_allclose(opengl.camera_to_world, opencv, rtol=0, atol=1e-12)
+    # REIM-NeRF's digits and C3VD's, each rounded on its own.
+    away = np.linalg.norm(poses.centers - opengl.centers, axis=1)
+    assert np.sqrt(np.mean(away**2)) < 2e-4
+    assert opengl.intrinsics is None
+    assert "OPENCV_FISHEYE" in opengl.remarks[-1]

@@ -1,0 +1,117 @@
+"""Comparison over scenes: pairing, seeds, adjustment, and what too few scenes allow."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+from statsmodels.stats.multitest import multipletests
+
+from coliags_plugin.results.comparisons import compare_with_rivals
+from coliags_plugin.results.spread import common_scenes, scene_means, spread
+
+
+def one_seed(values):
+    """Values of scenes a, b, ... under seed 0; None leaves a scene out."""
+    return {chr(97 + index): {0: value} for index, value in enumerate(values) if value is not None}
+
+
+def test_spread_by_hand():
+    values = {"a": {0: 1.0, 1: 3.0}, "b": {0: 5.0}, "c": {0: 7.0, 1: 7.0, 2: 13.0}}
+    found = spread(values, ["a", "b", "c"])
+    assert (found.mean, found.scenes) == (pytest.approx(16 / 3), 3)
+    assert found.over_scenes == pytest.approx(np.std([2, 5, 9], ddof=1))
+    assert found.over_seeds == pytest.approx(np.sqrt((2 + 12) / 2))
+    alone = spread(values, ["b"])
+    assert (alone.mean, alone.over_scenes, alone.over_seeds) == (5.0, None, None)
+
+
+def test_frames_and_seeds_do_not_count_as_scenes():
+    """Ten seeds of one scene are one number."""
+    values = {"x": {"a": dict.fromkeys(range(10), 2.0)}, "y": {"a": dict.fromkeys(range(10), 1.0)}}
+    (row,) = compare_with_rivals(values, "x", True)
+    assert (len(row.scenes), row.lead, row.tests, row.stars) == (1, 1.0, None, "")
+
+
+def test_common_scenes_keep_the_order():
+    assert common_scenes([one_seed([1, 2, 3]), {"c": {0: 1}, "a": {0: 1}, "b": {}}]) == ["a", "c"]
+    assert scene_means({"a": {0: 1.0, 3: 2.0}, "b": {}}) == {"a": 1.5}
+    assert common_scenes([]) == []
+
+
+def test_a_comparison_is_the_references():
+    rng = np.random.default_rng(1)
+    ours = rng.normal(33.0, 2.0, 10)
+    rivals = {"x": ours - rng.normal(1.0, 0.8, 10), "y": ours - rng.normal(0.4, 0.8, 10), "z": ours + 0.5}
+    values = {"ours": one_seed(ours), **{name: one_seed(rival) for name, rival in rivals.items()}}
+    rows = compare_with_rivals(values, "ours", higher_is_better=True)
+    raw = [stats.wilcoxon(ours, rival).pvalue for rival in rivals.values()]
+    holm = multipletests(raw, method="holm")[1]
+    assert [row.rival for row in rows] == ["x", "y", "z"]
+    assert [row.tests.wilcoxon for row in rows] == pytest.approx(raw)
+    assert [row.tests.wilcoxon_holm for row in rows] == pytest.approx(holm.tolist())
+    assert rows[0].tests.t_test == pytest.approx(stats.ttest_rel(ours, rivals["x"]).pvalue)
+    assert rows[2].tests.t_test is None  # all differences are -0.5
+    t_holm = multipletests([rows[0].tests.t_test, rows[1].tests.t_test], method="holm")[1]
+    assert [rows[0].tests.t_test_holm, rows[1].tests.t_test_holm] == pytest.approx(t_holm.tolist())
+    assert rows[2].lead == pytest.approx(-0.5)
+    assert (rows[2].better_on, rows[2].tests.rank_biserial) == (0, -1.0)
+    assert rows[0].tests.interval[0] < rows[0].lead < rows[0].tests.interval[1]
+
+
+def test_lower_is_better_turns_the_lead():
+    values = {"ours": one_seed([1.0, 2.0]), "rival": one_seed([3.0, 3.0])}
+    (lower,), (higher,) = (compare_with_rivals(values, "ours", which) for which in (False, True))
+    assert (lower.lead, lower.better_on) == (1.5, 2)
+    assert (higher.lead, higher.better_on) == (-1.5, 0)
+
+
+def test_every_pair_is_compared_on_its_own_scenes():
+    values = {
+        "ours": one_seed([9.0] * 8),
+        "whole": one_seed([1.0] * 8),
+        "part": one_seed([1.0, None, 3.0] + [1.0] * 5),
+        "none": {"q": {0: 1.0}},
+    }
+    whole, part, none = compare_with_rivals(values, "ours", True)
+    assert len(whole.scenes) == 8
+    assert part.scenes == ("a", "c", "d", "e", "f", "g", "h")
+    assert part.lead == pytest.approx(8 - 2 / 7)
+    assert (none.scenes, none.lead, none.tests) == ((), None, None)
+
+
+@pytest.mark.parametrize(
+    ("scenes", "rivals", "stars"),
+    [(5, 1, ""), (6, 1, "*"), (6, 2, ""), (8, 1, "**"), (8, 6, "*"), (8, 7, ""), (11, 1, "***"), (22, 6, "***")],
+)
+def test_stars_are_those_that_so_many_scenes_and_rivals_allow(scenes, rivals, stars):
+    """The reference wins everywhere: nothing can be more significant."""
+    leads = np.linspace(1.0, 2.0, scenes)
+    values = {"ours": one_seed(leads), **{f"rival {index}": one_seed(0 * leads) for index in range(rivals)}}
+    assert {row.stars for row in compare_with_rivals(values, "ours", True)} == {stars}
+
+
+def test_ties_give_no_star_below_what_is_possible():
+    """The normal approximation of six equal differences would give p = .014."""
+    values = {"ours": one_seed([2.0] * 6), "rival": one_seed([1.0] * 6)}
+    (row,) = compare_with_rivals(values, "ours", True)
+    assert row.tests.wilcoxon == pytest.approx(2 / 64)
+    assert row.stars == "*"
+
+
+leads_of_scenes = st.lists(st.integers(-50, 50).map(float), min_size=6, max_size=9)
+
+
+@settings(deadline=None, max_examples=20)
+@given(leads_of_scenes)
+def test_swapping_reference_and_rival(leads):
+    values = {"one": one_seed(leads), "other": one_seed([0.0] * len(leads))}
+    ((there,), (back,)) = (compare_with_rivals(values, name, True) for name in ("one", "other"))
+    assert there.lead == -back.lead
+    assert there.tests.wilcoxon == pytest.approx(back.tests.wilcoxon)
+    assert there.tests.rank_biserial == pytest.approx(-back.tests.rank_biserial)
+    assert there.tests.interval == pytest.approx((-back.tests.interval[1], -back.tests.interval[0]))
+    assert there.stars == back.stars
+    assert there.better_on + back.better_on == sum(lead != 0 for lead in leads)

@@ -1,0 +1,156 @@
+"""Paired tests against scipy and statsmodels, and their properties."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+from statsmodels.stats.multitest import multipletests
+
+from coliags_plugin.results.paired import (
+    RESAMPLES,
+    bootstrap_interval,
+    cohen_dz,
+    holm,
+    rank_biserial,
+    smallest_p,
+    t_test_p,
+    wilcoxon_p,
+)
+
+probabilities = st.lists(st.floats(0.0, 1.0), min_size=1, max_size=9)
+#: Multiples of 1/8, so that ties, zeros and their negatives are exact.
+differences = st.lists(st.integers(-40, 40).map(lambda k: k / 8), min_size=2, max_size=8).map(np.array)
+
+
+def sign_changes(sample: np.ndarray) -> np.ndarray:
+    """The sample under every change of signs. [2^n, n]"""
+    signs = np.array(np.meshgrid(*[[1.0, -1.0]] * len(sample))).reshape(len(sample), -1).T
+    return signs * np.abs(sample)
+
+
+def enumerated_p(sample: np.ndarray) -> float:
+    """Two-sided p of the signed-rank sum, by counting all sign changes."""
+    kept = sample[sample != 0]
+    if not len(kept):
+        return 1.0
+    ranks = stats.rankdata(np.abs(kept))
+    sums = (np.sign(sign_changes(kept)) * ranks).sum(axis=1)
+    return float(np.mean(np.abs(sums) >= abs((np.sign(kept) * ranks).sum()) - 1e-9))
+
+
+@pytest.mark.parametrize("p_values", [[0.01], [0.04, 0.01, 0.01, 0.9], [0.3, 0.02, 0.0, 1.0, 0.011, 0.02]])
+def test_holm_is_that_of_statsmodels(p_values):
+    assert holm(p_values) == pytest.approx(multipletests(p_values, method="holm")[1].tolist())
+
+
+@given(probabilities)
+def test_holm_keeps_the_order_and_never_lowers(p_values):
+    adjusted = holm(p_values)
+    assert all(p <= q <= 1.0 for p, q in zip(p_values, adjusted, strict=True))
+    order = np.argsort(p_values, kind="stable")
+    assert np.all(np.diff(np.array(adjusted)[order]) >= 0)
+    assert min(adjusted) == pytest.approx(min(1.0, len(p_values) * min(p_values)))
+
+
+@given(probabilities, st.data())
+def test_holm_does_not_depend_on_the_order(p_values, data):
+    order = data.draw(st.permutations(range(len(p_values))))
+    assert holm([p_values[index] for index in order]) == [holm(p_values)[index] for index in order]
+
+
+@pytest.mark.parametrize(
+    ("scenes", "p"), [(1, 1.0), (3, 0.25), (5, 0.0625), (6, 0.03125), (7, 0.015625), (8, 0.0078125)]
+)
+def test_smallest_p_is_reached_where_one_method_always_wins(scenes, p):
+    assert smallest_p(scenes) == p
+    assert wilcoxon_p(np.arange(1.0, scenes + 1)) == pytest.approx(p)
+
+
+@settings(deadline=None, max_examples=40)
+@given(differences)
+def test_wilcoxon_counts_sign_changes(sample):
+    """Exact with ties and zeros too."""
+    assert wilcoxon_p(sample) == pytest.approx(enumerated_p(sample))
+    assert smallest_p(len(sample)) <= wilcoxon_p(sample) <= 1.0
+
+
+@pytest.mark.parametrize("size", [6, 8, 22, 40])
+def test_wilcoxon_is_scipys_without_ties(size):
+    sample = np.random.default_rng(size).normal(0.3, 1.0, size)
+    assert wilcoxon_p(sample) == pytest.approx(stats.wilcoxon(sample, method="exact").pvalue)
+
+
+def test_wilcoxon_with_ties_is_scipys_enumeration():
+    sample = np.array([1.0, -1.0, 2.0, 2.0, -3.0, 4.0, 4.0, 4.0])
+    assert wilcoxon_p(sample) == pytest.approx(stats.wilcoxon(sample, method=stats.PermutationMethod()).pvalue)
+
+
+def test_large_samples_are_approximated():
+    sample = np.random.default_rng(2).normal(0.2, 1.0, 60)
+    assert wilcoxon_p(sample) == pytest.approx(stats.wilcoxon(sample, method="asymptotic").pvalue)
+    assert wilcoxon_p(np.round(sample, 1)) == pytest.approx(stats.wilcoxon(np.round(sample, 1)).pvalue)
+
+
+def test_fifty_ties_are_exact():
+    """All of one sign: only one of the 2^50 sign changes is as extreme on each side."""
+    assert wilcoxon_p(np.ones(50)) == smallest_p(50)
+
+
+def test_t_test_is_scipys():
+    one, other = np.random.default_rng(3).normal(size=(2, 8))
+    assert t_test_p(one - other) == pytest.approx(stats.ttest_rel(one, other).pvalue)
+
+
+@settings(deadline=None, max_examples=25)
+@given(differences, st.sampled_from([0.125, 0.5, 3.0, 1024.0]))
+def test_swap_and_scale(sample, factor):
+    """Swapping the methods flips effects and keeps p; another unit keeps both."""
+    for test in (wilcoxon_p, t_test_p):
+        p = test(sample)
+        assert test(-sample) == (None if p is None else pytest.approx(p))
+        assert test(factor * sample) == (None if p is None else pytest.approx(p))
+    for effect in (cohen_dz, rank_biserial):
+        size = effect(sample)
+        assert effect(-sample) == (None if size is None else pytest.approx(-size))
+        assert effect(factor * sample) == (None if size is None else pytest.approx(size))
+    low, high = bootstrap_interval(sample)
+    assert bootstrap_interval(-sample) == pytest.approx((-high, -low))
+    assert bootstrap_interval(factor * sample) == pytest.approx((factor * low, factor * high))
+
+
+@pytest.mark.parametrize("value", [0.0, 0.1, -3.7])
+def test_equal_differences_have_no_t_and_no_d(value):
+    sample = np.full(7, value)
+    assert t_test_p(sample) is None
+    assert cohen_dz(sample) is None
+    assert bootstrap_interval(sample) == pytest.approx((value, value))
+
+
+def test_effect_sizes_by_hand():
+    sample = np.array([1.0, 2.0, 3.0, -4.0])
+    assert cohen_dz(sample) == pytest.approx(0.5 / np.sqrt(29 / 3))
+    assert rank_biserial(sample) == pytest.approx((1 + 2 + 3 - 4) / 10)
+    assert rank_biserial(np.zeros(3)) == 0.0
+    assert rank_biserial(np.array([0.0, 1.0, 2.0])) == 1.0
+
+
+def test_bootstrap_is_scipys_percentile_interval():
+    sample = np.random.default_rng(5).gamma(2.0, size=8)
+    reference = stats.bootstrap(
+        (sample,), np.mean, n_resamples=RESAMPLES, method="percentile", random_state=np.random.default_rng(0)
+    ).confidence_interval
+    # Both take the same resamples of the same generator.
+    assert bootstrap_interval(sample) == pytest.approx((reference.low, reference.high))
+
+
+def test_bootstrap_is_reproducible_and_covers():
+    """The interval of the mean of 20 normal numbers contains the true mean about as often as it says."""
+    sample = np.random.default_rng(6).normal(size=12)
+    assert bootstrap_interval(sample, seed=1) == bootstrap_interval(sample, seed=1)
+    assert bootstrap_interval(sample, seed=1) != bootstrap_interval(sample, seed=2)
+    samples = np.random.default_rng(7).normal(size=(100, 20))
+    inside = sum(low <= 0.0 <= high for low, high in map(bootstrap_interval, samples))
+    assert 86 <= inside <= 99

@@ -1,0 +1,108 @@
+"""``coliags coverage`` on phantoms: files, truth, lenses, and errors."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from coliags_plugin.api.scenes import make_phantom
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.geometry.lenses.models import OmnidirectionalLens
+from coliags_plugin.geometry.meshes.files import read_mesh, write_mesh
+from coliags_plugin.geometry.meshes.truth import read_true_surface
+from coliags_plugin.surface.coverage.scene_views import recorded_views
+from coliags_plugin.surface.coverage.settings import CoverageSettings
+from coliags_plugin.surface.coverage.text import RESEARCH_USE
+from coliags_plugin.surface.coverage.writing import measure_scene, open_recording
+from tests.commands import refused, run
+
+SMALL = {"seed": 3, "frames": 9, "rotation_views": 0, "supersampling": 1, "mesh_spacing": 3.0, "texture_spacing": 1.0}
+SIZE = (96, 80)
+
+
+@pytest.fixture(scope="module", params=["c3vd", "c3vd-raw"])
+def phantom(request, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("coverage") / request.param
+    width, height = SIZE if request.param == "c3vd" else (100, 80)
+    return make_phantom(
+        folder, layout=request.param, width=width, height=height, interreflection=0.0, path_length=30.0, **SMALL
+    )
+
+
+def true_mesh(phantom):
+    return phantom / "truth" / "mesh.ply"
+
+
+def test_frames_are_seen_through_the_lens_that_recorded_them(phantom):
+    views = recorded_views(open_recording(phantom))
+    assert len(views) == 9
+    raw = isinstance(views[0].lens, OmnidirectionalLens)
+    assert raw == (phantom.name == "c3vd-raw") and (views[0].mask is not None) == raw
+    assert views[0].read_image().shape == (views[0].lens.height, views[0].lens.width, 3)
+
+
+def test_the_true_mesh_has_its_true_coverage(phantom, tmp_path):
+    """One ray at the centre of each pixel is what the truth of a phantom without supersampling is made of."""
+    scene = open_recording(phantom)
+    lens = recorded_views(scene)[0].lens
+    # The truth counts wall at any distance.
+    settings = CoverageSettings(rays=lens.width * lens.height, max_distance=500.0)
+    made = measure_scene(scene, read_mesh(true_mesh(phantom)), tmp_path / "made", settings)
+    scores = made.evaluation.surface
+    # Only triangles between the rays, seen by their centroids, differ.
+    assert scores.false_alarm == pytest.approx(0.0, abs=2e-3)
+    assert scores.face_iou > 0.9 and scores.region_iou > 0.9 and scores.recall == 1.0
+    rays = made.evaluation.rays
+    assert rays.face_iou > 0.995 and rays.false_reassurance == pytest.approx(0.0, abs=1e-6)
+    assert made.evaluation.all_unseen.false_reassurance == 0.0
+    assert made.evaluation.random.face_iou < scores.face_iou
+
+
+def test_the_command_writes_a_folder(phantom, tmp_path, capsys):
+    # Wall that nobody saw is cut out, as in a reconstruction.
+    truth = read_true_surface(phantom, any_frame=True)
+    wall, out = tmp_path / "wall.ply", tmp_path / "out"
+    write_mesh(wall, truth.mesh.part(truth.seen))
+    assert run("coverage", phantom, "--mesh", wall, "--out", out, "--set", "rays=8000") == 0
+    printed = capsys.readouterr().out
+    assert RESEARCH_USE in printed and printed.splitlines()[-1] == str(out)
+    found = json.loads((out / "coverage.json").read_text())
+    assert sum(found["shares"].values()) == pytest.approx(1.0)
+    assert found["guessed_share"] > 0.05 and found["note"] == RESEARCH_USE
+    # Nothing is called seen but what was reconstructed.
+    assert found["truth"]["surface"]["false_reassurance"] < 0.05
+    rows = list(csv.DictReader((out / "regions.csv").open()))
+    areas = [region["area"] for region in found["regions"]]
+    assert [float(row["area_mm2"]) for row in rows] == pytest.approx(areas, abs=1e-3)
+    assert len(rows) >= 1 and all(float(row["diameter_mm"]) > 5.0 for row in rows)
+    page = (out / "coverage.html").read_text()
+    assert RESEARCH_USE in page and "http" not in page.replace("http://www.w3.org", "")
+    assert (out / "map.png").is_file() and read_mesh(out / "coverage.ply").colors is not None
+    assert "already exists" in refused(capsys, "coverage", phantom, "--mesh", wall, "--out", out)
+
+
+def test_bad_input_is_one_clear_error(phantom, tmp_path, capsys):
+    mesh, out = true_mesh(phantom), tmp_path / "out"
+    for arguments, told in (
+        ((phantom,), "is not a run folder"),
+        ((phantom, "--mesh", tmp_path / "none.ply", "--out", out), "none.ply"),
+        ((phantom, "--mesh", mesh, "--out", out, "--set", "farr=3"), "'farr'"),
+        ((phantom, "--mesh", mesh, "--out", out, "--truth", tmp_path), "no true surface"),
+        ((tmp_path / "gone", "--mesh", mesh, "--out", out), "gone"),
+    ):
+        assert told in refused(capsys, "coverage", *arguments), arguments
+    assert not out.exists()
+
+
+def test_a_mesh_of_another_world_and_a_scene_of_unknown_unit_are_refused(phantom, tmp_path):
+    scene, mesh = open_recording(phantom), read_mesh(true_mesh(phantom))
+    away = type(mesh)(mesh.vertices + np.float32(5000.0), mesh.triangles)
+    with pytest.raises(InputError, match="no viewing ray"):
+        measure_scene(scene, away, tmp_path / "out", CoverageSettings())
+    scene.provenance["unit"] = "unknown"
+    with pytest.raises(InputError, match="unit of length"):
+        measure_scene(scene, mesh, tmp_path / "out", CoverageSettings())
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,150 @@
+"""Centreline, unrolling, closing of holes and missed regions on tubes of known shape."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tubes import grid_mesh, pinhole, plane, tube, view_at
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh
+from coliags_plugin.surface.coverage.centreline import find_centreline
+from coliags_plugin.surface.coverage.levels import Level
+from coliags_plugin.surface.coverage.map import draw_map
+from coliags_plugin.surface.coverage.measure import measure_coverage
+from coliags_plugin.surface.coverage.section import find_section
+from coliags_plugin.surface.coverage.settings import CoverageSettings
+from coliags_plugin.surface.coverage.tube import guessed_wall, wall_around
+from coliags_plugin.surface.coverage.visibility import RayCaster
+
+FEW_RAYS = CoverageSettings(rays=20_000)
+
+
+def path(*places: float, **options):
+    """Cameras on the axis, looking deeper."""
+    return [view_at((0.5, -0.3, z), name=f"z{z:g}", **options) for z in places]
+
+
+def without(mesh: TriangleMesh, z: tuple[float, float], angle: tuple[float, float]) -> TriangleMesh:
+    """The mesh with a window cut out, in mm along z and degrees from x to y."""
+    x, y, depth = mesh.centers.T
+    around = np.degrees(np.arctan2(y, x)) % 360.0
+    cut = (depth > z[0]) & (depth < z[1]) & (around > angle[0]) & (around < angle[1])
+    return mesh.part(~cut)
+
+
+def poses(views):
+    return np.stack([view.camera_to_world for view in views])
+
+
+def test_the_centreline_of_a_cylinder_is_its_axis():
+    mesh = tube(radius=10.0)
+    line = find_centreline(mesh, poses(path(10.0, 0.0, 5.0)))
+    assert np.abs(line.points[:, :2]).max() < 0.1
+    assert np.allclose(line.frames[:, :, 2], [0, 0, 1], atol=0.02)
+    assert line.points[0, 2] < -15.0 and line.points[-1, 2] > 75.0
+    points = np.array([[0.0, -10.0, 30.0], [10.0, 0.0, -7.0], [0.0, 10.0, 0.0], [-4.0, 0.0, 12.25]])
+    arc, clock, radius = line.unroll(points)
+    # Images are upright: their up is -y, their right x; place 0 is at the shallowest camera.
+    assert np.allclose(arc, points[:, 2], atol=1.0) and np.allclose(np.diff(arc), np.diff(points[:, 2]), atol=0.1)
+    assert np.allclose(clock % 360.0, [0.0, 90.0, 180.0, 270.0], atol=1.0) or np.isclose(clock[0], 360.0, atol=1.0)
+    assert np.allclose(radius, [10.0, 10.0, 10.0, 4.0], atol=0.1)
+
+
+def test_places_count_from_the_shallowest_camera_also_where_it_is_before_the_wall():
+    line = find_centreline(tube(radius=10.0, start=12.0), poses(path(0.0, 4.0, 8.0)))
+    arc, _, _ = line.unroll(np.array([[0.0, 10.0, 30.0], [10.0, 0.0, 60.0]]))
+    assert np.allclose(arc, [30.0, 60.0], atol=0.5)
+
+
+def test_the_centreline_follows_a_bend_around_folds():
+    turn, bend = np.linspace(0.0, np.pi / 2.0, 150), 50.0
+    angle = np.arange(72) * (2.0 * np.pi / 72)
+    size = 12.0 - 3.0 * np.exp(-(((turn[:, None] * bend) % 20.0 - 10.0) ** 2) / 4.0) * (1.0 + np.cos(angle)) / 2.0
+    reach = bend + size * np.cos(angle)
+    points = np.stack([bend - reach * np.cos(turn)[:, None], size * np.sin(angle), reach * np.sin(turn)[:, None]], -1)
+    line = find_centreline(grid_mesh(points, around=True), poses([view_at((0.5, 0, 15), (0.3, 0, 1))]))
+    off = np.hypot(np.hypot(line.points[:, 0] - bend, line.points[:, 2]) - bend, line.points[:, 1])
+    assert off.max() < 2.0 and off.mean() < 1.0
+    assert line.arc[-1] - line.arc[0] > 0.85 * bend * np.pi / 2.0
+
+
+def test_a_hole_is_closed_where_the_cylinder_was():
+    whole = tube(radius=15.0)
+    mesh = without(whole, (30.0, 42.0), (60.0, 120.0))
+    line = find_centreline(mesh, poses(path(0.0, 5.0)))
+    guess = guessed_wall(wall_around(RayCaster(mesh), line))
+    # The grid may reach over the edge of the hole by a cell, 1 mm along and 2 degrees around.
+    window = 12.0 * 15.0 * np.pi / 3.0
+    middle = np.abs(guess.vertices[:, 2] - 36.0) < 12.0
+    inside = np.abs(guess.centers[:, 2] - 36.0) < 12.0
+    assert window * 0.95 < guess.areas[inside].sum() < window * 1.25
+    assert np.allclose(np.hypot(*guess.vertices[middle, :2].T), 15.0, atol=0.1)
+    inward = -guess.centers[:, :2] / np.linalg.norm(guess.centers[:, :2], axis=1, keepdims=True)
+    assert ((guess.normals[:, :2] * inward).sum(axis=1) > 0.9).all()
+
+
+def test_behind_a_fold_the_guess_returns_to_the_wall():
+    def fold(z, angle):
+        return 18.0 - 8.0 * np.exp(-(np.abs((z - 30.0) / 1.5) ** 3)) * np.ones_like(angle)
+
+    mesh = without(tube(radius=fold, spacing=0.5), (30.5, 45.0), (-1.0, 361.0))
+    guess = guessed_wall(wall_around(RayCaster(mesh), find_centreline(mesh, poses(path(0.0, 5.0)))))
+    beyond = (guess.vertices[:, 2] > 38.0) & (guess.vertices[:, 2] < 45.0)
+    assert np.allclose(np.hypot(*guess.vertices[beyond, :2].T), 18.0, atol=1.5)
+
+
+def test_missed_regions_of_a_hole_and_of_hidden_wall():
+    """A hole of 12 mm by 60 degrees at 90 degrees from x to y, which is below: at six o'clock."""
+    mesh = without(tube(radius=15.0), (30.0, 42.0), (60.0, 120.0))
+    coverage = measure_coverage(mesh, path(0.0, 1.0, 2.0, 3.0, grey=100), FEW_RAYS)
+    inner = [region for region in coverage.regions if not region.at_end]
+    assert len(inner) == 1
+    region = inner[0]
+    assert region.area == pytest.approx(12.0 * 15.0 * np.pi / 3.0, rel=0.25)
+    assert region.guessed_area == pytest.approx(region.area)
+    assert region.arc == pytest.approx(36.0, abs=1.5) and region.clock == pytest.approx(180.0, abs=4.0)
+    assert region.centroid == pytest.approx([0.0, 15.0, 36.0], abs=1.5)
+    assert region.reach == pytest.approx((30.0, 42.0), abs=1.5)
+    assert region.diameter == pytest.approx(2.0 * np.sqrt(region.area / np.pi))
+    assert coverage.area(coverage.guessed) == pytest.approx(region.area, rel=0.01)
+    # What the corners of the image do not show where the section begins.
+    assert all(other.reach[0] < coverage.section.start + 1.0 for other in coverage.regions if other.at_end)
+    image = draw_map(coverage)
+    assert image.dtype == np.uint8 and image.ndim == 3
+
+
+def test_wall_behind_a_fold_is_missed_and_wall_before_it_is_seen():
+    def fold(z, angle):
+        return 18.0 - 8.0 * np.exp(-(((z - 40.0) / 1.2) ** 2)) * np.ones_like(angle)
+
+    mesh = tube(radius=fold, end=110.0)
+    views = path(0.0, 1.0, 2.0, 3.0, 4.0, grey=100, lens=pinhole(64, 64, 20.0))
+    coverage = measure_coverage(mesh, views, CoverageSettings(rays=100_000))
+    # From 4 mm, the crest of radius 10 at 40 mm hides wall up to 4 + 36 * 18 / 10 = 69 mm.
+    ring = next(region for region in coverage.regions if not region.at_end)
+    assert ring.reach[0] == pytest.approx(40.0, abs=1.5) and ring.reach[1] == pytest.approx(69.0, abs=4.0)
+    assert ring.guessed_area == 0.0
+    before = (coverage.arc > 25.0) & (coverage.arc < 35.0)
+    assert coverage.views.seen[before].all() and (coverage.level[before] >= Level.GLANCE).all()
+
+
+def test_a_section_ends_where_less_than_half_was_seen_but_not_at_a_gap_within_its_window():
+    arc = np.repeat(np.arange(100) + 0.5, 4)
+    areas = np.ones(400)
+    share = np.tile(np.arange(4), 100)
+    seen = (arc > 20.0) & (arc < 70.0)
+    section = find_section(arc, areas, seen)
+    assert (section.start, section.end) == pytest.approx((20.0, 70.0), abs=1.01)
+    gap = seen & ~((arc > 40.0) & (arc < 60.0))
+    assert find_section(arc, areas, gap) == section
+    quarter = seen | ((arc >= 70.0) & (share == 0))
+    assert find_section(arc, areas, quarter).end < 75.0
+    assert section.holds(np.array([19.0, 45.0, 72.0])).tolist() == [False, True, False]
+    with pytest.raises(InputError, match="half of the wall"):
+        find_section(arc, areas, np.zeros(400, bool))
+
+
+def test_a_mesh_that_is_no_tube_is_refused():
+    with pytest.raises(InputError, match="centreline"):
+        measure_coverage(plane(30.0, 30.0), [view_at((0, 0, 0), lens=pinhole())], FEW_RAYS)

@@ -1,0 +1,165 @@
+"""Fusion of runs whose depth is exact: the mesh is the surface, and nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.render_output import RenderOutput
+from coliags_plugin.core.scenes import PointCloud
+from coliags_plugin.core.settings import validated
+from coliags_plugin.surface.meshing import fusion
+from coliags_plugin.surface.meshing.fusion import fuse_run, incidence_cosines
+from coliags_plugin.surface.meshing.settings import MeshSettings, max_depth_of, voxel_size_of
+from tests.scenes import camera_at, wall_color, wall_scene
+from tests.surface.meshing.exact import SQUARE, WALL, depth_of, exact_run
+
+
+def test_a_wall():
+    mesh = fuse_run(exact_run())
+    assert np.abs(mesh.vertices[:, 2] - WALL).max() < 0.01
+    # Seen from the cameras, which look along +z, triangles are counter-clockwise.
+    assert (mesh.normals[:, 2] < -0.99).all()
+    expected = wall_color(torch.from_numpy(mesh.vertices)).numpy()
+    assert np.abs(mesh.colors / 255.0 - expected).max() < 0.04
+
+
+def test_no_triangles_fly_between_a_square_and_the_wall_behind_it():
+    settings = MeshSettings(voxel_size=0.3)
+    mesh = fuse_run(exact_run(square=True), settings)
+    z = mesh.vertices[:, 2]
+    # At its edges, the square is as thick as the truncation.
+    assert np.minimum(np.abs(z - SQUARE), np.abs(z - WALL)).max() < 0.3 * settings.truncation
+    assert (z < SQUARE - 0.05).sum() == 0
+    front = mesh.part(mesh.centers[:, 2] < SQUARE + 0.05)
+    # Flat up to a voxel from each of its four edges.
+    assert 3.4**2 <= front.areas.sum() <= 4.0**2
+
+
+def test_small_parts_go_and_large_ones_stay():
+    run = exact_run(square=True)
+    settings = MeshSettings(voxel_size=0.3, min_part=0.5)
+    assert fuse_run(run, settings).vertices[:, 2].min() > 16
+
+
+def test_what_is_masked_is_not_fused():
+    scene = wall_scene(9, 160, 120)
+    mask = torch.ones(120, 160, dtype=torch.bool)
+    mask[:, :80] = False
+    masked = replace(scene, train=[replace(frame, mask=mask) for frame in scene.train])
+    settings = MeshSettings(voxel_size=0.3)
+    half, whole = (fuse_run(exact_run(scene=s), settings).areas.sum() for s in (masked, scene))
+    assert 0.4 < half / whole < 0.65
+
+
+def test_where_the_sensor_clipped_nothing_is_fused():
+    scene = wall_scene(9, 160, 120)
+    bound = torch.full((120, 160), torch.nan)
+    bound[:, :80] = 15.0
+    clipped = replace(scene, train=[replace(frame, depth_at_least=bound) for frame in scene.train])
+    settings = MeshSettings(voxel_size=0.3)
+    half, whole = (fuse_run(exact_run(scene=s), settings).areas.sum() for s in (clipped, scene))
+    assert 0.4 < half / whole < 0.65
+
+
+def test_what_lies_too_far_is_not_fused():
+    with pytest.raises(InputError, match="no surface"):
+        fuse_run(exact_run(), MeshSettings(max_depth=10.0))
+    mesh = fuse_run(exact_run(square=True), MeshSettings(voxel_size=0.3, max_depth=11.5))
+    assert mesh.vertices[:, 2].max() < 16
+
+
+@pytest.mark.parametrize("kind", ["expected", "median"])
+def test_either_kind_of_depth(kind):
+    assert len(fuse_run(exact_run(frames=9), MeshSettings(depth=kind)))
+
+
+def test_transparent_views_have_no_surface():
+    with pytest.raises(InputError, match=r"no surface.*units|no surface.*mm"):
+        fuse_run(exact_run(alpha=0.7))
+    assert len(fuse_run(exact_run(alpha=0.7), MeshSettings(min_alpha=0.5)))
+
+
+def test_flattened_colours_are_those_of_a_held_light(monkeypatch):
+    run = exact_run()
+    asked = []
+
+    def held(name, model, cameras):
+        asked.append((name, len(cameras)))
+        return "light"
+
+    def dark(model, camera, light, wants):
+        assert light == "light"
+        size = (camera.height, camera.width)
+        return RenderOutput(torch.full((*size, 3), 0.2), torch.ones(size), camera)
+
+    monkeypatch.setattr(fusion, "held_light", held)
+    monkeypatch.setattr(fusion, "render_held", dark)
+    mesh = fuse_run(run, MeshSettings(color="flattened"))
+    assert asked == [("flattened", len(run.scene.train))]
+    assert set(np.unique(mesh.colors)) == {51}
+    plain = fuse_run(run)
+    # open3d's threads leave the order of vertices open.
+    assert mesh.areas.sum() == pytest.approx(plain.areas.sum()) and len(np.unique(plain.colors)) > 1
+
+
+def test_one_view_is_refused():
+    scene = wall_scene(9, 32, 24)
+    with pytest.raises(InputError, match="1 training view"):
+        fuse_run(exact_run(scene=replace(scene, train=scene.train[:1])))
+
+
+def test_a_method_without_depth_is_refused():
+    with pytest.raises(InputError, match="meshing with median depth"):
+        fuse_run(exact_run(depth=False))
+
+
+def test_two_views_are_enough():
+    scene = wall_scene(9, 160, 120)
+    assert len(fuse_run(exact_run(scene=replace(scene, train=scene.train[:2]))))
+
+
+def test_incidence_on_a_wall():
+    camera = camera_at(0.0, 0.0, 0.0, 60, 40, yaw=0.4)
+    found = incidence_cosines(depth_of(camera, square=False), camera)
+    rays = camera.rays()
+    assert torch.allclose(found, rays[..., 2].abs() / rays.norm(dim=-1))
+
+
+def test_incidence_at_a_jump():
+    """The last pixels before a jump count as the wall; a pixel in its midst as very oblique."""
+    camera = camera_at(0.0, 0.0, 0.0, 60, 40)
+    depth = torch.full((40, 60), 20.0, dtype=torch.float64)
+    depth[:, 30] = 15.0
+    depth[:, 31:] = 10.0
+    cosines = incidence_cosines(depth, camera)
+    assert cosines[:, 30].max() < 0.1
+    assert cosines[:, [28, 29, 31, 32]].min() > 0.8
+    depth[:, 30] = torch.nan
+    cosines = incidence_cosines(depth, camera)
+    assert cosines[:, [29, 31]].min() > 0.8 and not cosines[:, 30].isfinite().any()
+
+
+def test_defaults_follow_the_scene():
+    scene = wall_scene(9, 160, 120)
+    settings = MeshSettings()
+    assert voxel_size_of(settings, scene) == 2 * scene.pixel_footprint
+    assert voxel_size_of(MeshSettings(voxel_size=0.7), scene) == 0.7
+    # The first training camera stands at z = 0.5, and the points lie on the wall.
+    assert max_depth_of(settings, scene) == pytest.approx(WALL - 0.5, abs=1e-4)
+    empty = replace(scene, points=PointCloud(torch.zeros(0, 3)))
+    assert max_depth_of(settings, empty) == float("inf")
+    with pytest.raises(InputError, match="--voxel"):
+        voxel_size_of(settings, empty)
+
+
+def test_settings_by_name():
+    assert validated(MeshSettings, {"depth": "expected"}, "mesh option").depth == "expected"
+    with pytest.raises(InputError, match=r"unknown key 'dept'.*Did you mean 'depth'"):
+        validated(MeshSettings, {"dept": "expected"}, "mesh option")
+    with pytest.raises(InputError, match="voxel_size"):
+        validated(MeshSettings, {"voxel_size": 0.0}, "mesh option")
