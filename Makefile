@@ -4,48 +4,57 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PYTHONS ?= 3.10 3.11 3.12 3.13
 DEMO ?= demo
-DEMO_STEPS ?= 1200
+DEMO_STEPS ?= 500
 DEMO_FLAGS := --data $(DEMO)/phantom --steps $(DEMO_STEPS) --overwrite
 
-.PHONY: demo test test-slow lint docs options method-table notebooks matrix install system clean
+.PHONY: demo test test-thorough test-slow lint docs options method-table notebooks matrix install install-dev system clean
 
 demo: install
-	$(BIN)/coliags phantom $(DEMO)/phantom --seed 0 --overwrite
-	$(BIN)/coliags train coliags --output $(DEMO)/coliags $(DEMO_FLAGS)
-	$(BIN)/coliags train scaffold-gs-depth --output $(DEMO)/scaffold-gs-depth $(DEMO_FLAGS)
-	$(BIN)/coliags eval $(DEMO)/coliags
-	$(BIN)/coliags eval $(DEMO)/scaffold-gs-depth
-	$(BIN)/coliags report $(DEMO)/coliags $(DEMO)/scaffold-gs-depth --output $(DEMO)/report.html \
+	@echo "1/5  a synthetic colon with exact depth, poses and light ..."
+	@$(BIN)/coliags phantom $(DEMO)/phantom --seed 0 --overwrite
+	@echo "2/5  ColIAGS, $(DEMO_STEPS) steps: about a minute on two cores ..."
+	@$(BIN)/coliags train coliags --output $(DEMO)/coliags $(DEMO_FLAGS)
+	@echo "3/5  Scaffold-GS with the same depth supervision, as many steps: about a minute ..."
+	@$(BIN)/coliags train scaffold-gs-depth --output $(DEMO)/scaffold-gs-depth $(DEMO_FLAGS)
+	@echo "4/5  held-out views of both: seconds ..."
+	@$(BIN)/coliags eval $(DEMO)/coliags
+	@$(BIN)/coliags eval $(DEMO)/scaffold-gs-depth
+	@echo "5/5  the report ..."
+	@$(BIN)/coliags report $(DEMO)/coliags $(DEMO)/scaffold-gs-depth --output $(DEMO)/report.html \
 	  --title "ColIAGS and Scaffold-GS on a synthetic colon" \
 	  --note "A demonstration: $(DEMO_STEPS) steps on a CPU, where the paper trains 30,000."
 
 # In a process per CPU, up to four; each would take all CPUs otherwise.
-test: install
+test: install-dev
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --maxprocesses 4
 
-test-slow: install
+# Long sweeps: fuzz, kills, full disks, browsers, notebooks, benchmarks and the contract of every ablation.
+test-thorough: install-dev
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --maxprocesses 4 -m thorough
+
+test-slow: install-dev
 	$(BIN)/python -m pytest -q -m slow
 
-lint: install
+lint: install-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
 # The site, from docs/, README, CONTRIBUTING and docstrings, in build/site.
-docs: install $(VENV)/installed-docs
+docs: install-dev $(VENV)/installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict --config-file docs/tools/mkdocs.yml
 	@echo "built build/site/index.html"
 
 # docs/options.md, from the settings classes.
-options: install
+options: install-dev
 	$(BIN)/python docs/tools/options.py
 
 # docs/method_table.md, from the method configs.
-method-table: install
+method-table: install-dev
 	$(BIN)/python docs/tools/methods.py
 
 # The outputs stored in docs/notebooks.
-notebooks: install
+notebooks: install-dev
 	$(BIN)/python docs/tools/notebooks.py
 
 # The test suite on every Python that is here.
@@ -60,14 +69,24 @@ matrix:
 
 install: system $(VENV)/installed
 
-$(VENV)/installed: pyproject.toml constraints.txt
+install-dev: system $(VENV)/installed-dev
+
+$(VENV):
 	@$(PYTHON) -c 'import sys; sys.exit("Python 3.10 or newer is needed, not " + sys.version.split()[0] + "; try make PYTHON=python3.11" if sys.version_info < (3, 10) else 0)'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+
+$(VENV)/installed: pyproject.toml constraints.txt | $(VENV)
+	@echo "installing the package and PyTorch into $(VENV): one to two minutes ..."
+	@$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .
 	@touch $@
 
-$(VENV)/installed-docs: $(VENV)/installed
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
+$(VENV)/installed-dev: pyproject.toml constraints.txt | $(VENV)
+	@echo "installing the package, PyTorch and the tools of development into $(VENV): about two minutes ..."
+	@$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@touch $@ $(VENV)/installed
+
+$(VENV)/installed-docs: $(VENV)/installed-dev
+	@$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
 	@touch $@
 
 # open3d loads the system's libusb; no Python package brings it.

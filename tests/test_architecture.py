@@ -35,7 +35,6 @@ SOURCES = {
     ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"): path
     for path in sorted(PACKAGE.rglob("*.py"))
 }
-every_source = pytest.mark.parametrize("name", [name for name in SOURCES if name != ROOT])
 
 
 def imports(path: Path, top_level_only: bool = False) -> set[str]:
@@ -68,14 +67,21 @@ def package_of(name: str) -> str:
     return name.split(".")[1]
 
 
-@every_source
-def test_imports_point_down(name):
-    own = package_of(name)
-    for imported in imports(SOURCES[name]):
-        assert imported != ROOT, f"{name} imports the root, which imports everything"
-        if imported.startswith(ROOT + "."):
-            other = package_of(imported)
-            assert other == own or RANK[other] < RANK[own], f"{name} imports {imported}"
+def components() -> list[str]:
+    """Every module but the root."""
+    return [name for name in SOURCES if name != ROOT]
+
+
+def test_imports_point_down():
+    upwards = []
+    for name in components():
+        own = package_of(name)
+        for imported in imports(SOURCES[name]):
+            is_root = imported == ROOT  # which imports everything
+            other = own if is_root or not imported.startswith(ROOT + ".") else package_of(imported)
+            if is_root or (other != own and RANK[other] >= RANK[own]):
+                upwards.append(f"{name} imports {imported}")
+    assert upwards == []
 
 
 def test_no_import_circle():
@@ -86,35 +92,39 @@ def test_no_import_circle():
         pytest.fail(" <- ".join(error.args[1]))
 
 
-@every_source
-def test_only_the_registry_names_modules_in_strings(name):
+def test_only_the_registry_names_modules_in_strings():
     """What a module imports by name closes circles that no import statement shows; components are the one exception."""
-    assert name == f"{ROOT}.config.registry" or not targets(SOURCES[name])
+    assert {name for name in components() if targets(SOURCES[name])} == {f"{ROOT}.config.registry"}
 
 
-@every_source
-def test_heavy_libraries_are_imported_late(name):
-    path = SOURCES[name]
-    loaded = {imported.split(".")[0] for imported in imports(path, top_level_only=True)}
-    allowed = {"numba"} if "numba_kernels" in path.parts or path.stem == "numba_compilation" else set()
-    assert not loaded & (LAZY - allowed)
+def test_heavy_libraries_are_imported_late():
+    early = []
+    for name in components():
+        path = SOURCES[name]
+        loaded = {imported.split(".")[0] for imported in imports(path, top_level_only=True)}
+        allowed = {"numba"} if "numba_kernels" in path.parts or path.stem == "numba_compilation" else set()
+        early += [f"{name} imports {library}" for library in loaded & (LAZY - allowed)]
+    assert early == []
 
 
-@every_source
-def test_habits(name):
-    path = SOURCES[name]
-    text = path.read_text(encoding="utf-8")
-    tree = ast.parse(text)
-    assert ".cuda(" not in text, "device flows from inputs"
-    assert "manual_seed(" not in re.sub(r"Generator\([^)]*\)\.manual_seed\(", "", text), "no global seeding"
-    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)]
-    names = {call.func.id for call in calls}
-    assert not names & {"eval", "exec"}
-    if package_of(name) != "cli":
-        assert "print" not in names, "libraries log"
-    bare = [node for node in ast.walk(tree) if isinstance(node, ast.ExceptHandler) and node.type is None]
-    assert not bare
-    assert "method ==" not in text, "a method is a config, not a branch"
+def test_habits():
+    faults = []
+    for name in components():
+        text = SOURCES[name].read_text(encoding="utf-8")
+        nodes = list(ast.walk(ast.parse(text)))
+        calls = {node.func.id for node in nodes if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)}
+        bare = any(isinstance(node, ast.ExceptHandler) and node.type is None for node in nodes)
+        seeded = "manual_seed(" in re.sub(r"Generator\([^)]*\)\.manual_seed\(", "", text)
+        checks = {
+            "device flows from inputs": ".cuda(" in text,
+            "no global seeding": seeded,
+            "no eval or exec": bool(calls & {"eval", "exec"}),
+            "libraries log": package_of(name) != "cli" and "print" in calls,
+            "no bare except": bare,
+            "a method is a config, not a branch": "method ==" in text,
+        }
+        faults += [f"{name}: {rule}" for rule, broken in checks.items() if broken]
+    assert faults == []
 
 
 def test_every_package_has_a_layer():

@@ -13,6 +13,8 @@ import pytest
 from coliags_plugin.core.images import read_rgb
 from tests.scenes import write_wall
 
+pytestmark = pytest.mark.thorough
+
 ROOT = Path(__file__).parents[1]
 METHODS = ROOT / "method_configs"
 

@@ -22,6 +22,8 @@ from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.outputs.video import write_video
 from tests.faults import content
 
+pytestmark = pytest.mark.thorough
+
 FRAMES = np.random.default_rng(0).integers(0, 255, (12, 48, 64, 3)).astype(np.uint8)
 
 

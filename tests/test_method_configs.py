@@ -12,6 +12,8 @@ from coliags_plugin.config.method_files import method_files, method_folder
 FOLDER = method_folder()
 METHODS = sorted(name for name, path in method_files().items() if path.is_relative_to(FOLDER))
 
+#: Ablations are checked by ``make test-thorough``: each differs from its method by an option or two.
+THOROUGH = pytest.mark.thorough
 #: Networks so small that a CPU trains them in seconds, by the field's name.
 SMALL_NETWORKS = {
     "reim-nerf": (
@@ -27,7 +29,9 @@ def one_thread(two_threads):
     torch.set_num_threads(1)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "method", [name if "/" not in name else pytest.param(name, marks=THOROUGH) for name in METHODS]
+)
 def test_the_contract(method, tmp_path):
     config = load_method(method).config
     overrides = SMALL_NETWORKS.get(config.field.name, ())

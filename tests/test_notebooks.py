@@ -9,6 +9,8 @@ from runpy import run_path
 
 import pytest
 
+pytestmark = pytest.mark.thorough
+
 ROOT = Path(__file__).parents[1]
 TOOLS = run_path(str(ROOT / "docs" / "tools" / "notebooks.py"))
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))

@@ -58,6 +58,7 @@ def test_the_example_trains_and_is_evaluated(coliags, tmp_path):
     assert scores["psnr"] > 5
 
 
+@pytest.mark.thorough
 def test_the_example_keeps_the_contract(coliags, tmp_path):
     done = coliags("check", "round-gaussians")
     assert done.returncode == 0, done.stdout + done.stderr

@@ -17,6 +17,8 @@ from coliags_plugin.comparison.states import steps_saved
 from tests.comparison.small import TINY, compare_inline, hashes, trainings
 from tests.scenes import write_wall
 
+pytestmark = pytest.mark.thorough
+
 STEPS = 120
 METHODS = ("coliags", "scaffold-gs-depth")
 OFTEN = (*TINY, "schedule.checkpoint_every=10")

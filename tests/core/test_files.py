@@ -98,6 +98,7 @@ def test_every_operation_may_fail(tmp_path, write, before, kind, without_exchang
 
 @cases
 @exchanges
+@pytest.mark.thorough
 def test_a_kill_at_every_operation_leaves_old_or_new_and_is_swept(tmp_path, write, before, without_exchange):
     reference = tmp_path / "reference"
     before(reference)

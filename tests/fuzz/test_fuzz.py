@@ -14,6 +14,8 @@ from tests.fuzz.campaign import FINE, cases, corpus, run_all
 from tests.fuzz.seeds import make_seeds
 from tests.fuzz.targets import TARGETS, files_of
 
+pytestmark = pytest.mark.thorough
+
 #: Cases in the suite: about half a minute on a quiet core.
 COUNT = 150
 

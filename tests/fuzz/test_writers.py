@@ -5,8 +5,12 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
 from tests.fuzz.campaign import ROOT
 from tests.fuzz.writers import WRITERS, is_whole, judge
+
+pytestmark = pytest.mark.thorough
 
 QUICK = ("poses convert (TUM)", "poses convert (COLMAP)", "results export", "eval")
 

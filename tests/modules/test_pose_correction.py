@@ -158,6 +158,7 @@ def aligned_errors(found, true):
     return torch.stack(distances), torch.tensor(angles)
 
 
+@pytest.mark.thorough
 def test_known_perturbations_are_undone(tmp_path):
     """Nine cameras in a textured tube, each 0.5 mm and 0.5 degrees off: down to a tenth, up to a common motion."""
     frames = tube_frames(9, 1.0, (120, 96), coarseness=3.0)
