@@ -1,7 +1,9 @@
 """Digests of what short runs of every method end in, to prove that a change of the code changes no result.
 
-    python -m tests.engine.fingerprints --data PHANTOM --out before.json
-    python -m tests.engine.fingerprints --data PHANTOM --out after.json --compare before.json
+    python -m tests.engine.fingerprints --data PHANTOM --sparse COLMAP --out before.json
+    python -m tests.engine.fingerprints --data PHANTOM --sparse COLMAP --out after.json --compare before.json
+
+COLMAP is a phantom in COLMAP's layout, for methods that learn from depth at single points.
 
 Each run is taken to its end, then resumed from its middle and taken there again. Digests are compared without the
 tensors' names, which a refactoring may change. They hold for one machine and one set of library versions.
@@ -80,21 +82,24 @@ def main() -> None:
     """Take the fingerprints, write them, and compare."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--sparse", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--methods", nargs="*", default=method_names())
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--compare", type=Path)
     options = parser.parse_args()
-    jobs = [(method, seed, ()) for method in method_names() for seed in range(options.seeds)]
+    jobs = [(method, seed, ()) for method in options.methods for seed in range(options.seeds)]
     jobs += [("coliags", 0, (f"renderer.name={name}",)) for name in RENDERERS]
     before = json.loads(options.compare.read_text(encoding="utf-8")) if options.compare else {}
     found = {}
     with tempfile.TemporaryDirectory() as folder:
         for method, seed, changes in jobs:
             key = " ".join([method, str(seed), *changes])
-            found[key] = fingerprint(options.data, method, seed, changes, Path(folder))
+            data = options.sparse if "sparse-depth" in method else options.data
+            found[key] = fingerprint(data, method, seed, changes, Path(folder))
             verdict = "new" if key not in before else "same" if found[key] == before[key] else "DIFFERENT"
             print(f"{key}: grown {found[key]['grown']}, resumed {found[key]['resumed_alike']} {verdict}", flush=True)
-    options.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+            options.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     sys.exit(any(found[key] != before[key] for key in before.keys() & found.keys()))
 
 
