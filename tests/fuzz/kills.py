@@ -96,15 +96,22 @@ class Bench:
         return mark_old(self.place / self.writer.within)
 
     def kill(self, random: Random, found: Found) -> None:
-        """Kill the command once, look, and repeat it."""
+        """Kill the command, up to three times where it goes on, look, and repeat it."""
         while True:
             old = self._old()
-            words = self._words(bool(old))
-            pid = start(partial(command, words), self.log)
-            if _killed(pid, self.place, self.duration, random):
+            if self._killed(bool(old), random):
                 break
         self._look(old, found)
+        more = random.choice((0, 0, 1, 2)) if self.writer.goes_on else 0
+        while more and self._killed(bool(contents(self.place / self.writer.within)), random):
+            self._look(old, found)
+            more -= 1
         self._repeat(found)
+
+    def _killed(self, repeated: bool, random: Random) -> bool:
+        """Begin the command and kill it; False where it ended before."""
+        pid = start(partial(command, self._words(repeated)), self.log)
+        return _killed(pid, self.place, self.duration, random)
 
     def _look(self, old: dict[str, bytes], found: Found) -> None:
         now = contents(self.place / self.writer.within)

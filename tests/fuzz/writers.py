@@ -66,7 +66,7 @@ def _run(inputs: Path, place: Path) -> None:
 WRITERS: dict[str, Writer] = {
     "phantom": Writer(lambda i, o: ("phantom", o / "phantom", *_PHANTOM, *_COARSE)),
     "train": Writer(
-        lambda i, o: ("train", "coliags", "--data", i / "scene", "--output", o / "run", "--steps", 3, *_SMALL),
+        lambda i, o: ("train", "coliags", "--data", i / "scene", "--output", o / "run", "--steps", 9, *_SMALL),
         again=("--resume",),
         goes_on=True,
     ),
@@ -280,7 +280,9 @@ def is_whole(name: str, data: bytes, reference: bytes | None) -> bool:
         return True
     if suffix == ".html":
         return data.rstrip().endswith(b"</html>")
-    if suffix in _TEXTS or reference is None or name.endswith("SHA256SUMS") or suffix == ".safetensors":
+    if reference is not None and (suffix == ".safetensors" or name.endswith("per_frame.csv")):
+        return data == reference  # training and evaluation end in the same to the bit, whatever killed them
+    if suffix in _TEXTS or reference is None or name.endswith("SHA256SUMS"):
         return data.endswith(b"\n") or suffix in (".safetensors", ".log", "") or not data
     if suffix in (".npz", ".npy", ".db"):
         return len(data) > 0
