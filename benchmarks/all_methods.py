@@ -25,11 +25,11 @@ import numpy as np
 import tyro
 from machine import describe_machine, markdown_table, write_results
 
+from coliags_plugin.comparison.report.sources import read_study
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.outputs.colormaps import colorize_depth
 from coliags_plugin.outputs.image_files import encode_jpeg, read_depth_tiff
-from coliags_plugin.reporting.sources import read_study
 from coliags_plugin.results.record import Result
 
 PAPER = "3dgs,2dgs,scaffold-gs,gaussian-pancakes,pr-endo,coliags,3dgs-depth,scaffold-gs-depth"

@@ -55,8 +55,8 @@ def report(
             cannot be written.
     """
     from coliags_plugin.comparison.compare import Comparison
-    from coliags_plugin.reporting.content import Choices
-    from coliags_plugin.reporting.report import SUFFIXES, write_report
+    from coliags_plugin.comparison.report.content import Choices
+    from coliags_plugin.comparison.report.report import SUFFIXES, write_report
 
     parts = [of] if isinstance(of, (Run, Comparison, str, Path)) else of
     paths = [
@@ -74,8 +74,8 @@ def report(
 
 
 def _scene_section(of: Run | str | Path) -> str:
+    from coliags_plugin.comparison.report.scene_section import scene_section
     from coliags_plugin.export.viewer.saving import scene_page
-    from coliags_plugin.reporting.scene_section import scene_section
 
     run = of if isinstance(of, Run) else Run(of)
     return scene_section(scene_page(run.load()), f"{run.method} on {run.scene_name}, seed {run.seed}")

@@ -51,7 +51,7 @@ class Report:
     def run(self) -> None:
         """Write the report and print the paths."""
         from coliags_plugin.api.reports import report
-        from coliags_plugin.reporting.report import FORMATS
+        from coliags_plugin.comparison.report.report import FORMATS
 
         named = tuple(name for name in self.format if name != "all") or FORMATS[:1]
         files = report(

@@ -111,9 +111,9 @@ def coverage(place: Workplace) -> Outcome:
 
 def report(place: Workplace) -> Outcome:
     """Write the report of the run."""
+    from coliags_plugin.comparison.report.content import Choices
+    from coliags_plugin.comparison.report.report import write_report
     from coliags_plugin.engine.run_folder import RunFolder
-    from coliags_plugin.reporting.content import Choices
-    from coliags_plugin.reporting.report import write_report
 
     protocol = RunFolder(place.run).method().config.protocol
     title = f"Reconstruction of {place.source.name}"

@@ -1,1 +1,1 @@
-"""HTML report of evaluated runs: metrics, charts and images."""
+"""Presentation: one model of facts, tables and figures, written for the terminal, as HTML, Markdown, LaTeX and JSON."""

@@ -1,12 +1,23 @@
-"""The tables of a report as LaTeX with booktabs, to be included into a document."""
+"""The tables of a page as LaTeX with booktabs, to be included into a document."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
 
-from coliags_plugin.reporting.blocks import Block, Content, Folded, Paragraph
-from coliags_plugin.reporting.tables import Column, Entry, Row, Table, unit_text
+from coliags_plugin.reporting.model import (
+    Block,
+    Bullets,
+    Column,
+    FactList,
+    Folded,
+    Page,
+    Paragraph,
+    Section,
+    Table,
+    TableCell,
+)
+from coliags_plugin.reporting.numbers import sentence, unit_text
 
 _HEAD = "% Needs \\usepackage{booktabs}, and \\usepackage[T1]{fontenc} for names with underscores."
 _ESCAPES = {
@@ -38,13 +49,13 @@ _MINUS = re.compile(r"(?<![\w-])-(?=[\d.])")
 _SPECIAL = re.compile("|".join(map(re.escape, _ESCAPES)))
 
 
-def latex_report(content: Content) -> str:
-    """All tables in the order of the report, with the text between them as comments."""
-    parts = [_HEAD, _comment(content.title)]
-    parts += [_comment(content.note)] if content.note else []
-    parts += [_comment(f"{name}: {value}") for name, value in content.facts]
-    parts += [_comment(caution) for caution in content.cautions]
-    for section in content.sections:
+def latex_text(page: Page) -> str:
+    """All tables in the order of the page, with the text between them as comments."""
+    parts = [_HEAD, _comment(page.title)]
+    parts += [_comment(page.note)] if page.note else []
+    parts += [*_blocks([FactList([fact for fact in page.facts if not fact.wide])])]
+    parts += [_comment(caution) for caution in page.cautions]
+    for section in page.text_sections:
         parts += ["", _comment(f"==== {section.title}"), *_blocks(section.blocks)]
     return "\n".join(parts) + "\n"
 
@@ -53,30 +64,34 @@ def _blocks(blocks: Sequence[Block]) -> Iterator[str]:
     for block in blocks:
         if isinstance(block, Paragraph):
             yield _comment(block.text)
-        elif isinstance(block, Folded):
+        elif isinstance(block, Bullets):
+            yield from (_comment(": ".join(filter(None, (item.lead, item.text)))) for item in block.items)
+        elif isinstance(block, FactList):
+            yield from (_comment(f"{fact.name}: {fact.text}") for fact in block.facts if fact.text)
+        elif isinstance(block, (Section, Folded)):
             yield _comment(f"-- {block.title}")
             yield from _blocks(block.blocks)
-        else:
+        elif isinstance(block, Table):
             yield latex_table(block)
 
 
 def latex_table(table: Table) -> str:
     """A ``table`` environment with caption, label, footnotes and notes: the columns that are shown."""
     table = table.only_shown()
-    marks = {text: note.mark for text, note in table.footnotes().items()}
+    marks = {text: note.mark for text, note in table.footnotes.items()}
     count = f" ({table.count})" if table.count else ""
     below = [f"$^{{{mark}}}$ {escaped(text)}." for text, mark in marks.items()]
-    below += [f"{escaped(note)}." for note in table.notes]
+    below += [sentence(escaped(note)) for note in table.notes]
     lines = [
         r"\begin{table}[t]",
         r"\centering",
         rf"\caption{{{escaped(table.title + count)}}}",
         rf"\label{{tab:{re.sub('[^A-Za-z0-9:-]', '-', table.name)}}}",
-        rf"\begin{{tabular}}{{l{''.join('l' if column.words else 'r' for column in table.columns)}}}",
+        rf"\begin{{tabular}}{{l{''.join('l' if column.words else 'r' for column in table.columns[1:])}}}",
         r"\toprule",
-        _line([escaped(table.head), *map(_heading, table.columns)]),
+        _line([*map(_heading, table.columns)]),
         r"\midrule",
-        *_rows(table.rows, marks),
+        *_rows(table.cells, marks),
         r"\bottomrule",
         r"\end{tabular}",
         *([r"\par\smallskip", rf"{{\footnotesize {' '.join(below)}}}"] if below else []),
@@ -85,26 +100,26 @@ def latex_table(table: Table) -> str:
     return "\n".join(lines)
 
 
-def _rows(rows: Sequence[Row], marks: dict[str, str]) -> Iterator[str]:
+def _rows(rows: Sequence[Sequence[TableCell]], marks: dict[str, str]) -> Iterator[str]:
     for index, row in enumerate(rows):
-        if row.published and index and not rows[index - 1].published:
+        if row[0].published and index and not rows[index - 1][0].published:
             yield r"\midrule"
-        yield _line([escaped(row.label), *(_entry(entry, marks) for entry in row.entries)])
+        yield _line([escaped(row[0].text), *(_cell(cell, marks) for cell in row[1:])])
 
 
 def _heading(column: Column) -> str:
     unit = f"[{unit_text(column.unit)}]" if unit_text(column.unit) else ""
-    return escaped(" ".join(filter(None, (column.title, column.arrow, unit))))
+    return escaped(" ".join(filter(None, (column.name, column.arrow, unit))))
 
 
-def _entry(entry: Entry, marks: dict[str, str]) -> str:
-    mark = f"$^{{{marks[entry.note]}}}$" if entry.note else ""
-    if not entry.text:
+def _cell(cell: TableCell, marks: dict[str, str]) -> str:
+    mark = f"$^{{{marks[cell.note]}}}$" if cell.note else ""
+    if not cell.text:
         return f"--{mark}"
-    text = _MINUS.sub("$-$", escaped(entry.text))
-    text = {1: rf"\textbf{{{text}}}", 2: rf"\underline{{{text}}}"}.get(entry.rank or 0, text)
-    spread = rf" $\pm$ {entry.spread}" if entry.spread else ""
-    stars = f"$^{{{entry.stars}}}$" if entry.stars else ""
+    text = _MINUS.sub("$-$", escaped(cell.text))
+    text = {1: rf"\textbf{{{text}}}", 2: rf"\underline{{{text}}}"}.get(cell.rank or 0, text)
+    spread = rf" $\pm$ {cell.spread}" if cell.spread else ""
+    stars = f"$^{{{cell.stars}}}$" if cell.stars else ""
     return f"{text}{spread}{stars}{mark}"
 
 

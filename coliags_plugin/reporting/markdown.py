@@ -1,29 +1,42 @@
-"""A report as Markdown, as GitHub and most other programs show it."""
+"""Pages as Markdown, as GitHub and most other programs show it."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
 
-from coliags_plugin.reporting.blocks import Block, Content, Folded, Paragraph
-from coliags_plugin.reporting.tables import DASH, Column, Entry, Table, unit_text
+from coliags_plugin.reporting.model import (
+    Block,
+    Bullets,
+    Column,
+    FactList,
+    Folded,
+    Page,
+    Paragraph,
+    Section,
+    Table,
+    TableCell,
+)
+from coliags_plugin.reporting.numbers import DASH, sentence, unit_text
 
 _SPECIAL = re.compile(r"([\\`*_{}\[\]<>|#~])")
 
 
-def markdown_report(content: Content) -> str:
-    """The whole report."""
-    parts = [f"# {escaped(content.title)}"]
-    if content.note:
-        parts.append(f"> {escaped(content.note)}")
-    parts.append("\n".join(f"- {name}: {escaped(value)}" for name, value in content.facts))
-    if content.description:
-        parts.append(f"How the metrics are computed: {escaped(content.description)}")
-    if content.cautions:
-        parts.append("\n".join(f"- **{escaped(caution)}**" for caution in content.cautions))
-    for section in content.sections:
-        parts += [f"## {escaped(section.title)}", *_blocks(section.blocks, 3)]
-    return "\n\n".join(parts) + "\n"
+def markdown_text(page: Page) -> str:
+    """A page without its figures."""
+    parts = [f"# {escaped(page.title)}"]
+    if page.note:
+        parts.append(f"> {escaped(page.note)}")
+    parts.append(_facts(FactList([fact for fact in page.facts if not fact.wide])))
+    parts += [f"{fact.name}: {escaped(fact.text)}" for fact in page.facts if fact.wide and fact.text]
+    if page.cautions:
+        parts.append("\n".join(f"- **{escaped(caution)}**" for caution in page.cautions))
+    parts += _blocks(page.text_sections, 2)
+    return "\n\n".join(filter(None, parts)) + "\n"
+
+
+def _facts(block: FactList) -> str:
+    return "\n".join(f"- {escaped(fact.name)}: {escaped(fact.text)}" for fact in block.facts if fact.text)
 
 
 def _blocks(blocks: Sequence[Block], level: int) -> list[str]:
@@ -31,9 +44,17 @@ def _blocks(blocks: Sequence[Block], level: int) -> list[str]:
     for block in blocks:
         if isinstance(block, Paragraph):
             parts.append(escaped(block.text))
-        elif isinstance(block, Folded):
+        elif isinstance(block, Bullets):
+            items = (
+                (f"[{escaped(item.lead)}]({item.href})" if item.href else escaped(item.lead), item.text)
+                for item in block.items
+            )
+            parts.append("\n".join(f"- {': '.join(filter(None, (lead, escaped(text))))}" for lead, text in items))
+        elif isinstance(block, FactList):
+            parts.append(_facts(block))
+        elif isinstance(block, (Section, Folded)):
             parts += [f"{'#' * level} {escaped(block.title)}", *_blocks(block.blocks, level + 1)]
-        else:
+        elif isinstance(block, Table):
             parts.append(markdown_table(block))
     return parts
 
@@ -41,31 +62,31 @@ def _blocks(blocks: Sequence[Block], level: int) -> list[str]:
 def markdown_table(table: Table) -> str:
     """A table with its title, footnotes and notes: the columns that are shown."""
     table = table.only_shown()
-    marks = {text: note.mark for text, note in table.footnotes().items()}
-    title = f"**{escaped(table.title)}**" + (f" ({escaped(table.count)})" if table.count else "")
+    marks = {text: note.mark for text, note in table.footnotes.items()}
+    title = f"**{escaped(table.title)}**" + (f" ({escaped(table.count)})" if table.count else "") if table.title else ""
     lines = [
-        _line([table.head, *map(_heading, table.columns)]),
-        _line(["---", *("---" if column.words else "---:" for column in table.columns)]),
+        _line([*map(_heading, table.columns)]),
+        _line(["---" if column.words or not index else "---:" for index, column in enumerate(table.columns)]),
     ]
-    lines += [_line([escaped(row.label), *(_entry(entry, marks) for entry in row.entries)]) for row in table.rows]
+    lines += [_line([_cell(cell, marks) for cell in row]) for row in table.cells]
     below = [f"<sup>{mark}</sup> {escaped(text)}  " for text, mark in marks.items()]
-    below += [f"{escaped(note)}.  " for note in table.notes]
-    return "\n\n".join([title, "\n".join(lines), *(["\n".join(below).rstrip()] if below else [])])
+    below += [f"{sentence(escaped(note))}  " for note in table.notes]
+    return "\n\n".join(filter(None, [title, "\n".join(lines), "\n".join(below).rstrip()]))
 
 
 def _heading(column: Column) -> str:
     unit = f"[{unit_text(column.unit)}]" if unit_text(column.unit) else ""
-    return " ".join(filter(None, (escaped(column.title), column.arrow, escaped(unit))))
+    return " ".join(filter(None, (escaped(column.name), column.arrow, escaped(unit))))
 
 
-def _entry(entry: Entry, marks: dict[str, str]) -> str:
-    mark = f"<sup>{marks[entry.note]}</sup>" if entry.note else ""
-    if not entry.text:
+def _cell(cell: TableCell, marks: dict[str, str]) -> str:
+    mark = f"<sup>{marks[cell.note]}</sup>" if cell.note else ""
+    if not cell.text:
         return DASH + mark
-    text = escaped(entry.text)
-    text = {1: f"**{text}**", 2: f"<ins>{text}</ins>"}.get(entry.rank or 0, text)
-    spread = f" ± {entry.spread}" if entry.spread else ""
-    return f"{text}{spread}{escaped(entry.stars)}{mark}"
+    text = escaped(cell.text)
+    text = {1: f"**{text}**", 2: f"<ins>{text}</ins>"}.get(cell.rank or 0, text)
+    spread = f" ± {cell.spread}" if cell.spread else ""
+    return f"{text}{spread}{escaped(cell.stars)}{mark}"
 
 
 def _line(cells: Sequence[str]) -> str:

@@ -1,0 +1,1 @@
+"""HTML report of evaluated runs: metrics, charts and images."""

@@ -1,0 +1,197 @@
+"""What makes results incomparable, and what merely limits their comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from coliags_plugin.comparison.report.study import Cell, Study
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.outputs.page import leaves
+from coliags_plugin.results.record import Result
+
+
+def refuse_incomparable(cells: Sequence[Cell]) -> None:
+    """Refuse results that do not belong into one table.
+
+    Raises:
+        InputError: Two results have different protocols or versions of one; two of one scene and split have different
+            sizes, training frames, test frames or true images; or a method shares no scene with the others.
+    """
+    first: dict[tuple[str, str], Cell] = {}
+    for cell in cells:
+        _refuse_protocols(cells[0], cell)
+        scene = cell.result.scene
+        _refuse_scenes(first.setdefault((scene.name, scene.split), cell), cell)
+    _refuse_isolated(cells)
+
+
+def _refuse_protocols(first: Cell, other: Cell) -> None:
+    one, two = first.result.protocol, other.result.protocol
+    if (one.name, one.version) != (two.name, two.version):
+        raise InputError(
+            f"{_title(first)} was evaluated by protocol {one.name} version {one.version}, "
+            f"{_title(other)} by {two.name} version {two.version}",
+            "one protocol and version for every run: metrics of two protocols are not comparable",
+            "Run `coliags eval` again on the older run",
+        )
+
+
+def _refuse_scenes(first: Cell, other: Cell) -> None:
+    one, two = first.result, other.result
+    both = f"{_title(first)} and {_title(other)}"
+    if one.scene.size != two.scene.size:
+        (w1, h1), (w2, h2) = one.scene.size, two.scene.size
+        raise InputError(f"{both} are {w1} x {h1} and {w2} x {h2} px", "images of one size")
+    frames = [{name: part.frames for name, part in result.sets.items()} for result in (one, two)]
+    if frames[0] != frames[1]:
+        raise InputError(
+            f"{both} were evaluated on different frames ({_first_difference(*frames)})",
+            "the same held-out frames for every run",
+            "Evaluate both on the same data and split",
+        )
+    if one.scene.train != two.scene.train:
+        raise InputError(
+            f"{both} were trained on different frames ({len(one.scene.train)} and {len(two.scene.train)})",
+            "the same training frames for every run",
+            "Train both on the same split",
+        )
+    for name, part in one.sets.items():
+        if part.truth_sha256 != two.sets[name].truth_sha256:
+            raise InputError(
+                f"{both}: their true images or depths of set '{name}' differ",
+                "runs of the same data",
+                "Train on one copy",
+            )
+
+
+def _refuse_isolated(cells: Sequence[Cell]) -> None:
+    """Refuse a method that no other one can be compared with."""
+    places: dict[str, set[tuple[str, str]]] = {}
+    for cell in cells:
+        places.setdefault(cell.method, set()).add((cell.result.scene.name, cell.result.scene.split))
+    for method, own in places.items():
+        others = {place for other, found in places.items() if other != method for place in found}
+        if not others or own & others:
+            continue
+        if {scene for scene, _ in own} & {scene for scene, _ in others}:
+            one, two = ("', '".join(sorted({split for _, split in found})) for found in (own, others))
+            raise InputError(
+                f"{method} was trained on split '{one}', the other methods on split '{two}'",
+                "one split for every method",
+                "Train on the same split",
+            )
+        one, two = (", ".join(sorted({scene for scene, _ in found})) for found in (own, others))
+        raise InputError(
+            f"no scene in common: {method} has {one}, the other methods have {two}",
+            "methods on the same scenes",
+            "Write one report for each scene",
+        )
+
+
+def _title(cell: Cell) -> str:
+    return f"{cell.method} on {cell.scene} ({cell.stamp})"
+
+
+def _first_difference(one: Mapping[str, Sequence[str]], two: Mapping[str, Sequence[str]]) -> str:
+    name = next(name for name in [*one, *two] if one.get(name) != two.get(name))
+    if name not in one or name not in two:
+        return f"set '{name}' is in one of them only"
+    if len(one[name]) != len(two[name]):
+        return f"set '{name}' has {len(one[name])} and {len(two[name])} frames"
+    left, right = next(pair for pair in zip(one[name], two[name], strict=True) if pair[0] != pair[1])
+    return f"set '{name}' has '{left}' in one where the other has '{right}'"
+
+
+def cautions(study: Study) -> list[str]:
+    """Differences between the results that limit their comparison, and scenes that methods lack."""
+    results = [cell.result for cell in study.cells]
+    found = [
+        *_missing_scenes(study),
+        *_unpaired_seeds(study),
+        *_steps(study),
+        *_untrained_views(study),
+        *_transparent(study),
+    ]
+    for key, what in (("package_version", "versions of the package"), ("git", "states of the source")):
+        if len({str(result.software[key]) for result in results if result.software.get(key) is not None}) > 1:
+            found.append(f"The runs come from different {what}.")
+    sizes = dict.fromkeys(result.scene.size for result in results)
+    if len(sizes) > 1:
+        each = ", ".join(f"{width} x {height}" for width, height in sizes)
+        found.append(f"The scenes have images of different sizes: {each} px.")
+    differing = [
+        key for scene in study.scenes() for key in _differing_data([r for r in results if r.scene.name == scene])
+    ]
+    if differing:
+        found.append(f"Runs of one scene record different data, see Provenance: {', '.join(dict.fromkeys(differing))}.")
+    return found
+
+
+def _missing_scenes(study: Study) -> list[str]:
+    found = []
+    for split in dict.fromkeys(part.split for part in study.parts):
+        parts = [part for part in study.parts if part.split == split]
+        scenes = list(dict.fromkeys(scene for part in parts for scene in study.scenes(part)))
+        for method in study.methods:
+            lacking = [scene for scene in scenes if not any(study.runs(part, scene, method) for part in parts)]
+            if lacking:
+                found.append(
+                    f"{method} has no result of {', '.join(lacking)}: means and tests are over the scenes that the "
+                    "compared methods have in common."
+                )
+    return found
+
+
+def _unpaired_seeds(study: Study) -> list[str]:
+    seeds: dict[tuple[str, str], dict[str, set[int]]] = {}
+    for cell in study.cells:
+        place = (cell.scene, cell.result.scene.split)
+        seeds.setdefault(place, {}).setdefault(cell.method, set()).add(cell.result.seed)
+    found = []
+    for (scene, _), methods in seeds.items():
+        if len({frozenset(own) for own in methods.values()}) > 1:
+            each = "; ".join(f"{method}: {', '.join(map(str, sorted(own)))}" for method, own in methods.items())
+            found.append(f"{scene} ({each})")
+    if not found:
+        return []
+    more = f" and {len(found) - 1} more" if len(found) > 1 else ""
+    return [f"The methods were trained with different seeds on {found[0]}{more}; a mean over more seeds varies less."]
+
+
+def _steps(study: Study) -> list[str]:
+    steps = {method: sorted({cell.result.steps for cell in own}) for method, own in study.by_method.items()}
+    if len({tuple(own) for own in steps.values()}) == 1 and all(len(own) == 1 for own in steps.values()):
+        return []
+    each = ", ".join(f"{method} {' or '.join(f'{count:,}' for count in own)}" for method, own in steps.items())
+    return [f"The runs were trained for different numbers of steps: {each}."]
+
+
+def _untrained_views(study: Study) -> list[str]:
+    """Cautions on how view modules treat held-out views (gains, pose corrections), if the methods differ in it."""
+    by_method = {method: cells[0].result.provenance.get("untrained_views") for method, cells in study.by_method.items()}
+    treated = {method: dict(own) if isinstance(own, Mapping) else {} for method, own in by_method.items()}
+    if all(own == treated[study.methods[0]] for own in treated.values()):
+        return []
+    return [f"{method}, {name}: {what}." for method, own in treated.items() for name, what in own.items()]
+
+
+def _transparent(study: Study) -> list[str]:
+    return [
+        f"{cell.method} on {cell.scene}, set {name}: {part.transparency_warning}."
+        for cell in study.cells
+        for name, part in cell.result.sets.items()
+        if part.transparency_warning
+    ]
+
+
+def _differing_data(results: Sequence[Result]) -> list[str]:
+    data = [dict(leaves(scene_provenance(result))) for result in results]
+    keys = dict.fromkeys(key for one in data for key in one)
+    return [key for key in keys if any(one.get(key) != data[0].get(key) for one in data)]
+
+
+def scene_provenance(result: Result) -> dict[str, Any]:
+    """What is recorded of a result's data."""
+    recorded = result.provenance.get("scene")
+    return {"fingerprint": result.scene.fingerprint, **(recorded if isinstance(recorded, Mapping) else {})}

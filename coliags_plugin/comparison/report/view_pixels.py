@@ -1,0 +1,127 @@
+"""Reading of the pixels of a chosen frame from the run folders, reduced to the size of a report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Shaped, UInt8
+
+from coliags_plugin.comparison.report.study import Cell
+from coliags_plugin.comparison.report.view_selection import ChosenFrame
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import read_rgb
+from coliags_plugin.outputs.image_files import read_depth_tiff
+
+#: Wider images are reduced by an integer factor, to limit the size of the report, px.
+_WIDEST = 640
+
+Rgb = UInt8[np.ndarray, "H W 3"]
+Depth = Float[np.ndarray, "H W"]
+
+
+@dataclass(frozen=True)
+class ViewPixels:
+    """A frame and its renderings.
+
+    Attributes:
+        truth: Camera image.
+        true_depth: mm, NaN where unknown; None where the frame has none.
+        renders: One per run.
+        depths: One per run, mm; None where there is none to compare.
+        expected: Expected depth, one per run, NaN where pixels are nearly transparent; None where there is none.
+    """
+
+    truth: Rgb
+    true_depth: Depth | None
+    renders: Sequence[Rgb]
+    depths: Sequence[Depth | None]
+    expected: Sequence[Depth | None]
+
+
+def reduction(width: int) -> int:
+    """Integer factor by which images of a width are reduced."""
+    return math.ceil(width / _WIDEST)
+
+
+def read_pixels(frame: ChosenFrame, runs: Sequence[Cell]) -> ViewPixels:
+    """Read a frame of some runs of one scene.
+
+    Args:
+        frame: The frame.
+        runs: At least one, each with a run folder.
+
+    Raises:
+        InputError: An image is missing, damaged, or not of the true image's size.
+    """
+    truth = _read(read_rgb, runs[0], "truth", frame, ".png")
+    shape, factor = truth.shape[:2], reduction(truth.shape[1])
+    renders = [_reduced_rgb(_read(read_rgb, run, "renders", frame, ".png", shape), factor) for run in runs]
+    truths = (_read_depth(run, "true_depth", frame, shape) for run in runs)
+    true_depth = next((depth for depth in truths if depth is not None), None)
+    depths: list[Depth | None] = [None] * len(runs)
+    if true_depth is not None:
+        found = [_read_depth(run, "depth", frame, shape) for run in runs]
+        depths = [None if depth is None else _reduced_map(depth, factor) for depth in found]
+    found = [_read_depth(run, "expected_depth", frame, shape) for run in runs]
+    return ViewPixels(
+        truth=_reduced_rgb(truth, factor),
+        true_depth=None if true_depth is None else _reduced_map(true_depth, factor),
+        renders=renders,
+        depths=depths,
+        expected=[None if depth is None else _reduced_map(depth, factor) for depth in found],
+    )
+
+
+def _path(run: Cell, kind: str, frame: ChosenFrame, suffix: str) -> Path:
+    if run.evaluation is None:
+        raise ValueError(f"{run.method} has no run folder")
+    return run.evaluation / kind / frame.part.set_name / f"{frame.name}{suffix}"
+
+
+def _read(
+    reader: Callable[[Path], np.ndarray],
+    run: Cell,
+    kind: str,
+    frame: ChosenFrame,
+    suffix: str,
+    shape: tuple[int, ...] | None = None,
+) -> np.ndarray:
+    path = _path(run, kind, frame, suffix)
+    if not path.is_file():
+        raise InputError(
+            f"{path} is missing, though the results file lists its frame",
+            "a complete evaluation",
+            f"Run `coliags eval {run.run} --protocol {run.result.protocol.name}` again",
+        )
+    pixels = reader(path)
+    if shape is not None and pixels.shape[:2] != shape:
+        raise InputError(
+            f"{path} is {pixels.shape[1]} x {pixels.shape[0]} px", f"{shape[1]} x {shape[0]} px, as the true image"
+        )
+    return pixels
+
+
+def _read_depth(run: Cell, kind: str, frame: ChosenFrame, shape: tuple[int, ...]) -> np.ndarray | None:
+    if not _path(run, kind, frame, ".tiff").is_file():
+        return None
+    return _read(read_depth_tiff, run, kind, frame, ".tiff", shape)
+
+
+def _reduced_rgb(rgb: Rgb, factor: int) -> Rgb:
+    if factor == 1:
+        return rgb
+    height, width = rgb.shape[0] // factor, rgb.shape[1] // factor
+    whole = np.ascontiguousarray(rgb[: height * factor, : width * factor])
+    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA))
+
+
+def _reduced_map(values: Shaped[np.ndarray, "H W"], factor: int) -> Shaped[np.ndarray, "h w"]:
+    """Subsampled map: averaging across an edge would mix depths of different surfaces."""
+    height, width = values.shape[0] // factor, values.shape[1] // factor
+    middle = factor // 2
+    return values[middle::factor, middle::factor][:height, :width]

@@ -1,0 +1,457 @@
+"""The model of presentation: pages of facts, tables and figures, made once and written in several formats."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from coliags_plugin.reporting.numbers import Direction, column_decimals, number_text, plain, ranks_of, unit_text
+
+if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import UInt8
+
+    from coliags_plugin.outputs.charts import Series
+    from coliags_plugin.outputs.colormaps import ColorMap
+
+#: What a table may hold besides cells; None is shown as a dash.
+Value = str | int | float | None
+
+_LARGEST_MAPPING = 12
+_ABSOLUTE_PATH = re.compile(r"^(/|~|[A-Za-z]:[\\/]|\\\\|file:)")
+_LETTERS = "abcdefghijklmnopqrstuvwxyz"
+
+
+@dataclass(frozen=True)
+class Fact:
+    """A named value.
+
+    Attributes:
+        name: What it is.
+        value: Text or number; facts whose value is empty or None are not shown.
+        unit: Of a number.
+        note: What it means.
+        wide: Whether it takes a line of its own.
+    """
+
+    name: str
+    value: Value
+    unit: str = ""
+    note: str = ""
+    wide: bool = False
+
+    @property
+    def text(self) -> str:
+        """The value with unit and note."""
+        text = f"{value_text(self.value)} {unit_text(self.unit)}".rstrip() if self.value not in ("", None) else ""
+        return f"{text} ({self.note})" if text and self.note else text
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table.
+
+    Attributes:
+        key: Key of its values in the rows.
+        title: Heading; empty: the key.
+        unit: As recorded; empty for a plain number.
+        direction: Whether higher or lower is better; None where neither is.
+        shown: Whether it is part of the table unless the reader chooses otherwise.
+        words: Whether it holds words, which are aligned to the left.
+    """
+
+    key: str
+    title: str = ""
+    unit: str = ""
+    direction: Direction | None = None
+    shown: bool = True
+    words: bool = False
+
+    @property
+    def name(self) -> str:
+        """The heading without arrow and unit."""
+        return self.title or self.key
+
+    @property
+    def arrow(self) -> str:
+        """Arrow in the direction of better values."""
+        return {"higher": "↑", "lower": "↓", None: ""}[self.direction]
+
+    @property
+    def has_second_line(self) -> bool:
+        """Whether arrow or unit stand below the title."""
+        return bool(self.arrow or unit_text(self.unit))
+
+
+@dataclass(frozen=True)
+class TableCell:
+    """A cell of a table.
+
+    Attributes:
+        text: The value as printed; empty where there is none.
+        value: The number, for sorting; None where there is none.
+        spread: Number behind a plus-minus sign.
+        rank: 1 for the best; None where nothing is ranked.
+        stars: Marks of significance.
+        note: Footnote: why there is no value, or what it leaves out.
+        style: Colour index of the method that it names; None where it names none.
+        published: Whether it labels a row of numbers from a publication.
+    """
+
+    text: str = ""
+    value: float | None = None
+    spread: str = ""
+    rank: int | None = None
+    stars: str = ""
+    note: str = ""
+    style: int | None = None
+    published: bool = False
+
+
+@dataclass(frozen=True)
+class Footnote:
+    """A footnote of a table: mark, text, and the columns whose cells refer to it."""
+
+    mark: str
+    text: str
+    columns: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table: columns, and rows of values or cells by the keys of the columns.
+
+    Attributes:
+        title: Above it.
+        columns: The first one labels the rows.
+        rows: Values by key; a missing one is shown as a dash.
+        notes: Sentences below it.
+        count: What it is about, behind the title: for instance ``8 scenes``.
+        name: Identifier, unique on a page: part of labels and file names.
+    """
+
+    title: str
+    columns: Sequence[Column]
+    rows: Sequence[Mapping[str, Value | TableCell]]
+    notes: Sequence[str] = ()
+    count: str = ""
+    name: str = ""
+
+    kind: ClassVar[str] = "table"
+
+    @property
+    def cells(self) -> list[list[TableCell]]:
+        """One cell per row and column."""
+        return [[as_cell(row.get(column.key)) for column in self.columns] for row in self.rows]
+
+    def only_shown(self) -> Table:
+        """The table without the columns that are not shown."""
+        return replace(self, columns=[column for column in self.columns if column.shown])
+
+    @property
+    def footnotes(self) -> dict[str, Footnote]:
+        """Footnotes by their texts; equal texts share one. Those of columns that are not shown come last."""
+        keys: dict[str, dict[str, None]] = {}
+        for shown in (True, False):
+            for row in self.cells:
+                for column, cell in zip(self.columns, row, strict=True):
+                    if cell.note and column.shown is shown:
+                        keys.setdefault(cell.note, {})[column.key] = None
+        return {text: Footnote(_mark(index), text, tuple(own)) for index, (text, own) in enumerate(keys.items())}
+
+
+@dataclass(frozen=True)
+class Paragraph:
+    """Sentences, in the small print of a hint unless said otherwise."""
+
+    text: str
+    hint: bool = True
+
+    kind: ClassVar[str] = "paragraph"
+
+
+@dataclass(frozen=True)
+class Bullet:
+    """An item of a list: a leading name, which may be a link, and text."""
+
+    text: str
+    lead: str = ""
+    href: str = ""
+
+
+@dataclass(frozen=True)
+class Bullets:
+    """A list; of warnings, in a frame."""
+
+    items: Sequence[Bullet]
+    warning: bool = False
+
+    kind: ClassVar[str] = "bullets"
+
+
+@dataclass(frozen=True)
+class FactList:
+    """Facts in a column, names to the left of values; says so where there are none."""
+
+    facts: Sequence[Fact]
+
+    kind: ClassVar[str] = "facts"
+
+
+@dataclass(frozen=True)
+class EncodedImage:
+    """An image file.
+
+    Attributes:
+        data: Bytes.
+        mime: Its kind, for instance ``image/png``.
+        width: px.
+        height: px.
+    """
+
+    data: bytes
+    mime: str
+    width: int
+    height: int
+
+    @classmethod
+    def png(cls, rgb: UInt8[np.ndarray, "H W 3"]) -> EncodedImage:
+        """Colours as a PNG."""
+        from coliags_plugin.outputs.image_files import encode_png
+
+        return cls(encode_png(rgb), "image/png", rgb.shape[1], rgb.shape[0])
+
+
+@dataclass(frozen=True)
+class Image:
+    """A picture.
+
+    Attributes:
+        image: The file.
+        caption: Above it.
+        wide: Whether it takes the page's width, on white.
+    """
+
+    image: EncodedImage
+    caption: str
+    wide: bool = False
+
+    kind: ClassVar[str] = "image"
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A line chart (:func:`coliags_plugin.outputs.charts.line_chart`).
+
+    Attributes:
+        series: Lines over one x axis.
+        x_label: Quantity and unit of the x axis.
+        y_label: Quantity and unit of the y axis.
+        title: Above it.
+        log_y: Whether the y axis is logarithmic.
+        x_names: For a categorical x axis: the names of x = 0, 1, ...
+        markers: Whether to draw a dot at every point.
+        legend: Whether the names of the series stand below it.
+        group: Name of the charts that a switch of the page shows together; empty: always shown.
+    """
+
+    series: Sequence[Series]
+    x_label: str
+    y_label: str
+    title: str = ""
+    log_y: bool = False
+    x_names: Sequence[str] | None = None
+    markers: bool = False
+    legend: bool = False
+    group: str = ""
+
+    kind: ClassVar[str] = "chart"
+
+    @property
+    def names(self) -> list[tuple[int, str]]:
+        """Style and name of each line."""
+        return [(line.style, line.name) for line in self.series]
+
+
+@dataclass(frozen=True)
+class ColorBar:
+    """The scale of a colour map.
+
+    Attributes:
+        limits: Values of the first and the last colour.
+        unit: Of the values.
+        color_map: The colour map.
+        label: The quantity.
+        name: Identifier, unique on a page.
+    """
+
+    limits: tuple[float, float]
+    unit: str
+    color_map: ColorMap
+    label: str
+    name: str
+
+    kind: ClassVar[str] = "bar"
+
+
+Figure = Image | Chart | ColorBar
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Figures of one kind beside each other; charts without a line are left out.
+
+    Attributes:
+        figures: Of one kind.
+        title: Above them.
+        legend: Names of the styles 0, 1, ... of charts, above them.
+    """
+
+    figures: Sequence[Figure]
+    title: str = ""
+    legend: Sequence[str] = ()
+
+    kind: ClassVar[str] = "figures"
+
+
+@dataclass(frozen=True)
+class Template:
+    """What only the HTML page shows: a template of this package, filled with values.
+
+    Attributes:
+        file: Name of the file in ``reporting/assets``.
+        values: By the names that the template uses.
+    """
+
+    file: str
+    values: Mapping[str, Any] = field(default_factory=dict)
+
+    kind: ClassVar[str] = "template"
+
+
+@dataclass(frozen=True)
+class Folded:
+    """Blocks behind a title that a reader unfolds; in Markdown and LaTeX, blocks under a title."""
+
+    title: str
+    blocks: Sequence[Block]
+    is_open: bool = False
+
+    kind: ClassVar[str] = "folded"
+
+
+@dataclass(frozen=True)
+class Section:
+    """Blocks under a heading.
+
+    Attributes:
+        title: Heading.
+        blocks: Sections among them have smaller headings.
+        screen_only: Whether only the HTML page has it.
+        name: Identifier, unique on a page; empty: none.
+    """
+
+    title: str
+    blocks: Sequence[Block]
+    screen_only: bool = False
+    name: str = ""
+
+    kind: ClassVar[str] = "section"
+
+
+Block = Paragraph | Bullets | FactList | Table | Figures | Template | Folded | Section
+
+
+@dataclass(frozen=True)
+class Page:
+    """What a command says.
+
+    Attributes:
+        title: Heading.
+        sections: In order; those without blocks are left out.
+        facts: Below the heading.
+        note: Remark below the heading.
+        cautions: What limits what is said.
+        heading: Longer heading of the HTML page; empty: the title.
+    """
+
+    title: str
+    sections: Sequence[Section]
+    facts: Sequence[Fact] = ()
+    note: str = ""
+    cautions: Sequence[str] = ()
+    heading: str = ""
+
+    @property
+    def text_sections(self) -> list[Section]:
+        """The sections of formats without pictures."""
+        return [section for section in self.sections if section.blocks and not section.screen_only]
+
+
+def simple_table(head: Sequence[str], rows: Iterable[Sequence[Value | TableCell]], title: str = "") -> Table:
+    """A table of a heading, and rows of as many values.
+
+    Args:
+        head: Headings; the first column labels the rows.
+        rows: Text, numbers or cells; None is shown as a dash.
+        title: Above it.
+    """
+    columns = [Column(name, words=not index) for index, name in enumerate(head)]
+    return Table(title, columns, [dict(zip(head, row, strict=True)) for row in rows])
+
+
+def ranked_cells(
+    values: Sequence[float | None], unit: str, direction: Direction | None, spreads: Sequence[float | None] = ()
+) -> list[TableCell]:
+    """Cells of one column: equal decimals, and ranks by the printed digits.
+
+    Args:
+        values: One per row; None where there is none.
+        unit: Decides the decimals.
+        direction: None: not ranked.
+        spreads: One per row, or empty.
+    """
+    decimals = column_decimals(unit, values)
+    texts = ["" if value is None else number_text(value, decimals) for value in values]
+    shown = ["" if spread is None else number_text(spread, decimals) for spread in spreads or [None] * len(texts)]
+    ranks = ranks_of([float(text) if text else None for text in texts], direction)
+    return [
+        TableCell(text, value, spread if text else "", rank)
+        for text, value, spread, rank in zip(texts, values, shown, ranks, strict=True)
+    ]
+
+
+def record(title: str, values: Mapping[str, Any]) -> Folded:
+    """Nested values by dotted keys behind a title; paths of this machine are left out."""
+    return Folded(title, [FactList([Fact(key, plain(value)) for key, value in leaves(values)])])
+
+
+def leaves(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    """Leaf values by dotted keys; large mappings are kept whole, and paths of this machine are left out."""
+    items: list[tuple[str, Any]] = []
+    for key, value in values.items():
+        if isinstance(value, Mapping) and len(value) <= _LARGEST_MAPPING:
+            items += leaves(value, f"{prefix}{key}.")
+        elif key != "path" and not (isinstance(value, str) and _ABSOLUTE_PATH.match(value)):
+            items.append((f"{prefix}{key}", value))
+    return items
+
+
+def as_cell(value: Value | TableCell) -> TableCell:
+    """A value as the cell of a table."""
+    if isinstance(value, TableCell):
+        return value
+    return TableCell() if value is None else TableCell(value_text(value), None if isinstance(value, str) else value)
+
+
+def value_text(value: Value) -> str:
+    """A value as printed: numbers with a fraction to four significant digits, nothing for None."""
+    if value is None:
+        return ""
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _mark(index: int) -> str:
+    return (_LETTERS[index // 26 - 1] if index >= 26 else "") + _LETTERS[index % 26]

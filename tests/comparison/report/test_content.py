@@ -1,0 +1,446 @@
+"""The text of a report: summaries, what is missing, statistics, published numbers, costs."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from coliags_plugin.comparison.report.blocks import Folded, Paragraph
+from coliags_plugin.comparison.report.content import Choices, make_content
+from coliags_plugin.comparison.report.cost_table import duration
+from coliags_plugin.comparison.report.frame_values import per_frame_csv
+from coliags_plugin.comparison.report.published import _C3VD_FRAMES
+from coliags_plugin.comparison.report.sources import read_study
+from coliags_plugin.comparison.report.statistics_text import p_text
+from coliags_plugin.comparison.report.study import Failure
+from coliags_plugin.comparison.report.tables import Table
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.results.hashing import metrics_sha256
+from coliags_plugin.results.record import MetricRecord
+from tests.comparison.report.made import FRAMES, NO_LPIPS, made_scenes, result_of, write_comparison
+
+
+def blocks_of(section):
+    for block in section.blocks:
+        yield block
+        if isinstance(block, Folded):
+            yield from blocks_of(block)
+
+
+def tables(content):
+    return {b.name: b for section in content.sections for b in blocks_of(section) if isinstance(b, Table)}
+
+
+def entries(table, key):
+    index = [column.key for column in table.columns].index(key)
+    return {row.label: row.entries[index] for row in table.rows}
+
+
+def paragraphs(content):
+    return " ".join(block.text for block in blocks_of(content.metrics) if isinstance(block, Paragraph))
+
+
+def of(study_of, results, **choices):
+    return make_content(study_of(results), Choices(**choices))
+
+
+def test_facts_and_title(study_of):
+    content = of(study_of, [result_of("coliags"), result_of("3dgs")])
+    assert content.title == "2 methods compared on cecum"
+    facts = dict(content.facts)
+    assert facts["Methods"] == "coliags, 3dgs"
+    assert facts["Held-out frames"] == "5 test: held out along the path; 2 rotation: beyond the path"
+    assert facts["Image size"] == "16 \N{MULTIPLICATION SIGN} 12 px"
+    assert facts["Protocol"] == "paper, version 1"
+    assert facts["Evaluated with"] == "coliags_plugin 0.1.0"
+    assert content.description == "as in the <paper>"
+    assert of(study_of, [result_of("coliags")], title="Mine", note="40 steps").title == "Mine"
+    assert of(study_of, made_scenes({"coliags": 0}, scenes=14)).facts[0] == ("Scenes", "14")
+
+
+# Summary
+
+
+def test_lpips_of_another_net_where_there_is_no_vgg(study_of):
+    ours = result_of("coliags")
+    part = ours.sets["test"]
+    values = {**part.values, "lpips_squeeze": (0.1,) * len(part.frames)}
+    sets = {**ours.sets, "test": part.model_copy(update={"values": values})}
+    metrics = {**ours.metrics, "lpips_squeeze": ours.metrics["lpips"]}
+    squeezed = ours.model_copy(update={"metrics": metrics, "sets": sets, "metrics_sha256": metrics_sha256(sets)})
+    both = tables(of(study_of, [squeezed]))
+    assert [column.key for column in both["summary-test"].columns if column.shown][2] == "lpips_squeeze"
+    assert not {"lpips", "lpips_squeeze"} & {c.key for c in both["summary-rotation"].columns if c.shown}
+    chosen = tables(of(study_of, [squeezed], columns=["lpips"]))["summary-test"]
+    assert [column.key for column in chosen.columns if column.shown] == ["lpips"]
+
+
+def test_the_summary_of_one_scene_is_the_mean_of_its_frames(study_of):
+    content = of(study_of, [result_of("coliags", psnr=32.126, depth=0.5), result_of("3dgs", psnr=30.0, depth=1.0)])
+    table = tables(content)["summary-test"]
+    assert [column.key for column in table.columns if column.shown] == [
+        "psnr", "ssim", "depth_mse", "depth_mse_inner", "depth_median_error",
+    ]  # fmt: skip
+    assert f"Not shown, without values: LPIPS: {NO_LPIPS}" in table.notes
+    assert [(e.text, e.rank, e.spread) for e in entries(table, "psnr").values()] == [("32.13", 1, ""), ("30.00", 2, "")]
+    assert [(e.text, e.rank) for e in entries(table, "ssim").values()] == [("0.9000", 1), ("0.9000", 1)]
+    assert [(e.text, e.rank) for e in entries(table, "depth_mse").values()] == [("0.250", 1), ("1.000", 2)]
+    assert {e.note for e in entries(table, "lpips").values()} == {f"LPIPS: {NO_LPIPS}"}
+    assert table.count == "5 frames"
+    rotation = tables(content)["summary-rotation"]
+    assert [column.key for column in rotation.columns][:2] == ["psnr", "psnr_seen"]
+    assert "psnr_seen" not in [column.key for column in table.columns]
+    assert content.scenes is None
+
+
+def test_the_summary_of_many_scenes_is_the_mean_over_scenes(study_of):
+    results = made_scenes({"coliags": 2.0, "3dgs": 0.0}, seeds=3)
+    table = tables(of(study_of, results))["summary-test"]
+    means = [
+        np.mean([r.sets["test"].mean("psnr") for r in results if r.method == "coliags" and r.scene.name == scene])
+        for scene in dict.fromkeys(r.scene.name for r in results)
+    ]
+    entry = entries(table, "psnr")["coliags"]
+    assert entry.value == pytest.approx(np.mean(means))
+    assert float(entry.spread) == pytest.approx(np.std(means, ddof=1), abs=0.005)
+    assert table.count == "8 scenes, 40 frames"
+    assert any("standard deviation over scenes" in note for note in table.notes)
+
+
+def test_seeds_of_one_scene_spread_over_seeds(study_of):
+    results = [result_of("coliags", seed=seed, psnr=30.0 + seed) for seed in range(3)]
+    found = tables(of(study_of, results))
+    assert entries(found["summary-test"], "psnr")["coliags"].spread == "1.00"
+    assert "± standard deviation over seeds" in found["summary-test"].notes
+    assert entries(found["seeds-test"], "psnr")["coliags"].text == "1.00"
+    assert "Seeds: coliags 3" in found["seeds-test"].notes[0]
+
+
+def test_a_missing_scene_is_left_out_for_all(study_of):
+    results = made_scenes({"coliags": 2.0, "3dgs": 0.0, "2dgs": 1.0})
+    content = of(study_of, [r for r in results if (r.method, r.scene.name) != ("3dgs", "scene-5")])
+    table = tables(content)["summary-test"]
+    others = [r.sets["test"].mean("psnr") for r in results if r.method == "coliags" and r.scene.name != "scene-5"]
+    assert entries(table, "psnr")["coliags"].value == pytest.approx(np.mean(others))
+    assert "Means over 7 of 8 scenes, without scene-5, which not every method has" in table.notes
+    assert any(caution.startswith("3dgs has no result of scene-5") for caution in content.cautions)
+    lead = tables(content)["lead-test-psnr"]
+    assert [e.text for e in entries(lead, "scenes").values()] == ["7", "8"]
+    missing = entries(tables(content)["scene-scene-5-test"], "psnr")["3dgs"]
+    assert (missing.text, missing.note) == ("", "3dgs: no result")
+
+
+def test_a_metric_missing_on_a_scene_leaves_it_out_of_that_column(study_of):
+    """A scene without depth: it counts for PSNR, and for no depth metric."""
+    results = made_scenes({"coliags": 2.0, "3dgs": 0.0}, scenes=3)
+    flat = [result_of(method, "flat", depth=None) for method in ("coliags", "3dgs")]
+    content = of(study_of, [*results, *flat])
+    table = tables(content)["summary-test"]
+    left_out = [note for note in table.notes if "which not every method has" in note]
+    assert left_out == [
+        "Depth MSE; Depth MSE, inner; Depth median error; Depth AbsRel: "
+        "means over 3 of 4 scenes, without flat, which not every method has"
+    ]
+    assert entries(table, "depth_mse")["coliags"].note == (
+        "Depth MSE: not available for flat; the frame has no true depth"
+    )
+    scene = entries(tables(content)["scene-flat-test"], "depth_mse")["3dgs"]
+    assert (scene.text, scene.note) == ("", "Depth MSE: the frame has no true depth")
+
+
+def test_a_mean_over_some_frames_says_so(study_of):
+    content = of(study_of, [result_of("coliags", values={"ssim": (0.9, None, 0.8, 0.7, 0.6)})])
+    entry = entries(tables(content)["summary-test"], "ssim")["coliags"]
+    assert (entry.text, entry.rank) == ("0.7500", None)
+    assert entry.note == "SSIM: mean over 4 of 5 frames; no reason was recorded"
+
+
+def test_no_scene_that_all_have(study_of):
+    results = [result_of("a", "p"), result_of("b", "p"), result_of("b", "q"), result_of("c", "q")]
+    table = tables(of(study_of, results))["summary-test"]
+    assert {e.note for e in entries(table, "psnr").values()} == {"PSNR: no scene that all methods have"}
+
+
+# Columns and reference
+
+
+def test_columns_are_chosen(study_of):
+    results = [result_of("coliags"), result_of("3dgs")]
+
+    def shown(**choices):
+        table = tables(of(study_of, results, **choices))["summary-test"]
+        return [column.key for column in table.columns if column.shown]
+
+    assert shown(columns=("depth_abs_rel", "psnr")) == ["depth_abs_rel", "psnr"]
+    assert len(shown(columns=("all",))) == 7
+    assert shown(columns=("psnr_seen", "ssim")) == ["ssim"]  # which the rotation set has
+    with pytest.raises(InputError, match=r"--columns depth_mes: no such metric.*Did you mean 'depth_mse'"):
+        of(study_of, results, columns=("depth_mes",))
+
+
+def test_reference(study_of):
+    results = made_scenes({"a": 0.0, "b": 1.0, "c": 0.5})
+    assert "lead of b" in tables(of(study_of, results))["lead-test-psnr"].title
+    assert "b is the reference because it came out best" in paragraphs(of(study_of, results))
+    chosen = of(study_of, results, reference="a")
+    assert list(entries(tables(chosen)["lead-test-psnr"], "lead")) == ["b", "c"]
+    assert "came out best" not in paragraphs(chosen)
+    with pytest.raises(InputError, match=r"--reference d: no such method. Expected one of a, b, c"):
+        of(study_of, results, reference="d")
+
+
+# Statistics
+
+
+@pytest.mark.parametrize(
+    ("scenes", "rivals", "said"),
+    [
+        (5, 2, "No test is run: 5 scenes cannot tell methods apart. The unit is the scene, not the frame, and of "
+               "5 differences the two-sided Wilcoxon test cannot give less than p = .0625; tests are run from 6 scenes "
+               "on (p = .0312)."),
+        (1, 1, "No test is run: 1 scene cannot tell"),
+        (6, 1, "can give is .0312, or .0312 after Holm's adjustment for 1 rival."),
+        (6, 2, "can give is .0312, or .0625 after Holm's adjustment for 2 rivals. No star is possible, as that is not "
+               "below .05; it takes 7 scenes."),
+        (8, 6, "can give is .00781, or .0469 after Holm's adjustment for 6 rivals."),
+    ],
+)  # fmt: skip
+def test_what_the_statistics_can_say(study_of, scenes, rivals, said):
+    methods = {"coliags": 9.0} | {f"rival-{index}": 0.0 for index in range(rivals)}
+    content = of(study_of, made_scenes(methods, scenes))
+    assert said in paragraphs(content)
+    table = tables(content)["summary-test"]
+    stars = {entry.stars for label, entry in entries(table, "psnr").items() if label != "coliags"}
+    assert stars == ({"*"} if "No" not in said else {""})
+    lead = tables(content).get("lead-test-psnr")
+    assert (lead is None) == (scenes == 1)
+    if lead is not None:
+        keys = [column.key for column in lead.columns]
+        assert ("wilcoxon" in keys) == (scenes >= 6)
+        assert entries(lead, "better")["rival-0"].text == f"{scenes} of {scenes}"
+
+
+def test_a_rival_with_few_scenes_is_not_tested(study_of):
+    results = made_scenes({"coliags": 2.0, "3dgs": 0.0, "2dgs": 1.0})
+    content = of(study_of, [r for r in results if r.method != "2dgs" or r.scene.name < "scene-4"])
+    lead = tables(content)["lead-test-psnr"]
+    assert entries(lead, "wilcoxon")["2dgs"].note == "fewer than 6 scenes in common"
+    assert entries(lead, "wilcoxon")["3dgs"].text == ".0078"
+    assert entries(lead, "smallest")["3dgs"].text == ".00781"
+    assert "for 1 rival" in paragraphs(content)
+
+
+@pytest.mark.parametrize(
+    ("p", "text"),
+    [(1.0, "1"), (0.0625, ".062"), (0.03125, ".031"), (0.0078125, ".0078"), (0.5, ".5"), (9e-5, "< .0001")],
+)
+def test_p_text(p, text):
+    assert p_text(p) == text
+
+
+# Cautions
+
+
+def test_transparent_pixels_are_a_caution(study_of):
+    result = result_of("coliags")
+    sets = {name: part.model_copy(update={"transparent": 0.1234}) for name, part in result.sets.items()}
+    said = of(study_of, [result.model_copy(update={"sets": sets})]).cautions
+    assert said[0].startswith("coliags on cecum, set test: 12.3 % of the pixels have alpha below 0.5")
+    assert len(said) == len(sets)
+    few = {name: part.model_copy(update={"transparent": 0.01}) for name, part in result.sets.items()}
+    assert of(study_of, [result.model_copy(update={"sets": few})]).cautions == []
+
+
+def test_metrics_at_points_are_shown_where_there_is_no_true_depth(study_of):
+    result = result_of("coliags", depth=None)
+    part = result.sets["test"]
+    reasons = {name: "estimated depth is no truth" for name in result.metrics if name.startswith("depth")}
+    values = {**part.values, "sparse_depth_median": (3.0,) * len(part.frames)}
+    sets = {**result.sets, "test": part.model_copy(update={"values": values, "reasons": reasons})}
+    metrics = {**result.metrics, "sparse_depth_median": MetricRecord(unit="%", direction="lower")}
+    changed = result.model_copy(update={"sets": sets, "metrics": metrics, "metrics_sha256": metrics_sha256(sets)})
+    table = tables(of(study_of, [changed]))["summary-test"]
+    shown = [column.key for column in table.columns if column.shown]
+    assert "sparse_depth_median" in shown and not any(name.startswith("depth") for name in shown)
+    (note,) = [note for note in table.notes if "estimated depth is no truth" in note]
+    assert note.startswith("Not shown, without values: Depth MSE; ")
+
+
+def test_cautions(study_of):
+    ours = result_of("coliags")
+    other = result_of(
+        "3dgs", steps=80, software={"git": "def5678"}, data={"calibration": "fisheye"}, train=ours.scene.train
+    )
+    said = of(study_of, [ours, other]).cautions
+    assert "The runs were trained for different numbers of steps: coliags 40, 3dgs 80." in said
+    assert "The runs come from different states of the source." in said
+    assert "Runs of one scene record different data, see Provenance: calibration." in said
+    assert not any("versions of the package" in caution for caution in said)
+    assert of(study_of, [ours, result_of("3dgs")]).cautions == []
+
+
+def test_unpaired_seeds_are_said(study_of):
+    said = of(study_of, [result_of("coliags", seed=seed) for seed in range(2)] + [result_of("3dgs")]).cautions
+    assert said == [
+        "The methods were trained with different seeds on cecum (coliags: 0, 1; 3dgs: 0); a mean over more seeds "
+        "varies less."
+    ]
+
+
+def test_scenes_of_different_sizes_are_said(study_of):
+    results = [result_of(m, s, size=size) for m in "ab" for s, size in (("p", (16, 12)), ("q", (32, 24)))]
+    assert of(study_of, results).cautions == ["The scenes have images of different sizes: 16 x 12, 32 x 24 px."]
+
+
+def test_what_modules_make_of_held_out_views_is_said_where_methods_differ(study_of):
+    ours = result_of("coliags")
+    ours = ours.model_copy(update={"provenance": {**ours.provenance, "untrained_views": {"poses": "poses are moved"}}})
+    assert of(study_of, [ours, result_of("3dgs")]).cautions == ["coliags, poses: poses are moved."]
+    assert of(study_of, [ours]).cautions == []
+
+
+def test_failed_cells_are_listed(tmp_path):
+    failed = [("cecum", "3dgs", 0, "ran out of memory"), ("sigmoid", "3dgs", 1, "")]
+    content = make_content(read_study([write_comparison(tmp_path, [result_of("coliags")], failed)]), Choices())
+    rows = tables(content)["failed"].rows
+    assert [[row.label, *(entry.text for entry in row.entries)] for row in rows] == [
+        ["3dgs", "cecum", "0", "ran out of memory"],
+        ["3dgs", "sigmoid", "1", "no reason was recorded"],
+    ]
+
+
+def test_unfinished_cells_are_counted(study_of):
+    failures = tuple(Failure(scene, "3dgs", 0, None) for scene in "pq")
+    study = replace(study_of([result_of("coliags")]), failures=failures)
+    content = make_content(study, Choices())
+    assert "failed" not in tables(content)
+    assert Paragraph("2 cells not finished: 3dgs (2).") in content.failures.blocks
+
+
+# Published numbers
+
+
+def c3vd_sequences(method="coliags", **changes):
+    """All 22 sequences, under other names."""
+    sequences = []
+    for index, frames in enumerate(_C3VD_FRAMES.values()):
+        test = tuple(f"{frame:04d}" for frame in range(0, frames, 8))
+        train = tuple(f"{frame:04d}" for frame in range(frames) if frame % 8)
+        sequences.append(
+            result_of(
+                method,
+                f"sequence-{index}",
+                **{
+                    "frames": {"test": test},
+                    "train": train,
+                    "size": (338, 270),
+                    "data": {"dataset": "c3vd"},
+                    **changes,
+                },
+            )
+        )
+    return sequences
+
+
+def published(study_of, results):
+    table = tables(of(study_of, results))["summary-test"]
+    return {row.label: row for row in table.rows if row.published}, table
+
+
+def test_c3vd_has_the_published_numbers_beside_ours(study_of):
+    rows, table = published(study_of, c3vd_sequences())
+    assert len(rows) == 7
+    assert [entry.text for entry in rows["ColIAGS, published"].entries[:4]] == ["36.30", "0.91", "0.15", "0.042"]
+    assert all(entry.rank is None for row in rows.values() for entry in row.entries)
+    assert [row.published for row in table.rows] == [False] + [True] * 7
+    assert any("as printed in the paper of ColIAGS for C3VD, 22 sequences" in note for note in table.notes)
+
+
+def test_another_benchmark_has_none(study_of):
+    for results in (
+        c3vd_sequences()[:-1],  # a mean over fewer sequences
+        c3vd_sequences(size=(169, 135)),
+        c3vd_sequences(split="block"),
+        c3vd_sequences(data={"dataset": "colmap"}),
+        made_scenes({"coliags": 0.0}, size=(338, 270)),
+        [result_of("coliags")],
+    ):
+        assert published(study_of, results)[0] == {}
+
+
+def test_endogslam_and_rotatecolon(study_of):
+    names = list(_C3VD_FRAMES)[:10]
+    options = {"split": "endogslam", "frames": {"test": ("7",)}, "data": {"dataset": "c3vd-endogslam"}}
+    rows, _ = published(study_of, [result_of("coliags", name, **options) for name in names])
+    assert [entry.text for entry in rows["ColIAGS, published"].entries[:4]] == ["35.58", "0.91", "0.23", "0.122"]
+    phantoms = [result_of("coliags", f"phantom-{index}", **options) for index in range(10)]
+    assert published(study_of, phantoms)[0] == {}
+    frames = tuple(str(index) for index in range(223))
+    options = {"split": "all-train", "frames": {"test": frames}, "train": tuple(map(str, range(381)))}
+    rows, _ = published(study_of, [result_of("coliags", depth=None, data={"dataset": "rotatecolon"}, **options)])
+    ours = [entry.text for entry in rows["ColIAGS, published"].entries]
+    assert ours[:4] == ["23.29", "0.90", "0.21", ""]
+
+
+# Costs
+
+
+def test_costs_are_means_over_scenes(study_of):
+    results = [
+        result_of(m, s, cost={"train_seconds": t, "seconds_to_psnr": {"25": 5.0, "30": t / 2, "32": mark, "34": None}})
+        for m, s, t, mark in (("a", "p", 50.0, 9), ("a", "q", 150.0, 9), ("b", "p", 40.0, None), ("b", "q", 50.0, 8))
+    ]
+    table = tables(of(study_of, results))["costs"]
+    assert [(e.text, e.rank) for e in entries(table, "train_seconds").values()] == [("1 min 40 s", 2), ("45.0 s", 1)]
+    assert [e.text for e in entries(table, "seconds_to_30").values()] == ["50.0 s", "22.5 s"]
+    assert entries(table, "seconds_to_32")["b"].note == "To 32 dB: not reached; known of 1 of 2 scenes"
+    assert entries(table, "gaussians")["a"].rank is None
+    assert entries(table, "checkpoint")["a"].text == "3.0"
+    assert "All training on a processor, 2 threads" in table.notes
+    # Those that all reached, and the next one.
+    assert [c.key for c in table.columns if c.shown and "seconds_to" in c.key] == [
+        "seconds_to_25", "seconds_to_30", "seconds_to_32",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("change", [{"device": "a GPU"}, {"threads": 1}])
+def test_costs_on_different_devices_are_not_ranked(study_of, change):
+    table = tables(of(study_of, [result_of("a"), result_of("b", cost={"render_device": "a processor", **change})]))[
+        "costs"
+    ]
+    assert {e.rank for key in ("train_seconds", "memory") for e in entries(table, key).values()} == {None}
+    assert all(entry.text for entry in entries(table, "train_seconds").values())
+    assert any(note.startswith("Not ranked: training") and "different devices" in note for note in table.notes)
+    assert len({entry.text for entry in entries(table, "device").values()}) == 2
+
+
+def test_a_cost_that_was_not_measured(study_of):
+    content = of(study_of, [result_of("a", cost={"train_seconds": None, "gaussians": None})])
+    assert entries(tables(content)["costs"], "train_seconds")["a"].note == "Training: not measured"
+    assert "a radiance field" in entries(tables(content)["costs"], "gaussians")["a"].note
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.26, "0.3 s"), (59.0, "59.0 s"), (61.0, "1 min 01 s"), (7322.0, "2 h 02 min")]
+)
+def test_duration(seconds, text):
+    assert duration(seconds) == text
+
+
+# Frames
+
+
+def test_per_frame_csv(study_of):
+    results = [result_of(method, seed=seed) for method in ("a", "b") for seed in (0, 1)]
+    rows = list(csv.DictReader(io.StringIO(per_frame_csv(study_of(results)))))
+    assert len(rows) == 4 * sum(map(len, FRAMES.values()))
+    first = rows[0]
+    assert [first[key] for key in ("scene", "split", "set", "frame", "method", "seed")] == [
+        "cecum", "every-8th", "test", "0004", "a", "0",
+    ]  # fmt: skip
+    assert (float(first["psnr"]), first["lpips"], first["psnr_seen"]) == (28.0, "", "")
+    assert float(rows[-1]["psnr_seen"]) == 32.5

@@ -1,0 +1,410 @@
+"""The HTML page: self-contained, complete without scripts, and refusing what is damaged."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import io
+import re
+from html.parser import HTMLParser
+
+import cv2
+import numpy as np
+import pytest
+
+from coliags_plugin.comparison.report import html_report
+from coliags_plugin.comparison.report.content import Choices
+from coliags_plugin.comparison.report.report import write_report
+from coliags_plugin.comparison.report.view_selection import evenly
+from coliags_plugin.comparison.report.views import error_limit
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.outputs.colormaps import color_table, hatch
+from coliags_plugin.outputs.image_files import write_depth_tiff, write_png
+from tests.comparison.report.made import FRAMES, HEIGHT, WIDTH, made_scenes, result_of, write_comparison, write_run
+
+VOID = {"meta", "img", "br", "link", "input", "hr"}
+
+
+class Page(HTMLParser):
+    """Checks that every element is closed in order, and keeps what the tests ask about."""
+
+    def __init__(self, html):
+        super().__init__(convert_charrefs=True)
+        self.open, self.tags, self.text = [], [], []
+        self.feed(html)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if not {"style", "script"} & set(self.open):
+            self.text.append(data)
+
+    @property
+    def words(self):
+        return " ".join(" ".join(self.text).split())
+
+    def all(self, tag):
+        return [attrs for name, attrs in self.tags if name == tag]
+
+    def images(self, alt):
+        """Decoded images whose alternative text matches."""
+        found = [attrs["src"] for attrs in self.all("img") if re.search(alt, attrs["alt"])]
+        raw = [base64.b64decode(source.split(",", 1)[1], validate=True) for source in found]
+        return [cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1] for data in raw]
+
+    def charts(self):
+        return [attributes["aria-label"] for attributes in self.all("svg") if attributes["class"] == "chart"]
+
+
+def report(tmp_path, paths, *, choices=None, **options):
+    output = tmp_path / "out" / "report.html"
+    write_report(paths, output, choices=choices, **options)
+    return Page(output.read_text(encoding="utf-8"))
+
+
+@pytest.fixture
+def two_runs(tmp_path):
+    return [
+        write_run(tmp_path / "coliags", result_of("coliags", psnr=32.0, depth=0.5), depth=0.5),
+        write_run(tmp_path / "3dgs", result_of("3dgs", psnr=30.0, depth=1.0), depth=1.0),
+    ]
+
+
+# The page
+
+
+def test_one_file_that_needs_nothing_else(tmp_path, two_runs):
+    page = report(tmp_path, two_runs)
+    assert [file.name for file in (tmp_path / "out").iterdir()] == ["report.html"]
+    assert not {tag for tag, _ in page.tags} & {"link", "iframe", "object"}
+    assert page.all("script") == [{}]
+    for _, attributes in page.tags:
+        for name, value in attributes.items():
+            if name in ("src", "href", "srcset", "xlink:href", "data"):
+                assert value.startswith(("data:image/", "data:text/csv"))
+            assert "://" not in (value or "")
+    html = (tmp_path / "out" / "report.html").read_text()
+    assert "@import" not in html and "import(" not in html and "fetch(" not in html
+    assert re.findall(r"url\((.*?)\)", html) == ["#error-scale", "#depth-scale"]
+    assert "prefers-color-scheme: dark" in html
+
+
+def test_every_style_class_in_use_is_defined(tmp_path, two_runs):
+    page = report(tmp_path, two_runs)
+    style = (tmp_path / "out" / "report.html").read_text().split("<style>")[1].split("</style>")[0]
+    used = {word for _, attributes in page.tags for word in (attributes.get("class") or "").split()}
+    defined = set(re.findall(r"\.([a-z][\w-]*)", style))
+    assert used - defined <= {"tick", "frame", "right", "side", "views"}  # names for the script, and text of charts
+
+
+def test_the_same_runs_give_the_same_bytes(tmp_path, two_runs):
+    for name in ("a", "b"):
+        write_report(two_runs, tmp_path / name)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_heading(tmp_path, two_runs):
+    page = report(tmp_path, two_runs, choices=Choices(note="A demonstration: 40 steps <only>"))
+    assert page.words.index("A demonstration: 40 steps <only>") < page.words.index("Held-out views")
+    assert "2 methods compared on cecum" in page.words
+    assert "legacy-pinhole" in page.words
+    assert "My <title>" in report(tmp_path, two_runs, choices=Choices(title="My <title>")).words
+
+
+def test_names_are_escaped(tmp_path):
+    nasty = '<img src="x" onerror="alert(1)">'
+    run = write_run(tmp_path / "run", result_of(nasty, data={"calibration": nasty}))
+    page = report(tmp_path, [run], choices=Choices(reference=nasty))
+    assert nasty in page.words
+    assert not any("onerror" in attributes for _, attributes in page.tags)
+
+
+def test_columns_that_are_not_shown_are_hidden_with_their_footnotes(tmp_path, two_runs):
+    page = report(tmp_path, two_runs, choices=Choices(columns=("psnr",)))
+    heads = [attributes for attributes in page.all("th") if attributes.get("data-key") in ("psnr", "lpips")]
+    assert {("hidden" in attributes) == (attributes["data-key"] == "lpips") for attributes in heads} == {True}
+    notes = [attributes for attributes in page.all("li") if attributes.get("data-columns") == "lpips"]
+    assert notes and all("hidden" in attributes for attributes in notes)
+
+
+# Views
+
+
+def test_views_are_spread_over_each_set_and_the_worst_are_among_them(tmp_path):
+    psnr = (30.0, 29.0, 31.0, 20.0, 30.0)
+    depth = (0.1, 0.5, 0.1, 0.1, 0.1)
+    result = result_of("coliags", values={"psnr": psnr, "depth_mse": depth})
+    page = report(tmp_path, [write_run(tmp_path / "run", result)], frames=2)
+    found = re.findall(r"frame (\d{4}) (\d of \d)(?: · (worst [\w ]+ of coliags))?", page.words)
+    assert found == [
+        ("0004", "1 of 5", ""),
+        ("0012", "2 of 5", "worst Depth MSE of coliags"),
+        ("0028", "4 of 5", "worst PSNR of coliags"),
+        ("0036", "5 of 5", ""),
+        ("0100", "1 of 2", "worst PSNR and Depth MSE of coliags"),
+        ("0110", "2 of 2", ""),
+    ]
+    views = [attributes for attributes in page.all("article") if attributes["class"] == "frame"]
+    assert [float(view["data-psnr"]) for view in views[:4]] == [-30.0, -29.0, -20.0, -30.0]
+    assert [float(view["data-depth-mse"]) for view in views[:4]] == [0.1, 0.5, 0.1, 0.1]
+    # truth, its depth, a rendering and its error; two of the slider; and the sample of the hatch
+    assert len(page.all("img")) == 6 * 4 + 2 + 1
+
+
+def test_evenly():
+    assert evenly(15, 4) == [0, 5, 9, 14]
+    assert evenly(3, 10) == [0, 1, 2]
+    assert evenly(5, 1) == [2]
+    assert evenly(1, 1) == [0]
+
+
+def test_error_maps_share_one_scale(tmp_path, two_runs):
+    # The errors are 0.5 mm in one run and 1 mm in the other, so the scale ends at 1 mm.
+    page = report(tmp_path, two_runs)
+    table = color_table("error")
+    (first, *_), (second, *_) = (page.images(f"depth error of {name}") for name in ("coliags", "3dgs"))
+    assert first.shape == (HEIGHT, WIDTH, 3)
+    assert np.abs(first[5].astype(int) - table[128]).max() <= 2
+    assert (second[5] == table[255]).all()
+    assert not (first[0] == first[5]).all(), "pixels without truth look like pixels with one"
+    assert "|depth error| [mm] 0 0.2 0.4 0.6 0.8 1" in page.words
+    assert "depth [mm]" in page.words
+    assert "95 %" in page.words
+
+
+@pytest.mark.parametrize("with_truth", [True, False])
+def test_expected_depth_is_shown_and_hatched(tmp_path, with_truth):
+    error = 0.5 if with_truth else None
+    result = result_of("coliags", depth=error)
+    run = write_run(tmp_path / "run", result, depth=error)
+    for name, part in result.sets.items():
+        for frame in part.frames:
+            depth = np.full((HEIGHT, WIDTH), 40.0, np.float32)
+            depth[:4] = np.nan
+            write_depth_tiff(run / "eval" / "paper" / "expected_depth" / name / f"{frame}.tiff", depth)
+    page = report(tmp_path, [run])
+    shown = page.images("expected depth of coliags")
+    assert len(shown) == 6
+    # True depths span 20 to 60 mm; without any, the scale ends at 40 mm.
+    color = color_table("depth")[round(0.5 * 255 if with_truth else 255)]
+    assert all(np.abs(image[5].astype(int) - color).max() <= 2 for image in shown)
+    assert all((image[0] == hatch(HEIGHT, WIDTH)[0]).all() for image in shown)
+    assert "Below it the expected depth, hatched where alpha is below 0.5." in page.words
+    assert "depth [mm]" in page.words
+
+
+def test_error_limit():
+    assert error_limit([np.array([0.0, 1.3]), np.array([1.3, np.inf])]) == 2.0
+    assert error_limit([np.linspace(0, 1, 101)]) == 1.0
+    assert error_limit([np.linspace(0, 1, 1_000_001)]) == 1.0  # sampled
+    assert error_limit([]) == 1.0
+    assert 0 < error_limit([np.zeros(3)]) <= 1e-6
+
+
+def test_without_depth_colors_are_compared(tmp_path):
+    run = write_run(tmp_path / "run", result_of("coliags", depth=None), depth=None)
+    page = report(tmp_path, [run])
+    assert "|colour error| [levels of 255]" in page.words
+    assert len(page.images("colour error of coliags")) == 6
+    assert "depth [mm]" not in page.words and "expected depth" not in page.words
+    assert "Error against distance" not in page.words
+
+
+def test_one_run_lacking_depth_says_so(tmp_path, two_runs):
+    (two_runs[1] / "eval" / "paper" / "depth" / "test" / "0004.tiff").unlink()
+    assert report(tmp_path, two_runs).words.count("no depth to compare") == 1
+
+
+def test_large_images_are_reduced(tmp_path):
+    result = result_of("coliags", frames={"test": ("0001",)}, depth=None, size=(1281, 101))
+    page = report(tmp_path, [write_run(tmp_path / "run", result, depth=None)])
+    assert page.images("true image")[0].shape == (33, 427, 3)
+    assert "1/3 of their size" in page.words
+
+
+def test_pictures_beyond_the_limit_stand_beside_the_page(tmp_path, monkeypatch):
+    runs = [
+        write_run(tmp_path / method, result_of(method, size=(96, 80), frames={"test": FRAMES["test"]}))
+        for method in ("coliags", "3dgs")
+    ]
+    whole = report(tmp_path, runs)
+    limit = (tmp_path / "out" / "report.html").stat().st_size - 50_000
+    monkeypatch.setattr(html_report, "PAGE_LIMIT", limit)
+    page = report(tmp_path, runs)
+    assert limit - 100_000 < (tmp_path / "out" / "report.html").stat().st_size <= limit
+    folder = tmp_path / "out" / "report_files"
+    sources = [attributes["src"] for attributes in page.all("img") if "src" in attributes]
+    beside = {source for source in sources if source.startswith("report_files/")}
+    assert beside == {f"report_files/{file.name}" for file in folder.iterdir()}
+    assert len(beside) > 2 and sum(source.startswith("data:") for source in sources) > 5
+    assert len(sources) == len([attributes for attributes in whole.all("img") if "src" in attributes])
+    assert "pictures are in the folder report_files beside this page" in page.words
+    # A smaller report of that name leaves no pictures of the former, and no other file is touched.
+    monkeypatch.undo()
+    (folder / "notes.txt").write_text("mine")
+    report(tmp_path, runs)
+    assert [file.name for file in folder.iterdir()] == ["notes.txt"]
+
+
+# Curves and profiles
+
+
+def test_curves_against_steps_and_seconds(tmp_path, two_runs):
+    page = report(tmp_path, two_runs)
+    assert page.charts() == [
+        *(f"{y} over {x}" for x in ("distance to the camera [mm]", "angle to the optical axis [degrees]")
+          for y in ("PSNR [dB]", "RMS depth error [mm]"))
+    ] * 2 + [
+        "training PSNR [dB] over step",
+        "loss, log scale over step",
+        "training PSNR [dB] over training time [s]",
+        "loss, log scale over training time [s]",
+        "PSNR [dB] over frame",
+        "PSNR [dB] over frame",
+    ]  # fmt: skip
+    kinds = [attributes.get("class") for attributes in page.all("figure")]
+    assert [kinds.count(kind) for kind in ("by-step", "by-seconds")] == [2, 2]
+
+
+def test_profiles_are_pooled_by_pixels(tmp_path):
+    """RGB errors .001 and .004 are 30 and 24 dB; the empty bin is left out, and so is one of few pixels."""
+    results = [result_of("coliags"), result_of("coliags", "sigmoid"), result_of("3dgs")]
+    folder = write_comparison(tmp_path, results)
+    html = (tmp_path / "page").resolve()
+    write_report([folder], html)
+    chart = re.search(r'aria-label="PSNR \[dB\] over distance.*?</svg>', html.read_text()).group()
+    titles = re.findall(r"<title>([\w-]+), ([\d.]+): ([\d.]+)</title>", chart)
+    assert titles == [(method, x, y) for method in ("3dgs", "coliags") for x, y in (("5", "30"), ("15", "23.98"))]
+
+
+def test_long_logs_are_drawn_through_means(tmp_path):
+    page = report(tmp_path, [write_run(tmp_path / "run", result_of("coliags", steps=1000))])
+    assert "mean of up to 9 logged steps; the band spans their extremes" in page.words
+    lines = [attributes["d"] for attributes in page.all("path") if attributes["class"] == "line"]
+    assert max(line.count("L") for line in lines) == 119
+
+
+def test_seeds_have_curves_of_their_own(tmp_path):
+    runs = [write_run(tmp_path / str(seed), result_of("coliags", seed=seed)) for seed in (0, 1)]
+    words = report(tmp_path, runs).words
+    assert "One curve for each seed" in words
+    assert "Of several seeds, the first is shown" in words
+
+
+def test_no_log_is_no_fault(tmp_path):
+    run = write_run(tmp_path / "run", result_of("coliags"))
+    (run / "metrics.jsonl").unlink()
+    assert "No training log" in report(tmp_path, [run]).words
+
+
+# Results files alone, and whole comparisons
+
+
+def test_results_files_alone_give_everything_but_pictures_and_curves(tmp_path):
+    results = made_scenes({"coliags": 2.0, "3dgs": 0.0})
+    page = report(tmp_path, [write_comparison(tmp_path / "c", results, [("scene-1", "2dgs", 0, "ran out of memory")])])
+    for text in ("No images: only results files", "No training log", "ran out of memory", "Smallest p", "Every scene"):
+        assert text in page.words
+    assert page.all("img") == []
+    assert [label for label in page.charts() if "step" in label] == []
+    assert sum("over frame" in label for label in page.charts()) == 16
+    assert "Worst frames of coliags" in page.words
+
+
+def test_every_scene_of_a_comparison_is_folded(tmp_path):
+    results = made_scenes({"coliags": 2.0, "3dgs": 0.0}, scenes=2)
+    folder = write_comparison(tmp_path / "c", results)
+    for result in results:
+        write_run(folder / f"runs/{result.scene.name}/{result.method}/s0-{result.key[:8]}", result)
+    page = report(tmp_path, [folder], frames=1)
+    assert len(page.images("rendered by")) == 2 * len(page.all("article")) == 16
+    summaries = [text for text in page.text if text.startswith("scene-")]
+    assert summaries.count("scene-1") >= 3  # views, curves, tables
+
+
+def test_a_method_without_run_on_a_scene_is_left_out_of_its_views(tmp_path):
+    results = made_scenes({"coliags": 2.0, "3dgs": 0.0}, scenes=1)
+    folder = write_comparison(tmp_path / "c", results)
+    write_run(folder / f"runs/scene-1/3dgs/s0-{results[1].key[:8]}", results[1])
+    page = report(tmp_path, [folder])
+    assert {attributes["data-method"] for attributes in page.all("figure") if "data-method" in attributes} == {
+        "truth", "3dgs",
+    }  # fmt: skip
+
+
+def test_the_page_holds_the_values_of_all_frames(tmp_path, two_runs):
+    page = report(tmp_path, two_runs)
+    (link,) = page.all("a")
+    rows = list(csv.DictReader(io.StringIO(base64.b64decode(link["href"].split(",", 1)[1]).decode())))
+    assert link["download"] == "per_frame.csv"
+    assert len(rows) == 2 * sum(map(len, FRAMES.values()))
+
+
+# Formats
+
+
+def test_formats(tmp_path, two_runs):
+    files = write_report(two_runs, tmp_path / "out/tables.html", ("markdown", "html", "latex", "csv"))
+    assert {file.stem for file in files} == {"tables"}
+    text = {file.suffix: file.read_text() for file in files}
+    assert list(text) == [".md", ".html", ".tex", ".csv"]
+    assert text[".md"].startswith("# 2 methods compared on cecum")
+    assert r"\toprule" in text[".tex"]
+    assert text[".csv"].startswith("scene,split,set,frame,method,seed,psnr")
+    assert write_report(two_runs, tmp_path / "table.txt", ("markdown",)) == [tmp_path / "table.txt"]
+
+
+def test_tables_alone_need_no_images(tmp_path, two_runs):
+    (two_runs[0] / "eval/paper/renders/test/0004.png").unlink()
+    write_report(two_runs, tmp_path / "table.txt", ("markdown",))
+
+
+# Refusals
+
+
+def refuses(tmp_path, runs, match, **options):
+    with pytest.raises(InputError, match=match):
+        write_report(runs, tmp_path / "report.html", **options)
+    assert not (tmp_path / "report.html").exists()
+
+
+def test_what_is_missing_is_refused(tmp_path, two_runs):
+    refuses(tmp_path, two_runs, "at least one", frames=0)
+    refuses(tmp_path, two_runs, "no such metric", choices=Choices(columns=("x",)))
+    (two_runs[0] / "eval/paper/renders/test/0004.png").unlink()
+    refuses(tmp_path, two_runs, r"renders/test/0004\.png is missing")
+    with pytest.raises(InputError, match="is a folder"):
+        write_report(two_runs, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "match"),
+    [
+        ("metrics.jsonl", '{"step": 1}\n{"step": ', r"metrics\.jsonl, line 2 is not JSON"),
+        ("metrics.jsonl", "3\n", "line 1 holds a int"),
+        ("eval/paper/result.json", "{", r"result\.json is cut off"),
+        ("eval/paper/truth/test/0004.png", "x", r"truth/test/0004\.png .*cannot be decoded"),
+        ("eval/paper/depth/test/0004.tiff", "x", r"depth/test/0004\.tiff .*cannot be decoded"),
+    ],
+)
+def test_what_is_damaged_is_refused(tmp_path, file, content, match):
+    run = write_run(tmp_path / "run", result_of("coliags"))
+    (run / file).write_text(content)
+    refuses(tmp_path, [run], match)
+
+
+def test_images_of_another_size_are_refused(tmp_path):
+    run = write_run(tmp_path / "run", result_of("coliags"))
+    write_png(run / "eval" / "paper" / "renders" / "test" / "0004.png", np.zeros((5, 6, 3), np.uint8))
+    refuses(tmp_path, [run], r"6 x 5 px\. Expected 16 x 12 px")

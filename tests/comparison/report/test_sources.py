@@ -1,0 +1,259 @@
+"""Reading of runs, results files and comparisons; what is refused, and how methods are told apart."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from coliags_plugin.comparison.report.sources import read_study
+from coliags_plugin.comparison.report.study import Part
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.results.reading import write_result
+from tests.comparison.report.made import FRAMES, made_scenes, result_of, write_comparison, write_run
+
+TEST, ROTATION = Part("every-8th", "test"), Part("every-8th", "rotation")
+
+
+def refuses(paths, match, **options):
+    with pytest.raises(InputError, match=match):
+        read_study(paths, **options)
+
+
+def written(tmp_path, result):
+    path = tmp_path / f"{result.key}.json"
+    write_result(path, result)
+    return path
+
+
+def test_an_evaluation_against_the_truth_is_asked_for_by_name(tmp_path):
+    result = result_of("coliags")
+    run = write_run(tmp_path / "run", result)
+    with pytest.raises(InputError, match=r"Run `coliags eval \S+ --protocol paper --truth SCENE` first"):
+        read_study([run], protocol="paper-truth")
+    against = result.model_copy(
+        update={"provenance": {**result.provenance, "truth": {"scene": "cecum", "trained_on": {"name": "estimate"}}}}
+    )
+    (run / "eval" / "paper").rename(run / "eval" / "paper-truth")
+    write_result(run / "eval" / "paper-truth" / "result.json", against)
+    (cell,) = read_study([run], protocol="paper-truth").cells
+    assert cell.evaluation == run / "eval" / "paper-truth" and (cell.evaluation / "renders").is_dir()
+
+
+def test_a_run_a_file_and_a_comparison_are_read_alike(tmp_path):
+    result, other = result_of("coliags"), result_of("3dgs")
+    run = write_run(tmp_path / "run", result)
+    file = written(tmp_path, result)
+    folder = write_comparison(tmp_path / "comparison", [result])
+    for path in (run, file, folder, folder / "results"):
+        study = read_study([path])
+        assert [cell.result for cell in study.cells] == [result]
+        assert study.failures == ()
+    assert read_study([run]).cells[0].run == run
+    assert read_study([file]).cells[0].run is None
+    mixed = read_study([run, written(tmp_path, other)])
+    assert mixed.methods == ["coliags", "3dgs"]
+
+
+def test_a_comparison_finds_its_runs_by_the_results_key(tmp_path):
+    """Folders of runs have keys of their own, since several protocols share a run."""
+    result = result_of("coliags")
+    folder = write_comparison(tmp_path, [result])
+    write_run(folder / "runs/cecum/coliags/s0-11111111", result.model_copy(update={"key": "another"}))
+    assert read_study([folder]).cells[0].run is None
+    run = write_run(folder / "runs/cecum/coliags/s0-22222222", result)
+    assert read_study([folder]).cells[0].run == run
+    (run / "eval/paper/result.json").write_text("{")
+    assert read_study([folder]).cells[0].run is None
+
+
+def test_some_methods_alone_in_the_order_asked_for(tmp_path):
+    results = [result_of(name) for name in ("coliags", "2dgs", "3dgs")]
+    folder = write_comparison(tmp_path, results, [("cecum", "3dgs", 2, "no memory"), ("cecum", "2dgs", 2, "no memory")])
+    study = read_study([folder], methods=["3dgs", "coliags"])
+    assert study.methods == ["3dgs", "coliags"]
+    assert [failure.method for failure in study.failures] == ["3dgs"]
+    refuses([folder], "no method '3dg' .* Did you mean '3dgs'", methods=["3dg"])
+
+
+def test_variants_of_a_comparison_have_the_names_of_their_folders(tmp_path):
+    folder = write_comparison(tmp_path, [result_of("ablations/none"), result_of("coliags")])
+    (folder / "results/cecum/coliags").rename(folder / "results/cecum/coliags-steady")
+    assert read_study([folder]).methods == ["ablations/none", "coliags-steady"]
+
+
+def test_failures_are_kept_unless_there_is_a_result(tmp_path):
+    result = result_of("coliags")
+    failed = ("cecum", "3dgs", 2, "ran out of memory")
+    folder = write_comparison(tmp_path, [result], [failed])
+    repeated = folder / "failures/cecum/coliags" / f"s0-{result.key[:8]}.json"
+    repeated.parent.mkdir()
+    repeated.write_text(json.dumps({"reason": "once"}))
+    (failure,) = read_study([folder]).failures
+    assert (failure.scene, failure.method, failure.seed, failure.reason) == failed
+
+
+def plan(folder, results, *more):
+    """The plan of results, and of cells (scene, method, seed) without one."""
+    cells = []
+    for result in results:
+        place = f"{result.scene.name}/{result.method.replace('/', '-')}/s{result.seed}-"
+        cells.append((result.scene.name, result.method, result.seed, f"{place}{result.key[:8]}"))
+    cells += [(scene, method, seed, f"{scene}/{method}/s{seed}-00000000") for scene, method, seed in more]
+    entries = [
+        {"scene": scene, "method": method, "seed": seed, "protocol": "paper", "key": "", "run": f"runs/{place}",
+         "result": f"results/{place}.json"}
+        for scene, method, seed, place in cells
+    ]  # fmt: skip
+    (folder / "plan.json").write_text(json.dumps({"format": "coliags-comparison", "cells": entries}))
+
+
+def test_the_plan_gives_order_runs_and_what_is_not_finished(tmp_path):
+    results = [result_of("scaffold-gs"), result_of("coliags"), result_of("coliags", steps=4000)]
+    folder = write_comparison(tmp_path, results, [("cecum", "2dgs", 0, "no memory")])
+    plan(folder, results[:2], ("cecum", "2dgs", 0), ("cecum", "3dgs", 1))
+    write_run(folder / f"runs/cecum/coliags/s0-{results[1].key[:8]}", results[1])
+    (failed,) = (folder / "failures/cecum/2dgs").iterdir()
+    failed.rename(failed.with_name("s0-00000000.json"))
+    study = read_study([folder])
+    assert study.methods == ["scaffold-gs", "coliags"]  # without the result that the plan no longer has
+    assert [cell.run is None for cell in study.cells] == [True, False]
+    assert [(f.method, f.seed, f.reason) for f in study.failures] == [
+        ("2dgs", 0, "no memory"),
+        ("3dgs", 1, None),
+    ]
+    refuses([folder], "results of protocol paper only", protocol="authors-code")
+    damaged = {"{": "is not JSON", "[]": "holds a list", '{"cells": [{}]}': "a cell lacks 'scene'"}
+    for content, match in damaged.items():
+        (folder / "plan.json").write_text(content)
+        refuses([folder], f"plan.json.*{match}")
+
+
+def test_a_method_under_a_second_name_shows_the_run_of_the_first(tmp_path):
+    first, other = result_of("coliags"), result_of("3dgs")
+    second = first.model_copy(update={"method": "depth-imve-imia"})
+    folder = write_comparison(tmp_path, [second, first, other])
+    plan(folder, [second, first, other])
+    run = write_run(folder / f"runs/cecum/coliags/s0-{first.key[:8]}", first)
+    assert [cell.run for cell in read_study([folder]).cells] == [run, run, None]
+
+
+def test_nothing_is_refused(tmp_path):
+    refuses([], "no results")
+    refuses([tmp_path / "none"], "none.json|none")
+    refuses([tmp_path], "holds no results")
+    (tmp_path / "results").mkdir()
+    refuses([tmp_path], "holds no results. Expected at least one finished cell")
+    failed = write_comparison(tmp_path / "f", [], [("cecum", "3dgs", 0, "no <memory>")])
+    (failed / "results").mkdir()
+    refuses([failed], "none of the 1 cells of .* has a result; 3dgs on cecum: no <memory>")
+
+
+def test_what_was_not_evaluated_is_refused(tmp_path):
+    run = write_run(tmp_path / "run", result_of("coliags"))
+    refuses([run], f"Run `coliags eval {run} --protocol authors-code` first", protocol="authors-code")
+    refuses([run, run / ".." / "run"], "twice")
+    (run / "eval/paper/result.json").rename(run / "eval/paper/metrics.json")
+    refuses([run], "older release.*Run `coliags eval .*` again")
+
+
+def test_a_comparison_under_another_protocol_says_which(tmp_path):
+    folder = write_comparison(tmp_path, [result_of("coliags")])
+    refuses([folder], "results of protocol paper only.*Pass --protocol paper", protocol="authors-code")
+
+
+@pytest.mark.parametrize(("content", "match"), [("{", "cut off"), ("{}", "not a results file")])
+def test_a_damaged_file_is_refused_by_name(tmp_path, content, match):
+    folder = write_comparison(tmp_path, [result_of("coliags")])
+    (file,) = folder.glob("results/*/*/*.json")
+    file.write_text(content)
+    refuses([folder], f"{file.name}.*{match}")
+
+
+def test_a_damaged_failure_is_refused_by_name(tmp_path):
+    folder = write_comparison(tmp_path, [result_of("coliags")], [("cecum", "3dgs", 0, "")])
+    (file,) = folder.glob("failures/*/*/*.json")
+    file.write_text("{")
+    refuses([folder], f"{file.name} is not JSON")
+
+
+def test_what_cannot_be_compared_is_refused(study_of):
+    ours = result_of("coliags")
+
+    def refused(match, **options):
+        with pytest.raises(InputError, match=match):
+            study_of([ours, result_of("3dgs", **options)])
+
+    refused("version 1, .*version 2", version=2)
+    refused("16 x 12 and 32 x 24 px", size=(32, 24))
+    refused("no scene in common: coliags has cecum, the other methods have sigmoid", scene="sigmoid")
+    refused("coliags was trained on split 'every-8th', the other methods on split 'block'", split="block")
+    refused("trained on different frames", train=("0001", "0003"))
+    refused("'0036' in one where the other has '0037'", frames=FRAMES | {"test": (*FRAMES["test"][:-1], "0037")})
+    refused("5 and 1 frames", frames={"test": ("0004",)})
+    refused("'rotation' is in one of them", frames={"test": FRAMES["test"]})
+    other = result_of("3dgs")
+    moved = {name: part.model_copy(update={"truth_sha256": "f" * 64}) for name, part in other.sets.items()}
+    with pytest.raises(InputError, match="true images or depths of set 'test' differ"):
+        study_of([ours, other.model_copy(update={"sets": moved})])
+
+
+def test_another_scene_may_have_another_size_and_other_sets(study_of):
+    results = [result_of(method, **options) for method in ("a", "b") for options in ({}, OTHER_SCENE)]
+    study = study_of(results)
+    assert study.scenes() == ["cecum", "sigmoid"]
+    assert study.scenes(ROTATION) == ["cecum"]
+    assert study.parts == [TEST, ROTATION]
+
+
+OTHER_SCENE = {"scene": "sigmoid", "size": (32, 24), "frames": {"test": ("0",)}}
+
+
+def test_splits_are_parts_of_their_own(study_of):
+    results = [result_of(method, split=split) for split in ("every-8th", "block") for method in ("a", "b")]
+    study = study_of(results)
+    assert [(part.split, part.set_name) for part in study.parts] == [
+        ("every-8th", "test"),
+        ("every-8th", "rotation"),
+        ("block", "test"),
+        ("block", "rotation"),
+    ]
+    assert study.methods == ["a", "b"]
+
+
+def test_values_by_method_scene_and_seed(study_of):
+    study = study_of([result_of("a", psnr=30.0), result_of("a", seed=1, psnr=32.0), result_of("b", psnr=20.0)])
+    assert study.values(TEST, "psnr") == {"a": {"cecum": {0: 30.0, 1: 32.0}}, "b": {"cecum": {0: 20.0}}}
+    assert study.values(TEST, "lpips") == {"a": {}, "b": {}}
+    assert study.values(ROTATION, "psnr_seen")["b"] == {"cecum": {0: 22.0}}
+    assert list(study.metrics)[:2] == ["psnr", "psnr_seen"]
+    assert study.reason(TEST, "a", "lpips_seen") == "no VGG weights & none to be had"
+    assert study.reason(TEST, "a", "unheard") == "no reason was recorded"
+
+
+def labels(study):
+    return [cell.method for cell in study.cells]
+
+
+def test_seeds_of_one_config_are_one_method(study_of):
+    assert labels(study_of([result_of("a"), result_of("a", seed=1)])) == ["a", "a"]
+    assert labels(study_of(made_scenes({"a": 0, "b": 0}, scenes=2, seeds=2))) == ["a"] * 4 + ["b"] * 4
+
+
+def test_what_does_not_change_a_model_makes_no_other_method(study_of):
+    """A cell taken from an ablation keeps the description of its row."""
+    configs = [{"x": 1, "description": text, "schedule": {"log_every": seed}} for seed, text in enumerate("pq")]
+    study = study_of([result_of("a", seed=seed, config=config) for seed, config in enumerate(configs)])
+    assert labels(study) == ["a", "a"]
+
+
+def test_runs_of_one_method_are_told_apart(tmp_path, study_of):
+    steps = study_of([result_of("a"), result_of("a", seed=1), result_of("a", steps=2000), result_of("b")])
+    assert labels(steps) == ["a · 40 steps", "a · 40 steps", "a · 2,000 steps", "b"]
+    # Seeds of two configs: the stamps would make four methods of them.
+    variants = [result_of("a", seed=seed, scene=s, config={"x": x}) for x in (1, 2) for seed in (0, 1) for s in "pq"]
+    found = labels(study_of(variants))
+    assert len(set(found)) == 2 and found[0] == found[3] and found[0].startswith("a · config ")
+    runs = [write_run(tmp_path / name, result_of("a")) for name in ("one", "two", "sub/one")]
+    assert labels(read_study(runs[:2])) == ["a · one", "a · two"]
+    assert labels(read_study([runs[0], runs[2]])) == ["a · one (1)", "a · one (2)"]

@@ -1,0 +1,182 @@
+"""One page written for the terminal, as HTML, Markdown, LaTeX and JSON: the same facts, numbers, marks and notes."""
+
+from __future__ import annotations
+
+import json
+import re
+import xml.etree.ElementTree as ET
+
+import numpy as np
+import pytest
+
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.outputs.charts import Series
+from coliags_plugin.reporting.display import DisplayTable
+from coliags_plugin.reporting.html_page import html_blocks, html_text, write_html
+from coliags_plugin.reporting.json_values import page_values
+from coliags_plugin.reporting.latex import latex_text
+from coliags_plugin.reporting.markdown import markdown_text
+from coliags_plugin.reporting.model import (
+    Bullet,
+    Bullets,
+    Chart,
+    ColorBar,
+    Column,
+    EncodedImage,
+    Fact,
+    Figures,
+    Folded,
+    Image,
+    Page,
+    Paragraph,
+    Section,
+    Table,
+    TableCell,
+    leaves,
+    record,
+    simple_table,
+)
+from coliags_plugin.reporting.numbers import DASH
+from coliags_plugin.reporting.terminal import page_text, terminal_text
+
+PLAIN = DisplayTable(
+    "A <title>",
+    [Column("method"), Column("n"), Column("psnr", unit="dB")],
+    [{"method": "a&b", "n": 12, "psnr": 31.456}, {"method": "c"}],
+    ["a note"],
+)
+MARKED = Table(
+    "Means",
+    [Column("method", "Method", words=True), Column("psnr", "PSNR", "dB", "higher"), Column("more", shown=False)],
+    [
+        {"method": TableCell("coliags", style=0), "psnr": TableCell("31.20", 31.2, "0.30", 1, "*")},
+        {"method": TableCell("other", style=9), "psnr": TableCell(note="no weights"), "more": TableCell(note="hidden")},
+        {"method": TableCell("printed", published=True), "psnr": TableCell("30.1", 30.1, rank=2)},
+    ],
+    ["± over scenes"],
+    "8 scenes",
+    "summary",
+)
+CHART = Chart([Series("line", 0, [0, 1], [2, 3])], "x", "y", "A chart", legend=True)
+PICTURES = [EncodedImage.png(np.full((2, 3, 3), grey, np.uint8)) for grey in (0, 200)]
+
+
+def made_page():
+    return Page(
+        "A & b",
+        [
+            Section("Tables", [Paragraph("why <so>"), MARKED, Section("Nested", [Folded("More", [PLAIN])])]),
+            Section("Found", [Bullets([Bullet("it is. Mend it", "what")], warning=True)]),
+            Section("Files", [Bullets([Bullet("the mesh", "mesh.ply", "a/mesh.ply")])]),
+            Section("Recorded", [record("Data", {"a": {"b": True, "c": 0.25}, "path": "/home/me", "file": "/etc"})]),
+            Section("Seen", [Figures([CHART]), Figures([ColorBar((0, 5), "mm", "error", "|dz|", "bar")])]),
+            Section("Images", [Figures([Image(image, "a picture") for image in PICTURES], "Two")], screen_only=True),
+            Section("Nothing", []),
+        ],
+        [Fact("length", 3.14159, "mm^2"), Fact("empty", ""), Fact("long", "words", note="a remark", wide=True)],
+        "Research <use>",
+        ["careful"],
+    )
+
+
+def test_text_for_the_terminal():
+    assert (
+        str(PLAIN)
+        == repr(PLAIN)
+        == "A <title>\nmethod   n  psnr (dB)\na&b     12      31.46\nc        -          -\na note"
+    )
+    text = page_text(made_page())
+    assert text.startswith("length  3.142 mm²\nlong    words (a remark)\nResearch <use>\ncareful\n\nTables\nwhy <so>\n")
+    lines = ["coliags 31.20 ± 0.30*", "other - [a]", "printed 30.1", "[a] no weights", "± over scenes"]
+    assert "\n".join(lines) in re.sub(" +", " ", text)
+    assert "what: it is. Mend it" in text and "a/mesh.ply: the mesh" in text
+    assert "a.b  yes\na.c  0.25" in text and "/home" not in text and "Images" not in text and "Nothing" not in text
+
+
+def test_html_page(tmp_path):
+    write_html(made_page(), tmp_path / "page.html")
+    text = (tmp_path / "page.html").read_text()
+    body = re.sub(r"<(style|script)>.*?</\1>", "", text, flags=re.S).replace(" hidden", ' hidden=""')
+    tree = ET.fromstring(re.sub(r"(<meta[^>]*|<img[^>]*)>", r"\1/>", body.split("\n", 1)[1]))
+    said = " ".join(" ".join(tree.itertext()).split())
+    assert "A & b" in said and "3.142 mm²" in said and "why <so>" in said and "empty" not in said
+    assert [each.text for each in tree.iter("h2")] == ["Tables", "Found", "Files", "Recorded", "Seen", "Images"]
+    assert [each.text for each in tree.iter("h3")] == ["Nested", "Two"]
+    assert tree.find(".//span[@class='best']").text == "31.20" and tree.find(".//span[@class='second']").text == "30.1"
+    assert [row.get("class") for row in tree.iter("tr")].count("published") == 1
+    assert [each.get("class") for each in tree.iter("i")][:2] == ["swatch s0", "swatch s1 dash1"]
+    notes = {each.get("data-columns"): each for each in tree.iter("li") if each.get("data-columns")}
+    assert notes["psnr"].get("hidden") is None and notes["more"].get("hidden") == ""
+    assert tree.find(".//a[@href='a/mesh.ply']").text == "mesh.ply"
+    assert len(list(tree.iter("svg"))) == 2 and all(each.get("src")[:5] == "data:" for each in tree.iter("img"))
+    assert not (tmp_path / "page_files").exists()
+    write_html(made_page(), tmp_path / "again.html")
+    assert (tmp_path / "again.html").read_text() == text
+
+
+def test_notebooks_show_what_print_shows():
+    html = ET.fromstring(f"<div>{PLAIN._repr_html_().replace(' hidden', '')}</div>")
+    cells = [[" ".join("".join(cell.itertext()).split()) for cell in row] for row in html.iter("tr")]
+    assert cells == [["method", "n", "psnr dB"], ["a&b", "12", "31.46"], ["c", DASH, DASH]]
+    assert "".join(html.find(".//caption").itertext()) == "A <title>" and html.find(".//li").text == "a note."
+
+
+def test_pictures_without_room_are_written_beside_the_page(tmp_path):
+    page = made_page()
+    write_html(page, tmp_path / "page.html", limit=len(html_text(page)) - 1)
+    files = {path.name for path in (tmp_path / "page_files").iterdir()}
+    text = (tmp_path / "page.html").read_text()
+    assert len(files) == 1 and f'src="page_files/{min(files)}"' in text and text.count('src="data:') == 1
+    assert "1 picture in the folder page_files beside this page" in text
+    write_html(page, tmp_path / "page.html")
+    assert not (tmp_path / "page_files").exists()
+    with pytest.raises(InputError, match="is a folder"):
+        write_html(page, tmp_path)
+
+
+def test_markdown():
+    text = markdown_text(made_page())
+    assert text.startswith(
+        "# A & b\n\n> Research \\<use\\>\n\n- length: 3.142 mm²\n\nlong: words (a remark)\n\n- **careful**"
+    )
+    assert "**Means** (8 scenes)\n\n| Method | PSNR ↑ \\[dB\\] |\n| --- | ---: |\n" in text
+    assert f"| coliags | **31.20** ± 0.30\\* |\n| other | {DASH}<sup>a</sup> |\n| printed | <ins>30.1</ins> |" in text
+    assert "<sup>a</sup> no weights  \n± over scenes." in text and "### Nested\n\n#### More" in text
+    assert "[mesh.ply](a/mesh.ply): the mesh" in text
+
+
+def test_latex():
+    text = latex_text(made_page())
+    assert r"\caption{Means (8 scenes)}" in text and r"\label{tab:summary}" in text and r"\begin{tabular}{lr}" in text
+    assert "coliags & \\textbf{31.20} $\\pm$ 0.30$^{*}$ \\\\\nother & --$^{a}$ \\\\\n\\midrule\nprinted" in text
+    assert r"{\footnotesize $^{a}$ no weights. $\pm$ over scenes.}" in text and "% length: 3.142 mm²" in text
+
+
+def test_json_values():
+    values = json.loads(json.dumps(page_values(made_page())))
+    assert values["facts"] == {"length": {"value": 3.14159, "unit": "mm^2"}, "empty": "", "long": "words"}
+    tables, found, files, recorded, _ = values["sections"]
+    (table,) = tables["tables"]
+    assert table["rows"][1] == {"method": "other", "psnr": None, "more": None}
+    assert table["rows"][0]["psnr"] == 31.2 and table["columns"][1]["unit"] == "dB"
+    assert tables["sections"][0]["sections"][0]["tables"][0]["rows"][0] == {"method": "a&b", "n": 12, "psnr": 31.456}
+    assert found["items"][0][0]["name"] == "what" and files["items"][0][0]["href"] == "a/mesh.ply"
+    assert recorded["sections"][0]["facts"] == [{"a.b": "yes", "a.c": "0.25"}]
+
+
+def test_simple_tables_and_empty_blocks():
+    assert (
+        terminal_text([simple_table(["name", "value"], [["a", 1.5], ["b", None]])])
+        == "name  value\na       1.5\nb         -"
+    )
+    assert terminal_text([Section("Charts", [Figures([CHART])])]) == ""
+    assert "<svg" not in html_blocks([Figures([Chart([], "x", "y")])])
+
+
+def test_leaves_keep_large_mappings_whole():
+    large = {str(index): index for index in range(20)}
+    assert leaves({"a": large, "b": {"c": 1}}) == [("a", large), ("b.c", 1)]
+
+
+def test_text_that_looks_like_the_address_of_a_picture_is_kept():
+    assert "picture:0123456789abcdef0123" in html_text(Page("picture:0123456789abcdef0123", []))
