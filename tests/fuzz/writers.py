@@ -269,7 +269,7 @@ def scratch(place: Path) -> list[str]:
     return [str(path.relative_to(place)) for path in place.rglob(".*") if path.suffix in (".partial", ".replaced")]
 
 
-def is_whole(name: str, data: bytes, reference: bytes | None) -> bool:
+def is_whole(name: str, data: bytes, reference: bytes | None) -> bool:  # noqa: PLR0911 - a rule for each kind of file
     """Whether a file is one that the command wrote to the end, as it wrote the reference."""
     suffix = Path(name).suffix
     if suffix == ".json":
