@@ -269,15 +269,11 @@ def scratch(place: Path) -> list[str]:
     return [str(path.relative_to(place)) for path in place.rglob(".*") if path.suffix in (".partial", ".replaced")]
 
 
-def is_whole(name: str, data: bytes, reference: bytes | None) -> bool:  # noqa: PLR0911 - a rule for each kind of file
+def is_whole(name: str, data: bytes, reference: bytes | None) -> bool:
     """Whether a file is one that the command wrote to the end, as it wrote the reference."""
     suffix = Path(name).suffix
     if suffix == ".json":
-        try:
-            json.loads(data)
-        except ValueError:
-            return False
-        return True
+        return _is_json(data)
     if suffix == ".html":
         return data.rstrip().endswith(b"</html>")
     if reference is not None and (suffix == ".safetensors" or name.endswith("per_frame.csv")):
@@ -288,6 +284,14 @@ def is_whole(name: str, data: bytes, reference: bytes | None) -> bool:  # noqa: 
         return len(data) > 0
     # open3d's triangles come in any order, and what is made of them differs a little
     return _is_readable(name, data) if any(part in name for part in _FUSED) else data == reference
+
+
+def _is_json(data: bytes) -> bool:
+    try:
+        json.loads(data)
+    except ValueError:
+        return False
+    return True
 
 
 def _is_readable(name: str, data: bytes) -> bool:
