@@ -1,27 +1,25 @@
-"""Downloads that go on where they stopped and are checked before they get their name.
+"""Downloads by pooch that go on where they stopped and are checked before they get their name.
 
 Only ``coliags weights`` downloads, and nothing else imports this.
 """
 
 from __future__ import annotations
 
-import fcntl
 import os
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
-from http.client import HTTPException, HTTPResponse
-from io import FileIO
 from pathlib import Path
-from urllib.error import HTTPError
+from typing import IO, TYPE_CHECKING, Any
 from urllib.parse import urlsplit
-from urllib.request import Request, build_opener
 
 from coliags_plugin._version import __version__
 from coliags_plugin.core.checksums import file_sha256
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import make_folder, not_writable
+from coliags_plugin.core.locks import LockedError, locked
 from coliags_plugin.core.progress import Progress
+
+if TYPE_CHECKING:
+    import requests
 
 #: Without any byte for so long, a connection counts as lost, seconds.
 TIMEOUT = 30.0
@@ -32,7 +30,7 @@ _MIB = 1 << 20
 def download(url: str, target: Path, sha256: str, progress: Progress, otherwise: str = "") -> None:
     """Fetch a file by HTTP, through the proxy of ``HTTPS_PROXY`` where that is set.
 
-    What arrives is written to ``target`` with ``.part`` appended, which is locked, kept when the transfer fails or is
+    What arrives is written to ``target`` with ``.part`` appended, which is kept when the transfer fails or is
     interrupted, continued by the next call, and renamed once its checksum is right.
 
     Args:
@@ -47,122 +45,111 @@ def download(url: str, target: Path, sha256: str, progress: Progress, otherwise:
             checksum, a folder or disk that cannot be written, or another process that fetches the same file.
     """
     make_folder(target.parent)
-    part = target.with_name(f"{target.name}.part")
-    with _locked(part) as file:
-        if target.exists():
-            return
-        # The last call may have been stopped between the last byte and the renaming.
-        seen = file_sha256(part)
-        if not seen.startswith(sha256):
-            _transfer(url, file, target.name, progress, otherwise)
-            seen = file_sha256(part)
-        if not seen.startswith(sha256):
-            part.unlink()
-            raise InputError(
-                f"{url}: what arrived has the SHA-256 {seen}",
-                sha256 if len(sha256) == len(seen) else f"one that begins with {sha256}",
-                f"It was removed. Perhaps a proxy answered in the server's place. {otherwise}",
-            )
-        try:
-            os.fsync(file.fileno())
-            os.replace(part, target)
-        except OSError as error:
-            raise not_writable(part.parent, error) from error
-
-
-@contextmanager
-def _locked(part: Path) -> Iterator[FileIO]:
-    """The file, opened for appending by this process alone, and removed at the end where nothing is in it."""
+    part, lock = (target.with_name(f"{target.name}.{suffix}") for suffix in ("part", "lock"))
     try:
-        file = FileIO(part, "ab")
+        with locked(lock):
+            try:
+                if not target.exists():
+                    _fetch(url, part, sha256, progress, otherwise)
+                    os.replace(part, target)
+            finally:
+                lock.unlink()
+    except LockedError as error:
+        raise InputError(f"{part} is being written by {error}", "", "Wait until that is done") from error
     except OSError as error:
         raise not_writable(part.parent, error) from error
-    with file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # Between opening and locking, another process may have given the file its final name.
-            alone = part.exists() and os.path.samestat(part.stat(), os.fstat(file.fileno()))
-        except BlockingIOError:
-            alone = False
-        except OSError as error:
-            raise not_writable(part.parent, error) from error
-        if not alone:
-            raise InputError(f"{part} is being written by another process", "", "Wait until that is done")
-        try:
-            yield file
-        finally:
-            if _size(file) == 0:
-                part.unlink(missing_ok=True)
 
 
-def _transfer(url: str, file: FileIO, name: str, progress: Progress, otherwise: str) -> None:
-    """Append what is missing of the file, or all of it where the server cannot send a part."""
-    try:
-        response, received = _request(url, _size(file))
-    except HTTPError as error:
-        raise InputError(f"{url}: the server answered {error.code} {error.reason}", "the file", otherwise) from error
-    except (OSError, HTTPException) as error:
-        reason = getattr(error, "reason", error)
-        raise InputError(f"no connection to {urlsplit(url).netloc}: {reason}", "", otherwise) from error
-    with response:
-        total = None if response.length is None else received + response.length
-        _write(file, b"", at=received)
-        stopped: Exception | None = None
-        while True:
-            if total is not None:
-                progress(f"{name}, MiB", received // _MIB if received < total else -(-total // _MIB), -(-total // _MIB))
+def _fetch(url: str, part: Path, sha256: str, progress: Progress, otherwise: str) -> None:
+    """Complete a part and check it."""
+    with part.open("ab") as file:
+        # The last call may have been stopped between the last byte and the renaming.
+        digest = file_sha256(part)
+        if not digest.startswith(sha256):
             try:
-                chunk = response.read(_CHUNK)
-            except (OSError, HTTPException) as error:
-                stopped = error
-                break
-            if not chunk:
-                break
-            _write(file, chunk)
-            received += len(chunk)
-    if stopped is not None or (total is not None and received < total):
+                _Transfer(url, file, part.stem, progress).run(otherwise)
+            finally:
+                if not part.stat().st_size:
+                    part.unlink()
+            digest = file_sha256(part)
+        os.fsync(file.fileno())
+    if not digest.startswith(sha256):
+        part.unlink()
         raise InputError(
-            f"{url}: the connection broke after {received} bytes"
-            + (f" of {total}" if total is not None else "")
-            + (f" ({stopped})" if stopped is not None else ""),
-            "",
-            "Run the command again: it goes on from there",
-        ) from stopped
+            f"{url}: what arrived has the SHA-256 {digest}",
+            sha256 if len(sha256) == len(digest) else f"one that begins with {sha256}",
+            f"It was removed. Perhaps a proxy answered in the server's place. {otherwise}",
+        )
 
 
-def _request(url: str, have: int) -> tuple[HTTPResponse, int]:
-    """The server's response, and the position in the file of its first byte: ``have`` or, failing that, 0."""
-    # Some content networks refuse urllib's own name, for which reason torch.hub gives another too.
-    headers = {"User-Agent": f"coliags_plugin/{__version__}"} | ({"Range": f"bytes={have}-"} if have else {})
-    try:
-        response: HTTPResponse = build_opener().open(Request(url, headers=headers), timeout=TIMEOUT)
-    except HTTPError as error:
-        if have and error.code == 416:  # nothing beyond what is there, which is not the file
-            return _request(url, 0)
-        raise
-    if not have or response.status != 206:
-        return response, 0
-    begin = re.match(r"bytes (\d+)-", response.headers.get("Content-Range", ""))
-    if begin is not None and int(begin[1]) == have:
-        return response, have
-    response.close()
-    return _request(url, 0)
+class _UnusableRangeError(Exception):
+    """The server's answer does not continue the part."""
 
 
-def _write(file: FileIO, data: bytes, at: int | None = None) -> None:
-    """Append data; with ``at``, cut the file there first."""
-    try:
-        if at is not None:
-            file.truncate(at)
-        while data:
-            data = data[file.write(data) :]
-    except OSError as error:
-        raise InputError(
-            f"cannot write to {file.name}: {error.strerror} after {_size(file)} bytes",
-            "",
-            "Make room or choose another folder. Run again, the command goes on from there",
-        ) from error
+class _Transfer:
+    """The transfer of what is missing of a file, or of all of it where the server cannot send a part.
 
+    It is also the progress bar that pooch updates: its public names are pooch's.
+    """
 
-def _size(file: FileIO) -> int:
-    return os.fstat(file.fileno()).st_size
+    def __init__(self, url: str, file: IO[bytes], name: str, progress: Progress) -> None:
+        self.url, self.file, self.name, self.progress = url, file, name, progress
+        self.response: requests.Response | None = None
+        self.total, self.offset = 0, 0
+
+    def run(self, otherwise: str) -> None:
+        """Append to the file, or write it anew."""
+        import pooch
+        import requests
+
+        self.offset = self.file.tell()
+        # Some content networks refuse a library's own name. Compressed answers would have other ranges.
+        headers = {"User-Agent": f"coliags_plugin/{__version__}", "Accept-Encoding": "identity"}
+        headers |= {"Range": f"bytes={self.offset}-"} if self.offset else {}
+        hooks = {"response": self._answered}
+        fetch = pooch.HTTPDownloader(self, _CHUNK, timeout=TIMEOUT, headers=headers, hooks=hooks)
+        try:
+            fetch(self.url, self.file, None)
+        except _UnusableRangeError:
+            self.file.seek(0)
+            self.file.truncate()
+            self.run(otherwise)
+        except requests.HTTPError as error:
+            status = f"{error.response.status_code} {error.response.reason}"
+            raise InputError(f"{self.url}: the server answered {status}", "the file", otherwise) from error
+        except requests.RequestException as error:
+            if self.response is None:
+                reason = getattr(error.args[0] if error.args else error, "reason", error)
+                raise InputError(f"no connection to {urlsplit(self.url).netloc}: {reason}", "", otherwise) from error
+            arrived = f"{self.file.tell()} bytes" + (f" of {self.offset + self.total}" if self.total else "")
+            raise InputError(
+                f"{self.url}: the connection broke after {arrived}", "", "Run the command again: it goes on from there"
+            ) from error
+
+    def _answered(self, response: requests.Response, *_: Any, **__: Any) -> None:
+        """Prepare the file for the body of a response; redirections and failures have none."""
+        begin = re.match(r"bytes (\d+)-", response.headers.get("Content-Range", ""))
+        begins_elsewhere = response.status_code == 206 and (begin is None or int(begin[1]) != self.offset)
+        if self.offset and (begins_elsewhere or response.status_code == 416):
+            response.close()
+            raise _UnusableRangeError
+        self.response = response
+        if response.status_code == 200 and self.offset:
+            self.file.seek(0)
+            self.file.truncate()
+            self.offset = 0
+
+    def update(self, size: int) -> None:
+        """Report what has arrived; the whole is reported once, by :meth:`close`."""
+        done, total = self.file.tell(), self.offset + self.total
+        if done < total:
+            self.progress(f"{self.name}, MiB", done // _MIB, -(-total // _MIB))
+
+    def reset(self) -> None:
+        """Nothing: what has arrived is told from the file."""
+
+    def close(self) -> None:
+        """Report that all has arrived, where the server told how much that is."""
+        if self.total:
+            total = -(-(self.offset + self.total) // _MIB)
+            self.progress(f"{self.name}, MiB", total, total)

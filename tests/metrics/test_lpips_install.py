@@ -118,14 +118,14 @@ def test_a_folder_of_one_s_own_gets_everything(server, cache, tmp_path):
 
 
 def test_a_broken_transfer_goes_on_and_ends_with_the_same_values(server, cache, make, pair):
-    server.cuts = [3000, len(server.files["/v0.1/squeeze.pth"]), 1_000_000]
-    for left in (3000, 1_000_000):
-        with pytest.raises(InputError, match=f"broke after {left} bytes"):
-            install(["squeeze"], None, None, quiet)
-        (part,) = cache.rglob("*.part")
-        assert part.stat().st_size == left
+    server.cuts = [len(server.files["/v0.1/squeeze.pth"]), 1_000_000]
+    with pytest.raises(InputError, match="the connection broke after"):
+        install(["squeeze"], None, None, quiet)
+    (part,) = cache.rglob("*.part")
+    kept = part.stat().st_size
+    assert 900_000 < kept <= 1_000_000
     install(["squeeze"], None, None, quiet)
-    assert server.sent == sum(len(data) for path, data in server.files.items() if "squeeze" in path)
+    assert server.requests[-1][2] == f"bytes={kept}-"
     assert make("lpips", net="squeeze")(pair) == pytest.approx(direct("squeeze", pair), rel=1e-6)
 
 
