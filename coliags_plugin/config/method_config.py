@@ -21,9 +21,11 @@ from coliags_plugin.config.components import (
     StrategyNode,
 )
 from coliags_plugin.config.method_files import method_files
+from coliags_plugin.config.moved_options import with_moved_options
 from coliags_plugin.config.origins import errors_with_origins
-from coliags_plugin.config.yaml_tree import Node, dump, dump_inline, merge, override_all, read_tree
+from coliags_plugin.config.yaml_tree import Node, dump, dump_inline, merge, parse_assignment, read_tree
 from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.core.intrinsics import NEAR_PLANE
 from coliags_plugin.core.settings import Settings, refuse_zero_ends
 
 #: Of the run, neither its start nor its end.
@@ -66,6 +68,7 @@ class MethodConfig(Settings):
     datamanager: DataManagerNode  # reads the data
     field: FieldNode  # what is trained
     renderer: RendererNode  # draws it
+    near_plane: float = Field(default=NEAR_PLANE, ge=0)  # z-depth up to which nothing is drawn, scene units
     modules: dict[str, ModuleNode] = Field(default_factory=dict)  # what adjusts cameras and shades views, in this order
     sampler: SamplerNode = Field(default="frames", validate_default=True)  # what each step looks at
     strategy: StrategyNode  # grows and prunes
@@ -157,7 +160,10 @@ def method_tree(method: str, overrides: Iterable[str] = ()) -> Node:
     Raises:
         InputError: No such method, or a file of it is not YAML.
     """
-    return override_all(_resolve(_find(method, Path.cwd()), ()), overrides)
+    tree = _resolve(_find(method, Path.cwd()), ())
+    for assignment in overrides:
+        tree = merge(tree, with_moved_options(parse_assignment(assignment)))
+    return tree
 
 
 def _is_path(method: str) -> bool:
@@ -184,7 +190,7 @@ def _resolve(path: Path, seen: tuple[Path, ...]) -> Node:
     if path in seen:
         chain = " -> ".join(p.name for p in (*seen, path))
         raise InputError(f"method configs inherit from each other: {chain}", "a chain of bases that ends")
-    tree = read_tree(path)
+    tree = with_moved_options(read_tree(path))
     base = tree.value.get("base")
     if base is None:
         return tree

@@ -216,8 +216,8 @@ def merge(base: Node, over: Node) -> Node:
 _KEY = re.compile(r'"[^"]+"|[^".]+')
 
 
-def override(tree: Node, assignment: str) -> Node:
-    """Apply one ``key.path=value``; a key with a dot is put in double quotes.
+def parse_assignment(assignment: str) -> Node:
+    """The tree of one ``key.path=value``; a key with a dot is put in double quotes.
 
     Raises:
         InputError: It has no ``=``, an empty key, or bytes that are not UTF-8.
@@ -232,7 +232,7 @@ def override(tree: Node, assignment: str) -> Node:
     node = _nodes(parse_value(text), origin)
     for key in reversed(keys):
         node = Node({key.strip('"'): node}, origin)
-    return merge(tree, node)
+    return node
 
 
 def _nodes(value: Any, origin: str) -> Node:
@@ -246,10 +246,10 @@ def override_all(tree: Node, assignments: Iterable[str]) -> Node:
     """Apply ``key.path=value`` assignments, the last one last.
 
     Raises:
-        InputError: See :func:`override`.
+        InputError: See :func:`parse_assignment`.
     """
     for assignment in assignments:
-        tree = override(tree, assignment)
+        tree = merge(tree, parse_assignment(assignment))
     return tree
 
 

@@ -108,8 +108,12 @@ class Renderer(ABC):
         """:meth:`render` in a training step: with random samples from the generator where there are any."""
         return self.render(field, camera, wants, pixels)
 
-    def check_field(self, field: Any) -> None:  # noqa: B027 (optional)
-        """Check, before training, that a field has what the renderer's options need of it.
+    def check_field(self, field: Any, near_plane: float) -> None:  # noqa: B027 (optional)
+        """Check, before training, that the renderer's options fit a field and the near plane of its cameras.
+
+        Args:
+            field: See :meth:`render`.
+            near_plane: z-depth, scene units.
 
         Raises:
             InputError: See above.

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.core.intrinsics import NEAR_PLANE, Intrinsics
 
 
 @dataclass(frozen=True)
@@ -18,9 +18,11 @@ class Camera(Intrinsics):
     Attributes:
         fx, fy, cx, cy, width, height: See :class:`Intrinsics`.
         camera_to_world: Rigid transform. Scene units (mm for C3VD). [4, 4]
+        near_plane: z-depth up to which nothing is drawn, scene units: option ``near_plane`` of a method config.
     """
 
     camera_to_world: Float[Tensor, "4 4"]
+    near_plane: float = NEAR_PLANE
 
     @classmethod
     def of(cls, intrinsics: Intrinsics, camera_to_world: Float[Tensor, "4 4"]) -> Camera:

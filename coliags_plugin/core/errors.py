@@ -54,6 +54,10 @@ class NotFiniteError(ReportedError):
     """A loss or parameter became NaN or infinite."""
 
 
+class NothingDrawnError(ReportedError):
+    """Nothing was drawn for many steps: the field is not where the cameras look."""
+
+
 class UnavailableError(Exception):
     """A quantity cannot be computed (missing weights, missing ground truth); the message is the reason.
 
@@ -62,7 +66,7 @@ class UnavailableError(Exception):
 
 
 #: Former and present names of options ("Renamed options" in the changelog); hints name the new ones.
-RENAMED_OPTIONS = {"near": "near_plane", "far": "far_plane", "low_pass": "eps2d"}
+RENAMED_OPTIONS = {"far": "far_plane", "low_pass": "eps2d"}
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

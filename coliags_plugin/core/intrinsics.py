@@ -12,6 +12,9 @@ from typing_extensions import Self
 from coliags_plugin.core import bounds
 from coliags_plugin.core.errors import InputError
 
+#: z-depth of the near plane where nothing else is set, scene units: the splatting methods' (docs/methods.md 2.1).
+NEAR_PLANE = 0.2
+
 
 @dataclass(frozen=True)
 class Intrinsics:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import torch
@@ -171,6 +172,12 @@ class Frame(_MaskedImage):
         """The depth, if it was measured or rendered; None where there is none or it is an estimate. [H, W]"""
         return self.depth if self.depth_confidence is None else None
 
+    def with_near_plane(self, near_plane: float) -> Frame:
+        """The same frame, read as lazily as before, with another near plane of its camera, scene units."""
+        frame = copy(self)
+        object.__setattr__(frame, "camera", replace(self.camera, near_plane=near_plane))
+        return frame
+
     def view(self, trained: bool) -> View:
         """This frame, for the modules of a model."""
         return View(self.name, float(self.index), trained)
@@ -244,6 +251,14 @@ class Scene:
         sets = {"train": self.train, **self.test_sets}
         counts = ", ".join(f"{len(frames)} {name}" for name, frames in sets.items())
         return f"Scene {self.name}: frames {counts}; {len(self.points)} points"
+
+    def with_near_plane(self, near_plane: float) -> Scene:
+        """The scene with another near plane of all cameras, scene units."""
+        sets = {
+            name: [frame.with_near_plane(near_plane) for frame in frames]
+            for name, frames in {"": self.train, **self.test_sets}.items()
+        }
+        return replace(self, train=sets.pop(""), test_sets=sets)
 
     @property
     def extent(self) -> float:

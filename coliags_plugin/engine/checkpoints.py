@@ -249,7 +249,7 @@ def restore_model(checkpoint: Checkpoint, config: MethodConfig, scene: Scene, re
             module.load_state_dict(checkpoint.part(f"modules/{name}"))
         except RuntimeError as error:
             raise InputError(f"the checkpoint's module '{name}' does not fit: {error}", "one of this run") from error
-    return Model(field, renderer, modules)
+    return Model(field, renderer, modules, config.near_plane)
 
 
 def restore_strategy(checkpoint: Checkpoint, strategy: Strategy, name: str) -> None:

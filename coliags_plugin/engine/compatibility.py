@@ -31,7 +31,7 @@ def check_components(
     _check_sampler(config, chosen, losses)
     _check_splats(config, losses)
     _check_data(scene, losses)
-    _check_points_in_view(config, chosen, scene)
+    _check_points_in_view(config, scene)
     _warn_of_trusted_estimates(scene, losses)
     _check_schedule(losses, schedule)
 
@@ -99,10 +99,10 @@ def _check_data(scene: Scene, losses: Mapping[str, Loss]) -> None:
             )
 
 
-def _check_points_in_view(config: MethodConfig, chosen: ChosenRenderer, scene: Scene) -> None:
+def _check_points_in_view(config: MethodConfig, scene: Scene) -> None:
     if config.field.target.primitive == "radiance" or not len(scene.points):
         return
-    near = chosen.renderer.settings.near_plane
+    near = config.near_plane
     depths = scene.depths_in_view()
     if (depths > near).any():
         return
@@ -114,8 +114,7 @@ def _check_points_in_view(config: MethodConfig, chosen: ChosenRenderer, scene: S
     raise InputError(
         f"{seen}, and nothing nearer than {near:g} is drawn",
         "lengths in mm, and poses and points of one world",
-        "`coliags data check` looks into poses, depth and units; small units on purpose need "
-        "--set renderer.near_plane=LENGTH",
+        "`coliags data check` looks into poses, depth and units; small units on purpose need --set near_plane=LENGTH",
     )
 
 

@@ -53,7 +53,7 @@ def load_method_for(
 
 
 def load_scene(config: MethodConfig, path: Path) -> Scene:
-    """Read the data with the method's data manager, reporting progress when it takes long.
+    """Read the data with the method's data manager and near plane, reporting progress when it takes long.
 
     Raises:
         InputError: It cannot be read.
@@ -61,7 +61,7 @@ def load_scene(config: MethodConfig, path: Path) -> Scene:
     component = config.datamanager
     with progress_callback(after=READING_IS_LONG) as progress:
         scene: Scene = component.target(component.settings).load(path, progress)
-    return scene
+    return scene.with_near_plane(config.near_plane)
 
 
 def open_scene(

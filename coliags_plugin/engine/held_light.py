@@ -44,7 +44,7 @@ def flattened_light(model: Model, cameras: Sequence[Camera]) -> HeldLight:
     distances, cosines = [], []
     device = next(model.field.parameters()).device
     for camera in cameras[:: max(1, len(cameras) // _CAMERAS)]:
-        placed = camera.to(device)
+        placed = model.placed(camera).to(device)
         output = model.renderer.render(model.field, placed, ("rgb", "alpha", "depth_accumulated"))
         seen = output.alpha >= OPAQUE_ALPHA
         lengths = placed.rays().norm(dim=-1)[seen]
@@ -85,7 +85,7 @@ def render_held(model: Model, camera: Camera, light: HeldLight, wants: Sequence[
         light: What lights it.
         wants: Names of outputs.
     """
-    field, renderer = gaussians_of(model), splatting_of(model)
+    camera, field, renderer = model.placed(camera), gaussians_of(model), splatting_of(model)
     return renderer.draw(field.gaussians_in_light(camera, light), camera, wants)
 
 

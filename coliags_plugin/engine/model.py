@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -12,6 +13,7 @@ from coliags_plugin.config.method_config import MethodConfig
 from coliags_plugin.contracts import Field, GaussianField, Renderer, ViewModule
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.intrinsics import NEAR_PLANE
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Scene, View
 
@@ -23,14 +25,22 @@ class Model(nn.Module):
         field: Scene representation.
         renderer: Renderer of the field.
         view_modules: By their names in the method config; cameras pass through them in this order, outputs too.
+        near_plane: Of every camera that it renders from, scene units.
     """
 
     field: Field
 
-    def __init__(self, field: Field, renderer: Renderer, view_modules: Mapping[str, ViewModule]) -> None:
+    def __init__(
+        self,
+        field: Field,
+        renderer: Renderer,
+        view_modules: Mapping[str, ViewModule],
+        near_plane: float = NEAR_PLANE,
+    ) -> None:
         super().__init__()
         self.field = field
         self.renderer = renderer
+        self.near_plane = near_plane
         # A ModuleDict would refuse names of its own attributes, such as "train" and "keys".
         self._view_modules = nn.ModuleList(view_modules.values())
         self._names = tuple(view_modules)
@@ -39,6 +49,10 @@ class Model(nn.Module):
     def view_modules(self) -> dict[str, ViewModule]:
         """The view modules by name."""
         return dict(zip(self._names, self._view_modules, strict=True))  # type: ignore[arg-type]
+
+    def placed(self, camera: Camera) -> Camera:
+        """A camera, wherever it comes from, with the near plane of the model."""
+        return replace(camera, near_plane=self.near_plane)
 
     def render(
         self,
@@ -58,7 +72,7 @@ class Model(nn.Module):
             generator: In training, of the random samples of renderers and fields that have any; None renders without
                 chance.
         """
-        modules = self.view_modules.values()
+        camera, modules = self.placed(camera), self.view_modules.values()
         for module in modules:
             camera = module.adjust_camera(camera, view)
         needed = tuple(dict.fromkeys([*wants, *(name for module in modules for name in sorted(module.wants))]))

@@ -28,7 +28,7 @@ def relight(trained: TrainedRun, lamp: Lamp) -> TrainedRun:
             f"a method with one of these fields: {lit}",
             "Train such a method, for instance pr-endo",
         )
-    lit_model = Model(model.field.with_lamp(lamp), model.renderer, model.view_modules).eval()
+    lit_model = Model(model.field.with_lamp(lamp), model.renderer, model.view_modules, model.near_plane).eval()
     return replace(trained, model=lit_model, lamp=lamp)
 
 

@@ -13,13 +13,12 @@ from torch import Tensor
 
 from coliags_plugin.config.method_config import LoadedMethod
 from coliags_plugin.contracts import Draw, Loss, Sampler, Schedule, Strategy, TrainingStep
-from coliags_plugin.core.errors import InterruptedRunError, NotFiniteError
+from coliags_plugin.core.errors import InterruptedRunError, NotFiniteError, NothingDrawnError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.masked import masked_mean
 from coliags_plugin.core.render_output import RenderOutput, Splats, concatenate_pixels
 from coliags_plugin.core.scenes import Frame, Scene, Target, concatenate_targets
 from coliags_plugin.engine import checkpoints
-from coliags_plugin.engine.blank_views import BlankViews
 from coliags_plugin.engine.compatibility import check_components
 from coliags_plugin.engine.costs import CostMeter, TrainingCost
 from coliags_plugin.engine.devices import device_name
@@ -35,6 +34,10 @@ from coliags_plugin.renderers.choice import ChosenRenderer, choose_renderer
 
 logger = logging.getLogger(__name__)
 
+#: Views of a smaller mean alpha are blank.
+BLANK_ALPHA = 1e-3
+#: Blank views in a row after which a run stops.
+MAX_BLANK_VIEWS = 10
 #: So that the PSNR of a perfect view stays a number, dB.
 MAX_PSNR = 100.0
 
@@ -58,6 +61,7 @@ class Trainer:
         self, method: LoadedMethod, scene: Scene, scene_path: str, run: RunFolder, seed: int, device: torch.device
     ) -> None:
         config = method.config
+        scene = scene.with_near_plane(config.near_plane)
         self.method, self.scene, self.scene_path, self.run = method, scene, scene_path, run
         self.seed, self.device = seed, device
         self.steps = config.schedule.steps
@@ -76,15 +80,15 @@ class Trainer:
         modules = make_view_modules(config, scene, self.generators["initialisation"])
         for module in modules.values():
             module.prepare(scene)
-        self.model = Model(field, self.chosen.renderer, modules).to(device)
+        self.model = Model(field, self.chosen.renderer, modules, config.near_plane).to(device)
         self.wants = tuple(sorted({"rgb", "alpha"}.union(*(loss.wants for loss in self.losses.values()))))
         self.model.check_outputs(self.wants, "the losses")
         for loss in self.losses.values():
             loss.check(self.model)
-        self.chosen.renderer.check_field(field)
+        self.chosen.renderer.check_field(field, config.near_plane)
         self.optimizers = self._optimizers()
         self.step = 0
-        self.blank_views = BlankViews()
+        self.blank_views = 0  # in a row, up to this step
         self.costs = CostMeter(device)
 
     def start(self, overwrite: bool = False) -> None:
@@ -192,13 +196,13 @@ class Trainer:
         # A NaN opacity draws nothing and leaves every term finite, so parameters are looked at themselves.
         sums = _parameter_sums(self.model)
         # Everything the log and the checks need, in one wait for the device.
-        error_and_alpha = [_squared_error(output, target), output.alpha.detach().amax()]
+        error_and_alpha = [_squared_error(output, target), output.alpha.detach().mean()]
         scalars = [total, *error_and_alpha, *terms.values(), *sums.values()]
         loss, error, alpha, *rest = torch.stack(scalars).tolist()
         values, totals = rest[: len(terms)], rest[len(terms) :]
         self._check_parameters(dict(zip(sums, totals, strict=True)), step)
         self._check_terms(dict(zip(terms, values, strict=True)), step, target)
-        self.blank_views.see(alpha, step)
+        self._check_drawn(alpha, step)
         if total.requires_grad:
             torch.autograd.backward(total)
         done = self.strategy.after_backward(seen, self.optimizers)
@@ -251,6 +255,16 @@ class Trainer:
                     f"step {step - 1} left parameters of group '{group}' that are not finite. "
                     f"The last checkpoint is whole; look for too large a learning rate of {group}."
                 )
+
+    def _check_drawn(self, alpha: float, step: int) -> None:
+        self.blank_views = 0 if alpha >= BLANK_ALPHA else self.blank_views + 1
+        if self.blank_views >= MAX_BLANK_VIEWS:
+            raise NothingDrawnError(
+                f"nothing was drawn in the last {MAX_BLANK_VIEWS} views, until step {step}: their mean alpha is below "
+                f"{BLANK_ALPHA:g}. Checkpoints stay whole. Learning rates or weights of losses may be too large, or "
+                f"near_plane {self.method.config.near_plane:g} may lie beyond the tissue; `coliags data check` looks "
+                "into poses and units."
+            )
 
     def _check_terms(self, terms: dict[str, float], step: int, target: Target) -> None:
         for key, term in terms.items():

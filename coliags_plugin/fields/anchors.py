@@ -40,7 +40,6 @@ class AnchorFieldSettings(Settings):
     voxel_size: float | None = Option(default=None, gt=0)
     # Two pixels with ten children per anchor, about half of them transparent, put a Gaussian about every pixel.
     voxel_pixels: float = Option(default=2.0, gt=0)
-    near_plane: float = Option(default=0.2, ge=0)  # scene units; anchors entirely nearer are not decoded
 
 
 class AnchorField(GaussianField):
@@ -169,7 +168,7 @@ class AnchorField(GaussianField):
         """Indices of anchors of which any child may overlap the image. [V]"""
         reach = (self.offsets * self.scalings[:, None, :3].exp()).norm(dim=2).amax(dim=1)
         size = DRAWN_SIGMAS * self.scalings[:, 3:].amax(dim=1).exp()
-        inside = spheres_in_frustum(self.anchors, reach + size, camera, self.settings.near_plane)
+        inside = spheres_in_frustum(self.anchors, reach + size, camera)
         return inside.nonzero().squeeze(1)
 
     def _distances(self, camera: Camera) -> Float[Tensor, "V"]:

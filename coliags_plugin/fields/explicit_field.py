@@ -26,7 +26,6 @@ class ExplicitFieldSettings(Settings):
     """Options of all fields of explicit Gaussians (docs/methods.md 7.1)."""
 
     initial_opacity: float = Option(default=0.1, gt=0, lt=1)  # of every Gaussian
-    near_plane: float = Option(default=0.2, ge=0)  # scene units; nearer Gaussians are culled
     normal_neighbours: int | None = Option(
         default=None, ge=3
     )  # neighbours from which normals of the initial points are estimated, as references; null: no such normals
@@ -109,4 +108,4 @@ class ExplicitField(GaussianField):
     def _visible(self, camera: Camera) -> Tensor:
         """Rows that the camera may see. [V]"""
         reach = DRAWN_SIGMAS * self.scales.amax(dim=1).exp()
-        return spheres_in_frustum(self.means, reach, camera, self.settings.near_plane).nonzero().squeeze(1)
+        return spheres_in_frustum(self.means, reach, camera).nonzero().squeeze(1)

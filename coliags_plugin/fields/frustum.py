@@ -14,10 +14,8 @@ from coliags_plugin.core.cameras import Camera
 DRAWN_SIGMAS = math.sqrt(2.0 * math.log(255.0))
 
 
-def spheres_in_frustum(
-    centers: Float[Tensor, "M 3"], radii: Float[Tensor, "M"], camera: Camera, near_plane: float
-) -> Bool[Tensor, "M"]:
-    """Whether any part of a sphere may lie inside the viewing pyramid beyond the near plane.
+def spheres_in_frustum(centers: Float[Tensor, "M 3"], radii: Float[Tensor, "M"], camera: Camera) -> Bool[Tensor, "M"]:
+    """Whether any part of a sphere may lie inside the viewing pyramid beyond the camera's near plane.
 
     Conservative: near the pyramid's edges a sphere outside may pass, none inside is refused.
 
@@ -25,10 +23,9 @@ def spheres_in_frustum(
         centers: World positions, scene units. [M, 3]
         radii: Scene units. [M]
         camera: The camera.
-        near_plane: z-depth of the near plane, scene units.
     """
     x, y, z = ((centers - camera.center) @ camera.camera_to_world[:3, :3]).unbind(-1)
-    inside = z + radii > near_plane
+    inside = z + radii > camera.near_plane
     # Each side plane goes through the camera and one image border; its inward normal is (f, distance of the border
     # from the principal point) up to length.
     sides = (

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -75,7 +77,7 @@ def surface_distances(scene: Scene) -> Float[Tensor, "2"]:
     for frame in scene.train:
         camera = frame.camera.to(points.device, points.dtype)
         distances = (points - camera.center).norm(dim=1)
-        found.append(distances[spheres_in_frustum(points, radii, camera, near_plane=0.0)])
+        found.append(distances[spheres_in_frustum(points, radii, replace(camera, near_plane=0.0))])
     seen = torch.cat(found)
     if not len(seen):
         raise InputError(

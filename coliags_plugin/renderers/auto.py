@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
-from pydantic import Field
 from torch import Tensor
 
 from coliags_plugin.contracts import Availability, Renderer
@@ -21,8 +20,6 @@ class AutoSettings(Settings):
 
     prefer: tuple[str, ...] = ("gsplat", "cpu", "torch")
     """Names of renderers, the most preferred first."""
-    near_plane: float = Field(default=0.2, ge=0)
-    """Gaussians with a centre at z <= near_plane are not drawn. Scene units."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Background RGB."""
 

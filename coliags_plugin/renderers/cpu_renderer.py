@@ -136,10 +136,10 @@ def _view_table(camera: Camera, pose: Tensor, settings: CpuRendererSettings) -> 
         *matrix[:3].T.ravel(),
         *(camera.fx, camera.fy, camera.cx, camera.cy),
         *limits,
-        *(settings.near_plane, settings.eps2d, camera.width, camera.height),
+        *(camera.near_plane, settings.eps2d, camera.width, camera.height),
         *(math.log2(settings.alpha_min), settings.alpha_max, settings.transmittance_min),
         *settings.background,
-        *(math.sqrt(0.5 / math.log(2.0)) / settings.surfel_filter, settings.distortion_slope**2),
+        *(math.sqrt(0.5 / math.log(2.0)) / settings.surfel_filter, settings.distortion_slope(camera.near_plane) ** 2),
     ]
     if not np.isfinite(table).all():
         raise InputError(f"a camera with numbers that are not finite: {camera}", "finite intrinsics and pose")

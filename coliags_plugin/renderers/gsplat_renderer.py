@@ -156,7 +156,7 @@ def _draw_gaussians(gaussians: Gaussians, camera: Camera, needs: set[str], setti
         intrinsics[None],
         *size,
         eps2d=settings.eps2d,
-        near_plane=settings.near_plane,
+        near_plane=camera.near_plane,
         opacities=gaussians.opacities,
     )
     # Of what is not drawn gsplat leaves everything but the radii uninitialised.
@@ -235,7 +235,7 @@ def _median_by_definition(
     gaussians: Gaussians, camera: Camera, settings: GsplatRendererSettings
 ) -> Float[Tensor, "H W"]:
     """Median depth by the torch reference, as gsplat has none for 3D Gaussians; without gradient. [H, W]"""
-    options = TorchRendererSettings(near_plane=settings.near_plane, eps2d=settings.eps2d)
+    options = TorchRendererSettings(eps2d=settings.eps2d)
     return render_gaussians(gaussians, camera, ("depth_median",), options)["depth_median"]
 
 

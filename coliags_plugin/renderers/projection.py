@@ -46,13 +46,12 @@ class ProjectedGaussians:
     in_front: Bool[Tensor, "N"]
 
 
-def project_gaussians(gaussians: Gaussians, camera: Camera, near_plane: float, eps2d: float) -> ProjectedGaussians:
+def project_gaussians(gaussians: Gaussians, camera: Camera, eps2d: float) -> ProjectedGaussians:
     """Project Gaussians; differentiable in all of them and in ``camera.camera_to_world``.
 
     Args:
         gaussians: With three scales each. Their dtype and device are those of the result.
-        camera: Camera of the view.
-        near_plane: Gaussians whose centre has z <= near_plane are not drawn. Scene units.
+        camera: Camera of the view; Gaussians whose centre has z <= its near plane are not drawn.
         eps2d: Added to both diagonal terms of the 2D covariance. Square pixels.
 
     Raises:
@@ -68,7 +67,7 @@ def project_gaussians(gaussians: Gaussians, camera: Camera, near_plane: float, e
     camera_axes = camera.camera_to_world[:3, :3]
     # Subtracting the centre before rotating keeps float32 accurate far from the world's origin.
     local = (gaussians.means - camera.center) @ camera_axes
-    in_front = local[:, 2] > near_plane
+    in_front = local[:, 2] > camera.near_plane
     # A stand-in depth keeps 0 * inf out of the backward pass of what is not drawn.
     x, y, z = torch.where(in_front[:, None], local, local.new_tensor([0.0, 0.0, 1.0])).unbind(-1)
     means2d = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], dim=-1)

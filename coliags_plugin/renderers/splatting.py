@@ -9,7 +9,6 @@ from typing import ClassVar
 import pydantic
 import torch
 from torch import Tensor
-from typing_extensions import Self
 
 from coliags_plugin.contracts import GaussianField, Renderer
 from coliags_plugin.core.cameras import Camera
@@ -23,8 +22,6 @@ from coliags_plugin.renderers.checks import check_primitive
 class SplattingSettings(Settings):
     """Options common to all splatting renderers; the defaults are 3DGS's (docs/methods.md 2.1, 2.2)."""
 
-    near_plane: float = pydantic.Field(default=0.2, ge=0)
-    """Gaussians with a centre at z <= near_plane are not drawn. Scene units."""
     eps2d: float = pydantic.Field(default=0.3, gt=0)
     """Low-pass term added to the diagonal of every 2D covariance, square pixels."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -43,18 +40,20 @@ class CutSettings(SplattingSettings):
     surfel_filter: float = pydantic.Field(default=0.70710678, gt=0)
     """Standard deviation of the low-pass filter of surfels, pixels."""
     distortion_far: float = pydantic.Field(default=100.0, gt=0)
-    """z-depth that the output ``distortion`` maps to 1; ``near_plane`` is mapped to 0. Scene units."""
+    """z-depth that the output ``distortion`` maps to 1; the near plane is mapped to 0. Scene units."""
 
-    @pydantic.model_validator(mode="after")
-    def _near_before_far(self) -> Self:
-        if self.distortion_far <= self.near_plane:
-            raise ValueError(f"distortion_far {self.distortion_far} does not lie beyond near_plane {self.near_plane}")
-        return self
+    def distortion_slope(self, near_plane: float) -> float:
+        """Factor of -1/z in the depths whose differences ``distortion`` measures, scene units.
 
-    @property
-    def distortion_slope(self) -> float:
-        """Factor of -1/z in the depths whose differences ``distortion`` measures, scene units."""
-        return self.distortion_far * self.near_plane / (self.distortion_far - self.near_plane)
+        Raises:
+            InputError: ``distortion_far`` does not lie beyond the near plane.
+        """
+        if self.distortion_far <= near_plane:
+            raise InputError(
+                f"renderer.distortion_far {self.distortion_far:g} with near_plane {near_plane:g}",
+                "a distortion_far beyond the near plane",
+            )
+        return self.distortion_far * near_plane / (self.distortion_far - near_plane)
 
 
 class SplattingRenderer(Renderer):
@@ -102,6 +101,15 @@ class SplattingRenderer(Renderer):
         """:meth:`render` in a training step, with noise of the field from the generator where there is any."""
         self._check(field, pixels)
         return self.draw(field.gaussians_in_training(camera, generator), camera, wants)
+
+    def check_field(self, field: GaussianField, near_plane: float) -> None:
+        """Refuse a near plane beyond ``distortion_far``.
+
+        Raises:
+            InputError: See above.
+        """
+        if isinstance(self.settings, CutSettings):
+            self.settings.distortion_slope(near_plane)
 
     def _check(self, field: GaussianField, pixels: Tensor | None) -> None:
         """Refuse single pixels, and fields that are not for this renderer."""

@@ -58,19 +58,18 @@ class ProjectedSurfels:
         return torch.cat([self.means2d, self.slopes.flatten(1), torch.stack([at_center, self.offsets], dim=1)], dim=1)
 
 
-def project_surfels(gaussians: Gaussians, camera: Camera, near_plane: float) -> ProjectedSurfels:
+def project_surfels(gaussians: Gaussians, camera: Camera) -> ProjectedSurfels:
     """Project surfels; differentiable in all of them and in ``camera.camera_to_world``.
 
     Args:
         gaussians: With two scales each. Their dtype and device are those of the result.
-        camera: Camera of the view.
-        near_plane: Surfels whose centre has z <= near_plane are not drawn. Scene units.
+        camera: Camera of the view; surfels whose centre has z <= its near plane are not drawn.
     """
     camera = camera.to(gaussians.means.device, gaussians.means.dtype)
     camera_axes = camera.camera_to_world[:3, :3]
     # Subtracting the centre before rotating keeps float32 accurate far from the world's origin.
     local = (gaussians.means - camera.center) @ camera_axes
-    in_front = local[:, 2] > near_plane
+    in_front = local[:, 2] > camera.near_plane
     # A stand-in keeps 0 * inf out of the backward pass of what is not drawn.
     places = torch.where(in_front[:, None], local, local.new_tensor([0.0, 0.0, 1.0]))
     z = places[:, 2:]

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.core.cameras import Camera
 from coliags_plugin.renderers.projection import filtered_covariances
 from coliags_plugin.renderers.surfel_projection import ProjectedSurfels
 from coliags_plugin.renderers.tiles import (
@@ -59,10 +59,9 @@ class SurfelExtents:
 def surfel_extents(
     projected: ProjectedSurfels,
     opacities: Float[Tensor, "N"],
-    camera: Intrinsics,
+    camera: Camera,
     grid: TileGrid,
     alpha_min: float,
-    near_plane: float,
     surfel_filter: float,
 ) -> SurfelExtents:
     """Compute the extent of each surfel, and whether it overlaps the rectangle of pixel centres.
@@ -70,10 +69,9 @@ def surfel_extents(
     Args:
         projected: The surfels.
         opacities: [N]
-        camera: Intrinsics of the view.
+        camera: Of the view.
         grid: The tiles.
         alpha_min: Contributions of smaller alpha are skipped.
-        near_plane: z-depth, scene units.
         surfel_filter: Standard deviation of the low-pass filter, pixels.
     """
     tau = 2 * torch.log(opacities / alpha_min)
@@ -85,7 +83,7 @@ def surfel_extents(
     # within z +- |rise|, are positive.
     rise = rim[:, :, 2]
     spread = rise.norm(dim=-1)
-    everywhere = z - spread <= near_plane
+    everywhere = z - spread <= camera.near_plane
     span = torch.where(everywhere, 1.0, (z - spread) * (z + spread))[:, None]
     row_x = camera.fx * (rim[:, :, 0] - (x / z)[:, None] * rise)
     row_y = camera.fy * (rim[:, :, 1] - (y / z)[:, None] * rise)

@@ -116,7 +116,7 @@ def _draw_gaussians(
 ) -> _Drawn:
     grid = TileGrid(camera.width, camera.height, settings.tile_size)
     cuts = _cuts(settings)
-    projected = project_gaussians(gaussians, camera, settings.near_plane, settings.eps2d)
+    projected = project_gaussians(gaussians, camera, settings.eps2d)
     extents = gaussian_extents(projected, gaussians.opacities, grid, settings.alpha_min)
     pairs = bin_gaussians(projected, extents, grid)
 
@@ -148,9 +148,9 @@ def _draw_surfels(
     gaussians: Gaussians, camera: Camera, wants: Sequence[str], settings: TorchRendererSettings
 ) -> _Drawn:
     grid = TileGrid(camera.width, camera.height, settings.tile_size)
-    near, low_pass = settings.near_plane, settings.surfel_filter
-    projected = project_surfels(gaussians, camera, near)
-    extents = surfel_extents(projected, gaussians.opacities, camera, grid, settings.alpha_min, near, low_pass)
+    low_pass = settings.surfel_filter
+    projected = project_surfels(gaussians, camera)
+    extents = surfel_extents(projected, gaussians.opacities, camera, grid, settings.alpha_min, low_pass)
     pairs = bin_surfels(projected, extents, grid)
 
     opacities = torch.where(extents.drawn, gaussians.opacities, 1.0)
@@ -159,13 +159,13 @@ def _draw_surfels(
     of_pairs = torch.cat(of_surfels, dim=-1).index_select(0, pairs.gaussian)
     origins = grid.centers(pairs.tile, of_pairs.dtype)
     rows = pair_rows(of_pairs[:, :10], of_pairs[:, 10:12], of_pairs[:, 12], origins)
-    rules = SurfelRules(_cuts(settings), near, low_pass, depths=bool({*_OF_SURFELS, "depth_expected"} & {*wants}))
+    rules = SurfelRules(_cuts(settings), camera.near_plane, low_pass, bool({*_OF_SURFELS, "depth_expected"} & {*wants}))
     composited = composite_surfels(rows, of_pairs[:, 13:], pairs, grid.offsets(rows), rules)
     maps = _split(grid.to_image(composited.features), features)
     if rules.depths:
         maps |= dict(zip(_OF_SURFELS, grid.to_image(composited.depths).unbind(-1), strict=True))
         # m = far / (far - near) (1 - near / z) is linear in 1 / z.
-        maps["distortion"] = maps["distortion"] * settings.distortion_slope**2
+        maps["distortion"] = maps["distortion"] * settings.distortion_slope(camera.near_plane) ** 2
     return _Drawn(maps.pop("rgb"), maps.pop("alpha"), maps, projected.means2d, extents.radii)
 
 

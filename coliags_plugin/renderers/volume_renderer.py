@@ -28,12 +28,14 @@ _COARSE = "_coarse"
 
 
 class VolumeRendererSettings(Settings):
-    """Options of :class:`VolumeRenderer`."""
+    """Options of :class:`VolumeRenderer`.
 
-    near_plane: float | None = Field(default=0.2, gt=0)
-    """Start of the first interval in terms of ``spacing``, scene units; null: the field's own, a distance."""
+    The first interval starts at the camera's near plane, in terms of ``spacing``; near plane 0: at the field's own
+    distance.
+    """
+
     far_plane: float | None = Field(default=100.0, gt=0)
-    """End of the last interval; null: the field's own."""
+    """End of the last interval in terms of ``spacing``, scene units; null: the field's own, a distance."""
     spacing: Literal["depth", "distance"] = "depth"
     """The intervals are equal in z-depth, or in distance from the camera."""
     samples: int = Field(default=128, ge=2)
@@ -50,15 +52,9 @@ class VolumeRendererSettings(Settings):
     """Rays per batch when rendering whole images; bounds memory."""
 
     @model_validator(mode="after")
-    def _near_before_far(self) -> Self:
-        if self.near_plane is not None and self.far_plane is not None and self.far_plane <= self.near_plane:
-            raise ValueError(f"far_plane {self.far_plane} does not lie beyond near_plane {self.near_plane}")
-        return self
-
-    @model_validator(mode="after")
     def _bounds_are_distances(self) -> Self:
-        if self.spacing == "depth" and (self.near_plane is None or self.far_plane is None):
-            raise ValueError("near_plane or far_plane null with spacing 'depth': a field's own are distances")
+        if self.spacing == "depth" and self.far_plane is None:
+            raise ValueError("far_plane null with spacing 'depth': a field's own is a distance")
         return self
 
     @model_validator(mode="after")
@@ -84,18 +80,18 @@ class VolumeRenderer(Renderer):
         """Always available: PyTorch only."""
         return Availability(True, "plain PyTorch, runs wherever PyTorch does")
 
-    def check_field(self, field: RadianceField) -> None:
+    def check_field(self, field: RadianceField, near_plane: float) -> None:
         """Refuse a field without bounds where the options leave them to it, and bounds without anything between them.
 
         Raises:
             InputError: See above.
         """
-        near, far = (float(end) for end in self._bounds(field))
+        near, far = (float(end) for end in self._bounds(field, near_plane))
         if near >= far:
             raise InputError(
                 f"rays that start at {near:.4g} and end at {far:.4g} scene units",
                 "an end beyond the start",
-                "Change renderer.near_plane or renderer.far_plane",
+                "Change near_plane or renderer.far_plane",
             )
 
     def render(
@@ -162,7 +158,7 @@ class VolumeRenderer(Renderer):
     ) -> RenderOutput:
         """Sample and composite along rays normalised to z = 1."""
         options = self.settings
-        near, far = self._bounds(field)
+        near, far = self._bounds(field, camera.near_plane)
         lines = _Lines.of(rays, options.spacing == "distance", far - near)
         background = rays.new_tensor(options.background)
         chance = generator if options.jitter else None
@@ -207,23 +203,25 @@ class VolumeRenderer(Renderer):
         behind = transmittances(density, lines.stretches(places), self.settings.opaque_end)
         return CompositedRays(places * lines.depth_per_place, behind, rgb)
 
-    def _bounds(self, field: RadianceField) -> tuple[Tensor | float, Tensor | float]:
+    def _bounds(self, field: RadianceField, near_plane: float) -> tuple[Tensor | float, Tensor | float]:
         """Where rays start and end, in terms of ``spacing``.
 
         Raises:
             InputError: The options leave it to the field, and it does not know.
         """
-        near, far = self.settings.near_plane, self.settings.far_plane
-        if near is not None and far is not None:
-            return near, far
-        bounds = field.ray_bounds
+        far = self.settings.far_plane
+        if near_plane > 0.0 and far is not None:
+            return near_plane, far
+        bounds, to_do = field.ray_bounds, "Set them with --set near_plane=... --set renderer.far_plane=..."
+        if self.settings.spacing == "depth":
+            raise InputError("near_plane 0 with spacing 'depth'", "one above 0: a field's own is a distance", to_do)
         if bounds is None:
             raise InputError(
-                f"renderer.near_plane {near} and far_plane {far} for a field that does not know where its surface is",
-                "both in scene units",
-                "Set them with --set renderer.near_plane=... --set renderer.far_plane=...",
+                f"near_plane {near_plane:g} and far_plane {far} for a field that does not know where its surface is",
+                "both in scene units, above 0",
+                to_do,
             )
-        return bounds[0] if near is None else near, bounds[1] if far is None else far
+        return near_plane if near_plane > 0.0 else bounds[0], bounds[1] if far is None else far
 
 
 @dataclass(frozen=True)

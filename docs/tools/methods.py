@@ -32,7 +32,18 @@ intervals (`every`, `reset_every`) do not change with it ([configs.md](configs.m
 """
 
 #: Parts of a method config that hold constants, in the order of the tables.
-PARTS = ("datamanager", "field", "renderer", "modules", "sampler", "strategy", "losses", "optimizers", "schedule")
+PARTS = (
+    "datamanager",
+    "field",
+    "renderer",
+    "near_plane",
+    "modules",
+    "sampler",
+    "strategy",
+    "losses",
+    "optimizers",
+    "schedule",
+)
 #: Values that are no constants of a method.
 TECHNICAL = frozenset({"name", "log_every", "checkpoint_every"})
 
@@ -76,7 +87,7 @@ def of_method(name: str) -> Iterator[str]:
     rows = []
     for (parent, source), group in groupby(constants(name), key=lambda row: (row[0][:-1], row[2])):
         values = ", ".join(f"`{path[-1]}` {_text(value)}" for path, value, _ in group)
-        rows.append(f"| `{'.'.join(parent)}` | {values} | {source} |")
+        rows.append(f"| `{'.'.join(parent) or 'method'}` | {values} | {source} |")
     if rows:
         yield "\n".join(["| of | constants | source or meaning |", "|---|---|---|", *rows]) + "\n"
 

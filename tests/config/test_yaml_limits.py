@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from coliags_plugin.config.yaml_tree import override, parse_tree
+from coliags_plugin.config.yaml_tree import parse_assignment, parse_tree
 from coliags_plugin.core.errors import InputError
 
 
@@ -39,4 +39,4 @@ def test_text_that_cannot_be_encoded():
         with pytest.raises(InputError, match=r"x:1: .*ud800.* is not text"):
             parse_tree(text, "x")
     with pytest.raises(InputError, match=r"--set .*udcff.* UTF-8"):
-        override(parse_tree("", "x"), "a=\udcff")
+        parse_assignment("a=\udcff")

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from coliags_plugin.config.method_config import load_method
-from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.errors import InputError, NothingDrawnError
 from coliags_plugin.core.scenes import SparseDepth
 from coliags_plugin.engine.compatibility import _check_data, _check_sampler
 from coliags_plugin.engine.run_folder import RunFolder
@@ -205,7 +205,27 @@ def test_metres_are_refused(tmp_path, method):
     with pytest.raises(InputError, match=r"in view are at most 0\.0\d+ from the cameras, and nothing nearer than"):
         start(tmp_path / "run", method=method, scene=scaled(wall_scene(), 1e-3))
     assert not (tmp_path / "run").exists()
-    start(tmp_path / "run", ["renderer.near_plane=0.0001"], method, scaled(wall_scene(), 1e-3))
+
+
+@pytest.mark.parametrize("option", ["near_plane", "renderer.near_plane", "field.near_plane"])
+@pytest.mark.parametrize("method", ["scaffold-gs", "3dgs", "2dgs"])
+def test_metres_on_purpose_train_and_see_an_image(tmp_path, method, option):
+    changes = [f"{option}=0.0001", *(["field.voxel_size=0.002"] if method == "scaffold-gs" else [])]
+    trainer = start(tmp_path / "run", changes, method, scaled(wall_scene(), 1e-3))
+    assert trainer.method.config.near_plane == 0.0001
+    trainer.start()
+    row = trainer.take_step()
+    output, _ = trainer._render(trainer.sampler.next())
+    assert row["gaussians"] > 100 and output.alpha.mean() > 0.3
+
+
+@pytest.mark.parametrize("method", ["scaffold-gs", "3dgs", "2dgs"])
+def test_a_run_that_sees_nothing_stops_after_a_few_steps(tmp_path, method):
+    trainer = start(tmp_path / "run", method=method)
+    trainer.model.near_plane = 50.0  # beyond the wall
+    trainer.start()
+    with pytest.raises(NothingDrawnError, match=r"in the last 10 views, until step 10: .* near_plane 0.* may lie"):
+        trainer.train()
 
 
 def test_points_behind_all_cameras_are_refused(tmp_path):

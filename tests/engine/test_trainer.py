@@ -14,9 +14,8 @@ import torch
 
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.checksums import CHECKSUMS, write_checksums
-from coliags_plugin.core.errors import InputError, InterruptedRunError, NotFiniteError
-from coliags_plugin.engine import blank_views
-from coliags_plugin.engine.blank_views import NothingDrawnError
+from coliags_plugin.core.errors import InputError, InterruptedRunError, NotFiniteError, NothingDrawnError
+from coliags_plugin.engine import trainer as trainer_module
 from coliags_plugin.engine.checkpoints import (
     DamagedCheckpointError,
     latest_checkpoint,
@@ -149,7 +148,7 @@ def test_a_signal_that_nohup_ignores_stays_ignored(tmp_path):
 
 
 def test_a_run_that_draws_nothing_stops_and_says_so(tmp_path, monkeypatch):
-    monkeypatch.setattr(blank_views, "LIMIT", 3)
+    monkeypatch.setattr(trainer_module, "MAX_BLANK_VIEWS", 3)
     trainer = make_trainer(tmp_path / "run", steps=12)
     trainer.start()
     for _ in range(3):

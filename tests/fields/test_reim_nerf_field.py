@@ -116,11 +116,12 @@ def test_a_scene_in_other_units_elsewhere_looks_the_same():
     for field in fields:
         field.load_state_dict(field.state_dict() | {k: v for k, v in fields[0].state_dict().items() if "network" in k})
     renderer = VolumeRenderer(
-        VolumeRendererSettings(near_plane=None, far_plane=None, spacing="distance", samples=16, importance_samples=16)
+        VolumeRendererSettings(far_plane=None, spacing="distance", samples=16, importance_samples=16)
     )
     wants = ("depth_accumulated", "rgb_coarse")
     ours, theirs = (
-        renderer.render(field, s.train[3].camera, wants) for field, s in zip(fields, (scene, other), strict=True)
+        renderer.render(field, replace(s.train[3].camera, near_plane=0.0), wants)
+        for field, s in zip(fields, (scene, other), strict=True)
     )
     assert 0.01 < ours.alpha.mean() < 0.9999
     torch.testing.assert_close(theirs.rgb, ours.rgb, rtol=0, atol=2e-5)
@@ -173,7 +174,7 @@ def test_other_refusals(tmp_path):
     with pytest.raises(InputError, match="'depth' needs depth, and no training frame"):
         trainer(tmp_path / "run", scene=wall_scene(depth=False))
     with pytest.raises(InputError, match=r"start at 500 and end at"):
-        trainer(tmp_path / "run", ["renderer.near_plane=500.0"])
+        trainer(tmp_path / "run", ["near_plane=500.0"])
     with pytest.raises(InputError, match="draws gaussians3d, surfels, the field is made of radiance"):
         trainer(tmp_path / "run", ["renderer=torch"])
     with pytest.raises(InputError, match="outputs needed by the losses: rgb_coarse"):

@@ -32,8 +32,10 @@ def test_auto_falls_back_to_torch_and_says_why(monkeypatch):
 
 
 def test_auto_passes_its_options_on():
-    chosen = choose_renderer(make_component("renderers", {"name": "auto", "near_plane": 1.5}), "gaussians3d", CPU)
-    assert chosen.renderer.settings.near_plane == 1.5
+    chosen = choose_renderer(
+        make_component("renderers", {"name": "auto", "background": (0.5, 0.0, 0.0)}), "gaussians3d", CPU
+    )
+    assert chosen.renderer.settings.background == (0.5, 0.0, 0.0)
 
 
 def test_an_impossible_pair_names_both_sides():

@@ -45,8 +45,9 @@ def on_a_cutoff(gaussians, camera):
     plain = kind()
     alphas = []
     for factor in (1 - CUTOFF_MARGIN, 1 + CUTOFF_MARGIN):
-        cuts = {name: getattr(plain, name) * factor for name in ("alpha_min", "transmittance_min", "near_plane")}
-        alphas.append(torch_renderer.render_gaussians(gaussians, camera, settings=kind(**cuts)).alpha)
+        cuts = {name: getattr(plain, name) * factor for name in ("alpha_min", "transmittance_min")}
+        nearer = dataclasses.replace(camera, near_plane=camera.near_plane * factor)
+        alphas.append(torch_renderer.render_gaussians(gaussians, nearer, settings=kind(**cuts)).alpha)
     pose = camera.camera_to_world
     axes = pose[:3, :3].T @ rotation_matrices(gaussians.quats_wxyz)
     centers = (gaussians.means - pose[:3, 3]) @ pose[:3, :3]
@@ -56,7 +57,7 @@ def on_a_cutoff(gaussians, camera):
     for center, (first, second, normal), scales, opacity in zip(
         centers, axes.mT, gaussians.scales, gaussians.opacities, strict=True
     ):
-        if center[2] > plain.near_plane:
+        if center[2] > camera.near_plane:
             z = (center @ normal) / (rays @ normal)
             offsets = z[..., None] * rays - center
             on_disc = ((offsets @ first) / scales[0]).square() + ((offsets @ second) / scales[1]).square()
@@ -181,12 +182,14 @@ def test_bins_miss_no_pixel_that_a_surfel_reaches(seed, size, depth, low_pass):
         gaussians, camera, settings=cpu_renderer.CpuRendererSettings(surfel_filter=low_pass)
     )
     kind = torch_renderer.TorchRendererSettings
-    exact = (cast(gaussians, torch.float64), camera.to(dtype=torch.float64))
-    true = torch_renderer.render_gaussians(*exact, settings=kind(surfel_filter=low_pass)).alpha
+    exact, posed = cast(gaussians, torch.float64), camera.to(dtype=torch.float64)
+    true = torch_renderer.render_gaussians(exact, posed, settings=kind(surfel_filter=low_pass)).alpha
     # Pixels on the edge of what is drawn may fall to either side.
     brighter, dimmer = (
         torch_renderer.render_gaussians(
-            *exact, settings=kind(surfel_filter=low_pass, alpha_min=factor / 255, near_plane=0.2 * factor)
+            exact,
+            dataclasses.replace(posed, near_plane=0.2 * factor),
+            settings=kind(surfel_filter=low_pass, alpha_min=factor / 255),
         ).alpha
         for factor in (0.999, 1.001)
     )
@@ -216,8 +219,9 @@ def test_what_is_not_drawn_leaves_no_trace(near_plane):
     scales = torch.tensor([[0.3, 0.3], [0.3, 0.0], [0.3, 0.3], [0.3, 0.3]])
     gaussians = make_surfels(means, scales, torch.tensor([0.9, 0.9, 1 / 256, 0.9]))
     gaussians = cast(gaussians, torch.float32, grad=True)
-    options = cpu_renderer.CpuRendererSettings(near_plane=near_plane, background=(0.1, 0.2, 0.3))
-    output = cpu_renderer.render_gaussians(gaussians, pinhole(dtype=torch.float32), OUTPUTS, options)
+    options = cpu_renderer.CpuRendererSettings(background=(0.1, 0.2, 0.3))
+    camera = dataclasses.replace(pinhole(dtype=torch.float32), near_plane=near_plane)
+    output = cpu_renderer.render_gaussians(gaussians, camera, OUTPUTS, options)
     assert torch.equal(output.rgb, torch.tensor([0.1, 0.2, 0.3]).expand(7, 9, 3))
     assert not any(output[name].any() for name in OUTPUTS if name != "rgb")
     assert not output.splats.radii.any()

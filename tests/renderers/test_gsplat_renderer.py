@@ -217,10 +217,10 @@ def test_auto_and_the_doctor_give_the_reason(monkeypatch):
 
 def test_auto_takes_gsplat_where_it_works(calls):
     # The renderer seems to run on the CPU here, which is where the stand-in is.
-    component = make_component("renderers", {"name": "auto", "near_plane": 0.7, "background": BACKGROUND})
+    component = make_component("renderers", {"name": "auto", "background": BACKGROUND})
     chosen = choose_renderer(component, "gaussians3d", torch.device("cpu"))
     assert chosen.name == "gsplat" and chosen.reason == "auto chose gsplat: gsplat 1.5.3 on a stand-in"
-    assert chosen.renderer.settings == GsplatRendererSettings(near_plane=0.7, background=BACKGROUND)
+    assert chosen.renderer.settings == GsplatRendererSettings(background=BACKGROUND)
     assert choose_renderer(component, "surfels", torch.device("cpu")).name != "gsplat"
 
 
@@ -288,7 +288,8 @@ def test_nothing_is_composited_that_is_not_wanted(calls, wants, channels):
 
 def test_gsplat_is_told_the_camera_and_the_settings(calls):
     gaussians, camera = single("off centre")
-    settings = GsplatRendererSettings(near_plane=0.7, eps2d=0.1, background=BACKGROUND)
+    camera = dataclasses.replace(camera, near_plane=0.7)
+    settings = GsplatRendererSettings(eps2d=0.1, background=BACKGROUND)
     render_with_gsplat(gaussians, camera, ("depth_expected",), settings)
     (_, projection, options), *_, (_, rasterization, backgrounds) = calls
     means, _, _, _, view, intrinsics, width, height = projection
@@ -386,7 +387,7 @@ def test_a_pose_of_another_precision_is_cast(calls):
     assert render_with_gsplat(gaussians, camera.to(dtype=torch.float64)).rgb.dtype == torch.float32
 
 
-@pytest.mark.parametrize("options", [{"near_plane": -1.0}, {"eps2d": 0.0}, {"tile_size": 8}, {"alpha_max": 0.99}])
+@pytest.mark.parametrize("options", [{"eps2d": 0.0}, {"tile_size": 8}, {"alpha_max": 0.99}])
 def test_settings_are_checked(options):
     with pytest.raises(ValidationError):
         GsplatRendererSettings(**options)

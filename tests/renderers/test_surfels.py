@@ -454,7 +454,7 @@ def test_a_disc_is_cut_off_at_the_near_plane():
     rows = torch.arange(40) + 0.5 - camera.cy
     depth = 0.5 * camera.fy / rows
     for near in (0.2, 0.4):
-        output = render_gaussians(gaussians, camera, ("depth_expected",), TorchRendererSettings(near_plane=near))
+        output = render_gaussians(gaussians, dataclasses.replace(camera, near_plane=near), ("depth_expected",))
         met = (output.alpha[:, 1] > 0.5) & (rows > 1)
         assert torch.equal(met, (rows > 1) & (depth >= near))
         torch.testing.assert_close(output["depth_expected"][met, 1], depth[met].double())
@@ -522,10 +522,16 @@ def test_what_cannot_be_rendered_says_so():
         render_gaussians(dataclasses.replace(gaussians, scales=gaussians.scales[:, :1]), camera)
 
 
-@pytest.mark.parametrize("options", [{"surfel_filter": 0.0}, {"distortion_far": 0.2}, {"near_plane": 200.0}])
+@pytest.mark.parametrize("options", [{"surfel_filter": 0.0}, {"distortion_far": 0.0}])
 def test_settings_are_checked(options):
     with pytest.raises(ValidationError):
         TorchRendererSettings(**options)
+
+
+@pytest.mark.parametrize(("far", "near"), [(0.2, 0.2), (100.0, 200.0)])
+def test_a_near_plane_beyond_the_end_of_distortion_is_refused(far, near):
+    with pytest.raises(InputError, match="distortion_far beyond the near plane"):
+        TorchRenderer(TorchRendererSettings(distortion_far=far)).check_field(None, near)
 
 
 def test_depths_cost_nothing_where_they_are_not_wanted(monkeypatch):

@@ -258,10 +258,10 @@ def test_nothing_at_or_before_the_near_plane(depth):
     assert not output.splats.means2d.grad.any()
 
 
-def test_near_plane_is_a_setting():
+def test_the_near_plane_is_the_cameras():
     gaussians = make([[0, 0, 1.0]], 0.1, 0.7)
-    assert render_gaussians(gaussians, pinhole(), settings=TorchRendererSettings(near_plane=0.99)).alpha.any()
-    assert not render_gaussians(gaussians, pinhole(), settings=TorchRendererSettings(near_plane=1.0)).alpha.any()
+    assert render_gaussians(gaussians, dataclasses.replace(pinhole(), near_plane=0.99)).alpha.any()
+    assert not render_gaussians(gaussians, dataclasses.replace(pinhole(), near_plane=1.0)).alpha.any()
 
 
 @pytest.mark.parametrize("size", [(1, 1), (9, 7)])
@@ -596,9 +596,7 @@ def test_what_cannot_be_rendered_says_so():
         render_gaussians(dataclasses.replace(gaussians, scales=gaussians.scales[:, :1]), camera)
 
 
-@pytest.mark.parametrize(
-    "options", [{"tile_size": 0}, {"near_plane": -1.0}, {"eps2d": 0.0}, {"alpha_max": 1.0}, {"tile": 8}]
-)
+@pytest.mark.parametrize("options", [{"tile_size": 0}, {"eps2d": 0.0}, {"alpha_max": 1.0}, {"tile": 8}])
 def test_settings_are_checked(options):
     with pytest.raises(ValidationError):
         TorchRendererSettings(**options)

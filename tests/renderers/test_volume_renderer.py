@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -47,13 +48,17 @@ class Fog(RadianceField):
         return RadianceSamples(self.density * beyond, positions.new_tensor(COLOR).expand(positions.shape))
 
 
+def camera_from(near_plane, *place):
+    return replace(camera_at(*(place or (0, 0, 0))), near_plane=near_plane)
+
+
 def make(**options):
     return VolumeRenderer(VolumeRendererSettings(**options))
 
 
 def test_even_fog_absorbs_exponentially():
-    camera = camera_at(0, 0, 0)
-    output = make(near_plane=1.0, far_plane=9.0, samples=7, background=(0.0, 1.0, 0.0)).render(Fog(0.2), camera)
+    camera = camera_from(1.0)
+    output = make(far_plane=9.0, samples=7, background=(0.0, 1.0, 0.0)).render(Fog(0.2), camera)
     lengths = camera.rays().norm(dim=-1)
     alpha = 1 - torch.exp(-0.2 * 8.0 * lengths)
     torch.testing.assert_close(output.alpha, alpha)
@@ -63,13 +68,11 @@ def test_even_fog_absorbs_exponentially():
 
 def test_depths_of_a_hard_surface_are_z_depths():
     kinds = ("depth_accumulated", "depth_expected", "depth_median", "inverse_depth_accumulated")
-    output = make(near_plane=1.0, far_plane=21.0, samples=2000).render(
-        Fog(500.0, start=12.0), camera_at(0, 0, 0), kinds
-    )
+    output = make(far_plane=21.0, samples=2000).render(Fog(500.0, start=12.0), camera_from(1.0), kinds)
     for kind in kinds[:3]:
         torch.testing.assert_close(output[kind], torch.full_like(output.alpha, 12.0), rtol=0, atol=0.02)
     torch.testing.assert_close(output[kinds[3]], torch.full_like(output.alpha, 1 / 12), rtol=2e-3, atol=0)
-    empty = make(near_plane=1.0, far_plane=5.0).render(Fog(0.0), camera_at(0, 0, 0), kinds)
+    empty = make(far_plane=5.0).render(Fog(0.0), camera_from(1.0), kinds)
     assert not any(empty[kind].any() for kind in kinds)
 
 
@@ -87,8 +90,8 @@ def test_some_pixels_are_those_of_the_whole_image():
 def test_refusals():
     with pytest.raises(InputError, match="no renderer output 'normals'"):
         make().render(Fog(1.0), camera_at(0, 0, 0), ("normals",))
-    with pytest.raises(ValueError, match=r"far_plane 1\.0 does not lie beyond near_plane 2\.0"):
-        make(near_plane=2.0, far_plane=1.0)
+    with pytest.raises(InputError, match="start at 2 and end at 1"):
+        make(far_plane=1.0).check_field(Fog(1.0), 2.0)
 
 
 # --- from coarse to fine ----------------------------------------------------------------------------------------------
@@ -119,7 +122,7 @@ class Levels(Ball):
         return self.other
 
 
-REFINED = {"near_plane": 3.0, "far_plane": 9.0, "samples": 48, "importance_samples": 64, "opaque_end": True}
+REFINED = {"far_plane": 9.0, "samples": 48, "importance_samples": 64, "opaque_end": True}
 
 
 def ball_distance(camera):
@@ -133,7 +136,7 @@ def ball_distance(camera):
 
 @pytest.mark.parametrize("spacing", ["depth", "distance"])
 def test_depth_and_distance_of_a_ball_from_coarse_to_fine(spacing):
-    camera, field = camera_at(0.3, -0.2, 0.0, 40, 30), Ball()
+    camera, field = camera_from(3.0, 0.3, -0.2, 0.0, 40, 30), Ball()
     wants = ("depth_accumulated", "depth_accumulated_coarse", "ray_lengths")
     output = make(**REFINED, spacing=spacing).render(field, camera, wants)
     distance, hit, outside = ball_distance(camera)
@@ -157,9 +160,9 @@ def test_depth_and_distance_of_a_ball_from_coarse_to_fine(spacing):
 
 
 def test_a_plane_seen_obliquely_is_at_the_ray_lengths_times_its_depth():
-    camera = camera_at(0, 0, 0, 24, 18)
+    camera = camera_from(8.0, 0, 0, 0, 24, 18)
     field = Fog(5000.0, start=12.0)
-    renderer = make(near_plane=8.0, far_plane=20.0, samples=1200, spacing="distance")
+    renderer = make(far_plane=20.0, samples=1200, spacing="distance")
     output = renderer.render(field, camera, ("depth_accumulated", "ray_lengths"))
     column, row = torch.meshgrid(torch.arange(24.0) + 0.5, torch.arange(18.0) + 0.5, indexing="xy")
     tangents = ((column - camera.cx) / camera.fx) ** 2 + ((row - camera.cy) / camera.fy) ** 2
@@ -168,7 +171,7 @@ def test_a_plane_seen_obliquely_is_at_the_ray_lengths_times_its_depth():
 
 
 def test_the_coarse_outputs_are_the_coarse_levels_and_one_pass_has_but_one():
-    camera, other = camera_at(0, 0, 0), Ball(center=(0.5, 0.0, 5.0))
+    camera, other = camera_from(3.0), Ball(center=(0.5, 0.0, 5.0))
     wants = ("rgb_coarse", "alpha_coarse", "depth_median_coarse", "depth_median")
     pixels = torch.tensor([[16, 11], [20, 11], [0, 0]])
     both = make(**REFINED).render(Levels(other), camera, wants, pixels)
@@ -186,7 +189,7 @@ def test_the_coarse_outputs_are_the_coarse_levels_and_one_pass_has_but_one():
 
 
 def test_the_coarse_level_has_gradients_only_through_outputs_of_its_own():
-    camera, other = camera_at(0, 0, 0), Ball(0.5)
+    camera, other = camera_from(3.0), Ball(0.5)
     field = Levels(other)
     make(**REFINED).render(field, camera).rgb.sum().backward()
     assert field.density.grad is not None and other.density.grad is None
@@ -202,7 +205,7 @@ def test_colours_of_the_coarse_level_are_computed_for_its_image_alone():
         def query(self, positions, directions, camera):
             raise RuntimeError("asked for colours")
 
-    camera, field = camera_at(0, 0, 0), Levels(Silent())
+    camera, field = camera_from(3.0), Levels(Silent())
     silent = make(**REFINED).render(field, camera, ("depth_accumulated", "depth_accumulated_coarse"))
     spoken = make(**REFINED).render(Levels(Ball()), camera, ("depth_accumulated", "rgb_coarse"))
     assert torch.equal(silent.rgb, spoken.rgb)
@@ -211,7 +214,7 @@ def test_colours_of_the_coarse_level_are_computed_for_its_image_alone():
 
 
 def test_chance_places_samples_in_training_alone():
-    camera, field = camera_at(0, 0, 0), Fog(0.2, start=5.0)
+    camera, field = camera_from(3.0), Fog(0.2, start=5.0)
     wants, pixels = ("depth_accumulated",), torch.tensor([[3, 4], [5, 6]])
 
     def drawn(seed, **options):
@@ -227,19 +230,24 @@ def test_chance_places_samples_in_training_alone():
 
 def test_bounds_of_the_field_and_their_refusals():
     field, camera = Fog(50.0, start=12.0), camera_at(0, 0, 0)
-    open_ended = make(near_plane=None, far_plane=None, spacing="distance", samples=300)
+    open_ended = make(far_plane=None, spacing="distance", samples=300)
     with pytest.raises(InputError, match="does not know where its surface is"):
-        open_ended.check_field(field)
-    make().check_field(field)
+        open_ended.check_field(field, 0.0)
+    make().check_field(field, 0.2)
     bounded = type("Bounded", (Fog,), {"ray_bounds": torch.tensor([10.0, 25.0], dtype=torch.float64)})(50.0, 12.0)
-    open_ended.check_field(bounded)
-    given = make(near_plane=10.0, far_plane=25.0, spacing="distance", samples=300)
-    ours, theirs = (one.render(bounded, camera, ("depth_expected",)) for one in (open_ended, given))
+    open_ended.check_field(bounded, 0.0)
+    given = make(far_plane=25.0, spacing="distance", samples=300)
+    ours, theirs = (
+        one.render(bounded, replace(camera, near_plane=near), ("depth_expected",))
+        for one, near in ((open_ended, 0.0), (given, 10.0))
+    )
     assert torch.equal(ours["depth_expected"], theirs["depth_expected"])
     with pytest.raises(InputError, match=r"start at 30 and end at 25"):
-        make(near_plane=30.0, far_plane=None, spacing="distance").check_field(bounded)
-    with pytest.raises(ValueError, match="spacing 'depth': a field's own are distances"):
-        make(near_plane=None)
+        open_ended.check_field(bounded, 30.0)
+    with pytest.raises(ValueError, match="spacing 'depth': a field's own is a distance"):
+        make(far_plane=None)
+    with pytest.raises(InputError, match="near_plane 0 with spacing 'depth'"):
+        make().check_field(bounded, 0.0)
     with pytest.raises(ValueError, match="importance_samples with samples 2"):
         make(samples=2, importance_samples=4)
 
@@ -306,7 +314,8 @@ METHOD = """
 description: a grid of density and colour
 datamanager: {name: auto}
 field: {name: test-grid}
-renderer: {name: volume, near_plane: 3.0, far_plane: 9.0, samples: 64}
+renderer: {name: volume, far_plane: 9.0, samples: 64}
+near_plane: 3.0
 sampler: {name: pixels, pixels: 512, frames: 3}
 strategy: {name: none}
 losses: {l1: {name: l1, weight: 1.0}}

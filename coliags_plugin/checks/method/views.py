@@ -47,8 +47,15 @@ def _resized(camera: Camera) -> Camera:
     """The camera with fewer pixels, an odd number of them, over the same field of view."""
     width, height = (max(1, int(0.35 * side)) * 2 + 1 for side in (camera.width, camera.height))
     across, down = width / camera.width, height / camera.height
-    intrinsics = (camera.fx * across, camera.fy * down, camera.cx * across, camera.cy * down)
-    return Camera(*intrinsics, width, height, camera.camera_to_world)
+    return replace(
+        camera,
+        fx=camera.fx * across,
+        fy=camera.fy * down,
+        cx=camera.cx * across,
+        cy=camera.cy * down,
+        width=width,
+        height=height,
+    )
 
 
 @torch.no_grad()

@@ -43,7 +43,7 @@ def export_cost(trained: TrainedRun, cloud: SplatCloud, light: HeldLight | None)
     """
     scorer = Scorer(trained.config.protocol, _METRICS)
     renderer = choose_renderer(trained.config.renderer, "gaussians3d", trained.device).renderer
-    baked = Model(field_of_cloud(cloud).to(trained.device), renderer, {}).eval()
+    baked = Model(field_of_cloud(cloud).to(trained.device), renderer, {}, trained.model.near_plane).eval()
     sets = {name: frames for name, frames in trained.scene.test_sets.items() if frames}
     total, done, costs = sum(map(len, sets.values())), 0, dict[str, dict[str, Any]]()
     with ProgressReport("compare with the run", total) as progress:

@@ -131,7 +131,7 @@ class Content:
     @property
     def near_plane(self) -> float:
         """z-depth from which on the browser draws, scene units: what renderers use, or a share of the distance."""
-        return min(0.2, 0.02 * self.look_distance)
+        return min(self.first_camera.near_plane, 0.02 * self.look_distance)
 
 
 def distances(splats: Splats, cameras: Sequence[Camera]) -> Float[np.ndarray, "N"]:

@@ -178,7 +178,8 @@ class Session:
         theirs = self._client.camera
         height, width = theirs.image_height, theirs.image_width
         focal = 0.5 * height / float(torch.tan(torch.tensor(0.5 * theirs.fov)))
-        return Camera(focal, focal, 0.5 * width, 0.5 * height, width, height, _matrix(theirs))
+        near = self._content.first_camera.near_plane
+        return Camera(focal, focal, 0.5 * width, 0.5 * height, width, height, _matrix(theirs), near)
 
 
 def _matrix(theirs: Any) -> Float[Tensor, "4 4"]:
