@@ -50,7 +50,7 @@ class Check:
     def _print_results(self, folder: Path) -> bool:
         """Whether a check failed."""
         from coliags_plugin.checks.method.check import CHECKS, check_method
-        from coliags_plugin.checks.method.text import line, summary, tracebacks
+        from coliags_plugin.checks.results import line, summary, tracebacks
 
         encoding, width = sys.stdout.encoding or "ascii", max(len(check.name) for check in CHECKS)
         results = []

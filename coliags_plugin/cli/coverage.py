@@ -43,7 +43,7 @@ class Coverage:
         from coliags_plugin.api.runs import load_run
         from coliags_plugin.config.assignments import parse_assignments
         from coliags_plugin.core.errors import InputError
-        from coliags_plugin.surface.coverage.text import summary
+        from coliags_plugin.surface.coverage.page import summary
 
         settings = parse_assignments(self.set, "--set", "KEY=VALUE, for instance region_diameter=10")
         if (self.path / "config.yaml").is_file():

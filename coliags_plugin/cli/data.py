@@ -35,21 +35,23 @@ class Data:
     def run(self) -> None:
         """Run the checks and print the results."""
         from coliags_plugin.checks.data.check import check_scene
-        from coliags_plugin.checks.data.page import write_check_page
-        from coliags_plugin.checks.data.text import lines
+        from coliags_plugin.checks.data.page import check_page, verdict
         from coliags_plugin.core.files import write_json
         from coliags_plugin.engine.data_formats import open_scene
         from coliags_plugin.engine.progress import progress_callback
+        from coliags_plugin.reporting.html_page import write_html
+        from coliags_plugin.reporting.terminal import page_text
 
         with progress_callback() as progress:
             scene = open_scene(self.scene, self.format, self.set, progress)
             at_stored_size = partial(open_scene, self.scene, self.format, self.set, stored_size=True)
             check = check_scene(scene, progress, at_stored_size if scene.is_resized else None)
-        print("\n".join(lines(check)))
         if self.anonymous:
             check = check.anonymous()
+        page = check_page(check)
+        print(page_text(page), verdict(check), sep="\n\n")
         if self.html is not None:
-            write_check_page(check, self.html)
+            write_html(page, self.html)
             print(self.html.resolve())
         if self.json is not None:
             write_json(self.json, check.as_json())

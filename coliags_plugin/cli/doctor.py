@@ -10,13 +10,13 @@ class Doctor:
     """Report versions and devices, which renderer would be used and why, and where the weights of LPIPS are."""
 
     def run(self) -> None:
-        """Print the findings; exit with status 1 where a requirement is missing."""
+        """Print the results; exit with status 1 where a requirement is missing."""
         import sys
 
-        from coliags_plugin.engine.doctor import examine
+        from coliags_plugin.checks.installation import check_installation
 
-        findings = examine()
-        for finding in findings:
-            print(f"{'ok ' if finding.ok else 'BAD'} {finding.subject:<34} {finding.text}")
-        if not all(finding.ok for finding in findings):
+        results = check_installation()
+        for result in results:
+            print(f"{'ok ' if result.status == 'passed' else 'BAD'} {result.name:<34} {result.detail}")
+        if any(result.status == "failed" for result in results):
             sys.exit(1)

@@ -42,7 +42,8 @@ class Mesh:
         """Make the mesh, print the comparison, and print the folder."""
         from coliags_plugin.api.runs import load_run
         from coliags_plugin.config.assignments import parse_assignments
-        from coliags_plugin.surface.meshing.text import comparison_text
+        from coliags_plugin.reporting.terminal import terminal_text
+        from coliags_plugin.surface.meshing.writing import comparison_blocks
 
         settings = parse_assignments(self.set, "--set", "KEY=VALUE, for instance depth=median")
         settings.setdefault("color", self.color)
@@ -51,5 +52,5 @@ class Mesh:
         run = load_run(self.path, data=self.data, device=self.device)
         meshed = run.mesh(self.out, settings=settings, formats=self.format, truth=self.truth, overwrite=self.overwrite)
         if meshed.comparison is not None:
-            print(comparison_text(meshed.comparison))
+            print(terminal_text(comparison_blocks(meshed.comparison)))
         print(meshed.folder)

@@ -273,6 +273,14 @@ def side_by_side(
     return sheet
 
 
+def stacked(images: Sequence[UInt8[np.ndarray, "H W 3"]]) -> UInt8[np.ndarray, "Hs Ws 3"]:
+    """Images below each other on white."""
+    width = max(image.shape[1] for image in images)
+    return np.concatenate(
+        [np.pad(image, ((0, 0), (0, width - image.shape[1]), (0, 0)), constant_values=255) for image in images]
+    )
+
+
 def hatch(height: int, width: int) -> UInt8[np.ndarray, "H W 3"]:
     """Diagonal grey stripes, for pixels without ground truth. [H, W, 3]"""
     rows, columns = np.indices((height, width))

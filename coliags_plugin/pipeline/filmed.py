@@ -63,7 +63,8 @@ def make_poses(place: Workplace) -> Outcome:
 def check_data(place: Workplace) -> Outcome:
     """Check that images, poses and calibration agree. What is suspect is said, and does not stop."""
     from coliags_plugin.checks.data.check import check_scene
-    from coliags_plugin.checks.data.page import write_check_page
+    from coliags_plugin.checks.data.page import check_page, verdict
+    from coliags_plugin.reporting.html_page import write_html
 
     scene = place.open_posed()
     check = check_scene(
@@ -71,13 +72,12 @@ def check_data(place: Workplace) -> Outcome:
     )
     if place.anonymous:
         check = check.anonymous()
-    write_check_page(check, place.out / "check.html")
+    write_html(check_page(check), place.out / "check.html")
     write_json(place.out / "check.json", check.as_json())
     for finding in check.findings:
         log.warning("suspect: %s (%s). %s", finding.what, finding.evidence, finding.do)
-    count = len(check.findings)
     return Outcome(
-        f"{count} suspect finding{'' if count == 1 else 's'}" if count else "nothing suspect",
+        verdict(check),
         {"check.html": "consistency of images, poses and calibration", "check.json": "the same as JSON"},
     )
 

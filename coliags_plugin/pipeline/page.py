@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from html import escape
 from urllib.parse import quote
 
-from coliags_plugin.outputs.page import table, write_page
 from coliags_plugin.pipeline.record import Record
-from coliags_plugin.pipeline.stages import duration
+from coliags_plugin.reporting.html_page import write_html
+from coliags_plugin.reporting.model import Bullet, Bullets, Column, Page, Section, Table
+from coliags_plugin.reporting.numbers import duration
 
 #: Name of the file.
 PAGE_FILE = "index.html"
-#: Results are sentences.
-_STYLE = ":is(th, td):nth-child(2) { text-align: left; white-space: normal; }"
 
 
 def write_index(record: Record, title: str) -> None:
@@ -25,19 +23,9 @@ def write_index(record: Record, title: str) -> None:
     Raises:
         InputError: The file cannot be written.
     """
-    stages = [(name, stage.summary, duration(stage.seconds)) for name, stage in record.stages.items()]
-    links = "".join(
-        f'<li><a href="{quote(path)}">{escape(path)}</a>: {escape(what)}</li>'
-        for stage in record.stages.values()
-        for path, what in stage.files.items()
-    )
-    write_page(
-        record.folder / PAGE_FILE,
-        title,
-        f"<h1>{escape(title)}</h1><p>For research use only.</p>",
-        [
-            f"<section><h2>Files</h2><ul>{links}</ul></section>",
-            f"<section><h2>Stages</h2>{table(('stage', 'result', 'time'), stages)}</section>",
-        ],
-        _STYLE,
-    )
+    stages = record.stages.items()
+    links = [Bullet(what, path, quote(path)) for _, stage in stages for path, what in stage.files.items()]
+    columns = [Column("stage"), Column("result", words=True), Column("time")]
+    rows = [{"stage": name, "result": stage.summary, "time": duration(stage.seconds)} for name, stage in stages]
+    sections = [Section("Files", [Bullets(links)]), Section("Stages", [Table("", columns, rows)])]
+    write_html(Page(title, sections, note="For research use only."), record.folder / PAGE_FILE)

@@ -11,6 +11,7 @@ from typing import Any
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.pipeline.record import Record, StageRecord
+from coliags_plugin.reporting.numbers import duration
 
 log = logging.getLogger(__name__)
 
@@ -87,12 +88,6 @@ def run_stages(stages: Sequence[Stage], record: Record, overwrite: bool = False)
         )
         record.put(stage.name, ended)
         log.info("%s: %s; took %s", title, made.summary, duration(seconds))
-
-
-def duration(seconds: float) -> str:
-    """A time in words: ``12 s``, ``3 min 5 s``."""
-    whole = round(seconds)
-    return f"{whole} s" if whole < 60 else f"{whole // 60} min {whole % 60} s"
 
 
 def _check_options(stages: Sequence[Stage], record: Record, overwrite: bool) -> None:

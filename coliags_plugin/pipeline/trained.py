@@ -86,7 +86,7 @@ def coverage(place: Workplace) -> Outcome:
         NotWritableError: It could be measured, but not written.
     """
     from coliags_plugin.geometry.meshes.files import read_mesh
-    from coliags_plugin.surface.coverage.text import summary
+    from coliags_plugin.surface.coverage.page import summary
     from coliags_plugin.surface.coverage.writing import measure_scene
 
     scene = place.open_posed()

@@ -11,8 +11,7 @@ import pytest
 import torch
 
 from coliags_plugin.checks.method.check import CHECKS
-from coliags_plugin.checks.method.results import Result
-from coliags_plugin.checks.method.text import line, summary
+from coliags_plugin.checks.results import CheckResult, line, summary
 from coliags_plugin.config import registry
 from tests.commands import refused, run
 from tests.scenes import write_wall
@@ -92,9 +91,9 @@ def test_a_config_that_is_not_valid_fails_the_first_check(capsys):
 
 def test_words_stand_for_ticks_that_cannot_be_printed(monkeypatch, capsys):
     results = [
-        Result("one", "passed", 0.04, "fine"),
-        Result("two", "failed", 1.0, "µ"),
-        Result("three", "skipped", 0, "no"),
+        CheckResult("one", "passed", "fine", 0.04),
+        CheckResult("two", "failed", "µ", 1.0),
+        CheckResult("three", "skipped", "no"),
     ]
     assert [line(result, 5, "utf-8") for result in results] == [
         "✓ one      0.0 s  fine",

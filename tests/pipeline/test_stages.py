@@ -8,7 +8,7 @@ import pytest
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.pipeline.record import LOCK_FILE, RECORD_FILE, Record
-from coliags_plugin.pipeline.stages import Outcome, Stage, duration, run_stages
+from coliags_plugin.pipeline.stages import Outcome, Stage, run_stages
 
 
 class Killed(BaseException):
@@ -104,10 +104,6 @@ def test_the_record_is_json_with_version(tmp_path):
     found = json.loads((tmp_path / RECORD_FILE).read_text())
     assert found["format"] == 1
     assert list(found["stages"]) == ["first", "second", "third"]
-
-
-def test_durations_in_words():
-    assert [duration(seconds) for seconds in (0.4, 59.4, 60, 3725)] == ["0 s", "59 s", "1 min 0 s", "62 min 5 s"]
 
 
 def test_what_a_kill_leaves_before_the_record_is_no_hindrance(tmp_path):

@@ -12,10 +12,10 @@ import pytest
 import torch
 from pydantic import ValidationError
 
+from coliags_plugin.checks.installation import check_installation
 from coliags_plugin.config import registry
 from coliags_plugin.config.components import make_component
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.engine.doctor import examine
 from coliags_plugin.renderers import gsplat_library
 from coliags_plugin.renderers.choice import choose_renderer
 from coliags_plugin.renderers.gsplat_renderer import GsplatRenderer, GsplatRendererSettings, render_with_gsplat
@@ -208,11 +208,11 @@ def test_auto_and_the_doctor_give_the_reason(monkeypatch):
     reason = "gsplat runs on cuda, the device is cpu; "
     chosen = choose_renderer(make_component("renderers", "auto"), "gaussians3d", torch.device("cpu"))
     assert chosen.reason.startswith(reason)
-    told = {finding.subject: finding for finding in examine()}
+    told = {result.name: result for result in check_installation()}
     missing = "cannot run here: no CUDA device, as this PyTorch is built without CUDA"
-    assert told["renderer gsplat"].text == missing
-    assert told["renderer gsplat"].ok
-    assert f"would use {chosen.name} ({reason}" in told["renderer auto"].text
+    assert told["renderer gsplat"].detail == missing
+    assert told["renderer gsplat"].status == "passed"
+    assert f"would use {chosen.name} ({reason}" in told["renderer auto"].detail
 
 
 def test_auto_takes_gsplat_where_it_works(calls):

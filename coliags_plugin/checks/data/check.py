@@ -3,29 +3,37 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from coliags_plugin.checks.data import findings as suspect
+import numpy as np
+
+from coliags_plugin.checks.data import findings as rules
 from coliags_plugin.checks.data.facts import (
     DepthFacts,
     ImageFacts,
+    LampFacts,
     PathFacts,
     depth_facts,
     image_facts,
+    lamp_facts,
+    moving_step,
     path_facts,
     sampled_frames,
 )
 from coliags_plugin.checks.data.findings import Finding
 from coliags_plugin.checks.data.hypotheses import CHANGES
-from coliags_plugin.checks.data.lamp import LampFacts, lamp_facts
 from coliags_plugin.checks.data.matches import EpipolarAgreement, epipolar_agreement, match
-from coliags_plugin.checks.data.pairs import video_pairs
 from coliags_plugin.checks.data.reprojection import Agreement, BestScale, Pair, agreement, best_scale
 from coliags_plugin.core.anonymity import without_places
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame, Scene
+
+#: Largest number of frame pairs.
+_PAIRS = 12
+#: Steps count as at most this many typical ones, so that no jump takes all pairs.
+_LONGEST_STEP = 3.0
 
 
 @dataclass(frozen=True)
@@ -61,7 +69,7 @@ class SceneCheck:
 
     def as_json(self) -> dict[str, Any]:
         """The same as JSON values; unavailable ones are null."""
-        plain = {
+        values = {
             "scene": self.scene.name,
             "suspect": bool(self.findings),
             "findings": [asdict(finding) for finding in self.findings],
@@ -73,12 +81,11 @@ class SceneCheck:
             "images": asdict(self.images),
             "lamp": None if self.lamp is None else asdict(self.lamp),
             "pairs": [[source.name, target.name] for source, target in self.pairs],
-            "agreement": {name: asdict(found) for name, found in self.agreement.items()},
+            "agreement": {name: asdict(errors) for name, errors in self.agreement.items()},
             "best_depth_scale": None if self.scale is None else asdict(self.scale),
-            "matches": {name: asdict(found) for name, found in self.matches.items()},
+            "matches": {name: asdict(errors) for name, errors in self.matches.items()},
         }
-        cleaned: dict[str, Any] = _without_nan(plain)
-        return cleaned
+        return {key: _without_nan(value) for key, value in values.items()}
 
 
 def check_scene(
@@ -93,49 +100,66 @@ def check_scene(
             no depth; None: those of ``scene``.
     """
     video = scene.video
-    looked = sampled_frames(video)
+    sample = sampled_frames(video)
     pairs = video_pairs(video)
     with_depth = [Pair(a, b) for a, b in pairs if a.depth is not None and b.depth is not None]
-    readings, scale, matched = {}, None, {}
+    agreements: dict[str, Agreement] = {}
+    matches: dict[str, EpipolarAgreement] = {}
     if with_depth:
         for done, name in enumerate(CHANGES):
             if progress is not None:
                 progress("compare frames", done, len(CHANGES))
-            readings[name] = agreement(with_depth, name)
-        scale = best_scale(with_depth)
+            agreements[name] = agreement(with_depth, name)
     else:
         # Epipolar errors grow with the baseline, so frames further apart are compared.
         pairs = video_pairs(video, farther=3)
         full = {frame.name: frame for frame in (video if at_stored_size is None else at_stored_size().video)}
-        matches = match([(full[source.name], full[target.name]) for source, target in pairs])
-        found = {name: epipolar_agreement(matches, name) for name in CHANGES}
-        matched = {name: reading for name, reading in found.items() if reading is not None}
+        matched = match([(full[source.name], full[target.name]) for source, target in pairs])
+        errors = {name: epipolar_agreement(matched, name) for name in CHANGES}
+        matches = {name: error for name, error in errors.items() if error is not None}
+    scale = best_scale(with_depth) if with_depth else None
     if progress is not None:
         progress("compare frames", len(CHANGES), len(CHANGES))
-    depth, path, images = depth_facts(looked), path_facts(video), image_facts(looked)
-    lamp = lamp_facts(looked)
-    found_suspect = [
-        *suspect.agreement_findings(readings, scale, path, depth),
-        *suspect.match_findings(matched),
-        *suspect.depth_findings(depth, scene.is_metric),
-        *suspect.lamp_findings(lamp),
-        *suspect.path_findings(path),
-        *suspect.calibration_findings(video),
-        *suspect.image_findings(images),
+    depth, path, images, lamp = depth_facts(sample), path_facts(video), image_facts(sample), lamp_facts(sample)
+    findings = [
+        *rules.agreement_findings(agreements, scale, path, depth),
+        *rules.match_findings(matches),
+        *rules.depth_findings(depth, scene.is_metric),
+        *rules.lamp_findings(lamp),
+        *rules.path_findings(path),
+        *rules.calibration_findings(video),
+        *rules.image_findings(images),
     ]
-    return SceneCheck(
-        scene,
-        pairs,
-        depth,
-        path,
-        images,
-        lamp,
-        readings,
-        scale,
-        matched,
-        found_suspect,
-        list(suspect.undecided(matched)),
-    )
+    undecided = list(rules.undecided(matches))
+    return SceneCheck(scene, pairs, depth, path, images, lamp, agreements, scale, matches, findings, undecided)
+
+
+def video_pairs(frames: Sequence[Frame], farther: int = 1) -> list[tuple[Frame, Frame]]:
+    """Pairs of frames with a short baseline: long enough to reveal wrong poses, short enough to overlap.
+
+    They are spread evenly over the camera's path, not over time, so that none lies in a pause.
+
+    Args:
+        frames: Frames of the video.
+        farther: Factor on the default baseline, a thirtieth of the path and at most ten mean steps.
+    """
+    video = sorted(frames, key=lambda frame: frame.index)
+    apart = min(farther * min(max(1, round(len(video) / 30)), 10), max(1, len(video) - 1))
+    if len(video) <= apart:
+        return []
+    centers = np.stack([frame.camera.center.double().numpy() for frame in video])
+    steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+    typical = moving_step(steps)
+    # A camera that does not move has gone one step a frame, in effect.
+    counted = np.minimum(steps, _LONGEST_STEP * typical) if typical > 0.0 else np.ones_like(steps)
+    arc = np.concatenate([[0.0], np.cumsum(counted)])
+    baseline = arc[-1] * apart / (len(video) - 1) * (1.0 - 1e-9)
+    # The last frame of a pause, and the first that is far enough from it.
+    first = np.searchsorted(arc, np.linspace(0.0, arc[-1] - baseline, _PAIRS), side="right") - 1
+    second = np.minimum(np.searchsorted(arc, arc[first] + baseline), len(video) - 1)
+    return [
+        (video[here], video[there]) for here, there in dict.fromkeys(zip(first, second, strict=True)) if here < there
+    ]
 
 
 def _without_nan(value: Any) -> Any:

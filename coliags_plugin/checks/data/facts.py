@@ -1,4 +1,4 @@
-"""Statistics of a scene's depth, camera path and images."""
+"""Statistics of a scene's depth, camera path, images and lighting."""
 
 from __future__ import annotations
 
@@ -7,13 +7,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.stats
 import torch
 from jaxtyping import Float
 
 from coliags_plugin.core.scenes import Frame
 
 #: Largest number of frames sampled for depth and image statistics.
-_LOOKED_AT = 64
+_FRAMES = 64
+#: For the correlation of brightness and distance: largest number of frames and of pixels per frame, and fewest pixels.
+_LAMP_FRAMES, _LAMP_PIXELS, _LAMP_MIN_PIXELS = 16, 4000, 30
+#: Grey levels outside these are clipped.
+_DARKEST, _BRIGHTEST = 3, 253
+#: Smallest ratio of the 90th to the 10th percentile of the distances in a frame.
+_MIN_DEPTH_RATIO = 1.15
 
 
 @dataclass(frozen=True)
@@ -53,10 +60,25 @@ class ImageFacts:
     repeated: tuple[str, ...]
 
 
-def sampled_frames(frames: Sequence[Frame]) -> list[Frame]:
-    """Evenly spaced sample of the frames, at most 64."""
-    places = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), _LOOKED_AT)).astype(int))
-    return [frames[place] for place in places]
+@dataclass(frozen=True)
+class LampFacts:
+    """Rank correlation (Spearman's) of brightness and distance from the camera within frames.
+
+    Attributes:
+        correlation: Median of the frames; -1 where every farther pixel is darker, as under a lamp at the camera.
+        rising_share: Share of the frames in which it is positive.
+        frames: Number of frames.
+    """
+
+    correlation: float
+    rising_share: float
+    frames: int
+
+
+def sampled_frames(frames: Sequence[Frame], count: int = _FRAMES) -> list[Frame]:
+    """Evenly spaced sample of the frames, at most ``count``."""
+    indices = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), count)).astype(int))
+    return [frames[index] for index in indices]
 
 
 def depth_facts(frames: Sequence[Frame]) -> DepthFacts | None:
@@ -111,8 +133,8 @@ def moving_step(steps: Float[np.ndarray, "N"]) -> float:
     """
     jumps = max(len(steps) // 10, min(2, len(steps) // 3))
     ordered = np.sort(steps)[: len(steps) - jumps]
-    walked = np.cumsum(ordered)
-    return float(ordered[np.searchsorted(walked, 0.5 * walked[-1])])
+    lengths = np.cumsum(ordered)
+    return float(ordered[np.searchsorted(lengths, 0.5 * lengths[-1])])
 
 
 def image_facts(frames: Sequence[Frame]) -> ImageFacts:
@@ -137,3 +159,43 @@ def image_facts(frames: Sequence[Frame]) -> ImageFacts:
         masked_share=float(np.mean(masked)),
         repeated=tuple(repeated),
     )
+
+
+def lamp_facts(frames: Sequence[Frame]) -> LampFacts | None:
+    """Correlation of brightness with distance in an even sample of the frames; None where none has enough depth."""
+    values = [_correlation(frame) for frame in sampled_frames(frames, _LAMP_FRAMES)]
+    known = np.array([value for value in values if value is not None])
+    if not len(known):
+        return None
+    return LampFacts(float(np.median(known)), float(np.mean(known > 0.0)), len(known))
+
+
+def _correlation(frame: Frame) -> float | None:
+    """Correlation in one frame, from its dense depth or else its single points; None if too few or equally far."""
+    pixels, depth = _known_depth(frame)
+    brightness = frame.image.numpy()[pixels[:, 1], pixels[:, 0]]
+    clear = (brightness.min(axis=1) > _DARKEST) & (brightness.max(axis=1) < _BRIGHTEST)
+    clear &= frame.valid.numpy()[pixels[:, 1], pixels[:, 0]]
+    if clear.sum() < _LAMP_MIN_PIXELS:
+        return None
+    rays = frame.camera.rays_at(torch.from_numpy(pixels[clear])).double().norm(dim=1).numpy()
+    distance = depth[clear] * rays
+    near, far = np.quantile(distance, (0.1, 0.9))
+    mean = brightness[clear].mean(axis=1)
+    if far < _MIN_DEPTH_RATIO * near or mean.min() == mean.max():
+        return None
+    return float(scipy.stats.spearmanr(mean, distance).statistic)
+
+
+def _known_depth(frame: Frame) -> tuple[np.ndarray, Float[np.ndarray, "K"]]:
+    """Columns and rows of pixels of known depth [K, 2], and their z-depth [K]."""
+    dense, sparse = frame.depth, frame.sparse_depth
+    if dense is not None:
+        row, column = np.nonzero(np.isfinite(dense.numpy()))
+        every = max(1, len(row) // _LAMP_PIXELS)
+        row, column = row[::every], column[::every]
+        return np.stack([column, row], axis=1), dense.numpy()[row, column].astype(np.float64)
+    if sparse is None:
+        return np.zeros((0, 2), np.int64), np.zeros(0)
+    limits = np.array([frame.camera.width, frame.camera.height]) - 1
+    return sparse.pixels.floor().long().numpy().clip(0, limits), sparse.depth.double().numpy()

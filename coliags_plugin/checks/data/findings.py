@@ -6,36 +6,27 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from coliags_plugin.checks.data.facts import DepthFacts, ImageFacts, PathFacts
+from coliags_plugin.checks.data.facts import DepthFacts, ImageFacts, LampFacts, PathFacts
 from coliags_plugin.checks.data.hypotheses import ADVICE, GIVEN, NO_MOTION
-from coliags_plugin.checks.data.lamp import LampFacts
 from coliags_plugin.checks.data.matches import EpipolarAgreement
 from coliags_plugin.checks.data.reprojection import Agreement, BestScale
 from coliags_plugin.core.scenes import Frame
 
-#: Largest median depth difference of agreeing frames, relative to the depth.
-DEPTH_AGREES = 0.02
-#: The same under another reading of the poses, for it to be named.
-READING_AGREES = 0.04
-#: Depth differences below this share are limited by the sampling of depth, and raise no doubt.
-DEPTH_SURE = 0.005
+#: Largest median depth difference of agreeing frames, relative to the depth; and under the pose hypothesis.
+MAX_DEPTH_ERROR, MAX_CHANGED_ERROR = 0.02, 0.04
+#: Smaller errors, of the depth and of epipolar distances in px, are limited by sampling and sharpness, and no evidence.
+DEPTH_RESOLUTION, EPIPOLAR_RESOLUTION = 0.005, 0.5
 #: A pose hypothesis is reported when it reduces the error by this factor.
 CLEARLY_BETTER = 2.0
 #: Factors on depth closer to 1 than this (in the logarithm) are ignored.
 SCALE_TOLERANCE = 0.1
-#: Smallest share of pixels that must project into the other image.
-SHARE_LANDS = 0.3
-#: Epipolar distances below this are limited by image sharpness, px.
-EPIPOLAR_SURE = 0.5
-#: Smallest share of good matches in front of both cameras.
-IN_FRONT = 0.6
+#: Smallest share of pixels that must project into the other image, and of good matches in front of both cameras.
+MIN_SHARE, MIN_IN_FRONT = 0.3, 0.6
 #: Steps longer than this many typical steps of the moving camera are jumps.
 JUMP = 10.0
-#: Rank correlation of brightness and distance, and share of the frames where it is positive, above which depth is taken
-#: to be reversed.
-REVERSED, REVERSED_SHARE = 0.3, 0.75
-#: Fewest frames to tell.
-REVERSED_FRAMES = 4
+#: Rank correlation of brightness and distance, and share of at least so many frames where it is positive, above which
+#: depth is taken to be reversed.
+REVERSED, REVERSED_SHARE, REVERSED_FRAMES = 0.3, 0.75, 4
 #: The renderers' default near plane, scene units.
 NEAR = 0.2
 
@@ -119,7 +110,7 @@ def agreement_findings(
     given = readings.get(GIVEN)
     if given is None or path is None or path.length == 0.0 or depth is None or _is_flat(depth):
         return
-    error = math.inf if given.depth_error is None or given.share < SHARE_LANDS else given.depth_error
+    error = math.inf if given.depth_error is None or given.share < MIN_SHARE else given.depth_error
     errors = (
         f"surfaces differ by {_percent(given.depth_error)} of the depth, {given.share:.0%} of the pixels project into "
         "the other image"
@@ -127,12 +118,12 @@ def agreement_findings(
     better = {
         name: reading
         for name, reading in readings.items()
-        if name in ADVICE and reading.depth_error is not None and reading.share >= SHARE_LANDS
+        if name in ADVICE and reading.depth_error is not None and reading.share >= MIN_SHARE
     }
     best = min(better, key=lambda name: better[name].depth_error or 0.0, default=None)
     least = math.inf if best is None else better[best].depth_error or 0.0
     by_scale = math.inf
-    if scale is not None and error > DEPTH_SURE and abs(math.log(scale.factor)) >= SCALE_TOLERANCE:
+    if scale is not None and error > DEPTH_RESOLUTION and abs(math.log(scale.factor)) >= SCALE_TOLERANCE:
         # With dummy depth any factor does that makes the motion negligible.
         by_scale = scale.depth_error if scale.depth_error * CLEARLY_BETTER < scale.beside else math.inf
     if scale is not None and by_scale * CLEARLY_BETTER < min(error, least * CLEARLY_BETTER):
@@ -141,13 +132,13 @@ def agreement_findings(
             f"as given, {errors}; with depth times {scale.factor:.3g}, {_percent(by_scale)}",
             f"Check the units: depth seems to be {1.0 / scale.factor:.3g} times what the poses expect",
         )
-    elif best is not None and error > DEPTH_SURE and least * CLEARLY_BETTER < error and least < READING_AGREES:
+    elif best is not None and error > DEPTH_RESOLUTION and least * CLEARLY_BETTER < error and least < MAX_CHANGED_ERROR:
         yield Finding(
             f"poses agree with depth when read as: {best}",
             f"as given, {errors}; read this way, {_percent(least)}",
             ADVICE[best],
         )
-    elif error > DEPTH_AGREES:
+    elif error > MAX_DEPTH_ERROR:
         still = readings[NO_MOTION].depth_error
         yield Finding(
             "frames do not agree on the surface",
@@ -166,15 +157,15 @@ def match_findings(readings: Mapping[str, EpipolarAgreement]) -> Iterator[Findin
         if given.in_front is None
         else f"{given.in_front:.0%} in front of both cameras"
     )
-    in_front = given.in_front is None or given.in_front >= IN_FRONT
+    in_front = given.in_front is None or given.in_front >= MIN_IN_FRONT
     right = [
         name
         for name, reading in readings.items()
         if name in ADVICE
-        and (reading.in_front or 0.0) >= IN_FRONT
+        and (reading.in_front or 0.0) >= MIN_IN_FRONT
         and (
-            (given.error > EPIPOLAR_SURE and reading.error * CLEARLY_BETTER < given.error)
-            or (not in_front and reading.error <= max(EPIPOLAR_SURE, given.error))
+            (given.error > EPIPOLAR_RESOLUTION and reading.error * CLEARLY_BETTER < given.error)
+            or (not in_front and reading.error <= max(EPIPOLAR_RESOLUTION, given.error))
         )
     ]
     best = min(right, key=lambda name: readings[name].error, default=None)

@@ -16,10 +16,6 @@ GIVEN = "given"
 NO_MOTION = "no motion"
 
 
-def _inverse(pose: Tensor) -> Tensor:
-    return torch.linalg.inv(pose)
-
-
 def _transposed(pose: Tensor) -> Tensor:
     turned = pose.clone()
     turned[:3, :3] = pose[:3, :3].T
@@ -39,7 +35,7 @@ def _flipped(pose: Tensor) -> Tensor:
 CHANGES: dict[str, Change] = {
     GIVEN: lambda pose: pose,
     NO_MOTION: lambda pose: torch.eye(4, dtype=pose.dtype),
-    "world-to-camera": _inverse,
+    "world-to-camera": torch.linalg.inv,
     "rotation transposed": _transposed,
     "translation of opposite sign": _opposite_translation,
     "camera axes y up, z backward": _flipped,

@@ -7,27 +7,26 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from coliags_plugin.checks.data.hypotheses import CHANGES, GIVEN
 from coliags_plugin.core.scenes import Frame
 
 #: Smallest number of matches of a usable pair.
-_ENOUGH = 8
+_MIN_MATCHES = 8
 #: Largest epipolar distance of a good match, px.
-_NEAR = 3.0
+_MAX_DISTANCE = 3.0
 #: Largest median epipolar distance of matches that agree with the poses, px, and as a share of the image's width: true
 #: poses of C3VD, registered to 0.3 mm, have 2.1 px at a width of 800.
-_AGREES, _AGREES_SHARE = 2.0, 0.005
-#: Largest distance of a match from the epipolar geometry of its pair's matches, px.
-_CONSISTENT = 1.5
-#: Smallest parallax from which a point's side of the camera can be told, px.
-_PARALLAX = 2.0
+_MAX_ERROR, _MAX_ERROR_SHARE = 2.0, 0.005
+#: Largest distance of an inlier from the epipolar geometry estimated from its pair's matches, px.
+_MAX_RESIDUAL = 1.5
+#: Smallest parallax that tells whether a point is in front of the camera, px.
+_MIN_PARALLAX = 2.0
 
 
 @dataclass(frozen=True)
-class Matches:
+class FeatureMatches:
     """Matched features of two frames: (column, row), pixel centres at integers + 0.5. [K, 2] each."""
 
     source: Frame
@@ -58,10 +57,10 @@ class EpipolarAgreement:
     @property
     def agrees(self) -> bool:
         """Whether the error is that of right poses: real ones are off by some share of the image."""
-        return self.error <= max(_AGREES, _AGREES_SHARE * self.width)
+        return self.error <= max(_MAX_ERROR, _MAX_ERROR_SHARE * self.width)
 
 
-def match(pairs: Sequence[tuple[Frame, Frame]]) -> list[Matches]:
+def match(pairs: Sequence[tuple[Frame, Frame]]) -> list[FeatureMatches]:
     """Mutual best matches of SIFT features on CLAHE images that some epipolar geometry explains, whatever the poses.
 
     Pairs with few matches are left out.
@@ -71,46 +70,56 @@ def match(pairs: Sequence[tuple[Frame, Frame]]) -> list[Matches]:
     detector: Any = cv2.SIFT.create(nfeatures=2000, contrastThreshold=0.01)
     contrast = cv2.createCLAHE(clipLimit=4.0, tileGridSize=(8, 8))
     matcher = cv2.BFMatcher(cv2.NORM_L2)
-    found = []
+    matches = []
     for source, target in pairs:
         described = []
         for frame in (source, target):
             gray = contrast.apply(cv2.cvtColor(frame.image.numpy(), cv2.COLOR_RGB2GRAY))
             described.append(detector.detectAndCompute(gray, frame.valid.numpy().astype(np.uint8)))
         (points, features), (points_there, features_there) = described
-        if features is None or features_there is None or min(len(points), len(points_there)) < _ENOUGH:
+        if features is None or features_there is None or min(len(points), len(points_there)) < _MIN_MATCHES:
             continue
         forward = [m for m, n in matcher.knnMatch(features, features_there, k=2) if m.distance < 0.8 * n.distance]
         back = {m.queryIdx: m.trainIdx for m in matcher.match(features_there, features)}
         mutual = [m for m in forward if back.get(m.trainIdx) == m.queryIdx]
-        if len(mutual) < _ENOUGH:
+        if len(mutual) < _MIN_MATCHES:
             continue
         # OpenCV has pixel centres at integers.
         here = np.array([points[m.queryIdx].pt for m in mutual]) + 0.5
         there = np.array([points_there[m.trainIdx].pt for m in mutual]) + 0.5
-        _, inliers = cv2.findFundamentalMat(here, there, cv2.USAC_MAGSAC, _CONSISTENT, 0.999, 10_000)
-        kept = np.zeros(len(here), bool) if inliers is None else inliers[:, 0] > 0
-        if kept.sum() >= _ENOUGH:
-            found.append(Matches(source, target, here[kept], there[kept]))
-    return found
+        inlier = _epipolar_inliers(here, there)
+        if inlier.sum() >= _MIN_MATCHES:
+            matches.append(FeatureMatches(source, target, here[inlier], there[inlier]))
+    return matches
 
 
-def epipolar_agreement(matches: Sequence[Matches], change: str = GIVEN) -> EpipolarAgreement | None:
+def _epipolar_inliers(here: np.ndarray, there: np.ndarray) -> Bool[np.ndarray, "K"]:
+    """Which matches some fundamental matrix explains; none where OpenCV finds no such matrix. [K]"""
+    import cv2
+
+    try:
+        _, inliers = cv2.findFundamentalMat(here, there, cv2.USAC_MAGSAC, _MAX_RESIDUAL, 0.999, 10_000)
+    except cv2.error:  # raised instead of returning nothing where all samples are degenerate
+        inliers = None
+    return np.zeros(len(here), bool) if inliers is None else np.asarray(inliers[:, 0] > 0)
+
+
+def epipolar_agreement(matches: Sequence[FeatureMatches], change: str = GIVEN) -> EpipolarAgreement | None:
     """Epipolar errors under the hypothesis ``change``; None without matches or camera motion."""
-    judged = [found for pair in matches if (found := _judge(pair, change)) is not None]
-    if not judged:
+    errors = [error for pair in matches if (error := _epipolar_errors(pair, change)) is not None]
+    if not errors:
         return None
-    distance, front, parallax = (np.concatenate(values) for values in zip(*judged, strict=True))
-    near = distance < _NEAR
-    telling = near & (parallax > _PARALLAX)
-    in_front = None if near.any() else 0.0
-    if telling.sum() >= _ENOUGH:
-        in_front = float(front[telling].mean())
+    distance, front, parallax = (np.concatenate(values) for values in zip(*errors, strict=True))
+    good = distance < _MAX_DISTANCE
+    in_front = None if good.any() else 0.0
+    good &= parallax > _MIN_PARALLAX
+    if good.sum() >= _MIN_MATCHES:
+        in_front = float(front[good].mean())
     width = float(np.mean([pair.target.camera.width for pair in matches]))
     return EpipolarAgreement(float(np.median(distance)), in_front, float(np.median(parallax)), len(distance), width)
 
 
-def _judge(pair: Matches, change: str) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+def _epipolar_errors(pair: FeatureMatches, change: str) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Distances from the epipolar lines, px; whether points are in front of both cameras; parallax, px. [K] each"""
     cameras = [
         replace(frame.camera, camera_to_world=CHANGES[change](frame.camera.camera_to_world.double()))
@@ -121,23 +130,22 @@ def _judge(pair: Matches, change: str) -> tuple[np.ndarray, np.ndarray, np.ndarr
     length = float(np.linalg.norm(translation))
     if length == 0.0:
         return None
-    rays = _rays(pair.pixels, cameras[0].intrinsics_matrix)
-    rays_there = _rays(pair.pixels_there, cameras[1].intrinsics_matrix)
+    matrices = [camera.intrinsics_matrix.double().numpy() for camera in cameras]
+    pixels, pixels_there = _homogeneous(pair.pixels), _homogeneous(pair.pixels_there)
+    rays, rays_there = pixels @ np.linalg.inv(matrices[0]).T, pixels_there @ np.linalg.inv(matrices[1]).T
     x, y, z = translation / length
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
-    lines = np.linalg.inv(cameras[1].intrinsics_matrix.double().numpy()).T @ essential @ rays.T
-    homogeneous = np.concatenate([pair.pixels_there, np.ones((len(rays), 1))], axis=1)
-    distance = np.abs((homogeneous * lines.T).sum(axis=1)) / np.linalg.norm(lines[:2], axis=0)
+    lines = np.linalg.inv(matrices[1]).T @ essential @ rays.T
+    distance = np.abs((pixels_there * lines.T).sum(axis=1)) / np.linalg.norm(lines[:2], axis=0)
     turned = rays @ rotation.T
     with np.errstate(divide="ignore", invalid="ignore"):
-        far = (turned / turned[:, 2:]) @ cameras[1].intrinsics_matrix.double().numpy().T
+        far = (turned / turned[:, 2:]) @ matrices[1].T
     parallax = np.where(turned[:, 2] > 0.0, np.linalg.norm(far[:, :2] - pair.pixels_there, axis=1), np.inf)
     return distance, _in_front(turned, rays_there, translation), parallax
 
 
-def _rays(pixels: np.ndarray, intrinsics: torch.Tensor) -> np.ndarray:
-    homogeneous = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
-    return np.asarray(homogeneous @ np.linalg.inv(intrinsics.double().numpy()).T)
+def _homogeneous(pixels: Float[np.ndarray, "K 2"]) -> Float[np.ndarray, "K 3"]:
+    return np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
 
 
 def _in_front(turned: np.ndarray, there: np.ndarray, translation: np.ndarray) -> np.ndarray:

@@ -1,10 +1,10 @@
-"""HTML page of the consistency checks: statistics, findings, and frames reprojected into each other."""
+"""Page of the consistency checks: statistics, findings, pose hypotheses, and frames reprojected into each other."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from html import escape
-from pathlib import Path
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,82 +12,167 @@ import torch
 from coliags_plugin.checks.data.check import SceneCheck
 from coliags_plugin.checks.data.findings import Finding
 from coliags_plugin.checks.data.reprojection import warp_image
-from coliags_plugin.checks.data.text import fact_rows, reading_rows
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.outputs.charts import Series, line_chart
+from coliags_plugin.outputs.charts import Series
 from coliags_plugin.outputs.colormaps import colorize_depth, colorize_rgb_error
-from coliags_plugin.outputs.image_files import encode_png
-from coliags_plugin.outputs.page import fact_list, figure, record, table, write_page
+from coliags_plugin.reporting.model import (
+    Bullet,
+    Bullets,
+    Chart,
+    EncodedImage,
+    Fact,
+    Figures,
+    Image,
+    Page,
+    Paragraph,
+    Section,
+    Table,
+    record,
+    simple_table,
+)
+from coliags_plugin.reporting.numbers import counted, sentence
 
 #: Number of pairs shown.
 _SHOWN = 3
-_AXES = "xyz"
 
 
-def write_check_page(check: SceneCheck, output: Path) -> None:
-    """Write the HTML page of a check.
-
-    Raises:
-        InputError: ``output`` is a folder, or cannot be written.
-    """
+def check_page(check: SceneCheck) -> Page:
+    """Everything that the checks found; in the terminal without pictures, trajectory and origin of the data."""
     name = check.scene.name
-    verdict = f"{len(check.findings)} suspect" if check.findings else "nothing suspect"
-    header = f"<h1>{escape(name)}: {verdict}</h1>" + fact_list(dict(fact_rows(check)))
-    sections = [_findings(check), _readings(check), _images(check), _path(check.scene.video), _provenance(check)]
-    write_page(output, f"{name}: data check", header, sections)
-
-
-def _findings(check: SceneCheck) -> str:
-    parts = [
-        f'<h2>{title}</h2><ul class="cautions">{"".join(map(_item, found))}</ul>'
-        for title, found in (("Suspect", check.findings), ("Undecided", check.undecided))
-        if found
+    sections = [
+        Section("Suspect", _bullets(check.findings)),
+        Section("Undecided", _bullets(check.undecided)),
+        Section("Agreement", _agreement(check)),
+        Section("Reprojected frames", [_pair_images(*pair) for pair in _shown(check.pairs)], screen_only=True),
+        Section("Trajectory", [_trajectory(check.scene.video)], screen_only=True),
+        Section("Data", [record("Origin of the data", check.scene.provenance)], screen_only=True),
     ]
-    return f"<section>{''.join(parts)}</section>" if parts else ""
+    return Page(f"{name}: data check", sections, list(_facts(check)), heading=f"{name}: {verdict(check)}")
 
 
-def _item(finding: Finding) -> str:
-    return f"<li><strong>{escape(finding.what)}</strong>: {escape(finding.evidence)}. {escape(finding.do)}</li>"
+def _bullets(findings: Sequence[Finding]) -> list[Bullets]:
+    items = [Bullet(" ".join(map(sentence, filter(None, (f.evidence, f.do)))), f.what) for f in findings]
+    return [Bullets(items, warning=True)] if items else []
 
 
-def _readings(check: SceneCheck) -> str:
-    head, rows = reading_rows(check)
-    if not rows:
-        return ""
+def verdict(check: SceneCheck) -> str:
+    """How many findings there are."""
+    return counted(len(check.findings), "suspect finding") if check.findings else "nothing suspect"
+
+
+def _facts(check: SceneCheck) -> Iterator[Fact]:
+    scene = check.scene
+    data = scene.provenance
+    camera = scene.train[0].camera
+    counts = {"train": len(scene.train), **{name: len(frames) for name, frames in scene.test_sets.items()}}
+    layout, stored = data.get("layout"), data.get("stored_size")
+    yield Fact("format", str(data.get("dataset", "unknown")), note=f"{layout} layout" if layout else "")
+    yield Fact("frames", ", ".join(f"{count} {name}" for name, count in counts.items()))
+    yield Fact("split", str(data.get("split", {}).get("name", "unknown")))
+    size = f"{camera.width} x {camera.height} px" + (f", stored {stored[0]} x {stored[1]}" if stored else "")
+    yield Fact("image size", size)
+    yield Fact("lens", str(data["lens"]) if data.get("lens") else "pinhole images")
+    angle = 2.0 * math.degrees(math.atan(0.5 * camera.width / camera.fx))
+    focal, center = f"f {camera.fx:.2f}, {camera.fy:.2f}", f"centre {camera.cx:.2f}, {camera.cy:.2f}"
+    yield Fact("calibration", f"{focal}, {center} px, {angle:.1f} degrees across")
+    yield Fact("pose convention", _convention(data.get("pose_convention")))
+    unit = data.get("unit", "mm")
+    yield Fact("unit of length", str(unit))
+    if depth := check.depth:
+        values = f"median {depth.median:.4g}, 1 % to 99 %: {depth.nearest:.4g} to {depth.farthest:.4g}"
+        unknown = f"{depth.invalid_share:.1%} unknown, of which {depth.clipped_share:.1%} clipped"
+        yield Fact("depth", f"{values}{' mm' if unit == 'mm' else ''}; {unknown}")
+    else:
+        yield Fact("depth", "none")
+    if path := check.path:
+        steps = f"steps {path.mean_step:.3g} (largest {path.largest_step:.3g} to {path.largest_step_at})"
+        yield Fact("trajectory", f"{path.length:.4g} long, {steps}, turns {path.turn:.3g} degrees in all")
+    images = check.images
+    frames = f"mean {images.mean:.0f} of 255, frames {images.darkest_frame:.0f} to {images.brightest_frame:.0f}"
+    shares = f"{images.overexposed_share:.1%} white, {images.masked_share:.1%} masked"
+    yield Fact("brightness", f"{frames}, {shares}")
+    if lamp := check.lamp:
+        correlation = f"rank correlation {lamp.correlation:.2f} (median of {counted(lamp.frames, 'frame')})"
+        yield Fact("brightness and distance", f"{correlation}; below 0, the near is brighter")
+    yield Fact("initial points", f"{len(scene.points)} from {data.get('points', {}).get('source', 'unknown')}")
+
+
+def _convention(facts: Any) -> str:
+    if not isinstance(facts, dict):
+        return str(facts) if facts else "not stated"
+    words = [value for value in facts.values() if isinstance(value, str)]
+    numbers = [f"{key.replace('_', ' ')} {value:.3g}" for key, value in facts.items() if isinstance(value, float)]
+    return "; ".join([*words, ", ".join(numbers)] if numbers else words) or "not stated"
+
+
+def _agreement(check: SceneCheck) -> list[Paragraph | Table]:
+    """Errors by pose hypothesis; nothing where nothing could be compared."""
     gaps = [target.index - source.index for source, target in check.pairs] or [0]
     apart = f"{min(gaps)} to {max(gaps)} frames"
-    note = (
-        f"Each of {len(check.pairs)} frames is reprojected {apart} ahead by depth, poses and calibration; "
-        "medians over all pixels. If the given poses are not the best row, they are suspect."
-        if check.agreement
-        else f"Matched features of {len(check.pairs)} pairs of frames, {apart} apart, as there is no depth."
+    if check.agreement:
+        note = (
+            f"Each of {len(check.pairs)} frames is reprojected {apart} ahead by depth, poses and calibration; medians "
+            "over all pixels. If the given poses are not the best row, they are suspect."
+        )
+        head = ["depth error, %", "depth error, mm", "colour error, grey levels", "projects into the image, %"]
+        rows = [
+            [name, *map(_number, (_percent(e.depth_error), e.depth_error_mm, e.color_error, _percent(e.share)))]
+            for name, e in check.agreement.items()
+        ]
+        if scale := check.scale:
+            error = _number(_percent(scale.depth_error))
+            rows.append([f"given, depth times {scale.factor:.3g}", error, None, None, None])
+    else:
+        note = f"Matched features of {len(check.pairs)} pairs of frames, {apart} apart, as there is no depth."
+        head = ["distance from the epipolar line, px", "in front of both cameras, %", "parallax, px", "matches"]
+        rows = [
+            [name, *map(_number, (e.error, _percent(e.in_front), e.parallax)), str(e.count)]
+            for name, e in check.matches.items()
+        ]
+    return [Paragraph(note), simple_table(["poses read as", *head], rows)] if rows else []
+
+
+def _percent(value: float | None) -> float | None:
+    return None if value is None else 100.0 * value
+
+
+def _number(value: float | None) -> str | None:
+    return None if value is None else f"{value:.3g}"
+
+
+def _shown(pairs: Sequence[tuple[Frame, Frame]]) -> Sequence[tuple[Frame, Frame]]:
+    return pairs[:: max(1, len(pairs) // _SHOWN)][:_SHOWN]
+
+
+def _pair_images(source: Frame, target: Frame) -> Figures:
+    """Both images; the source warped into the target view and its difference; and the target's depth."""
+    images = [(source.image.numpy(), source.name), (target.image.numpy(), target.name)]
+    if source.depth is not None and target.depth is not None:
+        painted, shown = warp_image(source, target)
+        canvas = torch.where(shown[..., None], painted, torch.full_like(painted, 0.5))
+        mixed = torch.where(_checkered(shown)[..., None], canvas, target.rgb.double())
+        images += [
+            (_bytes(canvas), f"{target.name} warped from {source.name}"),
+            (_bytes(mixed), "checkerboard of both: edges must be continuous"),
+            (
+                colorize_rgb_error(painted.float(), target.rgb, shown),
+                "difference, black 0 to yellow 20 % of full scale",
+            ),
+        ]
+    if target.depth is not None:
+        depth = target.depth.numpy()
+        known = depth[np.isfinite(depth)]
+        if len(known):
+            low, high = (float(value) for value in np.quantile(known, (0.01, 0.99)))
+            limits = (low, max(high, low * 1.001))
+            images.append((colorize_depth(depth, limits), f"z-depth, {low:.3g} to {high:.3g} scene units"))
+    return Figures(
+        [Image(EncodedImage.png(rgb), caption) for rgb, caption in images], f"{source.name} and {target.name}"
     )
-    return f'<section><h2>Agreement</h2><p class="hint">{escape(note)}</p>{table(head, rows)}</section>'
 
 
-def _images(check: SceneCheck) -> str:
-    chosen = check.pairs[:: max(1, len(check.pairs) // _SHOWN)][:_SHOWN]
-    parts = []
-    for source, target in chosen:
-        cells = [_cell(source.image.numpy(), source.name), _cell(target.image.numpy(), target.name)]
-        if source.depth is not None and target.depth is not None:
-            painted, shown = warp_image(source, target)
-            canvas = torch.where(shown[..., None], painted, torch.full_like(painted, 0.5))
-            cells.append(_cell((canvas * 255).round().byte().numpy(), f"{target.name} warped from {source.name}"))
-            mixed = torch.where(_checkered(shown)[..., None], canvas, target.rgb.double())
-            cells.append(_cell((mixed * 255).round().byte().numpy(), "checkerboard of both: edges must be continuous"))
-            error = colorize_rgb_error(painted.float(), target.rgb, shown)
-            cells.append(_cell(error, "difference, black 0 to yellow 20 % of full scale"))
-        if target.depth is not None:
-            depth = target.depth.numpy()
-            known = depth[np.isfinite(depth)]
-            if len(known):
-                low, high = (float(value) for value in np.quantile(known, (0.01, 0.99)))
-                title = f"z-depth, {low:.3g} to {high:.3g} scene units"
-                cells.append(_cell(colorize_depth(depth, (low, max(high, low * 1.001))), title))
-        parts.append(f"<h3>{escape(source.name)} and {escape(target.name)}</h3>")
-        parts.append(f'<div class="view" style="--cells: 3">{"".join(cells)}</div>')
-    return f"<section><h2>Reprojected frames</h2>{''.join(parts)}</section>" if parts else ""
+def _bytes(rgb: torch.Tensor) -> np.ndarray:
+    return np.asarray((rgb * 255).round().byte().numpy())
 
 
 def _checkered(shown: torch.Tensor) -> torch.Tensor:
@@ -98,28 +183,16 @@ def _checkered(shown: torch.Tensor) -> torch.Tensor:
     return ((rows + columns) % 2 == 0) & shown
 
 
-def _path(video: Sequence[Frame]) -> str:
+def _trajectory(video: Sequence[Frame]) -> Figures:
     centers = np.stack([frame.camera.center.double().numpy() for frame in video])
-    numbers = [float(frame.index) for frame in video]
-    along = [Series(_AXES[axis], axis, numbers, [float(value) for value in centers[:, axis]]) for axis in range(3)]
-    x, y, z = ([float(value) for value in centers[:, axis]] for axis in range(3))
-    charts = [
-        ("Camera centre along the video", line_chart(along, "frame", "position, scene units"), _legend()),
-        ("From above", line_chart([Series("path", 3, z, x)], "z, scene units", "x, scene units"), ""),
-        ("From the side", line_chart([Series("path", 3, z, y)], "z, scene units", "y, scene units"), ""),
-    ]
-    figures = "".join(f"<figure><h4>{title}</h4>{chart}{legend}</figure>" for title, chart, legend in charts)
-    return f'<section><h2>Trajectory</h2><div class="charts">{figures}</div></section>'
-
-
-def _legend() -> str:
-    items = "".join(f'<li><i class="swatch s{axis}"></i>{name}</li>' for axis, name in enumerate(_AXES))
-    return f'<ul class="legend">{items}</ul>'
-
-
-def _provenance(check: SceneCheck) -> str:
-    return f"<section><h2>Data</h2>{record('What the data manager found', check.scene.provenance)}</section>"
-
-
-def _cell(rgb: np.ndarray, caption: str) -> str:
-    return figure(encode_png(rgb), caption)
+    x, y, z = (values.tolist() for values in centers.T)
+    frames = [float(frame.index) for frame in video]
+    along = [Series("x", 0, frames, x), Series("y", 1, frames, y), Series("z", 2, frames, z)]
+    position, depth = "position, scene units", "z, scene units"
+    return Figures(
+        [
+            Chart(along, "frame", position, "Camera centre along the video", legend=True),
+            Chart([Series("path", 3, z, x)], depth, "x, scene units", "From above"),
+            Chart([Series("path", 3, z, y)], depth, "y, scene units", "From the side"),
+        ]
+    )

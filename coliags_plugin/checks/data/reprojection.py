@@ -19,9 +19,9 @@ _PIXELS = 4000
 #: Factors on depth of the coarse search.
 _SCALES = np.logspace(-4.0, 4.0, 65)
 #: Stride of the pixels used in that search.
-_THINNED = 8
+_STRIDE = 8
 #: Smallest share of pixels that project into the other image for a factor to count.
-_LAND = 0.2
+_MIN_SHARE = 0.2
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,8 @@ class Pair:
 
     def __init__(self, source: Frame, target: Frame) -> None:
         depth, there = _known_depth(source), _known_depth(target)
-        chosen = _some(torch.isfinite(depth))
+        known = torch.isfinite(depth).reshape(-1).nonzero()[:, 0]
+        chosen = known[:: max(1, len(known) // _PIXELS)]
         own_axes = replace(source.camera, camera_to_world=torch.eye(4, dtype=torch.float64))
         self._source, self._target = source.camera, target.camera
         #: Points in the source camera's axes. [K, 3]
@@ -77,15 +78,15 @@ class Pair:
         pixels, z = camera.project(points @ pose[:3, :3].T + pose[:3, 3])
         column, row = pixels.floor().nan_to_num(-1.0).clamp(-1, 1 << 20).long().unbind(-1)
         lands = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        place = row[lands] * camera.width + column[lands]
-        there = self._depth_there[place] * scale
+        hit = row[lands] * camera.width + column[lands]
+        there = self._depth_there[hit] * scale
         difference = (z[lands] - there).abs()
         known = torch.isfinite(difference)
         return ReprojectedPixels(
             float(lands.double().mean()),
             (difference / there)[known],
             difference[known],
-            _color_difference(self._colors[::every][lands], self._colors_there[place]),
+            _color_difference(self._colors[::every][lands], self._colors_there[hit]),
         )
 
 
@@ -110,10 +111,10 @@ def agreement(pairs: Sequence[Pair], change: str = GIVEN, scale: float = 1.0, ev
     """Reproject the first frame of every pair into the second; arguments as in :meth:`Pair.reproject`."""
     reprojected = [pair.reproject(CHANGES[change], scale, every) for pair in pairs]
     return Agreement(
-        _median([landing.depth_errors for landing in reprojected]),
-        _median([landing.depth_errors_mm for landing in reprojected]),
-        _median([landing.color_errors for landing in reprojected]),
-        float(np.mean([landing.share for landing in reprojected])) if reprojected else 0.0,
+        _median([result.depth_errors for result in reprojected]),
+        _median([result.depth_errors_mm for result in reprojected]),
+        _median([result.color_errors for result in reprojected]),
+        float(np.mean([result.share for result in reprojected])) if reprojected else 0.0,
     )
 
 
@@ -136,8 +137,8 @@ def best_scale(pairs: Sequence[Pair]) -> BestScale | None:
     """The factor on depth with the smallest reprojection error; None if none fits."""
 
     def error(scale: float) -> float:
-        found = agreement(pairs, scale=float(scale), every=_THINNED)
-        return np.inf if found.depth_error is None or found.share < _LAND else found.depth_error
+        result = agreement(pairs, scale=float(scale), every=_STRIDE)
+        return np.inf if result.depth_error is None or result.share < _MIN_SHARE else result.depth_error
 
     errors = [error(scale) for scale in _SCALES]
     least = int(np.argmin(errors))
@@ -176,12 +177,6 @@ def _known_depth(frame: Frame) -> Float[Tensor, "H W"]:
 
 def _changed(camera: Camera, change: Change = CHANGES[GIVEN]) -> Camera:
     return replace(camera, camera_to_world=change(camera.camera_to_world.double()))
-
-
-def _some(known: Bool[Tensor, "H W"]) -> Tensor:
-    """Flat indices of an even sample of the known pixels. [K]"""
-    places = known.reshape(-1).nonzero()[:, 0]
-    return places[:: max(1, len(places) // _PIXELS)]
 
 
 def _color_difference(colors: Tensor, colors_there: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from coliags_plugin.checks.depth.measures import Errors, Measures, measure, median_scale, pooled
+from coliags_plugin.checks.depth.measures import DepthErrors, DepthStatistics, measure, median_scale, pooled
 from coliags_plugin.checks.depth.pairing import (
     FramePairs,
     Samples,
@@ -24,7 +24,7 @@ from coliags_plugin.core.progress import Progress
 
 @dataclass(frozen=True)
 class FrameErrors:
-    """Errors of one frame; None where the truth has no depth of that kind.
+    """DepthErrors of one frame; None where the truth has no depth of that kind.
 
     Attributes:
         name: Of the estimate's frame.
@@ -32,8 +32,8 @@ class FrameErrors:
     """
 
     name: str
-    dense: Errors | None
-    sparse: Errors | None
+    dense: DepthErrors | None
+    sparse: DepthErrors | None
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class DepthCheck:
         unit: Of lengths: ``"mm"``, or ``"units of the truth"``.
         scale: Factor that the estimate was multiplied by; None: not aligned.
         dense, sparse: Statistics over all pixels and points of all frames; None where the truth has no such depth.
-        frames: Errors of every frame.
+        frames: DepthErrors of every frame.
     """
 
     estimate: DepthSource
@@ -54,8 +54,8 @@ class DepthCheck:
     pairs: FramePairs
     unit: str
     scale: float | None
-    dense: Measures | None
-    sparse: Measures | None
+    dense: DepthStatistics | None
+    sparse: DepthStatistics | None
     frames: list[FrameErrors]
 
     def as_json(self) -> dict[str, Any]:
@@ -92,7 +92,7 @@ def check_depth(
     pairs = match_frames(estimate, truth)
     dense: list[Samples | None] = []
     sparse: list[Samples | None] = []
-    for done, (here, there) in enumerate(pairs.places, start=1):
+    for done, (here, there) in enumerate(pairs.indices, start=1):
         estimated, true = estimate.read(here), truth.read(there)
         if true.confidence is not None:
             raise InputError(
@@ -105,13 +105,13 @@ def check_depth(
         dense.append(None if surface is None else dense_samples(estimated, surface))
         sparse.append(sparse_samples(estimated, true))
         if progress is not None:
-            progress("compare depth", done, len(pairs.places))
+            progress("compare depth", done, len(pairs.indices))
     of_all = [_pooled(dense), _pooled(sparse)]
     counted = [samples for samples in of_all if samples is not None and np.isfinite(samples.estimated).any()]
     if not counted:
         raise InputError(
             f"{estimate.path} has no estimate at any of the {sum(len(s.true) for s in of_all if s is not None)} pixels "
-            f"of {len(pairs.places)} frames whose depth {truth.path} knows",
+            f"of {len(pairs.indices)} frames whose depth {truth.path} knows",
             "an estimate and a truth that overlap",
             "Check that both have depth, and which of the two paths is the estimate",
         )
@@ -120,7 +120,7 @@ def check_depth(
     measured = [None if samples is None else measure(samples, factor) for samples in of_all]
     frames = [
         FrameErrors(estimate.names[here], _frame_errors(surface, factor), _frame_errors(points, factor))
-        for (here, _), surface, points in zip(pairs.places, dense, sparse, strict=True)
+        for (here, _), surface, points in zip(pairs.indices, dense, sparse, strict=True)
     ]
     unit = "mm" if truth.metric else "units of the truth"
     return DepthCheck(estimate, truth, pairs, unit, scale, measured[0], measured[1], frames)
@@ -141,5 +141,5 @@ def _pooled(parts: list[Samples | None]) -> Samples | None:
     return pooled(there) if there else None
 
 
-def _frame_errors(samples: Samples | None, scale: float) -> Errors | None:
+def _frame_errors(samples: Samples | None, scale: float) -> DepthErrors | None:
     return None if samples is None else measure(samples, scale).errors

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from coliags_plugin.checks.depth.pairing import Samples
 
-#: Errors below this share of the depth are good, as in the definition of the confidence.
+#: DepthErrors below this share of the depth are good, as in the definition of the confidence.
 WITHIN = 0.05
 #: Confidence from which an estimate is rather good than not.
 SURE = 0.5
@@ -21,8 +21,8 @@ _BINS = 10
 
 
 @dataclass(frozen=True)
-class Errors:
-    """Errors of the pixels that have both an estimate and a truth; None where there are none.
+class DepthErrors:
+    """DepthErrors of the pixels that have both an estimate and a truth; None where there are none.
 
     Attributes:
         pixels: Their number.
@@ -36,21 +36,21 @@ class Errors:
 
     pixels: int
     coverage: float
-    median: float | None
-    p90: float | None
-    within: float | None
-    bias: float | None
-    median_length: float | None
-    p90_length: float | None
+    median: float | None = None
+    p90: float | None = None
+    within: float | None = None
+    bias: float | None = None
+    median_length: float | None = None
+    p90_length: float | None = None
 
 
 @dataclass(frozen=True)
 class Band:
-    """Errors of the pixels whose true depth is in [low, high), units of the truth."""
+    """DepthErrors of the pixels whose true depth is in [low, high), units of the truth."""
 
     low: float
     high: float
-    errors: Errors
+    errors: DepthErrors
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class ConfidenceBin:
 
 
 @dataclass(frozen=True)
-class Measures:
+class DepthStatistics:
     """Statistics of a set of samples.
 
     Attributes:
@@ -84,14 +84,14 @@ class Measures:
             weighted by their pixels; None without such pixels.
     """
 
-    errors: Errors
-    sure: Errors | None
+    errors: DepthErrors
+    sure: DepthErrors | None
     bands: list[Band]
     bins: list[ConfidenceBin]
     calibration_error: float | None
 
 
-def measure(samples: Samples, scale: float = 1.0) -> Measures:
+def measure(samples: Samples, scale: float = 1.0) -> DepthStatistics:
     """All statistics of samples.
 
     Args:
@@ -101,13 +101,13 @@ def measure(samples: Samples, scale: float = 1.0) -> Measures:
     true = samples.true.astype(np.float64)
     relative = samples.estimated.astype(np.float64) * scale / true - 1.0
     bins = _bins(samples.confidence, relative)
-    stated = [found for found in bins if found.high > 0.0]
-    total = sum(found.pixels for found in stated)
-    gap = sum(found.pixels * abs(found.stated - found.observed) for found in stated)
+    stated = [entry for entry in bins if entry.high > 0.0]
+    total = sum(entry.pixels for entry in stated)
+    gap = sum(entry.pixels * abs(entry.stated - entry.observed) for entry in stated)
     sure = None
     if samples.confidence is not None:
         sure = _errors(np.where(samples.confidence >= SURE, relative, np.nan), true)
-    return Measures(_errors(relative, true), sure, _bands(relative, true), bins, gap / total if total else None)
+    return DepthStatistics(_errors(relative, true), sure, _bands(relative, true), bins, gap / total if total else None)
 
 
 def median_scale(samples: Samples) -> float | None:
@@ -130,36 +130,28 @@ def pooled(parts: Sequence[Samples]) -> Samples:
     )
 
 
-def _errors(relative: Float[np.ndarray, "N"], true: Float[np.ndarray, "N"]) -> Errors:
+def _errors(relative: Float[np.ndarray, "N"], true: Float[np.ndarray, "N"]) -> DepthErrors:
     known = np.isfinite(relative)
     signed = relative[known]
     coverage = float(known.mean()) if len(known) else 0.0
     if not len(signed):
-        return Errors(0, coverage, None, None, None, None, None, None)
+        return DepthErrors(0, coverage)
     size = np.abs(signed)
     median, p90 = (float(value) for value in np.quantile(size, (0.5, 0.9)))
-    median_length, p90_length = (float(value) for value in np.quantile(size * true[known], (0.5, 0.9)))
-    return Errors(
-        len(signed),
-        coverage,
-        median,
-        p90,
-        float((size < WITHIN).mean()),
-        float(np.median(signed)),
-        median_length,
-        p90_length,
-    )
+    lengths = (float(value) for value in np.quantile(size * true[known], (0.5, 0.9)))
+    within, bias = float((size < WITHIN).mean()), float(np.median(signed))
+    return DepthErrors(len(signed), coverage, median, p90, within, bias, *lengths)
 
 
 def _bands(relative: Float[np.ndarray, "N"], true: Float[np.ndarray, "N"]) -> list[Band]:
     if not len(true):
         return []
-    octave = np.maximum(np.floor(np.log2(true / _BAND_EDGE)), -1.0)
+    octaves = np.maximum(np.floor(np.log2(true / _BAND_EDGE)), -1.0)
     bands = []
-    for place in np.unique(octave):
-        inside = octave == place
-        low = 0.0 if place < 0 else _BAND_EDGE * 2.0**place
-        bands.append(Band(low, float(_BAND_EDGE * 2.0 ** (place + 1)), _errors(relative[inside], true[inside])))
+    for octave in np.unique(octaves):
+        inside = octaves == octave
+        low = 0.0 if octave < 0 else _BAND_EDGE * 2.0**octave
+        bands.append(Band(low, float(_BAND_EDGE * 2.0 ** (octave + 1)), _errors(relative[inside], true[inside])))
     return bands
 
 
@@ -168,11 +160,11 @@ def _bins(confidence: Float[np.ndarray, "N"] | None, relative: Float[np.ndarray,
         return []
     known = np.isfinite(relative)
     stated, good = confidence[known].astype(np.float64), np.abs(relative[known]) < WITHIN
-    place = np.minimum((stated * _BINS).astype(np.int64), _BINS - 1)
+    index = np.minimum((stated * _BINS).astype(np.int64), _BINS - 1)
     ends = [(0.0, 0.0, stated == 0.0)]
-    ends += [(k / _BINS, (k + 1) / _BINS, (place == k) & (stated > 0.0)) for k in range(_BINS)]
-    return [_bin(low, high, stated[inside], good[inside]) for low, high, inside in ends if inside.any()]
-
-
-def _bin(low: float, high: float, stated: Float[np.ndarray, "K"], good: Bool[np.ndarray, "K"]) -> ConfidenceBin:
-    return ConfidenceBin(low, high, len(stated), float(stated.mean()), float(good.mean()))
+    ends += [(k / _BINS, (k + 1) / _BINS, (index == k) & (stated > 0.0)) for k in range(_BINS)]
+    return [
+        ConfidenceBin(low, high, int(inside.sum()), float(stated[inside].mean()), float(good[inside].mean()))
+        for low, high, inside in ends
+        if inside.any()
+    ]

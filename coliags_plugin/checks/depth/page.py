@@ -1,96 +1,215 @@
-"""HTML page of the comparison of depth: tables, the calibration of the confidence, and frames."""
+"""Page of the comparison of depth: errors, the calibration of the confidence, and frames; and maps of the error."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from html import escape
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float, UInt8
 
 from coliags_plugin.checks.depth.check import DepthCheck
-from coliags_plugin.checks.depth.error_maps import error_limit, error_map
-from coliags_plugin.checks.depth.measures import Measures
+from coliags_plugin.checks.depth.measures import SURE, DepthErrors, DepthStatistics
 from coliags_plugin.checks.depth.pairing import true_depth_at
-from coliags_plugin.checks.depth.text import (
-    calibration_line,
-    confidence_table,
-    error_table,
-    fact_rows,
-    frame_table,
-    kinds,
+from coliags_plugin.checks.depth.sources import FrameDepth, known_depth
+from coliags_plugin.core.files import atomic_folder
+from coliags_plugin.outputs.axis_ticks import round_up
+from coliags_plugin.outputs.charts import Series
+from coliags_plugin.outputs.colormaps import (
+    UNKNOWN_GREY,
+    color_bar,
+    colorize_depth,
+    colorize_error,
+    depth_limits,
+    stacked,
 )
-from coliags_plugin.outputs.charts import Series, color_bar_svg, line_chart
-from coliags_plugin.outputs.colormaps import colorize_depth, depth_limits
-from coliags_plugin.outputs.image_files import encode_png
-from coliags_plugin.outputs.page import fact_list, figure, table, write_page
+from coliags_plugin.outputs.image_files import write_png
+from coliags_plugin.reporting.model import (
+    Block,
+    Chart,
+    ColorBar,
+    EncodedImage,
+    Fact,
+    Figures,
+    Image,
+    Page,
+    Paragraph,
+    Section,
+    simple_table,
+)
 
 #: Number of frames shown.
 _SHOWN = 4
+#: Smallest width of a colour bar with legible ticks, px.
+_BAR_WIDTH = 320
+#: Smallest full scale of the error, units of the truth.
+_SMALLEST_LIMIT = 0.01
 
 
-def write_depth_page(check: DepthCheck, output: Path) -> None:
-    """Write the HTML page of a comparison.
+def depth_page(check: DepthCheck) -> Page:
+    """All results of a comparison; in the terminal without single frames."""
+    kinds = (("dense true depth", check.dense), ("single points of true depth", check.sparse))
+    sections = [
+        Section(f"Against {kind}", _statistics(check, statistics))
+        for kind, statistics in kinds
+        if statistics is not None
+    ]
+    errors = [[frame.name, *_cells(errors)] for frame in check.frames if (errors := frame.dense or frame.sparse)]
+    sections += [
+        Section("Frames", [] if check.dense is None else list(_frames(check)), screen_only=True),
+        Section("Every frame", [simple_table(["frame", *_head(check)], errors)], screen_only=True),
+    ]
+    return Page(f"{check.estimate.path.name}: depth check", sections, list(_facts(check)))
 
-    Raises:
-        InputError: ``output`` is a folder, or cannot be written.
-    """
-    title = f"{check.estimate.path.name}: depth check"
-    sections = [_measures(check, kind, measures) for kind, measures in kinds(check)]
-    sections += [_frames(check), _every_frame(check)]
-    header = f"<h1>{escape(title)}</h1>" + fact_list(dict(fact_rows(check)))
-    write_page(output, title, header, sections)
+
+def _facts(check: DepthCheck) -> Iterator[Fact]:
+    sides = zip(("estimate", "truth"), check.pairs.left_out, strict=True)
+    left_out = ", ".join(f"{count} of the {name}" for name, count in sides if count)
+    matched = f"{len(check.frames)}, matched by {check.pairs.by}"
+    yield Fact("estimate", check.estimate.path.name)
+    yield Fact("truth", check.truth.path.name)
+    yield Fact("frames", f"{matched}; without a partner: {left_out}" if left_out else matched)
+    if check.scale is None:
+        yield Fact("scale", "as given")
+    else:
+        factor = f"the estimate times {check.scale:.4g}, the median of true / estimated depth"
+        yield Fact("scale", f"aligned: {factor}")
+    errors = [(errors.median, frame.name) for frame in check.frames if (errors := frame.dense or frame.sparse)]
+    medians = sorted((median, name) for median, name in errors if median is not None)
+    if medians:
+        (least, best), (middle, _), (most, worst) = medians[0], medians[len(medians) // 2], medians[-1]
+        ends = f"median |dz|/z {least:.2%} ({best}) to {most:.2%} ({worst})"
+        yield Fact("by frame", f"{ends}, {middle:.2%} in the median frame")
 
 
-def _measures(check: DepthCheck, kind: str, measures: Measures) -> str:
-    parts = [f"<h2>Against {escape(kind)}</h2>", table(*error_table(check, measures))]
-    confidence = confidence_table(measures)
-    if confidence is not None:
-        parts.append(f'<h3>Confidence</h3><p class="hint">{escape(calibration_line(measures))}</p>')
-        parts.append(table(*confidence))
-        bins = [found for found in measures.bins if found.high > 0.0]
-        stated = [100.0 * found.stated for found in bins]
-        series = [
-            Series("observed", 0, stated, [100.0 * found.observed for found in bins]),
-            Series("calibrated", 1, [0.0, 100.0], [0.0, 100.0]),
+def _statistics(check: DepthCheck, statistics: DepthStatistics) -> list[Block]:
+    """Errors over all pixels and by distance, and the confidence's calibration where there is one."""
+    rows = [["all", *_cells(statistics.errors)]]
+    if statistics.sure is not None:
+        rows.append([f"confidence {SURE:g} or more", *_cells(statistics.sure)])
+    rows += [[f"{band.low:g} to {band.high:g} {_unit(check)}", *_cells(band.errors)] for band in statistics.bands]
+    blocks: list[Block] = [simple_table(["true depth", *_head(check)], rows)]
+    if statistics.bins:
+        blocks.append(Section("Confidence", _confidence(statistics)))
+    return blocks
+
+
+def _confidence(statistics: DepthStatistics) -> list[Block]:
+    """Stated and observed share of good pixels by confidence."""
+    error = statistics.calibration_error
+    rows = [
+        [
+            "0 (unknown)" if entry.high == 0.0 else f"{entry.low:g} to {entry.high:g}",
+            entry.pixels,
+            _number(entry.stated, 100.0),
+            _number(entry.observed, 100.0),
         ]
-        legend = "".join(f'<li><i class="swatch s{line.style}"></i>{line.name}</li>' for line in series)
-        chart = line_chart(series, "stated confidence, %", "within 5 %, % of the pixels", markers=True)
-        parts.append(f'<div class="charts"><figure>{chart}<ul class="legend">{legend}</ul></figure></div>')
-    return f"<section>{''.join(parts)}</section>"
+        for entry in statistics.bins
+    ]
+    bins = [entry for entry in statistics.bins if entry.high > 0.0]
+    stated, observed = [100.0 * entry.stated for entry in bins], [100.0 * entry.observed for entry in bins]
+    series = [Series("observed", 0, stated, observed), Series("calibrated", 1, [0.0, 100.0], [0.0, 100.0])]
+    axes = "stated confidence, %", "within 5 %, % of the pixels"
+    return [
+        Paragraph(
+            "no pixel has a confidence above 0"
+            if error is None
+            else f"expected calibration error {100.0 * error:.3g} %"
+        ),
+        simple_table(["confidence", "pixels", "stated, %", "observed within 5 %, %"], rows),
+        Figures([Chart(series, *axes, markers=True, legend=True)]),
+    ]
 
 
-def _every_frame(check: DepthCheck) -> str:
-    return f"<section><h2>Every frame</h2>{table(*frame_table(check))}</section>"
+def _head(check: DepthCheck) -> list[str]:
+    shares = ["coverage, %", "median |dz|/z, %", "90th percentile, %", "within 5 %, %", "bias, %"]
+    return ["pixels", *shares, f"median |dz|, {_unit(check)}"]
 
 
-def _frames(check: DepthCheck) -> str:
-    if check.dense is None:
-        return ""
-    places = np.unique(np.linspace(0, len(check.pairs.places) - 1, _SHOWN).astype(int))
-    limit, unit = error_limit(check), "mm" if check.truth.metric else "units"
-    bar = color_bar_svg((0.0, limit), unit, "error", "|dz|", "depth-error")
-    views = "".join("".join(_view(check, place, limit)) for place in places)
-    note = "Errors are hatched where the truth is unknown, and grey where there is no estimate."
-    return f'<section><h2>Frames</h2><p class="hint">{note}</p><div class="scales">{bar}</div>{views}</section>'
+def _cells(errors: DepthErrors) -> list[str | int | None]:
+    shares = [_number(share, 100.0) for share in (errors.coverage, errors.median, errors.p90, errors.within)]
+    return [errors.pixels, *shares, _number(errors.bias, 100.0, "+"), _number(errors.median_length)]
 
 
-def _view(check: DepthCheck, place: int, limit: float) -> Iterator[str]:
-    here, there = check.pairs.places[place]
-    estimate, truth = check.estimate.read(here), check.truth.read(there)
+def _number(value: float | None, factor: float = 1.0, sign: str = "") -> str | None:
+    return None if value is None else f"{value * factor:{sign}.3g}"
+
+
+def _unit(check: DepthCheck) -> str:
+    return "mm" if check.truth.metric else "units"
+
+
+def _frames(check: DepthCheck) -> Iterator[Block]:
+    limit = error_limit(check)
+    yield Paragraph("Errors are hatched where the truth is unknown, and grey where there is no estimate.")
+    yield Figures([ColorBar((0.0, limit), _unit(check), "error", "|dz|", "depth-error")])
+    for index in np.unique(np.linspace(0, len(check.pairs.indices) - 1, _SHOWN).astype(int)):
+        here, there = check.pairs.indices[index]
+        images = _frame_images(check, check.estimate.read(here), check.truth.read(there), limit)
+        if images:
+            figures = [Image(EncodedImage.png(rgb), caption) for caption, rgb in images.items()]
+            yield Figures(figures, check.estimate.names[here])
+
+
+def _frame_images(
+    check: DepthCheck, estimate: FrameDepth, truth: FrameDepth, limit: float
+) -> dict[str, UInt8[np.ndarray, "H W 3"]]:
+    """Pictures of a frame by their captions; none where the truth has no dense depth."""
     true, error = true_depth_at(estimate, truth), error_map(check, estimate, truth, limit)
     if true is None or error is None or estimate.depth is None:
-        return
+        return {}
     limits = depth_limits([true])
     scaled = estimate.depth * (1.0 if check.scale is None else check.scale)
-    cells = [] if estimate.image is None else [figure(encode_png(estimate.image), "image")]
-    cells += [
-        figure(encode_png(colorize_depth(true, limits)), f"true, 0 to {limits[1]:g}"),
-        figure(encode_png(colorize_depth(scaled, limits)), "estimate, same colours"),
-        figure(encode_png(error), "|dz|"),
-    ]
+    images = {} if estimate.image is None else {"image": estimate.image}
+    images[f"true, 0 to {limits[1]:g}"] = colorize_depth(true, limits)
+    images["estimate, same colours"] = colorize_depth(scaled, limits)
+    images["|dz|"] = error
     if estimate.confidence is not None:
-        grey = np.repeat(np.rint(estimate.confidence * 255.0).astype(np.uint8)[..., None], 3, axis=2)
-        cells.append(figure(encode_png(grey), "confidence, white 1"))
-    yield f"<h3>{escape(check.estimate.names[here])}</h3>"
-    yield f'<div class="view" style="--cells: {len(cells)}">{"".join(cells)}</div>'
+        grey = np.rint(estimate.confidence * 255.0).astype(np.uint8)
+        images["confidence, white 1"] = np.repeat(grey[..., None], 3, axis=2)
+    return images
+
+
+def error_limit(check: DepthCheck) -> float:
+    """The error of the last colour, the same for all frames, units of the truth: the 90th percentile, rounded up."""
+    length = None if check.dense is None else check.dense.errors.p90_length
+    return round_up(max(length or 0.0, _SMALLEST_LIMIT))
+
+
+def error_map(
+    check: DepthCheck, estimate: FrameDepth, truth: FrameDepth, limit: float
+) -> UInt8[np.ndarray, "H W 3"] | None:
+    """|dz| of a frame, colour-mapped: hatched where the truth is unknown, plain grey where there is no estimate.
+
+    Args:
+        check: For its scale.
+        estimate: Of the frame.
+        truth: Of the frame.
+        limit: The error of the last colour, units of the truth.
+
+    Returns:
+        The picture at the estimate's size; None where the truth has no dense depth. [H, W, 3]
+    """
+    true = true_depth_at(estimate, truth)
+    if true is None or estimate.depth is None:
+        return None
+    known, there = np.isfinite(true), known_depth(estimate.depth)
+    error: Float[np.ndarray, "H W"] = np.abs(estimate.depth * (1.0 if check.scale is None else check.scale) - true)
+    image = colorize_error(np.where(there & known, error, 0.0), known, limit)
+    image[known & ~there] = UNKNOWN_GREY
+    return image
+
+
+def write_error_maps(check: DepthCheck, folder: Path) -> None:
+    """Write the error maps as ``NAME.png``, each above its colour bar; ``folder`` must be new or empty.
+
+    Raises:
+        InputError: The folder holds files, or cannot be written.
+    """
+    limit = error_limit(check)
+    bar = color_bar((0.0, limit), f"|dz|, {_unit(check)}", width=_BAR_WIDTH)
+    with atomic_folder(folder) as scratch:
+        for here, there in check.pairs.indices:
+            image = error_map(check, check.estimate.read(here), check.truth.read(there), limit)
+            if image is not None:
+                write_png(scratch / f"{check.estimate.names[here]}.png", stacked([image, bar]))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from coliags_plugin.checks.depth.sources import DepthMap, DepthSource, known_depth
+from coliags_plugin.checks.depth.sources import DepthSource, FrameDepth, known_depth
 from coliags_plugin.core.errors import InputError
 
 #: Largest difference of the relative intrinsics (focal length and centre over the image size) of one view.
@@ -22,12 +22,12 @@ class FramePairs:
 
     Attributes:
         by: ``"name"`` or ``"index"``.
-        places: Places of each frame in the estimate and in the truth.
+        indices: Of each frame in the estimate and in the truth.
         left_out: Number of frames of the estimate, and of the truth, without a partner.
     """
 
     by: str
-    places: list[tuple[int, int]]
+    indices: list[tuple[int, int]]
     left_out: tuple[int, int]
 
 
@@ -52,12 +52,12 @@ def match_frames(estimate: DepthSource, truth: DepthSource) -> FramePairs:
     Raises:
         InputError: No name is common, and the counts differ.
     """
-    there = {name: place for place, name in enumerate(truth.names)}
-    places = [(place, there[name]) for place, name in enumerate(estimate.names) if name in there]
-    if places:
-        return FramePairs("name", places, (len(estimate.names) - len(places), len(truth.names) - len(places)))
+    names = {name: index for index, name in enumerate(truth.names)}
+    indices = [(index, names[name]) for index, name in enumerate(estimate.names) if name in names]
+    if indices:
+        return FramePairs("name", indices, (len(estimate.names) - len(indices), len(truth.names) - len(indices)))
     if len(estimate.names) == len(truth.names):
-        return FramePairs("index", [(place, place) for place in range(len(truth.names))], (0, 0))
+        return FramePairs("index", [(index, index) for index in range(len(truth.names))], (0, 0))
     raise InputError(
         f"{estimate.path} ({len(estimate.names)} frames with depth, the first {estimate.names[0]}) and {truth.path} "
         f"({len(truth.names)}, the first {truth.names[0]}) have no frame in common",
@@ -66,7 +66,7 @@ def match_frames(estimate: DepthSource, truth: DepthSource) -> FramePairs:
     )
 
 
-def true_depth_at(estimate: DepthMap, truth: DepthMap) -> Float[np.ndarray, "H W"] | None:
+def true_depth_at(estimate: FrameDepth, truth: FrameDepth) -> Float[np.ndarray, "H W"] | None:
     """Dense true depth at the estimate's pixel centres, nearest neighbour; NaN where unknown. [H, W]"""
     if truth.depth is None:
         return None
@@ -77,7 +77,7 @@ def true_depth_at(estimate: DepthMap, truth: DepthMap) -> Float[np.ndarray, "H W
     return np.where(known_depth(sampled), sampled, np.float32(np.nan))
 
 
-def dense_samples(estimate: DepthMap, true: Float[np.ndarray, "H W"]) -> Samples:
+def dense_samples(estimate: FrameDepth, true: Float[np.ndarray, "H W"]) -> Samples:
     """Samples at the estimate's pixels.
 
     Args:
@@ -88,7 +88,7 @@ def dense_samples(estimate: DepthMap, true: Float[np.ndarray, "H W"]) -> Samples
     return Samples(_estimated(estimate)[known], true[known], _confidence(estimate, known))
 
 
-def sparse_samples(estimate: DepthMap, truth: DepthMap) -> Samples | None:
+def sparse_samples(estimate: FrameDepth, truth: FrameDepth) -> Samples | None:
     """Samples at the points of the truth, from the estimate's pixels that hold them; None without points."""
     if truth.sparse is None or not len(truth.sparse.depth):
         return None
@@ -97,11 +97,11 @@ def sparse_samples(estimate: DepthMap, truth: DepthMap) -> Samples | None:
     column = np.floor(pixels[:, 0] * width / truth.size[0]).astype(np.int64).clip(0, width - 1)
     row = np.floor(pixels[:, 1] * height / truth.size[1]).astype(np.int64).clip(0, height - 1)
     known = known_depth(true)
-    place = row[known], column[known]
-    return Samples(_estimated(estimate)[place], true[known], _confidence(estimate, place))
+    holding = row[known], column[known]
+    return Samples(_estimated(estimate)[holding], true[known], _confidence(estimate, holding))
 
 
-def check_same_view(name: str, estimate: DepthMap, truth: DepthMap) -> None:
+def check_same_view(name: str, estimate: FrameDepth, truth: FrameDepth) -> None:
     """Check that two maps of one frame show the same view, if at different sizes.
 
     Raises:
@@ -127,11 +127,11 @@ def check_same_view(name: str, estimate: DepthMap, truth: DepthMap) -> None:
         )
 
 
-def _estimated(estimate: DepthMap) -> Float[np.ndarray, "H W"]:
+def _estimated(estimate: FrameDepth) -> Float[np.ndarray, "H W"]:
     if estimate.depth is None:
         return np.full(estimate.size[::-1], np.nan, np.float32)
     return np.where(known_depth(estimate.depth), estimate.depth, np.float32(np.nan))
 
 
-def _confidence(estimate: DepthMap, chosen: np.ndarray | tuple[np.ndarray, ...]) -> Float[np.ndarray, "N"] | None:
+def _confidence(estimate: FrameDepth, chosen: np.ndarray | tuple[np.ndarray, ...]) -> Float[np.ndarray, "N"] | None:
     return None if estimate.confidence is None else np.asarray(estimate.confidence[chosen])

@@ -12,20 +12,18 @@ from jaxtyping import Bool, Float, UInt8
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.progress import Progress
-from coliags_plugin.core.scenes import Frame, Scene, SparseDepth
+from coliags_plugin.core.scenes import Frame, SparseDepth
 from coliags_plugin.datamanagers.reading.depth_arrays import DepthArray
 from coliags_plugin.datamanagers.reading.images import read_gray
 from coliags_plugin.datamanagers.recognition import recognised
 from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.outputs.image_files import read_depth_tiff
 
-#: Files of a folder of depth maps.
-_TIFF, _ARRAY = (".tiff", ".tif"), ".npy"
-_EXPECTED_FOLDER = "float32 TIFF or .npy files of z-depth in mm"
+_TIFF = (".tiff", ".tif")
 
 
 @dataclass(frozen=True)
-class DepthMap:
+class FrameDepth:
     """Depth of one frame.
 
     Attributes:
@@ -53,13 +51,13 @@ class DepthSource:
         path: The scene or folder.
         metric: Whether lengths are in mm; False where the unit is unknown.
         names: Of the frames, in order.
-        read: Reads the depth map of a frame by its place.
+        read: Reads the depth map of a frame by its index.
     """
 
     path: Path
     metric: bool
     names: Sequence[str]
-    read: Callable[[int], DepthMap]
+    read: Callable[[int], FrameDepth]
 
 
 def open_depth(
@@ -77,49 +75,42 @@ def open_depth(
     Raises:
         InputError: Neither a scene nor such a folder, or it holds no depth.
     """
-    files = _depth_files(path) if data_format is None and path.is_dir() and not recognised(path) else []
-    if files:
-        return _of_folder(path, files)
+    if data_format is None and path.is_dir() and not recognised(path):
+        files = sorted(file for file in path.iterdir() if file.suffix.lower() in (*_TIFF, ".npy"))
+        if files:
+            return _of_folder(path, files)
     scene = open_scene(path, data_format, (*options, "initial_points=none"), progress)
-    return _of_scene(path, scene)
-
-
-def _of_scene(path: Path, scene: Scene) -> DepthSource:
     kept = [frame for frame in scene.video if frame.depth is not None or frame.sparse_depth is not None]
     if not kept:
         raise InputError(f"{path} has no depth", "a scene with depth files or sparse depth", "Name a scene with depth")
-    return DepthSource(path, scene.is_metric, [frame.name for frame in kept], lambda place: _of_frame(kept[place]))
+    return DepthSource(path, scene.is_metric, [frame.name for frame in kept], lambda index: _of_frame(kept[index]))
 
 
-def _of_frame(frame: Frame) -> DepthMap:
+def _of_frame(frame: Frame) -> FrameDepth:
     valid = frame.valid.numpy()
     depth = None if frame.depth is None else np.where(valid, frame.depth.numpy(), np.float32(np.nan))
     stated = frame.depth_confidence
     confidence = None if stated is None else stated.numpy()
     camera = frame.camera
-    return DepthMap(
+    return FrameDepth(
         depth, confidence, frame.sparse_depth, (camera.width, camera.height), camera.intrinsics, frame.image.numpy()
     )
 
 
-def _depth_files(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in (*_TIFF, _ARRAY))
-
-
 def _of_folder(folder: Path, files: Sequence[Path]) -> DepthSource:
     stems = [path.stem for path in files]
-    double = next((stem for place, stem in enumerate(stems) if stem in stems[:place]), None)
+    double = next((stem for index, stem in enumerate(stems) if stem in stems[:index]), None)
     if double is not None:
         raise InputError(f"{folder} holds several files {double}.*", "one depth map per frame", "Move the others away")
-    return DepthSource(folder, True, stems, lambda place: _of_file(files[place]))
+    return DepthSource(folder, True, stems, lambda index: _of_file(files[index]))
 
 
-def _of_file(path: Path) -> DepthMap:
+def _of_file(path: Path) -> FrameDepth:
     reader = DepthArray(1.0)
     stored = read_depth_tiff(path) if path.suffix.lower() in _TIFF else reader.read(path)
     depth = reader.z_depth(stored)
     height, width = depth.shape
-    return DepthMap(depth, _confidence_beside(path, depth.shape), None, (width, height))
+    return FrameDepth(depth, _confidence_beside(path, depth.shape), None, (width, height))
 
 
 def _confidence_beside(path: Path, shape: tuple[int, ...]) -> Float[np.ndarray, "H W"] | None:

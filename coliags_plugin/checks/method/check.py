@@ -10,20 +10,20 @@ from contextlib import redirect_stderr
 from dataclasses import dataclass
 from pathlib import Path
 
-from coliags_plugin.checks.method import construction, learning, other_data, outcomes, rows, storage, views
-from coliags_plugin.checks.method.bench import Bench
-from coliags_plugin.checks.method.blame import describe
-from coliags_plugin.checks.method.results import CheckFailedError, CheckSkippedError, Result
+from coliags_plugin.checks.method import construction, learning, other_data, rendering, rows, storage
+from coliags_plugin.checks.method.context import CheckContext
+from coliags_plugin.checks.method.error_location import describe
 from coliags_plugin.checks.method.scenes import write_phantom
+from coliags_plugin.checks.results import CheckFailedError, CheckResult, CheckSkippedError, Status
 from coliags_plugin.config.method_config import method_tree
 from coliags_plugin.core.errors import InputError, InterruptedRunError
 
 #: Fewer leave nothing to stop half-way, nor between events of a strategy.
-LEAST_STEPS = 10
+MIN_STEPS = 10
 
 
 @dataclass(frozen=True)
-class Check:
+class MethodCheck:
     """One entry of the list.
 
     Attributes:
@@ -34,32 +34,32 @@ class Check:
     """
 
     name: str
-    run: Callable[[Bench], str]
+    run: Callable[[CheckContext], str]
     needs: tuple[str, ...] = ()
 
 
 CHECKS = (
-    Check("resolves", construction.resolves),
-    Check("options", construction.refuses_options, ("resolves",)),
-    Check("builds", construction.builds, ("resolves",)),
-    Check("groups", construction.has_all_groups, ("builds",)),
-    Check("trains", learning.trains, ("builds",)),
-    Check("terms", learning.every_term_counts, ("trains",)),
-    Check("learns", learning.error_falls, ("trains",)),
-    Check("gradients", learning.gradients_arrive, ("trains",)),
-    Check("renders", views.renders_every_output, ("trains",)),
-    Check("renders again", views.renders_again, ("renders",)),
-    Check("pixels", views.renders_pixels, ("renders again",)),
-    Check("requests", views.refuses_requests, ("renders",)),
-    Check("loads", storage.loads, ("renders again",)),
-    Check("repeats", storage.repeats, ("renders again",)),
-    Check("resumes", storage.resumes, ("loads", "repeats")),
-    Check("checkpoints", storage.refuses_checkpoints, ("trains",)),
-    Check("rows", rows.keeps_rows_together, ("resumes",)),
-    Check("evaluates", outcomes.evaluates, ("loads",)),
-    Check("images", outcomes.writes_images, ("loads",)),
-    Check("other data", other_data.copes_with_other_data, ("trains",)),
-    Check("ignored pixels", other_data.ignores_masked_pixels, ("repeats",)),
+    MethodCheck("resolves", construction.resolves),
+    MethodCheck("options", construction.refuses_options, ("resolves",)),
+    MethodCheck("builds", construction.builds, ("resolves",)),
+    MethodCheck("groups", construction.has_all_groups, ("builds",)),
+    MethodCheck("trains", learning.trains, ("builds",)),
+    MethodCheck("terms", learning.every_term_counts, ("trains",)),
+    MethodCheck("learns", learning.error_falls, ("trains",)),
+    MethodCheck("gradients", learning.gradients_arrive, ("trains",)),
+    MethodCheck("renders", rendering.renders_every_output, ("trains",)),
+    MethodCheck("renders again", rendering.renders_again, ("renders",)),
+    MethodCheck("pixels", rendering.renders_pixels, ("renders again",)),
+    MethodCheck("requests", rendering.refuses_requests, ("renders",)),
+    MethodCheck("loads", storage.loads, ("renders again",)),
+    MethodCheck("repeats", storage.repeats, ("renders again",)),
+    MethodCheck("resumes", storage.resumes, ("loads", "repeats")),
+    MethodCheck("checkpoints", storage.refuses_checkpoints, ("trains",)),
+    MethodCheck("rows", rows.keeps_rows_together, ("resumes",)),
+    MethodCheck("evaluates", rendering.evaluates, ("loads",)),
+    MethodCheck("images", rendering.writes_images, ("loads",)),
+    MethodCheck("other data", other_data.copes_with_other_data, ("trains",)),
+    MethodCheck("ignored pixels", other_data.ignores_masked_pixels, ("repeats",)),
 )
 
 
@@ -70,7 +70,7 @@ def check_method(
     data: Path | None = None,
     data_format: str | None = None,
     steps: int = 20,
-) -> Iterator[Result]:
+) -> Iterator[CheckResult]:
     """Check a method, yielding one result after the other.
 
     Args:
@@ -85,32 +85,32 @@ def check_method(
         InputError: No such method or data, or ``steps`` is too small.
     """
     method_tree(method, overrides)
-    if steps < LEAST_STEPS:
-        raise InputError(f"--steps {steps}", f"{LEAST_STEPS} or more")
+    if steps < MIN_STEPS:
+        raise InputError(f"--steps {steps}", f"{MIN_STEPS} or more")
     if data is not None and not data.exists():
         raise InputError(f"no folder {data}", "a scene", "Check the path, or leave --data out")
     scene = data or write_phantom(method, overrides, folder)
-    bench = Bench(method, tuple(overrides), scene, data_format, steps, folder)
+    context = CheckContext(method, tuple(overrides), scene, data_format, steps, folder)
     passed: set[str] = set()
     for check in CHECKS:
-        result = _run(check, bench, passed)
+        result = _run(check, context, passed)
         if result.status == "passed":
             passed.add(check.name)
         yield result
 
 
-def _run(check: Check, bench: Bench, passed: set[str]) -> Result:
-    lacking = [name for name in check.needs if name not in passed]
-    if lacking:
-        return Result(check.name, "skipped", 0.0, f"needs '{lacking[0]}'")
-    began = time.monotonic()
+def _run(check: MethodCheck, context: CheckContext, passed: set[str]) -> CheckResult:
+    missing = [name for name in check.needs if name not in passed]
+    if missing:
+        return CheckResult(check.name, "skipped", f"needs '{missing[0]}'")
+    start = time.monotonic()
 
-    def result(status: str, detail: str, trace: str = "") -> Result:
-        return Result(check.name, status, time.monotonic() - began, detail, trace)  # type: ignore[arg-type]
+    def result(status: Status, detail: str, trace: str = "") -> CheckResult:
+        return CheckResult(check.name, status, detail, time.monotonic() - start, trace)
 
     try:
         with redirect_stderr(io.StringIO()):  # progress bars
-            return result("passed", check.run(bench))
+            return result("passed", check.run(context))
     except CheckSkippedError as reason:
         return result("skipped", str(reason))
     except CheckFailedError as error:
@@ -118,4 +118,4 @@ def _run(check: Check, bench: Bench, passed: set[str]) -> Result:
     except InterruptedRunError as error:
         raise KeyboardInterrupt from error
     except Exception as error:
-        return result("failed", describe(error, bench.config), traceback.format_exc())
+        return result("failed", describe(error, context.config), traceback.format_exc())

@@ -7,9 +7,9 @@ from collections import Counter
 from pydantic import ValidationError
 from pydantic_core import PydanticCustomError
 
-from coliags_plugin.checks.method.bench import Bench, as_in_new_process
-from coliags_plugin.checks.method.blame import components
-from coliags_plugin.checks.method.results import CheckFailedError
+from coliags_plugin.checks.method.context import CheckContext, as_in_new_process
+from coliags_plugin.checks.method.error_location import components
+from coliags_plugin.checks.results import CheckFailedError
 from coliags_plugin.config.components import make_component
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.engine.data_formats import load_scene
@@ -18,12 +18,12 @@ from coliags_plugin.engine.data_formats import load_scene
 NO_OPTION = "no_such_option"
 
 
-def resolves(bench: Bench) -> str:
+def resolves(context: CheckContext) -> str:
     """The config is valid, and written to YAML and read again it is itself."""
-    bench.loaded = bench.load()
-    config = bench.loaded.config
+    context.loaded = context.load()
+    config = context.loaded.config
     text = config.to_yaml()
-    path = bench.folder / "resolved.yaml"
+    path = context.folder / "resolved.yaml"
     path.write_text(text, encoding="utf-8")
     again = load_method(str(path.resolve())).config
     if again != config or again.to_yaml() != text:
@@ -33,9 +33,9 @@ def resolves(bench: Bench) -> str:
     return f"{len(names)} components: {', '.join(dict.fromkeys(names))}"
 
 
-def refuses_options(bench: Bench) -> str:
+def refuses_options(context: CheckContext) -> str:
     """Every component refuses an option that it does not have, by name."""
-    there = components(bench.loaded.config)
+    there = components(context.loaded.config)
     for path, component in there.items():
         options = {"name": component.name, **component.settings.model_dump(), NO_OPTION: 1}
         try:
@@ -51,21 +51,21 @@ def refuses_options(bench: Bench) -> str:
     return f"unknown options of {len(there)} components are refused"
 
 
-def builds(bench: Bench) -> str:
+def builds(context: CheckContext) -> str:
     """The components fit one another and the scene."""
-    bench.scene = load_scene(bench.loaded.config, bench.data)
+    context.scene = load_scene(context.loaded.config, context.data)
     with as_in_new_process():
-        trainer = bench.build("built")
+        trainer = context.build("built")
     if trainer.run.path.exists():
         raise CheckFailedError("the run folder was written before training began")
     numbers = sum(parameter.numel() for parameter in trainer.model.parameters())
-    frames = f"{len(bench.scene.train)} training frames, {len(bench.scene.points)} initial points"
+    frames = f"{len(context.scene.train)} training frames, {len(context.scene.points)} initial points"
     return f"{numbers} parameters, renderer {trainer.chosen.name}; {frames}"
 
 
-def has_all_groups(bench: Bench) -> str:
+def has_all_groups(context: CheckContext) -> str:
     """Every trainable parameter is in exactly one parameter group, which an optimizer trains."""
-    trainer = bench.build("groups")
+    trainer = context.build("groups")
     groups = trainer.model.parameter_groups()
     counts = Counter(id(parameter) for group in groups.values() for parameter in group)
     named = dict(trainer.model.named_parameters())

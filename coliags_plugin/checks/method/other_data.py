@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from coliags_plugin.checks.method.bench import Bench, as_in_new_process, difference
-from coliags_plugin.checks.method.blame import describe
-from coliags_plugin.checks.method.results import CheckFailedError
+from coliags_plugin.checks.method.context import CheckContext, as_in_new_process, difference
+from coliags_plugin.checks.method.error_location import describe
 from coliags_plugin.checks.method.scenes import with_ignored_pixels, with_one_frame, without_depth, without_points
+from coliags_plugin.checks.results import CheckFailedError
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.trainer import Trainer
@@ -21,25 +21,25 @@ _VARIANTS: dict[str, Callable[[Scene], Scene]] = {
 _STEPS = 2
 
 
-def copes_with_other_data(bench: Bench) -> str:
+def copes_with_other_data(context: CheckContext) -> str:
     """A scene without depth, without points or with one training frame is trained on, or refused beforehand."""
     told = {}
     for what, change in _VARIANTS.items():
         try:
-            told[what] = _outcome(bench, change(bench.scene))
+            told[what] = _outcome(context, change(context.scene))
         except CheckFailedError as error:
             raise CheckFailedError(f"{what}: {error}") from error
         except Exception as error:
             raise CheckFailedError(
-                f"{what}: {describe(error, bench.loaded.config)}; expected training, or an InputError beforehand"
+                f"{what}: {describe(error, context.loaded.config)}; expected training, or an InputError beforehand"
             ) from error
     return ", ".join(f"{what} {outcome}" for what, outcome in told.items())
 
 
-def _outcome(bench: Bench, scene: Scene) -> str:
+def _outcome(context: CheckContext, scene: Scene) -> str:
     with as_in_new_process():
         try:
-            trainer = bench.build("elsewhere", scene)
+            trainer = context.build("elsewhere", scene)
         except InputError:
             return "refused"
         try:
@@ -49,12 +49,12 @@ def _outcome(bench: Bench, scene: Scene) -> str:
     return "trains"
 
 
-def ignores_masked_pixels(bench: Bench) -> str:
+def ignores_masked_pixels(context: CheckContext) -> str:
     """What is in masked pixels, NaN included, changes no loss and no parameter."""
     runs: list[tuple[list[dict[str, Any]], Trainer]] = []
     for spoilt in (False, True):
         with as_in_new_process():
-            trainer = bench.build("masked", with_ignored_pixels(bench.scene, spoilt))
+            trainer = context.build("masked", with_ignored_pixels(context.scene, spoilt))
             runs.append((_take_steps(trainer), trainer))
     (rows, first), (spoilt_rows, second) = runs
     for ours, theirs in zip(rows, spoilt_rows, strict=True):

@@ -8,25 +8,25 @@ from itertools import pairwise
 
 from torch import nn
 
-from coliags_plugin.checks.method.bench import Bench, as_in_new_process
-from coliags_plugin.checks.method.results import CheckFailedError, CheckSkippedError
+from coliags_plugin.checks.method.context import CheckContext, as_in_new_process
 from coliags_plugin.checks.method.storage import continues_alike
+from coliags_plugin.checks.results import CheckFailedError, CheckSkippedError
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.engine.trainer import Trainer
 
 
-def keeps_rows_together(bench: Bench) -> str:
+def keeps_rows_together(context: CheckContext) -> str:
     """Rows change together at every event, and a run resumed right after one ends in the same bits."""
-    node = bench.loaded.config.strategy
+    node = context.loaded.config.strategy
     if node.target.serves is None:
         raise CheckSkippedError(f"strategy '{node.name}' changes no rows")
-    method = bench.load(_hastened(node.settings, bench.steps))
+    method = context.load(_hastened(node.settings, context.steps))
     with as_in_new_process():
-        trainer = bench.build("events", method=method)
+        trainer = context.build("events", method=method)
         trainer.start()
         before = start = _Census(trainer)
         if not start.count:
-            raise CheckFailedError(f"element_count of field '{bench.loaded.config.field.name}' is 0: override it")
+            raise CheckFailedError(f"element_count of field '{context.loaded.config.field.name}' is 0: override it")
         counts = [start.count]
         while trainer.step < trainer.steps and start.count == before.count:
             before = _stepped(trainer, start, before)
@@ -35,15 +35,15 @@ def keeps_rows_together(bench: Bench) -> str:
             raise CheckSkippedError(f"no row came or went in {trainer.steps} steps ({trainer.strategy.plan()})")
         changed_at = trainer.step
         trainer.save()
-        copy = bench.folder / "events-resumed"
+        copy = context.folder / "events-resumed"
         shutil.copytree(trainer.run.path, copy, dirs_exist_ok=True)
         while trainer.step < trainer.steps:
             before = _stepped(trainer, start, before)
             counts.append(before.count)
     with as_in_new_process():
-        resumed = bench.build(copy.name, method=method)
+        resumed = context.build(copy.name, method=method)
         resumed.resume()
-        apart = continues_alike(trainer, resumed, bench)
+        apart = continues_alike(trainer, resumed, context)
     if apart:
         raise CheckFailedError(f"resumed after the event of step {changed_at}: {apart}")
     events = sum(a != b for a, b in pairwise(counts))

@@ -41,25 +41,26 @@ class CheckDepth:
     def run(self) -> None:
         """Compare, and print the results."""
         from coliags_plugin.checks.depth.check import check_depth
-        from coliags_plugin.checks.depth.error_maps import write_error_maps
-        from coliags_plugin.checks.depth.page import write_depth_page
+        from coliags_plugin.checks.depth.page import depth_page, write_error_maps
         from coliags_plugin.checks.depth.sources import open_depth
-        from coliags_plugin.checks.depth.text import lines
         from coliags_plugin.core.anonymity import without_places
         from coliags_plugin.core.files import write_json
         from coliags_plugin.engine.progress import progress_callback
+        from coliags_plugin.reporting.html_page import write_html
+        from coliags_plugin.reporting.terminal import page_text
 
         with progress_callback() as progress:
             estimate = open_depth(self.estimate, self.estimate_format, self.set, progress)
             truth = open_depth(self.truth, self.truth_format, self.set, progress)
             check = check_depth(estimate, truth, self.align_scale, progress)
-        print("\n".join(lines(check)))
+        page = depth_page(check)
+        print(page_text(page))
         if self.html is not None:
-            write_depth_page(check, self.html)
+            write_html(page, self.html)
             print(self.html.resolve())
         if self.json is not None:
-            found = check.as_json()
-            write_json(self.json, without_places(found) if self.anonymous else found)
+            values = check.as_json()
+            write_json(self.json, without_places(values) if self.anonymous else values)
         if self.maps is not None:
             write_error_maps(check, self.maps)
             print(self.maps.resolve())

@@ -1,12 +1,12 @@
-"""Centreline of a tube's surface, followed from a camera inside it, and cylinder coordinates about it."""
+"""Centreline of a lumen, followed from a camera inside it, cylinder coordinates about it, and the section shown."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float64
-from scipy.ndimage import gaussian_filter1d
+from jaxtyping import Bool, Float, Float64
+from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 from scipy.spatial import cKDTree
 
 from coliags_plugin.core.errors import InputError
@@ -25,6 +25,9 @@ _RING, _SHARE, _WIDEST = 72, 0.5, 60.0
 _SMOOTHING = 8.0
 #: Share of the way to a ring's middle, and to the direction of the last stride, that the search takes at once.
 _TOWARDS_MIDDLE, _TOWARDS_STRIDE = 0.4, 0.25
+#: Window over which the seen share of a ring is taken, mm, so that what lies behind a fold ends no section; and the
+#: share that a ring of the section must have at its ends.
+_WINDOW, _SEEN_SHARE = 10, 0.5
 
 Array = Float64[np.ndarray, "..."]
 
@@ -59,15 +62,15 @@ class Centreline:
         clock = np.degrees(np.arctan2(local[:, 1], local[:, 0])) % 360.0
         return self.arc[nearest] + ahead, clock, np.hypot(local[:, 0], local[:, 1])
 
-    def directions(self, place: int, clock: Float[np.ndarray, "C"]) -> Float[np.ndarray, "C 3"]:
+    def directions(self, index: int, clock: Float[np.ndarray, "C"]) -> Float[np.ndarray, "C 3"]:
         """Unit directions across the curve at one of its points.
 
         Args:
-            place: Index of the point.
+            index: Of the point.
             clock: Angles, degrees. [C]
         """
         angle = np.radians(clock)[:, None]
-        frame = self.frames[place]
+        frame = self.frames[index]
         return np.asarray(np.cos(angle) * frame[:, 0] + np.sin(angle) * frame[:, 1])
 
 
@@ -104,6 +107,50 @@ def find_centreline(
             "Check that the mesh is the wall that the camera filmed, in the world of its poses",
         )
     return _curve(np.concatenate([behind[::-1], start[None], ahead]), poses)
+
+
+@dataclass(frozen=True)
+class LumenSection:
+    """The part of a lumen that a recording is about, along the centreline, mm; beyond it nothing counts as missed."""
+
+    start: float
+    end: float
+
+    def holds(self, arc: Float[np.ndarray, "N"]) -> Bool[np.ndarray, "N"]:
+        """Which places are inside. [N]"""
+        return np.asarray((arc >= self.start) & (arc <= self.end))
+
+    @property
+    def length(self) -> float:
+        """From end to end, mm."""
+        return self.end - self.start
+
+
+def find_section(
+    arc: Float[np.ndarray, "F"], areas: Float[np.ndarray, "F"], seen: Bool[np.ndarray, "F"]
+) -> LumenSection:
+    """From the first to the last place at which half of the wall was seen, over windows of 10 mm.
+
+    Args:
+        arc: Place of each triangle along the centreline, mm. [F]
+        areas: Of the triangles, mm^2; those that are missing have to be among them. [F]
+        seen: Which triangles were seen. [F]
+
+    Raises:
+        InputError: Nowhere was half of the wall seen.
+    """
+    first = float(np.floor(arc.min()))
+    index = (arc - first).astype(int)
+    whole = uniform_filter1d(np.bincount(index, areas).astype(float), _WINDOW, mode="constant")
+    shown = uniform_filter1d(np.bincount(index, areas * seen).astype(float), _WINDOW, mode="constant")
+    half = np.flatnonzero((shown >= _SEEN_SHARE * whole) & (whole > 0.0))
+    if not len(half):
+        raise InputError(
+            "nowhere along the lumen was half of the wall seen",
+            "a recording that shows a section of a lumen",
+            "Check that the mesh is the wall that the camera filmed, in the world of its poses",
+        )
+    return LumenSection(first + float(half[0]), first + float(half[-1]) + 1.0)
 
 
 def _settled(caster: RayCaster, start: Array, axis: Array) -> tuple[Array, Array]:
@@ -185,9 +232,9 @@ def _curve(points: Array, poses: Array) -> Centreline:
     # The filter pulls the ends inwards: keep the ends themselves.
     weight = np.minimum(np.arange(len(points)), np.arange(len(points))[::-1]) * _STRIDE / (2.0 * _SMOOTHING)
     smooth += (points - smooth) * np.clip(1.0 - weight, 0.0, 1.0)[:, None]
-    walked = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(smooth, axis=0), axis=1))])
-    arc = np.arange(0.0, walked[-1], STEP)
-    line = np.stack([np.interp(arc, walked, smooth[:, axis]) for axis in range(3)], axis=1)
+    lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(smooth, axis=0), axis=1))])
+    arc = np.arange(0.0, lengths[-1], STEP)
+    line = np.stack([np.interp(arc, lengths, smooth[:, axis]) for axis in range(3)], axis=1)
     tangents = np.gradient(line, axis=0)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     places = cKDTree(line).query(poses[:, :3, 3])[1]

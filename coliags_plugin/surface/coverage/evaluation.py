@@ -11,12 +11,11 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from coliags_plugin.geometry.meshes.truth import TrueSurface
-from coliags_plugin.surface.coverage.centreline import find_centreline
+from coliags_plugin.surface.coverage.centreline import LumenSection, find_centreline, find_section
 from coliags_plugin.surface.coverage.levels import Level
-from coliags_plugin.surface.coverage.measure import Coverage
+from coliags_plugin.surface.coverage.measure import WallCoverage
 from coliags_plugin.surface.coverage.regions import neighbours
 from coliags_plugin.surface.coverage.scores import CoverageScores, score_unseen
-from coliags_plugin.surface.coverage.section import Section, find_section
 from coliags_plugin.surface.coverage.views import CoverageView
 from coliags_plugin.surface.coverage.visibility import RayCaster, RayGrids, facing_cameras, see_faces
 
@@ -32,7 +31,7 @@ _CELL, _SECTOR, _DRAWS = 10.0, 30.0, 10
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class CoverageEvaluation:
     """Scores on the true surface, within the true section.
 
     Attributes:
@@ -50,7 +49,7 @@ class Evaluation:
     rays: CoverageScores
     all_unseen: CoverageScores
     random: CoverageScores
-    section: Section
+    section: LumenSection
     unseen_share: float
 
     def as_json(self) -> dict[str, Any]:
@@ -65,7 +64,7 @@ class Evaluation:
         }
 
 
-def evaluate_coverage(coverage: Coverage, truth: TrueSurface, views: Sequence[CoverageView]) -> Evaluation:
+def evaluate_coverage(coverage: WallCoverage, truth: TrueSurface, views: Sequence[CoverageView]) -> CoverageEvaluation:
     """Compare measured coverage with the truth.
 
     Args:
@@ -93,7 +92,7 @@ def evaluate_coverage(coverage: Coverage, truth: TrueSurface, views: Sequence[Co
     share = float(areas[unseen].sum() / areas.sum())
     generator = np.random.default_rng(0)
     draws = [scored(_random_cells(arc, clock, share, generator)) for _ in range(_DRAWS)]
-    return Evaluation(
+    return CoverageEvaluation(
         surface=scored(~_carried_over(coverage, mesh.centers, mesh.normals)),
         rays=scored(~_confirmed(coverage, caster, views, len(mesh))),
         all_unseen=scored(np.ones(len(mesh), bool)),
@@ -104,22 +103,22 @@ def evaluate_coverage(coverage: Coverage, truth: TrueSurface, views: Sequence[Co
 
 
 def _carried_over(
-    coverage: Coverage, centers: Float[np.ndarray, "F 3"], normals: Float[np.ndarray, "F 3"]
+    coverage: WallCoverage, centers: Float[np.ndarray, "F 3"], normals: Float[np.ndarray, "F 3"]
 ) -> Bool[np.ndarray, "F"]:
     """Whether the nearest reconstructed triangle of a like normal was seen; False where none is within reach. [F]"""
     seen = (coverage.level != Level.UNSEEN)[~coverage.guessed]
     own = coverage.mesh.part(~coverage.guessed)
     tree = cKDTree(np.concatenate([own.centers, _NORMAL_WEIGHT * own.normals], axis=1))
-    places = np.concatenate([centers, _NORMAL_WEIGHT * normals], axis=1)
-    distance, nearest = tree.query(places, distance_upper_bound=_REACH)
-    found = np.isfinite(distance)
+    queries = np.concatenate([centers, _NORMAL_WEIGHT * normals], axis=1)
+    distance, nearest = tree.query(queries, distance_upper_bound=_REACH)
+    within = np.isfinite(distance)
     called = np.zeros(len(centers), bool)
-    called[found] = seen[np.asarray(nearest)[found]]
+    called[within] = seen[np.asarray(nearest)[within]]
     return called
 
 
 def _confirmed(
-    coverage: Coverage, caster: RayCaster, views: Sequence[CoverageView], count: int
+    coverage: WallCoverage, caster: RayCaster, views: Sequence[CoverageView], count: int
 ) -> Bool[np.ndarray, "F"]:
     """Whether a viewing ray that hits a true triangle meets the reconstructed wall at about the same distance. [F]"""
     own = RayCaster(coverage.mesh.part(~coverage.guessed))

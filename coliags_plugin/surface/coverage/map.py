@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, UInt8
 from coliags_plugin.outputs.axis_ticks import linear_ticks, tick_label
 from coliags_plugin.surface.coverage.centreline import STEP
 from coliags_plugin.surface.coverage.levels import GUESS_COLOR, GUESS_LABEL, Level
-from coliags_plugin.surface.coverage.measure import Coverage
+from coliags_plugin.surface.coverage.measure import WallCoverage
 
 _INK, _SOFT, _GRID, _NOTHING = (32, 32, 32), (110, 110, 110), (225, 225, 225), (245, 245, 245)
 _FONT, _TEXT = cv2.FONT_HERSHEY_SIMPLEX, 0.45
@@ -21,7 +21,7 @@ _HEIGHT, _PER_MM, _WIDEST = 420, 9.0, 1500
 _MARGIN = 12.0
 
 
-def draw_map(coverage: Coverage) -> UInt8[np.ndarray, "H W 3"]:
+def draw_map(coverage: WallCoverage) -> UInt8[np.ndarray, "H W 3"]:
     """Draw the unrolled map, with axes in mm and degrees, a legend with areas, and the numbers of the missed regions.
 
     Every place shows the wall that a ray from the centreline at that clock angle meets first. Wall beyond the ends of
@@ -34,8 +34,8 @@ def draw_map(coverage: Coverage) -> UInt8[np.ndarray, "H W 3"]:
     spread = cv2.resize(colors.transpose(1, 0, 2), (width, _HEIGHT), interpolation=cv2.INTER_NEAREST)
     image[_TOP : _TOP + _HEIGHT, _LEFT : _LEFT + width] = spread
 
-    def column(place: float) -> int:
-        return _LEFT + round((place - first) / (last - first) * width)
+    def column(arc: float) -> int:
+        return _LEFT + round((arc - first) / (last - first) * width)
 
     _axes(image, (first, last), width)
     for end in (coverage.section.start, coverage.section.end):
@@ -48,7 +48,7 @@ def draw_map(coverage: Coverage) -> UInt8[np.ndarray, "H W 3"]:
     return image
 
 
-def _cells(coverage: Coverage) -> tuple[UInt8[np.ndarray, "M C 3"], Float[np.ndarray, "M"]]:
+def _cells(coverage: WallCoverage) -> tuple[UInt8[np.ndarray, "M C 3"], Float[np.ndarray, "M"]]:
     """Colours of the cells around the section, and their places along the centreline, mm."""
     grid, section = coverage.grid, coverage.section
     arc = grid.line.arc
@@ -61,7 +61,7 @@ def _cells(coverage: Coverage) -> tuple[UInt8[np.ndarray, "M C 3"], Float[np.nda
     return colors, arc
 
 
-def face_colors(coverage: Coverage) -> UInt8[np.ndarray, "F 3"]:
+def face_colors(coverage: WallCoverage) -> UInt8[np.ndarray, "F 3"]:
     """Colour of each triangle by its level. [F, 3]"""
     table = np.array([level.color for level in Level], np.uint8)
     colors = table[coverage.level]
@@ -69,7 +69,7 @@ def face_colors(coverage: Coverage) -> UInt8[np.ndarray, "F 3"]:
     return np.asarray(colors)
 
 
-def legend_entries(coverage: Coverage) -> list[tuple[str, tuple[int, int, int], Bool[np.ndarray, "F"]]]:
+def legend_entries(coverage: WallCoverage) -> list[tuple[str, tuple[int, int, int], Bool[np.ndarray, "F"]]]:
     """Label, colour and triangles of each entry of a legend."""
     entries = [(level.label, level.color, (coverage.level == level) & ~coverage.guessed) for level in reversed(Level)]
     return [*entries, (GUESS_LABEL, GUESS_COLOR, coverage.guessed)]
@@ -91,8 +91,8 @@ def _axes(image: np.ndarray, limits: tuple[float, float], width: int) -> None:
     _text(image, "clock angle [deg]; 0: up, 90: right", (_LEFT - 60, bottom + 44))
 
 
-def _legend(image: np.ndarray, coverage: Coverage) -> None:
-    total = coverage.area(np.ones(len(coverage.level), bool))
+def _legend(image: np.ndarray, coverage: WallCoverage) -> None:
+    total = coverage.area()
     x, y = _LEFT, 28
     for label, color, chosen in legend_entries(coverage):
         area = coverage.area(chosen)

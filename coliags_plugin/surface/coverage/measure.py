@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
-from coliags_plugin.surface.coverage.centreline import STEP, Centreline, find_centreline
+from coliags_plugin.surface.coverage.centreline import STEP, Centreline, LumenSection, find_centreline, find_section
 from coliags_plugin.surface.coverage.levels import Level, classify
 from coliags_plugin.surface.coverage.regions import large_regions, near_pairs, neighbours
-from coliags_plugin.surface.coverage.section import Section, find_section
 from coliags_plugin.surface.coverage.settings import CoverageSettings
 from coliags_plugin.surface.coverage.tube import TubeGrid, guessed_wall, wall_around
 from coliags_plugin.surface.coverage.views import CoverageView
@@ -22,7 +21,7 @@ from coliags_plugin.surface.coverage.visibility import FaceViews, RayCaster, fac
 #: Guessed wall continues a region of reconstructed wall whose centroids are as near as this, mm.
 _TOUCHING = 2.0
 #: Points of a region that choose its picture, and a distance within which views are alike for that, mm.
-_PROBED, _NEAR = 200, 20.0
+_SAMPLES, _NEAR = 200, 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +29,7 @@ class MissedRegion:
     """A connected piece of the section that no frame shows.
 
     Attributes:
-        triangles: Indices in :attr:`Coverage.mesh`. [K]
+        triangles: Indices in :attr:`WallCoverage.mesh`. [K]
         area: mm^2.
         guessed_area: Area of it whose place is a guess, mm^2.
         centroid: World, mm. [3]
@@ -58,7 +57,7 @@ class MissedRegion:
 
 
 @dataclass(frozen=True, eq=False)
-class Coverage:
+class WallCoverage:
     """What a recording shows of a lumen's wall, F triangles.
 
     Attributes:
@@ -82,7 +81,7 @@ class Coverage:
     line: Centreline
     arc: Float[np.ndarray, "F"]
     clock: Float[np.ndarray, "F"]
-    section: Section
+    section: LumenSection
     grid: TubeGrid
     regions: list[MissedRegion]
     names: list[str]
@@ -93,9 +92,9 @@ class Coverage:
         """Triangles of the section. [F]"""
         return self.section.holds(self.arc)
 
-    def area(self, chosen: Bool[np.ndarray, "F"]) -> float:
-        """Area of some triangles of the section, mm^2."""
-        return float(self.mesh.areas[chosen & self.inside].sum())
+    def area(self, chosen: Bool[np.ndarray, "F"] | None = None) -> float:
+        """Area of some triangles of the section, or of all, mm^2."""
+        return float(self.mesh.areas[self.inside if chosen is None else chosen & self.inside].sum())
 
 
 def measure_coverage(
@@ -103,7 +102,7 @@ def measure_coverage(
     views: Sequence[CoverageView],
     settings: CoverageSettings | None = None,
     progress: Progress | None = None,
-) -> Coverage:
+) -> WallCoverage:
     """Measure what a recording shows of the wall of a lumen, and what it misses.
 
     Where the mesh has no wall, a guess of it closes the lumen (:func:`guessed_wall`), since only surface that is there
@@ -121,13 +120,13 @@ def measure_coverage(
     """
     settings = settings or CoverageSettings()
     mesh = facing_cameras(mesh, views, settings)
-    views_of_wall = see_faces(mesh, views, settings, progress)
+    face_views = see_faces(mesh, views, settings, progress)
     poses = np.stack([np.asarray(view.camera_to_world, np.float64) for view in views])
     caster = RayCaster(mesh)
     line = find_centreline(mesh, poses, caster)
     guess = guessed_wall(wall_around(caster, line))
     whole, guessed = _joined(mesh, guess)
-    seen = _extended(views_of_wall, len(guess))
+    seen = _extended(face_views, len(guess))
     level = classify(seen, settings)
     arc, clock, _ = line.unroll(whole.centers)
     # Beyond the ends of the centreline nothing was guessed, so that the share of wall seen there says nothing.
@@ -138,10 +137,12 @@ def measure_coverage(
     pairs = np.concatenate(
         [neighbours(whole), near_pairs(whole.centers, missed & guessed, missed & ~guessed, _TOUCHING)]
     )
-    found = large_regions(missed, pairs, whole.areas, settings.region_area)
-    regions = [_described(chosen, whole, guessed, line, arc, section, views) for chosen in found]
+    regions = [
+        _described(triangles, whole, guessed, line, arc, section, views)
+        for triangles in large_regions(missed, pairs, whole.areas, settings.region_area)
+    ]
     names = [view.name for view in views]
-    return Coverage(whole, guessed, seen, level, line, arc, clock, section, grid, regions, names, settings)
+    return WallCoverage(whole, guessed, seen, level, line, arc, clock, section, grid, regions, names, settings)
 
 
 def _joined(mesh: TriangleMesh, guess: TriangleMesh) -> tuple[TriangleMesh, Bool[np.ndarray, "F"]]:
@@ -153,22 +154,13 @@ def _joined(mesh: TriangleMesh, guess: TriangleMesh) -> tuple[TriangleMesh, Bool
 
 def _extended(views: FaceViews, more: int) -> FaceViews:
     """The same with unseen triangles behind."""
-
-    def counted(values: Int[np.ndarray, "F"], value: int = 0) -> Int[np.ndarray, "G"]:
-        return np.concatenate([values, np.full(more, value, values.dtype)])
-
-    def measured(values: Float32[np.ndarray, "F"]) -> Float32[np.ndarray, "G"]:
-        return np.concatenate([values, np.full(more, np.nan, np.float32)])
-
+    unseen = {"best_frame": -1, "frames": 0, "clear_frames": 0, "good_frames": 0}
+    values = {field.name: getattr(views, field.name) for field in fields(views)}
     return FaceViews(
-        counted(views.frames),
-        counted(views.clear_frames),
-        counted(views.good_frames),
-        measured(views.distance),
-        measured(views.incidence),
-        measured(views.pixels_per_mm),
-        measured(views.brightness),
-        counted(views.best_frame, -1),
+        **{
+            name: np.concatenate([array, np.full(more, unseen.get(name, np.nan), array.dtype)])
+            for name, array in values.items()
+        }
     )
 
 
@@ -178,7 +170,7 @@ def _described(
     guessed: Bool[np.ndarray, "F"],
     line: Centreline,
     arc: Float[np.ndarray, "F"],
-    section: Section,
+    section: LumenSection,
     views: Sequence[CoverageView],
 ) -> MissedRegion:
     areas, centers = mesh.areas[triangles], mesh.centers[triangles]
@@ -186,18 +178,18 @@ def _described(
     centroid = (centers * areas[:, None]).sum(axis=0) / area
     # On the wall, not inside the lumen, where the centroid of a ring would be.
     middle = centers[np.argmin(np.linalg.norm(centers - centroid, axis=1))]
-    place, clock, _ = line.unroll(middle[None])
+    position, clock, _ = line.unroll(middle[None])
     start, end = float(arc[triangles].min()), float(arc[triangles].max())
     return MissedRegion(
         triangles,
         area,
         float(areas[guessed[triangles]].sum()),
         middle,
-        float(place[0]),
+        float(position[0]),
         float(clock[0]),
         (start, end),
         start < section.start + STEP or end > section.end - STEP,
-        _nearest_view(centers[:: max(1, len(centers) // _PROBED)], views),
+        _nearest_view(centers[:: max(1, len(centers) // _SAMPLES)], views),
     )
 
 

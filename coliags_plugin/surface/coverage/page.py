@@ -1,126 +1,62 @@
-"""HTML page of a measurement of coverage."""
+"""Page and summary of a measurement of coverage."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from html import escape
-from pathlib import Path
+from collections.abc import Iterator, Sequence
 
+import cv2
 import numpy as np
+from jaxtyping import UInt8
 
-from coliags_plugin.outputs.image_files import encode_png
-from coliags_plugin.outputs.page import fact_list, figure, record, table, write_page
-from coliags_plugin.surface.coverage.evaluation import Evaluation
-from coliags_plugin.surface.coverage.levels import Level
-from coliags_plugin.surface.coverage.map import draw_map
-from coliags_plugin.surface.coverage.measure import Coverage
-from coliags_plugin.surface.coverage.pictures import region_picture
-from coliags_plugin.surface.coverage.text import (
-    RESEARCH_USE,
-    clock_text,
-    level_table,
-    region_table,
-    segment_table,
-    truth_table,
+from coliags_plugin.reporting.model import (
+    Block,
+    EncodedImage,
+    Fact,
+    Figures,
+    Image,
+    Page,
+    Paragraph,
+    Section,
+    Table,
+    record,
+    simple_table,
 )
+from coliags_plugin.surface.coverage.evaluation import CoverageEvaluation
+from coliags_plugin.surface.coverage.levels import Level
+from coliags_plugin.surface.coverage.map import draw_map, legend_entries
+from coliags_plugin.surface.coverage.measure import MissedRegion, WallCoverage
 from coliags_plugin.surface.coverage.views import CoverageView
 
-#: Regions with a picture.
-_PICTURED = 12
+#: Said wherever a clinician could read the results.
+RESEARCH_USE = "Research use only: not a medical device, and not for decisions about a patient."
+#: Length of a segment in the table of segments, mm.
+_SEGMENT = 20.0
+#: Regions with a picture; widest picture, px; and how strongly the region covers the image.
+_PICTURED, _WIDTH, _OPACITY = 12, 480, 0.55
 
-_STYLE = ".map img { width: 100%; height: auto; background: #fff; }"
 
-
-def write_coverage_page(
-    coverage: Coverage,
-    views: Sequence[CoverageView],
-    output: Path,
-    name: str,
-    evaluation: Evaluation | None = None,
-) -> None:
-    """Write the self-contained page.
+def coverage_page(
+    coverage: WallCoverage, views: Sequence[CoverageView], name: str, evaluation: CoverageEvaluation | None = None
+) -> Page:
+    """The page.
 
     Args:
         coverage: The measurement.
         views: The frames that it was measured from, for pictures.
-        output: The file.
         name: Of the scene or run, for the title.
         evaluation: Against the truth, where there is one.
 
     Raises:
-        InputError: ``output`` is a folder, or cannot be written, or an image of a frame cannot be read.
+        InputError: An image of a frame cannot be read.
     """
-    title = f"{name}: coverage"
-    everything = np.ones(len(coverage.level), bool)
-    seen = 1.0 - coverage.area(coverage.level == Level.UNSEEN) / coverage.area(everything)
-    missed = sum(region.area for region in coverage.regions)
-    facts = {
-        "seen": f"{100.0 * seen:.0f} % of the wall",
-        "section": f"{coverage.section.length:.0f} mm of the lumen, {coverage.area(everything) / 100.0:.0f} cm²",
-        "missed regions": f"{len(coverage.regions)}, {missed / 100.0:.1f} cm² together",
-        "place guessed": f"{100.0 * coverage.area(coverage.guessed) / coverage.area(everything):.0f} % of the wall",
-        "frames": str(len(coverage.names)),
-    }
-    header = f'<h1>{escape(title)}</h1><p class="note">{escape(RESEARCH_USE)}</p>{fact_list(facts)}'
-    sections = [_map(coverage), _regions(coverage, views), _segments(coverage), _truth(evaluation), _how(coverage)]
-    write_page(output, title, header, sections, style=_STYLE)
-
-
-def _map(coverage: Coverage) -> str:
-    note = (
+    settings = coverage.settings
+    map_note = (
         "The wall, cut open at 12 o'clock and laid flat: along the lumen from left to right, round the clock from top "
         "to bottom, as seen by a viewer who looks deeper into the lumen. Wall that turns away from the lumen, as the "
         "sides of folds, is narrower here than it is; areas in the tables are those of the surface. Numbers mark "
         "missed regions, lines the ends of the section."
     )
-    image = figure(encode_png(draw_map(coverage)), "unrolled map")
-    return (
-        f'<section><h2>Map</h2><p class="hint">{escape(note)}</p><div class="map">{image}</div>'
-        f"{table(*level_table(coverage))}</section>"
-    )
-
-
-def _regions(coverage: Coverage, views: Sequence[CoverageView]) -> str:
-    limit = f"{coverage.settings.region_diameter:g} mm"
-    if not coverage.regions:
-        return f"<section><h2>Missed regions</h2><p>None is larger than a circle of {limit} diameter.</p></section>"
-    cells = []
-    for number, region in enumerate(coverage.regions[:_PICTURED], start=1):
-        picture = region_picture(coverage, region, views[region.nearest])
-        if picture is not None:
-            place = f"{number}: {region.area:.0f} mm² at {region.arc:.0f} mm, {clock_text(region.clock)} o'clock"
-            cells.append(figure(encode_png(picture), f"{place}, frame {coverage.names[region.nearest]}"))
-    note = (
-        f"Connected wall of the section that no frame shows, larger than a circle of {limit} diameter. Pictures are "
-        "the nearest recorded frames that look where each region is; it is drawn where it lies, behind folds where it "
-        "is hidden. Where the place of a region is guessed, so are its shape and area."
-    )
-    pictures = f'<div class="view" style="--cells: 3">{"".join(cells)}</div>' if cells else ""
-    return (
-        f'<section><h2>Missed regions</h2><p class="hint">{escape(note)}</p>{table(*region_table(coverage))}'
-        f"{pictures}</section>"
-    )
-
-
-def _segments(coverage: Coverage) -> str:
-    return f"<section><h2>Along the lumen</h2>{table(*segment_table(coverage))}</section>"
-
-
-def _truth(evaluation: Evaluation | None) -> str:
-    if evaluation is None:
-        return ""
-    note = (
-        f"On the true surface, of which {100.0 * evaluation.unseen_share:.0f} % of the section is unseen. False "
-        "reassurance: share of the unseen surface that is called seen. False alarm: share of the surface called "
-        "unseen that was seen. Calling everything unseen finds every region, so that recall says nothing alone."
-    )
-    scores = table(*truth_table(evaluation))
-    return f'<section><h2>Against the truth</h2><p class="hint">{escape(note)}</p>{scores}</section>'
-
-
-def _how(coverage: Coverage) -> str:
-    settings = coverage.settings
-    note = (
+    method_note = (
         f"Seen: {settings.glance_frames} frames or more show the surface from at most {settings.far:g} mm, in pixels "
         f"of a grey value of {settings.dark:g} or more (of 1), at most {settings.grazing:g} degrees from its normal. "
         "At a glance: fewer frames do. Too dark or too far: frames show it, but none so near and bright. The section "
@@ -128,5 +64,165 @@ def _how(coverage: Coverage) -> str:
         "beyond it, nothing is called missed. Where no wall was reconstructed, its place is guessed from the wall "
         "around it."
     )
-    chosen = record("Settings", settings.model_dump())
-    return f'<section><h2>How it is measured</h2><p class="hint">{escape(note)}</p>{chosen}</section>'
+    unrolled = Image(EncodedImage.png(draw_map(coverage)), "unrolled map", wide=True)
+    sections = [
+        Section("Map", [Paragraph(map_note), Figures([unrolled]), _level_table(coverage)]),
+        Section("Missed regions", list(_missed_regions(coverage, views))),
+        Section("Along the lumen", [_segment_table(coverage)]),
+        Section("Against the truth", [] if evaluation is None else _against_truth(evaluation)),
+        Section("How it is measured", [Paragraph(method_note), record("Settings", settings.model_dump())]),
+    ]
+    return Page(f"{name}: coverage", sections, _facts(coverage), note=RESEARCH_USE)
+
+
+def summary(coverage: WallCoverage, evaluation: CoverageEvaluation | None) -> list[str]:
+    """A few lines for a terminal."""
+    total = coverage.area()
+    missed = sum(region.area for region in coverage.regions)
+    lines = [f"section of {coverage.section.length:.0f} mm, {len(coverage.names)} frames"]
+    for label, _, chosen in legend_entries(coverage):
+        area = coverage.area(chosen)
+        lines.append(f"{100.0 * area / total:>5.1f} %  {label} ({area / 100.0:.1f} cm²)")
+    limit = f"{coverage.settings.region_diameter:g} mm"
+    lines.append(f"{len(coverage.regions)} missed regions above {limit}, {missed / 100.0:.1f} cm²")
+    if evaluation is not None:
+        scores = evaluation.surface.main_scores
+        known = ", ".join(f"{name} {value:.3f}" for name, value in scores.items() if value is not None)
+        lines.append(f"against the truth: {known}")
+    return [*lines, RESEARCH_USE]
+
+
+def clock_text(degrees: float) -> str:
+    """Clock angle as the hour on a dial: 0 degrees is 12 o'clock."""
+    minutes = round(degrees / 360.0 * 720.0) % 720
+    return f"{minutes // 60 or 12}:{minutes % 60:02d}"
+
+
+def _facts(coverage: WallCoverage) -> list[Fact]:
+    total = coverage.area()
+    seen = 1.0 - coverage.area(coverage.level == Level.UNSEEN) / total
+    missed = sum(region.area for region in coverage.regions)
+    return [
+        Fact("seen", f"{100.0 * seen:.0f} % of the wall"),
+        Fact("section", f"{coverage.section.length:.0f} mm of the lumen, {total / 100.0:.0f} cm²"),
+        Fact("missed regions", f"{len(coverage.regions)}, {missed / 100.0:.1f} cm² together"),
+        Fact("place guessed", f"{100.0 * coverage.area(coverage.guessed) / total:.0f} % of the wall"),
+        Fact("frames", str(len(coverage.names))),
+    ]
+
+
+def _level_table(coverage: WallCoverage) -> Table:
+    areas = {label: coverage.area(chosen) for label, _, chosen in legend_entries(coverage)}
+    rows = [[name, f"{area / 100.0:.1f}", f"{100.0 * area / coverage.area():.1f}"] for name, area in areas.items()]
+    return simple_table(["wall", "area, cm²", "share, %"], rows)
+
+
+def _missed_regions(coverage: WallCoverage, views: Sequence[CoverageView]) -> Iterator[Block]:
+    limit = f"{coverage.settings.region_diameter:g} mm"
+    if not coverage.regions:
+        yield Paragraph(f"None is larger than a circle of {limit} diameter.", hint=False)
+        return
+    yield Paragraph(
+        f"Connected wall of the section that no frame shows, larger than a circle of {limit} diameter. Pictures are "
+        "the nearest recorded frames that look where each region is; it is drawn where it lies, behind folds where it "
+        "is hidden. Where the place of a region is guessed, so are its shape and area."
+    )
+    yield _region_table(coverage)
+    images = []
+    for number, region in enumerate(coverage.regions[:_PICTURED], start=1):
+        picture = region_picture(coverage, region, views[region.nearest])
+        if picture is not None:
+            where = f"{region.area:.0f} mm² at {region.arc:.0f} mm, {clock_text(region.clock)} o'clock"
+            caption = f"{number}: {where}, frame {coverage.names[region.nearest]}"
+            images.append(Image(EncodedImage.png(picture), caption))
+    if images:
+        yield Figures(images)
+
+
+def _region_table(coverage: WallCoverage) -> Table:
+    head = ["region", "area, mm²", "diameter, mm", "along, mm", "from, mm", "to, mm", "at an end", "clock"]
+    rows = [
+        [
+            str(number),
+            f"{region.area:.0f}",
+            f"{region.diameter:.1f}",
+            *(f"{position:.0f}" for position in (region.arc, *region.reach)),
+            "yes" if region.at_end else "no",
+            clock_text(region.clock),
+            f"{100.0 * region.guessed_area / region.area:.0f}",
+            ", ".join(f"{value:.1f}" for value in region.centroid),
+            coverage.names[region.nearest],
+        ]
+        for number, region in enumerate(coverage.regions, start=1)
+    ]
+    return simple_table([*head, "place guessed, %", "x, y, z, mm", "nearest frame"], rows)
+
+
+def _segment_table(coverage: WallCoverage) -> Table:
+    """Shares of each 20 mm of the section."""
+    levels = list(reversed(Level))
+    rows = []
+    areas, start = coverage.mesh.areas, coverage.section.start
+    while start < coverage.section.end:
+        end = min(start + _SEGMENT, coverage.section.end)
+        inside = (coverage.arc >= start) & (coverage.arc < end)
+        total = float(areas[inside].sum())
+        if total:
+            shares = [100.0 * float(areas[inside & (coverage.level == level)].sum()) / total for level in levels]
+            rows.append([f"{start:.0f} to {end:.0f}", f"{total / 100.0:.1f}", *(f"{share:.0f}" for share in shares)])
+        start = end
+    return simple_table(["along, mm", "area, cm²", *(f"{level.label}, %" for level in levels)], rows)
+
+
+def _against_truth(evaluation: CoverageEvaluation) -> list[Block]:
+    """Scores beside those of the baselines."""
+    note = (
+        f"On the true surface, of which {100.0 * evaluation.unseen_share:.0f} % of the section is unseen. False "
+        "reassurance: share of the unseen surface that is called seen. False alarm: share of the surface called "
+        "unseen that was seen. Calling everything unseen finds every region, so that recall says nothing alone."
+    )
+    kinds = {
+        "measured wall": evaluation.surface,
+        "measured distance along viewing rays": evaluation.rays,
+        "all unseen": evaluation.all_unseen,
+        "random cells of the same area": evaluation.random,
+    }
+    rows = [
+        [
+            name,
+            *(None if value is None else f"{value:.3f}" for value in scores.main_scores.values()),
+            f"{scores.predicted_regions} of {scores.true_regions}",
+        ]
+        for name, scores in kinds.items()
+    ]
+    return [Paragraph(note), simple_table(["unseen by", *evaluation.surface.main_scores, "regions"], rows)]
+
+
+def region_picture(
+    coverage: WallCoverage, region: MissedRegion, view: CoverageView
+) -> UInt8[np.ndarray, "H W 3"] | None:
+    """The recorded frame nearest to a region, with the region drawn over it where it lies, hidden or not.
+
+    Args:
+        coverage: The measurement.
+        region: One of its regions.
+        view: The frame, that of ``region.nearest``.
+
+    Returns:
+        RGB; None where the recording has no images. [H, W, 3]
+    """
+    if view.read_image is None:
+        return None
+    image = view.read_image()
+    scale = min(1.0, _WIDTH / image.shape[1])
+    size = round(image.shape[1] * scale), round(image.shape[0] * scale)
+    image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    used, corners = np.unique(coverage.mesh.triangles[region.triangles], return_inverse=True)
+    local = (coverage.mesh.vertices[used] - view.center) @ view.camera_to_world[:3, :3]
+    pixels = view.lens.project(local) * scale
+    drawable = np.isfinite(pixels).all(axis=1) & (np.abs(pixels) < 1e4).all(axis=1)
+    corners = corners.reshape(-1, 3)
+    painted = image.copy()
+    for triangle in np.rint(pixels[corners[drawable[corners].all(axis=1)]]).astype(np.int32):
+        cv2.fillConvexPoly(painted, triangle, Level.UNSEEN.color)
+    return np.asarray(cv2.addWeighted(painted, _OPACITY, image, 1.0 - _OPACITY, 0.0))

@@ -38,8 +38,8 @@ def near_pairs(
     if not len(first) or not len(second):
         return np.zeros((0, 2), np.int64)
     distance, nearest = cKDTree(centers[second]).query(centers[first], distance_upper_bound=within)
-    found = np.isfinite(distance)
-    return np.stack([first[found], second[np.asarray(nearest)[found]]], axis=1)
+    near = np.isfinite(distance)
+    return np.stack([first[near], second[np.asarray(nearest)[near]]], axis=1)
 
 
 def connected(chosen: Bool[np.ndarray, "F"], pairs: Int[np.ndarray, "E 2"]) -> Int[np.ndarray, "F"]:

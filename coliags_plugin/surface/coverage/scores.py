@@ -39,6 +39,17 @@ class CoverageScores:
     true_regions: int
     predicted_regions: int
 
+    @property
+    def main_scores(self) -> dict[str, float | None]:
+        """Those of texts and tables, by their names."""
+        return {
+            "face IoU": self.face_iou,
+            "region IoU": self.region_iou,
+            "recall": self.recall,
+            "false reassurance": self.false_reassurance,
+            "false alarm": self.false_alarm,
+        }
+
     def as_json(self) -> dict[str, float | int | None]:
         """By name."""
         return asdict(self)
@@ -68,9 +79,9 @@ def score_unseen(
         return float(areas[part & whole].sum()) / total if total else None
 
     truth = large_regions(true, pairs, areas, smallest)
-    found = large_regions(predicted, pairs, areas, smallest)
+    called = large_regions(predicted, pairs, areas, smallest)
     caught = [float(areas[region[predicted[region]]].sum()) >= 0.5 * float(areas[region].sum()) for region in truth]
-    ious = _region_ious(truth, found, areas)
+    ious = _region_ious(truth, called, areas)
     return CoverageScores(
         face_iou=share(predicted & true, predicted | true),
         region_iou=float(np.average(ious, weights=[areas[region].sum() for region in truth])) if ious else None,
@@ -81,12 +92,12 @@ def score_unseen(
         unseen_among_called_seen=share(true, counted & ~predicted),
         called_unseen_among_seen=share(predicted, counted & ~true),
         true_regions=len(truth),
-        predicted_regions=len(found),
+        predicted_regions=len(called),
     )
 
 
 def _region_ious(
-    truth: Sequence[Int[np.ndarray, "K"]], found: Sequence[Int[np.ndarray, "K"]], areas: Float[np.ndarray, "F"]
+    truth: Sequence[Int[np.ndarray, "K"]], called: Sequence[Int[np.ndarray, "K"]], areas: Float[np.ndarray, "F"]
 ) -> list[float]:
     """Of each true region with all predicted regions that overlap it, leaving out the surface of other true regions.
 
@@ -96,7 +107,7 @@ def _region_ious(
     for number, region in enumerate(truth):
         owner[region] = number
     common, more = np.zeros(len(truth)), np.zeros(len(truth))
-    for region in found:
+    for region in called:
         inside = region[owner[region] >= 0]
         overlap = np.bincount(owner[inside], areas[inside], minlength=len(truth))
         common += overlap

@@ -51,12 +51,12 @@ class TubeGrid:
 def wall_around(caster: RayCaster, line: Centreline) -> TubeGrid:
     """Cast rays outwards from a centreline."""
     origins = np.repeat(line.points, CLOCKS, axis=0)
-    directions = np.concatenate([line.directions(place, _clocks()) for place in range(len(line.points))])
+    directions = np.concatenate([line.directions(index, _clocks()) for index in range(len(line.points))])
     triangle, distance = caster.cast(origins, directions)
-    found = (triangle >= 0) & (distance <= _WIDEST)
+    hit = (triangle >= 0) & (distance <= _WIDEST)
     shape = (len(line.points), CLOCKS)
-    radius = np.where(found, distance, np.nan).astype(np.float64)
-    return TubeGrid(line, radius.reshape(shape), np.where(found, triangle, -1).reshape(shape))
+    radius = np.where(hit, distance, np.nan).astype(np.float64)
+    return TubeGrid(line, radius.reshape(shape), np.where(hit, triangle, -1).reshape(shape))
 
 
 def guessed_wall(grid: TubeGrid) -> TriangleMesh:
@@ -78,7 +78,7 @@ def guessed_wall(grid: TubeGrid) -> TriangleMesh:
         return TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
     radius = _filled(grid)
     line = grid.line
-    outward = np.stack([line.directions(place, grid.clock) for place in range(len(line.points))])
+    outward = np.stack([line.directions(index, grid.clock) for index in range(len(line.points))])
     vertices = line.points[:, None] + radius[..., None] * outward
     # Cells with a corner in a gap; the others are reconstructed.
     gap = ~there

@@ -1,4 +1,4 @@
-"""What a camera recorded, for the measurement of coverage: poses, lens, mask and brightness."""
+"""What a camera recorded: poses, masks, brightness and rays through the lens of the stored images, not undistorted."""
 
 from __future__ import annotations
 
@@ -10,7 +10,14 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.images import read_rgb
+from coliags_plugin.core.scenes import Frame, Scene
+from coliags_plugin.datamanagers.reading.images import read_mask
+from coliags_plugin.datamanagers.recording import Shot
+from coliags_plugin.datamanagers.stored_frames import StoredFrame
 from coliags_plugin.geometry.lenses.models import Lens
+from coliags_plugin.geometry.lenses.pinhole import PinholeLens
 
 
 @dataclass(frozen=True)
@@ -43,7 +50,7 @@ class RayGrid:
 
     Attributes:
         size: Width and height of the grid.
-        cells: Places in the grid, row by row. [R]
+        cells: Indices in the grid, row by row. [R]
         directions: Camera axes, z = 1. [R, 3]
         pixel_angles: Solid angle of one pixel of the image along each ray, steradians. [R]
     """
@@ -94,9 +101,9 @@ class RayGrid:
         """The ray nearest to each pixel of the lens; -1 outside the image and its content. [N]"""
         width, height = self.size
         with np.errstate(invalid="ignore"):
-            place = pixels * (width / lens.width, height / lens.height)
-            inside = np.all((place >= 0.0) & (place < (width, height)), axis=1)
-        column, row = np.where(inside[:, None], place, 0.0).astype(int).T
+            cell = pixels * (width / lens.width, height / lens.height)
+            inside = np.all((cell >= 0.0) & (cell < (width, height)), axis=1)
+        column, row = np.where(inside[:, None], cell, 0.0).astype(int).T
         return np.asarray(np.where(inside, self._ray_of_cell[row * width + column], -1))
 
     def brightness(self, image: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "R"]:
@@ -118,3 +125,43 @@ def _pixel_angles(
     area = np.abs(right[:, 0] * down[:, 1] - right[:, 1] * down[:, 0])
     angles = area / np.linalg.norm(directions, axis=1) ** 3
     return np.asarray(np.nan_to_num(angles))
+
+
+def recorded_views(scene: Scene) -> list[CoverageView]:
+    """Views of all frames of the video, held out or not, in its order.
+
+    Raises:
+        InputError: The unit of length is unknown, or there are fewer than two frames.
+    """
+    if not scene.is_metric:
+        raise InputError(
+            f"the unit of length of scene '{scene.name}' is unknown, and coverage is in mm",
+            "a scene in mm",
+            "Scale its poses to mm, for instance by a known diameter of the lumen",
+        )
+    if len(scene.video) < 2:
+        raise InputError(f"scene '{scene.name}' has {len(scene.video)} frame", "two frames or more")
+    return [_view(frame) for frame in scene.video]
+
+
+def _view(frame: Frame) -> CoverageView:
+    if isinstance(frame, StoredFrame):
+        return _stored_view(frame.shot)
+    camera = frame.camera
+    mask = None if frame.mask is None else frame.mask.numpy()
+    pose = camera.camera_to_world.double().numpy()
+    return CoverageView(frame.name, pose, PinholeLens.of(camera.intrinsics), mask, frame.image.numpy)
+
+
+def _stored_view(shot: Shot) -> CoverageView:
+    rectification = shot.rectification
+    content = rectification.stored_content
+    if shot.mask is not None:
+        mask = rectification.checked(shot.mask, read_mask(shot.mask))
+        content = mask if content is None else mask & content
+    pose = np.asarray(shot.camera_to_world, np.float64)
+    return CoverageView(shot.name, pose, rectification.stored_lens, content, _reader(shot))
+
+
+def _reader(shot: Shot) -> Callable[[], UInt8[np.ndarray, "H W 3"]]:
+    return lambda: shot.rectification.checked(shot.image, read_rgb(shot.image))

@@ -15,7 +15,7 @@ from coliags_plugin.surface.coverage.settings import CoverageSettings
 from coliags_plugin.surface.coverage.views import CoverageView, RayGrid
 
 #: Frames that decide which side of a mesh the cameras are on, and rays of each.
-_PROBED, _PROBING_RAYS = 8, 20_000
+_PROBE_FRAMES, _PROBE_RAYS = 8, 20_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +49,12 @@ class FaceViews:
 
 
 @dataclass(frozen=True)
-class _Hits:
+class RayHits:
     """Rays of one frame that hit a triangle within the range.
 
     Attributes:
         triangle: What they hit. [N]
-        ray: Their places among the rays of the grid. [N]
+        ray: Indices among the rays of the grid. [N]
         distance: mm. [N]
         cosine: Of the angle between ray and normal, 1 where perpendicular to the surface. [N]
     """
@@ -91,7 +91,7 @@ class RayCaster:
         """Distance of points to the surface, mm. [N]"""
         return self._rays.distance(points)
 
-    def seen_by(self, view: CoverageView, grid: RayGrid, farthest: float, both_sides: bool = False) -> _Hits:
+    def seen_by(self, view: CoverageView, grid: RayGrid, farthest: float, both_sides: bool = False) -> RayHits:
         """What a view sees.
 
         Args:
@@ -105,15 +105,14 @@ class RayCaster:
         triangle, z_depth = self.cast(view.center, rays)
         hit = np.flatnonzero((triangle >= 0) & (z_depth <= farthest))
         length = np.linalg.norm(grid.directions[hit], axis=1)
-        found = triangle[hit]
-        cosine = -np.einsum("nc,nc->n", rays[hit], self._normals[found]) / length
+        cosine = -np.einsum("nc,nc->n", rays[hit], self._normals[triangle[hit]]) / length
         kept = np.flatnonzero(cosine > -np.inf if both_sides else cosine > 0.0)
-        hit, found = hit[kept], found[kept]
-        return _Hits(found, hit, (z_depth[hit] * length[kept]).astype(np.float32), cosine[kept])
+        hit = hit[kept]
+        return RayHits(triangle[hit], hit, (z_depth[hit] * length[kept]).astype(np.float32), cosine[kept])
 
     def centroids_seen_by(
         self, view: CoverageView, grid: RayGrid, triangles: Int[np.ndarray, "K"], farthest: float
-    ) -> _Hits:
+    ) -> RayHits:
         """Which of some triangles a view sees by their centroids.
 
         Args:
@@ -132,7 +131,7 @@ class RayCaster:
         kept, rays = kept[rays >= 0], rays[rays >= 0]
         blocked = self._rays.blocked(view.center, offset[kept])
         kept, rays = kept[~blocked], rays[~blocked]
-        return _Hits(triangles[kept], rays, distance[kept].astype(np.float32), cosine[kept].astype(np.float32))
+        return RayHits(triangles[kept], rays, distance[kept].astype(np.float32), cosine[kept].astype(np.float32))
 
 
 def facing_cameras(
@@ -151,13 +150,13 @@ def facing_cameras(
     settings = settings or CoverageSettings()
     if not views:
         raise InputError("a recording without frames", "one frame or more")
-    caster, grids = RayCaster(mesh), RayGrids(_PROBING_RAYS)
-    probed = views[:: max(1, len(views) // _PROBED)]
-    hits = [caster.seen_by(view, grids.of(view), settings.max_distance, both_sides=True) for view in probed]
-    cosines = np.concatenate([found.cosine for found in hits])
+    caster, grids = RayCaster(mesh), RayGrids(_PROBE_RAYS)
+    probes = views[:: max(1, len(views) // _PROBE_FRAMES)]
+    hits = [caster.seen_by(view, grids.of(view), settings.max_distance, both_sides=True) for view in probes]
+    cosines = np.concatenate([each.cosine for each in hits])
     if not len(cosines):
         raise InputError(
-            f"no viewing ray of {len(probed)} frames hits the mesh within {settings.max_distance:g} mm",
+            f"no viewing ray of {len(probes)} frames hits the mesh within {settings.max_distance:g} mm",
             "a mesh in the world and unit of the poses",
             "Check that the mesh belongs to this scene",
         )
@@ -241,7 +240,7 @@ class _Tally:
     def add(
         self,
         number: int,
-        hits: _Hits,
+        hits: RayHits,
         grid: RayGrid,
         view: CoverageView,
         settings: CoverageSettings,

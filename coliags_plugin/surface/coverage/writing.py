@@ -2,20 +2,33 @@
 
 from __future__ import annotations
 
+import csv
+import io
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import atomic_folder, atomic_write, write_json
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.engine.progress import progress_callback
+from coliags_plugin.geometry.meshes.files import write_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.geometry.meshes.truth import find_true_surface, read_true_surface
-from coliags_plugin.surface.coverage.evaluation import Evaluation, evaluate_coverage
-from coliags_plugin.surface.coverage.files import write_coverage
-from coliags_plugin.surface.coverage.measure import Coverage, measure_coverage
-from coliags_plugin.surface.coverage.scene_views import recorded_views
+from coliags_plugin.outputs.image_files import write_png
+from coliags_plugin.reporting.html_page import write_html
+from coliags_plugin.surface.coverage.evaluation import CoverageEvaluation, evaluate_coverage
+from coliags_plugin.surface.coverage.levels import Level
+from coliags_plugin.surface.coverage.map import draw_map, face_colors
+from coliags_plugin.surface.coverage.measure import WallCoverage, measure_coverage
+from coliags_plugin.surface.coverage.page import RESEARCH_USE, coverage_page
 from coliags_plugin.surface.coverage.settings import CoverageSettings
+from coliags_plugin.surface.coverage.views import CoverageView, recorded_views
 
 
 @dataclass(frozen=True)
@@ -29,8 +42,8 @@ class MeasuredCoverage:
     """
 
     folder: Path
-    coverage: Coverage = field(repr=False)
-    evaluation: Evaluation | None = field(repr=False, default=None)
+    coverage: WallCoverage = field(repr=False)
+    evaluation: CoverageEvaluation | None = field(repr=False, default=None)
 
 
 def measure_scene(
@@ -84,3 +97,106 @@ def check_free(folder: Path, overwrite: bool) -> None:
     """
     if not overwrite and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder} already exists", "a new or empty folder", "Choose another, or pass --overwrite")
+
+
+def write_coverage(
+    coverage: WallCoverage,
+    views: Sequence[CoverageView],
+    output: Path,
+    name: str,
+    evaluation: CoverageEvaluation | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Write ``coverage.json``, ``regions.csv``, ``map.png``, ``coverage.ply`` and ``coverage.html``, atomically.
+
+    Args:
+        coverage: The measurement.
+        views: The frames that it was measured from.
+        output: The folder to make.
+        name: Of the scene or run, for titles.
+        evaluation: Against the truth, where there is one.
+        overwrite: Replace the folder where it exists.
+
+    Raises:
+        InputError: The folder exists or cannot be written, or an image of a frame cannot be read.
+    """
+    with atomic_folder(output, overwrite) as folder:
+        values = coverage_values(coverage, evaluation)
+        write_json(folder / "coverage.json", values)
+        atomic_write(folder / "regions.csv", _regions_csv(values["regions"]))
+        write_png(folder / "map.png", draw_map(coverage))
+        write_mesh(folder / "coverage.ply", colored_mesh(coverage))
+        write_html(coverage_page(coverage, views, name, evaluation), folder / "coverage.html")
+
+
+def colored_mesh(coverage: WallCoverage) -> TriangleMesh:
+    """The wall, guessed parts included, in the colours of the map; triangles share no vertices, so that none mix."""
+    mesh = coverage.mesh
+    vertices = mesh.vertices[mesh.triangles].reshape(-1, 3)
+    colors = np.repeat(face_colors(coverage), 3, axis=0)
+    return TriangleMesh(vertices, np.arange(3 * len(mesh)).reshape(-1, 3), colors)
+
+
+def coverage_values(coverage: WallCoverage, evaluation: CoverageEvaluation | None) -> dict[str, Any]:
+    """Everything that is measured, as JSON values."""
+    total = coverage.area()
+    views, seen = coverage.views, coverage.inside & coverage.views.seen
+    return {
+        "note": RESEARCH_USE,
+        "unit": "mm",
+        "settings": coverage.settings.model_dump(),
+        "frames": len(coverage.names),
+        "section": {
+            "start": round(coverage.section.start, 3),
+            "end": round(coverage.section.end, 3),
+            "rule": "from the first to the last place along the lumen where half of the wall of 10 mm was seen",
+        },
+        "area": total,
+        "shares": {level.name.lower(): coverage.area(coverage.level == level) / total for level in Level},
+        "guessed_share": coverage.area(coverage.guessed) / total,
+        "seen_surface": {
+            "median_distance": _median(coverage, views.distance, seen),
+            "median_incidence_degrees": _median(coverage, views.incidence, seen),
+            "median_pixels_per_mm": _median(coverage, views.pixels_per_mm, seen),
+            "median_frames": _median(coverage, views.frames.astype(np.float32), seen),
+        },
+        "regions": [
+            {
+                "number": number,
+                "area": region.area,
+                "diameter": region.diameter,
+                "guessed_area": region.guessed_area,
+                "along": region.arc,
+                "clock_degrees": region.clock,
+                "from": region.reach[0],
+                "to": region.reach[1],
+                "at_end_of_section": region.at_end,
+                "centroid": [float(value) for value in region.centroid],
+                "nearest_frame": coverage.names[region.nearest],
+            }
+            for number, region in enumerate(coverage.regions, start=1)
+        ],
+        "truth": None if evaluation is None else evaluation.as_json(),
+    }
+
+
+def _median(coverage: WallCoverage, values: Float[np.ndarray, "F"], chosen: Bool[np.ndarray, "F"]) -> float | None:
+    """Median over chosen surface, weighted by area; None without any."""
+    areas, values = coverage.mesh.areas[chosen], values[chosen]
+    if not len(values):
+        return None
+    order = np.argsort(values)
+    half = np.searchsorted(np.cumsum(areas[order]), 0.5 * areas.sum())
+    return float(values[order][min(int(half), len(values) - 1)])
+
+
+def _regions_csv(regions: Sequence[Mapping[str, Any]]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    lengths = ("area_mm2", "diameter_mm", "guessed_area_mm2", "along_mm", "clock_degrees", "from_mm", "to_mm")
+    writer.writerow(["number", *lengths, "x_mm", "y_mm", "z_mm", "nearest_frame"])
+    for region in regions:
+        numbers = [region[key] for key in ("area", "diameter", "guessed_area", "along", "clock_degrees", "from", "to")]
+        rounded = [f"{value:.3f}" for value in (*numbers, *region["centroid"])]
+        writer.writerow([region["number"], *rounded, region["nearest_frame"]])
+    return text.getvalue()

@@ -18,6 +18,7 @@ from coliags_plugin.outputs.colormaps import (
     color_bar,
     color_table,
     side_by_side,
+    stacked,
 )
 
 #: Of each picture, px.
@@ -66,11 +67,8 @@ def comparison_picture(mesh: TriangleMesh, truth: TrueSurface, cameras: Sequence
         ]
         labels = (f"{name} {number}: true, mm to the mesh", "mesh, mm to the true surface", "mesh, colour")
         rows.append(side_by_side(images, labels))
-    width = max(row.shape[1] for row in rows)
-    rows.append(color_bar((0.0, DEPTH_ERROR_LIMIT_MM), "mm", width=width))
-    return np.concatenate(
-        [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=255) for row in rows]
-    )
+    bar = color_bar((0.0, DEPTH_ERROR_LIMIT_MM), "mm", width=max(row.shape[1] for row in rows))
+    return stacked([*rows, bar])
 
 
 def outside_cameras(mesh: TriangleMesh, width: int) -> list[Camera]:

@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from jaxtyping import Bool
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, write_json
-from coliags_plugin.core.scenes import Scene
+from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.engine.truth import match_truth
@@ -20,9 +22,9 @@ from coliags_plugin.geometry.meshes.files import MESH_FORMATS, write_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.geometry.meshes.truth import TrueSurface, find_true_surface, read_true_surface
 from coliags_plugin.outputs.image_files import write_png
+from coliags_plugin.reporting.model import Block, Paragraph, simple_table
 from coliags_plugin.surface.meshing.fusion import fuse_run
 from coliags_plugin.surface.meshing.pictures import comparison_picture, distance_colors
-from coliags_plugin.surface.meshing.seen import first_hits
 from coliags_plugin.surface.meshing.settings import MeshSettings, max_depth_of, voxel_size_of
 
 #: Version of mesh.json.
@@ -103,6 +105,22 @@ def _true_surface(scene: Scene, given: Path | None) -> TrueSurface | None:
     return replace(surface, seen=seen, seen_by="first hit of a pixel of a training frame, cast at the mesh")
 
 
+def first_hits(mesh: TriangleMesh, frames: Sequence[Frame]) -> Bool[np.ndarray, "F"]:
+    """Triangles that are the first hit of the ray through the centre of an unmasked pixel of any frame. [F]
+
+    Args:
+        mesh: In the world of the poses.
+        frames: The views.
+    """
+    seen = np.zeros(len(mesh), bool)
+    for frame in frames:
+        camera = frame.camera.to("cpu", torch.float64)
+        directions = camera.rays()[frame.valid.cpu()]
+        hit, _ = mesh.rays.cast(camera.center.numpy(), directions.numpy())
+        seen[hit[hit >= 0]] = True
+    return seen
+
+
 def _check_same_world(scene: Scene, truth: Path) -> None:
     """Of a scene of unknown scale, accept the truth of a scene with the same poses only, whose scale it then shares."""
     if not truth.is_dir():
@@ -148,12 +166,37 @@ def _summary(
         "triangles": len(mesh),
         "area": float(mesh.areas.sum()),
         "bounds": [mesh.vertices.min(axis=0).tolist(), mesh.vertices.max(axis=0).tolist()],
-        "truth": None if truth is None else _place_of(truth.path, scene),
+        "truth": None if truth is None else _relative_path(truth.path, scene),
         "comparison": None if compared is None else compared.as_json(),
     }
 
 
-def _place_of(path: Path, scene: Scene) -> str:
+def _relative_path(path: Path, scene: Scene) -> str:
     """The path of a file in the scene's folder, or the name of another."""
     folder, file = Path(scene.provenance.get("path", "")).resolve(), path.resolve()
     return file.relative_to(folder).as_posix() if file.is_relative_to(folder) else file.name
+
+
+def comparison_blocks(compared: SurfaceComparison) -> list[Block]:
+    """The figures of a comparison as two tables and a few sentences."""
+    directions = {
+        "accuracy: mesh to true surface": compared.accuracy,
+        "completeness: seen to mesh": compared.completeness,
+    }
+    distances = [[name, f"{d.mean:.3f}", f"{d.median:.3f}", f"{d.percentile_95:.3f}"] for name, d in directions.items()]
+    shares = [
+        [f"{score.threshold_mm:g} mm", f"{score.precision:.4f}", f"{score.recall:.4f}", f"{score.f:.4f}"]
+        for score in compared.scores
+    ]
+    return [
+        simple_table(["mm", "mean", "median", "95 %"], distances),
+        simple_table(["within", "precision", "recall", "F"], shares),
+        Paragraph(
+            f"Chamfer distance (mean of both means) {compared.chamfer:.3f} mm, HD95 {compared.hausdorff_95:.3f} mm, "
+            f"normals {compared.normal_error:.1f} degrees off"
+        ),
+        Paragraph(
+            f"seen: {compared.seen_area:.0f} mm^2 ({compared.seen_by}); "
+            f"{compared.beyond_seen:.1%} of the mesh lies beyond it"
+        ),
+    ]

@@ -15,11 +15,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coliags_plugin.checks.depth.check import check_depth
-from coliags_plugin.checks.depth.error_maps import error_map
 from coliags_plugin.checks.depth.measures import measure
+from coliags_plugin.checks.depth.page import depth_page, error_map
 from coliags_plugin.checks.depth.pairing import Samples
-from coliags_plugin.checks.depth.sources import DepthMap, DepthSource, open_depth
-from coliags_plugin.checks.depth.text import lines
+from coliags_plugin.checks.depth.sources import DepthSource, FrameDepth, open_depth
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.intrinsics import Intrinsics
@@ -28,6 +27,7 @@ from coliags_plugin.datamanagers.c3vd.writer import write_c3vd_scene
 from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.outputs.colormaps import UNKNOWN_GREY, color_table
 from coliags_plugin.outputs.image_files import write_depth_tiff
+from coliags_plugin.reporting.terminal import page_text
 from tests.commands import refused, run
 from tests.scenes import wall_scene
 
@@ -35,11 +35,11 @@ SIZE = (40, 30)
 TRUE = np.random.default_rng(0).uniform(6.0, 70.0, SIZE[::-1]).astype(np.float32)
 
 
-def depth_map(depth=TRUE, confidence=None, sparse=None, size=None, intrinsics=None) -> DepthMap:
-    return DepthMap(depth, confidence, sparse, size or depth.shape[::-1], intrinsics)
+def depth_map(depth=TRUE, confidence=None, sparse=None, size=None, intrinsics=None) -> FrameDepth:
+    return FrameDepth(depth, confidence, sparse, size or depth.shape[::-1], intrinsics)
 
 
-def source(*maps: DepthMap, names=None, metric=True, path="scene") -> DepthSource:
+def source(*maps: FrameDepth, names=None, metric=True, path="scene") -> DepthSource:
     names = names or [f"{place:04d}" for place in range(len(maps))]
     return DepthSource(Path(path), metric, names, lambda place: maps[place])
 
@@ -58,7 +58,7 @@ def test_a_factor_is_measured_exactly():
     assert [(band.low, band.high) for band in check.dense.bands] == [(5, 10), (10, 20), (20, 40), (40, 80)]
     assert sum(band.errors.pixels for band in check.dense.bands) == errors.pixels
     assert all(frame.dense.median == pytest.approx(0.03, rel=1e-5) for frame in check.frames)
-    assert "+3" in "\n".join(lines(check))
+    assert "+3" in page_text(depth_page(check))
 
 
 def test_coverage_counts_only_known_truth():
@@ -82,7 +82,7 @@ def test_alignment_takes_the_median_ratio_out():
     assert check.scale == pytest.approx(7.0, rel=1e-6)
     assert check.dense.errors.median == pytest.approx(0.0, abs=1e-6)
     assert check.dense.errors.within == pytest.approx(0.9)
-    assert "times 7" in "\n".join(lines(check))
+    assert "times 7" in page_text(depth_page(check))
 
 
 def test_a_calibrated_confidence_has_no_calibration_error():
@@ -142,7 +142,7 @@ def test_single_points_are_compared_with_the_pixels_that_hold_them():
     assert check.sparse.errors.within == pytest.approx(2 / 3)
     assert check.frames[0].dense is None
     assert check.as_json()["sparse"]["errors"]["pixels"] == 3
-    assert "single points" in "\n".join(lines(check))
+    assert "single points" in page_text(depth_page(check))
 
 
 def test_frames_are_matched_by_name_and_else_by_index():
@@ -150,7 +150,7 @@ def test_frames_are_matched_by_name_and_else_by_index():
     check = check_depth(shifted, TRUTH)
     assert check.dense.errors.median == 0.0
     assert check.pairs.left_out == (1, 1)
-    assert "without a partner: 1 of the estimate, 1 of the truth" in "\n".join(lines(check))
+    assert "without a partner: 1 of the estimate, 1 of the truth" in page_text(depth_page(check))
     renamed = source(depth_map(), depth_map(TRUE + 1), names=["a", "b"])
     assert check_depth(renamed, TRUTH).pairs.by == "index"
     with pytest.raises(InputError, match="no frame in common"):

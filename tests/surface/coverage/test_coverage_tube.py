@@ -8,11 +8,10 @@ from tubes import grid_mesh, pinhole, plane, tube, view_at
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
-from coliags_plugin.surface.coverage.centreline import find_centreline
+from coliags_plugin.surface.coverage.centreline import find_centreline, find_section
 from coliags_plugin.surface.coverage.levels import Level
 from coliags_plugin.surface.coverage.map import draw_map
 from coliags_plugin.surface.coverage.measure import measure_coverage
-from coliags_plugin.surface.coverage.section import find_section
 from coliags_plugin.surface.coverage.settings import CoverageSettings
 from coliags_plugin.surface.coverage.tube import guessed_wall, wall_around
 from coliags_plugin.surface.coverage.visibility import RayCaster

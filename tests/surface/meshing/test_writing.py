@@ -13,10 +13,9 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.geometry.meshes.files import read_mesh, write_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
-from coliags_plugin.surface.meshing.seen import first_hits
+from coliags_plugin.reporting.terminal import terminal_text
 from coliags_plugin.surface.meshing.settings import MeshSettings
-from coliags_plugin.surface.meshing.text import comparison_text
-from coliags_plugin.surface.meshing.writing import mesh_run
+from coliags_plugin.surface.meshing.writing import comparison_blocks, first_hits, mesh_run
 from tests.scenes import wall_scene, write_wall
 from tests.surface.meshing.exact import exact_run, with_provenance
 
@@ -54,7 +53,7 @@ def test_files_and_figures(truth, tmp_path):
     assert summary["comparison"]["scores"][1]["f"] == compared.f_at(1.0) > 0.98
     assert compared.accuracy.mean < 0.01 and compared.normal_error < 1.0
     assert "cast" in compared.seen_by
-    assert f"{compared.chamfer:.3f} mm" in comparison_text(compared)
+    assert f"{compared.chamfer:.3f} mm" in terminal_text(comparison_blocks(compared))
     errors = read_mesh(made.folder / "truth_error.ply")
     corner = np.abs(errors.vertices[:, :2]).min(axis=1) > 29
     assert (errors.colors[corner] == 128).all(), "what was not seen is grey"

@@ -1,16 +1,45 @@
-"""Results of the checks as lines of text."""
+"""Results of checks, their text, and the exceptions that end a check which has not passed."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
-from coliags_plugin.checks.method.results import Result, Status
+Status = Literal["passed", "failed", "skipped"]
 
 _TICKS: dict[Status, str] = {"passed": "\u2713", "failed": "\u2717", "skipped": "-"}
 _WORDS: dict[Status, str] = {"passed": "ok  ", "failed": "FAIL", "skipped": "-   "}
 
 
-def line(result: Result, width: int, encoding: str) -> str:
+@dataclass(frozen=True)
+class CheckResult:
+    """Outcome of one check.
+
+    Attributes:
+        name: Of the check.
+        status: How it ended.
+        detail: One line: what was measured, what is wrong, or why it was skipped.
+        seconds: How long it took.
+        traceback: Of an exception that ended it; empty without.
+    """
+
+    name: str
+    status: Status
+    detail: str
+    seconds: float = 0.0
+    traceback: str = ""
+
+
+class CheckFailedError(Exception):
+    """The method breaks what the check is about; the message says how."""
+
+
+class CheckSkippedError(Exception):
+    """The check does not apply to the method; the message says why."""
+
+
+def line(result: CheckResult, width: int, encoding: str) -> str:
     """One result: tick, cross or dash, name, seconds and detail.
 
     Args:
@@ -27,14 +56,14 @@ def line(result: Result, width: int, encoding: str) -> str:
     return _printable(f"{mark} {result.name:<{width}} {seconds}  {result.detail}".rstrip(), encoding)
 
 
-def summary(results: Sequence[Result]) -> str:
+def summary(results: Sequence[CheckResult]) -> str:
     """How many passed, failed and were skipped, and in what time."""
     counts = {status: sum(result.status == status for result in results) for status in _TICKS}
     told = ", ".join(f"{count} {status}" for status, count in counts.items() if count or status != "skipped")
     return f"{told} in {sum(result.seconds for result in results):.1f} s"
 
 
-def tracebacks(results: Sequence[Result], encoding: str) -> list[str]:
+def tracebacks(results: Sequence[CheckResult], encoding: str) -> list[str]:
     """Name and traceback of every check that ended with an exception."""
     return [_printable(f"\n{result.name}:\n{result.traceback}", encoding) for result in results if result.traceback]
 

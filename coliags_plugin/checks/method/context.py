@@ -25,7 +25,7 @@ SEED = 0
 
 
 @dataclass
-class Bench:
+class CheckContext:
     """What the checks of one method share. A check may use what the checks that it needs have filled in.
 
     Attributes:

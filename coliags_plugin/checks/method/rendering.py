@@ -1,7 +1,9 @@
-"""Checks of rendering: every promised output, at any size, the same each time."""
+"""Checks of rendering and evaluation: every promised output, at any size, the same each time; metrics and images."""
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -9,14 +11,17 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from coliags_plugin.checks.method.bench import Bench, difference
-from coliags_plugin.checks.method.results import CheckFailedError, CheckSkippedError
+from coliags_plugin.checks.method.context import CheckContext, difference
 from coliags_plugin.checks.method.scenes import depth_range
+from coliags_plugin.checks.results import CheckFailedError, CheckSkippedError
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.render_output import DEPTH_KINDS, RenderOutput
 from coliags_plugin.core.scenes import Frame, View
+from coliags_plugin.engine.evaluator import evaluate
 from coliags_plugin.engine.model import Model
+from coliags_plugin.engine.rendering import render_run
+from coliags_plugin.engine.trained import TrainedRun
 
 #: Alpha from which a pixel has a depth.
 _OPAQUE = 0.95
@@ -24,12 +29,14 @@ _OPAQUE = 0.95
 _MARGIN = 10.0
 _ROUNDING = 1e-4
 NO_OUTPUT = "no_such_output"
+#: Frames of each test set that are evaluated and rendered.
+_TEST_FRAMES = 2
 
 
-def renders_every_output(bench: Bench) -> str:
+def renders_every_output(context: CheckContext) -> str:
     """Every output has its shape and finite values in range, for views of the video, another size and a free camera."""
-    model, frame = bench.trainer.model, bench.scene.train[0]
-    depths = depth_range(bench.scene)
+    model, frame = context.trainer.model, context.scene.train[0]
+    depths = depth_range(context.scene)
     views: dict[str, tuple[Camera, View | None]] = {
         "a training view": (frame.camera, frame.view(trained=True)),
         "an untrained view": (frame.camera, replace(frame.view(trained=False), name="no such frame", time=0.5)),
@@ -104,9 +111,9 @@ def _shape(name: str, camera: Camera) -> tuple[int, ...] | None:
     return (camera.height, camera.width) if name == "alpha" or name in DEPTH_KINDS else None
 
 
-def renders_again(bench: Bench) -> str:
+def renders_again(context: CheckContext) -> str:
     """Rendering a view twice gives the same bits, with another view in between."""
-    model, frame = bench.trainer.model, bench.scene.train[0]
+    model, frame = context.trainer.model, context.scene.train[0]
     view = frame.view(trained=True)
     first = maps(_render(model, frame.camera, view))
     _render(model, _resized(frame.camera), None)
@@ -130,9 +137,9 @@ def _other_threads() -> Iterator[str]:
         torch.set_num_threads(before)
 
 
-def refuses_requests(bench: Bench) -> str:
+def refuses_requests(context: CheckContext) -> str:
     """An output that does not exist is refused, and so are single pixels by a renderer of whole images."""
-    model, camera = bench.trainer.model, bench.scene.train[0].camera
+    model, camera = context.trainer.model, context.scene.train[0].camera
     refused = {f"output '{NO_OUTPUT}'": {"wants": ("rgb", NO_OUTPUT)}}
     if not model.renderer.renders_pixels:
         refused["single pixels"] = {"pixels": torch.tensor([[1, 2], [0, 0]])}  # type: ignore[dict-item]
@@ -148,9 +155,9 @@ def refuses_requests(bench: Bench) -> str:
     return f"{', '.join(refused)}: refused"
 
 
-def renders_pixels(bench: Bench) -> str:
+def renders_pixels(context: CheckContext) -> str:
     """Single pixels are those of the whole image."""
-    model, frame = bench.trainer.model, bench.scene.train[0]
+    model, frame = context.trainer.model, context.scene.train[0]
     if not model.renderer.renders_pixels:
         raise CheckSkippedError(f"{type(model.renderer).__name__} renders whole images")
     if any(module.whole_image for module in model.view_modules.values()):
@@ -178,3 +185,45 @@ def same_views(first: Model, second: Model, frames: list[Frame]) -> str:
             if apart:
                 return f"frame {frame.name}: {apart}"
     return ""
+
+
+def evaluates(context: CheckContext) -> str:
+    """The method's protocol yields finite metrics, or reasons for those that cannot be had."""
+    trained = _few_frames(context)
+    file = evaluate(trained, trained.config.protocol) / "metrics.json"
+    summary = json.loads(file.read_text(encoding="utf-8"))
+    names = [name for name in summary["directions"] if name in summary]
+    unexplained = [
+        name
+        for name in names
+        if not (summary["reasons"].get(name) if summary[name] is None else math.isfinite(summary[name]))
+    ]
+    if unexplained:
+        raise CheckFailedError(f"metrics without value or reason: {', '.join(unexplained)}")
+    values = [f"{name} {summary[name]:.4g}" for name in names if summary[name] is not None]
+    if not values:
+        raise CheckFailedError(f"no metric has a value: {next(iter(summary['reasons'].values()))}")
+    return f"{trained.config.protocol}: {', '.join(values[:4])}"
+
+
+def writes_images(context: CheckContext) -> str:
+    """``coliags render`` writes an image of every kind for every frame."""
+    trained = _few_frames(context)
+    name, frames = next(iter(trained.scene.test_sets.items()))
+    folder = context.folder / "renders"
+    render_run(trained, folder, name, video=False, fps=15.0, overwrite=True)
+    kinds = {"rgb", "depth", "rgb_error"} | ({"depth_error"} if frames[0].depth is not None else set())
+    wanted = [folder / kind / f"{frame.name}.png" for kind in sorted(kinds) for frame in frames]
+    missing = [path for path in wanted if not path.is_file() or not path.stat().st_size]
+    if missing:
+        raise CheckFailedError(f"no image {missing[0].relative_to(folder)}")
+    return f"{len(wanted)} images"
+
+
+def _few_frames(context: CheckContext) -> TrainedRun:
+    """The run with only a few test frames."""
+    scene = context.trained.scene
+    sets = {name: frames[:_TEST_FRAMES] for name, frames in scene.test_sets.items() if frames}
+    if not sets:
+        raise CheckSkippedError("the scene holds out no test frames")
+    return replace(context.trained, scene=replace(scene, test_sets=sets))

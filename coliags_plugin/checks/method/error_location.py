@@ -1,4 +1,4 @@
-"""The line of the user's code that an exception comes from."""
+"""The components of a method, and the line of the user's code that an exception comes from."""
 
 from __future__ import annotations
 
@@ -16,37 +16,29 @@ from coliags_plugin.config.method_config import MethodConfig
 from coliags_plugin.core.errors import ReportedError
 
 _PACKAGE = Path(__file__).parents[2]
-#: Code of the checks themselves, never to blame.
+#: Code of the checks themselves, never the cause.
 _CHECKS = Path(__file__).parent
 _LIBRARIES = tuple(Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
 
 
 def components(config: MethodConfig) -> dict[str, Component]:
     """Every component of a method by its path in the config, for instance ``field.geometry_head``."""
-    found: dict[str, Component] = {}
-    for name in type(config).model_fields:
-        value = getattr(config, name)
-        for path, node in {name: value, **_entries(name, value)}.items():
-            found |= _nested(path, node)
-    return found
+    fields = {name: getattr(config, name) for name in type(config).model_fields}
+    return {path: node for name, value in fields.items() for path, node in _nested(name, value)}
 
 
-def _entries(name: str, value: Any) -> dict[str, Any]:
-    return {f"{name}.{key}": node for key, node in value.items()} if isinstance(value, dict) else {}
-
-
-def _nested(path: str, node: Any) -> dict[str, Component]:
-    """A component and those among its options."""
-    if not isinstance(node, Component):
-        return {}
-    found = {path: node}
-    for name in type(node.settings).model_fields:
-        found |= _nested(f"{path}.{name}", getattr(node.settings, name))
-    return found
+def _nested(path: str, node: Any) -> Iterator[tuple[str, Component]]:
+    """Paths and components of a value of the config: itself, its entries, or those among its options."""
+    children: dict[str, Any] = node if isinstance(node, dict) else {}
+    if isinstance(node, Component):
+        yield path, node
+        children = {name: getattr(node.settings, name) for name in type(node.settings).model_fields}
+    for name, child in children.items():
+        yield from _nested(f"{path}.{name}", child)
 
 
 def describe(error: BaseException, config: MethodConfig | None) -> str:
-    """An exception in one line: its message, with type and place in the user's code unless it is a reported one.
+    """An exception in one line: its message, with type and line in the user's code unless it is a reported one.
 
     Args:
         error: As caught, with its traceback.
@@ -55,11 +47,11 @@ def describe(error: BaseException, config: MethodConfig | None) -> str:
     message = "; ".join(str(error).split("\n"))
     if isinstance(error, ReportedError):
         return message
-    place = _place(error, config)
-    return f"{type(error).__name__}: {message}{f' ({place})' if place else ''}"
+    location = _location(error, config)
+    return f"{type(error).__name__}: {message}{f' ({location})' if location else ''}"
 
 
-def _place(error: BaseException, config: MethodConfig | None) -> str:
+def _location(error: BaseException, config: MethodConfig | None) -> str:
     """``file:line`` of the innermost frame in the method's own components, or else in code that is no library's."""
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not _within(frame.filename, [_CHECKS])]
     own = [] if config is None else [root for node in components(config).values() for root in _roots(node.target)]
