@@ -63,7 +63,7 @@ def test_a_run_that_another_process_trains_is_left_alone(scene, trained, tmp_pat
     """
     with subprocess.Popen([sys.executable, "-c", owner], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         assert other.stdout.readline() == b"owned\n"
-        with pytest.raises(InputError, match=rf"is being trained by process {other.pid} on .* since 20\d\d-"):
+        with pytest.raises(InputError, match=rf"is in use by process {other.pid} on .* since 20\d\d-"):
             cp.train("coliags", scene, mine, steps=8, seed=3, settings=SETTINGS, **how)
         other.kill()
     assert {path: path.read_bytes() for path in mine.rglob("*") if path.is_file()} == before
@@ -172,7 +172,7 @@ def test_examples_of_the_pages_run(tmp_path, monkeypatch):
     """In the order of the page, each with a few steps of a small model."""
     write_wall(tmp_path / "SCENE", frames=17)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("coliags_plugin.comparison.compare.make_executor", lambda how: InlineExecutor())
+    monkeypatch.setattr("coliags_plugin.comparison.compare.make_executor", lambda options: InlineExecutor())
 
     def quick(function):
         def call(*args, settings=None, **options):

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import pytest
+from rich.console import Console
 
 import coliags_plugin as cp
-from coliags_plugin.comparison import live
+from coliags_plugin.comparison import runner
 from coliags_plugin.config.assignments import parse_assignments
 from coliags_plugin.core.errors import InputError
 from tests.commands import run
@@ -26,7 +27,7 @@ def wall(tmp_path_factory):
 def inline(monkeypatch):
     """Runs in this process; the titles of those that were trained."""
     executor = InlineExecutor()
-    monkeypatch.setattr("coliags_plugin.comparison.compare.make_executor", lambda how: executor)
+    monkeypatch.setattr("coliags_plugin.comparison.compare.make_executor", lambda options: executor)
     return executor
 
 
@@ -34,7 +35,7 @@ def inline(monkeypatch):
 def compared(wall, tmp_path_factory):
     folder = tmp_path_factory.mktemp("compared") / "comparison"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("coliags_plugin.comparison.compare.make_executor", lambda how: InlineExecutor())
+        patch.setattr("coliags_plugin.comparison.compare.make_executor", lambda options: InlineExecutor())
         return cp.compare(["coliags", cp.variant(*WITHOUT_DEPTH)], wall, folder, steps=3, settings=SETTINGS)
 
 
@@ -109,7 +110,6 @@ def test_a_report_of_a_comparison_is_the_commands(compared, tmp_path):
 def test_a_notebook_shows_one_line(wall, tmp_path, inline, monkeypatch):
     shown = Shown()
     monkeypatch.setattr("IPython.display.display", shown)
-    monkeypatch.setattr(live.Console, "is_jupyter", True, raising=False)
-    monkeypatch.setattr(live, "_log_console", lambda: live.Console(force_jupyter=True))
+    monkeypatch.setattr(runner, "log_console", lambda: Console(force_jupyter=True))
     cp.compare("coliags", wall, tmp_path / "new", steps=3, settings=SETTINGS)
-    assert shown.text == "1 done"
+    assert shown.text.startswith("compare 3/3, took") and shown.text.endswith("1 done")

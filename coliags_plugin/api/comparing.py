@@ -10,7 +10,7 @@ from coliags_plugin.config.assignments import assignments
 
 if TYPE_CHECKING:
     from coliags_plugin.comparison.cells import Variant
-    from coliags_plugin.comparison.compare import Comparison
+    from coliags_plugin.comparison.compare import FinishedComparison
 
 
 def compare(
@@ -30,7 +30,7 @@ def compare(
     executor: str = "local",
     ray_address: str | None = None,
     retries: int = 2,
-) -> Comparison:
+) -> FinishedComparison:
     """Train and evaluate methods on scenes: what is missing is run, what is done is kept.
 
     Args:
@@ -56,26 +56,19 @@ def compare(
         InterruptedRunError: Ctrl-C; all runs are saved, and the same call goes on with them.
     """
     from coliags_plugin.comparison.cells import Variant
-    from coliags_plugin.comparison.compare import How
-    from coliags_plugin.comparison.compare import compare as compare_methods
+    from coliags_plugin.comparison.compare import ExecutionOptions, carry_out, make_request
+    from coliags_plugin.comparison.folder import ComparisonFolder
 
-    return compare_methods(
-        [methods] if isinstance(methods, (str, Variant)) else methods,
-        [scenes] if isinstance(scenes, (str, Path)) else scenes,
-        output,
-        data=data,
-        seeds=seeds,
-        protocol=protocol,
-        splits=splits,
-        steps=steps,
-        overrides=assignments(settings),
-        how=How(jobs, threads, device, executor, ray_address, retries),
-    )
+    methods = [methods] if isinstance(methods, (str, Variant)) else methods
+    scenes = [scenes] if isinstance(scenes, (str, Path)) else scenes
+    request = make_request(methods, scenes, data, seeds, protocol, splits, steps, assignments(settings))
+    options = ExecutionOptions(jobs, threads, device, executor, ray_address, retries)
+    return carry_out(request, ComparisonFolder(Path(output)), options)
 
 
 def ablate(
     file: str | Path, scenes: str | Path | Sequence[str | Path], output: str | Path = "ablation", **options: Any
-) -> Comparison:
+) -> FinishedComparison:
     """Compare the variants of methods that a file names.
 
     Args:

@@ -10,14 +10,14 @@ from coliags_plugin.api.runs import Run
 from coliags_plugin.core.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
-    from coliags_plugin.comparison.compare import Comparison
+    from coliags_plugin.comparison.compare import FinishedComparison
 
 #: What a report can be written as.
 Format = Literal["html", "markdown", "latex", "csv"]
 
 
 def report(
-    of: Run | Comparison | str | Path | Sequence[Run | Comparison | str | Path],
+    of: Run | FinishedComparison | str | Path | Sequence[Run | FinishedComparison | str | Path],
     output: str | Path | None = None,
     *,
     formats: Format | Sequence[Format] = "html",
@@ -54,13 +54,13 @@ def report(
         InputError: A result is missing, damaged or not comparable with the others, a choice is not possible, or a file
             cannot be written.
     """
-    from coliags_plugin.comparison.compare import Comparison
+    from coliags_plugin.comparison.compare import FinishedComparison
     from coliags_plugin.comparison.report.content import Choices
     from coliags_plugin.comparison.report.report import SUFFIXES, write_report
 
-    parts = [of] if isinstance(of, (Run, Comparison, str, Path)) else of
+    parts = [of] if isinstance(of, (Run, FinishedComparison, str, Path)) else of
     paths = [
-        part.path if isinstance(part, Run) else part.folder if isinstance(part, Comparison) else Path(part)
+        part.path if isinstance(part, Run) else part.folder if isinstance(part, FinishedComparison) else Path(part)
         for part in parts
     ]
     wanted: Sequence[Format] = (formats,) if isinstance(formats, str) else formats

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from coliags_plugin.api.runs import Run
 from coliags_plugin.config.assignments import assignments
@@ -50,7 +50,7 @@ def train(
         NotFiniteError: A loss or parameter became NaN or infinite.
     """
     from coliags_plugin.engine.devices import choose_device
-    from coliags_plugin.engine.training import TrainingRequest, resume_training, start_training
+    from coliags_plugin.engine.training import TrainingRequest, open_training
 
     if resume and overwrite:
         raise InputError("--resume and --overwrite together", "one of them")
@@ -61,8 +61,8 @@ def train(
         method, data, (*assignments(settings), *assignments(chosen)), seed, data_format, anonymous
     )
     folder = _run_folder(method, data, output, resume)
-    training = resume_training(request, folder, on) if resume else start_training(request, folder, on, overwrite)
-    with training as trainer:
+    if_exists: Literal["resume", "overwrite", "refuse"] = "resume" if resume else "overwrite" if overwrite else "refuse"
+    with open_training(request, folder, on, if_exists) as trainer:
         trainer.train()
     return Run(folder.path, data=data, device=device)
 

@@ -53,24 +53,22 @@ class ComparisonArguments:
     retries: int = 2
     """How often a run is resumed whose process was killed or crashed."""
     dry_run: bool = False
-    """Only print what would be done, with estimates of time and disk."""
+    """Only print what would be done: every cell with its state, and the disk that is needed."""
 
     def carry_out(self, methods: Sequence[str | Variant]) -> None:
         """Compare, print a summary and the folder; exit with status 1 if a cell failed."""
-        from coliags_plugin.comparison.compare import How, carry_out, dry_run, make_executor, make_request
+        from coliags_plugin.comparison.compare import ExecutionOptions, carry_out, dry_run, make_request
         from coliags_plugin.comparison.folder import ComparisonFolder
 
         request = make_request(
             methods, self.scenes, self.data, self.seeds, self.protocol, self.splits, self.steps, self.set
         )
-        how = How(self.jobs, self.threads, self.device, self.executor, self.ray_address, self.retries)
-        folder, executor = ComparisonFolder(self.output), make_executor(how)
+        options = ExecutionOptions(self.jobs, self.threads, self.device, self.executor, self.ray_address, self.retries)
+        folder = ComparisonFolder(self.output)
         if self.dry_run:
-            ahead = dry_run(request, folder, executor)
-            print(ahead.table())
-            print(ahead.line())
+            print(dry_run(request, folder, options).table())
             return
-        done = carry_out(request, folder, executor, how)
+        done = carry_out(request, folder, options)
         print(done.table())
         print(done.folder)
         if done.failures:

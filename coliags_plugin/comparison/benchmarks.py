@@ -19,7 +19,7 @@ from coliags_plugin.phantom.settings import PhantomSettings, phantom_settings
 _NAME = re.compile(r"[\w.-]*\w")
 
 
-class SceneEntry(Settings):
+class BenchmarkScene(Settings):
     """One scene of a benchmark: a folder of a dataset, or a phantom that is made when it is missing."""
 
     folder: str | tuple[str, ...] = Field(
@@ -56,7 +56,7 @@ class BenchmarkSettings(Settings):
     format: str | None = None  # data manager of all scenes; null: recognised from the files
     split: str | None = None  # of all scenes; null: the data manager's
     options: dict[str, Any] = Field(default_factory=dict)  # options of the data manager, for all scenes
-    scenes: dict[str, SceneEntry] = Field(min_length=1)  # by name
+    scenes: dict[str, BenchmarkScene] = Field(min_length=1)  # by name
 
     @field_validator("scenes", mode="before")
     @classmethod

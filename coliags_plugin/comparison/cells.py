@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 from coliags_plugin.comparison.named_files import is_path
 from coliags_plugin.comparison.scenes import SceneSource
@@ -38,7 +39,7 @@ class CellKeys:
 
 
 @dataclass(frozen=True)
-class Cell:
+class ComparisonCell:
     """One run of the comparison and its evaluation.
 
     Attributes:
@@ -60,6 +61,21 @@ class Cell:
     overrides: tuple[str, ...]
     config: MethodConfig
     keys: CellKeys | None
+
+    @property
+    def named(self) -> dict[str, Any]:
+        """Scene, method, seed, protocol and key of its result, as records hold them.
+
+        Raises:
+            ValueError: The scene is not there yet.
+        """
+        return {
+            "scene": self.scene_label,
+            "method": self.variant.name,
+            "seed": self.seed,
+            "protocol": self.protocol,
+            "key": self.known_keys.result,
+        }
 
     @property
     def identity(self) -> tuple[str, str, int, str]:
@@ -88,16 +104,16 @@ class Cell:
         return self.keys
 
     @property
-    def run_place(self) -> PurePosixPath:
+    def run_path(self) -> PurePosixPath:
         """Of the run, among runs: ``SCENE/METHOD/sSEED-KEY``; protocols share a run."""
-        return self._place(self.known_keys.training)
+        return self._path(self.known_keys.training)
 
     @property
-    def result_place(self) -> PurePosixPath:
+    def result_path(self) -> PurePosixPath:
         """Of the result, among results, without suffix: ``SCENE/METHOD/sSEED-KEY``."""
-        return self._place(self.known_keys.result)
+        return self._path(self.known_keys.result)
 
-    def _place(self, key: str) -> PurePosixPath:
+    def _path(self, key: str) -> PurePosixPath:
         return PurePosixPath(self.scene_label, file_name(self.variant.name), f"s{self.seed}-{key[:_SHORT]}")
 
 

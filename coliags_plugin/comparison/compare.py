@@ -1,41 +1,42 @@
-"""Comparison of methods over scenes in one call."""
+"""Comparison of methods over scenes: what is missing is run, what is done is kept."""
 
 from __future__ import annotations
 
 import logging
 import os
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
-from coliags_plugin.comparison.cells import Cell, Variant
-from coliags_plugin.comparison.driver import Sweep, run_cells
-from coliags_plugin.comparison.estimates import Estimates
+from coliags_plugin.comparison.cells import ComparisonCell, Variant
+from coliags_plugin.comparison.dry_run import DryRun, RunSizes, forecast
 from coliags_plugin.comparison.executors import Executor, LocalExecutor
-from coliags_plugin.comparison.folder import ComparisonFolder, Failure
-from coliags_plugin.comparison.live import live_report
+from coliags_plugin.comparison.folder import ComparisonFolder
 from coliags_plugin.comparison.plan import Request, make_cells
-from coliags_plugin.comparison.preview import Preview, preview
+from coliags_plugin.comparison.plan_file import FailureRecord
 from coliags_plugin.comparison.ray_executor import RayExecutor
-from coliags_plugin.comparison.scenes import SceneSource, find_scenes, make_phantoms
-from coliags_plugin.comparison.summary import COLUMNS, summary_table
+from coliags_plugin.comparison.runner import RunnerConfig, run_cells
+from coliags_plugin.comparison.scenes import find_scenes, make_phantoms
 from coliags_plugin.config.method_config import method_name
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.datamanagers.splits import Split
 from coliags_plugin.engine.devices import choose_device
 from coliags_plugin.engine.progress import progress_callback
-from coliags_plugin.results.display import Table
+from coliags_plugin.reporting.display import DisplayTable
+from coliags_plugin.reporting.model import Column
 from coliags_plugin.results.record import Result
 
 log = logging.getLogger(__name__)
 
 ExecutorName = Literal["local", "ray"]
+#: Metrics of a summary unless others are chosen.
+COLUMNS = ("psnr", "ssim", "depth_mse")
 
 
 @dataclass(frozen=True)
-class Comparison:
+class FinishedComparison:
     """What a comparison came to.
 
     Attributes:
@@ -46,12 +47,12 @@ class Comparison:
     """
 
     folder: Path
-    cells: Sequence[Cell]
+    cells: Sequence[ComparisonCell]
     results: Sequence[Result]
-    failures: Sequence[Failure]
+    failures: Sequence[FailureRecord]
 
-    def table(self, columns: Sequence[str] = COLUMNS) -> Table:
-        """Mean of every method over its finished cells, with the reasons of failures.
+    def table(self, columns: Sequence[str] = COLUMNS) -> DisplayTable:
+        """Mean of every method over its finished cells, of their main test sets, with the reasons of failures.
 
         Args:
             columns: Names of metrics.
@@ -59,14 +60,30 @@ class Comparison:
         Raises:
             InputError: No result has one of the metrics.
         """
-        return summary_table(self.cells, self.results, self.failures, columns)
+        units = {name: metric.unit for result in self.results for name, metric in result.metrics.items()}
+        for name in columns:
+            if self.results and name not in units:
+                raise InputError(f"no metric '{name}'", f"one of {', '.join(units)}", did_you_mean(name, units))
+        rows, by_method = [], defaultdict(list)
+        for result in self.results:
+            by_method[result.method].append(result)
+        for method, count in Counter(cell.variant.name for cell in self.cells).items():
+            own = by_method[method]
+            means = {name: _mean(own, name) for name in columns}
+            rows.append({"method": method, "done": f"{len(own)} of {count}", **means})
+        return DisplayTable(
+            f"{len(self.results)} of {len(self.cells)} cells",
+            [Column("method"), Column("done"), *(Column(name, unit=units.get(name, "")) for name in columns)],
+            rows,
+            [f"failed: {each.scene} {each.method} seed {each.seed}: {each.reason}" for each in self.failures],
+        )
 
     @property
     def runs(self) -> dict[tuple[str, str, int], Path]:
         """Folders of the runs that were begun, by scene, method and seed."""
         folder = ComparisonFolder(self.folder)
-        places = {(cell.scene_label, cell.variant.name, cell.seed): folder.run(cell) for cell in self.cells}
-        return {name: place for name, place in places.items() if place.is_dir()}
+        paths = {(cell.scene_label, cell.variant.name, cell.seed): folder.run(cell).path for cell in self.cells}
+        return {name: path for name, path in paths.items() if path.is_dir()}
 
     def __repr__(self) -> str:
         """How much is done, in one line."""
@@ -78,8 +95,13 @@ class Comparison:
         return self.table()._repr_html_()
 
 
+def _mean(results: Sequence[Result], metric: str) -> float | None:
+    means = [mean for each in results if metric in each.metrics and (mean := each.mean(metric)) is not None]
+    return sum(means) / len(means) if means else None
+
+
 @dataclass(frozen=True)
-class How:
+class ExecutionOptions:
     """How a comparison is carried out.
 
     Attributes:
@@ -101,96 +123,53 @@ class How:
     save_seconds: float = 60.0
 
 
-def compare(
-    methods: Sequence[str | Variant],
-    scenes: Sequence[str | Path],
-    output: str | Path,
-    *,
-    data: str | Path | None = None,
-    seeds: int = 1,
-    protocol: str = "paper",
-    splits: Sequence[str] = (),
-    steps: int | None = None,
-    overrides: Sequence[str] = (),
-    how: How | None = None,
-) -> Comparison:
-    """Train and evaluate methods on scenes: what is missing is run, what is done is kept.
+def carry_out(request: Request, folder: ComparisonFolder, options: ExecutionOptions) -> FinishedComparison:
+    """Train and evaluate methods on scenes, as far as that is not done in a folder.
 
     Args:
-        methods: Names of methods, paths of method configs, or variants of methods.
-        scenes: Benchmarks, ``BENCHMARK/SCENE``, paths of benchmark files, or folders of scenes.
-        output: Folder of the comparison, new or with another that this one extends.
-        data: Folder of the benchmark's scenes; None: ``scenes/BENCHMARK``.
-        seeds: Runs of every cell, with the seeds 0, 1, ...
-        protocol: Name of the evaluation protocol.
-        splits: Splits, each a cell of its own; empty: each scene's own.
-        steps: Length of all runs; None: each method's own.
-        overrides: ``key.path=value`` changes of all methods.
-        how: How to carry it out.
+        request: What is asked for.
+        folder: New, or with a comparison that this one extends.
+        options: How.
 
     Raises:
         InputError: Methods, scenes or options are not valid or not there, the folder cannot be used, or the disk is
             too small; nothing was run.
         InterruptedRunError: Ctrl-C; all runs are saved.
     """
-    how = how or How()
-    request = make_request(methods, scenes, data, seeds, protocol, splits, steps, overrides)
-    return carry_out(request, ComparisonFolder(Path(output)), make_executor(how), how)
-
-
-def carry_out(request: Request, folder: ComparisonFolder, executor: Executor, how: How) -> Comparison:
-    """Run what is missing.
-
-    Args:
-        request: What is asked for.
-        folder: Where.
-        executor: Where workers run.
-        how: The other options.
-
-    Raises:
-        InputError: See :func:`compare`.
-        InterruptedRunError: See :func:`compare`.
-    """
-    cells = plan_cells(request, folder)
+    executor = make_executor(options)
+    cells = _plan_cells(request, folder)
     with folder.held():
-        finished = folder.finished()
+        finished, sizes = folder.finished(), RunSizes(folder)
         missing = {cell.scene.name: cell.scene for cell in cells if finished.of(cell) is None}
         if any(not scene.is_there for scene in missing.values()):
             with progress_callback() as progress:
                 make_phantoms(list(missing.values()), progress)
             cells = make_cells(request, folder.recorded_fingerprint)
-        estimates = Estimates(folder, finished.results)
-        ahead = preview(cells, folder, finished, estimates, executor.slots)
-        log.info("%s", ahead.line())
+        ahead = forecast(cells, folder, finished, sizes, executor.slots)
+        log.info("%s", ahead)
         ahead.check_disk()
-        left = {cell.scene.path for cell in cells if finished.of(cell) is None}
-        if left:
-            executor.check(folder.path, sorted(left))
+        scenes = {cell.scene.path for cell in cells if finished.of(cell) is None}
+        if scenes:
+            executor.check(folder.path, sorted(scenes))
         folder.record(request, cells)
-        sweep = Sweep(folder, executor, how.device, how.retries, how.save_seconds)
-        with live_report() as show:
-            failures = run_cells(sweep, cells, finished, estimates, show)
+        config = RunnerConfig(folder, executor, options.device, options.retries, options.save_seconds)
+        failures = run_cells(config, cells, finished, sizes)
         results = [result for cell in cells if (result := finished.of(cell)) is not None]
-    return Comparison(folder.path, cells, results, failures)
+    return FinishedComparison(folder.path, cells, results, failures)
 
 
-def dry_run(request: Request, folder: ComparisonFolder, executor: Executor) -> Preview:
+def dry_run(request: Request, folder: ComparisonFolder, options: ExecutionOptions) -> DryRun:
     """What :func:`carry_out` would do; writes nothing.
 
     Raises:
-        InputError: See :func:`compare`.
+        InputError: See :func:`carry_out`.
     """
-    cells = plan_cells(request, folder)
-    finished = folder.finished()
-    return preview(cells, folder, finished, Estimates(folder, finished.results), executor.slots)
+    slots, cells = make_executor(options).slots, _plan_cells(request, folder)
+    return forecast(cells, folder, folder.finished(), RunSizes(folder), slots)
 
 
-def plan_cells(request: Request, folder: ComparisonFolder) -> list[Cell]:
-    """The cells that are asked for, after what can be checked without writing anything.
-
-    Raises:
-        InputError: A method, split or change is not valid, or the folder is of something else.
-    """
+def _plan_cells(request: Request, folder: ComparisonFolder) -> list[ComparisonCell]:
+    """The cells that are asked for, after what can be checked without writing anything."""
     folder.check()
     folder.check_extends(request)
     return make_cells(request, folder.recorded_fingerprint)
@@ -199,14 +178,24 @@ def plan_cells(request: Request, folder: ComparisonFolder) -> list[Cell]:
 def make_request(
     methods: Sequence[str | Variant],
     scenes: Sequence[str | Path],
-    data: str | Path | None,
-    seeds: int,
-    protocol: str,
-    splits: Sequence[str],
-    steps: int | None,
-    overrides: Sequence[str],
+    data: str | Path | None = None,
+    seeds: int = 1,
+    protocol: str = "paper",
+    splits: Sequence[str] = (),
+    steps: int | None = None,
+    overrides: Sequence[str] = (),
 ) -> Request:
-    """What is asked for, checked as far as names and numbers go; see :func:`compare`.
+    """What is asked for, checked as far as names and numbers go.
+
+    Args:
+        methods: Names of methods, paths of method configs, or variants of methods.
+        scenes: Benchmarks, ``BENCHMARK/SCENE``, paths of benchmark files, or folders of scenes.
+        data: Folder of the benchmark's scenes; None: ``scenes/BENCHMARK``.
+        seeds: Runs of every cell, with the seeds 0, 1, ...
+        protocol: Name of the evaluation protocol.
+        splits: Splits, each a cell of its own; empty: each scene's own.
+        steps: Length of all runs; None: each method's own.
+        overrides: ``key.path=value`` changes of all methods.
 
     Raises:
         InputError: A name is unknown or there twice, or a number is not valid.
@@ -219,40 +208,40 @@ def make_request(
         raise InputError(f"more than one method is named {', '.join(twice)}", "methods of different names")
     if not scenes:
         raise InputError("no scene", "at least one", "--scenes phantoms-8 needs no dataset")
-    if seeds < 1:
-        raise InputError(f"--seeds {seeds}", "at least 1")
-    if steps is not None and steps < 1:
-        raise InputError(f"--steps {steps}", "at least 1")
+    _check_number("seeds", seeds)
+    _check_number("steps", steps)
     for split in splits:
-        if split not in get_args(Split):
-            known = ", ".join(get_args(Split))
-            raise InputError(f"no split '{split}'", f"one of {known}", did_you_mean(split, get_args(Split)))
-    found: list[SceneSource] = find_scenes([str(scene) for scene in scenes], None if data is None else Path(data))
-    return Request(variants, found, range(seeds), protocol, tuple(dict.fromkeys(splits)), steps, tuple(overrides))
+        _check_name("split", split, get_args(Split))
+    sources = find_scenes([str(scene) for scene in scenes], None if data is None else Path(data))
+    return Request(variants, sources, range(seeds), protocol, tuple(dict.fromkeys(splits)), steps, tuple(overrides))
 
 
-def make_executor(how: How) -> Executor:
+def make_executor(options: ExecutionOptions) -> Executor:
     """The executor of a comparison.
 
     Raises:
         InputError: An option is not valid, or the executor cannot be used.
     """
-    for name, number in (("jobs", how.jobs), ("threads", how.threads)):
-        if number is not None and number < 1:
-            raise InputError(f"--{name} {number}", "at least 1")
-    if how.retries < 0:
-        raise InputError(f"--retries {how.retries}", "0 or more")
-    if how.executor not in get_args(ExecutorName):
-        known = get_args(ExecutorName)
-        raise InputError(
-            f"no executor '{how.executor}'", f"one of {', '.join(known)}", did_you_mean(how.executor, known)
-        )
-    if how.executor == "ray":
-        return RayExecutor(how.ray_address, how.jobs, how.threads or 1, how.device)
-    cpus = len(os.sched_getaffinity(0))
-    gpus = _gpus(how.device)
-    jobs = how.jobs or len(gpus) or cpus
-    return LocalExecutor(jobs, how.threads or max(1, cpus // jobs), gpus)
+    _check_number("jobs", options.jobs)
+    _check_number("threads", options.threads)
+    _check_number("retries", options.retries, least=0)
+    _check_name("executor", options.executor, get_args(ExecutorName))
+    if options.executor == "ray":
+        return RayExecutor(options.ray_address, options.jobs, options.threads or 1, options.device)
+    cpus = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    gpus = _gpus(options.device)
+    jobs = options.jobs or len(gpus) or cpus
+    return LocalExecutor(jobs, options.threads or max(1, cpus // jobs), gpus)
+
+
+def _check_number(option: str, number: int | None, least: int = 1) -> None:
+    if number is not None and number < least:
+        raise InputError(f"--{option} {number}", f"at least {least}")
+
+
+def _check_name(noun: str, name: str, known: Sequence[str]) -> None:
+    if name not in known:
+        raise InputError(f"no {noun} '{name}'", f"one of {', '.join(known)}", did_you_mean(name, known))
 
 
 def _gpus(device: str) -> list[str]:

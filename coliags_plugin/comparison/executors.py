@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO
 
-from coliags_plugin.comparison.tasks import Outcome, Task, read_outcome
+from coliags_plugin.comparison.tasks import Task, TaskOutcome, read_outcome
 
 #: For workers to save and end once they were asked to, seconds; then they are killed.
 STOPPING = 45.0
@@ -46,7 +46,7 @@ class Executor(ABC):
         """
 
     @abstractmethod
-    def wait(self, seconds: float) -> list[tuple[Task, Outcome]]:
+    def wait(self, seconds: float) -> list[tuple[Task, TaskOutcome]]:
         """Tasks that have ended, after so many seconds at most."""
 
     @abstractmethod
@@ -77,7 +77,7 @@ class LocalExecutor(Executor):
         gpu = self._gpus[slot % len(self._gpus)] if self._gpus else None
         self._workers[slot] = LocalWorker(task, gpu)
 
-    def wait(self, seconds: float) -> list[tuple[Task, Outcome]]:
+    def wait(self, seconds: float) -> list[tuple[Task, TaskOutcome]]:
         """See :class:`Executor`."""
         until = time.monotonic() + seconds
         while True:
@@ -134,7 +134,7 @@ class LocalWorker:
         """Whether the process has."""
         return self._process.poll() is not None
 
-    def outcome(self) -> Outcome:
+    def outcome(self) -> TaskOutcome:
         """How it ended; waits until it has."""
         printed = _pipe(self._process.stdout).read()
         returncode = self._process.wait()

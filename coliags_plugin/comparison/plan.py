@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from coliags_plugin._version import __version__
-from coliags_plugin.comparison.cells import Cell, CellKeys, Variant
+from coliags_plugin.comparison.cells import CellKeys, ComparisonCell, Variant
 from coliags_plugin.comparison.scenes import SceneSource
 from coliags_plugin.config import registry
 from coliags_plugin.config.components import Component
@@ -49,7 +49,7 @@ class Request:
         return (*(() if self.steps is None else (f"schedule.steps={self.steps}",)), *self.overrides)
 
 
-def make_cells(request: Request, recorded: RecordedFingerprint | None = None) -> list[Cell]:
+def make_cells(request: Request, recorded: RecordedFingerprint | None = None) -> list[ComparisonCell]:
     """All cells, those of one seed together, and within it those of one scene.
 
     Args:
@@ -61,7 +61,7 @@ def make_cells(request: Request, recorded: RecordedFingerprint | None = None) ->
     """
     protocol = registry.protocols.get(request.protocol)
     fingerprints = _Fingerprints(recorded or (lambda scene: None))
-    cells: list[Cell] = []
+    cells: list[ComparisonCell] = []
     with _warnings_only():
         for scene in request.scenes:
             for split in request.splits or (None,):
@@ -78,7 +78,7 @@ def _seeds(
     variant: Variant,
     fingerprints: _Fingerprints,
     protocol_version: int,
-) -> Iterator[Cell]:
+) -> Iterator[ComparisonCell]:
     chosen = () if split is None else (f"datamanager.split={split}",)
     overrides = (*scene.overrides, *chosen, *variant.overrides, *request.changes)
     config = _config(scene, variant.method, overrides)
@@ -94,7 +94,7 @@ def _seeds(
                 training_key(plain, fingerprint, seed, __version__),
                 result_key(plain, fingerprint, seed, __version__, request.protocol, protocol_version),
             )
-        yield Cell(variant, scene, label, seed, request.protocol, overrides, config, keys)
+        yield ComparisonCell(variant, scene, label, seed, request.protocol, overrides, config, keys)
 
 
 def _config(scene: SceneSource, method: str, overrides: Sequence[str]) -> MethodConfig:

@@ -19,7 +19,7 @@ from typing import Any
 
 from coliags_plugin._version import __version__
 from coliags_plugin.comparison.executors import STOPPING, Executor, LocalWorker
-from coliags_plugin.comparison.tasks import Outcome, Task
+from coliags_plugin.comparison.tasks import Task, TaskOutcome
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
 
@@ -92,7 +92,7 @@ class RayExecutor(Executor):
         """See :class:`Executor`."""
         self._tasks[self._work.remote(task.to_json())] = task
 
-    def wait(self, seconds: float) -> list[tuple[Task, Outcome]]:
+    def wait(self, seconds: float) -> list[tuple[Task, TaskOutcome]]:
         """See :class:`Executor`."""
         if not self._tasks:
             return []
@@ -162,14 +162,14 @@ class RayExecutor(Executor):
             time.sleep(_PAUSE)
         return True
 
-    def _outcome(self, reference: Any) -> Outcome:
+    def _outcome(self, reference: Any) -> TaskOutcome:
         try:
-            return Outcome(**self._ray.get(reference))
+            return TaskOutcome(**self._ray.get(reference))
         except self._ray.exceptions.TaskCancelledError:
-            return Outcome("stopped")
+            return TaskOutcome("stopped")
         except self._ray.exceptions.RayError as error:
             told = _DEATHS.get(type(error).__name__)
-            return Outcome("died", told or f"{type(error).__name__}: {_last_line(error)}")
+            return TaskOutcome("died", told or f"{type(error).__name__}: {_last_line(error)}")
 
 
 def _check_node(node: Mapping[str, Any], seen: Mapping[str, Any], file: Path, token: str) -> None:
@@ -219,7 +219,7 @@ def _work(text: str) -> dict[str, Any]:
         worker.ask_to_stop()
         with suppress(KeyboardInterrupt):
             worker.wait_or_kill(STOPPING)
-        return asdict(Outcome("stopped"))
+        return asdict(TaskOutcome("stopped"))
 
 
 def _library() -> Any:

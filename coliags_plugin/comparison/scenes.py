@@ -100,7 +100,7 @@ def make_phantoms(sources: Sequence[SceneSource], progress: Progress | None = No
     for source in sources:
         if source.phantom is None or source.is_there:
             continue
-        with locked(source.path.parent / f".{source.path.name}.lock", wait=math.inf):
+        with locked(source.path.parent / f".{source.path.name}.lock", source.path, wait=math.inf):
             if not source.is_there:  # another comparison may have made it meanwhile
                 log.info("making phantom %s", source.path)
                 generate(source.phantom, source.path, progress=progress)

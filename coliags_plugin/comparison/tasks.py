@@ -33,7 +33,6 @@ class Task:
         device: ``auto``, ``cpu`` or ``cuda``.
         protocol: Name of the evaluation protocol.
         run: Run folder.
-        lock: File that one process at a time may hold.
         result: Where the results file goes.
         result_key: Key that the result must have.
         log: File of the worker's messages.
@@ -54,7 +53,6 @@ class Task:
     device: str
     protocol: str
     run: str
-    lock: str
     result: str
     result_key: str
     log: str
@@ -90,7 +88,7 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TaskOutcome:
     """How a worker ended.
 
     Attributes:
@@ -102,12 +100,12 @@ class Outcome:
     reason: str = ""
 
 
-def outcome_line(outcome: Outcome) -> str:
+def outcome_line(outcome: TaskOutcome) -> str:
     """One line of JSON, which a worker prints last."""
     return json.dumps(asdict(outcome))
 
 
-def read_outcome(returncode: int, printed: str) -> Outcome:
+def read_outcome(returncode: int, printed: str) -> TaskOutcome:
     """The outcome of a worker that has ended.
 
     Args:
@@ -116,9 +114,9 @@ def read_outcome(returncode: int, printed: str) -> Outcome:
     """
     try:
         told: dict[str, Any] = json.loads(printed.strip().splitlines()[-1])
-        return Outcome(**told)
+        return TaskOutcome(**told)
     except (IndexError, ValueError, TypeError):
-        return Outcome("died", _how_it_died(returncode))
+        return TaskOutcome("died", _how_it_died(returncode))
 
 
 def _how_it_died(returncode: int) -> str:

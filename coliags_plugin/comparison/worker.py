@@ -3,7 +3,7 @@
     python -m coliags_plugin.comparison.worker TASK
 
 TASK is a :class:`~coliags_plugin.comparison.tasks.Task` as JSON. The last line printed is its
-:class:`~coliags_plugin.comparison.tasks.Outcome`; messages go to standard error. When standard input is a pipe, the
+:class:`~coliags_plugin.comparison.tasks.TaskOutcome`; messages go to standard error. When standard input is a pipe, the
 worker stops when it is closed, with its state saved: so it ends with whatever started it, however that ends.
 """
 
@@ -21,14 +21,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coliags_plugin.comparison.tasks import STOPPED, Outcome, Task, outcome_line
+from coliags_plugin.comparison.tasks import STOPPED, Task, TaskOutcome, outcome_line
 from coliags_plugin.core.errors import InputError, InterruptedRunError, ReportedError
-from coliags_plugin.core.locks import LockedError, locked
+from coliags_plugin.engine.run_folder import RunFolder
 
 if TYPE_CHECKING:
     import torch
-
-    from coliags_plugin.engine.run_folder import RunFolder
 
 log = logging.getLogger(__name__)
 
@@ -53,28 +51,25 @@ def main() -> None:
     sys.exit({"done": 0, "stopped": STOPPED}.get(outcome.ending, 1))
 
 
-def work(task: Task) -> Outcome:
+def work(task: Task) -> TaskOutcome:
     """Complete a cell, whatever state it is in; every error becomes the reason of its failure."""
     try:
         log.info("%s: process %d", task.title, os.getpid())
-        waiting = "waiting for %s, which has " + task.run
-        with locked(Path(task.lock), task.lock_seconds, lambda holder: log.info(waiting, holder)):
+        with RunFolder(Path(task.run)).owned(task.lock_seconds):
             complete(task)
     except (InterruptedRunError, KeyboardInterrupt) as error:
-        return Outcome("stopped", str(error))
-    except LockedError as error:
-        return Outcome("failed", f"{task.run} is still in use by {error}")
+        return TaskOutcome("stopped", str(error))
     except ReportedError as error:
-        return Outcome("failed", str(error))
+        return TaskOutcome("failed", str(error))
     except OSError as error:
         log.exception("%s", task.title)
         full = f"no space left for {task.run}"
-        return Outcome("failed", full if error.errno in (errno.ENOSPC, errno.EDQUOT) else f"{error}")
+        return TaskOutcome("failed", full if error.errno in (errno.ENOSPC, errno.EDQUOT) else f"{error}")
     except Exception as error:
         log.exception("%s", task.title)
         first = str(error).strip().partition("\n")[0]
-        return Outcome("failed", f"{type(error).__name__}: {first}" if first else type(error).__name__)
-    return Outcome("done")
+        return TaskOutcome("failed", f"{type(error).__name__}: {first}" if first else type(error).__name__)
+    return TaskOutcome("done")
 
 
 def complete(task: Task) -> None:
@@ -87,7 +82,6 @@ def complete(task: Task) -> None:
     """
     from coliags_plugin.engine import evaluator
     from coliags_plugin.engine.devices import choose_device
-    from coliags_plugin.engine.run_folder import RunFolder
     from coliags_plugin.engine.trained import load_trained
     from coliags_plugin.results.reading import RESULT_FILE, read_result, write_result
 
@@ -112,35 +106,30 @@ def _train(task: Task, run: RunFolder, device: torch.device) -> None:
     import torch
 
     from coliags_plugin.engine.checkpoints import keep_newest, take_newest
-    from coliags_plugin.engine.data_formats import load_method_for, load_scene
-    from coliags_plugin.engine.evaluator import check_evaluable
-    from coliags_plugin.engine.resuming import resumed_method
-    from coliags_plugin.engine.scoring import Scorer
-    from coliags_plugin.engine.trainer import Trainer
+    from coliags_plugin.engine.training import TrainingRequest, open_training
 
-    data, begun = Path(task.data), run.config_file.is_file()
-    threads = int(run.provenance().get("threads", task.threads)) if begun else task.threads
+    threads = task.threads
+    if run.config_file.is_file():
+        saved = take_newest(run.checkpoints, task.name, torch.device("cpu"))
+        if saved is not None and saved.step == run.method().config.schedule.steps:
+            log.info("trained: %d steps", saved.step)
+            return
+        threads = int(run.provenance().get("threads", threads))
     torch.set_num_threads(threads)
     cv2.setNumThreads(threads)
-    if begun:
-        method = resumed_method(run, task.name, data)
-        saved = take_newest(run.checkpoints, task.name, torch.device("cpu"))
-        step = 0 if saved is None else saved.step
-        if step == method.config.schedule.steps:
-            log.info("trained: %d steps", step)
-            return
-    else:
-        loaded = load_method_for(data, task.method, task.overrides, task.data_format)
-        method, step = replace(loaded, name=task.name), 0
-    scene = replace(load_scene(method.config, data), name=task.scene)
-    trainer = Trainer(method, scene, task.data, run, task.seed, device)
-    check_evaluable(trainer.model, scene, Scorer(task.protocol))
-    if begun:
-        trainer.resume()
-    else:
-        trainer.start()
-    log.info("training from step %d of %d on %d threads", step, trainer.steps, threads)
-    trainer.train(task.save_seconds, _KEPT)
+    request = TrainingRequest(
+        task.method,
+        Path(task.data),
+        task.overrides,
+        task.seed,
+        task.data_format,
+        method_name=task.name,
+        scene_name=task.scene,
+        protocol=task.protocol,
+    )
+    with open_training(request, run, device, "continue", owned=True) as trainer:
+        log.info("training from step %d of %d on %d threads", trainer.step, trainer.steps, threads)
+        trainer.train(task.save_seconds, _KEPT)
     keep_newest(run.checkpoints, 1)
 
 

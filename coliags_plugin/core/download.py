@@ -15,7 +15,7 @@ from coliags_plugin._version import __version__
 from coliags_plugin.core.checksums import file_sha256
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import make_folder, not_writable
-from coliags_plugin.core.locks import LockedError, locked
+from coliags_plugin.core.locks import locked
 from coliags_plugin.core.progress import Progress
 
 if TYPE_CHECKING:
@@ -47,15 +47,13 @@ def download(url: str, target: Path, sha256: str, progress: Progress, otherwise:
     make_folder(target.parent)
     part, lock = (target.with_name(f"{target.name}.{suffix}") for suffix in ("part", "lock"))
     try:
-        with locked(lock):
+        with locked(lock, part):
             try:
                 if not target.exists():
                     _fetch(url, part, sha256, progress, otherwise)
                     os.replace(part, target)
             finally:
                 lock.unlink()
-    except LockedError as error:
-        raise InputError(f"{part} is being written by {error}", "", "Wait until that is done") from error
     except OSError as error:
         raise not_writable(part.parent, error) from error
 

@@ -2,64 +2,72 @@
 
 from __future__ import annotations
 
-import fcntl
+import logging
+import math
 import os
 import platform
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 
+from filelock import FileLock, Timeout
+
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import make_folder, not_writable
 
+log = logging.getLogger(__name__)
+
 #: Between two attempts, seconds.
-_PAUSE = 0.2
+_POLL_INTERVAL_S = 0.2
 
 
-class LockedError(Exception):
+class LockedError(InputError):
     """Another process holds a lock; the message names it."""
 
 
 @contextmanager
-def locked(file: Path, wait: float = 0.0, waiting: Callable[[str], None] | None = None) -> Iterator[None]:
+def locked(file: Path, what: str | Path, wait: float = 0.0) -> Iterator[None]:
     """Hold the lock of a file, which ends with the process, however that ends. The file stays.
 
     Args:
         file: Created where it is missing; holds the name of the process that has the lock.
-        wait: Seconds to wait for another process.
-        waiting: Called with the name of that process, once, before waiting.
+        what: What the lock protects, for messages.
+        wait: Seconds to wait for another process; infinity: without end.
 
     Raises:
         LockedError: Another process still holds it.
         InputError: The file cannot be written.
     """
     make_folder(file.parent)
+    lock = FileLock(file, poll_interval=_POLL_INTERVAL_S)
     try:
-        handle = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            if wait <= 0.0:
+                raise
+            log.info("waiting for %s, which has %s", _holder(file), what)
+            lock.acquire(timeout=-1 if math.isinf(wait) else wait)
+    except Timeout as error:
+        raise LockedError(
+            f"{what} is in use by {_holder(file)}",
+            "one process at a time",
+            "Wait until it has ended, or choose another output",
+        ) from error
     except OSError as error:
         raise not_writable(file.parent, error) from error
     try:
-        _acquire(handle, wait, waiting)
         began = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
-        holder = f"process {os.getpid()} on {platform.node()} since {began}".encode()
-        os.ftruncate(handle, os.pwrite(handle, holder, 0))
+        with suppress(OSError):  # a full disk; on Windows a locked file
+            file.write_text(f"process {os.getpid()} on {platform.node()} since {began}", encoding="utf-8")
         yield
     finally:
-        os.close(handle)
+        lock.release()
 
 
-def _acquire(handle: int, wait: float, waiting: Callable[[str], None] | None) -> None:
-    until, told = time.monotonic() + wait, False
-    while True:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return
-        except BlockingIOError as error:
-            holder = os.pread(handle, 200, 0).decode(errors="replace") or "another process"
-            if time.monotonic() >= until:
-                raise LockedError(holder) from error
-        if waiting is not None and not told:
-            waiting(holder)
-            told = True
-        time.sleep(_PAUSE)
+def _holder(file: Path) -> str:
+    """The process that has a lock, as its file says."""
+    with suppress(OSError):
+        return file.read_text(encoding="utf-8", errors="replace") or "another process"
+    return "another process"

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ctypes
 import errno
-import fcntl
 import logging
 import os
 import re
@@ -19,6 +18,8 @@ from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
+
+from filelock import lock_descriptor
 
 logger = logging.getLogger(__name__)
 
@@ -84,7 +85,7 @@ def _name(target: Path, suffix: str) -> Path:
 def _lock(handle: int, path: Path) -> bool:
     """Lock a new scratch; False where another process took it for a dead one's and removed it before that."""
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
+        lock_descriptor(handle)
     except OSError:
         return True  # no locks on this file system: nothing is ever swept there either
     try:
@@ -114,8 +115,7 @@ def _is_abandoned(path: Path) -> bool:
     except OSError:
         return False
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        return True
+        return lock_descriptor(handle, blocking=False)
     except OSError:
         return False
     finally:

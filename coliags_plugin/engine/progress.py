@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -9,8 +10,9 @@ from contextlib import ExitStack, contextmanager
 from types import TracebackType
 
 from rich.console import Console
+from rich.logging import RichHandler
 
-from coliags_plugin.engine.progress_displays import Display, open_display
+from coliags_plugin.engine.progress_displays import PLAIN_LINE_EVERY, Display, open_display
 
 
 class ProgressReport:
@@ -22,15 +24,25 @@ class ProgressReport:
         title: What is being done.
         total: Where the count ends.
         start: Where it begins.
+        plain_every: Between lines where there is neither a terminal nor a notebook, seconds.
+        console: Where to; None: standard error.
     """
 
-    def __init__(self, title: str, total: int, start: int = 0) -> None:
+    def __init__(
+        self,
+        title: str,
+        total: int,
+        start: int = 0,
+        plain_every: float = PLAIN_LINE_EVERY,
+        console: Console | None = None,
+    ) -> None:
         self.title = title
-        self._total, self._start = total, start
+        self._total, self._start, self._plain_every, self._console = total, start, plain_every, console
         self._display: Display | None = None
 
     def __enter__(self) -> ProgressReport:
-        self._display = open_display(Console(file=sys.stderr), self.title, self._total, self._start)
+        console = self._console or Console(file=sys.stderr)
+        self._display = open_display(console, self.title, self._total, self._start, self._plain_every)
         return self
 
     def update(self, done: int, facts: str = "") -> None:
@@ -67,3 +79,9 @@ def progress_callback(after: float = 0.0) -> Iterator[Callable[[str, int, int], 
             current[-1].update(done)
 
         yield report
+
+
+def log_console() -> Console | None:
+    """The console that messages go to, so that they appear above a bar; None where they go elsewhere."""
+    handlers = logging.getLogger().handlers
+    return next((handler.console for handler in handlers if isinstance(handler, RichHandler)), None)

@@ -25,7 +25,9 @@ class Display(Protocol):
         """Leave what was shown last."""
 
 
-def open_display(console: Console, title: str, total: int, start: int) -> Display:
+def open_display(
+    console: Console, title: str, total: int, start: int, plain_every: float = PLAIN_LINE_EVERY
+) -> Display:
     """The display that fits where the console writes to.
 
     Args:
@@ -33,11 +35,12 @@ def open_display(console: Console, title: str, total: int, start: int) -> Displa
         title: What is being done.
         total: Where the count ends.
         start: Where it begins.
+        plain_every: Between plain lines, seconds.
     """
     if console.is_terminal:
         return TerminalBar(console, title, total, start)
     counted = Counted(title, total, start)
-    return NotebookLine(counted) if console.is_jupyter else PlainLines(console, counted)
+    return NotebookLine(counted) if console.is_jupyter else PlainLines(console, counted, plain_every)
 
 
 class TerminalBar:
@@ -87,16 +90,16 @@ class Counted:
 
 
 class PlainLines:
-    """A line every ten seconds, and one at the end."""
+    """A line every so many seconds, and one at the end."""
 
-    def __init__(self, console: Console, counted: Counted) -> None:
-        self._console, self._counted = console, counted
+    def __init__(self, console: Console, counted: Counted, every: float) -> None:
+        self._console, self._counted, self._every = console, counted, every
         self._last = counted.began
 
     def update(self, done: int, facts: str) -> None:
         """See :class:`Display`."""
         now = time.monotonic()
-        if now - self._last >= PLAIN_LINE_EVERY or done == self._counted.total:
+        if now - self._last >= self._every or done == self._counted.total:
             self._last = now
             self._console.print(self._counted.text(done, facts), highlight=False)
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import os
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -16,10 +17,12 @@ from coliags_plugin.config.method_config import LoadedMethod, load_method
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, atomic_write, not_writable, write_json
 from coliags_plugin.core.json_files import parse_json, read_json
-from coliags_plugin.core.locks import LockedError, locked
+from coliags_plugin.core.locks import locked
 from coliags_plugin.results.record import TRUTH_SUFFIX
 
 FORMAT = 1
+#: Of the end of a training log, more than a row has.
+_TAIL_BYTES = 8192
 
 
 @dataclass(frozen=True)
@@ -74,22 +77,9 @@ class RunFolder:
         """File beside the folder, whose lock the process has that trains the run."""
         return self.path.with_name(f".{self.path.name}.lock")
 
-    @contextmanager
-    def owned(self) -> Iterator[None]:
-        """Keep other processes from training this run; the lock ends with the process, however that ends.
-
-        Raises:
-            InputError: Another process trains it, or the parent folder cannot be written.
-        """
-        try:
-            with locked(self.lock_file):
-                yield
-        except LockedError as error:
-            raise InputError(
-                f"{self.path} is being trained by {error}",
-                "one process per run",
-                "Wait for it, or choose another --output",
-            ) from error
+    def owned(self, wait: float = 0.0) -> AbstractContextManager[None]:
+        """Keep other processes from training this run; see :func:`coliags_plugin.core.locks.locked`."""
+        return locked(self.lock_file, self.path, wait)
 
     @property
     def evaluations(self) -> Path:
@@ -233,6 +223,12 @@ class RunFolder:
             with suppress(OSError):  # of what could not be flushed, which was reported
                 file.close()
 
+    @property
+    def logged_step(self) -> int:
+        """Step of the last whole row of the training log; 0 without one. Reads the end of the file alone."""
+        rows = filter(None, map(_log_row, reversed(_last_lines(self.log_file))))
+        return int(next(rows, {"step": 0})["step"])
+
     def log_rows(self, until: float = math.inf) -> list[dict[str, Any]]:
         """Rows of the training log up to a step, without lines that a kill cut short; none without a log.
 
@@ -246,6 +242,16 @@ class RunFolder:
             return []
         except (OSError, ValueError) as error:
             raise InputError(f"cannot read {self.log_file}: {error}", "what `coliags train` wrote") from error
+
+
+def _last_lines(file: Path) -> list[str]:
+    """The last lines of a file; none where it cannot be read."""
+    try:
+        with file.open("rb") as log:
+            log.seek(max(0, log.seek(0, os.SEEK_END) - _TAIL_BYTES))
+            return log.read().decode(errors="replace").splitlines()
+    except OSError:
+        return []
 
 
 def checkpoints_in_order(folder: Path) -> list[Path]:

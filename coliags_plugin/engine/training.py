@@ -1,23 +1,28 @@
-"""Training of a method on a scene, from the start or resumed."""
+"""Training of a method on a scene: the one place that decides whether a run begins, goes on or is refused."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import torch
 
-from coliags_plugin.config.method_config import LoadedMethod
 from coliags_plugin.core.anonymity import without_places
 from coliags_plugin.engine.data_formats import load_method_for, load_scene
+from coliags_plugin.engine.evaluator import check_evaluable
 from coliags_plugin.engine.resuming import resumed_method, resumed_seed
 from coliags_plugin.engine.run_folder import RunFolder
+from coliags_plugin.engine.scoring import Scorer
 from coliags_plugin.engine.trainer import Trainer
 
 log = logging.getLogger(__name__)
+
+#: What becomes of a run folder that is there; see :func:`open_training`.
+IfExists = Literal["refuse", "overwrite", "resume", "continue"]
 
 
 @dataclass(frozen=True)
@@ -31,6 +36,9 @@ class TrainingRequest:
         seed: Of all random generators; None: 0, or that of the resumed run.
         data_format: Name of a data manager; None: the method's, or the one that recognises the folder.
         anonymous: Keep absolute paths out of the run, so that ``--data`` has to name the scene afterwards.
+        method_name: Name of the method in the run; None: its own.
+        scene_name: Name of the scene in the run; None: its own.
+        protocol: Evaluation protocol that has to fit the run; None: not checked.
     """
 
     method: str
@@ -39,59 +47,66 @@ class TrainingRequest:
     seed: int | None = None
     data_format: str | None = None
     anonymous: bool = False
+    method_name: str | None = None
+    scene_name: str | None = None
+    protocol: str | None = None
 
 
 @contextmanager
-def start_training(
-    request: TrainingRequest, folder: RunFolder, device: torch.device, overwrite: bool = False
+def open_training(
+    request: TrainingRequest,
+    folder: RunFolder,
+    device: torch.device,
+    if_exists: IfExists = "refuse",
+    owned: bool = False,
 ) -> Iterator[Trainer]:
-    """Make a run folder and what trains in it; no other process can train it until the block ends.
+    """What trains a run, from its newest whole checkpoint or from the start, after everything has been checked.
+
+    ============  ====================  ============================================
+    ``if_exists`` no or an empty folder a run
+    ============  ====================  ============================================
+    ``refuse``    begins                is refused
+    ``overwrite`` begins                is replaced
+    ``resume``    is refused            goes on, with the overrides on its own config
+    ``continue``  begins                goes on as it was begun
+    ============  ====================  ============================================
+
+    Any other folder is refused. No other process can train the run until the block ends.
 
     Args:
         request: What to train.
-        folder: The run folder to make.
-        device: Where to compute.
-        overwrite: Replace an existing run folder.
-
-    Raises:
-        InputError: Method, data or options are invalid or do not fit each other, or the folder exists or is another
-            process's; nothing was written.
-    """
-    folder.check_free(overwrite)
-    loaded = load_method_for(request.data, request.method, request.overrides, request.data_format)
-    trainer = _trainer(loaded, request, folder, request.seed or 0, device)
-    with folder.owned():
-        trainer.start(overwrite)
-        yield trainer
-
-
-@contextmanager
-def resume_training(request: TrainingRequest, folder: RunFolder, device: torch.device) -> Iterator[Trainer]:
-    """What trains on in a run folder, from its newest whole checkpoint; no other process can until the block ends.
-
-    Args:
-        request: What is trained; overrides are applied to the run's own config.
         folder: The run.
         device: Where to compute.
+        if_exists: See above.
+        owned: Whether the caller holds the run's lock.
 
     Raises:
-        InputError: There is no run, it is another process's, or of another method, seed, other settings or data.
+        InputError: See above; method, data or options are invalid or do not fit each other or the run; or another
+            process trains it. Nothing was written.
     """
-    folder = RunFolder.existing(folder.path)
-    loaded = resumed_method(folder, request.method, request.data, request.overrides, request.data_format)
-    trainer = _trainer(loaded, request, folder, resumed_seed(folder, request.seed), device)
-    with folder.owned():
-        trainer.resume()
-        yield trainer
-
-
-def _trainer(
-    loaded: LoadedMethod, request: TrainingRequest, folder: RunFolder, seed: int, device: torch.device
-) -> Trainer:
-    data = request.data
-    scene, path = load_scene(loaded.config, data), str(data.resolve())
+    resumes = if_exists == "resume" or (if_exists == "continue" and folder.config_file.is_file())
+    if resumes:
+        folder = RunFolder.existing(folder.path)
+        overrides, data_format = ((), None) if if_exists == "continue" else (request.overrides, request.data_format)
+        name = request.method_name or request.method
+        method = resumed_method(folder, name, request.data, overrides, data_format)
+        seed = resumed_seed(folder, request.seed)
+    else:
+        folder.check_free(if_exists == "overwrite")
+        method = load_method_for(request.data, request.method, request.overrides, request.data_format)
+        method, seed = replace(method, name=request.method_name or method.name), request.seed or 0
+    scene, path = load_scene(method.config, request.data), str(request.data.resolve())
+    if request.scene_name is not None:
+        scene = replace(scene, name=request.scene_name)
     if request.anonymous:
         scene, path = replace(scene, provenance=without_places(scene.provenance)), scene.name
-    trainer = Trainer(loaded, scene, path, folder, seed, device)
+    trainer = Trainer(method, scene, path, folder, seed, device)
+    if request.protocol is not None:
+        check_evaluable(trainer.model, scene, Scorer(request.protocol))
     log.info("renderer %s: %s", trainer.chosen.name, trainer.chosen.reason)
-    return trainer
+    with nullcontext() if owned else folder.owned():
+        if resumes:
+            trainer.resume()
+        else:
+            trainer.start(if_exists == "overwrite")
+        yield trainer

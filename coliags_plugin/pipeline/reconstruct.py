@@ -12,7 +12,7 @@ import torch
 
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.locks import LockedError, locked
+from coliags_plugin.core.locks import locked
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.datamanagers.recognition import find_format, recognised
 from coliags_plugin.pipeline import filmed, trained
@@ -70,14 +70,11 @@ def reconstruct(
     Record.of(out)  # refuses another folder before anything is written
     place = Workplace(out, source, settings, mask, data_format, device, progress, anonymous)
     stages = stages_of(place)
-    try:
-        with locked(out / LOCK_FILE):
-            record = Record.of(out)
-            record.write()  # so that the folder is known for one from now on, whatever happens in the first stage
-            run_stages(stages, record, overwrite)
-            write_index(record, f"Reconstruction of {source.resolve().name}")
-    except LockedError as error:
-        raise InputError(f"{out} is in use by {error}", "one reconstruction at a time", "Wait for it") from error
+    with locked(out / LOCK_FILE, out):
+        record = Record.of(out)
+        record.write()  # so that the folder is known for one from now on, whatever happens in the first stage
+        run_stages(stages, record, overwrite)
+        write_index(record, f"Reconstruction of {source.resolve().name}")
     return record
 
 

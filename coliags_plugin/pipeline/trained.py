@@ -29,7 +29,7 @@ def train(place: Workplace) -> Outcome:
         InterruptedRunError: Ctrl-C, after the state was saved.
     """
     from coliags_plugin.engine.run_folder import RunFolder
-    from coliags_plugin.engine.training import TrainingRequest, resume_training, start_training
+    from coliags_plugin.engine.training import TrainingRequest, open_training
     from coliags_plugin.reconstruction.depth.scene import training_options
 
     settings = place.settings
@@ -38,8 +38,7 @@ def train(place: Workplace) -> Outcome:
     data_format = None if place.estimates_depth else place.data_format
     request = TrainingRequest(method_for(place), place.scene, options, settings.seed, data_format, place.anonymous)
     folder = RunFolder(place.run)
-    begun = folder.config_file.is_file()
-    with (resume_training if begun else start_training)(request, folder, place.device) as trainer:
+    with open_training(request, folder, place.device, "continue") as trainer:
         try:
             trainer.train(_SAVE_SECONDS, _KEPT)
         except InterruptedRunError as error:

@@ -6,10 +6,13 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from coliags_plugin.comparison.compare import How, carry_out, make_request
+import pytest
+
+from coliags_plugin.comparison import compare
+from coliags_plugin.comparison.compare import ExecutionOptions, carry_out, make_request
 from coliags_plugin.comparison.executors import Executor
 from coliags_plugin.comparison.folder import ComparisonFolder
-from coliags_plugin.comparison.tasks import Outcome, Task
+from coliags_plugin.comparison.tasks import Task, TaskOutcome
 from coliags_plugin.comparison.worker import work
 
 #: Overrides that make the anchor methods small, whose steps then take some milliseconds.
@@ -36,23 +39,24 @@ class InlineExecutor(Executor):
         self.tasks.append(task)
         self._next.append(task)
 
-    def wait(self, seconds: float) -> list[tuple[Task, Outcome]]:
+    def wait(self, seconds: float) -> list[tuple[Task, TaskOutcome]]:
         ended = [(task, self.outcome(task)) for task in self._next]
         self._next.clear()
         return ended
 
-    def outcome(self, task: Task) -> Outcome:
+    def outcome(self, task: Task) -> TaskOutcome:
         return work(task)
 
     def stop(self) -> None:
         self._next.clear()
 
 
-def compare_inline(methods, scenes, output, executor=None, *, steps=3, overrides=TINY, seeds=1, splits=(), **how):
-    """``compare`` in this process."""
-    request = make_request(methods, scenes, how.pop("data", None), seeds, "paper", splits, steps, overrides)
-    executor = executor or InlineExecutor()
-    return carry_out(request, ComparisonFolder(Path(output)), executor, How(device="cpu", **how))
+def compare_inline(methods, scenes, output, executor=None, *, steps=3, overrides=TINY, seeds=1, splits=()):
+    """A comparison in this process."""
+    request = make_request(methods, scenes, None, seeds, "paper", splits, steps, overrides)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compare, "make_executor", lambda options: executor or InlineExecutor())
+        return carry_out(request, ComparisonFolder(Path(output)), ExecutionOptions(device="cpu"))
 
 
 def hashes(folder: Path) -> dict[str, str]:

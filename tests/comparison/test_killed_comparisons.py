@@ -12,8 +12,9 @@ import time
 import pytest
 import torch
 
-from coliags_plugin.comparison.compare import How, compare
-from coliags_plugin.comparison.states import steps_saved
+import coliags_plugin as cp
+from coliags_plugin.config.assignments import parse_assignments
+from coliags_plugin.engine.run_folder import RunFolder
 from tests.comparison.small import TINY, compare_inline, hashes, trainings
 from tests.scenes import write_wall
 
@@ -65,7 +66,7 @@ def step_of(run):
 def process_of(folder, method):
     """The worker that has the run of a method."""
     (lock,) = folder.glob(f"runs/wall/{method}/.*.lock")
-    return int(lock.read_text(encoding="utf-8").split()[1])
+    return int(until("name in the lock", lambda: lock.read_text(encoding="utf-8")).split()[1])
 
 
 def run_of(folder, method):
@@ -93,7 +94,7 @@ def test_a_comparison_that_is_asked_to_stop_saves_its_runs(wall, undisturbed, tm
     assert first.returncode == 130
     assert "stopped with 0 of 2 cells done; the same command goes on where it stopped" in told
     runs = sorted(folder.glob("runs/wall/*/s0-*"))
-    saved = {run.relative_to(folder / "runs").as_posix(): steps_saved(run) for run in runs}
+    saved = {run.relative_to(folder / "runs").as_posix(): RunFolder(run).step for run in runs}
     assert list(saved.values()) == list(map(step_of, runs)), "the last step that was taken is saved"
     last = driver(wall, folder)
     last.communicate()
@@ -114,8 +115,8 @@ def test_killed_worker_and_killed_driver(wall, undisturbed, tmp_path):
     assert "SIGKILL" in told and "trying again" in told
     until("end of the workers", lambda: not any(map(alive, workers)))
 
-    done = compare(METHODS, [wall], folder, steps=STEPS, overrides=OFTEN, how=How(jobs=2, threads=1, device="cpu"))
-    assert not done.failures
+    options = {"steps": STEPS, "settings": parse_assignments(OFTEN), "jobs": 2, "threads": 1, "device": "cpu"}
+    assert not cp.compare(METHODS, wall, folder, **options).failures
     assert hashes(folder) == undisturbed
     for run, begun in trainings(folder).items():
         log = [json.loads(line)["step"] for line in (folder / "runs" / run / "metrics.jsonl").read_text().splitlines()]
@@ -124,5 +125,5 @@ def test_killed_worker_and_killed_driver(wall, undisturbed, tmp_path):
     assert any(len(begun) > 1 for begun in trainings(folder).values())
 
     before = trainings(folder)
-    compare(METHODS, [wall], folder, steps=STEPS, overrides=OFTEN, how=How(jobs=2, threads=1, device="cpu"))
+    cp.compare(METHODS, wall, folder, **options)
     assert trainings(folder) == before, "what is done is not run again"

@@ -63,13 +63,13 @@ def test_a_method_under_another_name_has_the_same_key(wall):
         wall, ["coliags", Variant("whole", "ablations/depth-imve-imia"), Variant("no-lamp", "ablations/depth-imve")]
     )
     assert ours.keys == same.keys and ours.keys != other.keys
-    assert ours.run_place != same.run_place
+    assert ours.run_path != same.run_path
 
 
 def test_places_are_made_of_scene_method_seed_and_key(wall):
     (cell,) = cells(wall, ["ablations/depth"])
-    assert str(cell.run_place) == f"wall/ablations-depth/s0-{cell.keys.training[:8]}"
-    assert str(cell.result_place) == f"wall/ablations-depth/s0-{cell.keys.result[:8]}"
+    assert str(cell.run_path) == f"wall/ablations-depth/s0-{cell.keys.training[:8]}"
+    assert str(cell.result_path) == f"wall/ablations-depth/s0-{cell.keys.result[:8]}"
     assert file_name("ablations/depth") == "ablations-depth"
 
 

@@ -17,8 +17,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from coliags_plugin.comparison.compare import How, compare
+import coliags_plugin as cp
 from coliags_plugin.comparison.ray_executor import RayExecutor
+from coliags_plugin.config.assignments import parse_assignments
 from coliags_plugin.core.errors import InputError
 from tests.commands import refused
 from tests.comparison.small import TINY, compare_inline, hashes, trainings
@@ -188,8 +189,9 @@ def test_a_sweep_that_nobody_disturbs_and_one_that_is_asked_to_stop(cluster, wal
     until("run", lambda: under_way(folder))
     os.kill(first.pid, signal.SIGINT)
     assert first.wait() == 130 and "the same command goes on" in told_by(folder)
-    how = How(threads=1, device="cpu", executor="ray", ray_address=made.address)
-    done = compare(METHODS, [wall], folder, steps=STEPS, overrides=OFTEN, how=how)
+    settings = parse_assignments(OFTEN)
+    options = {"threads": 1, "device": "cpu", "executor": "ray", "ray_address": made.address}
+    done = cp.compare(METHODS, wall, folder, steps=STEPS, settings=settings, **options)
     assert not done.failures
     check(folder, undisturbed)
 
@@ -201,8 +203,9 @@ def test_tries_are_counted_when_memory_runs_out(monkeypatch, request, wall, tmp_
     monkeypatch.setenv("RAY_memory_monitor_refresh_ms", "100")
     monkeypatch.setattr(RayExecutor, "check", lambda *_: None)  # whose tasks would end likewise
     made, _ = request.getfixturevalue("cluster")
-    how = How(threads=1, device="cpu", executor="ray", ray_address=made.address, retries=1)
-    done = compare(["coliags"], [wall], tmp_path / "full", steps=100_000, overrides=TINY, how=how)
+    settings = parse_assignments(TINY)
+    options = {"threads": 1, "device": "cpu", "executor": "ray", "ray_address": made.address, "retries": 1}
+    done = cp.compare("coliags", wall, tmp_path / "full", steps=100_000, settings=settings, **options)
     (failure,) = done.failures
     assert (failure.reason, failure.attempts) == ("the node's memory ran out, 2 times", 2)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
 import sys
 import time
 from dataclasses import replace
@@ -13,14 +12,14 @@ from pathlib import Path
 import pytest
 
 from coliags_plugin.comparison.executors import LocalExecutor
-from coliags_plugin.comparison.tasks import Outcome, Task, outcome_line, read_outcome
+from coliags_plugin.comparison.tasks import Task, TaskOutcome, outcome_line, read_outcome
 from coliags_plugin.comparison.worker import work
-from coliags_plugin.core.locks import LockedError, locked
+from coliags_plugin.engine.run_folder import RunFolder
 
 
 @pytest.fixture
 def task(tmp_path):
-    places = {name: str(tmp_path / name) for name in ("data", "run", "lock", "result", "log")}
+    places = {name: str(tmp_path / name) for name in ("data", "run", "result", "log")}
     return Task(
         title="wall coliags seed 0",
         name="coliags",
@@ -50,7 +49,9 @@ def test_the_environment_names_threads_package_and_variables(task):
     assert second == "mine" and os.path.isdir(os.path.join(first, "coliags_plugin"))
 
 
-@pytest.mark.parametrize("outcome", [Outcome("done"), Outcome("failed", 'no "depth"\nat all'), Outcome("stopped", "x")])
+@pytest.mark.parametrize(
+    "outcome", [TaskOutcome("done"), TaskOutcome("failed", 'no "depth"\nat all'), TaskOutcome("stopped", "x")]
+)
 def test_an_outcome_is_read_from_the_last_line(outcome):
     assert read_outcome(1, f"noise\n{outcome_line(outcome)}\n") == outcome
 
@@ -65,7 +66,7 @@ def test_an_outcome_is_read_from_the_last_line(outcome):
     ],
 )
 def test_a_process_that_says_nothing_has_died(returncode, printed, reason):
-    assert read_outcome(returncode, printed) == Outcome("died", reason)
+    assert read_outcome(returncode, printed) == TaskOutcome("died", reason)
 
 
 def test_a_scene_that_is_gone_is_the_reason(task):
@@ -74,27 +75,11 @@ def test_a_scene_that_is_gone_is_the_reason(task):
 
 
 def test_a_run_that_another_process_has_is_left_alone(task):
-    with locked(Path(task.lock)):
+    with RunFolder(Path(task.run)).owned():
         outcome = work(replace(task, lock_seconds=0.3))
     assert outcome.ending == "failed"
-    owner = f"{task.run} is still in use by process {os.getpid()} on {os.uname().nodename} since 20"
+    owner = f"{task.run} is in use by process {os.getpid()} on {os.uname().nodename} since 20"
     assert outcome.reason.startswith(owner)
-
-
-def test_locks_end_with_their_process(tmp_path):
-    file = tmp_path / "deep" / "lock"
-    code = "import sys, time\nfrom pathlib import Path\nfrom coliags_plugin.core.locks import locked\n"
-    code += "with locked(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)\n"
-    with subprocess.Popen([sys.executable, "-c", code, str(file)], stdout=subprocess.PIPE, text=True) as holder:
-        assert holder.stdout.readline() == "held\n"
-        told = []
-        with pytest.raises(LockedError, match=f"process {holder.pid} on"), locked(file, 0.3, told.append):
-            pass
-        (named,) = told
-        assert named.startswith(f"process {holder.pid} on {os.uname().nodename} since 20")
-        holder.kill()
-    with locked(file, wait=5.0):
-        assert str(os.getpid()) in file.read_text()
 
 
 class Sleeper(Task):

@@ -308,7 +308,7 @@ def test_a_second_process_is_refused(server, target):
     first = threading.Thread(target=fetch, args=(server, target, DIGEST, lambda *_: arrived.set()))
     first.start()
     assert arrived.wait(10)
-    assert f"net.pth.part is being written by process {os.getpid()}" in refusal(server, target)
+    assert f"net.pth.part is in use by process {os.getpid()}" in refusal(server, target)
     server.go_on.set()
     first.join()
     assert target.read_bytes() == DATA

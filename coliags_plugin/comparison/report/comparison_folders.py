@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
+from coliags_plugin.comparison.plan_file import FAILURES, PLAN_FILE, RESULTS, RUNS, PlannedCell, read_plan
 from coliags_plugin.comparison.report.study import Cell, Failure
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import json_text, parse_json, read_json
 from coliags_plugin.results.reading import RESULT_FILE, read_result
 
-_PLAN, _RESULTS, _RUNS, _FAILURES = "plan.json", "results", "runs", "failures"
 #: Below results and failures: scene, method, and seed with key.
 _CELL = "*/*/s*-*.json"
 _SEED = re.compile(r"s(\d+)-")
@@ -29,7 +28,7 @@ class FoundResult:
 
 def is_comparison(folder: Path) -> bool:
     """Whether a folder is that of a comparison, or holds its results alone."""
-    return (folder / _PLAN).is_file() or (folder / _RESULTS).is_dir() or any(folder.glob(_CELL))
+    return (folder / PLAN_FILE).is_file() or (folder / RESULTS).is_dir() or any(folder.glob(_CELL))
 
 
 def read_comparison(folder: Path, protocol: str) -> tuple[list[FoundResult], list[Failure]]:
@@ -38,10 +37,11 @@ def read_comparison(folder: Path, protocol: str) -> tuple[list[FoundResult], lis
     Raises:
         InputError: A file is damaged, or there are results of other protocols only.
     """
-    if (folder / _PLAN).is_file():
-        return _planned(folder, protocol)
-    if (folder / _RESULTS).is_dir():
-        return _unplanned(folder / _RESULTS, folder / _RUNS, protocol), list(_failures(folder))
+    plan = read_plan(folder)
+    if plan is not None:
+        return _planned(folder, plan.cells, protocol)
+    if (folder / RESULTS).is_dir():
+        return _unplanned(folder / RESULTS, folder / RUNS, protocol), list(_failures(folder))
     return _unplanned(folder, None, protocol), []
 
 
@@ -51,31 +51,24 @@ def read_file(file: Path, stamp: str, run: Path | None = None) -> FoundResult:
     return FoundResult(file, Cell(result.method, result, stamp, run))
 
 
-def _planned(folder: Path, protocol: str) -> tuple[list[FoundResult], list[Failure]]:
-    plan = _read_json(folder / _PLAN, "what `coliags compare` wrote")
+def _planned(folder: Path, cells: Sequence[PlannedCell], protocol: str) -> tuple[list[FoundResult], list[Failure]]:
     found, failures = [], []
-    protocols: set[str] = set()
     runs: dict[str, Path] = {}  # by key: what is the same as another method under a second name has no run of its own
-    for entry in plan.get("cells", []):
-        try:
-            scene, method, seed = entry["scene"], entry["method"], int(entry["seed"])
-            run, place = entry["run"], entry["result"]
-            protocols.add(entry["protocol"])
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(f"{folder / _PLAN}: a cell lacks {error}", "what `coliags compare` wrote") from error
-        if entry["protocol"] != protocol:
+    for entry in cells:
+        if entry.protocol != protocol:
             continue
-        file = folder / place
+        file = folder / entry.result
         if file.is_file():
             one = read_file(file, file.stem)
-            own = _with_images(folder / run, protocol)
+            own = _with_images(folder / entry.run, protocol)
             if own is not None:
                 runs[one.cell.result.key] = own
-            found.append(replace(one, cell=replace(one.cell, method=method, run=own)))
+            found.append(replace(one, cell=replace(one.cell, method=entry.method, run=own)))
         else:
-            failure = folder / _FAILURES / Path(place).relative_to(_RESULTS)
-            failures.append(Failure(scene, method, seed, _reason(failure) if failure.is_file() else None))
-    _refuse_other_protocols(folder, protocol, protocols)
+            failure = folder / FAILURES / Path(entry.result).relative_to(RESULTS)
+            reason = _reason(failure) if failure.is_file() else None
+            failures.append(Failure(entry.scene, entry.method, entry.seed, reason))
+    _refuse_other_protocols(folder, protocol, {entry.protocol for entry in cells})
     return [one if one.cell.run else _with_run(one, runs) for one in found], failures
 
 
@@ -128,19 +121,14 @@ def _with_images(run: Path, protocol: str) -> Path | None:
 
 def _failures(folder: Path) -> Iterator[Failure]:
     """Cells that failed and have no result."""
-    for file in sorted((folder / _FAILURES).glob(_CELL)):
-        place = file.relative_to(folder / _FAILURES)
+    for file in sorted((folder / FAILURES).glob(_CELL)):
+        place = file.relative_to(folder / FAILURES)
         seed = _SEED.match(file.name)
-        if seed is not None and not (folder / _RESULTS / place).is_file():
+        if seed is not None and not (folder / RESULTS / place).is_file():
             yield Failure(place.parts[0], place.parts[1], int(seed.group(1)), _reason(file))
 
 
 def _reason(file: Path) -> str:
-    return str(_read_json(file, "the reason of a failure").get("reason") or "no reason was recorded")
-
-
-def _read_json(file: Path, expected: str) -> dict[str, Any]:
-    content = read_json(file, expected)
-    if not isinstance(content, dict):
-        raise InputError(f"{file} holds a {type(content).__name__}", expected)
-    return content
+    record = read_json(file, "the reason of a failure")
+    reason = record.get("reason") if isinstance(record, dict) else None
+    return str(reason or "no reason was recorded")

@@ -14,9 +14,8 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write, make_folder, write_arrays, write_json
-from coliags_plugin.core.locks import LockedError, locked
+from coliags_plugin.core.locks import locked
 
 log = logging.getLogger(__name__)
 
@@ -89,26 +88,21 @@ def work_folder(out: Path, request: Mapping[str, Any]) -> Iterator[WorkFolder]:
     """
     path = out.parent / f".{out.name}.work"
     make_folder(path)
-    try:
-        with locked(path / "lock"):
-            file, wanted = path / _REQUEST, json.loads(json.dumps(dict(request)))
-            kept = json.loads(file.read_text()) if file.is_file() else None
-            if kept is not None and kept != wanted:
-                log.warning("%s: work files of other data or options are removed", path)
-            if kept != wanted:
-                for old in path.iterdir():
-                    if old.is_dir():
-                        shutil.rmtree(old)
-                    elif old.name != "lock":
-                        old.unlink()
-                write_json(file, wanted)
-            else:
-                log.info("resuming from the work files in %s", path)
-            yield WorkFolder(path)
-    except LockedError as error:
-        raise InputError(
-            f"{error} is writing {out}", "one process for each output", "Wait for it, or choose another"
-        ) from error
+    with locked(path / "lock", out):
+        file, wanted = path / _REQUEST, json.loads(json.dumps(dict(request)))
+        kept = json.loads(file.read_text()) if file.is_file() else None
+        if kept is not None and kept != wanted:
+            log.warning("%s: work files of other data or options are removed", path)
+        if kept != wanted:
+            for old in path.iterdir():
+                if old.is_dir():
+                    shutil.rmtree(old)
+                elif old.name != "lock":
+                    old.unlink()
+            write_json(file, wanted)
+        else:
+            log.info("resuming from the work files in %s", path)
+        yield WorkFolder(path)
     shutil.rmtree(path, ignore_errors=True)
 
 

@@ -123,7 +123,7 @@ def test_the_plan_gives_order_runs_and_what_is_not_finished(tmp_path):
         ("3dgs", 1, None),
     ]
     refuses([folder], "results of protocol paper only", protocol="authors-code")
-    damaged = {"{": "is not JSON", "[]": "holds a list", '{"cells": [{}]}': "a cell lacks 'scene'"}
+    damaged = {"{": "is not JSON", "[]": "valid dictionary", '{"cells": [{}]}': "cells.0.scene: Field required"}
     for content, match in damaged.items():
         (folder / "plan.json").write_text(content)
         refuses([folder], f"plan.json.*{match}")
