@@ -7,7 +7,7 @@ DEMO ?= demo
 DEMO_STEPS ?= 500
 DEMO_FLAGS := --data $(DEMO)/phantom --steps $(DEMO_STEPS) --overwrite
 
-.PHONY: demo test test-thorough test-slow lint docs options method-table notebooks matrix install install-dev system clean
+.PHONY: demo test test-thorough test-slow lint docs notebooks matrix install install-dev system clean
 
 demo: install
 	@echo "1/5  a synthetic colon with exact depth, poses and light ..."
@@ -44,14 +44,6 @@ lint: install-dev
 docs: install-dev $(VENV)/installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict --config-file docs/tools/mkdocs.yml
 	@echo "built build/site/index.html"
-
-# docs/options.md, from the settings classes.
-options: install-dev
-	$(BIN)/python docs/tools/options.py
-
-# docs/method_table.md, from the method configs.
-method-table: install-dev
-	$(BIN)/python docs/tools/methods.py
 
 # The outputs stored in docs/notebooks.
 notebooks: install-dev

@@ -8,6 +8,8 @@ import re
 import shlex
 import subprocess
 import sys
+import tarfile
+from functools import cache
 from pathlib import Path
 from runpy import run_path
 from typing import Any
@@ -31,16 +33,13 @@ from coliags_plugin.datamanagers.splits import held_out
 from coliags_plugin.engine.randomness import PURPOSES
 from coliags_plugin.phantom.settings import PRESETS, PhantomSettings
 from coliags_plugin.pipeline.settings import FrameSettings
+from coliags_plugin.results.finding import find_results
 from coliags_plugin.surface.coverage.settings import CoverageSettings
 from tests.scenes import SMALL, write_wall
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-#: Written by people; tables under docs/results are `coliags report`'s.
-PAGES = [
-    *(ROOT / "README.md", ROOT / "CONTRIBUTING.md"),
-    *(page for page in sorted(DOCS.rglob("*.md")) if DOCS / "results" not in page.parents),
-]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
 SOURCES = sorted(
     path
     for folder in ("coliags_plugin", "tests", "method_configs", "benchmarks", "docs")
@@ -88,7 +87,8 @@ def cited(text: str) -> list[tuple[str, list[str]]]:
     """Pages named in a text, each with the section numbers that follow it, over the ends of commented lines too."""
     text = re.sub(r"\s*\n\s*(?:#:?|\|)?\s*", " ", text)
     number = r"\d+(?:\.\d+)*(?!\w)"
-    pattern = rf"(?<![\w/-])((?:docs/)?(?:layouts/|rivals/)?[\w-]+\.md)(?:`*,? +({number}(?:(?:, | and ){number})*))?"
+    named = r"(?<![\w/-])((?:docs/)?(?:layouts/|rivals/|experiments/)?[\w-]+\.md)"
+    pattern = rf"{named}(?:`*,? +({number}(?:(?:, | and ){number})*))?"
     return [(page, re.findall(number, numbers or "")) for page, numbers in re.findall(pattern, text)]
 
 
@@ -103,7 +103,7 @@ def test_citations_lead_to_a_section(path):
 @pytest.mark.parametrize("path", PAGES, ids=name_of)
 def test_pages_cite_one_another_rightly(path):
     for page, numbers in cited(path.read_text()):
-        known = [ROOT / page, path.parent / page]
+        known = [ROOT / page, path.parent / page, DOCS / page]
         target = next((found for found in known if found.is_file()), None)
         assert target is not None, f"{page} is not there"
         assert set(numbers) <= sections(target), f"{page} has no section {', '.join(numbers)}"
@@ -363,20 +363,70 @@ def test_test_frames_of_the_sequences_are_counted_rightly():
         assert held_out("every-8th", frames).sum() == test
 
 
-def test_the_page_of_options_is_what_the_settings_say():
-    page = run_path(str(DOCS / "tools" / "options.py"))["page"]()
-    assert (DOCS / "options.md").read_text() == page, "make options"
+# Pages of the site that are generated
+
+METHODS = sorted(path.stem for path in (ROOT / "method_configs").glob("*.yaml"))
 
 
-def test_the_table_of_methods_is_what_the_configs_say():
-    page = run_path(str(DOCS / "tools" / "methods.py"))["page"]()
-    assert (DOCS / "method_table.md").read_text() == page, "make method-table"
+@cache
+def tool(name: str) -> dict[str, Any]:
+    """A program of docs/tools."""
+    return run_path(str(DOCS / "tools" / f"{name}.py"))
 
 
-@pytest.mark.parametrize("name", sorted(path.stem for path in (ROOT / "method_configs").glob("*.yaml")))
+@cache
+def generated(name: str) -> str:
+    """The page that a program of docs/tools makes."""
+    return tool(name)["page"]()
+
+
+@pytest.mark.parametrize("kind", REGISTRIES)
+def test_the_page_of_options_has_each_with_its_range_and_meaning(kind):
+    text = generated("options")
+    for name in REGISTRIES[kind]:
+        assert f"### {kind}: {name}\n" in text
+        settings = getattr(REGISTRIES[kind].get(name), "Settings", None)
+        for option, field in {} if settings is None else settings.model_fields.items():
+            rows = re.findall(rf"^\| `{option}` \| (.+) \| (.+) \| (.+) \|$", text, re.MULTILINE)
+            assert rows, f"{name}: {option} is not there"
+            assert any(told.startswith(tool("options")["type_text"](field).replace("|", "\\|")) for told, _, _ in rows)
+            for limit in field.metadata:
+                bounds = [f"{getattr(limit, side):g}" for side in ("ge", "le", "gt", "lt") if hasattr(limit, side)]
+                assert any(all(bound in told for bound in bounds) for told, _, _ in rows), f"{name}: range of {option}"
+
+
+def test_the_table_of_methods_has_every_method_and_constant():
+    text = generated("methods")
+    for name in METHODS:
+        assert f"\n### {name}\n" in text and f"| `{name}` | " in text
+        for path, _, source in tool("methods")["constants"](name):
+            assert f"`{path[-1]}` " in text and source in text
+
+
+@pytest.mark.parametrize("name", METHODS)
 def test_every_constant_has_a_source(name):
-    constants = run_path(str(DOCS / "tools" / "methods.py"))["constants"]
-    assert [".".join(path) for path, _, source in constants(name) if not source] == []
+    assert [".".join(path) for path, _, source in tool("methods")["constants"](name) if not source] == []
+
+
+@pytest.mark.parametrize("name", ["options", "methods"])
+def test_generated_pages_cite_rightly(name):
+    for page, numbers in cited(generated(name)):
+        target = ROOT / page if page.startswith("docs/") else DOCS / page
+        assert target.is_file() or page in ("options.md", "method_table.md"), page
+        assert not numbers or set(numbers) <= sections(target), f"{page} has no section {', '.join(numbers)}"
+
+
+# Tables of results
+
+
+def test_tables_of_results_are_those_of_the_archive(tmp_path):
+    with tarfile.open(DOCS / "results" / "comparisons.tar.xz") as archive:
+        archive.extractall(tmp_path, filter="data")
+    for folder in tmp_path.iterdir():
+        table = tool("results")["table"](find_results([folder / "results"]))
+        assert (DOCS / "results" / f"{folder.name}.csv").read_text() == table
+        cells = json.loads((folder / "plan.json").read_text())["cells"]
+        assert cells and all((folder / cell["result"]).is_file() for cell in cells)
 
 
 def test_protocols_page_names_every_protocol_metric_and_version():

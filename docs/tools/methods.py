@@ -1,14 +1,13 @@
-"""Writes docs/method_table.md: what every method optimises, its losses and strategy, and the source of each constant.
+"""The page *Methods at a glance* of the site: what every method optimises, and the source of each constant.
 
 Everything is read from the method configs: values from the resolved config, the source of a constant from the comment
-on its line or, without one, on the line of the key that it belongs to. ``python docs/tools/methods.py`` writes the
-page; with ``--check`` it only says whether the page is what it would write.
+on its line or, without one, on the line of the key that it belongs to. ``make docs`` builds the page;
+``python docs/tools/methods.py`` prints it.
 """
 
 from __future__ import annotations
 
 import io
-import sys
 from collections.abc import Iterator, Mapping
 from functools import cache
 from itertools import groupby
@@ -21,12 +20,10 @@ from coliags_plugin.config.method_config import MethodConfig, load_method
 from coliags_plugin.config.method_files import method_files
 from coliags_plugin.config.yaml_tree import Node, read_tree
 
-PAGE = Path(__file__).parents[1] / "method_table.md"
-
 HEAD = """\
 # Methods at a glance
 
-Generated from `method_configs/` by `make method-table`: do not edit this page. Formulas and differences from released
+Generated from `method_configs/`. Formulas and differences from released
 code are in [methods.md](methods.md) and in the pages on rivals; the meaning of options is in [options.md](options.md).
 Ablations (`method_configs/ablations/`) change one part of `coliags` each and are not listed.
 
@@ -139,8 +136,4 @@ def line_comments(path: Path) -> dict[int, str]:
 
 
 if __name__ == "__main__":
-    text = page()
-    if "--check" in sys.argv[1:]:
-        stale = not PAGE.is_file() or PAGE.read_text(encoding="utf-8") != text
-        sys.exit(f"{PAGE.name} is stale: make method-table" if stale else 0)
-    PAGE.write_text(text, encoding="utf-8")
+    print(page(), end="")

@@ -1,8 +1,8 @@
-"""Writes docs/options.md: every option of every component, from the settings classes themselves.
+"""The page *Options* of the site: every option of every component, from the settings classes themselves.
 
 Names, types, ranges and defaults are pydantic's; what an option means is its ``description``, the string below it, the
-comment behind it or the one above it, whichever the source has. ``python docs/tools/options.py`` writes the page;
-with ``--check`` it only says whether the page is what it would write.
+comment behind it or the one above it, whichever the source has. ``make docs`` builds the page;
+``python docs/tools/options.py`` prints it.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import inspect
 import io
 import json
 import re
-import sys
 import textwrap
 import tokenize
 import types
@@ -29,13 +28,11 @@ from coliags_plugin.config.method_config import MethodConfig, OptimizerSettings,
 from coliags_plugin.config.registry import REGISTRIES, Registry
 from coliags_plugin.core.settings import Settings
 
-PAGE = Path(__file__).parents[1] / "options.md"
-
 HEAD = """\
 # Options
 
-Every option there is, generated from the settings classes by `make options`: do not edit this page. How a method
-config is written and changed is in [configs.md](configs.md), where constants come from in [methods.md](methods.md).
+Every option there is, generated from the settings classes. How a method config is written and changed is in
+[configs.md](configs.md), where constants come from in [methods.md](methods.md).
 
 A component is `{name: ..., options...}`. Lengths are in scene units: mm, where the data are metric.
 """
@@ -124,7 +121,7 @@ def whole_text(found: type) -> str:
 def as_markdown(text: str) -> str:
     """Sphinx's roles as code, and pages of the documentation as links."""
     text = re.sub(r":\w+:`~?([^`]+)`", r"`\1`", text.replace("``", "`"))
-    return re.sub(r"`?docs/((?:layouts/|rivals/)?[\w-]+\.md)`?", r"[\1](\1)", text)
+    return re.sub(r"`?docs/((?:layouts/|rivals/|experiments/)?[\w-]+\.md)`?", r"[\1](\1)", text)
 
 
 def table(settings: type[Settings], own_only: bool = False) -> str:
@@ -256,8 +253,4 @@ def _string(node: ast.stmt | None) -> str:
 
 
 if __name__ == "__main__":
-    text = page()
-    if "--check" in sys.argv[1:]:
-        stale = not PAGE.is_file() or PAGE.read_text(encoding="utf-8") != text
-        sys.exit(f"{PAGE.name} is stale: make options" if stale else 0)
-    PAGE.write_text(text, encoding="utf-8")
+    print(page(), end="")

@@ -1,4 +1,4 @@
-"""Pages of the site that are not Markdown in docs/: those of the root, notebooks, and a reference of every module."""
+"""Pages of the site that are not Markdown in docs/: those of the root, notebooks, generated ones, and a reference."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import notebooks  # of this folder
+import methods  # this and the next two: of this folder
+import notebooks
+import options
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parents[2]
@@ -31,6 +33,8 @@ def on_files(files: Files, config: Any, **_: Any) -> Files:
     for page, name in FROM_ROOT.items():
         files.append(File.generated(config, page, content=for_site((ROOT / name).read_text(encoding="utf-8"))))
     files.append(File.generated(config, "site.css", content=STYLE))
+    files.append(File.generated(config, "options.md", content=options.page()))
+    files.append(File.generated(config, "method_table.md", content=methods.page()))
     for path in sorted(notebooks.NOTEBOOKS.glob("*.ipynb")):
         page = f"notebooks/{path.stem}.md"
         files.append(File.generated(config, page, content=notebooks.as_markdown(path)))

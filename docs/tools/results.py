@@ -1,0 +1,68 @@
+"""Packs finished comparisons as docs/results keeps them: a table of means for each, and all their cells in one archive.
+
+    python docs/tools/results.py COMPARISON ...
+
+takes folders of ``coliags compare``. The same folders give the same bytes. Cells without a result are left out.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import lzma
+import sys
+import tarfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from coliags_plugin.results.finding import find_results
+from coliags_plugin.results.record import Result
+
+FOLDER = Path(__file__).parents[1] / "results"
+ARCHIVE = FOLDER / "comparisons.tar.xz"
+#: Columns of a table in front of the metrics, and behind them.
+RUN = ("scene", "method", "split", "seed", "set", "frames")
+COST = ("gaussians", "processor_seconds", "peak_memory_mib", "key")
+
+
+def main(comparisons: Sequence[Path]) -> None:
+    """Write a table for each comparison, and the archive of all."""
+    archive = io.BytesIO()
+    with tarfile.open(fileobj=archive, mode="w", format=tarfile.PAX_FORMAT) as tar:
+        for folder in sorted(comparisons, key=lambda path: path.name):
+            (FOLDER / f"{folder.name}.csv").write_text(table(find_results([folder / "results"])), encoding="utf-8")
+            for name, content in files(folder):
+                member = tarfile.TarInfo(f"{folder.name}/{name}")
+                member.size = len(content)
+                tar.addfile(member, io.BytesIO(content))
+    ARCHIVE.write_bytes(lzma.compress(archive.getvalue(), preset=9 | lzma.PRESET_EXTREME))
+
+
+def table(results: Sequence[Result]) -> str:
+    """CSV with a row for each run and test set: means over its frames, empty where no frame has the metric."""
+    metrics = list(dict.fromkeys(name for result in results for name in result.metrics))
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*RUN, *metrics, *COST])
+    for result in sorted(results, key=lambda result: (result.scene.name, result.method, result.seed)):
+        for name, part in result.sets.items():
+            run = (result.scene.name, result.method, result.scene.split, result.seed, name, len(part.frames))
+            means = [part.mean(metric) for metric in metrics]
+            cost = [result.cost.gaussians, result.cost.processor_seconds, result.cost.peak_memory_mib]
+            numbers = ["" if value is None else f"{value:.6g}" for value in (*means, *cost)]
+            writer.writerow([*run, *numbers, result.key])
+    return text.getvalue()
+
+
+def files(folder: Path) -> Iterator[tuple[str, bytes]]:
+    """Names and contents of what a comparison's report needs: the plan of its finished cells, and their results."""
+    plan = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
+    plan["cells"] = [cell for cell in plan["cells"] if (folder / cell["result"]).is_file()]
+    yield "plan.json", (json.dumps(plan, indent=2) + "\n").encode()
+    for name in sorted(cell["result"] for cell in plan["cells"]):
+        yield name, (folder / name).read_bytes()
+
+
+if __name__ == "__main__":
+    main([Path(argument) for argument in sys.argv[1:]])
