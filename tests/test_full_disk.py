@@ -14,7 +14,7 @@ import torch
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder
 from coliags_plugin.core.intrinsics import Intrinsics
-from coliags_plugin.datamanagers.rotatecolon.writer import write_view
+from coliags_plugin.datamanagers.rotatecolon.exr_depth import write_exr_channels
 from coliags_plugin.engine.checkpoints import save_tensors
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.geometry.poses import colmap
@@ -64,7 +64,7 @@ def checkpoint(target, count):
 
 def exr(target, count):
     with atomic_folder(target, overwrite=True) as scratch:
-        write_view(scratch, 0, FRAMES[count], np.ones((48, 64), np.float32))
+        write_exr_channels(scratch / "0000.exr", {"Z": FRAMES[count, ..., 0].astype(np.float32)})
 
 
 @pytest.mark.parametrize("write", [colmap_binary, colmap_text, video, checkpoint, exr])

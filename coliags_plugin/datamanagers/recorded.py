@@ -21,7 +21,7 @@ from coliags_plugin.datamanagers.fusion import fuse_depth, read_points, subsampl
 from coliags_plugin.datamanagers.recording import Recording, Shot
 from coliags_plugin.datamanagers.rectification import PAPER_SIZE, fitted
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
-from coliags_plugin.datamanagers.seen import with_valid_seen_masks
+from coliags_plugin.datamanagers.seen_masks import with_valid_seen_masks
 from coliags_plugin.datamanagers.splits import Split, divide
 from coliags_plugin.datamanagers.stored_frames import StoredFrame, read_in_parallel
 from coliags_plugin.datamanagers.units import read_unit

@@ -47,6 +47,34 @@ class Shot:
     confidence: Path | None = None
 
 
+def make_shots(
+    images: Sequence[Path],
+    rectification: Rectification,
+    camera_to_world: Float[np.ndarray, "N 4 4"],
+    depths: Sequence[Path | None] | None,
+    depth_format: DepthFormat | None,
+    seen: Mapping[int, Path],
+    prefix: str = "",
+) -> list[Shot]:
+    """Frames of one camera, named by their image files.
+
+    Args:
+        images: In video order.
+        rectification: Of all images.
+        camera_to_world: Rigid, OpenCV axes, scene units. [N, 4, 4]
+        depths: Depth files of the same frames; None if there are none.
+        depth_format: Of the depth files.
+        seen: Seen masks by frame index.
+        prefix: Of the names.
+    """
+    return [
+        Shot(prefix + image.stem, image, rectification, pose, depth, depth_format, seen=seen.get(index))
+        for index, (image, pose, depth) in enumerate(
+            zip(images, camera_to_world, depths or (None,) * len(images), strict=True)
+        )
+    ]
+
+
 @dataclass(frozen=True)
 class Recording:
     """A posed video on disk.

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -19,6 +21,8 @@ from coliags_plugin.geometry.lenses.models import Lens
 from coliags_plugin.geometry.lenses.pinhole import PinholeLens
 from coliags_plugin.geometry.lenses.undistortion import Undistortion
 
+_Key = TypeVar("_Key")
+
 #: How far a raw frame's aspect ratio may be from the lens's: rounding to whole pixels, but no cropping.
 ASPECT_TOLERANCE = 0.02
 
@@ -27,6 +31,9 @@ FAR_FROM_MIDDLE = 0.2
 
 #: The paper's working size, a quarter of C3VD's raw frame.
 PAPER_SIZE = (338, 270)
+
+#: Undistortions from many lenses kept at a time, some 10 MB each: as many as images are read in parallel.
+_KEPT = 8
 
 
 def fitted(width: int, height: int, within: tuple[int, int] | None) -> tuple[int, int]:
@@ -53,14 +60,18 @@ class Rectification:
         source_width, source_height: Size of the stored images, pixels.
         pinhole: The camera of the working images.
         described_by: The file with the size of the stored images, for errors.
-        undistortion: For images taken through a lens; None for pinhole images.
+        lens: Lens of the stored images; None for pinhole images.
+        undistortion: Makes the undistortion of images taken through a lens, or returns the one that is kept.
+        stored_content: Stored pixels with image content; None where all have. [H, W]
     """
 
     source_width: int
     source_height: int
     pinhole: Intrinsics
     described_by: Path
-    undistortion: Undistortion | None = None
+    lens: Lens | None = None
+    undistortion: Callable[[], Undistortion] | None = None
+    stored_content: Bool[np.ndarray, "H W"] | None = None
 
     @classmethod
     def through(
@@ -81,7 +92,8 @@ class Rectification:
             shows: Stored pixels with image content; None for all. [H, W]
         """
         pinhole = undistorted_camera(lens, size, focal_scale)
-        return cls(lens.width, lens.height, pinhole, described_by, Undistortion(lens, pinhole, shows))
+        undistortion = Undistortion(lens, pinhole, shows)
+        return cls(lens.width, lens.height, pinhole, described_by, lens, lambda: undistortion, shows)
 
     @classmethod
     def of_pinhole(cls, pinhole: Intrinsics, described_by: Path, size: tuple[int, int]) -> Rectification:
@@ -91,14 +103,7 @@ class Rectification:
     @property
     def stored_lens(self) -> Lens:
         """The lens of the stored images; a pinhole camera where they are not distorted."""
-        if self.undistortion is not None:
-            return self.undistortion.lens
-        return PinholeLens.of(self.pinhole.resized(self.source_width, self.source_height))
-
-    @property
-    def stored_content(self) -> Bool[np.ndarray, "H W"] | None:
-        """Stored pixels with image content; None where all have."""
-        return None if self.undistortion is None else self.undistortion.source_mask
+        return self.lens or PinholeLens.of(self.pinhole.resized(self.source_width, self.source_height))
 
     @property
     def width(self) -> int:
@@ -118,20 +123,23 @@ class Rectification:
         """A colour image at the working size."""
         if self.undistortion is None:
             return resize_rgb(rgb, self.width, self.height)
-        return self.undistortion.image(rgb)
+        return self.undistortion().image(rgb)
 
     def nearest(self, values: Shaped[np.ndarray, "H W"]) -> Shaped[np.ndarray, "h w"]:
         """Values at the working size by nearest neighbour; 0 where there is no source."""
         if self.undistortion is None:
             return resize_nearest(values, self.width, self.height)
-        return self.undistortion.nearest(values, 0)
+        return self.undistortion().nearest(values, 0)
+
+    def sampled(self, path: Path, values: Shaped[np.ndarray, "H W"]) -> Shaped[np.ndarray, "h w"]:
+        """Values of a file as :meth:`nearest`, after a check of its size as :meth:`checked`."""
+        return self.nearest(self.checked(path, values))
 
     @property
     def valid(self) -> Bool[np.ndarray, "h w"] | None:
         """Working pixels with image content; None where all have."""
-        if self.undistortion is None or self.undistortion.valid.all():
-            return None
-        return self.undistortion.valid
+        valid = None if self.undistortion is None else self.undistortion().valid
+        return None if valid is None or valid.all() else valid
 
     def doubt(self) -> str | None:
         """Warning where the intrinsics seem to be of another resolution; None otherwise."""
@@ -167,6 +175,35 @@ class Rectification:
                 "Write that image again, or correct the size in that file",
             )
         return image
+
+
+def rectifications(
+    lenses: Mapping[_Key, Lens],
+    described_by: Path,
+    working_size: Callable[[int, int], tuple[int, int]],
+    focal_scale: float,
+) -> dict[_Key, Rectification]:
+    """Rectifications of images from many lenses, some of them pinholes, without keeping the maps of all.
+
+    Undistortion maps take some 10 MB each, and COLMAP models often have one camera per image.
+
+    Args:
+        lenses: Of the stored images.
+        described_by: The file that describes them.
+        working_size: Working width and height for a stored width and height, pixels.
+        focal_scale: Factor on the nominal focal length of undistorted images.
+    """
+    undistort = lru_cache(maxsize=_KEPT)(Undistortion)
+
+    def rectification(lens: Lens) -> Rectification:
+        size = working_size(lens.width, lens.height)
+        if isinstance(lens, PinholeLens):
+            return Rectification.of_pinhole(lens.pinhole, described_by, size)
+        pinhole = undistorted_camera(lens, size, focal_scale)
+        undistortion = partial(undistort, lens, pinhole)
+        return Rectification(lens.width, lens.height, pinhole, described_by, lens, undistortion)
+
+    return {key: rectification(lens) for key, lens in lenses.items()}
 
 
 def undistorted_camera(lens: Lens, size: tuple[int, int], focal_scale: float) -> Intrinsics:

@@ -44,16 +44,9 @@ class StoredFrame(Frame):
     """
 
     def __init__(self, shot: Shot, index: int, keep: bool = True) -> None:
-        values = {
-            "name": shot.name,
-            "index": index,
-            "camera": shot.rectification.camera(shot.camera_to_world),
-            "sparse_depth": shot.sparse_depth,
-            "_shot": shot,
-            "_keep": keep,
-            "_pixels": None,
-        }
-        for name, value in values.items():
+        camera = shot.rectification.camera(shot.camera_to_world)
+        values = {"name": shot.name, "index": index, "camera": camera, "sparse_depth": shot.sparse_depth}
+        for name, value in {**values, "_shot": shot, "_keep": keep, "_pixels": None}.items():
             object.__setattr__(self, name, value)
 
     @property
@@ -175,30 +168,26 @@ def _mask(shot: Shot) -> Bool[np.ndarray, "H W"] | None:
     valid = shot.rectification.valid
     if shot.mask is None:
         return valid
-    own = shot.rectification.nearest(shot.rectification.checked(shot.mask, read_mask(shot.mask)))
+    own = shot.rectification.sampled(shot.mask, read_mask(shot.mask))
     return own if valid is None else own & valid
 
 
 def _depth(shot: Shot, mask: Bool[np.ndarray, "H W"] | None) -> Shaped[np.ndarray, "H W"] | None:
     if shot.depth is None or shot.depth_format is None:
         return None
-    depth = shot.rectification.nearest(shot.rectification.checked(shot.depth, shot.depth_format.read(shot.depth)))
+    depth = shot.rectification.sampled(shot.depth, shot.depth_format.read(shot.depth))
     return depth if mask is None else np.where(mask, depth, np.zeros((), depth.dtype))
 
 
 def _seen(shot: Shot) -> Bool[np.ndarray, "H W"] | None:
-    return (
-        None
-        if shot.seen is None
-        else shot.rectification.nearest(shot.rectification.checked(shot.seen, read_mask(shot.seen)))
-    )
+    return None if shot.seen is None else shot.rectification.sampled(shot.seen, read_mask(shot.seen))
 
 
 def _confidence(shot: Shot) -> UInt8[np.ndarray, "H W"] | None:
     if shot.confidence is None:
         return None
     stored = read_gray(shot.confidence, 8, "a one-channel 8-bit image of the confidence in depth, 255 = 1")
-    return shot.rectification.nearest(shot.rectification.checked(shot.confidence, stored))
+    return shot.rectification.sampled(shot.confidence, stored)
 
 
 def _share(stored: UInt8[np.ndarray, "H W"] | None) -> Float[Tensor, "H W"] | None:

@@ -17,21 +17,20 @@ from coliags_plugin.config.registry import phantom_layouts
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, write_arrays
 from coliags_plugin.core.images import write_image
+from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.lighting.tone_curve import KNEE
 from coliags_plugin.phantom.colon import ColonSurface, build_surface, grow_anatomy
 from coliags_plugin.phantom.imaging import Exposure, Sensor, World, expose, meter
 from coliags_plugin.phantom.interreflection import IndirectLight, indirect_lights
-from coliags_plugin.phantom.layouts import meshes
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints
-from coliags_plugin.phantom.light import Lamp
+from coliags_plugin.phantom.light import CameraLight
 from coliags_plugin.phantom.mucosa import Mucosa, paint_mucosa
 from coliags_plugin.phantom.response import develop, exposure_for, exposures, white_balances
 from coliags_plugin.phantom.settings import PhantomSettings, value_or_default
 from coliags_plugin.phantom.streams import Purpose, stream
-from coliags_plugin.phantom.tracing import Tracer
+from coliags_plugin.phantom.tracing import Tracer, nearest_poses_first, seen_from
 from coliags_plugin.phantom.trajectory import RotationView, camera_path, turn_away
-from coliags_plugin.phantom.visibility import nearest_poses_first, seen_from
 
 _LOG = logging.getLogger(__name__)
 
@@ -44,7 +43,7 @@ _POINTS = 20_000
 
 
 @dataclass(frozen=True)
-class Phantom:
+class PreparedPhantom:
     """A prepared phantom: scene, camera poses and exposure, from which :func:`generate` renders the frames.
 
     Attributes:
@@ -52,7 +51,7 @@ class Phantom:
         layout: Output layout.
         world: Wall, material, lamp.
         sensor: Sensor of every image.
-        poses: Poses of the sequence. Each [4, 4]
+        poses: Poses of the sequence. [T, 4, 4]
         rotation_views: Test views with rotated cameras.
         indirect: Indirect light for the sequence and then the rotation views.
         gains: Red, green, blue gain of every frame of the sequence. [T, 3]
@@ -62,7 +61,7 @@ class Phantom:
     layout: Layout
     world: World
     sensor: Sensor
-    poses: list[Float[np.ndarray, "4 4"]]
+    poses: Float[np.ndarray, "T 4 4"]
     rotation_views: list[RotationView]
     indirect: list[IndirectLight | None]
     gains: Float[np.ndarray, "T 3"]
@@ -109,18 +108,18 @@ def image_size(settings: PhantomSettings, layout: Layout) -> tuple[int, int]:
 
 def resolve(settings: PhantomSettings, layout: Layout) -> PhantomSettings:
     """Settings with every None replaced, and without rotation views if the layout does not support them."""
-    width, height = image_size(settings, layout)
+    size = dict(zip(("width", "height"), image_size(settings, layout), strict=True))
     views = settings.rotation_views if layout.has_rotation else 0
-    return settings.model_copy(update={"width": width, "height": height, "rotation_views": views}).resolved()
+    return settings.model_copy(update={**size, "rotation_views": views}).resolved()
 
 
-def prepare(settings: PhantomSettings, progress: Progress | None = None) -> Phantom:
+def prepare(settings: PhantomSettings, progress: Progress | None = None) -> PreparedPhantom:
     """Generate the colon and the camera path, and solve for indirect light and exposure.
 
     Raises:
         InputError: The seed's colon leaves no clearance for the path, or open3d is missing.
     """
-    report = progress or _silent
+    report = progress or (lambda stage, done, total: None)
     layout: Layout = phantom_layouts.get(settings.layout)()
     settings = resolve(settings, layout)
     report("colon", 0, 4)
@@ -130,33 +129,27 @@ def prepare(settings: PhantomSettings, progress: Progress | None = None) -> Phan
     mucosa = paint_mucosa(anatomy, surface, settings)
     report("colon", 2, 4)
     tracer = Tracer(surface)
-    lamp = Lamp.of(settings)
+    lamp = CameraLight.of(settings)
     world = World(surface, mucosa, tracer, lamp, value_or_default(settings.vignetting, settings.preset.vignetting))
-    poses = list(camera_path(anatomy.centre_line, settings, tracer))
-    views = turn_away(np.stack(poses), settings, layout.is_test) if layout.has_rotation else []
+    poses = camera_path(anatomy.centre_line, settings, tracer)
+    views = turn_away(poses, settings, layout.is_test) if layout.has_rotation else []
     everywhere = [*poses, *(view.camera_to_world for view in views)]
     indirect: list[IndirectLight | None] = [None] * len(everywhere)
     if settings.interreflection > 0.0:
         generator = stream(settings.seed, Purpose.INTERREFLECTION)
-        indirect[:] = indirect_lights(
-            surface,
-            vertex_albedo(surface, mucosa),
-            tracer,
-            lamp,
-            everywhere,
-            settings.interreflection,
-            generator,
-        )
+        albedo = vertex_albedo(surface, mucosa)
+        indirect[:] = indirect_lights(surface, albedo, tracer, lamp, everywhere, settings.interreflection, generator)
     report("colon", 3, 4)
     lens, mask = layout.lens(*image_size(settings, layout))
     sensor = Sensor.behind(lens, mask, settings.supersampling)
     thin = sensor.subsampled(_METERED)
-    ideal = []
-    for index, pose in enumerate(poses):
-        ideal.append(exposure_for(meter(world, thin, pose, indirect[index]), settings.target_grey, settings.gamma))
+    ideal = [
+        exposure_for(meter(world, thin, pose, light), settings.target_grey, settings.gamma)
+        for pose, light in zip(poses, indirect[: len(poses)], strict=True)
+    ]
     gains = exposures(ideal, settings)[:, None] * white_balances(settings)
     report("colon", 4, 4)
-    return Phantom(settings, layout, world, sensor, poses, views, indirect, gains)
+    return PreparedPhantom(settings, layout, world, sensor, poses, views, indirect, gains)
 
 
 def generate(
@@ -178,7 +171,7 @@ def generate(
         InputError: The folder exists or cannot be written, the seed's colon leaves no clearance for the path, or open3d
             is missing.
     """
-    report = progress or _silent
+    report = progress or (lambda stage, done, total: None)
     try:
         with atomic_folder(output, overwrite) as folder:
             phantom = prepare(settings, report)
@@ -192,9 +185,9 @@ def generate(
     _LOG.info("phantom of seed %d written to %s", settings.seed, output)
 
 
-def _write(phantom: Phantom, folder: Path, report: Progress) -> None:
+def _write(phantom: PreparedPhantom, folder: Path, report: Progress) -> None:
     layout, lens, frames = phantom.layout, phantom.sensor.lens, len(phantom.poses)
-    rotated = [view.camera_to_world for view in phantom.rotation_views]
+    rotated = np.array([view.camera_to_world for view in phantom.rotation_views])
     total = frames + len(rotated)
     # Coverage as C3VD counts it: triangles that are the first hit of any pixel ray of any frame.
     observed = np.zeros(len(phantom.world.surface.triangles), bool)
@@ -219,18 +212,18 @@ def _write(phantom: Phantom, folder: Path, report: Progress) -> None:
             write_image(layout.seen_mask(folder, part, index), seen)
         report("frames", number + 1, total)
     layout.write_sequence(folder, "video", phantom.poses, lens)
-    if rotated:
+    if len(rotated):
         layout.write_sequence(folder, "rotation", rotated, lens)
     if layout.has_points:
         layout.write_points(folder, _wall_points(phantom, drawn), phantom.poses, lens)
     if layout.has_coverage_mesh:
-        meshes.write_coverage_obj(folder / "coverage_mesh.obj", phantom.world.surface, observed)
+        _write_coverage_mesh(folder / "coverage_mesh.obj", phantom.world.surface, observed)
     report("truth", 0, 1)
     _write_truth(phantom, folder / "truth", trained_on, observed)
     report("truth", 1, 1)
 
 
-def _rendered_frames(phantom: Phantom, total: int) -> Iterator[tuple[Exposure, UInt8[np.ndarray, "P 3"]]]:
+def _rendered_frames(phantom: PreparedPhantom, total: int) -> Iterator[tuple[Exposure, UInt8[np.ndarray, "P 3"]]]:
     """All images in order, rendered a few ahead of the writer."""
     with ThreadPoolExecutor(_AT_ONCE) as pool:
         waiting = [pool.submit(phantom.render_frame, number) for number in range(min(_AT_ONCE, total))]
@@ -242,18 +235,18 @@ def _rendered_frames(phantom: Phantom, total: int) -> Iterator[tuple[Exposure, U
 
 
 def _seen_mask(
-    phantom: Phantom, exposure: Exposure, camera_to_world: Float[np.ndarray, "4 4"]
+    phantom: PreparedPhantom, exposure: Exposure, camera_to_world: Float[np.ndarray, "4 4"]
 ) -> UInt8[np.ndarray, "P"]:
     """Seen mask: 255 where a training frame sees the pixel's surface point, else 0. [P]"""
-    found = np.flatnonzero(exposure.z_depth > 0.0)
-    points = _wall(phantom, exposure, camera_to_world, found)
+    hit = np.flatnonzero(exposure.z_depth > 0.0)
+    points = _wall(phantom, exposure, camera_to_world, hit)
     mask = np.zeros(len(exposure.z_depth), np.uint8)
-    mask[found] = np.where(phantom.seen(points, camera_to_world), 255, 0)
+    mask[hit] = np.where(phantom.seen(points, camera_to_world), 255, 0)
     return mask
 
 
 def _wall(
-    phantom: Phantom,
+    phantom: PreparedPhantom,
     exposure: Exposure,
     camera_to_world: Float[np.ndarray, "4 4"],
     pixels: Int[np.ndarray, "N"],
@@ -264,18 +257,18 @@ def _wall(
 
 
 def _draw_points(
-    phantom: Phantom, index: int, exposure: Exposure, color: UInt8[np.ndarray, "P 3"]
+    phantom: PreparedPhantom, index: int, exposure: Exposure, color: UInt8[np.ndarray, "P 3"]
 ) -> tuple[Float[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"]]:
     """This training frame's share of the initial points and their colours."""
-    found = np.flatnonzero(exposure.z_depth > 0.0)
-    share = min(-(-_POINTS // len(phantom.training_poses)), len(found))
+    hit = np.flatnonzero(exposure.z_depth > 0.0)
+    share = min(-(-_POINTS // len(phantom.training_poses)), len(hit))
     generator = stream(phantom.settings.seed, Purpose.POINTS, index)
-    chosen = np.sort(generator.choice(found, share, replace=False))
+    chosen = np.sort(generator.choice(hit, share, replace=False))
     return _wall(phantom, exposure, phantom.poses[index], chosen), color[chosen]
 
 
 def _wall_points(
-    phantom: Phantom, drawn: Sequence[tuple[Float[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"]]]
+    phantom: PreparedPhantom, drawn: Sequence[tuple[Float[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"]]]
 ) -> WallPoints:
     positions = np.concatenate([positions for positions, _ in drawn])
 
@@ -287,12 +280,12 @@ def _wall_points(
 
 
 def _write_truth(
-    phantom: Phantom, folder: Path, trained_on: Bool[np.ndarray, "F"], observed: Bool[np.ndarray, "F"]
+    phantom: PreparedPhantom, folder: Path, trained_on: Bool[np.ndarray, "F"], observed: Bool[np.ndarray, "F"]
 ) -> None:
     surface, settings = phantom.world.surface, phantom.settings
     folder.mkdir(parents=True, exist_ok=True)
     albedo = phantom.vertex_albedo
-    meshes.write_mesh(folder / "mesh.ply", surface, albedo)
+    _write_mesh(folder / "mesh.ply", surface, albedo)
     vertices = surface.vertices.astype(np.float64)
     seen = seen_from(vertices, phantom.training_poses, phantom.sensor.lens, phantom.sensor.mask, phantom.world.tracer)
     write_arrays(
@@ -307,7 +300,7 @@ def _write_truth(
             "columns": np.array(surface.columns),
         },
     )
-    np.save(folder / "camera_to_world.npy", np.stack(phantom.poses))
+    np.save(folder / "camera_to_world.npy", phantom.poses)
     (folder / "gain.csv").write_text(_gain_csv(range(len(phantom.poses)), phantom.gains))
     if phantom.rotation_views:
         used = phantom.gains[[view.frame for view in phantom.rotation_views]]
@@ -338,6 +331,27 @@ def vertex_albedo(surface: ColonSurface, mucosa: Mucosa) -> Float[np.ndarray, "V
     return mucosa.sample(row.ravel(), column.ravel(), footprint).albedo
 
 
+def _write_mesh(path: Path, surface: ColonSurface, albedo: Float[np.ndarray, "V 3"]) -> None:
+    """Write the wall as a binary PLY; vertex colours are the albedo, encoded with gamma 2.2."""
+    colors = np.rint(255.0 * np.clip(albedo, 0.0, 1.0) ** (1.0 / 2.2)).astype(np.uint8)
+    normals = dict(zip(("nx", "ny", "nz"), surface.normals.T, strict=True))
+    shades = dict(zip(("red", "green", "blue"), colors.T, strict=True))
+    properties = point_properties(surface.vertices) | normals | shades
+    write_ply(path, properties, surface.triangles, "millimetres; colour = albedo ^ (1 / 2.2)")
+
+
+def _write_coverage_mesh(path: Path, surface: ColonSurface, observed: Bool[np.ndarray, "F"]) -> None:
+    """Write C3VD's coverage mesh: face corners ``v/vt`` with vt 1 for observed triangles and 2 for others."""
+    with path.open("w") as file:
+        file.write("# millimetres; vt 1 = observed, vt 2 = not observed\n")
+        np.savetxt(file, surface.vertices, "v %.6f %.6f %.6f")
+        file.write("vt 0.25 0.5\nvt 0.75 0.5\n")
+        corners = np.empty((len(surface.triangles), 6), np.int64)
+        corners[:, ::2] = surface.triangles.astype(np.int64) + 1
+        corners[:, 1::2] = np.where(observed, 1, 2)[:, None]
+        np.savetxt(file, corners, "f %d/%d %d/%d %d/%d")
+
+
 def _gain_csv(frames: range, gains: Float[np.ndarray, "T 3"]) -> str:
     lines = [
         f"{frame},{red:.9g},{green:.9g},{blue:.9g}" for frame, (red, green, blue) in zip(frames, gains, strict=True)
@@ -347,7 +361,3 @@ def _gain_csv(frames: range, gains: Float[np.ndarray, "T 3"]) -> str:
 
 def _json(value: object) -> str:
     return json.dumps(value, indent=2) + "\n"
-
-
-def _silent(stage: str, done: int, total: int) -> None:
-    pass

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from coliags_plugin.geometry.lenses.models import Lens
 from coliags_plugin.phantom.colon import ColonSurface
 from coliags_plugin.phantom.interreflection import IndirectLight
-from coliags_plugin.phantom.light import Lamp
+from coliags_plugin.phantom.light import CameraLight
 from coliags_plugin.phantom.mucosa import Mucosa
 from coliags_plugin.phantom.tracing import Hits, Tracer, rotated
 
@@ -74,7 +74,7 @@ class World:
     surface: ColonSurface
     mucosa: Mucosa
     tracer: Tracer
-    lamp: Lamp
+    lamp: CameraLight
     vignetting: float
 
 

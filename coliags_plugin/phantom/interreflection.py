@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from coliags_plugin.phantom.colon import RADIUS, ColonSurface
-from coliags_plugin.phantom.light import Lamp
+from coliags_plugin.phantom.light import CameraLight
 from coliags_plugin.phantom.tracing import Tracer
 
 _PATCH = 5.0
@@ -155,7 +155,7 @@ def indirect_lights(
     surface: ColonSurface,
     vertex_albedo: Float[np.ndarray, "V 3"],
     tracer: Tracer,
-    lamp: Lamp,
+    lamp: CameraLight,
     cameras_to_world: Sequence[Float[np.ndarray, "4 4"]],
     share: float,
     generator: np.random.Generator,

@@ -24,7 +24,7 @@ UNIT_DISTANCE = 20.0
 
 
 @dataclass(frozen=True)
-class Lamp:
+class CameraLight:
     """A spotlight fixed to the camera, and the mucosa's specular reflection.
 
     Attributes:
@@ -43,7 +43,7 @@ class Lamp:
     f0: float
 
     @classmethod
-    def of(cls, settings: PhantomSettings) -> Lamp:
+    def of(cls, settings: PhantomSettings) -> CameraLight:
         """Lamp from settings; it is tilted downwards in the image."""
         preset = settings.preset
         tilt = np.radians(value_or_default(settings.tilt, preset.tilt))

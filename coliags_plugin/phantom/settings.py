@@ -37,13 +37,7 @@ class Preset:
     """Defaults of settings left at None, and motion parameters.
 
     Attributes:
-        light_offset: Lamp position in camera axes, mm.
-        spread_law: See :class:`PhantomSettings`.
-        spread: See :class:`PhantomSettings`.
-        vignetting: See :class:`PhantomSettings`.
-        tilt: See :class:`PhantomSettings`.
-        gain: See :class:`PhantomSettings`.
-        white_balance_drift: See :class:`PhantomSettings`.
+        light_offset, spread_law, spread, vignetting, tilt, gain, white_balance_drift: See :class:`PhantomSettings`.
         turn: Largest yaw, pitch and roll of the wobble, degrees.
         scan: Largest rotation away from the lumen of the ``rotation`` trajectory, degrees.
         wobble: Smallest and largest lateral excursion from the centre line, mm.

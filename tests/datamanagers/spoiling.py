@@ -7,7 +7,7 @@ import re
 import shutil
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ class Kind:
         depths: Glob of the depth files; empty where there are none.
         poses: The pose file; empty where spoiling it is of no use.
         scene: Where in the phantom the scene's folder is.
-        options: Of the data manager.
+        params: EndoGSLAM's result, from the scene's folder; empty where there is none.
         prepare: What makes another form of the layout.
     """
 
@@ -43,7 +43,7 @@ class Kind:
     depths: str
     poses: str
     scene: str = "."
-    options: dict[str, Any] = field(default_factory=dict)
+    params: str = ""
     prepare: Spoil | None = None
 
 
@@ -81,8 +81,13 @@ KINDS = {
     "c3vd-raw": Kind("c3vd-raw", "c3vd", "*_color.png", "*_depth.tiff", "pose.txt"),
     "c3vd-raw-old": Kind("c3vd-raw", "c3vd", "*_color.png", "*_depth.tiff", "pose.txt", prepare=_rows),
     "c3vd-v2": Kind("c3vd-v2", "c3vd-v2", "rgb/*.png", "depth/*.tiff", "pose.txt"),
-    "c3vd-endogslam": Kind("endogslam", "c3vd-endogslam", "color/*.png", "depth/*.tiff", "pose.txt"),
-    "pr-endo": Kind("pr-endo", "c3vd-endogslam", "color/*.png", "depth/*.tiff", "", "C3VD/phantom"),
+    "c3vd-endogslam": Kind(
+        "endogslam", "c3vd-endogslam", "color/*.png", "depth/*.tiff", "pose.txt", params="params.npz"
+    ),
+    "pr-endo": Kind(
+        *("pr-endo", "c3vd-endogslam", "color/*.png", "depth/*.tiff", "", "C3VD/phantom"),
+        params="../../C3VD_endogslam_optimized/phantom/params.npz",
+    ),
     "rotatecolon": Kind("rotatecolon", "rotatecolon", "train_views/*.png", "depth_train/*.exr", "transforms.json"),
     "colmap": Kind("colmap", "colmap", "images/*.png", "", ""),
     "colmap-text": Kind("colmap", "colmap", "images/*.png", "", "sparse/0/images.txt", prepare=_text_model),
@@ -140,6 +145,21 @@ def three_channels(pixels: np.ndarray) -> np.ndarray:
     return np.dstack([pixels] * 3)
 
 
+def grey(pixels: np.ndarray) -> np.ndarray:
+    """A colour image saved as a grey one."""
+    return np.ascontiguousarray(pixels[..., 0])
+
+
+def square(pixels: np.ndarray) -> np.ndarray:
+    """A crop."""
+    return np.ascontiguousarray(pixels[:50, :50])
+
+
+def paint(name: str, shape: tuple[int, ...]) -> Spoil:
+    """Write a black image."""
+    return lambda folder: cv2.imwrite(str(folder / name), np.zeros(shape, np.uint8))
+
+
 def rename_channel(pattern: str, place: int, old: str, new: str) -> Spoil:
     """Give a channel of an EXR file another name."""
 
@@ -161,13 +181,37 @@ def _change_exr(path: Path, change: Callable[[dict[str, np.ndarray]], dict[str, 
     OpenEXR.File(header, change(channels)).write(str(path))
 
 
-def cut(pattern: str, place: int = 0, share: float = 0.6) -> Spoil:
-    """Leave the beginning of a file."""
+def cut(pattern: str, place: int = 0, share: float = 0.6, lines: int | None = None) -> Spoil:
+    """Leave the beginning of a file: a share of its bytes, or some lines."""
 
     def spoil(folder: Path) -> None:
         path = files(folder, pattern)[place]
         data = path.read_bytes()
-        path.write_bytes(data[: int(len(data) * share)])
+        path.write_bytes(
+            data[: int(len(data) * share)] if lines is None else b"".join(data.splitlines(keepends=True)[:lines])
+        )
+
+    return spoil
+
+
+def write_text(name: str, content: str | bytes) -> Spoil:
+    """Replace the content of a file."""
+    return lambda folder: (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+
+
+def rename(patterns: list[str], change: Callable[[int], object]) -> Spoil:
+    """Change the first number in the names of files."""
+
+    def spoil(folder: Path) -> None:
+        for pattern in patterns:
+            renamed = {
+                path: re.sub(r"\d+", lambda match: str(change(int(match[0]))), path.name, count=1)
+                for path in files(folder, pattern)
+            }
+            for path in renamed:
+                path.rename(path.with_name(f"aside-{path.name}"))
+            for path, name in renamed.items():
+                path.with_name(f"aside-{path.name}").rename(path.with_name(name))
 
     return spoil
 
@@ -205,6 +249,17 @@ def drop_last_line(name: str, count: int = 1) -> Spoil:
 def repeat_last_line(name: str) -> Spoil:
     """More poses than images."""
     return lambda folder: (folder / name).write_text("\n".join([*_lines(folder / name), _lines(folder / name)[-1]]))
+
+
+def change_line(name: str, number: int, text: str) -> Spoil:
+    """Replace a line."""
+
+    def spoil(folder: Path) -> None:
+        lines = _lines(folder / name)
+        lines[number] = text
+        (folder / name).write_text("\n".join(lines))
+
+    return spoil
 
 
 def change_matrices(name: str, change: Callable[[np.ndarray], np.ndarray | None]) -> Spoil:
@@ -253,6 +308,17 @@ def change_json(pattern: str, change: Callable[[dict[str, Any]], Any]) -> Spoil:
     return spoil
 
 
+def change_camera(pattern: str = "camera.json", **values: Any) -> Spoil:
+    """Set keys of JSON files; None removes one."""
+
+    def spoil(content: dict[str, Any]) -> None:
+        content.update(values)
+        for key in [key for key, value in values.items() if value is None]:
+            del content[key]
+
+    return change_json(pattern, spoil)
+
+
 def change_frame(pattern: str, place: int, change: Callable[[np.ndarray], Any]) -> Spoil:
     """Change the matrix of a frame, in place."""
 
@@ -295,6 +361,28 @@ def change_npz(name: str, change: Callable[[dict[str, np.ndarray]], Any]) -> Spo
             arrays = dict(file)
         change(arrays)
         np.savez(folder / name, allow_pickle=False, **arrays)
+
+    return spoil
+
+
+def shorten(arrays: dict[str, np.ndarray], by: int) -> None:
+    """EndoGSLAM's result without its last frames."""
+    for key in ("cam_unnorm_rots", "cam_trans"):
+        arrays[key] = arrays[key][..., :-by]
+    arrays["gt_w2c_all_frames"] = arrays["gt_w2c_all_frames"][:-by]
+
+
+def double_colmap(size: bool) -> Spoil:
+    """Double a model's focal lengths and principal points and, optionally, its image sizes."""
+
+    def spoil(folder: Path) -> None:
+        model = pycolmap.Reconstruction(str(folder / "sparse/0"))
+        for camera in model.cameras.values():
+            if size:
+                camera.rescale(2.0)
+            else:
+                camera.params = 2.0 * camera.params
+        model.write_binary(str(folder / "sparse/0"))
 
     return spoil
 

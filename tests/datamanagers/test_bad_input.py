@@ -10,12 +10,11 @@ import json
 import logging
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import cv2
 import numpy as np
-import pycolmap
 import pytest
 
 from coliags_plugin.checks.data.check import check_scene
@@ -29,27 +28,35 @@ from tests.datamanagers.spoiling import (
     Kind,
     Spoil,
     change_binary_pose,
+    change_camera,
     change_frame,
     change_json,
+    change_line,
     change_matrices,
     change_npz,
     change_row,
     clear,
     cut,
+    double_colmap,
     drop_last_line,
     files,
+    grey,
     half_size,
     mirror,
     mirror_rows,
+    paint,
     remove,
+    rename,
     rename_channel,
     repaint,
     repeat_last_line,
+    shorten,
     spoil_number,
+    square,
     stretch,
     three_channels,
     unregistered,
-    write_all,
+    write_text,
 )
 from tests.phantom.phantom_layouts import in_video_order, true_poses
 
@@ -58,31 +65,32 @@ MATRICES = ("c3vd", "c3vd-raw", "c3vd-raw-old", "c3vd-v2", "c3vd-endogslam")
 #: Kinds whose poses are frames of a JSON file.
 FRAMES_OF_JSON = ("rotatecolon", "nerfstudio", "reim-nerf")
 TUM = ("rgbd", "rgbd-by-order")
-#: EndoGSLAM's result, from the scene's folder.
-PARAMS = {"c3vd-endogslam": "params.npz", "pr-endo": "../../C3VD_endogslam_optimized/phantom/params.npz"}
+COLMAP = ("colmap", "colmap-text")
+#: Kinds with EndoGSLAM's result.
+PARAMS = tuple(name for name, kind in KINDS.items() if kind.params)
 WITH_DEPTH = tuple(name for name, kind in KINDS.items() if kind.depths)
+#: Kinds whose depth, if any, belongs to every image of a number.
+PAIRED = ("c3vd", "c3vd-raw", "c3vd-raw-old", "c3vd-v2", "c3vd-endogslam", "pr-endo")
+RUBBISH = bytes(range(256))
+SIZES = {
+    "c3vd": "camera.json",
+    "colmap": "cameras.bin",
+    "colmap-text": "cameras.txt",
+    "nerfstudio": "transforms.json",
+    "rgbd": "camera.json",
+    "rgbd-by-order": "camera.json",
+    "reim-nerf": "transforms_train.json",
+}
 
-Rows = dict[str, tuple[Spoil, tuple[str, ...]]]
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    return write_all(tmp_path_factory.mktemp("phantoms"))
-
-
-@pytest.fixture
-def copied(made, tmp_path) -> Callable[[str], Path]:
-    """A scene of a kind to spoil."""
-    return lambda name: Path(shutil.copytree(made[name], tmp_path / "data")) / KINDS[name].scene
+Rows = dict[str, tuple[Spoil, str]]
+#: Kinds, how to spoil one, and the pattern of the message, in which ``<3>`` is the name of image 3, ``<size>`` the file
+#: that says how large images are and ``<poses>`` the pose file.
+Row = tuple[str | Iterable[str], Callable[[Kind], Spoil], str]
 
 
 def load(folder: Path, name: str) -> Scene:
     manager = datamanagers.get(KINDS[name].format)
     return manager(manager.Settings()).load(folder)
-
-
-def per_kind(names, row: Callable[[str, Kind], tuple[Spoil, tuple[str, ...]]]) -> Rows:
-    return {name: row(name, KINDS[name]) for name in names}
 
 
 def numbered(name: str, place: int) -> str:
@@ -94,432 +102,545 @@ def numbered(name: str, place: int) -> str:
 
 def said_size(name: str) -> str:
     """The file that says how large images are."""
-    said = {
-        "c3vd": "camera.json",
-        "colmap": "cameras.bin",
-        "colmap-text": "cameras.txt",
-        "nerfstudio": "transforms.json",
-        "rgbd": "camera.json",
-        "rgbd-by-order": "camera.json",
-        "reim-nerf": "transforms_train.json",
-    }
-    return said.get(name, rf"{numbered(name, 0)}\.png")
+    return SIZES.get(name, rf"{numbered(name, 0)}\.png")
+
+
+def expanded(table: Mapping[str, list[Row]]) -> dict[str, Rows]:
+    """The rows of each fault by kind."""
+    result: dict[str, Rows] = {}
+    for fault, rows in table.items():
+        result[fault] = {}
+        for kinds, spoil, message in rows:
+            for name in [kinds] if isinstance(kinds, str) else kinds:
+                kind = KINDS[name]
+                pattern = message.replace("<size>", said_size(name)).replace("<poses>", kind.poses)
+                pattern = re.sub(r"<(\d)>", lambda match, name=name: numbered(name, int(match[1])), pattern)
+                result[fault][name] = spoil(kind), pattern
+    return result
 
 
 def _doubled(*keys: str) -> Callable[[dict], None]:
     return lambda content: content.update({key: 2 * content[key] for key in keys})
 
 
-def _double_colmap(size: bool) -> Spoil:
-    def spoil(folder: Path) -> None:
-        model = pycolmap.Reconstruction(str(folder / "sparse/0"))
-        for camera in model.cameras.values():
-            if size:
-                camera.rescale(2.0)
-            else:
-                camera.params = 2.0 * camera.params
-        model.write_binary(str(folder / "sparse/0"))
+_TWICE_K = ("fx", "fy", "cx", "cy")
+_TWICE_FL = ("fl_x", "fl_y", "cx", "cy")
 
-    return spoil
-
-
-def _cut_after_lines(name: str, count: int) -> Spoil:
-    return lambda folder: (folder / name).write_text("".join((folder / name).open().readlines()[:count]))
-
-
-def _rubbish(name: str) -> Spoil:
-    return lambda folder: (folder / name).write_bytes(bytes(range(256)))
-
-
-#: fault -> kind -> how to spoil it, and what the message must hold, in this order.
-REFUSED: dict[str, Rows] = {
-    "an image of another size": per_kind(
-        KINDS,
-        lambda name, kind: (
-            repaint(kind.images, 4, half_size),
-            (rf"{numbered(name, 4)}\.png is 32 x 26, but \S*{said_size(name)} says 64 x 51", "of one size"),
+#: Faults that can befall several layouts.
+ERRORS: dict[str, list[Row]] = {
+    "an image of another size": [
+        (
+            KINDS,
+            lambda kind: repaint(kind.images, 4, half_size),
+            r"<4>\.png is 32 x 26, but \S*<size> says 64 x 51.*of one size",
+        )
+    ],
+    "the first image of another size": [
+        (KINDS, lambda kind: repaint(kind.images, 0, half_size), r"(32 x 26.*64 x 51|64 x 51.*32 x 26)")
+    ],
+    "a depth file of another size": [
+        (
+            WITH_DEPTH,
+            lambda kind: repaint(kind.depths, 0, half_size),
+            r"<0>\.(png|tiff|exr) is 32 x 26, but \S*<size> says 64 x 51",
+        )
+    ],
+    "an image cut short": [
+        (KINDS, lambda kind: cut(kind.images, 4), r"<4>\.png \(\d+ bytes\) cannot be decoded.*a complete image")
+    ],
+    "an empty image": [(KINDS, lambda kind: cut(kind.images, 4, 0.0), r"<4>\.png \(0 bytes\) cannot be decoded")],
+    "an image of one channel": [
+        (KINDS, lambda kind: repaint(kind.images, 4, grey), r"<4>\.png is an image of 1 channel of uint8")
+    ],
+    "a depth file cut short": [
+        (WITH_DEPTH, lambda kind: cut(kind.depths, 5), r"<5>\.(png|tiff|exr) \(\d+ bytes\) cannot be decoded.*complete")
+    ],
+    "a depth file of three channels": [
+        (
+            [name for name in WITH_DEPTH if name != "rotatecolon"],
+            lambda kind: repaint(kind.depths, 5, three_channels),
+            r"<5>\.(png|tiff) is an image of 3 channels of uint(8|16).*one-channel (8|16)-bit",
+        )
+    ],
+    "a depth file of other bits": [
+        (
+            [name for name in WITH_DEPTH if name not in ("rotatecolon", *PARAMS)],
+            lambda kind: repaint(kind.depths, 5, lambda depth: (depth // 256).astype(np.uint8)),
+            r"<5>\.(png|tiff) is an image of 1 channel of uint8",
         ),
-    ),
-    "the first image of another size": per_kind(
-        KINDS,
-        lambda name, kind: (repaint(kind.images, 0, half_size), (r"(32 x 26.*64 x 51|64 x 51.*32 x 26)",)),
-    ),
-    "a depth file of another size": per_kind(
-        WITH_DEPTH,
-        lambda name, kind: (
-            repaint(kind.depths, 0, half_size),
-            (rf"{numbered(name, 0)}\.(png|tiff|exr) is 32 x 26, but \S*{said_size(name)} says 64 x 51",),
+        (
+            PARAMS,
+            lambda kind: repaint(kind.depths, 5, lambda depth: depth.astype(np.uint16)),
+            r"<5>\.tiff is an image of 1 channel of uint16",
         ),
-    ),
-    "an image cut short": per_kind(
-        KINDS,
-        lambda name, kind: (
-            cut(kind.images, 4),
-            (rf"{numbered(name, 4)}\.png \(\d+ bytes\) cannot be decoded", "a complete image"),
+    ],
+    "depth that is missing for a frame": [
+        (
+            (*PAIRED, "rgbd-by-order"),
+            lambda kind: remove(kind.depths, 3),
+            "11 images and 10 depth files; frame 3 has only one of the two.*for every image",
         ),
-    ),
-    "an empty image": per_kind(
-        KINDS,
-        lambda name, kind: (cut(kind.images, 4, 0.0), (rf"{numbered(name, 4)}\.png \(0 bytes\) cannot be decoded",)),
-    ),
-    "a depth file cut short": per_kind(
-        WITH_DEPTH,
-        lambda name, kind: (
-            cut(kind.depths, 5),
-            (rf"{numbered(name, 5)}\.(png|tiff|exr) \(\d+ bytes\) cannot be decoded", "complete"),
+        (
+            "rotatecolon",
+            lambda kind: remove(kind.depths, 3),
+            "depth_train has 10 depth files for 11 frames; frame 3 has none.*for every image",
         ),
-    ),
-    "a depth file of three channels": per_kind(
-        [name for name in WITH_DEPTH if name != "rotatecolon"],
-        lambda name, kind: (
-            repaint(kind.depths, 5, three_channels),
-            (rf"{numbered(name, 5)}\.(png|tiff) is an image of 3 channels of uint(8|16)", r"one-channel (8|16)-bit"),
+        (
+            "nerfstudio",
+            lambda kind: remove(kind.depths, 3),
+            r"transforms\.json, frame images/frame_00004\.png: no file \S*depth/frame_00004\.png",
         ),
-    ),
-    "depth that is missing for a frame": {
-        **per_kind(
-            ("c3vd", "c3vd-raw", "c3vd-raw-old", "c3vd-v2", "c3vd-endogslam", "pr-endo", "rgbd-by-order"),
-            lambda name, kind: (
-                remove(kind.depths, 3),
-                ("11 images and 10 depth files; frame 3 has only one of the two", "for every image"),
+        ("reim-nerf", lambda kind: remove(kind.depths, 3), r"names \S*distmaps/0003_color\.png, which does not exist"),
+    ],
+    "no depth and no points": [
+        (
+            ("c3vd", "c3vd-raw", "c3vd-v2", "rgbd"),
+            lambda kind: remove(kind.depths),
+            r"neither depth files nor points3D\.ply.*points3D\.ply \(world of the poses\)",
+        )
+    ],
+    "an empty folder": [
+        (KINDS, lambda _: clear, "(holds nothing|holds no COLMAP model|no file .*transforms.json).*Expected")
+    ],
+    "no images": [
+        (
+            KINDS,
+            lambda kind: remove(kind.images),
+            "(holds nothing|holds 0000_depth|have no image|are not in|has no image|does not exist).*Expected",
+        )
+    ],
+    "an image that is gone": [
+        (PAIRED, lambda kind: remove(kind.images, 3), "has 10 images, numbers 0 to 10, but none is 3.*without gaps"),
+        ("rotatecolon", lambda kind: remove(kind.images, 3), r"transforms\.json: frame 3 has no image \S*0003\.png"),
+        (
+            COLMAP,
+            lambda kind: remove(kind.images, 3),
+            r"1 of the 11 images of \S*sparse/0 are not in \S*images: 0003\.png",
+        ),
+        (
+            "nerfstudio",
+            lambda kind: remove(kind.images, 3),
+            r"transforms\.json: 1 of 11 frames have no image in .*images/frame_00004\.png",
+        ),
+        ("rgbd-by-order", lambda kind: remove(kind.images, 3), r"groundtruth\.txt has 11 poses for 10 images"),
+        ("reim-nerf", lambda kind: remove(kind.images, 3), r"names \S*images/0003_color\.png, which does not exist"),
+    ],
+    "two images of one number": [
+        (
+            ("c3vd", "c3vd-raw-old", "c3vd-v2", "c3vd-endogslam", "rgbd-by-order"),
+            lambda kind: (
+                lambda folder: shutil.copy(image := files(folder, kind.images)[4], image.with_name(f"00{image.name}"))
             ),
-        ),
-        "rotatecolon": (
-            remove("depth_train/*.exr", 3),
-            ("depth_train has 10 depth files for 11 frames; frame 3 has none", "for every image"),
-        ),
-        "nerfstudio": (
-            remove("depth/*.png", 3),
-            (r"transforms\.json, frame images/frame_00004\.png: no file \S*depth/frame_00004\.png",),
-        ),
-        "reim-nerf": (remove("distmaps/*.png", 3), (r"names \S*distmaps/0003_color\.png, which does not exist",)),
-    },
-    "no depth and no points": per_kind(
-        ("c3vd", "c3vd-raw", "c3vd-v2", "rgbd"),
-        lambda name, kind: (
-            remove(kind.depths),
-            (r"neither depth files nor points3D\.ply", r"points3D\.ply \(world of the poses\)"),
-        ),
-    ),
-    "an empty folder": per_kind(
-        KINDS,
-        lambda name, kind: (clear, ("(holds nothing|holds no COLMAP model|no file .*transforms.json)", "Expected")),
-    ),
-    "no images": per_kind(
-        KINDS,
-        lambda name, kind: (
-            remove(kind.images),
-            ("(holds nothing|holds 0000_depth|have no image|are not in|has no image|does not exist)", "Expected"),
-        ),
-    ),
-    "an image that is gone": {
-        **per_kind(
-            ("c3vd", "c3vd-raw", "c3vd-raw-old", "c3vd-v2", "c3vd-endogslam", "pr-endo"),
-            lambda name, kind: (
-                remove(kind.images, 3),
-                ("has 10 images, numbers 0 to 10, but none is 3", "without gaps"),
-            ),
-        ),
-        "rotatecolon": (remove("train_views/*.png", 3), (r"transforms\.json: frame 3 has no image \S*0003\.png",)),
-        **per_kind(
-            ("colmap", "colmap-text"),
-            lambda name, kind: (
-                remove(kind.images, 3),
-                (r"1 of the 11 images of \S*sparse/0 are not in \S*images: 0003\.png",),
-            ),
-        ),
-        "nerfstudio": (
-            remove("images/*.png", 3),
-            (r"transforms\.json: 1 of 11 frames have no image in .*images/frame_00004\.png",),
-        ),
-        "rgbd-by-order": (remove("rgb/*.png", 3), (r"groundtruth\.txt has 11 poses for 10 images",)),
-        "reim-nerf": (remove("images/*.png", 3), (r"names \S*images/0003_color\.png, which does not exist",)),
-    },
-    "fewer poses than images": {
-        **per_kind(
+            "have the same number",
+        )
+    ],
+    "numbers from one on": [
+        (
+            ("c3vd", "c3vd-v2"),
+            lambda kind: rename([kind.images, kind.depths], lambda number: number + 1),
+            "numbers 1 to 11, but none is 0",
+        )
+    ],
+    "no pose file": [
+        (("c3vd", "c3vd-raw", "c3vd-v2"), lambda kind: remove(kind.poses), "has images but no <poses>"),
+        ("c3vd-endogslam", lambda kind: remove(kind.poses), "no pose.txt"),
+        (TUM, lambda kind: remove(kind.poses), r"has images but no groundtruth\.txt or poses\.txt"),
+        ("reim-nerf", lambda kind: remove(kind.poses), r"Add transforms_train\.json"),
+    ],
+    "fewer poses than images": [
+        (
             (*MATRICES, "rgbd-by-order"),
-            lambda name, kind: (
-                drop_last_line(kind.poses),
-                (rf"{kind.poses} has 10 poses for 11 images", "a pose for every image"),
-            ),
+            lambda kind: drop_last_line(kind.poses),
+            "<poses> has 10 poses for 11 images.*a pose for every image",
         ),
-        **per_kind(
+        (
             PARAMS,
-            lambda name, kind: (
-                change_npz(PARAMS[name], lambda arrays: _shorten(arrays, 2)),
-                (r"params\.npz has 8 poses for 11 images|params\.npz has 9 poses for 11 images", "Expected 11"),
-            ),
+            lambda kind: change_npz(kind.params, lambda arrays: shorten(arrays, 2)),
+            r"params\.npz has [89] poses for 11 images.*Expected 11",
         ),
-    },
-    "more poses than images": {
-        **per_kind(
+    ],
+    "more poses than images": [
+        (
             (*MATRICES, "rgbd-by-order"),
-            lambda name, kind: (
-                repeat_last_line(kind.poses),
-                (rf"{kind.poses} has 12 poses for 11 images", "a pose for every image"),
+            lambda kind: repeat_last_line(kind.poses),
+            "<poses> has 12 poses for 11 images.*a pose for every image",
+        ),
+        (
+            FRAMES_OF_JSON,
+            lambda kind: change_json(
+                kind.poses,
+                lambda content: content["frames"].append({**content["frames"][-1], "file_path": "images/99"}),
             ),
+            r"<poses>(: frame 99 has no image| names \S*images/99|: 1 of 12 frames have no image).*Expected",
         ),
-        **per_kind(
+    ],
+    "no poses": [
+        ((*MATRICES, *TUM, "colmap-text"), lambda kind: cut(kind.poses, 0, 0.0), "<poses> holds no poses.*Expected"),
+        (FRAMES_OF_JSON, lambda kind: cut(kind.poses, 0, 0.0), "<poses> is not JSON.*Expected"),
+    ],
+    "no frames": [
+        (
             FRAMES_OF_JSON,
-            lambda name, kind: (
-                change_json(
-                    kind.poses,
-                    lambda content: content["frames"].append({**content["frames"][-1], "file_path": "images/99"}),
-                ),
-                (
-                    rf"{kind.poses}(: frame 99 has no image| names \S*images/99|: 1 of 12 frames have no image)",
-                    "Expected",
-                ),
-            ),
-        ),
-    },
-    "no poses": {
-        **per_kind(
-            (*MATRICES, *TUM, "colmap-text"),
-            lambda name, kind: (cut(kind.poses, 0, 0.0), (rf"{kind.poses} holds no poses", "Expected")),
-        ),
-        **per_kind(
-            FRAMES_OF_JSON,
-            lambda name, kind: (cut(kind.poses, 0, 0.0), (rf"{kind.poses} is not JSON", "Expected")),
-        ),
-    },
-    "a pose file cut short": {
-        **per_kind(
-            (*MATRICES, *TUM),
-            lambda name, kind: (cut(kind.poses), (rf"{kind.poses}, line \d+: '.*'", r"\d+ finite numbers")),
-        ),
-        **per_kind(
-            FRAMES_OF_JSON,
-            lambda name, kind: (cut(kind.poses), (rf"{kind.poses} is not JSON: .* line \d+", "Expected")),
-        ),
-        "colmap-text": (cut("sparse/0/images.txt"), (r"sparse/0 cannot be read", r"images\.txt", "complete")),
-        "colmap": (cut("sparse/0/images.bin"), (r"images\.bin \(\d+ bytes\) is damaged or cut short",)),
-        **per_kind(
+            lambda kind: change_json(kind.poses, lambda content: content["frames"].clear()),
+            "<poses> has no frames",
+        )
+    ],
+    "a pose file cut short": [
+        ((*MATRICES, *TUM), lambda kind: cut(kind.poses), r"<poses>, line \d+: '.*'.*\d+ finite numbers"),
+        (FRAMES_OF_JSON, lambda kind: cut(kind.poses), r"<poses> is not JSON: .* line \d+.*Expected"),
+        ("colmap-text", lambda kind: cut(kind.poses), r"sparse/0 cannot be read.*images\.txt.*complete"),
+        ("colmap", lambda _: cut("sparse/0/images.bin"), r"images\.bin \(\d+ bytes\) is damaged or cut short"),
+        (
             PARAMS,
-            lambda name, kind: (
-                lambda folder: (folder / PARAMS[name]).write_bytes((folder / PARAMS[name]).read_bytes()[:4000]),
-                (r"cannot read \S*params\.npz", "written by EndoGSLAM"),
-            ),
+            lambda kind: lambda folder: write_text(kind.params, (folder / kind.params).read_bytes()[:4000])(folder),
+            r"cannot read \S*params\.npz.*written by EndoGSLAM",
         ),
-    },
-    "a pose file of something else": per_kind(
-        (*MATRICES, *TUM, *FRAMES_OF_JSON, "colmap-text"),
-        lambda name, kind: (_rubbish(kind.poses), (rf"cannot read \S*{kind.poses}", "Expected")),
-    ),
-    "a number that is none": {
-        **per_kind(
+    ],
+    "a pose file of something else": [
+        (
+            (*MATRICES, *TUM, *FRAMES_OF_JSON, "colmap-text"),
+            lambda kind: write_text(kind.poses, RUBBISH),
+            r"cannot read \S*<poses>.*Expected",
+        ),
+        (TUM, lambda kind: write_text(kind.poses, "1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1\n"), "<poses>, line 1: '1,0,0,0"),
+        (PARAMS, lambda kind: write_text(kind.params, "PK nonsense"), r"cannot read \S*params\.npz"),
+    ],
+    "a number that is none": [
+        (
             MATRICES,
-            lambda name, kind: (
-                change_matrices(kind.poses, lambda matrices: spoil_number(matrices[3])),
-                (rf"{kind.poses}, line 4: 'nan,", "16 finite numbers"),
-            ),
+            lambda kind: change_matrices(kind.poses, lambda matrices: spoil_number(matrices[3])),
+            "<poses>, line 4: 'nan,.*16 finite numbers",
         ),
-        **per_kind(
+        (
             FRAMES_OF_JSON,
-            lambda name, kind: (
-                change_frame(kind.poses, 1, spoil_number),
-                (rf"{kind.poses}, frame 1 \(.*\): transform_matrix", "rows of 4 finite numbers"),
-            ),
+            lambda kind: change_frame(kind.poses, 1, spoil_number),
+            r"<poses>, frame 1 \(.*\): transform_matrix.*rows of 4 finite numbers",
         ),
-        **per_kind(
+        (
             TUM,
-            lambda name, kind: (
-                change_row(kind.poses, 3, 4, lambda quat: quat * np.nan),
-                (rf"{kind.poses}, line \d+: '", "8 finite numbers"),
-            ),
+            lambda kind: change_row(kind.poses, 3, 4, lambda quat: quat * np.nan),
+            r"<poses>, line \d+: '.*8 finite numbers",
         ),
-        "colmap-text": (
-            change_row("sparse/0/images.txt", 6, 1, lambda quat: quat * np.nan),
-            (r"images\.txt, line \d+: '4 nan", "all numbers finite"),
+        (
+            "colmap-text",
+            lambda kind: change_row(kind.poses, 6, 1, lambda quat: quat * np.nan),
+            r"images\.txt, line \d+: '4 nan.*all numbers finite",
         ),
-        "colmap": (
-            change_binary_pose(3, lambda values: values * np.nan),
-            (r"images\.bin, image \d+ ", "its pose is nan"),
+        (
+            "colmap",
+            lambda _: change_binary_pose(3, lambda values: values * np.nan),
+            r"images\.bin, image \d+ .*its pose is nan",
         ),
-        **per_kind(
+        (
             PARAMS,
-            lambda name, kind: (
-                change_npz(PARAMS[name], lambda arrays: arrays.update(cam_trans=arrays["cam_trans"] * np.nan)),
-                (r"params\.npz: cam_trans holds numbers that are not finite",),
-            ),
+            lambda kind: change_npz(kind.params, lambda arrays: arrays.update(cam_trans=arrays["cam_trans"] * np.nan)),
+            r"params\.npz: cam_trans holds numbers that are not finite",
         ),
-    },
-    "a rotation that is none": {
-        **per_kind(
+    ],
+    "a word for a pose": [(MATRICES, lambda kind: change_line(kind.poses, 2, "none"), "<poses>, line 3: 'none'")],
+    "no matrix": [
+        (
+            FRAMES_OF_JSON,
+            lambda kind: change_json(kind.poses, lambda content: content["frames"][1].pop("transform_matrix")),
+            r"<poses>, frame 1 \(.*\): transform_matrix",
+        )
+    ],
+    "a rotation that is none": [
+        (
             MATRICES,
-            lambda name, kind: (
-                change_matrices(kind.poses, lambda matrices: stretch(matrices[3])),
-                (rf"{kind.poses}, line 4: not a rigid transform \(R\^T R is 3", r"within 0\.001"),
-            ),
+            lambda kind: change_matrices(kind.poses, lambda matrices: stretch(matrices[3])),
+            r"<poses>, line 4: not a rigid transform \(R\^T R is 3.*within 0\.001",
         ),
-        **per_kind(
+        (
             FRAMES_OF_JSON,
-            lambda name, kind: (
-                change_frame(kind.poses, 1, stretch),
-                (rf"{kind.poses}, frame 1 \(.*\): not a rigid transform \(R\^T R is 3", r"within 0\.001"),
-            ),
+            lambda kind: change_frame(kind.poses, 1, stretch),
+            r"<poses>, frame 1 \(.*\): not a rigid transform \(R\^T R is 3.*within 0\.001",
         ),
-        **per_kind(
+        (
             TUM,
-            lambda name, kind: (
-                change_row(kind.poses, 3, 4, lambda quat: 2.0 * quat),
-                (rf"{kind.poses}, line \d+: a quaternion of length 2", "length 1"),
-            ),
+            lambda kind: change_row(kind.poses, 3, 4, lambda quat: 2.0 * quat),
+            r"<poses>, line \d+: a quaternion of length 2.*length 1",
         ),
-        "colmap-text": (
-            change_row("sparse/0/images.txt", 6, 1, lambda quat: 2.0 * quat),
-            (r"images\.txt, line \d+: a quaternion of length 2", "length 1"),
+        (
+            "colmap-text",
+            lambda kind: change_row(kind.poses, 6, 1, lambda quat: 2.0 * quat),
+            r"images\.txt, line \d+: a quaternion of length 2.*length 1",
         ),
-        "colmap": (
-            change_binary_pose(3, lambda values: 2.0 * values),
-            (r"images\.bin, image 4 \(0003\.png\): a quaternion of length 2", "length 1"),
+        (
+            "colmap",
+            lambda _: change_binary_pose(3, lambda values: 2.0 * values),
+            r"images\.bin, image 4 \(0003\.png\): a quaternion of length 2.*length 1",
         ),
-        **per_kind(
+        (
             PARAMS,
-            lambda name, kind: (
-                change_npz(PARAMS[name], lambda arrays: arrays["cam_unnorm_rots"][..., 3].fill(0.0)),
-                (r"params\.npz, cam_unnorm_rots, frame 3: the quaternion \(0, 0, 0, 0\) is not a rotation",),
-            ),
+            lambda kind: change_npz(kind.params, lambda arrays: arrays["cam_unnorm_rots"][..., 3].fill(0.0)),
+            r"params\.npz, cam_unnorm_rots, frame 3: the quaternion \(0, 0, 0, 0\) is not a rotation",
         ),
-    },
-    "a left-handed pose": {
-        **per_kind(
+    ],
+    "a left-handed pose": [
+        (
             MATRICES,
-            lambda name, kind: (
-                change_matrices(
-                    kind.poses, lambda matrices: (mirror if name == "c3vd-raw-old" else mirror_rows)(matrices[3])
-                ),
-                (rf"{kind.poses}, line 4: a left-handed transform \(det R = -1\)", "x right, y down, z forward"),
+            lambda kind: change_matrices(
+                kind.poses, lambda matrices: (mirror if kind is KINDS["c3vd-raw-old"] else mirror_rows)(matrices[3])
             ),
+            r"<poses>, line 4: a left-handed transform \(det R = -1\).*x right, y down, z forward",
         ),
-        **per_kind(
+        (
             FRAMES_OF_JSON,
-            lambda name, kind: (
-                change_frame(kind.poses, 1, mirror),
-                (rf"{kind.poses}, frame 1 \(.*\): a left-handed transform", "right-handed"),
-            ),
+            lambda kind: change_frame(kind.poses, 1, mirror),
+            r"<poses>, frame 1 \(.*\): a left-handed transform.*right-handed",
         ),
-        **per_kind(
+        (
             PARAMS,
-            lambda name, kind: (
-                change_npz(PARAMS[name], lambda arrays: mirror(arrays["gt_w2c_all_frames"][3])),
-                (r"params\.npz, gt_w2c_all_frames, frame 3: a left-handed transform", "right-handed"),
-            ),
+            lambda kind: change_npz(kind.params, lambda arrays: mirror(arrays["gt_w2c_all_frames"][3])),
+            r"params\.npz, gt_w2c_all_frames, frame 3: a left-handed transform.*right-handed",
         ),
-    },
-    "intrinsics of another resolution": {
-        "c3vd": (
-            change_json("camera.json", _doubled("fx", "fy", "cx", "cy", "w", "h")),
-            (r"0000_color\.png is 64 x 51, but \S*camera\.json says 128 x 102",),
-        ),
-        **per_kind(
-            TUM,
-            lambda name, kind: (
-                change_json("camera.json", _doubled("fx", "fy", "cx", "cy", "w", "h")),
-                (r"\.png is 64 x 51, but \S*camera\.json says 128 x 102",),
-            ),
-        ),
-        "nerfstudio": (
-            change_json("transforms.json", _doubled("fl_x", "fl_y", "cx", "cy", "w", "h")),
-            (r"frame_00001\.png is 64 x 51, but \S*transforms\.json says 128 x 102",),
-        ),
-        "reim-nerf": (
-            change_json("transforms_*.json", _doubled("fx", "fy", "cx", "cy", "w", "h")),
-            (r"rgb_mask\.png is 64 x 51", "128 x 102"),
-        ),
-        "colmap": (_double_colmap(size=True), (r"0000\.png is 64 x 51, but \S*cameras\.bin says 128 x 102",)),
-        **per_kind(
-            PARAMS,
-            lambda name, kind: (
-                change_npz(
-                    PARAMS[name], lambda arrays: arrays.update(intrinsics=arrays["intrinsics"] * [[2], [2], [1]])
-                ),
-                (r"params\.npz: the principal point .* is 5\d % of the image", "org_width"),
-            ),
-        ),
-        "c3vd-v2": (
-            lambda folder: (folder / "camera_intrinsics.txt").write_text(
-                (folder / "camera_intrinsics.txt").read_text().replace("cx = 677", "cx = 338")
-            ),
-            (r"camera_intrinsics\.txt is ambiguous or implausible: a centre \(338\.739, 543\.058\) far",),
-        ),
-        "rotatecolon": (
-            change_json("transforms.json", lambda content: content.update(camera_angle_x=80.0)),
-            (r"transforms\.json: camera_angle_x is 80", "radians"),
-        ),
-    },
-    "a camera file cut short": {
-        **per_kind(
+    ],
+    "intrinsics of another resolution": [
+        (
             ("c3vd", *TUM),
-            lambda name, kind: (cut("camera.json"), (r"camera\.json is not JSON: .* line", "JSON object")),
+            lambda _: change_json("camera.json", _doubled(*_TWICE_K, "w", "h")),
+            r"\.png is 64 x 51, but \S*camera\.json says 128 x 102",
         ),
-        "c3vd-v2": (cut("camera_intrinsics.txt"), (r"camera_intrinsics\.txt is ambiguous or implausible: no a3, a4",)),
-        "colmap": (cut("sparse/0/cameras.bin"), (r"cameras\.bin \(\d+ bytes\) is damaged or cut short",)),
-        "colmap-text": (cut("sparse/0/cameras.txt", 0, 0.9), (r"cameras\.txt, line 4: '1 PINHOLE 64 51",)),
-    },
-    "another file of the layout cut short": {
-        "colmap": (cut("sparse/0/points3D.bin"), (r"points3D\.bin \(\d+ bytes\) is damaged or cut short",)),
-        "colmap-text": (
-            _cut_after_lines("sparse/0/points3D.txt", 100),
-            (r"points3D\.txt has 97 points, but not \d+",),
+        (
+            "nerfstudio",
+            lambda kind: change_json(kind.poses, _doubled(*_TWICE_FL, "w", "h")),
+            r"frame_00001\.png is 64 x 51, but \S*transforms\.json says 128 x 102",
         ),
-        "rotatecolon": (cut("init_point_cloud.ply"), (r"init_point_cloud\.ply says it has \d+ vertices, but holds",)),
-        "reim-nerf": (cut("rgb_mask.png"), (r"rgb_mask\.png \(\d+ bytes\) cannot be decoded",)),
-        "pr-endo": (
-            cut("../../C3VD_endogslam_optimized/phantom/point_cloud/iteration_30000/point_cloud.ply"),
-            (r"point_cloud\.ply says it has 20000 vertices, but holds \d+",),
+        (
+            "reim-nerf",
+            lambda _: change_json("transforms_*.json", _doubled(*_TWICE_K, "w", "h")),
+            r"rgb_mask\.png is 64 x 51.*128 x 102",
         ),
-        "c3vd": (cut("rotation/camera_pose.txt"), (r"rotation/camera_pose\.txt, line \d: '",)),
-        "c3vd-raw": (cut("rotation/*_depth.tiff"), (r"rotation/0000_depth\.tiff \(\d+ bytes\) cannot be decoded",)),
-        "c3vd-v2": (cut("rotation/rgb/*.png"), (r"rotation/rgb/0000\.png \(\d+ bytes\) cannot be decoded",)),
-        "c3vd-endogslam": (cut("rotation/pose.txt"), (r"rotation/pose\.txt, line \d: '",)),
-    },
-    "a model without images": {
-        "colmap": (unregistered, (r"images\.bin holds no poses", "at least one registered image")),
-        "colmap-text": (
-            lambda folder: shutil.rmtree(folder / "images"),
-            (r"no folder \S*images", "the images that the model was made from"),
-        ),
-    },
-    "another channel than expected": {
-        "rotatecolon": (
-            rename_channel("depth_train/*.exr", 4, "ViewLayer.Depth.Z", "View Layer.Depth.Z"),
-            (
-                r"0004\.exr has the channels View Layer\.Depth\.Z, .*R",
-                r"a channel ViewLayer\.Depth\.Z",
-                "depth_channel",
+        ("colmap", lambda _: double_colmap(size=True), r"0000\.png is 64 x 51, but \S*cameras\.bin says 128 x 102"),
+        (
+            PARAMS,
+            lambda kind: change_npz(
+                kind.params, lambda arrays: arrays.update(intrinsics=arrays["intrinsics"] * [[2], [2], [1]])
             ),
+            r"params\.npz: the principal point .* is 5\d % of the image.*org_width",
         ),
-    },
-    "a depth scale that nobody says": per_kind(
-        TUM,
-        lambda name, kind: (
-            change_json("camera.json", lambda content: content.pop("depth_scale")),
-            ("their number of steps per unit", "5000 steps per metre", "depth_scale=5000"),
+        (
+            "c3vd-v2",
+            lambda _: (
+                lambda folder: write_text(
+                    "camera_intrinsics.txt",
+                    (folder / "camera_intrinsics.txt").read_text().replace("cx = 677", "cx = 338"),
+                )(folder)
+            ),
+            r"camera_intrinsics\.txt is ambiguous or implausible: a centre \(338\.739, 543\.058\) far",
         ),
-    ),
+        (
+            "rotatecolon",
+            lambda kind: change_json(kind.poses, lambda content: content.update(camera_angle_x=80.0)),
+            r"transforms\.json: camera_angle_x is 80.*radians",
+        ),
+    ],
+    "no camera file": [
+        ("c3vd", lambda _: remove("camera.json"), r"has images but no camera\.json"),
+        (TUM, lambda _: remove("camera.json"), r"has images but no camera\.json, intrinsics\.txt, cameras\.txt"),
+    ],
+    "a camera file cut short": [
+        (("c3vd", *TUM), lambda _: cut("camera.json"), r"camera\.json is not JSON: .* line.*JSON object"),
+        (
+            "c3vd-v2",
+            lambda _: cut("camera_intrinsics.txt"),
+            r"camera_intrinsics\.txt is ambiguous or implausible: no a3, a4",
+        ),
+        ("colmap", lambda _: cut("sparse/0/cameras.bin"), r"cameras\.bin \(\d+ bytes\) is damaged or cut short"),
+        ("colmap-text", lambda _: cut("sparse/0/cameras.txt", 0, 0.9), r"cameras\.txt, line 4: '1 PINHOLE 64 51"),
+    ],
+    "camera.json without numbers": [
+        (("c3vd", *TUM), lambda _: write_text("camera.json", "[]"), r"camera\.json has no fx, fy")
+    ],
+    "camera.json without keys": [
+        (("c3vd", *TUM), lambda _: change_camera(fx=None, cy=None), r"camera\.json has no fx, cy")
+    ],
+    "a word for a focal length": [(("c3vd", *TUM), lambda _: change_camera(fx="wide"), r"camera\.json: .*'wide'")],
+    "no focal length": [
+        (("c3vd", *TUM), lambda _: change_camera(fy=0), r"camera\.json: .*above 0"),
+        ("reim-nerf", lambda _: change_camera("transforms_*.json", fy=0), r"transforms_train\.json: .*above 0"),
+    ],
+    "half pixels": [
+        (("c3vd", *TUM), lambda _: change_camera(w=64.5), "whole pixels"),
+        ("reim-nerf", lambda _: change_camera("transforms_*.json", h=51.5), "w = 64.0, h = 51.5"),
+    ],
+    "a crop": [
+        (
+            ("c3vd-raw", "c3vd-v2"),
+            lambda kind: repaint(kind.images, 0, square),
+            "<0>.png is 50 x 50.*undistorted layout",
+        )
+    ],
+    "another file of the layout cut short": [
+        ("colmap", lambda _: cut("sparse/0/points3D.bin"), r"points3D\.bin \(\d+ bytes\) is damaged or cut short"),
+        ("colmap-text", lambda _: cut("sparse/0/points3D.txt", lines=100), r"points3D\.txt has 97 points, but not \d+"),
+        (
+            "rotatecolon",
+            lambda _: cut("init_point_cloud.ply"),
+            r"init_point_cloud\.ply says it has \d+ vertices, but holds",
+        ),
+        ("reim-nerf", lambda _: cut("rgb_mask.png"), r"rgb_mask\.png \(\d+ bytes\) cannot be decoded"),
+        (
+            "pr-endo",
+            lambda _: cut("../../C3VD_endogslam_optimized/phantom/point_cloud/iteration_30000/point_cloud.ply"),
+            r"point_cloud\.ply says it has 20000 vertices, but holds \d+",
+        ),
+        ("c3vd", lambda _: cut("rotation/camera_pose.txt"), r"rotation/camera_pose\.txt, line \d: '"),
+        (
+            "c3vd-raw",
+            lambda _: cut("rotation/*_depth.tiff"),
+            r"rotation/0000_depth\.tiff \(\d+ bytes\) cannot be decoded",
+        ),
+        ("c3vd-v2", lambda _: cut("rotation/rgb/*.png"), r"rotation/rgb/0000\.png \(\d+ bytes\) cannot be decoded"),
+        ("c3vd-endogslam", lambda _: cut("rotation/pose.txt"), r"rotation/pose\.txt, line \d: '"),
+    ],
+    "a model without images": [
+        ("colmap", lambda _: unregistered, r"images\.bin holds no poses.*at least one registered image"),
+        (
+            "colmap-text",
+            lambda _: lambda folder: shutil.rmtree(folder / "images"),
+            r"no folder \S*images.*the images that the model was made from",
+        ),
+    ],
+    "another channel than expected": [
+        (
+            "rotatecolon",
+            lambda kind: rename_channel(kind.depths, 4, "ViewLayer.Depth.Z", "View Layer.Depth.Z"),
+            r"0004\.exr has the channels View Layer\.Depth\.Z, .*R.*a channel ViewLayer\.Depth\.Z.*depth_channel",
+        )
+    ],
+    "a depth scale that nobody says": [
+        (
+            TUM,
+            lambda _: change_camera(depth_scale=None),
+            "their number of steps per unit.*5000 steps per metre.*depth_scale=5000",
+        )
+    ],
+}
+REFUSED = expanded(ERRORS)
+
+
+def _frame(index: int, change: Callable[[dict], object], pattern: str = "transforms_*.json") -> Spoil:
+    return change_json(pattern, lambda content: change(content["frames"][index]))
+
+
+_TURNED = [[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+
+#: Faults of one layout: by kind, how to spoil it and the pattern of the message.
+OWN: dict[str, list[tuple[Spoil, str]]] = {
+    "c3vd": [
+        (rename(["images/*.png"], lambda number: f"frame{number}"), "images holds frame0_color.png"),
+        (paint("0000_color.png", (51, 64, 3)), r"holds both 0000_color\.png and images/"),
+        (remove("images/*.png", 10), "10 images and 11 depth files; frame 10"),
+    ],
+    "c3vd-endogslam": [
+        (
+            change_matrices("pose.txt", lambda matrices: matrices[[*range(1, 11), 0]]),
+            r"params\.npz: the true pose of image \d+ is .* mm and .* degrees from that of .*pose\.txt",
+        ),
+        (change_npz("params.npz", lambda arrays: arrays.pop("means3D")), "no means3D"),
+        (change_npz("params.npz", lambda arrays: arrays.pop("org_width")), "no org_width"),
+        (
+            change_npz("params.npz", lambda arrays: arrays.update(org_width=np.array(800), org_height=np.array(540))),
+            r"0000_color\.png is 64 x 51, but .*params\.npz is for 800 x 540",
+        ),
+    ],
+    "rotatecolon": [
+        (write_text("transforms.json", "{}"), r"transforms\.json has no frames"),
+        (change_json("transforms.json", lambda content: content.pop("camera_angle_x")), "camera_angle_x is None"),
+        (
+            change_json("transforms_test.json", lambda content: content.update(camera_angle_x=80.0)),
+            r"transforms_test\.json: camera_angle_x is 80.0",
+        ),
+        (remove("test_views_1/*.png", 1), "frame 1 has no .*test_views_1"),
+        (_frame(2, lambda frame: frame.update(file_path="r_2"), "transforms.json"), "file_path 'r_2'"),
+        (_frame(2, lambda frame: frame.update(file_path="0001"), "transforms.json"), "frame 1 is repeated"),
+    ],
+    "rgbd": [
+        (lambda folder: shutil.rmtree(folder / "rgb"), r"data holds camera\.json, depth\.txt, depth/"),
+        (lambda folder: (folder / "images").mkdir(), "holds rgb/ and images/"),
+        (lambda folder: (folder / "depths").mkdir(), "holds depth/ and depths/"),
+        (
+            lambda folder: shutil.copy(folder / "groundtruth.txt", folder / "slam_poses.txt"),
+            r"has the trajectories groundtruth\.txt, slam_poses\.txt.*--set datamanager\.trajectory=groundtruth\.txt",
+        ),
+        (
+            lambda folder: (folder / "rgb/1305031102.000000.png").rename(folder / "rgb/0.png"),
+            r"rgb/0\.png is not named by a timestamp",
+        ),
+        *((change_camera(depth_scale=scale), "depth_scale") for scale in (0, -5.0, "5000", True)),
+    ],
+    "reim-nerf": [
+        (remove("transforms_true_test.json"), r"has no transforms_true_test\.json.*choose another split"),
+        (write_text("transforms_val.json", "{"), r"transforms_val\.json is not JSON"),
+        (_frame(1, lambda frame: frame.pop("file_path"), "*_train.json"), r"_train\.json, frame 1: no file_path"),
+        (
+            change_frame("transforms_test.json", 0, lambda matrix: matrix.__setitem__((0, 3), 0.5)),
+            r"_test\.json: pose or distance map of images/0000_color\.png differs",
+        ),
+        (
+            change_json("transforms_train.json", lambda content: content["frames"].append(content["frames"][0])),
+            r"_train\.json: 'images/0000_color\.png' is repeated",
+        ),
+        (change_camera("*_val.json", scene_scale=0.5), r"_val\.json: scene_scale differs from transforms_train\.json"),
+        (change_camera("transforms_*.json", scene_scale=None), r"_train\.json: scene_scale is None"),
+        (change_camera("transforms_*.json", scene_scale=0.0), r"_train\.json: scene_scale is 0"),
+        (change_camera("transforms_*.json", distmap_scale=-1.0), r"_train\.json: distmap_scale is -1"),
+        (change_camera("transforms_*.json", scene_T=_TURNED), r"_train\.json: scene_T is not a translation"),
+        (change_camera("transforms_*.json", scene_T=None), r"_train\.json: scene_T is not a translation"),
+        (change_camera("transforms_*.json", camera_model="OPENCV"), "camera_model 'OPENCV'.*FISHEYE_OPENCV"),
+        (change_camera("transforms_*.json", w=None), r"_train\.json: w is None"),
+        (change_camera("transforms_*.json", p1=0.01), r"_train\.json: p1 = 0.01"),
+        (
+            change_json(
+                "transforms_*.json",
+                lambda content: [f.pop("distmap_path") for f in content["frames"] if "0005" in f["file_path"]],
+            ),
+            r"images/0005_color\.png has no distmap_path, but others have",
+        ),
+        (remove("rgb_mask.png"), r"no file .*rgb_mask\.png.*mask: false"),
+        (paint("rgb_mask.png", (26, 32)), r"rgb_mask\.png is 32 x 26.*64 x 51"),
+        (
+            repaint("rgb_mask.png", 0, lambda mask: np.dstack([mask, mask // 2, mask])),
+            r"rgb_mask\.png is a colour image.*three equal ones",
+        ),
+    ],
 }
 
 
-def _shorten(arrays: dict[str, np.ndarray], by: int) -> None:
-    for key in ("cam_unnorm_rots", "cam_trans"):
-        arrays[key] = arrays[key][..., :-by]
-    arrays["gt_w2c_all_frames"] = arrays["gt_w2c_all_frames"][:-by]
-
-
-@pytest.mark.parametrize(("fault", "name"), [(fault, name) for fault, rows in REFUSED.items() for name in rows])
-def test_one_clear_error(copied, fault, name):
-    spoil, fragments = REFUSED[fault][name]
-    folder = copied(name)
-    spoil(folder)
+def refused(folder: Path, name: str) -> InputError:
     # Whatever is in the folder, looking which format it is does not fail.
     datamanagers.get(KINDS[name].format).recognise(folder)
     with pytest.raises(InputError) as caught:
         load(folder, name)
-    message = str(caught.value)
-    assert re.search(".*".join(f"(?:{fragment})" for fragment in fragments), message), message
-    assert caught.value.expected, message
-    assert "\n" not in message
+    assert caught.value.expected, caught.value
+    assert "\n" not in str(caught.value)
+    return caught.value
+
+
+@pytest.mark.parametrize(("fault", "name"), [(fault, name) for fault, rows in REFUSED.items() for name in rows])
+def test_one_clear_error(copied, fault, name):
+    spoil, pattern = REFUSED[fault][name]
+    folder = copied(name)
+    spoil(folder)
+    message = str(refused(folder, name))
+    assert re.search(pattern, message), message
+
+
+@pytest.mark.parametrize(("name", "row"), [(name, row) for name, rows in OWN.items() for row in range(len(rows))])
+def test_one_clear_error_of_its_own(copied, name, row):
+    spoil, pattern = OWN[name][row]
+    folder = copied(name)
+    spoil(folder)
+    message = str(refused(folder, name))
+    assert re.search(pattern, message), message
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_folder_that_is_not_there(tmp_path, name):
+    with pytest.raises(InputError, match=r"no (folder|file) .*nowhere"):
+        load(tmp_path / "nowhere", name)
 
 
 def test_every_fault_meets_every_layout_it_can_befall():
@@ -540,59 +661,61 @@ def test_every_fault_meets_every_layout_it_can_befall():
 
 _DOUBLE_K = r"the principal point is (4\d|5\d)% of the image \(64 x 51\) from its middle.*another resolution"
 
-WARNED: dict[str, Rows] = {
-    "intrinsics of another resolution that say they are of this one": {
-        "c3vd": (change_json("camera.json", _doubled("fx", "fy", "cx", "cy")), (rf"camera\.json: {_DOUBLE_K}",)),
-        "rgbd": (change_json("camera.json", _doubled("fx", "fy", "cx", "cy")), (rf"camera\.json: {_DOUBLE_K}",)),
-        "colmap": (_double_colmap(size=False), (rf"cameras\.bin: {_DOUBLE_K}",)),
-        "nerfstudio": (
-            change_json("transforms.json", _doubled("fl_x", "fl_y", "cx", "cy")),
-            (rf"transforms\.json: {_DOUBLE_K}",),
+WARNINGS: dict[str, list[Row]] = {
+    "intrinsics of another resolution that say they are of this one": [
+        (("c3vd", "rgbd"), lambda _: change_json("camera.json", _doubled(*_TWICE_K)), rf"camera\.json: {_DOUBLE_K}"),
+        ("colmap", lambda _: double_colmap(size=False), rf"cameras\.bin: {_DOUBLE_K}"),
+        ("nerfstudio", lambda kind: change_json(kind.poses, _doubled(*_TWICE_FL)), rf"transforms\.json: {_DOUBLE_K}"),
+        (
+            "reim-nerf",
+            lambda _: change_json("transforms_*.json", _doubled(*_TWICE_K)),
+            rf"transforms_train\.json: {_DOUBLE_K}",
         ),
-        "reim-nerf": (
-            change_json("transforms_*.json", _doubled("fx", "fy", "cx", "cy")),
-            (rf"transforms_train\.json: {_DOUBLE_K}",),
+    ],
+    "images without a pose": [
+        (
+            "rotatecolon",
+            lambda kind: change_json(kind.poses, lambda content: content["frames"].pop()),
+            r"transforms\.json: 1 images of train_views have no pose and are left out",
         ),
-    },
-    "images without a pose": {
-        "rotatecolon": (
-            change_json("transforms.json", lambda content: content["frames"].pop()),
-            (r"transforms\.json: 1 images of train_views have no pose and are left out",),
+        (
+            "nerfstudio",
+            lambda kind: change_json(kind.poses, lambda content: content["frames"].pop()),
+            r"transforms\.json: 1 images have no pose and are left out: frame_00011\.png",
         ),
-        "nerfstudio": (
-            change_json("transforms.json", lambda content: content["frames"].pop()),
-            (r"transforms\.json: 1 images have no pose and are left out: frame_00011\.png",),
+        (
+            "colmap",
+            lambda _: lambda folder: shutil.copy(folder / "images/0000.png", folder / "images/0011.png"),
+            r"images\.bin: 1 images have no pose and are left out: 0011\.png",
         ),
-        "colmap": (
-            lambda folder: shutil.copy(folder / "images/0000.png", folder / "images/0011.png"),
-            (r"images\.bin: 1 images have no pose and are left out: 0011\.png",),
+        (
+            "reim-nerf",
+            lambda _: lambda folder: shutil.copy(folder / "images/0000_color.png", folder / "images/0011_color.png"),
+            r"1 images have no pose and are left out: 0011_color\.png",
         ),
-        "reim-nerf": (
-            lambda folder: shutil.copy(folder / "images/0000_color.png", folder / "images/0011_color.png"),
-            (r"1 images have no pose and are left out: 0011_color\.png",),
-        ),
-        "rgbd": (drop_last_line("groundtruth.txt"), (r"of 11 images 1 have no pose and 0 no depth within 0\.02 s",)),
-    },
-    "depth that is missing for a frame": {
-        "rgbd": (remove("depth/*.png", 3), (r"of 11 images 0 have no pose and 1 no depth within 0\.02 s",)),
-    },
+        ("rgbd", lambda kind: drop_last_line(kind.poses), r"of 11 images 1 have no pose and 0 no depth within 0\.02 s"),
+    ],
+    "depth that is missing for a frame": [
+        ("rgbd", lambda kind: remove(kind.depths, 3), r"of 11 images 0 have no pose and 1 no depth within 0\.02 s")
+    ],
 }
+WARNED = expanded(WARNINGS)
 
 
 @pytest.mark.parametrize(("fault", "name"), [(fault, name) for fault, rows in WARNED.items() for name in rows])
 def test_one_clear_warning(copied, caplog, fault, name):
-    spoil, (message,) = WARNED[fault][name]
+    spoil, message = WARNED[fault][name]
     folder = copied(name)
     spoil(folder)
     with caplog.at_level(logging.WARNING):
         load(folder, name)
-    (found,) = [record.getMessage() for record in caplog.records if re.search(message, record.getMessage())]
-    assert str(folder) in found
+    (warning,) = [record.getMessage() for record in caplog.records if re.search(message, record.getMessage())]
+    assert str(folder) in warning
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_nothing_is_wrong_with_an_unspoilt_folder(made, caplog, name):
-    folder = made[name] / KINDS[name].scene
+def test_nothing_is_wrong_with_an_unspoilt_folder(phantoms, caplog, name):
+    folder = phantoms[name] / KINDS[name].scene
     with caplog.at_level(logging.WARNING):
         scene = load(folder, name)
     assert caplog.records == []
@@ -632,12 +755,7 @@ def test_depth_in_metres_is_suspect(copied, name):
 
 
 def _unpad(*patterns: str) -> Spoil:
-    def spoil(folder: Path) -> None:
-        for pattern in patterns:
-            for path in files(folder, pattern):
-                path.rename(path.with_name(re.sub(r"0*(\d+)", r"\1", path.name, count=1)))
-
-    return spoil
+    return rename([pattern for pattern in patterns if pattern], lambda number: number)
 
 
 def _unpad_json(pattern: str) -> Spoil:
@@ -673,12 +791,15 @@ UNPADDED = {
 
 
 @pytest.mark.parametrize("name", UNPADDED)
-def test_names_without_leading_zeros_come_in_the_order_of_their_numbers(copied, made, name):
+def test_names_without_leading_zeros_come_in_the_order_of_their_numbers(copied, phantoms, name):
     folder = copied(name)
     UNPADDED[name](folder)
     images = files(folder, KINDS[name].images)
     assert sorted(images) != images, "the names' own order is another one"
-    frames, expected = in_video_order(load(folder, name)), in_video_order(load(made[name] / KINDS[name].scene, name))
+    frames, expected = (
+        in_video_order(load(folder, name)),
+        in_video_order(load(phantoms[name] / KINDS[name].scene, name)),
+    )
     assert [frame.index for frame in frames] == [frame.index for frame in expected]
     for frame, same in zip(frames, expected, strict=True):
         assert (frame.image == same.image).all()
@@ -687,11 +808,11 @@ def test_names_without_leading_zeros_come_in_the_order_of_their_numbers(copied, 
         assert frame.depth is None or frame.depth.nan_to_num().equal(same.depth.nan_to_num())
 
 
-def test_an_image_less_than_there_are_poses_is_no_fault_by_time(copied, made):
+def test_an_image_less_than_there_are_poses_is_no_fault_by_time(copied, phantoms):
     folder = copied("rgbd")
     remove("rgb/*.png", 3)(folder)
     found = in_video_order(load(folder, "rgbd"))
-    expected = in_video_order(load(made["rgbd"], "rgbd"))
+    expected = in_video_order(load(phantoms["rgbd"], "rgbd"))
     for frame, same in zip(found, [*expected[:3], *expected[4:]], strict=True):
         assert frame.name == same.name
         assert (frame.camera.camera_to_world == same.camera.camera_to_world).all()
@@ -705,18 +826,20 @@ def test_quaternions_that_may_be_of_any_length(copied, name):
     """EndoGSLAM optimises quaternions without normalising them, and says so in their name."""
     folder = copied(name)
     before = in_video_order(load(folder, name))
-    change_npz(PARAMS[name], lambda arrays: arrays.update(cam_unnorm_rots=3.0 * arrays["cam_unnorm_rots"]))(folder)
+    change_npz(KINDS[name].params, lambda arrays: arrays.update(cam_unnorm_rots=3.0 * arrays["cam_unnorm_rots"]))(
+        folder
+    )
     after = in_video_order(load(folder, name))
     for one, other in zip(before, after, strict=True):
         np.testing.assert_allclose(one.camera.camera_to_world, other.camera.camera_to_world, atol=1e-5)
 
 
-def test_both_reading_orders_of_c3vds_poses_give_the_true_ones(made):
+def test_both_reading_orders_of_c3vds_poses_give_the_true_ones(phantoms):
     for name, order in (("c3vd-raw", "column-major"), ("c3vd-raw-old", "row-major")):
-        scene = load(made[name], name)
+        scene = load(phantoms[name], name)
         assert scene.provenance["pose_convention"]["order"] == order
         found = np.stack([frame.camera.camera_to_world.numpy() for frame in in_video_order(scene)])
-        np.testing.assert_allclose(found, true_poses(made[name]), atol=1e-4)
+        np.testing.assert_allclose(found, true_poses(phantoms[name]), atol=1e-4)
 
 
 # What the pages say is refused
@@ -787,9 +910,9 @@ def examples(page: str) -> list[str]:
 def test_the_pages_examples_are_what_is_said(copied, page, row):
     told = examples(page)
     assert len(told) == len(TOLD[page])
-    name, how = TOLD[page][row]
+    name, fault = TOLD[page][row]
     folder = copied(name)
-    (REFUSED[how][name][0] if isinstance(how, str) else how)(folder)
+    (REFUSED[fault][name][0] if isinstance(fault, str) else fault)(folder)
     with pytest.raises(InputError) as caught:
         load(folder, name)
     said = str(caught.value).replace(f"{folder}/", "")

@@ -6,7 +6,6 @@ import json
 import shutil
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -18,7 +17,7 @@ from coliags_plugin.datamanagers.c3vd_v2.lens import CANDIDATE_LENS, ORDER, read
 from coliags_plugin.datamanagers.c3vd_v2.reader import C3VDv2DataManager, C3VDv2Settings
 from coliags_plugin.geometry.lenses.models import LENSES, Lens
 from tests.datamanagers.wall_scenes import off_wall, poses, write_raw
-from tests.phantom.phantom_layouts import depth_gap, in_video_order, read, true_poses, write_phantom
+from tests.phantom.phantom_layouts import in_video_order, read, true_poses, write_phantom
 
 SMALL_LENS = CANDIDATE_LENS.resized(270, 216)
 
@@ -76,11 +75,6 @@ class TestPhantom:
         k, camera = CANDIDATE_LENS.resized(90, 72).pinhole, frames[0].camera
         assert (camera.fx, camera.fy) == pytest.approx((k.fx, k.fy))
         assert (camera.cx, camera.cy) == pytest.approx((k.cx, k.cy))
-
-    def test_depth_agrees_from_frame_to_frame(self, phantom):
-        first, second = in_video_order(read(phantom, "c3vd-v2", width=90, height=72))[3:5]
-        gap, share = depth_gap(first, second)
-        assert gap < 0.5 and share > 0.4
 
     def test_rotation_views_and_marks_come_along(self, phantom):
         scene = read(phantom, "c3vd-v2", width=90, height=72)
@@ -188,25 +182,6 @@ class TestVideosWithoutDepth:
         assert scene.train[0].depth is None
         assert len(scene.points) == 50
 
-    def test_points_are_asked_for(self, mine):
-        shutil.rmtree(mine / "depth")
-        with pytest.raises(InputError, match=r"neither depth files nor points3D.ply"):
-            load(mine)
-
-
-def test_both_pose_orders(tmp_path):
-    for row_major in (True, False):
-        scene = load(write_v2(tmp_path / str(row_major), row_major=row_major, count=2))
-        assert scene.provenance["pose_convention"]["order"] == ("row-major" if row_major else "column-major")
-        np.testing.assert_allclose(scene.train[0].camera.camera_to_world, poses(2)[1], atol=1e-5)
-
-
-def test_unpadded_names_are_sorted_by_number(tmp_path):
-    folder = write_v2(tmp_path / "wall", count=11, padded=False)
-    frames = in_video_order(load(folder))
-    assert [frame.name for frame in frames] == [str(index) for index in range(11)]
-    np.testing.assert_allclose(frames[10].camera.camera_to_world, poses(11)[10], atol=1e-5)
-
 
 def test_other_files_of_the_release_are_left_alone(mine):
     for kind in ("normals", "optical_flow", "occlusions", "diffuse"):
@@ -214,57 +189,3 @@ def test_other_files_of_the_release_are_left_alone(mine):
         (mine / kind / "0000_x.tiff").write_text("not looked at")
     (mine / "coverage_mesh.obj").write_text("not looked at")
     assert len(in_video_order(load(mine))) == 4
-
-
-def spoil_pose(folder: Path, line: int, text: str) -> None:
-    lines = (folder / "pose.txt").read_text().splitlines()
-    lines[line] = text
-    (folder / "pose.txt").write_text("\n".join(lines))
-
-
-REFUSED = {
-    "a gap": (lambda f: (f / "rgb/0001.png").unlink(), r"rgb has 3 images, numbers 0 to 3, but none is 1"),
-    "one number twice": (lambda f: shutil.copy(f / "rgb/0001.png", f / "rgb/1.png"), "same number"),
-    "depth for some": (lambda f: (f / "depth/0002_depth.tiff").unlink(), "frame 2 has only one of the two"),
-    "no poses": (lambda f: (f / "pose.txt").unlink(), "has images but no pose.txt"),
-    "no images": (lambda f: shutil.rmtree(f / "rgb"), "wall holds depth/, pose.txt"),
-    "poses cut short": (lambda f: spoil_pose(f, 3, ""), "pose.txt has 3 poses for 4 images"),
-    "a word in a pose": (lambda f: spoil_pose(f, 2, "none"), "pose.txt, line 3: 'none'"),
-    "left-handed": (
-        lambda f: spoil_pose(f, 1, "1,0,0,0, 0,1,0,0, 0,0,-1,0, 1,2,3,1"),
-        "pose.txt, line 2: a left-handed transform",
-    ),
-    "an image cut short": (
-        lambda f: (f / "rgb/0002.png").write_bytes((f / "rgb/0002.png").read_bytes()[:300]),
-        r"0002.png \(300 bytes\) cannot be decoded",
-    ),
-    "depth in colour": (
-        lambda f: cv2.imwrite(str(f / "depth/0001_depth.tiff"), np.zeros((216, 270, 3), np.uint16)),
-        "0001_depth.tiff is an image of 3 channels of uint16",
-    ),
-    "depth in 8 bits": (
-        lambda f: cv2.imwrite(str(f / "depth/0001_depth.tiff"), np.zeros((216, 270), np.uint8)),
-        "0001_depth.tiff is an image of 1 channel of uint8",
-    ),
-    "another size": (
-        lambda f: cv2.imwrite(str(f / "rgb/0003.png"), np.zeros((100, 125, 3), np.uint8)),
-        "0003.png is 125 x 100, but .*0000.png says 270 x 216",
-    ),
-    "cropped": (
-        lambda f: cv2.imwrite(str(f / "rgb/0000.png"), np.zeros((200, 200, 3), np.uint8)),
-        "0000.png is 200 x 200",
-    ),
-}
-
-
-@pytest.mark.parametrize("fault", REFUSED)
-def test_refused(mine, fault):
-    spoil, message = REFUSED[fault]
-    spoil(mine)
-    with pytest.raises(InputError, match=message):
-        load(mine)
-
-
-def test_no_such_folder(tmp_path):
-    with pytest.raises(InputError, match="no folder"):
-        load(tmp_path / "nowhere")

@@ -19,7 +19,7 @@ from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.geometry.poses import colmap as colmap_poses
 from tests.datamanagers.colmap_scenes import CAMERAS, HEIGHT, POINTS, WIDTH, camera, taken, wall_model, write_colmap
 from tests.datamanagers.wall_scenes import look, off_wall, poses
-from tests.phantom.phantom_layouts import distance_from_wall, in_video_order, read, true_poses, write_phantom
+from tests.phantom.phantom_layouts import distance_from_wall, in_video_order, read, write_phantom
 
 
 def load(folder: Path, **options):
@@ -300,12 +300,6 @@ def test_another_folder_of_images(folder):
         load(folder)
 
 
-def test_nothing_is_written(folder):
-    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
-    load(folder)
-    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
-
-
 def test_the_fingerprint_sees_the_model(folder):
     before = opened(folder).fingerprint
     assert opened(folder).fingerprint == before
@@ -315,26 +309,6 @@ def test_the_fingerprint_sees_the_model(folder):
 
 
 # What is refused
-
-
-def test_missing_images_are_named(folder):
-    for index in (2, 5):
-        (folder / "images" / f"{index}.png").unlink()
-    with pytest.raises(InputError, match=r"2 of the 9 images of .* are not in .*images: 2\.png, 5\.png"):
-        load(folder)
-
-
-def test_an_image_of_another_size(folder):
-    cv2.imwrite(str(folder / "images/4.png"), np.zeros((24, 32, 3), np.uint8))
-    with pytest.raises(InputError, match=r"4\.png is 32 x 24, but .*cameras\.bin says 64 x 48"):
-        load(folder)
-
-
-def test_an_image_cut_short(folder):
-    data = (folder / "images/4.png").read_bytes()
-    (folder / "images/4.png").write_bytes(data[:200])
-    with pytest.raises(InputError, match=r"4\.png \(200 bytes\) cannot be decoded"):
-        load(folder)
 
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D", "rigs", "frames"])
@@ -371,12 +345,10 @@ def test_text_files_that_end_in_rubbish(tmp_path, name):
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (lambda words: ["nan", *words[1:]], r"images\.txt, line 5"),
-        (lambda words: [str(2.0 * float(word)) for word in words[:4]] + words[4:], r"a quaternion of length 2"),
         (lambda words: ["0", "0", "0", "0", *words[4:]], r"is not a rotation"),
         (lambda words: [*words[:4], "inf", *words[5:]], r"images\.txt, line 5"),
     ],
-    ids=["nan", "not of unit length", "zero", "infinite"],
+    ids=["zero", "infinite"],
 )
 def test_poses_that_are_none(tmp_path, spoil, message):
     write_colmap(tmp_path, text=True)
@@ -386,15 +358,6 @@ def test_poses_that_are_none(tmp_path, spoil, message):
     lines[4] = " ".join([words[0], *spoil(words[1:8]), *words[8:]])
     path.write_text("\n".join(lines) + "\n")
     with pytest.raises(InputError, match=message):
-        opened(tmp_path)
-
-
-def test_a_model_without_registered_images(tmp_path):
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(camera())
-    (tmp_path / "sparse").mkdir()
-    model.write_binary(str(tmp_path / "sparse"))
-    with pytest.raises(InputError, match=r"images\.bin holds no poses"):
         opened(tmp_path)
 
 
@@ -445,14 +408,8 @@ def phantom(tmp_path_factory) -> Path:
     return write_phantom(tmp_path_factory.mktemp("phantoms") / "colmap", "colmap")
 
 
-def test_the_phantom_comes_back(phantom):
-    scene = read(phantom, "colmap")
-    frames = in_video_order(scene)
-    assert [frame.name for frame in frames] == [f"{index:04d}" for index in range(9)]
-    found = torch.stack([frame.camera.camera_to_world for frame in frames]).numpy()
-    np.testing.assert_allclose(found, true_poses(phantom), atol=1e-5)
-    assert distance_from_wall(phantom, scene.points.positions).max() < 1e-3
-    for frame in frames:
+def test_the_phantoms_sparse_depth_lies_on_its_wall(phantom):
+    for frame in in_video_order(read(phantom, "colmap")):
         assert len(frame.sparse_depth.depth) > 100
         assert distance_from_wall(phantom, torch.from_numpy(sparse_points(frame))).max() < 1e-3
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,83 +10,48 @@ import numpy as np
 import pytest
 import torch
 
+from coliags_plugin.config.registry import datamanagers
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame, concatenate_targets
-from coliags_plugin.datamanagers.nerfstudio.reader import NerfstudioDataManager, NerfstudioSettings
 from coliags_plugin.datamanagers.reading.images import resize_nearest
+from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
-from coliags_plugin.datamanagers.rgbd.reader import RGBDDataManager, RGBDSettings
-from coliags_plugin.geometry.poses import tum
-from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
-from coliags_plugin.geometry.poses.trajectory import Trajectory
-from tests.datamanagers.wall_scenes import PINHOLE, look, poses, rays
+from tests.datamanagers.spoiling import HEIGHT, WIDTH, change_json, files
 from tests.scenes import camera_at
 
-WIDTH, HEIGHT, COUNT = 64, 48, 9
-#: Steps per mm.
-SCALE = 1000.0
+PIXELS = WIDTH * HEIGHT
 
 
 def stored(index: int) -> np.ndarray:
     """Confidence of frame ``index``, all of 0..255. [H, W]"""
-    return np.roll(np.arange(WIDTH * HEIGHT) % 256, 7 * index).astype(np.uint8).reshape(HEIGHT, WIDTH)
-
-
-def write_frames(folder: Path, place: str) -> None:
-    for name in (place, "depth", "confidence"):
-        (folder / name).mkdir(parents=True)
-    for index, pose in enumerate(poses(COUNT)):
-        depth, color = look(pose, rays(PINHOLE))
-        cv2.imwrite(str(folder / place / f"{index}.png"), color[..., ::-1])
-        cv2.imwrite(str(folder / "depth" / f"{index}.png"), np.rint(depth * SCALE).astype(np.uint16))
-        cv2.imwrite(str(folder / "confidence" / f"{index}.png"), stored(index))
-
-
-def write_rgbd(folder: Path) -> Path:
-    write_frames(folder, "rgb")
-    tum.write(folder / "groundtruth.txt", Trajectory(poses(COUNT), timestamps=np.arange(COUNT, dtype=float)))
-    center = {"cx": PINHOLE.cx - 0.5, "cy": PINHOLE.cy - 0.5}
-    size = {"w": WIDTH, "h": HEIGHT, "depth_scale": SCALE}
-    (folder / "camera.json").write_text(json.dumps({"fx": PINHOLE.fx, "fy": PINHOLE.fy, **center, **size}))
-    return folder
-
-
-def write_nerfstudio(folder: Path) -> Path:
-    write_frames(folder, "images")
-    frames = [
-        {
-            "file_path": f"images/{index}.png",
-            "depth_file_path": f"depth/{index}.png",
-            "confidence_file_path": f"confidence/{index}.png",
-            "transform_matrix": (pose @ FLIP_Y_AND_Z).tolist(),
-        }
-        for index, pose in enumerate(poses(COUNT))
-    ]
-    camera = {"fl_x": PINHOLE.fx, "fl_y": PINHOLE.fy, "cx": PINHOLE.cx, "cy": PINHOLE.cy, "w": WIDTH, "h": HEIGHT}
-    content = {"camera_model": "PINHOLE", **camera, "depth_unit_scale_factor": 1 / SCALE, "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(content))
-    return folder
+    return np.roll(np.arange(PIXELS) % 256, 7 * index).astype(np.uint8).reshape(HEIGHT, WIDTH)
 
 
 def manager(folder: Path, **options) -> RecordedDataManager:
-    size = {"width": WIDTH, "height": HEIGHT}
-    if (folder / "transforms.json").is_file():
-        return NerfstudioDataManager(NerfstudioSettings(**{**size, **options}))
-    return RGBDDataManager(RGBDSettings(**{**size, **options}))
+    kind = datamanagers.get(find_format(folder))
+    return kind(kind.Settings(**options))
 
 
-@pytest.fixture(params=[write_rgbd, write_nerfstudio])
-def folder(request, tmp_path):
-    return request.param(tmp_path / "wall")
+@pytest.fixture(params=["rgbd-by-order", "nerfstudio"])
+def folder(request, copied) -> Path:
+    """A scene whose depth has a confidence; nerfstudio's without its lens, which resamples images."""
+    scene = copied(request.param)
+    for index, path in enumerate(files(scene, "depth/*.png")):
+        (scene / "confidence").mkdir(exist_ok=True)
+        cv2.imwrite(str(scene / "confidence" / path.name), stored(index))
+    if request.param == "nerfstudio":
+        plain = {"k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
+        change_json("transforms.json", lambda content: content.update(plain))(scene)
+        edit(
+            scene,
+            lambda _, entry: entry.update(confidence_file_path=entry["depth_file_path"].replace("depth", "confidence")),
+        )
+    return scene
 
 
 def edit(folder: Path, change) -> None:
     """Change the entries of transforms.json."""
-    path = folder / "transforms.json"
-    content = json.loads(path.read_text())
-    for index, entry in enumerate(content["frames"]):
-        change(index, entry)
-    path.write_text(json.dumps(content))
+    change_json("transforms.json", lambda content: [change(*entry) for entry in enumerate(content["frames"])])(folder)
 
 
 @pytest.mark.parametrize("keep", [True, False])
@@ -109,8 +73,7 @@ def test_it_is_resized_by_the_nearest_like_depth(folder):
 
 def test_it_is_part_of_the_fingerprint(folder):
     before = manager(folder).fingerprint(folder)
-    file = folder / "confidence" / "3.png"
-    cv2.imwrite(str(file), np.zeros((HEIGHT, WIDTH), np.uint8))
+    cv2.imwrite(str(files(folder, "confidence/*.png")[3]), np.zeros((HEIGHT, WIDTH), np.uint8))
     assert manager(folder).fingerprint(folder) != before
 
 
@@ -128,18 +91,19 @@ def edit_or_remove(folder: Path) -> None:
         (folder / "confidence").rename(folder / "aside")
 
 
-def test_depth_none_ignores_it(tmp_path):
-    folder = write_rgbd(tmp_path / "wall")
+@pytest.mark.parametrize("folder", ["rgbd-by-order"], indirect=True)
+def test_depth_none_ignores_it(folder):
     shots = manager(folder, depth="none").open(folder).shots
     assert all(shot.confidence is None and shot.depth is None for shot in shots)
 
 
 def test_initial_points_are_fused_from_trusted_depth(folder):
-    cv2.imwrite(str(folder / "confidence" / "1.png"), np.full((HEIGHT, WIDTH), 127, np.uint8))  # a frame without any
+    without_any = files(folder, "confidence/*.png")[1]
+    cv2.imwrite(str(without_any), np.full((HEIGHT, WIDTH), 127, np.uint8))
     scene = manager(folder).load(folder)
-    trusted = {frame.index: int((stored(frame.index) >= 128).sum()) for frame in scene.train}
-    trusted[1] = WIDTH * HEIGHT
-    assert len(scene.points) == sum(trusted.values())
+    known = {frame.index: torch.isfinite(frame.depth).numpy() for frame in scene.train}
+    trusted = {index: pixels & (stored(index) >= 128) if index != 1 else pixels for index, pixels in known.items()}
+    assert len(scene.points) == sum(pixels.sum() for pixels in trusted.values())
 
 
 # Refused
@@ -148,7 +112,7 @@ def test_initial_points_are_fused_from_trusted_depth(folder):
 def test_confidence_for_some_frames_only(folder):
     if (folder / "transforms.json").is_file():
         edit(folder, lambda index, entry: entry.pop("confidence_file_path") if index == 4 else None)
-        said = r"8 of 9 frames have a confidence_file_path; images/4\.png has not"
+        said = r"10 of 11 frames have a confidence_file_path; images/frame_00005\.png has not"
     else:
         (folder / "confidence" / "4.png").unlink()
         said = r"confidence has no confidence for 4\.png"
@@ -170,13 +134,13 @@ def test_confidence_without_depth(folder):
 @pytest.mark.parametrize(
     ("values", "said"),
     [
-        (np.zeros((HEIGHT // 2, WIDTH // 2), np.uint8), r"confidence/2\.png is 32 x 24, but .* says 64 x 48"),
-        (np.zeros((HEIGHT, WIDTH), np.uint16), r"confidence/2\.png is an image of 1 channel of uint16.*255 = 1"),
-        (np.zeros((HEIGHT, WIDTH, 3), np.uint8), r"confidence/2\.png is an image of 3 channels"),
+        (np.zeros((HEIGHT // 2, WIDTH // 2), np.uint8), r"confidence/\S*\.png is 32 x 25, but .* says 64 x 51"),
+        (np.zeros((HEIGHT, WIDTH), np.uint16), r"confidence/\S*\.png is an image of 1 channel of uint16.*255 = 1"),
+        (np.zeros((HEIGHT, WIDTH, 3), np.uint8), r"confidence/\S*\.png is an image of 3 channels"),
     ],
 )
 def test_another_size_or_kind_of_image(folder, values, said):
-    cv2.imwrite(str(folder / "confidence" / "2.png"), values)
+    cv2.imwrite(str(files(folder, "confidence/*.png")[2]), values)
     with pytest.raises(InputError, match=said):
         manager(folder).load(folder)
 

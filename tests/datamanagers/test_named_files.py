@@ -9,7 +9,7 @@ import pytest
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.nerfstudio.reader import NerfstudioDataManager
-from coliags_plugin.datamanagers.reading.named_files import named_file
+from coliags_plugin.datamanagers.reading.files import named_file
 from tests.phantom.phantom_layouts import write_phantom
 
 

@@ -25,7 +25,7 @@ from coliags_plugin.geometry.lenses.undistortion import Undistortion
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
 from tests.datamanagers.real_frames import real_lens
 from tests.datamanagers.wall_scenes import PINHOLE, look, off_wall, poses, rays
-from tests.phantom.phantom_layouts import depth_gap, distance_from_wall, in_video_order, read, true_poses, write_phantom
+from tests.phantom.phantom_layouts import in_video_order, read, write_phantom
 
 WIDTH, HEIGHT = 64, 48
 SIZE = vars(PINHOLE)
@@ -320,56 +320,6 @@ def test_what_the_file_may_not_say(folder, content, message):
         opened(changed(folder, **content))
 
 
-@pytest.mark.parametrize("spoil", ["left-handed", "not rigid", "not finite", "missing"])
-def test_poses_that_are_none(folder, spoil):
-    content = json.loads((folder / "transforms.json").read_text())
-    frame = content["frames"][4]
-    matrix = np.array(frame["transform_matrix"])
-    if spoil == "left-handed":
-        matrix[:, 0] *= -1.0
-    if spoil == "not rigid":
-        matrix[:3, :3] *= 1.1
-    if spoil == "not finite":
-        matrix[0, 3] = math.inf
-    frame["transform_matrix"] = None if spoil == "missing" else matrix.tolist()
-    with pytest.raises(InputError, match=r"transforms\.json, frame 4 \(images/frame_00005\.png\)"):
-        opened(changed(folder, frames=content["frames"]))
-
-
-def test_missing_images_are_named(folder):
-    for index in (2, 5):
-        (folder / f"images/frame_{index:05d}.png").unlink()
-    with pytest.raises(InputError, match=r"2 of 9 frames have no image in .*: images/frame_00002\.png, images/fr"):
-        opened(folder)
-
-
-def test_depth_or_masks_that_are_not_there(tmp_path):
-    write(tmp_path, frame_keys=depth_files(tmp_path, 1.0, ".png"))
-    (tmp_path / "depth/3.png").unlink()
-    with pytest.raises(InputError, match=r"frame images/frame_00004\.png: no file .*depth/3\.png"):
-        opened(tmp_path)
-    content = json.loads((tmp_path / "transforms.json").read_text())
-    del content["frames"][3]["depth_file_path"]
-    with pytest.raises(InputError, match=r"8 of 9 frames have a depth_file_path; images/frame_00004\.png has not"):
-        opened(changed(tmp_path, frames=content["frames"]))
-
-
-@pytest.mark.parametrize(
-    ("write_bad", "message"),
-    [
-        (lambda path: cv2.imwrite(str(path), np.zeros((HEIGHT, WIDTH), np.uint8)), "1 channel of uint8"),
-        (lambda path: cv2.imwrite(str(path), np.zeros((HEIGHT, WIDTH, 3), np.uint16)), "3 channels of uint16"),
-        (lambda path: cv2.imwrite(str(path), np.zeros((9, 9), np.uint16)), "is 9 x 9, but"),
-        (lambda path: path.write_bytes(b"\x89PNG"), "cannot be decoded"),
-    ],
-)
-def test_depth_images_of_another_kind(tmp_path, write_bad, message):
-    write(tmp_path, frame_keys=depth_files(tmp_path, 1.0, ".png"))
-    write_bad(tmp_path / "depth/3.png")
-    with pytest.raises(InputError, match=rf"depth/3\.png.*{message}"):
-        load(tmp_path)
-
-
 @pytest.mark.parametrize(
     ("write_bad", "message"),
     [
@@ -389,18 +339,8 @@ def test_depth_arrays_of_another_kind(tmp_path, write_bad, message):
 
 def test_images_of_two_sizes(folder):
     cv2.imwrite(str(folder / "images/frame_00004.png"), np.zeros((24, 32, 3), np.uint8))
-    with pytest.raises(InputError, match=r"frame_00004\.png is 32 x 24, but .*transforms\.json says 64 x 48"):
-        load(folder)
     with pytest.raises(InputError, match=r"frame_00004\.png is 32 x 24"):
         load(changed(folder, w=None, h=None))
-
-
-def test_no_file(tmp_path):
-    with pytest.raises(InputError, match=r"no file .*transforms\.json"):
-        opened(tmp_path)
-    (tmp_path / "transforms.json").write_text("{")
-    with pytest.raises(InputError, match="is not JSON"):
-        opened(tmp_path)
 
 
 def test_neither_depth_nor_points(folder):
@@ -412,20 +352,10 @@ def test_neither_depth_nor_points(folder):
 # The phantom's layout
 
 
-@pytest.fixture(scope="module")
-def phantoms(tmp_path_factory) -> tuple[Path, Path]:
-    """One colon through nerfstudio's lens and through the pinhole that its images are undistorted to."""
-    base = tmp_path_factory.mktemp("phantoms")
-    return tuple(write_phantom(base / name, name, noise=0.0) for name in ("nerfstudio", "c3vd"))
-
-
-def test_the_phantom_comes_back(phantoms):
-    bent, plain = read(phantoms[0], "nerfstudio"), read(phantoms[1], "c3vd")
+def test_the_phantom_is_the_one_of_the_pinhole_that_its_images_are_undistorted_to(tmp_path):
+    bent, plain = (read(write_phantom(tmp_path / name, name, noise=0.0), name) for name in ("nerfstudio", "c3vd"))
     assert bent.provenance["lens"] == "OpenCVLens"
-    frames = in_video_order(bent)
-    found = torch.stack([frame.camera.camera_to_world for frame in frames]).numpy()
-    np.testing.assert_allclose(found, true_poses(phantoms[0]), atol=1e-5)
-    for one, other in zip(frames, in_video_order(plain), strict=True):
+    for one, other in zip(in_video_order(bent), in_video_order(plain), strict=True):
         assert astuple(one.camera.intrinsics) == pytest.approx(astuple(other.camera.intrinsics))
         assert one.mask is None
         # The nearest source pixel is up to half a pixel away, which matters where the wall slants.
@@ -434,9 +364,6 @@ def test_the_phantom_comes_back(phantoms):
         # A slightly different image asks for a slightly different exposure.
         exposure = other.rgb.mean() / one.rgb.mean()
         assert (exposure * one.rgb - other.rgb).abs().mean() < 4 / 255
-    assert distance_from_wall(phantoms[0], bent.points.positions).mean() < 0.5
-    median, share = depth_gap(frames[4], frames[5])
-    assert median < 0.5 and share > 0.3
 
 
 # The real sequence

@@ -73,10 +73,10 @@ def write_layout(folder: Path, name: str) -> Lens:
     depth, normals = np.full((HEIGHT, WIDTH), 20.0), np.zeros((HEIGHT, WIDTH, 3))
     for index in range(COUNT):
         layout.write_frame(folder, PhantomFrame("video", index, spot(lens), depth, normals))
-    layout.write_sequence(folder, "video", list(poses()), lens)
+    layout.write_sequence(folder, "video", poses(), lens)
     if layout.has_points:
         position, color = POINT + poses()[INDEX, :3, 3], np.full((1, 3), 200, np.uint8)
-        layout.write_points(folder, WallPoints(position[None], color, lambda _: np.ones(1, bool)), list(poses()), lens)
+        layout.write_points(folder, WallPoints(position[None], color, lambda _: np.ones(1, bool)), poses(), lens)
     return lens
 
 

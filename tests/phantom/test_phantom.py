@@ -19,6 +19,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.lenses.models import LENSES, octagon_mask
 from coliags_plugin.phantom.generate import generate
 from coliags_plugin.phantom.settings import PhantomSettings
+from tests.phantom.phantom_layouts import distance_from_wall
 
 TINY = {
     "width": 48,
@@ -74,15 +75,6 @@ def digest(folder: Path) -> dict[str, str]:
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
-def mesh_distance(folder: Path, points: np.ndarray) -> np.ndarray:
-    import open3d
-
-    mesh = open3d.t.io.read_triangle_mesh(str(folder / "truth" / "mesh.ply"))
-    scene = open3d.t.geometry.RaycastingScene()
-    scene.add_triangles(mesh)
-    return scene.compute_distance(open3d.core.Tensor(points.astype(np.float32))).numpy()
-
-
 def test_layout_is_coliags_own(phantom):
     assert [path.name for path in sorted((phantom / "images").iterdir())] == [f"{i:04d}_color.png" for i in range(17)]
     color, depth = read(phantom / "images/0000_color.png"), read(phantom / "depths/0016_depth.png")
@@ -113,32 +105,6 @@ def test_poses_are_rigid_column_major_and_those_of_the_truth(phantom):
         rotation = row.reshape(4, 4).T[:3, :3]
         np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-7)
         assert np.linalg.det(rotation) == pytest.approx(1.0)
-
-
-def test_depth_lies_on_the_mesh(phantom):
-    for folder in (phantom, phantom / "rotation"):
-        depth = z_depth(folder / "depths/0001_depth.png")
-        points = cameras(folder)[1].unproject(depth).numpy()[(depth < 99.9).numpy()]
-        # Half a depth step of .0015 mm, a little more along oblique rays.
-        assert mesh_distance(phantom, points).max() < 0.003
-
-
-def test_depth_of_one_frame_reprojects_onto_another(phantom):
-    views = cameras(phantom)
-    for first, second in ((3, 4), (4, 3), (10, 12)):
-        depth = z_depth(phantom / f"depths/{first:04d}_depth.png")
-        other = z_depth(phantom / f"depths/{second:04d}_depth.png")
-        known = depth < 99.9
-        pixels, z = views[second].project(views[first].unproject(depth)[known])
-        column, row = (pixels - 0.5).round().long().unbind(-1)
-        framed = (z > 0) & (column >= 0) & (row >= 0) & (column < 48) & (row < 38)
-        column, row, z, pixels = column[framed], row[framed], z[framed], pixels[framed]
-        found = other[row, column]
-        # The nearest pixel is up to half a pixel away, so compare where the wall is nearly square to the view.
-        gradient = torch.stack(torch.gradient(other)).abs().sum(0)[row, column]
-        fair = (gradient < 1.0) & (found < 99.9)
-        assert fair.sum() > 100
-        assert ((found - z).abs() / z)[fair].median() < 0.01
 
 
 def test_seen_masks_agree_with_a_depth_test(phantom):
@@ -212,7 +178,7 @@ def test_raw_layout_is_the_releases_own(raw):
     z = depth[lit] * (100.0 / 65535.0)
     pose = poses(raw / "pose.txt")[4].reshape(4, 4).T
     points = (directions * z[:, None]) @ pose[:3, :3].T + pose[:3, 3]
-    assert mesh_distance(raw, points[z < 99.9]).max() < 0.004
+    assert distance_from_wall(raw, torch.from_numpy(points[z < 99.9])).max() < 0.004
     unit = normals[..., ::-1][lit] / 65535.0 * 2.0 - 1.0
     np.testing.assert_allclose(np.linalg.norm(unit, axis=1), 1.0, atol=1e-3)
     assert ((unit * directions).sum(axis=1) < 0.05).mean() > 0.99  # towards the camera

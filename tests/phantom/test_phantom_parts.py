@@ -13,21 +13,20 @@ from coliags_plugin.lighting.tone_curve import encode
 from coliags_plugin.phantom.colon import ColonSurface, build_surface, grow_anatomy
 from coliags_plugin.phantom.imaging import Sensor, World, expose
 from coliags_plugin.phantom.interreflection import form_factors, make_patches, solve
-from coliags_plugin.phantom.light import UNIT_DISTANCE, Lamp
+from coliags_plugin.phantom.light import UNIT_DISTANCE, CameraLight
 from coliags_plugin.phantom.motion import NEAREST, rotation, rotation_about
 from coliags_plugin.phantom.mucosa import Mucosa, paint_mucosa
 from coliags_plugin.phantom.response import develop, exposure_for, exposures, white_balances
 from coliags_plugin.phantom.settings import PRESETS, PhantomSettings, phantom_settings
 from coliags_plugin.phantom.streams import Purpose, SolidNoise, stream
-from coliags_plugin.phantom.tracing import Tracer
+from coliags_plugin.phantom.tracing import Tracer, nearest_poses_first, seen_from
 from coliags_plugin.phantom.trajectory import camera_path, turn_away
-from coliags_plugin.phantom.visibility import nearest_poses_first, seen_from
 
 ALBEDO = (0.7, 0.3, 0.2)
 COARSE = {"mesh_spacing": 1.2, "texture_spacing": 0.4}
 
 
-def lamp(**changes) -> Lamp:
+def lamp(**changes) -> CameraLight:
     plain = {
         "offset": (0.0, 0.0, 0.0),
         "axis": (0.0, 0.0, 1.0),
@@ -37,7 +36,7 @@ def lamp(**changes) -> Lamp:
         "roughness": 0.3,
         "f0": 0.028,
     }
-    return Lamp(**{**plain, **changes})
+    return CameraLight(**{**plain, **changes})
 
 
 def grid_surface(grid: np.ndarray, normals: np.ndarray, tangents: np.ndarray) -> ColonSurface:
@@ -81,7 +80,7 @@ def plain_mucosa() -> Mucosa:
     return Mucosa((color,) * 6, (relief,) * 6, 1.0, 1.0, 1.0)
 
 
-def photograph_plane(distance: float, light: Lamp, vignetting: float = 0.0):
+def photograph_plane(distance: float, light: CameraLight, vignetting: float = 0.0):
     surface = plane_at(distance)
     lens = PinholeLens(20.0, 20.0, 12.5, 9.5, 25, 19)
     sensor = Sensor.behind(lens, np.ones((19, 25), bool), 1)

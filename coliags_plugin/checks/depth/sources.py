@@ -13,7 +13,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame, SparseDepth
-from coliags_plugin.datamanagers.reading.depth_arrays import DepthArray
+from coliags_plugin.datamanagers.reading.depth_formats import DepthArray
 from coliags_plugin.datamanagers.reading.images import read_gray
 from coliags_plugin.datamanagers.recognition import recognised
 from coliags_plugin.engine.data_formats import open_scene

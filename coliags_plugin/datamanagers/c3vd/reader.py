@@ -2,17 +2,32 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field
 
-from coliags_plugin.datamanagers.c3vd.layouts import find_layout, recognise
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.c3vd.sequences import SequenceDataManager, SequenceFiles
 from coliags_plugin.datamanagers.reading.camera_json import read_intrinsics
+from coliags_plugin.datamanagers.reading.files import (
+    DEPTH_SUFFIXES,
+    IMAGE_SUFFIXES,
+    TIFF_SUFFIXES,
+    inventory,
+    numbered,
+    paired,
+    require_folder,
+)
 from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
 from coliags_plugin.geometry.lenses.models import LENSES
+
+LAYOUTS = (
+    "the raw release (NNNN_color.png, NNNN_depth.tiff and pose.txt in one folder) "
+    "or the undistorted layout (images/, depths/, camera_pose.txt and camera.json)"
+)
 
 
 class C3VDSettings(SceneSettings):
@@ -41,11 +56,40 @@ class C3VDDataManager(SequenceDataManager):
     @classmethod
     def recognise(cls, path: Path) -> str | None:
         """See :class:`DataManager`."""
-        return recognise(path)
+        if (path / "camera_pose.txt").is_file() and (path / "images").is_dir():
+            return "camera_pose.txt beside images/"
+        if (path / "pose.txt").is_file() and next(path.glob("*_color.png"), None) is not None:
+            return "pose.txt beside NNNN_color.png"
+        return None
 
     def find(self, folder: Path) -> SequenceFiles:
-        """See :class:`SequenceDataManager`."""
-        return find_layout(folder)
+        """See :class:`SequenceDataManager`; ``kind`` is ``raw`` (distorted) or ``undistorted`` (pinhole images)."""
+        require_folder(folder, f"a C3VD sequence: {LAYOUTS}")
+        raw = [path for path in folder.iterdir() if re.fullmatch(r"\d+_color\.png", path.name)]
+        camera = None
+        if raw and (folder / "images").is_dir():
+            raise InputError(
+                f"{folder} holds both {raw[0].name} and images/",
+                "one sequence in one layout",
+                "Move one of the two to its own folder",
+            )
+        if raw:
+            kind, poses = "raw", folder / "pose.txt"
+            images = numbered(folder, "color", frozenset({".png"}))
+            depths = numbered(folder, "depth", TIFF_SUFFIXES)
+        elif (folder / "images").is_dir():
+            kind, poses, camera = "undistorted", folder / "camera_pose.txt", folder / "camera.json"
+            images = numbered(folder / "images", "color", IMAGE_SUFFIXES)
+            depths = numbered(folder / "depths", "depth", DEPTH_SUFFIXES)
+        else:
+            do = "Name the sequence's own folder, for instance cecum_t1_a"
+            raise InputError(f"{folder} holds {inventory(folder)}", LAYOUTS, do)
+        if not images:
+            raise InputError(f"{folder / 'images'} holds {inventory(folder / 'images')}", "<number>_color.png files")
+        for path in filter(None, (poses, camera)):
+            if not path.is_file():
+                raise InputError(f"{folder} has images but no {path.name}", LAYOUTS, f"Add {path.name}")
+        return SequenceFiles(kind, folder, *paired(folder, images, depths), poses, camera)
 
     def rectification(self, files: SequenceFiles) -> tuple[Rectification, dict[str, Any]]:
         """See :class:`SequenceDataManager`."""

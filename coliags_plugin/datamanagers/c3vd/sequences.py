@@ -11,10 +11,10 @@ from typing import Any
 from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
-from coliags_plugin.datamanagers.recording import Recording, Shot, check_pose_count, fingerprint
+from coliags_plugin.datamanagers.recording import Recording, Shot, check_pose_count, fingerprint, make_shots
 from coliags_plugin.datamanagers.rectification import Rectification, whole_frame
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE
-from coliags_plugin.datamanagers.seen import ROTATION, find_seen_masks
+from coliags_plugin.datamanagers.seen_masks import ROTATION, find_seen_masks
 from coliags_plugin.geometry.lenses.models import Lens, octagon_mask
 from coliags_plugin.geometry.poses.c3vd import read_poses
 
@@ -104,11 +104,7 @@ class SequenceDataManager(RecordedDataManager):
         poses = read_poses(files.poses)
         check_pose_count(files.poses, len(poses.camera_to_world), len(files.images))
         rectification, described = self.rectification(files)
-        depths = files.depths or (None,) * len(files.images)
-        shots = [
-            Shot(prefix + image.stem, image, rectification, pose, depth, C3VD_DEPTH, seen=seen.get(index))
-            for index, (image, depth, pose) in enumerate(zip(files.images, depths, poses.camera_to_world, strict=True))
-        ]
+        shots = make_shots(files.images, rectification, poses.camera_to_world, files.depths, C3VD_DEPTH, seen, prefix)
         facts: dict[str, Any] = {
             "layout": files.kind,
             **described,

@@ -40,27 +40,6 @@ def write_frame(
         write_image(folder / "depths" / f"{index:04d}_depth.png", depth_steps(z_depth))
 
 
-def write_raw_frame(
-    folder: Path,
-    index: int,
-    image: UInt8[np.ndarray, "H W 3"],
-    z_depth: Float[np.ndarray, "H W"],
-    normals: Float[np.ndarray, "H W 3"],
-) -> None:
-    """Write a frame of the raw release (docs/layouts/c3vd.md 1).
-
-    Args:
-        folder: Folder of the sequence.
-        index: Index of the frame, from 0.
-        image: RGB, as the lens shows it. [H, W, 3]
-        z_depth: mm, as for :func:`depth_steps`. [H, W]
-        normals: As for :func:`normal_steps`. [H, W, 3]
-    """
-    write_image(folder / f"{index:04d}_color.png", image)
-    write_image(folder / f"{index:04d}_depth.tiff", depth_steps(z_depth))
-    write_image(folder / f"{index:04d}_normals.tiff", normal_steps(normals))
-
-
 def write_poses(path: Path, camera_to_world: Float[np.ndarray, "N 4 4"]) -> None:
     """Write a pose file with the release's nine digits; OpenCV axes, mm. [N, 4, 4]"""
     atomic_write(path, matrix_lines(camera_to_world, digits=9))

@@ -7,7 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.datamanagers.reading.frame_files import TIFF_SUFFIXES, inventory, numbered, paired
+from coliags_plugin.datamanagers.reading.files import (
+    TIFF_SUFFIXES,
+    numbered,
+    numbered_images,
+    paired,
+    require_folder,
+)
 from coliags_plugin.datamanagers.recording import fingerprint
 from coliags_plugin.geometry.poses.c3vd import recognise as has_matrices
 
@@ -64,8 +70,7 @@ def scene_folder(path: Path) -> Path:
     Raises:
         InputError: ``path`` is missing, or holds several scenes.
     """
-    if not path.is_dir():
-        raise InputError(f"no folder {path}", LAYOUT, "Check the path")
+    require_folder(path, LAYOUT)
     scenes = [] if (path / "color").is_dir() else _release(path)
     if len(scenes) > 1:
         raise InputError(f"{path} holds several scenes", "one scene", f"Name one, for instance {sorted(scenes)[0]}")
@@ -83,15 +88,8 @@ def find_sequence(folder: Path, params_file: str | None) -> PreparedFiles:
     Raises:
         InputError: The folder has another layout, its files do not pair up, or ``params_file`` does not exist.
     """
-    images = numbered(folder / "color", "color", frozenset({".png"})) if (folder / "color").is_dir() else {}
-    if not images:
-        searched = folder / "color" if (folder / "color").is_dir() else folder
-        raise InputError(
-            f"{searched} holds {inventory(searched)}",
-            LAYOUT,
-            "Name the sequence's own folder, for instance C3VD/cecum_t1_b",
-        )
-    depths = numbered(folder / "depth", "depth", TIFF_SUFFIXES) if (folder / "depth").is_dir() else {}
+    images = numbered_images(folder / "color", "color", LAYOUT, "C3VD/cecum_t1_b")
+    depths = numbered(folder / "depth", "depth", TIFF_SUFFIXES)
     params = _params(folder, params_file)
     poses = folder / "pose.txt"
     return PreparedFiles(
@@ -115,12 +113,12 @@ def _params(folder: Path, params_file: str | None) -> Path | None:
 
 def _newest_cloud(folder: Path) -> Path | None:
     """``point_cloud/iteration_N/point_cloud.ply`` of the largest N."""
-    found = {
+    clouds = {
         int(match.group(1)): path
         for path in folder.glob("point_cloud/iteration_*/point_cloud.ply")
         if (match := re.fullmatch(r"iteration_(\d+)", path.parent.name))
     }
-    return found[max(found)] if found else None
+    return clouds[max(clouds)] if clouds else None
 
 
 def _release(folder: Path) -> list[Path]:

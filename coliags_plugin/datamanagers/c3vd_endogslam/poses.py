@@ -52,11 +52,8 @@ class _Slam:
     """EndoGSLAM's trajectory aligned with the true one.
 
     Attributes:
-        params: EndoGSLAM's result.
-        path: Its file.
         indices: The image index of each of its F poses. [F]
         from_true: Transform from the true poses, relative to their first camera, to EndoGSLAM's world. [4, 4]
-        facts: Provenance.
     """
 
     params: EndoGslamParams

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
@@ -23,13 +21,13 @@ from coliags_plugin.datamanagers.c3vd_endogslam.files import (
     scene_folder,
 )
 from coliags_plugin.datamanagers.c3vd_endogslam.poses import PoseSource, SequencePoses, load_poses
-from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH, DepthFormat, DepthSteps
+from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH, DepthSteps
 from coliags_plugin.datamanagers.reading.images import bits_of, size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
-from coliags_plugin.datamanagers.recording import Recording, Shot, check_pose_count
+from coliags_plugin.datamanagers.recording import Recording, Shot, check_pose_count, make_shots
 from coliags_plugin.datamanagers.rectification import ASPECT_TOLERANCE, Rectification
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
-from coliags_plugin.datamanagers.seen import ROTATION, find_seen_masks
+from coliags_plugin.datamanagers.seen_masks import ROTATION, find_seen_masks
 from coliags_plugin.datamanagers.splits import Split
 from coliags_plugin.geometry.poses.c3vd import read_poses
 from coliags_plugin.geometry.poses.endogslam import EndoGslamParams, read_params
@@ -100,7 +98,7 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
             **rectification.facts(),
         }
         seen = find_seen_masks(folder / "truth", len(files.images))
-        shots = _shots(files, rectification, poses.camera_to_world, depth_format, seen)
+        shots = make_shots(files.images, rectification, poses.camera_to_world, files.depths, depth_format, seen)
         test_sets = {}
         if (folder / ROTATION).is_dir():
             test_sets[ROTATION] = self._rotation(folder / ROTATION, rectification, poses)
@@ -149,22 +147,10 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
         rotation = read_poses(files.poses).camera_to_world
         check_pose_count(files.poses, len(rotation), len(files.images))
         seen = find_seen_masks(folder, len(files.images))
-        return _shots(files, rectification, poses.from_file @ rotation, _depth_format(files), seen, f"{ROTATION}-")
-
-
-def _shots(
-    files: PreparedFiles,
-    rectification: Rectification,
-    camera_to_world: Float[np.ndarray, "N 4 4"],
-    depth_format: DepthFormat | None,
-    seen: Mapping[int, Path],
-    prefix: str = "",
-) -> list[Shot]:
-    depths: Sequence[Path | None] = files.depths or (None,) * len(files.images)
-    return [
-        Shot(prefix + image.stem, image, rectification, pose, depth, depth_format, seen=seen.get(index))
-        for index, (image, depth, pose) in enumerate(zip(files.images, depths, camera_to_world, strict=True))
-    ]
+        camera_to_world, depth_format = poses.from_file @ rotation, _depth_format(files)
+        return make_shots(
+            files.images, rectification, camera_to_world, files.depths, depth_format, seen, f"{ROTATION}-"
+        )
 
 
 def _depth_format(files: PreparedFiles) -> DepthSteps | None:

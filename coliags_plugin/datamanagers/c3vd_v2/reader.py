@@ -3,20 +3,33 @@
 from __future__ import annotations
 
 import logging
+import re
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field
 
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.c3vd.sequences import SequenceDataManager, SequenceFiles
-from coliags_plugin.datamanagers.c3vd_v2.files import INTRINSICS, find_sequence, recognise
 from coliags_plugin.datamanagers.c3vd_v2.lens import CANDIDATE_LENS, read_camera_intrinsics
+from coliags_plugin.datamanagers.reading.files import (
+    TIFF_SUFFIXES,
+    numbered,
+    numbered_images,
+    paired,
+    require_folder,
+)
 from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
-from coliags_plugin.datamanagers.seen import ROTATION
+from coliags_plugin.datamanagers.seen_masks import ROTATION
 from coliags_plugin.geometry.lenses.models import LENSES, Lens
+from coliags_plugin.geometry.poses import c3vd as c3vd_poses
 
 log = logging.getLogger(__name__)
+
+LAYOUT = "rgb/NNNN.png and pose.txt, for registered videos also depth/NNNN_depth.tiff"
+#: Announced for the release; its location and format are not documented.
+INTRINSICS = "camera_intrinsics.txt"
 
 
 class C3VDv2Settings(SceneSettings):
@@ -44,11 +57,22 @@ class C3VDv2DataManager(SequenceDataManager):
     @classmethod
     def recognise(cls, path: Path) -> str | None:
         """See :class:`DataManager`."""
-        return recognise(path)
+        numbers = any(re.fullmatch(r"\d+", image.stem) for image in path.glob("rgb/*.png"))
+        if numbers and (path / "pose.txt").is_file() and c3vd_poses.recognise(path / "pose.txt"):
+            return "pose.txt (16 numbers a line) beside rgb/NNNN.png"
+        return None
 
     def find(self, folder: Path) -> SequenceFiles:
-        """See :class:`SequenceDataManager`."""
-        return find_sequence(folder)
+        """See :class:`SequenceDataManager`; ``camera`` is the intrinsics file, in it or up to two folders up."""
+        require_folder(folder, f"a C3VDv2 sequence: {LAYOUT}")
+        images = numbered_images(folder / "rgb", "", LAYOUT, "c1_cecum_t1_v1")
+        poses = folder / "pose.txt"
+        if not poses.is_file():
+            raise InputError(f"{folder} has images but no pose.txt", LAYOUT, "Add pose.txt")
+        depths = numbered(folder / "depth", "depth", TIFF_SUFFIXES)
+        here = folder.resolve()
+        camera = next((path / INTRINSICS for path in (here, *here.parents[:2]) if (path / INTRINSICS).is_file()), None)
+        return SequenceFiles("c3vd-v2", folder, *paired(folder, images, depths), poses, camera)
 
     def rectification(self, files: SequenceFiles) -> tuple[Rectification, dict[str, Any]]:
         """See :class:`SequenceDataManager`."""

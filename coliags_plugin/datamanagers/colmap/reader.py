@@ -13,16 +13,21 @@ from pydantic import Field
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud, SparseDepth
 from coliags_plugin.datamanagers.colmap.files import Model, RegisteredImage, find_models, read_model, sidecar_file
-from coliags_plugin.datamanagers.colmap.lens import PINHOLES, ColmapLens
-from coliags_plugin.datamanagers.lens_rectification import LensRectification, undistorter
-from coliags_plugin.datamanagers.reading.depth_arrays import depth_format
-from coliags_plugin.datamanagers.reading.image_names import first_few, short_names, unposed_images, warn_of_unposed
-from coliags_plugin.datamanagers.reading.named_files import named_file
+from coliags_plugin.datamanagers.colmap.lens import PINHOLES
+from coliags_plugin.datamanagers.reading.depth_formats import depth_format
+from coliags_plugin.datamanagers.reading.files import (
+    first_few,
+    named_file,
+    short_names,
+    unposed_images,
+    warn_of_unposed,
+)
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
-from coliags_plugin.datamanagers.rectification import Rectification
+from coliags_plugin.datamanagers.rectification import Rectification, rectifications
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
-from coliags_plugin.datamanagers.seen import find_seen_masks
+from coliags_plugin.datamanagers.seen_masks import find_seen_masks
+from coliags_plugin.geometry.lenses.pinhole import PinholeLens
 
 log = logging.getLogger(__name__)
 
@@ -88,7 +93,11 @@ class ColmapDataManager(RecordedDataManager):
         paths = _image_paths(path / settings.images_folder, model, settings.outside_files)
         masks = [sidecar_file(path / "masks", image.name, (".png",)) for image in model.images]
         depths = _depths(path / "depths", model)
-        rectifications = self._rectifications(model)
+        lenses = {
+            number: PinholeLens.of(lens.pinhole) if lens.model in PINHOLES else lens
+            for number, lens in model.cameras.items()
+        }
+        rectification_of = rectifications(lenses, model.cameras_file, self.working_size, settings.focal_scale)
         names = short_names([image.name for image in model.images])
         others = unposed_images(paths, (*masks, *depths))
         warn_of_unposed(model.files[1], others)
@@ -97,7 +106,7 @@ class ColmapDataManager(RecordedDataManager):
         for index, image in enumerate(model.images):
             camera_to_world = model.camera_to_world[index].copy()
             camera_to_world[:3, 3] *= settings.scale
-            rectification, depth = rectifications[image.camera], depths[index]
+            rectification, depth = rectification_of[image.camera], depths[index]
             sparse = self._sparse_depth(model, image, camera_to_world, rectification)
             used += 0 if sparse is None else len(sparse.depth)
             shots.append(
@@ -119,8 +128,8 @@ class ColmapDataManager(RecordedDataManager):
             "model": str(model.folder),
             "lens": ", ".join(kinds),
             "focal_scale": settings.focal_scale if set(kinds) - PINHOLES else None,
-            "cameras": len(rectifications),
-            **next(iter(rectifications.values())).facts(),
+            "cameras": len(rectification_of),
+            **next(iter(rectification_of.values())).facts(),
             "scale": settings.scale,
             "sparse_points": len(model.positions),
             "observations": sum(len(image.points) for image in model.images),
@@ -151,17 +160,6 @@ class ColmapDataManager(RecordedDataManager):
             others = ", ".join(folder.relative_to(path).as_posix() for folder in found[1:])
             log.warning("reading %s; there are further models, which datamanager.model chooses: %s", found[0], others)
         return found[0]
-
-    def _rectifications(self, model: Model) -> dict[int, Rectification]:
-        focal_scale, undistort = self.settings.focal_scale, undistorter()
-
-        def rectification(lens: ColmapLens) -> Rectification:
-            size = self.working_size(lens.width, lens.height)
-            if lens.model in PINHOLES:
-                return Rectification.of_pinhole(lens.pinhole, model.cameras_file, size)
-            return LensRectification.of(lens, model.cameras_file, size, focal_scale, undistort)
-
-        return {number: rectification(lens) for number, lens in model.cameras.items()}
 
     def _sparse_depth(
         self, model: Model, image: RegisteredImage, camera_to_world: np.ndarray, rectification: Rectification

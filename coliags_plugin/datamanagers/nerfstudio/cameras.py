@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.datamanagers.reading.json_numbers import image_size, read_number
 from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens
 from coliags_plugin.geometry.lenses.opencv import OpenCVLens
 from coliags_plugin.geometry.lenses.pinhole import PinholeLens
@@ -24,7 +25,7 @@ _BENDS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
 def camera_of(
-    values: Mapping[str, Any], place: str, pixel_centers: PixelCenters, image_size: Callable[[], tuple[int, int]]
+    values: Mapping[str, Any], place: str, pixel_centers: PixelCenters, stored_size: Callable[[], tuple[int, int]]
 ) -> Lens:
     """The camera of one frame: a :class:`PinholeLens` where its images need no undistortion.
 
@@ -32,7 +33,7 @@ def camera_of(
         values: Keys of the file, overlaid with those of the frame.
         place: Name of the frame in messages.
         pixel_centers: Where ``cx`` and ``cy`` count pixel centres.
-        image_size: Returns width and height of the image; called only if the file has no size.
+        stored_size: Returns width and height of the image; called only if the file has no size.
 
     Raises:
         InputError: The model is unknown, or a value is missing, not a number, or not a parameter of the model.
@@ -40,15 +41,15 @@ def camera_of(
     model = values.get("camera_model") or ("OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")
     if not isinstance(model, str) or model not in _MODELS:
         raise InputError(f"{place}: camera_model is {model}", f"one of {', '.join(_MODELS)}")
-    width, height = _size(values, place) if "w" in values or "h" in values else image_size()
+    width, height = image_size(values, place) if "w" in values or "h" in values else stored_size()
     fx, fy = _focal_lengths(values, place, width, height)
     # The default principal point is the image centre in either convention.
     shift = 0.0 if pixel_centers == "half" else 0.5
-    cx = number(values, "cx", place) + shift if "cx" in values else 0.5 * width
-    cy = number(values, "cy", place) + shift if "cy" in values else 0.5 * height
+    cx = read_number(values, "cx", place) + shift if "cx" in values else 0.5 * width
+    cy = read_number(values, "cy", place) + shift if "cy" in values else 0.5 * height
     if min(fx, fy, width, height) <= 0.0:
         raise InputError(f"{place}: fl_x {fx:g}, fl_y {fy:g}, w {width}, h {height}", "numbers above 0")
-    bends = {key: number(values, key, place) for key in _BENDS if values.get(key)}
+    bends = {key: read_number(values, key, place) for key in _BENDS if values.get(key)}
     if wrong := sorted(set(bends) - set(_MODELS[model])):
         meaning = "nerfstudio and OpenCV mean different things by k4" if wrong == ["k4"] else "it has no such term"
         raise InputError(
@@ -65,35 +66,15 @@ def camera_of(
     return OpenCVLens(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, k1=k1, k2=k2, p1=p1, p2=p2, k3=k3)
 
 
-def number(values: Mapping[str, Any], key: str, place: str) -> float:
-    """A finite number.
-
-    Raises:
-        InputError: It is missing or not a finite number.
-    """
-    value = values.get(key)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{place}: {key} is {value!r}", "a finite number")
-    return float(value)
-
-
-def _size(values: Mapping[str, Any], place: str) -> tuple[int, int]:
-    width, height = number(values, "w", place), number(values, "h", place)
-    if width != int(width) or height != int(height):
-        raise InputError(f"{place}: w = {width}, h = {height}", "whole pixels")
-    return int(width), int(height)
-
-
 def _focal_lengths(values: Mapping[str, Any], place: str, width: int, height: int) -> tuple[float, float]:
     """Horizontal and vertical focal length, pixels; equal if only one is given."""
     lengths: dict[str, float] = {}
     for axis, pixels in (("x", width), ("y", height)):
         if f"fl_{axis}" in values:
-            lengths[axis] = number(values, f"fl_{axis}", place)
+            lengths[axis] = read_number(values, f"fl_{axis}", place)
         elif f"camera_angle_{axis}" in values:
-            angle = number(values, f"camera_angle_{axis}", place)
-            if not 0.0 < angle < math.pi:
-                raise InputError(f"{place}: camera_angle_{axis} is {angle:g}", "radians, above 0 and below pi")
+            expected = "radians, above 0 and below pi"
+            angle = read_number(values, f"camera_angle_{axis}", place, expected, above=0.0, below=math.pi)
             lengths[axis] = 0.5 * pixels / math.tan(0.5 * angle)
     if not lengths:
         raise InputError(f"{place}: neither fl_x nor camera_angle_x", "one of the two", "Add it")

@@ -13,10 +13,10 @@ import numpy as np
 
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.json_files import read_json
-from coliags_plugin.datamanagers.nerfstudio.cameras import PixelCenters, camera_of, number
-from coliags_plugin.datamanagers.reading.image_names import first_few
+from coliags_plugin.datamanagers.nerfstudio.cameras import PixelCenters, camera_of
+from coliags_plugin.datamanagers.reading.files import first_few, named_file
 from coliags_plugin.datamanagers.reading.images import size_of
-from coliags_plugin.datamanagers.reading.named_files import named_file
+from coliags_plugin.datamanagers.reading.json_numbers import read_number
 from coliags_plugin.geometry.lenses.models import Lens
 
 FILE = "transforms.json"
@@ -24,7 +24,7 @@ _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 
 
 @dataclass(frozen=True)
-class Entry:
+class FrameFiles:
     """An entry of ``frames``: its existing files and its camera."""
 
     name: str
@@ -51,7 +51,7 @@ class Transforms:
         self.content: dict[str, Any] = read_json(path, "a transforms.json")
         self.frames: dict[str, dict[str, Any]] = {frame["file_path"]: frame for frame in self.content["frames"]}
 
-    def entries(self, names: Sequence[str], pixel_centers: PixelCenters) -> list[Entry]:
+    def entries(self, names: Sequence[str], pixel_centers: PixelCenters) -> list[FrameFiles]:
         """Frame entries by name.
 
         Raises:
@@ -70,7 +70,7 @@ class Transforms:
         # Without a size in the file, all images must have the size of the first.
         first_size = cache(lambda: size_of(images[0]))
         return [
-            Entry(
+            FrameFiles(
                 name,
                 image,
                 camera_of(
@@ -129,10 +129,7 @@ class Transforms:
         """World units before applied_scale per stored depth unit; None if not given."""
         if "depth_unit_scale_factor" not in self.content:
             return None
-        factor = number(self.content, "depth_unit_scale_factor", str(self.path))
-        if factor <= 0.0:
-            raise InputError(f"{self.path}: depth_unit_scale_factor is {factor:g}", "a number above 0")
-        return factor
+        return read_number(self.content, "depth_unit_scale_factor", self.path, "a number above 0", above=0.0)
 
     def _indices(self, key: str, listed: Any, index_of: Mapping[str, int]) -> list[int]:
         if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):

@@ -12,18 +12,16 @@ from pydantic import Field
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.fusion import load_points
-from coliags_plugin.datamanagers.lens_rectification import LensRectification, undistorter
 from coliags_plugin.datamanagers.nerfstudio.cameras import PixelCenters
-from coliags_plugin.datamanagers.nerfstudio.files import FILE, Entry, Transforms
-from coliags_plugin.datamanagers.reading.depth_arrays import depth_format
-from coliags_plugin.datamanagers.reading.image_names import short_names, unposed_images, warn_of_unposed
+from coliags_plugin.datamanagers.nerfstudio.files import FILE, Transforms
+from coliags_plugin.datamanagers.reading.depth_formats import depth_format
+from coliags_plugin.datamanagers.reading.files import short_names, unposed_images, warn_of_unposed
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
-from coliags_plugin.datamanagers.rectification import Rectification
+from coliags_plugin.datamanagers.rectification import rectifications
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
-from coliags_plugin.datamanagers.seen import find_seen_masks
+from coliags_plugin.datamanagers.seen_masks import find_seen_masks
 from coliags_plugin.datamanagers.units import printed_unit
-from coliags_plugin.geometry.lenses.models import Lens
 from coliags_plugin.geometry.lenses.pinhole import PinholeLens
 from coliags_plugin.geometry.poses import nerfstudio as nerfstudio_poses
 
@@ -78,9 +76,10 @@ class NerfstudioDataManager(RecordedDataManager):
         camera_to_world = trajectory.camera_to_world.copy()
         camera_to_world[:, :3, 3] *= settings.scale
         depth_unit = self._depth_unit(transforms)
-        rectifications = self._rectifications(entries, file)
+        lenses = {entry.camera: entry.camera for entry in entries}
+        rectification_of = rectifications(lenses, file, self.working_size, settings.focal_scale)
         images = [entry.image for entry in entries]
-        others = [found for entry in entries for found in (entry.depth, entry.mask, entry.confidence)]
+        others = [path for entry in entries for path in (entry.depth, entry.mask, entry.confidence)]
         unposed = unposed_images(images, others)
         warn_of_unposed(file, unposed)
         seen = find_seen_masks(path / "truth", len(images), complete=not unposed)
@@ -88,7 +87,7 @@ class NerfstudioDataManager(RecordedDataManager):
             Shot(
                 short,
                 entry.image,
-                rectifications[entry.camera],
+                rectification_of[entry.camera],
                 pose,
                 entry.depth,
                 None if entry.depth is None else depth_format(entry.depth, depth_unit),
@@ -98,14 +97,14 @@ class NerfstudioDataManager(RecordedDataManager):
             )
             for index, (short, entry, pose) in enumerate(zip(short_names(names), entries, camera_to_world, strict=True))
         ]
-        lenses = sorted({type(lens).__name__ for lens in rectifications})
-        bent = not all(isinstance(lens, PinholeLens) for lens in rectifications)
+        kinds = sorted({type(lens).__name__ for lens in lenses})
+        bent = not all(isinstance(lens, PinholeLens) for lens in lenses)
         facts: dict[str, Any] = {
             "layout": "nerfstudio",
-            "lens": ", ".join(lenses),
+            "lens": ", ".join(kinds),
             "focal_scale": settings.focal_scale if bent else None,
-            "cameras": len(rectifications),
-            **next(iter(rectifications.values())).facts(),
+            "cameras": len(rectification_of),
+            **next(iter(rectification_of.values())).facts(),
             "scale": settings.scale,
             "depth_unit": depth_unit if shots[0].depth is not None else None,
             "depth_is_estimated": shots[0].confidence is not None,
@@ -133,17 +132,6 @@ class NerfstudioDataManager(RecordedDataManager):
             if factor is not None:
                 return factor * self.settings.scale
         return 1.0
-
-    def _rectifications(self, entries: list[Entry], file: Path) -> dict[Lens, Rectification]:
-        focal_scale, undistort = self.settings.focal_scale, undistorter()
-
-        def rectification(lens: Lens) -> Rectification:
-            size = self.working_size(lens.width, lens.height)
-            if isinstance(lens, PinholeLens):
-                return Rectification.of_pinhole(lens.pinhole, file, size)
-            return LensRectification.of(lens, file, size, focal_scale, undistort)
-
-        return {lens: rectification(lens) for lens in dict.fromkeys(entry.camera for entry in entries)}
 
     def _own_points(self, path: Path, transforms: Transforms) -> tuple[Callable[[], PointCloud] | None, Path | None]:
         """Points of ``ply_file_path`` (in the file's world), or else of ``points3D.ply`` (in the scene's world)."""

@@ -1,61 +1,100 @@
-"""Writes nerfstudio's layout with OpenCV's lens model (docs/layouts/nerfstudio.md)."""
+"""Writes scenes with estimated depth in nerfstudio's layout (docs/depth.md)."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
+from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.files import write_json
-from coliags_plugin.core.images import write_image
-from coliags_plugin.geometry.lenses.opencv import OpenCVLens
+from coliags_plugin.core.images import write_image, write_mask
+from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
 
-
-def write_frame(
-    folder: Path, index: int, image: UInt8[np.ndarray, "H W 3"], z_depth: Float[np.ndarray, "H W"], depth_unit: float
-) -> None:
-    """Write a frame.
-
-    Args:
-        folder: Folder of the scene.
-        index: Index of the frame, from 0.
-        image: RGB, as the lens shows it. [H, W, 3]
-        z_depth: Scene units; 0 where unknown. [H, W]
-        depth_unit: Scene units per 16-bit step.
-    """
-    write_image(folder / "images" / _name(index), image)
-    steps = np.rint(z_depth / depth_unit).clip(0.0, 65535.0)
-    write_image(folder / "depth" / _name(index), steps.astype(np.uint16))
+_POINTS = "points.ply"
 
 
-def write_transforms(
-    folder: Path, camera_to_world: Float[np.ndarray, "N 4 4"], lens: OpenCVLens, depth_unit: float
-) -> None:
-    """Write ``transforms.json``.
+class EstimatedSceneWriter:
+    """Writes the frames of a scene one by one, then ``transforms.json`` and the points.
 
     Args:
         folder: Folder of the scene.
-        camera_to_world: OpenCV axes, scene units. [N, 4, 4]
-        lens: Of all frames, at their size, with radial terms up to k2.
-        depth_unit: As for :func:`write_frame`.
+        depth_unit: Scene units per 16-bit step of depth.
     """
-    frames = [
-        {
-            "file_path": f"images/{_name(index)}",
-            "depth_file_path": f"depth/{_name(index)}",
-            "transform_matrix": (pose @ FLIP_Y_AND_Z).tolist(),
+
+    def __init__(self, folder: Path, depth_unit: float) -> None:
+        self.folder, self.depth_unit = folder, depth_unit
+        self._frames: list[dict[str, Any]] = []
+
+    def write_frame(
+        self,
+        name: str,
+        camera: Camera,
+        image: UInt8[np.ndarray, "H W 3"],
+        mask: Bool[np.ndarray, "H W"] | None,
+        depth: Float[np.ndarray, "H W"],
+        confidence: Float[np.ndarray, "H W"],
+    ) -> None:
+        """Write the files of a frame.
+
+        Args:
+            name: Unique; the stem of its files.
+            camera: Pinhole of the image, posed.
+            image: RGB. [H, W, 3]
+            mask: False where a pixel is to be ignored; None: nowhere. [H, W]
+            depth: z-depth, scene units; not positive where unknown. [H, W]
+            confidence: 0 to 1. [H, W]
+        """
+        file = f"{name}.png"
+        steps = np.clip(np.rint(depth / self.depth_unit), 0, 65535).astype(np.uint16)
+        write_image(self.folder / "images" / file, image)
+        write_image(self.folder / "depth" / file, steps if mask is None else np.where(mask, steps, 0).astype(np.uint16))
+        grey = np.rint(255.0 * confidence).astype(np.uint8)
+        write_image(
+            self.folder / "confidence" / file, grey if mask is None else np.where(mask, grey, 0).astype(np.uint8)
+        )
+        entry: dict[str, Any] = {
+            "file_path": f"images/{file}",
+            "depth_file_path": f"depth/{file}",
+            "confidence_file_path": f"confidence/{file}",
         }
-        for index, pose in enumerate(camera_to_world)
-    ]
-    k = lens.pinhole
-    camera = {"camera_model": "OPENCV", "fl_x": k.fx, "fl_y": k.fy, "cx": k.cx, "cy": k.cy}
-    size = {"w": lens.width, "h": lens.height}
-    bends = {"k1": lens.k1, "k2": lens.k2, "p1": lens.p1, "p2": lens.p2}
-    unit = {"depth_unit_scale_factor": depth_unit}
-    write_json(folder / "transforms.json", {**camera, **size, **bends, **unit, "frames": frames})
+        if mask is not None:
+            write_mask(self.folder / "masks" / file, mask)
+            entry["mask_path"] = f"masks/{file}"
+        k = camera.intrinsics
+        entry |= {"fl_x": k.fx, "fl_y": k.fy, "cx": k.cx, "cy": k.cy, "w": k.width, "h": k.height}
+        entry["transform_matrix"] = (camera.camera_to_world.cpu().double().numpy() @ FLIP_Y_AND_Z).tolist()
+        self._frames.append(entry)
 
+    def finish(
+        self,
+        positions: Float[np.ndarray, "N 3"],
+        colors: UInt8[np.ndarray, "N 3"],
+        split: tuple[Sequence[str], Sequence[str]] | None,
+    ) -> None:
+        """Write the points and ``transforms.json``.
 
-def _name(index: int) -> str:
-    return f"frame_{index + 1:05d}.png"
+        Args:
+            positions: Initial points, world. [N, 3]
+            colors: RGB. [N, 3]
+            split: Names of the training and the test frames, where the source has a split of its own.
+        """
+        write_ply(self.folder / _POINTS, point_properties(positions, colors))
+        lists = {}
+        if split is not None:
+            lists = {
+                f"{part}_filenames": [f"images/{name}.png" for name in names]
+                for part, names in zip(("train", "test"), split, strict=True)
+            }
+        content = {
+            "camera_model": "OPENCV",
+            "depth_unit_scale_factor": self.depth_unit,
+            "ply_file_path": _POINTS,
+            **lists,
+            "frames": self._frames,
+        }
+        write_json(self.folder / "transforms.json", content)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.json_files import read_json
+from coliags_plugin.datamanagers.reading.json_numbers import image_size, read_number
 
 
 def read_intrinsics(path: Path) -> Intrinsics:
@@ -26,14 +26,9 @@ def read_intrinsics(path: Path) -> Intrinsics:
             "fx, fy, cx, cy in pixels (centres at integers) and the image's w, h",
             "Add them",
         )
-    values = [data[key] for key in keys]
-    numbers = [v for v in values if isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v)]
-    if len(numbers) < len(keys) or min(numbers[0], numbers[1], numbers[4], numbers[5]) <= 0:
-        raise InputError(f"{path}: {dict(zip(keys, values, strict=True))}", "numbers, focal lengths and sizes above 0")
-    fx, fy, cx, cy, width, height = numbers
-    if width != int(width) or height != int(height):
-        raise InputError(f"{path}: w = {width}, h = {height}", "whole pixels")
-    return Intrinsics(float(fx), float(fy), cx + 0.5, cy + 0.5, int(width), int(height))
+    fx, fy = (read_number(data, key, path, "a number above 0", above=0.0) for key in ("fx", "fy"))
+    cx, cy = (read_number(data, key, path) for key in ("cx", "cy"))
+    return Intrinsics(fx, fy, cx + 0.5, cy + 0.5, *image_size(data, path))
 
 
 def write_camera_json(path: Path, intrinsics: Intrinsics, **more: float) -> None:

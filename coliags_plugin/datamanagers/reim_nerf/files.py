@@ -15,9 +15,9 @@ from jaxtyping import Bool, Float, Float32, Shaped
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import read_json
 from coliags_plugin.datamanagers.reading.depth_formats import DepthFormat
-from coliags_plugin.datamanagers.reading.frame_files import inventory
+from coliags_plugin.datamanagers.reading.files import inventory, named_file, require_folder
 from coliags_plugin.datamanagers.reading.images import read_gray
-from coliags_plugin.datamanagers.reading.named_files import named_file
+from coliags_plugin.datamanagers.reading.json_numbers import image_size, read_number
 from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z, check_rigid
 from coliags_plugin.geometry.poses.trajectory import natural_order, refuse_repeated
@@ -29,8 +29,11 @@ EXPECTED = "images/, distmaps/, rgb_mask.png and transforms_train.json as REIM-N
 C3VD_RANGE = 100.0
 #: Digits tried of numbers in file names.
 _DIGITS = 6
-_LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "w", "h")
-_SHARED = (*_LENS, "p1", "p2", "scene_scale", "distmap_scale", "camera_model")
+#: Keys that have the same value in all files of a sequence.
+_SHARED = (
+    *("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "w", "h"),
+    *("camera_model", "scene_scale", "distmap_scale", "scene_T"),
+)
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,7 @@ class FrameEntry:
 
 
 @dataclass(frozen=True)
-class Sequence:
+class ReimNerfSequence:
     """Combined contents of a folder's JSON files.
 
     Attributes:
@@ -123,15 +126,7 @@ def ray_cosines(lens: Lens) -> Float32[np.ndarray, "H W"]:
     return np.nan_to_num(cosine, nan=0.0).astype(np.float32).reshape(lens.height, lens.width)
 
 
-def recognise(folder: Path) -> str | None:
-    """The files that identify this layout; None if the folder has another one."""
-    if not (folder / "transforms_train.json").is_file():
-        return None
-    beside = next((name for name in ("distmaps", "rgb_mask.png") if (folder / name).exists()), None)
-    return None if beside is None else f"transforms_train.json beside {beside}"
-
-
-def read_sequence(folder: Path, outside: bool = False) -> Sequence:
+def read_sequence(folder: Path, outside: bool = False) -> ReimNerfSequence:
     """Read and combine the JSON files of a folder.
 
     Args:
@@ -142,8 +137,7 @@ def read_sequence(folder: Path, outside: bool = False) -> Sequence:
         InputError: The folder or ``transforms_train.json`` is missing; a file is invalid (the message names the frame);
             or two files contradict each other.
     """
-    if not folder.is_dir():
-        raise InputError(f"no folder {folder}", EXPECTED, "Check the path")
+    require_folder(folder, EXPECTED)
     files = {part: folder / f"transforms_{part}.json" for part in PARTS}
     files = {part: file for part, file in files.items() if file.is_file()}
     if "train" not in files:
@@ -154,12 +148,14 @@ def read_sequence(folder: Path, outside: bool = False) -> Sequence:
         _check_same(files["train"], first, files[part], content)
     lens = _lens(files["train"], first)
     scale, shift = _normalisation(files["train"], first)
-    found: dict[str, FrameEntry] = {}
-    named: dict[str, list[str]] = {}
+    defaults = {"distmap_scale": math.pi, **first}
+    distmap_scale = read_number(defaults, "distmap_scale", files["train"], "a number above 0", above=0.0)
+    frames: dict[str, FrameEntry] = {}
+    names_of: dict[str, list[str]] = {}
     for part, content in contents.items():
-        named[part] = []
+        names_of[part] = []
         for name, frame in _frames(folder, files[part], content, scale, shift, outside):
-            known = found.setdefault(name, frame)
+            known = frames.setdefault(name, frame)
             if known.distances != frame.distances or not np.allclose(
                 known.camera_to_world, frame.camera_to_world, atol=1e-4
             ):
@@ -168,21 +164,21 @@ def read_sequence(folder: Path, outside: bool = False) -> Sequence:
                     "the same values for a frame in all files",
                     "Write all files in one run",
                 )
-            named[part].append(name)
-    names = list(found)
+            names_of[part].append(name)
+    names = list(frames)
     names = [names[index] for index in natural_order(names)]
     index_of = {name: index for index, name in enumerate(names)}
-    if sum(frame.distances is not None for frame in found.values()) not in (0, len(found)):
-        lone = next(name for name in names if found[name].distances is None)
+    if sum(frame.distances is not None for frame in frames.values()) not in (0, len(frames)):
+        lone = next(name for name in names if frames[name].distances is None)
         raise InputError(f"{folder}: {lone} has no distmap_path, but others have", "one for every frame, or for none")
-    return Sequence(
+    return ReimNerfSequence(
         files,
         lens,
         scale,
         shift,
-        _positive(files["train"], first, "distmap_scale", math.pi),
-        tuple(found[name] for name in names),
-        {part: tuple(sorted(index_of[name] for name in names)) for part, names in named.items()},
+        distmap_scale,
+        tuple(frames[name] for name in names),
+        {part: tuple(sorted(index_of[name] for name in names)) for part, names in names_of.items()},
     )
 
 
@@ -196,7 +192,7 @@ def _read(file: Path) -> dict[str, Any]:
 
 
 def _check_same(file: Path, first: Mapping[str, Any], other: Path, content: Mapping[str, Any]) -> None:
-    for key in (*_SHARED, "scene_T"):
+    for key in _SHARED:
         if first.get(key) != content.get(key):
             raise InputError(
                 f"{other}: {key} differs from {file.name}",
@@ -208,23 +204,18 @@ def _check_same(file: Path, first: Mapping[str, Any], other: Path, content: Mapp
 def _lens(file: Path, content: Mapping[str, Any]) -> FisheyeLens:
     if content.get("camera_model") not in ("FISHEYE_OPENCV", "OPENCV_FISHEYE"):
         raise InputError(f"{file}: camera_model {content.get('camera_model')!r}", "FISHEYE_OPENCV")
-    values = {key: _number(file, content, key) for key in _LENS}
-    width, height = values.pop("w"), values.pop("h")
-    if min(width, height, values["fx"], values["fy"]) <= 0 or width != int(width) or height != int(height):
-        raise InputError(
-            f"{file}: an image of {width:g} x {height:g}, focal lengths {values['fx']:g}, {values['fy']:g}",
-            "whole sizes and focal lengths above 0",
-        )
+    width, height = image_size(content, file)
+    fx, fy = (read_number(content, key, file, "a number above 0", above=0.0) for key in ("fx", "fy"))
+    cx, cy, k1, k2, k3, k4 = (read_number(content, key, file) for key in ("cx", "cy", "k1", "k2", "k3", "k4"))
     for key in ("p1", "p2"):
         if content.get(key):
             raise InputError(f"{file}: {key} = {content[key]!r}", "0: OpenCV's fisheye has no such term")
-    fx, fy, cx, cy, k1, k2, k3, k4 = (values[key] for key in ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"))
     cx, cy = cx + 0.5, cy + 0.5  # the file counts pixel centres at integers
-    return FisheyeLens(width=int(width), height=int(height), fx=fx, fy=fy, cx=cx, cy=cy, k1=k1, k2=k2, k3=k3, k4=k4)
+    return FisheyeLens(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, k1=k1, k2=k2, k3=k3, k4=k4)
 
 
 def _normalisation(file: Path, content: Mapping[str, Any]) -> tuple[float, Float[np.ndarray, "3"]]:
-    scale = _positive(file, content, "scene_scale", None)
+    scale = read_number(content, "scene_scale", file, "a number above 0", above=0.0)
     shift = _array(content.get("scene_T"))
     if shift.shape != (4, 4) or not np.allclose(shift[:3, :3], np.eye(3)) or not np.allclose(shift[3], (0, 0, 0, 1)):
         raise InputError(f"{file}: scene_T is not a translation", "a 4x4 matrix without rotation")
@@ -254,11 +245,11 @@ def _frames(
         camera_to_world = matrix @ FLIP_Y_AND_Z
         camera_to_world[:3, 3] = camera_to_world[:3, 3] / scale - shift
         distances = frame.get("distmap_path")
-        texts = [name, *([distances] if isinstance(distances, str) else [])]
-        named = [named_file(folder, text, str(file), outside) for text in texts]
-        paths = [_stored(path) for path in named]
-        for path, found in zip(named, paths, strict=True):
-            if not found.is_file():
+        stated = [name, *([distances] if isinstance(distances, str) else [])]
+        named = [named_file(folder, text, str(file), outside) for text in stated]
+        paths = [_padded_otherwise(path) for path in named]
+        for path, existing in zip(named, paths, strict=True):
+            if not existing.is_file():
                 raise InputError(
                     f"{file} names {path}, which does not exist, nor with its number padded otherwise",
                     "every named file",
@@ -268,7 +259,7 @@ def _frames(
     return result
 
 
-def _stored(named: Path) -> Path:
+def _padded_otherwise(named: Path) -> Path:
     """The file that a JSON file names, or else the one whose number has more or fewer leading zeros.
 
     C3VD's releases and the preprocessing write both 0_color.png and 0000_color.png.
@@ -288,19 +279,3 @@ def _array(value: Any) -> np.ndarray:
     except (TypeError, ValueError, OverflowError):
         return np.empty(0)
     return array if np.all(np.isfinite(array)) else np.empty(0)
-
-
-def _positive(file: Path, content: Mapping[str, Any], key: str, default: float | None) -> float:
-    if default is not None and key not in content:
-        return default
-    number = _number(file, content, key)
-    if number <= 0.0:
-        raise InputError(f"{file}: {key} = {number:g}", "a number above 0")
-    return number
-
-
-def _number(file: Path, content: Mapping[str, Any], key: str) -> float:
-    value = content.get(key)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise InputError(f"{file}: {key} = {value!r}", "a finite number")
-    return float(value)

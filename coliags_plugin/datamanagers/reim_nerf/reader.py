@@ -10,20 +10,25 @@ from jaxtyping import Bool
 from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.datamanagers.reading.image_names import unposed_images, warn_of_unposed
+from coliags_plugin.datamanagers.reading.files import unposed_images, warn_of_unposed
 from coliags_plugin.datamanagers.reading.images import read_mask
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
 from coliags_plugin.datamanagers.rectification import Rectification
-from coliags_plugin.datamanagers.reim_nerf.files import RayDistance, Sequence, ray_cosines, read_sequence, recognise
+from coliags_plugin.datamanagers.reim_nerf.files import (
+    RayDistance,
+    ReimNerfSequence,
+    ray_cosines,
+    read_sequence,
+)
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
-from coliags_plugin.datamanagers.seen import find_seen_masks
+from coliags_plugin.datamanagers.seen_masks import find_seen_masks
 from coliags_plugin.datamanagers.splits import Split
 
 MASK_FILE = "rgb_mask.png"
 
 
-class ReimNerfSettings(SceneSettings):
+class ReimNerfDataSettings(SceneSettings):
     """Options of the ``reim-nerf`` data manager."""
 
     split: Split = Field(
@@ -37,9 +42,9 @@ class ReimNerfSettings(SceneSettings):
 class ReimNerfDataManager(RecordedDataManager):
     """Reads REIM-NeRF's preprocessed C3VD in millimetres and C3VD's world frame (docs/layouts/reim-nerf.md)."""
 
-    Settings = ReimNerfSettings
+    Settings = ReimNerfDataSettings
 
-    settings: ReimNerfSettings
+    settings: ReimNerfDataSettings
     name = "reim-nerf"
     #: REIM-NeRF trains and evaluates at a fifth of the raw size.
     fits = (270, 216)
@@ -48,7 +53,10 @@ class ReimNerfDataManager(RecordedDataManager):
     @classmethod
     def recognise(cls, path: Path) -> str | None:
         """See :class:`DataManager`."""
-        return recognise(path)
+        if not (path / "transforms_train.json").is_file():
+            return None
+        beside = next((name for name in ("distmaps", MASK_FILE) if (path / name).exists()), None)
+        return None if beside is None else f"transforms_train.json beside {beside}"
 
     def open(self, path: Path) -> Recording:
         """See :class:`RecordedDataManager`."""
@@ -81,7 +89,7 @@ class ReimNerfDataManager(RecordedDataManager):
             )
             for index, frame in enumerate(sequence.frames)
         ]
-        large = [found for frame in sequence.frames for found in (frame.image, frame.distances)]
+        large = [file for frame in sequence.frames for file in (frame.image, frame.distances)]
         warn_of_unposed(path, unposed_images([frame.image for frame in sequence.frames], large))
         parts = sequence.parts
         return Recording(
@@ -92,7 +100,7 @@ class ReimNerfDataManager(RecordedDataManager):
             own_split={"train": parts["train"], "test": parts.get("true_test", ())},
         )
 
-    def _facts(self, sequence: Sequence, rectification: Rectification) -> dict[str, Any]:
+    def _facts(self, sequence: ReimNerfSequence, rectification: Rectification) -> dict[str, Any]:
         return {
             "layout": "REIM-NeRF",
             "lens": "fisheye of the JSON files",

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import Intrinsics
@@ -16,11 +17,13 @@ from coliags_plugin.core.json_files import read_json
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.core.text_files import read_text, text_lines
 from coliags_plugin.datamanagers.reading.camera_json import read_intrinsics
-from coliags_plugin.datamanagers.reading.frame_files import DEPTH_SUFFIXES, IMAGE_SUFFIXES, inventory
+from coliags_plugin.datamanagers.reading.files import DEPTH_SUFFIXES, IMAGE_SUFFIXES, inventory, require_folder
 from coliags_plugin.datamanagers.reading.images import size_of
+from coliags_plugin.datamanagers.reading.json_numbers import read_number
 from coliags_plugin.geometry.poses import tum
 from coliags_plugin.geometry.poses.colmap import read_text_cameras
 from coliags_plugin.geometry.poses.text import shortened
+from coliags_plugin.geometry.poses.trajectory import natural_order
 
 IMAGE_FOLDERS = ("rgb", "color", "images")
 DEPTH_FOLDERS = ("depth", "depths")
@@ -34,6 +37,10 @@ EXPECTED = (
 )
 #: Where the principal point of an image may lie, as a share of its size, when nothing says which size it is for.
 _MIDDLE = (0.3, 0.7)
+
+
+#: A file stem that is a timestamp in seconds with a fraction, as TUM's, with an optional suffix.
+_TIME = re.compile(r"(\d+\.\d+)(?:_[a-z]+)?", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -66,14 +73,13 @@ def find_images(folder: Path) -> list[Path]:
     Raises:
         InputError: There is no folder of images, or more than one, or it is empty.
     """
-    if not folder.is_dir():
-        raise InputError(f"no folder {folder}", EXPECTED, "Check the path")
-    found = _only(folder, IMAGE_FOLDERS)
-    if found is None:
+    require_folder(folder, EXPECTED)
+    image_folder = _only(folder, IMAGE_FOLDERS)
+    if image_folder is None:
         raise InputError(f"{folder} holds {inventory(folder)}", EXPECTED, "Name the scene's own folder")
-    images = [path for path in found.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
+    images = [path for path in image_folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
     if not images:
-        raise InputError(f"{found} holds {inventory(found)}", "PNG or JPEG images")
+        raise InputError(f"{image_folder} holds {inventory(image_folder)}", "PNG or JPEG images")
     return images
 
 
@@ -83,8 +89,8 @@ def find_depths(folder: Path) -> list[Path]:
     Raises:
         InputError: There is more than one such folder.
     """
-    found = _only(folder, DEPTH_FOLDERS)
-    return [] if found is None else [path for path in found.iterdir() if path.suffix.lower() in DEPTH_SUFFIXES]
+    depths = _only(folder, DEPTH_FOLDERS)
+    return [] if depths is None else [path for path in depths.iterdir() if path.suffix.lower() in DEPTH_SUFFIXES]
 
 
 def find_masks(folder: Path, images: Sequence[Path]) -> dict[str, Path]:
@@ -107,30 +113,30 @@ def find_confidences(folder: Path, images: Sequence[Path], with_depth: bool) -> 
     Raises:
         InputError: An image has none, or there is no depth.
     """
-    found = _of_every_image(folder, CONFIDENCE_FOLDERS, images, "confidence")
-    if found and not with_depth:
+    confidences = _of_every_image(folder, CONFIDENCE_FOLDERS, images, "confidence")
+    if confidences and not with_depth:
         raise InputError(
             f"{folder} holds confidence/, but no depth",
             "confidence beside the depth that it is about",
             "Add the depth, or move confidence/ away",
         )
-    return found
+    return confidences
 
 
-def _of_every_image(folder: Path, places: tuple[str, ...], images: Sequence[Path], what: str) -> dict[str, Path]:
+def _of_every_image(folder: Path, names: tuple[str, ...], images: Sequence[Path], what: str) -> dict[str, Path]:
     """Files by the stem of their image, which must all be there if their folder is."""
-    place = _only(folder, places)
-    if place is None:
+    file_folder = _only(folder, names)
+    if file_folder is None:
         return {}
-    found = {path.stem: path for path in place.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES}
-    lone = next((image for image in images if image.stem not in found), None)
+    files = {path.stem: path for path in file_folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES}
+    lone = next((image for image in images if image.stem not in files), None)
     if lone is not None:
         raise InputError(
-            f"{place} has no {what} for {lone.name}",
+            f"{file_folder} has no {what} for {lone.name}",
             f"a {what} of the same name for every image, or no such folder",
             "Restore the missing ones, or move the folder away",
         )
-    return {image.stem: found[image.stem] for image in images}
+    return {image.stem: files[image.stem] for image in images}
 
 
 def lacks_trajectory(folder: Path) -> bool:
@@ -158,20 +164,20 @@ def find_trajectory(folder: Path, named: str | None) -> Path:
         if not (folder / named).is_file():
             raise InputError(f"no file {folder / named}", "a TUM trajectory", "Correct the option trajectory")
         return folder / named
-    found = _trajectories(folder)
-    if not found:
+    trajectories = _trajectories(folder)
+    if not trajectories:
         raise InputError(
             f"{folder} has images but no {' or '.join(TRAJECTORIES)}",
             EXPECTED,
             "Add it, or estimate one from depth by coliags poses track",
         )
-    if len(found) > 1:
+    if len(trajectories) > 1:
         raise InputError(
-            f"{folder} has the trajectories {', '.join(path.name for path in found)}",
+            f"{folder} has the trajectories {', '.join(path.name for path in trajectories)}",
             "one trajectory",
-            f"Choose with the option trajectory, for instance --set datamanager.trajectory={found[0].name}",
+            f"Choose with the option trajectory, for instance --set datamanager.trajectory={trajectories[0].name}",
         )
-    return found[0]
+    return trajectories[0]
 
 
 def find_camera(folder: Path, image: Path) -> CameraFile:
@@ -192,8 +198,8 @@ def find_camera(folder: Path, image: Path) -> CameraFile:
 
 def find_mesh(folder: Path) -> Path | None:
     """The OBJ file of the folder; None if there is none or several."""
-    found = sorted(folder.glob("*.obj"))
-    return found[0] if len(found) == 1 else None
+    meshes = sorted(folder.glob("*.obj"))
+    return meshes[0] if len(meshes) == 1 else None
 
 
 def read_obj_points(path: Path) -> PointCloud:
@@ -203,7 +209,7 @@ def read_obj_points(path: Path) -> PointCloud:
         InputError: The file cannot be read, or a vertex line does not hold three or six numbers.
     """
     rows: list[list[float]] = []
-    for number, line in text_lines(path, "an OBJ file"):
+    for row_number, line in text_lines(path, "an OBJ file"):
         if not line.startswith("v "):
             continue
         try:
@@ -211,7 +217,9 @@ def read_obj_points(path: Path) -> PointCloud:
         except ValueError:
             row = []
         if len(row) not in (3, 6) or (rows and len(row) != len(rows[0])):
-            raise InputError(f"{path}, line {number}: '{shortened(line)}'", "v x y z, or v x y z r g b in every line")
+            raise InputError(
+                f"{path}, line {row_number}: '{shortened(line)}'", "v x y z, or v x y z r g b in every line"
+            )
         rows.append(row)
     values = np.array(rows).reshape(len(rows), -1)
     colors = None
@@ -221,29 +229,24 @@ def read_obj_points(path: Path) -> PointCloud:
 
 
 def _only(folder: Path, names: tuple[str, ...]) -> Path | None:
-    found = [folder / name for name in names if (folder / name).is_dir()]
-    if len(found) > 1:
-        raise InputError(
-            f"{folder} holds {' and '.join(f'{path.name}/' for path in found)}",
-            "only one of them",
-            "Move the other away",
-        )
-    return found[0] if found else None
+    folders = [folder / name for name in names if (folder / name).is_dir()]
+    if len(folders) > 1:
+        listed = " and ".join(f"{path.name}/" for path in folders)
+        raise InputError(f"{folder} holds {listed}", "only one of them", "Move the other away")
+    return folders[0] if folders else None
 
 
 def _trajectories(folder: Path) -> list[Path]:
-    found = {path for pattern in TRAJECTORIES for path in folder.glob(pattern) if path.is_file()}
-    return sorted(found)
+    return sorted({path for pattern in TRAJECTORIES for path in folder.glob(pattern) if path.is_file()})
 
 
 def _read_json(path: Path, image: Path) -> CameraFile:
     intrinsics = read_intrinsics(path)
-    scale = read_json(path, "a JSON object").get("depth_scale")
-    if scale is None:
+    content = read_json(path, "a JSON object")
+    if content.get("depth_scale") is None:
         return CameraFile(path, intrinsics)
-    if isinstance(scale, bool) or not isinstance(scale, (int, float)) or not (math.isfinite(scale) and scale > 0):
-        raise InputError(f"{path}: depth_scale = {scale!r}", "a number above 0: depth steps per scene unit")
-    return CameraFile(path, intrinsics, float(scale))
+    expected = "a number above 0: depth steps per scene unit"
+    return CameraFile(path, intrinsics, read_number(content, "depth_scale", path, expected, above=0.0))
 
 
 def _read_intrinsics_txt(path: Path, image: Path) -> CameraFile:
@@ -279,3 +282,46 @@ def _read_cameras_txt(path: Path, image: Path) -> CameraFile:
     if isinstance(camera, str):
         raise InputError(f"{path}: {camera}", "PINHOLE or SIMPLE_PINHOLE", "Undistort the images first")
     return CameraFile(path, camera)
+
+
+def is_time(name: str) -> bool:
+    """Whether a file stem is a timestamp in seconds; unlike a frame number it has a decimal point."""
+    return _TIME.fullmatch(name) is not None
+
+
+def times(paths: Sequence[Path]) -> Float[np.ndarray, "N"]:
+    """Timestamps from file names, seconds; integers are accepted too. [N]
+
+    Raises:
+        InputError: A name is not a number.
+    """
+    return np.array([_time(path) for path in paths])
+
+
+def by_number(paths: Sequence[Path]) -> dict[tuple[int, ...], Path]:
+    """Files in natural order, 2 before 10, by all integers in their names, which tell the frame whatever the padding.
+
+    Raises:
+        InputError: A name has no number, or two have the same.
+    """
+    files: dict[tuple[int, ...], Path] = {}
+    for index in natural_order([path.name for path in paths]):
+        path = paths[index]
+        key = tuple(int(digits) for digits in re.findall(r"\d+", path.stem))
+        if not key:
+            raise InputError(f"{path}: no number in its name", "names that count the frames", "Move other files away")
+        if key in files:
+            raise InputError(f"{files[key]} and {path.name} have the same number", "one file per frame", "Remove one")
+        files[key] = path
+    return files
+
+
+def _time(path: Path) -> float:
+    match = _TIME.fullmatch(path.stem)
+    if match is not None:
+        return float(match.group(1))
+    if path.stem.isdecimal():
+        return float(path.stem)
+    raise InputError(
+        f"{path}: its name is not a timestamp", "a name in seconds, for instance 1305031102.175304.png", "Rename it"
+    )

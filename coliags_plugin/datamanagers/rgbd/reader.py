@@ -19,9 +19,9 @@ from coliags_plugin.datamanagers.reading.depth_formats import DepthSteps
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
 from coliags_plugin.datamanagers.rectification import Rectification
-from coliags_plugin.datamanagers.rgbd.association import by_number, is_time, nearest_in_time, times
 from coliags_plugin.datamanagers.rgbd.files import (
     CameraFile,
+    by_number,
     find_camera,
     find_confidences,
     find_depths,
@@ -29,14 +29,17 @@ from coliags_plugin.datamanagers.rgbd.files import (
     find_masks,
     find_mesh,
     find_trajectory,
+    is_time,
     lacks_trajectory,
     read_obj_points,
     recognise,
+    times,
 )
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
-from coliags_plugin.datamanagers.seen import find_seen_masks
+from coliags_plugin.datamanagers.seen_masks import find_seen_masks
 from coliags_plugin.datamanagers.units import printed_unit
 from coliags_plugin.geometry.poses import tum
+from coliags_plugin.geometry.poses.association import nearest_in_time
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
@@ -192,7 +195,9 @@ class RGBDDataManager(RecordedDataManager):
             first = int(same[0])
             raise InputError(f"{images[first]} and {images[first + 1].name} have the same timestamp", "one of them")
         known = np.zeros(0) if trajectory.timestamps is None else trajectory.timestamps
-        pose = nearest_in_time(taken, known, tolerance)
+        # Names are rounded to microseconds; pairs exactly at the tolerance must match.
+        within = tolerance + 1e-6
+        pose = nearest_in_time(taken, known, within)
         if not (pose >= 0).any():
             raise InputError(
                 f"no pose of {file} is within {tolerance:g} of an image: images from {taken[0]:.6f} to "
@@ -204,7 +209,7 @@ class RGBDDataManager(RecordedDataManager):
         depth = np.full(len(images), -1)
         complete = posed.copy()
         if depths:
-            depth[posed] = nearest_in_time(taken[posed], times(depths), tolerance)
+            depth[posed] = nearest_in_time(taken[posed], times(depths), within)
             complete &= depth >= 0
         if not complete.any():
             raise InputError(

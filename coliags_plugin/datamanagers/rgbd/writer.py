@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8, UInt16
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.files import atomic_folder, atomic_write
+from coliags_plugin.core.files import atomic_folder
 from coliags_plugin.core.images import write_image, write_mask
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.reading.camera_json import write_camera_json
-from coliags_plugin.datamanagers.rgbd.association import is_time, times
+from coliags_plugin.datamanagers.rgbd.files import is_time, times
 from coliags_plugin.geometry.poses import tum
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 
@@ -45,13 +45,6 @@ def write_frame(
     write_image(folder / "depth" / name, depth_steps(z_depth, scale))
     if mask is not None:
         write_mask(folder / "mask" / name, mask)
-
-
-def write_lists(folder: Path, stamps: Sequence[str]) -> None:
-    """Write TUM's file lists ``rgb.txt`` and ``depth.txt`` for images named by timestamps in seconds."""
-    for kind in ("rgb", "depth"):
-        lines = ["# timestamp filename", *(f"{stamp} {kind}/{stamp}.png" for stamp in stamps)]
-        atomic_write(folder / f"{kind}.txt", "\n".join(lines) + "\n")
 
 
 def write_rgbd_scene(

@@ -87,9 +87,7 @@ def _sampled(
     if shot.depth is None or shot.depth_format is None:
         raise InputError(f"{shot.name} has no depth", "a frame with depth")
     rectification = shot.rectification
-    depth = shot.depth_format.z_depth(
-        rectification.nearest(rectification.checked(shot.depth, shot.depth_format.read(shot.depth)))
-    )
+    depth = shot.depth_format.z_depth(rectification.sampled(shot.depth, shot.depth_format.read(shot.depth)))
     known = np.flatnonzero(np.isfinite(depth))
     pixels = generator.choice(known, min(_PIXELS, len(known)), replace=False)
     row, column = np.divmod(pixels, rectification.width)

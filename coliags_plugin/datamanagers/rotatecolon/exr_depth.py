@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 from jaxtyping import Float32, Shaped
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import make_folder
 from coliags_plugin.datamanagers.reading.depth_formats import DepthFormat
 
 #: Stored depth from this value on is background; Blender writes 1e10.
@@ -63,6 +65,22 @@ def read_exr_channel(path: Path, channel: str) -> Float32[np.ndarray, "H W"]:
             "Set depth_channel to the one that holds depth",
         )
     return np.asarray(channels[channel]).astype(np.float32)
+
+
+def write_exr_channels(path: Path, channels: Mapping[str, np.ndarray]) -> None:
+    """Write float channels [H, W] by their full names.
+
+    Raises:
+        InputError: The file cannot be written.
+    """
+    import OpenEXR
+
+    make_folder(path.parent)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    try:
+        OpenEXR.File(header, dict(channels)).write(str(path))
+    except RuntimeError as error:  # the only error it knows, of a full disk too
+        raise InputError(f"cannot write {path}: {error}", "a writable folder with space left") from error
 
 
 def _damaged(path: Path) -> InputError:

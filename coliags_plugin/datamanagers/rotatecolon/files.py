@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +13,8 @@ from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import read_json
-from coliags_plugin.datamanagers.reading.frame_files import inventory, numbered
+from coliags_plugin.datamanagers.reading.files import numbered
+from coliags_plugin.datamanagers.reading.json_numbers import read_number
 from coliags_plugin.geometry.poses.nerfstudio import read as read_transforms
 
 log = logging.getLogger(__name__)
@@ -45,43 +46,6 @@ class ViewFiles:
     unposed: int
 
 
-def recognise(folder: Path) -> str | None:
-    """The files that identify a RotateColon scene; None if the folder is none."""
-    if (folder / TRAIN).is_file() and (folder / TRAIN_VIEWS).is_dir():
-        return f"{TRAIN} beside {TRAIN_VIEWS}/"
-    return None
-
-
-def find_train(folder: Path) -> ViewFiles:
-    """The training views.
-
-    Raises:
-        InputError: The folder is missing or has another layout; or as :func:`find_views`.
-    """
-    if not folder.is_dir():
-        raise InputError(f"no folder {folder}", LAYOUT, "Check the path")
-    if recognise(folder) is None:
-        raise InputError(f"{folder} holds {inventory(folder)}", LAYOUT, "Name the scene's own folder")
-    return find_views(folder / TRAIN, folder / TRAIN_VIEWS, folder / TRAIN_DEPTH)
-
-
-def find_test(folder: Path, test_folder: str) -> ViewFiles | None:
-    """The test views, without depth; None if there are none.
-
-    Raises:
-        InputError: There are poses but no images; or as :func:`find_views`.
-    """
-    if not (folder / TEST).is_file():
-        return None
-    if not (folder / test_folder).is_dir():
-        raise InputError(
-            f"{folder} has {TEST} but no folder {test_folder}",
-            "the images of the test views",
-            "Set test_folder to the folder they are in",
-        )
-    return find_views(folder / TEST, folder / test_folder, None)
-
-
 def find_views(transforms: Path, images: Path, depth: Path | None) -> ViewFiles:
     """Find the images and depth files of the poses in a JSON file.
 
@@ -90,26 +54,28 @@ def find_views(transforms: Path, images: Path, depth: Path | None) -> ViewFiles:
             image; or only some frames have a depth file.
     """
     trajectory = read_transforms(transforms)
-    found = numbered(images, "", frozenset({".png"}))
+    expected = "the horizontal field of view, radians, between 0 and pi"
+    content = read_json(transforms, "a transforms.json")
+    image_files = numbered(images, "", frozenset({".png"}))
     stated = _numbers(transforms, trajectory.names_or_numbers())
     order = sorted(range(len(stated)), key=stated.__getitem__)
     numbers = [stated[index] for index in order]
     for number in numbers:
-        if number not in found:
+        if number not in image_files:
             raise InputError(
                 f"{transforms}: frame {number} has no image {images / f'{number:04d}.png'}",
                 "an image for every frame",
                 "Restore it, or remove the frame",
             )
-    unposed = len(found) - len(numbers)
+    unposed = len(image_files) - len(numbers)
     if unposed:
         log.warning("%s: %d images of %s have no pose and are left out", transforms, unposed, images.name)
     return ViewFiles(
         transforms,
-        tuple(found[number] for number in numbers),
+        tuple(image_files[number] for number in numbers),
         _depths(numbers, depth),
         trajectory.camera_to_world[order],
-        _angle(transforms),
+        read_number(content, "camera_angle_x", transforms, expected, above=0.0, below=math.pi),
         unposed,
     )
 
@@ -117,24 +83,20 @@ def find_views(transforms: Path, images: Path, depth: Path | None) -> ViewFiles:
 def _numbers(transforms: Path, names: Sequence[str]) -> list[int]:
     """Frame numbers from ``file_path``, with or without folder and suffix."""
     numbers: list[int] = []
-    seen: set[int] = set()
     for name in names:
         stem = name.replace("\\", "/").rsplit("/", 1)[-1].removesuffix(".png")
         if not stem.isdecimal():
             raise InputError(f"{transforms}: file_path '{name}'", "the frame's number, for instance '12'")
         number = int(stem)
-        if number in seen:
+        if number in numbers:
             raise InputError(f"{transforms}: frame {number} is repeated", "one pose for each image")
-        seen.add(number)
         numbers.append(number)
     return numbers
 
 
 def _depths(numbers: Sequence[int], folder: Path | None) -> tuple[Path, ...] | None:
-    found: Mapping[int, Path] = {}
-    if folder is not None and folder.is_dir():
-        found = numbered(folder, "", frozenset({".exr"}))
-    lacking = [number for number in numbers if number not in found]
+    files = {} if folder is None else numbered(folder, "", frozenset({".exr"}))
+    lacking = [number for number in numbers if number not in files]
     if folder is None or len(lacking) == len(numbers):
         return None
     if lacking:
@@ -144,13 +106,4 @@ def _depths(numbers: Sequence[int], folder: Path | None) -> tuple[Path, ...] | N
             "a depth file for every image, or none at all",
             "Restore the missing files: incomplete archives are common",
         )
-    return tuple(found[number] for number in numbers)
-
-
-def _angle(transforms: Path) -> float:
-    angle = read_json(transforms, "a transforms.json").get("camera_angle_x")
-    if isinstance(angle, bool) or not isinstance(angle, int | float) or not 0.0 < angle < math.pi:
-        raise InputError(
-            f"{transforms}: camera_angle_x is {angle!r}", "the horizontal field of view, radians, between 0 and pi"
-        )
-    return float(angle)
+    return tuple(files[number] for number in numbers)

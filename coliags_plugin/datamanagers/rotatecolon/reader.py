@@ -10,18 +10,29 @@ from typing import Any
 import torch
 from pydantic import Field
 
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.fusion import load_points
+from coliags_plugin.datamanagers.reading.files import inventory, require_folder
 from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
-from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
+from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint, make_shots
 from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.datamanagers.rotatecolon.depth_scale import fit_scale
 from coliags_plugin.datamanagers.rotatecolon.exr_depth import ExrDepth
-from coliags_plugin.datamanagers.rotatecolon.files import POINTS, ViewFiles, find_test, find_train, recognise
+from coliags_plugin.datamanagers.rotatecolon.files import (
+    LAYOUT,
+    POINTS,
+    TEST,
+    TRAIN,
+    TRAIN_DEPTH,
+    TRAIN_VIEWS,
+    ViewFiles,
+    find_views,
+)
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
-from coliags_plugin.datamanagers.seen import ROTATION, find_seen_masks
+from coliags_plugin.datamanagers.seen_masks import ROTATION, find_seen_masks
 from coliags_plugin.datamanagers.splits import Split
 
 log = logging.getLogger(__name__)
@@ -66,12 +77,12 @@ class RotateColonDataManager(RecordedDataManager):
     @classmethod
     def recognise(cls, path: Path) -> str | None:
         """See :class:`DataManager`."""
-        return recognise(path)
+        return f"{TRAIN} beside {TRAIN_VIEWS}/" if (path / TRAIN).is_file() and (path / TRAIN_VIEWS).is_dir() else None
 
     def open(self, path: Path) -> Recording:
         """See :class:`RecordedDataManager`."""
         settings = self.settings
-        train, test = find_train(path), find_test(path, settings.test_folder)
+        train, test = self._views(path)
         shots, facts = self._shots(train)
         holds_out = settings.split not in ("all-train", "own")
         name = ROTATION if holds_out else _MAIN_SET
@@ -100,6 +111,23 @@ class RotateColonDataManager(RecordedDataManager):
             points_source=points,
         )
 
+    def _views(self, path: Path) -> tuple[ViewFiles, ViewFiles | None]:
+        """The training views, and the test views if there are any."""
+        require_folder(path, LAYOUT)
+        if self.recognise(path) is None:
+            raise InputError(f"{path} holds {inventory(path)}", LAYOUT, "Name the scene's own folder")
+        train = find_views(path / TRAIN, path / TRAIN_VIEWS, path / TRAIN_DEPTH)
+        if not (path / TEST).is_file():
+            return train, None
+        images = path / self.settings.test_folder
+        if not images.is_dir():
+            raise InputError(
+                f"{path} has {TEST} but no folder {self.settings.test_folder}",
+                "the images of the test views",
+                "Set test_folder to the folder they are in",
+            )
+        return train, find_views(path / TEST, images, None)
+
     def _shots(
         self, files: ViewFiles, seen: dict[int, Path] | None = None, prefix: str = ""
     ) -> tuple[list[Shot], dict[str, Any]]:
@@ -109,11 +137,9 @@ class RotateColonDataManager(RecordedDataManager):
         pinhole = Intrinsics(focal, focal, 0.5 * width, 0.5 * height, width, height)
         rectification = Rectification.of_pinhole(pinhole, files.images[0], self.working_size(width, height))
         depth_format = ExrDepth(settings.depth_channel, settings.depth_divisor)
-        depths = files.depths or (None,) * len(files.images)
-        shots = [
-            Shot(prefix + image.stem, image, rectification, pose, depth, depth_format, seen=(seen or {}).get(index))
-            for index, (image, depth, pose) in enumerate(zip(files.images, depths, files.camera_to_world, strict=True))
-        ]
+        shots = make_shots(
+            files.images, rectification, files.camera_to_world, files.depths, depth_format, seen or {}, prefix
+        )
         facts = {
             "layout": "rotatecolon",
             "transforms": files.transforms.name,

@@ -8,7 +8,7 @@ from pathlib import PurePosixPath
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.poses.endogslam import image_indices
@@ -78,6 +78,35 @@ def associate(first: Trajectory, second: Trajectory, match: Match = "auto", tole
     )
 
 
+def nearest_in_time(
+    wanted: Float[np.ndarray, "N"], known: Float[np.ndarray, "M"], tolerance: float
+) -> Int[np.ndarray, "N"]:
+    """Match timestamps one to one, closest pairs first, as TUM's tools do.
+
+    Args:
+        wanted: Timestamps, in any order. [N]
+        known: Timestamps to match them with, in any order. [M]
+        tolerance: Largest difference.
+
+    Returns:
+        Indices into ``known``, -1 without a match within the tolerance. [N]
+    """
+    order = np.argsort(known, kind="stable")
+    low = np.searchsorted(known[order], wanted - tolerance, side="left")
+    high = np.searchsorted(known[order], wanted + tolerance, side="right")
+    first = np.repeat(np.arange(len(wanted)), high - low)
+    ranges = [np.arange(0), *(np.arange(a, b) for a, b in zip(low, high, strict=True))]
+    second = order[np.concatenate(ranges)]
+    partner = np.full(len(wanted), -1, np.int64)
+    taken = np.zeros(len(known), bool)
+    for pair in np.argsort(np.abs(wanted[first] - known[second]), kind="stable"):
+        here, there = first[pair], second[pair]
+        if partner[here] < 0 and not taken[there]:
+            partner[here] = there
+            taken[there] = True
+    return partner
+
+
 _Pairs = tuple[np.ndarray, str]
 _NO_PAIRS = np.empty((0, 2), np.int64)
 
@@ -102,25 +131,9 @@ def _by_time(first: Trajectory, second: Trajectory, tolerance: float) -> _Pairs:
         return _NO_PAIRS, "not both have timestamps"
     if any(len(np.unique(times)) < len(times) for times in (first.timestamps, second.timestamps)):
         return _NO_PAIRS, "timestamps are repeated"
-    # All pairs within the tolerance, by binary search; then the nearest first, each frame once.
-    order = np.argsort(second.timestamps, kind="stable")
-    times = second.timestamps[order]
-    low = np.searchsorted(times, first.timestamps - tolerance, side="left")
-    high = np.searchsorted(times, first.timestamps + tolerance, side="right")
-    candidates = [
-        (abs(first.timestamps[index] - times[place]), index, int(order[place]))
-        for index in range(len(first))
-        for place in range(low[index], high[index])
-    ]
-    taken_first: set[int] = set()
-    taken_second: set[int] = set()
-    pairs = []
-    for _, index, other in sorted(candidates):
-        if index not in taken_first and other not in taken_second:
-            taken_first.add(index)
-            taken_second.add(other)
-            pairs.append((index, other))
-    return np.array(pairs, np.int64).reshape(-1, 2), f"{len(pairs)} within {tolerance:g} s"
+    partner = nearest_in_time(first.timestamps, second.timestamps, tolerance)
+    matched = np.flatnonzero(partner >= 0)
+    return np.column_stack([matched, partner[matched]]), f"{len(matched)} within {tolerance:g} s"
 
 
 def _by_index(first: Trajectory, second: Trajectory, tolerance: float) -> _Pairs:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -58,7 +58,7 @@ class WallPoints:
 
 
 class Layout(ABC):
-    """Interface of a folder layout that a phantom is written in.
+    """Interface of a folder layout that a phantom is written in: the files of a data format (docs/layouts).
 
     A folder is written in this order: every frame of the video, every rotation view, then :meth:`write_sequence` for
     the video and for the rotation views, then :meth:`write_points`. ``phantom.json`` and ``truth/`` are the same in
@@ -103,19 +103,17 @@ class Layout(ABC):
         """
 
     @abstractmethod
-    def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
+    def write_sequence(self, folder: Path, part: Part, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
         """Write the poses and, if part of the layout, the camera of all frames of a part.
 
         Args:
             folder: Folder of the phantom.
             part: Part that the frames belong to.
-            poses: Camera-to-world, OpenCV axes, mm. Each [4, 4]
+            poses: Camera-to-world, OpenCV axes, mm. [N, 4, 4]
             lens: Lens of all frames, from :meth:`lens`.
         """
 
-    def write_points(
-        self, folder: Path, points: WallPoints, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens
-    ) -> None:
+    def write_points(self, folder: Path, points: WallPoints, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
         """Write initial points; called if :attr:`has_points`. ``poses`` are those of the video."""
         raise NotImplementedError(f"{type(self).__name__} does not support points")
 

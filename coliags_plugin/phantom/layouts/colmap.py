@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ from coliags_plugin.geometry.poses.rigid import inverse
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints, pinhole_of
 
 #: A point is observed in one of this many images that show it, like a detected feature.
-_FOUND_IN_ONE_OF = 3
+_SEEN_IN_ONE_OF = 3
 
 
 class ColmapLayout(Layout):
@@ -27,24 +26,22 @@ class ColmapLayout(Layout):
         """See :class:`Layout`; depth and normals are not part of this layout."""
         write_image_and_mask(folder, _name(frame.index), frame.color)
 
-    def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
+    def write_sequence(self, folder: Path, part: Part, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
         """See :class:`Layout`; poses are part of the model."""
 
-    def write_points(
-        self, folder: Path, points: WallPoints, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens
-    ) -> None:
+    def write_points(self, folder: Path, points: WallPoints, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
         """See :class:`Layout`. Points seen in fewer than two images are left out, as COLMAP leaves them out."""
         names = [_name(index) for index in range(len(poses))]
-        model = posed_model(colmap_poses(np.stack(poses)), names, [pinhole_of(lens)], [0] * len(poses))
+        model = posed_model(colmap_poses(poses), names, [pinhole_of(lens)], [0] * len(poses))
         numbers = np.arange(len(points.positions))
-        seen = [points.seen_in(index) & ((numbers + index) % _FOUND_IN_ONE_OF == 0) for index in range(len(poses))]
+        seen = [points.seen_in(index) & ((numbers + index) % _SEEN_IN_ONE_OF == 0) for index in range(len(poses))]
         kept = np.flatnonzero(np.sum(seen, axis=0) >= 2)
-        found = []
-        for index, matrix in enumerate(inverse(np.stack(poses))):
-            here = np.flatnonzero(seen[index][kept])
-            local = points.positions[kept[here]] @ matrix[:3, :3].T + matrix[:3, 3]
-            found.append(SeenPoints(lens.project(local), here))
-        add_points(model, found, points.positions[kept], points.colors[kept])
+        observations = []
+        for index, matrix in enumerate(inverse(poses)):
+            indices = np.flatnonzero(seen[index][kept])
+            local = points.positions[kept[indices]] @ matrix[:3, :3].T + matrix[:3, 3]
+            observations.append(SeenPoints(lens.project(local), indices))
+        add_points(model, observations, points.positions[kept], points.colors[kept])
         write_model(folder, model)
 
 

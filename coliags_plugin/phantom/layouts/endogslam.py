@@ -1,22 +1,31 @@
-"""EndoGSLAM's layout of C3VD with a simulated result of EndoGSLAM (docs/layouts/c3vd-endogslam.md 1)."""
+"""C3VD as prepared by EndoGSLAM, and PR-Endo's release of it, with an ideal result (docs/layouts/c3vd-endogslam.md)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
+from coliags_plugin.core.arrays import read_arrays
+from coliags_plugin.core.files import write_arrays
+from coliags_plugin.core.images import write_image
+from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.datamanagers.c3vd.writer import write_poses
-from coliags_plugin.datamanagers.c3vd_endogslam.files import PARAMS
-from coliags_plugin.datamanagers.c3vd_endogslam.reader import PREPARED_PINHOLE
-from coliags_plugin.datamanagers.c3vd_endogslam.writer import write_frame, write_params
+from coliags_plugin.datamanagers.c3vd_endogslam.files import OPTIMIZED, PARAMS
+from coliags_plugin.datamanagers.c3vd_endogslam.reader import PREPARED_DEPTH, PREPARED_PINHOLE, SH0
 from coliags_plugin.geometry.lenses.models import Lens
 from coliags_plugin.geometry.lenses.pinhole import PinholeLens
+from coliags_plugin.geometry.poses import endogslam
+from coliags_plugin.geometry.poses.rigid import inverse
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints, part_folder, pinhole_of
 from coliags_plugin.phantom.trajectory import TEST_EVERY
+
+#: Folder and scene of PR-Endo's release, and the iteration of its Gaussians.
+_DATA, _SCENE, _ITERATION = "C3VD", "phantom", 30_000
+#: Standard deviation of the map's Gaussians, mm.
+_SIZE = 0.3
 
 
 class EndoGSLAMLayout(Layout):
@@ -35,17 +44,76 @@ class EndoGSLAMLayout(Layout):
         return PinholeLens.of(PREPARED_PINHOLE.resized(width, height)), np.ones((height, width), bool)
 
     def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
-        """See :class:`Layout`; normals are not part of this layout."""
-        write_frame(part_folder(folder, frame.part), frame.index, frame.color, frame.z_depth)
+        """See :class:`Layout`; depth is rounded down like EndoGSLAM's script does."""
+        folder = part_folder(folder, frame.part)
+        steps = np.clip(np.floor(frame.z_depth / PREPARED_DEPTH.size), 0.0, 255.0).astype(np.uint8)
+        write_image(folder / "color" / f"{frame.index:04d}_color.png", frame.color)
+        write_image(folder / "depth" / f"{frame.index:04d}_depth.tiff", steps)
 
-    def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
+    def write_sequence(self, folder: Path, part: Part, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
         """See :class:`Layout`."""
-        write_poses(part_folder(folder, part) / "pose.txt", np.stack(poses))
+        write_poses(part_folder(folder, part) / "pose.txt", poses)
 
-    def write_points(
-        self, folder: Path, points: WallPoints, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens
-    ) -> None:
+    def write_points(self, folder: Path, points: WallPoints, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
         """See :class:`Layout`."""
-        training = [pose for index, pose in enumerate(poses) if not self.is_test(index)]
-        found = Trajectory(np.stack(training), intrinsics=pinhole_of(lens))
-        write_params(folder / PARAMS, found, points.positions, points.colors)
+        training = [index for index in range(len(poses)) if not self.is_test(index)]
+        _write_params(folder / PARAMS, Trajectory(poses[training], intrinsics=pinhole_of(lens)), points)
+
+
+class PREndoLayout(EndoGSLAMLayout):
+    """C3VD/phantom without poses, and the result of an ideal EndoGSLAM run on all frames, also as a 3DGS PLY."""
+
+    has_rotation = False
+
+    def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
+        """See :class:`Layout`."""
+        super().write_frame(folder / _DATA / _SCENE, frame)
+
+    def write_sequence(self, folder: Path, part: Part, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
+        """See :class:`Layout`; poses are in params.npz."""
+
+    def write_points(self, folder: Path, points: WallPoints, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
+        """See :class:`Layout`."""
+        results = folder / f"{_DATA}{OPTIMIZED}" / _SCENE
+        means = _write_params(results / PARAMS, Trajectory(poses, intrinsics=pinhole_of(lens)), points)
+        cloud = results / "point_cloud" / f"iteration_{_ITERATION}" / "point_cloud.ply"
+        _write_gaussians(cloud, means, points.colors)
+
+    def seen_mask(self, folder: Path, part: Part, index: int) -> Path:
+        """In the scene's folder, beside the images."""
+        return super().seen_mask(folder / _DATA / _SCENE, part, index)
+
+
+def _write_params(path: Path, trajectory: Trajectory, points: WallPoints) -> Float[np.ndarray, "N 3"]:
+    """Write ``params.npz`` like EndoGSLAM, with given poses and an isotropic Gaussian at every point.
+
+    Returns:
+        The map's points in EndoGSLAM's world, that of the first camera, mm. [N, 3]
+    """
+    endogslam.write(path, trajectory)
+    arrays = read_arrays(path, "what was just written", optional=None)
+    to_first = inverse(trajectory.camera_to_world[:1])[0]
+    means = points.positions @ to_first[:3, :3].T + to_first[:3, 3]
+    count = len(means)
+    arrays |= {
+        "means3D": means.astype(np.float32),
+        "rgb_colors": (points.colors / 255.0).astype(np.float32),
+        "unnorm_rotations": np.tile(np.array([1.0, 0.0, 0.0, 0.0], np.float32), (count, 1)),
+        "logit_opacities": np.full((count, 1), 4.0, np.float32),
+        "log_scales": np.full((count, 1), np.log(_SIZE), np.float32),
+        "timestep": np.zeros(count, np.float32),
+    }
+    write_arrays(path, arrays)
+    return np.asarray(means)
+
+
+def _write_gaussians(path: Path, positions: Float[np.ndarray, "N 3"], colors: UInt8[np.ndarray, "N 3"]) -> None:
+    """Write isotropic Gaussians of equal size as a 3DGS PLY file of spherical-harmonics degree 0."""
+    count = len(positions)
+    properties = point_properties(positions)
+    properties |= {f"n{name}": np.zeros(count) for name in "xyz"}
+    properties |= {f"f_dc_{channel}": (colors[:, channel] / 255.0 - 0.5) / SH0 for channel in range(3)}
+    properties |= {"opacity": np.full(count, 4.0)}
+    properties |= {f"scale_{axis}": np.full(count, -1.2) for axis in range(3)}
+    properties |= {f"rot_{axis}": np.full(count, float(axis == 0)) for axis in range(4)}
+    write_ply(path, properties)

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from coliags_plugin.datamanagers.reim_nerf.writer import ReimNerfWriter
+from coliags_plugin.core.files import write_json
+from coliags_plugin.core.images import write_image
+from coliags_plugin.datamanagers.reim_nerf.files import C3VD_RANGE, PARTS, ray_cosines
+from coliags_plugin.datamanagers.reim_nerf.reader import MASK_FILE
 from coliags_plugin.geometry.lenses.models import LENSES, FisheyeLens, Lens
+from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame
 
 #: Normalised units per mm. REIM-NeRF's own are 0.0092 to 0.0229, so that a scene lies between -1 and 1.
@@ -27,11 +31,13 @@ class ReimNerfLayout(Layout):
     default_size = (1350, 1080)
 
     def __init__(self) -> None:
-        self._writer: ReimNerfWriter | None = None
+        self._cosines: Float[np.ndarray, "H W"] | None = None
+        #: Nearest and farthest normalised distance by frame, for the JSON files.
+        self._ranges: dict[int, tuple[float, float]] = {}
 
     def lens(self, width: int, height: int) -> tuple[Lens, Bool[np.ndarray, "H W"]]:
         """REIM-NeRF's lens, and the circle that its preprocessing keeps."""
-        lens = _lens(width, height)
+        lens = LENSES["fisheye"].resized(width, height)
         # Its preprocessing counts pixel centres at integers.
         cx, cy = lens.pinhole.cx - 0.5, lens.pinhole.cy - 0.5
         radius = max(min(cx, width - cx), min(cy, height - cy)) - 20.0 * width / 1350.0
@@ -43,41 +49,71 @@ class ReimNerfLayout(Layout):
         return index % 5 != 0 or _validates(index)
 
     def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
-        """See :class:`Layout`; normals are not part of this layout."""
-        height, width = frame.z_depth.shape
-        self._of(folder, width, height).write_frame(frame.index, frame.color, frame.z_depth)
+        """See :class:`Layout`; z-depth is clipped at C3VD's 100 mm, normals are not part of this layout."""
+        clipped = np.minimum(frame.z_depth.astype(np.float64), C3VD_RANGE)
+        height, width = clipped.shape
+        if self._cosines is None or self._cosines.shape != clipped.shape:
+            self._cosines = ray_cosines(LENSES["fisheye"].resized(width, height)).astype(np.float64)
+        distance = np.divide(clipped, self._cosines, out=np.zeros_like(clipped), where=self._cosines > 0.0)
+        steps = np.rint(distance * (SCENE_SCALE / DISTMAP_SCALE * 65535.0))
+        stored = np.clip(steps, 0.0, 65535.0).astype(np.uint16)
+        write_image(folder / "images" / _name(frame.index), frame.color)
+        write_image(folder / "distmaps" / _name(frame.index), stored)
+        known = stored[stored > 0] * (DISTMAP_SCALE / 65535.0)
+        nearest, farthest = float(known.min(initial=DISTMAP_SCALE)), float(known.max(initial=0.0))
+        self._ranges[frame.index] = (0.9 * nearest, 1.1 * farthest)
 
-    def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
-        """See :class:`Layout`."""
-        stacked = np.stack(poses)
-        shift = -(stacked[:, :3, 3] + _AHEAD * stacked[:, :3, 2]).mean(axis=0)
-        _, shows = self.lens(lens.width, lens.height)
-        self._of(folder, lens.width, lens.height).write_sequence(stacked, shift, shows, _parts(len(poses)))
+    def write_sequence(self, folder: Path, part: Part, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
+        """See :class:`Layout`; the mask, and a JSON file for each part of REIM-NeRF's split."""
+        _, lit = self.lens(lens.width, lens.height)
+        write_image(folder / MASK_FILE, np.where(lit, 0, 255).astype(np.uint8))
+        shift = -(poses[:, :3, 3] + _AHEAD * poses[:, :3, 2]).mean(axis=0)
+        to_middle = np.eye(4)
+        to_middle[:3, 3] = shift
+        frames = []
+        for index, pose in enumerate(poses):
+            normalised = pose @ FLIP_Y_AND_Z
+            normalised[:3, 3] = (normalised[:3, 3] + shift) * SCENE_SCALE
+            near, far = self._ranges[index]
+            names = {"file_path": f"images/{_name(index)}", "distmap_path": f"distmaps/{_name(index)}"}
+            frames.append({**names, "near": near, "far": far, "transform_matrix": normalised.tolist()})
+        camera = {**_camera(lens), "scene_T": to_middle.tolist()}
+        for name in PARTS:
+            held = [frame for index, frame in enumerate(frames) if name in _parts_of(index)]
+            write_json(folder / f"transforms_{name}.json", {**camera, "frames": held})
 
-    def _of(self, folder: Path, width: int, height: int) -> ReimNerfWriter:
-        """The writer of a folder, which keeps the depth range of each frame."""
-        if self._writer is None or self._writer.folder != folder:
-            self._writer = ReimNerfWriter(folder, _lens(width, height), SCENE_SCALE, DISTMAP_SCALE)
-        return self._writer
 
-
-def _lens(width: int, height: int) -> FisheyeLens:
-    lens = LENSES["fisheye"].resized(width, height)
+def _camera(lens: Lens) -> dict[str, Any]:
     if not isinstance(lens, FisheyeLens):
         raise TypeError("REIM-NeRF's lens is a fisheye")
-    return lens
+    k = lens.pinhole
+    return {
+        "camera_model": "FISHEYE_OPENCV",
+        # Pixel centres at integers, as OpenCV calibrates.
+        **{"fx": k.fx, "fy": k.fy, "cx": k.cx - 0.5, "cy": k.cy - 0.5},
+        **{"k1": lens.k1, "k2": lens.k2, "k3": lens.k3, "k4": lens.k4, "p1": 0.0, "p2": 0.0},
+        "w": lens.width,
+        "h": lens.height,
+        "camera_angle_x": 2.0 * math.atan(lens.width / (2.0 * k.fx)),
+        "camera_angle_y": 2.0 * math.atan(lens.height / (2.0 * k.fy)),
+        "scene_scale": SCENE_SCALE,
+        "dist_ftype": "png",
+        "distmap": True,
+        "rgb_mask": MASK_FILE,
+        "distmap_scale": DISTMAP_SCALE,
+    }
 
 
 def _validates(index: int) -> bool:
     return index % 25 == 0 and index > 0
 
 
-def _parts(count: int) -> dict[str, list[int]]:
-    """REIM-NeRF's split: every fifth frame, of those every fifth but the first for validation."""
-    fifth = range(0, count, 5)
-    return {
-        "train": [index for index in fifth if not _validates(index)],
-        "val": [index for index in fifth if _validates(index)],
-        "test": list(range(count)),
-        "true_test": [index for index in range(count) if index % 5],
-    }
+def _parts_of(index: int) -> tuple[str, ...]:
+    """REIM-NeRF's split: every fifth frame trains, of those every fifth but the first validates; all are ``test``."""
+    if index % 5:
+        return "test", "true_test"
+    return "test", "val" if _validates(index) else "train"
+
+
+def _name(index: int) -> str:
+    return f"{index:04d}_color.png"

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
+from coliags_plugin.core.files import atomic_write
 from coliags_plugin.datamanagers.reading.camera_json import write_camera_json
-from coliags_plugin.datamanagers.rgbd.writer import CAMERA, write_frame, write_lists
+from coliags_plugin.datamanagers.rgbd.writer import CAMERA, write_frame
 from coliags_plugin.geometry.lenses.models import Lens
 from coliags_plugin.geometry.poses import tum
 from coliags_plugin.geometry.poses.trajectory import Trajectory
@@ -28,12 +28,14 @@ class RGBDLayout(Layout):
         """See :class:`Layout`; normals are not part of this layout."""
         write_frame(folder, f"{_time(frame.index)}.png", frame.color, frame.z_depth, DEPTH_SCALE)
 
-    def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
+    def write_sequence(self, folder: Path, part: Part, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
         """See :class:`Layout`."""
         times = [_time(index) for index in range(len(poses))]
-        tum.write(folder / "groundtruth.txt", Trajectory(np.stack(poses), timestamps=np.array(times, np.float64)))
+        tum.write(folder / "groundtruth.txt", Trajectory(poses, timestamps=np.array(times, np.float64)))
         write_camera_json(folder / CAMERA, lens.pinhole, h=lens.height, w=lens.width, depth_scale=DEPTH_SCALE)
-        write_lists(folder, times)
+        for kind in ("rgb", "depth"):
+            lines = ["# timestamp filename", *(f"{time} {kind}/{time}.png" for time in times)]
+            atomic_write(folder / f"{kind}.txt", "\n".join(lines) + "\n")
 
 
 def _time(index: int) -> str:

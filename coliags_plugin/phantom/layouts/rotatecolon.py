@@ -1,19 +1,26 @@
-"""RotateColon's layout (docs/layouts/rotatecolon.md)."""
+"""RotateColon's layout: Blender's views and EXR depth (docs/layouts/rotatecolon.md)."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from coliags_plugin.datamanagers.rotatecolon.writer import write_points, write_test_view, write_transforms, write_view
+from coliags_plugin.core.files import write_json
+from coliags_plugin.core.images import write_image
+from coliags_plugin.core.ply import point_properties, write_ply
+from coliags_plugin.datamanagers.rotatecolon.exr_depth import write_exr_channels
+from coliags_plugin.datamanagers.rotatecolon.files import POINTS, TEST, TRAIN, TRAIN_DEPTH, TRAIN_VIEWS
 from coliags_plugin.geometry.lenses.models import Lens
 from coliags_plugin.geometry.lenses.pinhole import PinholeLens
+from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints
 
+_TEST_VIEWS = "test_views_1"
+#: Stored depth per mm, as in the dataset, and Blender's depth of the background.
+_DEPTH_FACTOR, _BACKGROUND = 1.4, 1e10
 #: Horizontal field of view, radians: that of C3VD's undistorted frames.
 _ANGLE = 2.0 * math.atan(169.0 / 200.8769)
 
@@ -36,20 +43,28 @@ class RotateColonLayout(Layout):
 
     def write_frame(self, folder: Path, frame: PhantomFrame) -> None:
         """See :class:`Layout`; normals are not part of this layout, nor is the depth of test views."""
-        if frame.part == "rotation":
-            write_test_view(folder, frame.index, frame.color)
-        else:
-            write_view(folder, frame.index, frame.color, frame.z_depth)
+        views = _TEST_VIEWS if frame.part == "rotation" else TRAIN_VIEWS
+        write_image(folder / views / f"{frame.index:04d}.png", frame.color)
+        if frame.part == "video":
+            linear = ((frame.color / 255.0) ** 2.2).astype(np.float16)
+            channels = {f"ViewLayer.Combined.{name}": linear[..., at].copy() for at, name in enumerate("RGB")}
+            channels["ViewLayer.Combined.A"] = np.ones(frame.z_depth.shape, np.float16)
+            depth = np.where(frame.z_depth > 0.0, frame.z_depth * _DEPTH_FACTOR, _BACKGROUND).astype(np.float32)
+            write_exr_channels(
+                folder / TRAIN_DEPTH / f"{frame.index:04d}.exr", {**channels, "ViewLayer.Depth.Z": depth}
+            )
 
-    def write_sequence(self, folder: Path, part: Part, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens) -> None:
+    def write_sequence(self, folder: Path, part: Part, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
         """See :class:`Layout`."""
-        write_transforms(folder, np.stack(poses), _ANGLE, test=part == "rotation")
+        frames = [
+            {"file_path": str(index), "transform_matrix": (pose @ FLIP_Y_AND_Z).tolist()}
+            for index, pose in enumerate(poses)
+        ]
+        write_json(folder / (TEST if part == "rotation" else TRAIN), {"camera_angle_x": _ANGLE, "frames": frames})
 
-    def write_points(
-        self, folder: Path, points: WallPoints, poses: Sequence[Float[np.ndarray, "4 4"]], lens: Lens
-    ) -> None:
+    def write_points(self, folder: Path, points: WallPoints, poses: Float[np.ndarray, "N 4 4"], lens: Lens) -> None:
         """See :class:`Layout`."""
-        write_points(folder, points.positions, points.colors)
+        write_ply(folder / POINTS, point_properties(points.positions, points.colors))
 
     def seen_mask(self, folder: Path, part: Part, index: int) -> Path:
         """In ``truth/``: the dataset has no seen masks."""

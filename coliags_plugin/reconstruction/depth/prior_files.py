@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float32
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.datamanagers.reading.depth_arrays import depth_format
-from coliags_plugin.datamanagers.reading.image_names import first_few
+from coliags_plugin.datamanagers.reading.depth_formats import depth_format
+from coliags_plugin.datamanagers.reading.files import first_few
 from coliags_plugin.datamanagers.rotatecolon.exr_depth import read_exr_channel
 from coliags_plugin.reconstruction.depth.priors import DepthPrior
 from coliags_plugin.reconstruction.depth.robust_fit import robust_fit

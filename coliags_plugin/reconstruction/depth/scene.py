@@ -14,7 +14,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame, Scene
-from coliags_plugin.datamanagers.nerfstudio.estimated import EstimatedSceneWriter
+from coliags_plugin.datamanagers.nerfstudio.writer import EstimatedSceneWriter
 from coliags_plugin.datamanagers.rectification import PAPER_SIZE, fitted
 from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.reconstruction.depth.depth_range import DepthRange, find_range, given_range

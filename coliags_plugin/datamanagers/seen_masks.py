@@ -7,7 +7,8 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from coliags_plugin.datamanagers.reading.frame_files import numbered_masks
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.datamanagers.reading.files import numbered
 from coliags_plugin.datamanagers.recording import Recording, Shot
 from coliags_plugin.datamanagers.splits import Split, divide
 
@@ -30,14 +31,19 @@ def find_seen_masks(path: Path, count: int, complete: bool = True) -> dict[int, 
         InputError: A mask has no frame.
     """
     folder = path / "seen"
-    if complete:
-        return numbered_masks(folder, "seen", count)
-    if folder.is_dir():
-        log.warning(
-            "%s: seen masks are for all images, but some are left out, so metrics on seen pixels are unavailable",
-            folder,
-        )
-    return {}
+    if not complete:
+        if folder.is_dir():
+            log.warning(
+                "%s: seen masks are for all images, but some are left out, so metrics on seen pixels are unavailable",
+                folder,
+            )
+        return {}
+    masks = numbered(folder, "seen", frozenset({".png"}))
+    for index, mask in masks.items():
+        if index >= count:
+            do = "Restore the missing frames, or remove the file"
+            raise InputError(f"{mask}, but there are {count} frames", f"numbers below {count}", do)
+    return masks
 
 
 def with_valid_seen_masks(

@@ -1,0 +1,186 @@
+"""Finding the files of a scene: numbered frames, files named by other files, and names of frames."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import posixpath
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path, PurePosixPath
+
+from coliags_plugin.core.errors import InputError
+
+log = logging.getLogger(__name__)
+
+IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
+TIFF_SUFFIXES = frozenset({".tiff", ".tif"})
+DEPTH_SUFFIXES = TIFF_SUFFIXES | {".png"}
+
+
+def require_folder(folder: Path, expected: str) -> None:
+    """Raise InputError if a folder is missing."""
+    if not folder.is_dir():
+        raise InputError(f"no folder {folder}", expected, "Check the path")
+
+
+def numbered(folder: Path, what: str, suffixes: frozenset[str]) -> dict[int, Path]:
+    """Files ``<number>_<what>`` by number, padded or not; ``<number>`` alone if ``what`` is empty.
+
+    None if the folder is missing.
+
+    Raises:
+        InputError: Two files have the same number.
+    """
+    files: dict[int, Path] = {}
+    pattern = rf"(\d+)_{what}" if what else r"(\d+)"
+    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+        match = re.fullmatch(pattern, path.stem)
+        if match is None or path.suffix.lower() not in suffixes:
+            continue
+        index = int(match.group(1))
+        if index in files:
+            raise InputError(f"{files[index]} and {path.name} have the same number", "one file per frame", "Remove one")
+        files[index] = path
+    return files
+
+
+def numbered_images(folder: Path, what: str, expected: str, example: str) -> dict[int, Path]:
+    """PNG images by number, at least one; see :func:`numbered`.
+
+    Args:
+        folder: Folder of the images, a part of the sequence's own.
+        what: See :func:`numbered`.
+        expected: The layout, for the error.
+        example: A sequence's own folder, for the error.
+
+    Raises:
+        InputError: There is none, or two have the same number.
+    """
+    images = numbered(folder, what, frozenset({".png"}))
+    if not images:
+        searched = folder if folder.is_dir() else folder.parent
+        do = f"Name the sequence's own folder, for instance {example}"
+        raise InputError(f"{searched} holds {inventory(searched)}", expected, do)
+    return images
+
+
+def paired(
+    folder: Path, images: Mapping[int, Path], depths: Mapping[int, Path]
+) -> tuple[tuple[Path, ...], tuple[Path, ...] | None]:
+    """Image files and, if any, depth files in frame order.
+
+    Args:
+        folder: Folder of the sequence, for errors.
+        images: Images by number; at least one.
+        depths: Depth files by number; none, or one for every image.
+
+    Raises:
+        InputError: Numbers do not run from 0 without gaps, or images and depth files do not pair up.
+    """
+    count = len(images)
+    gap = next((index for index in range(count) if index not in images), None)
+    if gap is not None:
+        first, last = min(images), max(images)
+        raise InputError(
+            f"{images[first].parent} has {count} images, numbers {first} to {last}, but none is {gap}",
+            "numbers from 0 without gaps, as line n of the pose file belongs to image n",
+            "Restore the missing images, or renumber them and drop their poses",
+        )
+    if depths and sorted(depths) != sorted(images):
+        lone = min(set(depths) ^ set(images))
+        raise InputError(
+            f"{folder} has {count} images and {len(depths)} depth files; frame {lone} has only one of the two",
+            "a depth file for every image, or none at all",
+            "Restore the missing files: incomplete archives are common",
+        )
+    frames = range(count)
+    return tuple(images[index] for index in frames), tuple(depths[index] for index in frames) if depths else None
+
+
+def inventory(folder: Path) -> str:
+    """The first few names in a folder, for error messages."""
+    names = sorted(path.name + "/" * path.is_dir() for path in folder.iterdir())
+    if not names:
+        return "nothing"
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+
+
+def named_file(folder: Path, name: str, said: str, outside: bool) -> Path:
+    """The path of a file that another one names; it need not exist.
+
+    Args:
+        folder: What names are relative to.
+        name: As it stands.
+        said: Where, for the message.
+        outside: Whether it may lie outside of the folder. Links within the folder may always lead anywhere.
+
+    Raises:
+        InputError: It lies outside, and must not; or no file can have this name.
+    """
+    path = folder / name
+    within = Path(posixpath.normpath(folder.absolute()))
+    if not outside and not Path(posixpath.normpath(path.absolute())).is_relative_to(within):
+        raise InputError(
+            f"{said} names {name[:200]}, which is outside of {folder}",
+            "files in the scene's own folder",
+            "If you trust it, set datamanager.outside_files=true (in other commands --set outside_files=true)",
+        )
+    try:
+        path.lstat()
+    except ValueError as error:  # it has a zero
+        raise InputError(f"{said} names {name[:200]!r}", "the name of a file") from error
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            raise InputError(f"{said} names {name[:200]}..., {len(name):,} letters", "the name of a file") from error
+    return path
+
+
+def short_names(paths: Sequence[str]) -> list[str]:
+    """Unique names of images given by relative paths, usable as file names.
+
+    Common parent folders are removed and the remaining ones joined by a dash; suffixes are dropped if names stay
+    unique.
+
+    Raises:
+        InputError: Two names would be equal.
+    """
+    whole = [PurePosixPath(posixpath.normpath(path)) for path in paths]
+    common = len(PurePosixPath(os.path.commonpath([path.parent for path in whole])).parts)
+    inner = [PurePosixPath(*path.parts[common:]) for path in whole]
+    for short in ([str(path.with_suffix("")) for path in inner], [str(path) for path in inner]):
+        names = [name.replace("/", "-") for name in short]
+        if len(set(names)) == len(names):
+            return names
+    double = next(name for index, name in enumerate(names) if name in names[:index])
+    raise InputError(f"two images would be called '{double}'", "names that differ in more than / and -", "Rename one")
+
+
+def unposed_images(used: Sequence[Path], excluded: Iterable[Path | None] = ()) -> list[Path]:
+    """Images without a pose in the folders of those with one.
+
+    Args:
+        used: Images with a pose.
+        excluded: Other files in these folders: depth, masks.
+    """
+    known = {*used, *excluded}
+    suffixes = {path.suffix.lower() for path in used}
+    return [
+        path
+        for folder in dict.fromkeys(path.parent for path in used)
+        for path in sorted(folder.iterdir())
+        if path.suffix.lower() in suffixes and path not in known and path.is_file()
+    ]
+
+
+def warn_of_unposed(file: Path, others: Sequence[Path]) -> None:
+    """Log a warning that names the images without a pose in ``file``, if any."""
+    if others:
+        named = first_few([path.name for path in others])
+        log.warning("%s: %d images have no pose and are left out: %s", file, len(others), named)
+
+
+def first_few(names: Sequence[str]) -> str:
+    """The first three names, for messages."""
+    return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
