@@ -7,12 +7,11 @@ from coliags_plugin._version import __version__
 
 if TYPE_CHECKING:
     from coliags_plugin.api.comparing import ablate, compare, variant
-    from coliags_plugin.api.exchange import import_splats
     from coliags_plugin.api.reconstructing import reconstruct
     from coliags_plugin.api.reports import report
     from coliags_plugin.api.runs import Run, load_run
     from coliags_plugin.api.scenes import load_scene, make_phantom
-    from coliags_plugin.api.training import train
+    from coliags_plugin.api.training import import_splats, train
 
 __all__ = [
     "Run",
@@ -32,12 +31,11 @@ __all__ = [
 #: Names of the API by its modules.
 _MODULES = {
     "comparing": ("ablate", "compare", "variant"),
-    "exchange": ("import_splats",),
     "reconstructing": ("reconstruct",),
     "reports": ("report",),
     "runs": ("Run", "load_run"),
     "scenes": ("load_scene", "make_phantom"),
-    "training": ("train",),
+    "training": ("import_splats", "train"),
 }
 
 

@@ -86,6 +86,19 @@ def test_its_log_is_arrays(trained):
     assert np.isfinite(history["psnr"]).all()
 
 
+def test_columns_of_a_log_have_nan_where_a_row_has_no_number(trained, tmp_path):
+    shutil.copytree(trained.path, tmp_path / "run")
+    log, run = tmp_path / "run/metrics.jsonl", cp.load_run(tmp_path / "run")
+    row = {"step": 1, "psnr": 20.0, "seconds": 0.5}
+    rows = [{**row, "terms": {"l1": 0.5}, "ok": True, "name": "x"}, {**row, "terms": {"l1": 0.25}, "grown": 3}]
+    log.write_text("".join(json.dumps(each) + "\n" for each in rows))
+    assert run.history.keys() == {*row, "terms.l1", "grown"}
+    np.testing.assert_array_equal(run.history["terms.l1"], [0.5, 0.25])
+    np.testing.assert_array_equal(run.history["grown"], [np.nan, 3.0])
+    log.unlink()
+    assert run.history == {}
+
+
 def test_an_evaluation_is_a_result(trained, result):
     summary = json.loads((trained.path / "eval/paper/metrics.json").read_text(encoding="utf-8"))
     assert result.mean("psnr") == summary["psnr"] > 10.0

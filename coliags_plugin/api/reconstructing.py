@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from coliags_plugin.config.assignments import assignments
 
 if TYPE_CHECKING:
-    from coliags_plugin.pipeline.record import Record
+    from coliags_plugin.pipeline.stages import Record
 
 
 def reconstruct(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Float
 
-    from coliags_plugin.api.views import View
+    from coliags_plugin.api.views import RenderedView
     from coliags_plugin.config.method_config import MethodConfig
     from coliags_plugin.core.cameras import Camera
     from coliags_plugin.core.scenes import Scene
@@ -90,9 +91,7 @@ class Run:
         Raises:
             InputError: The log cannot be read.
         """
-        from coliags_plugin.engine.history import columns
-
-        return columns(self.folder.log_rows())
+        return _columns(self.folder.log_rows())
 
     @property
     def results(self) -> dict[str, Result]:
@@ -152,7 +151,9 @@ class Run:
 
         return [frame.name for frame in choose_frames(self.load().scene, frames)]
 
-    def render(self, frame: str | Camera, *, depth: str = "depth_accumulated", outputs: Sequence[str] = ()) -> View:
+    def render(
+        self, frame: str | Camera, *, depth: str = "depth_accumulated", outputs: Sequence[str] = ()
+    ) -> RenderedView:
         """Render one view.
 
         Args:
@@ -351,7 +352,7 @@ class Run:
             InputError: See :meth:`load`; an option is unknown or invalid, or the field does not model the lamp.
         """
         from coliags_plugin.core.settings import validated
-        from coliags_plugin.engine.relighting import relight
+        from coliags_plugin.engine.held_light import relight
         from coliags_plugin.lighting.lamps import Lamp
 
         made = validated(Lamp, lamp, "lamp option")
@@ -367,7 +368,7 @@ class Run:
         Raises:
             InputError: See :meth:`load`; or the method does not make Gaussians.
         """
-        from coliags_plugin.engine.relighting import flatten
+        from coliags_plugin.engine.held_light import flatten
 
         flat = Run(self.path, data=self.data, device=self.device)
         flat._loaded = flatten(self.load())
@@ -389,3 +390,31 @@ def load_run(path: str | Path, *, data: str | Path | None = None, device: str = 
         InputError: This is no run folder.
     """
     return Run(path, data=data, device=device)
+
+
+def _columns(rows: Sequence[Mapping[str, Any]]) -> dict[str, Float[np.ndarray, "T"]]:
+    """Columns of the T rows of a training log.
+
+    Numbers in a part of a row have dotted names (``terms.l1``); what is no number is left out.
+
+    Args:
+        rows: As :meth:`RunFolder.log_rows` reads them. [T]
+
+    Returns:
+        Numbers by name, NaN where a row has none. [T] each
+    """
+    import numpy as np
+
+    numbers = [_numbers(row) for row in rows]
+    names = dict.fromkeys(name for row in numbers for name in row)
+    return {name: np.array([row.get(name, math.nan) for row in numbers]) for name in names}
+
+
+def _numbers(row: Mapping[str, Any], prefix: str = "") -> dict[str, float]:
+    numbers: dict[str, float] = {}
+    for name, value in row.items():
+        if isinstance(value, Mapping):
+            numbers |= _numbers(value, f"{prefix}{name}.")
+        elif isinstance(value, (int, float)) and not isinstance(value, bool):
+            numbers[prefix + name] = float(value)
+    return numbers

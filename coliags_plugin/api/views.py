@@ -30,7 +30,7 @@ _SHOWN_WIDTH = 200
 
 
 @dataclass(frozen=True)
-class View:
+class RenderedView:
     """A rendered view, with the recorded one where it is of a frame.
 
     Attributes:
@@ -86,7 +86,7 @@ class View:
         )
 
 
-def view_of(trained: TrainedRun, of: str | Camera, depth: str, outputs: Sequence[str]) -> View:
+def view_of(trained: TrainedRun, of: str | Camera, depth: str, outputs: Sequence[str]) -> RenderedView:
     """Render a view of a run; see :meth:`coliags_plugin.api.runs.Run.render`.
 
     Raises:
@@ -99,14 +99,14 @@ def view_of(trained: TrainedRun, of: str | Camera, depth: str, outputs: Sequence
     wants = ("rgb", "alpha", depth, *outputs)
     trained.model.check_outputs(wants, "this view")
     frame, camera = (None, of) if isinstance(of, Camera) else _frame(trained.scene, of)
-    found = rendering.render_view(trained, frame or camera, wants)
-    return View(
+    output = rendering.render_view(trained, frame or camera, wants)
+    return RenderedView(
         name="" if frame is None else frame.name,
         camera=camera,
-        rgb=as_array(eight_bit(found.rgb)),
-        alpha=as_array(found.alpha),
-        depth=as_array(found[depth]),
-        outputs={name: as_array(found[name]) for name in outputs},
+        rgb=as_array(eight_bit(output.rgb)),
+        alpha=as_array(output.alpha),
+        depth=as_array(output[depth]),
+        outputs={name: as_array(output[name]) for name in outputs},
         true_rgb=None if frame is None or trained.lamp is not None else as_array(frame.image),
         true_depth=None if frame is None else _true_depth(frame),
         unit=trained.scene.length_unit,

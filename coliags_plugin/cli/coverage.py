@@ -39,8 +39,8 @@ class Coverage:
 
     def run(self) -> None:
         """Measure, write the folder and print a summary."""
-        from coliags_plugin.api.coverage import measure_scene_coverage
         from coliags_plugin.api.runs import load_run
+        from coliags_plugin.api.scenes import measure_scene_coverage
         from coliags_plugin.config.assignments import parse_assignments
         from coliags_plugin.core.errors import InputError
         from coliags_plugin.surface.coverage.page import summary

@@ -32,7 +32,7 @@ class Import:
 
     def run(self) -> None:
         """Import and print the run folder."""
-        from coliags_plugin.api.exchange import import_splats
+        from coliags_plugin.api.training import import_splats
 
         run = import_splats(
             self.file,

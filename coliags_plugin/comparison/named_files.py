@@ -55,8 +55,8 @@ def read_settings(path: Path, content: type[_Settings], noun: str) -> _Settings:
 
 def descriptions(folder: str = "") -> dict[str, str]:
     """One line on every shipped file of a folder, by name."""
-    found = {}
+    texts = {}
     for name, path in shipped(folder).items():
         description = read_tree(path).value.get("description")
-        found[name] = "" if description is None else str(description.value)
-    return found
+        texts[name] = "" if description is None else str(description.value)
+    return texts

@@ -81,9 +81,9 @@ class RayExecutor(Executor):
         atomic_write(file, token)
         try:
             for node in self._nodes():
-                seen = self._seen_by(node, file, scenes)
-                if seen is not None:
-                    _check_node(node, seen, file, token)
+                report = self._ask(node, file, scenes)
+                if report is not None:
+                    _check_node(node, report, file, token)
         finally:
             for path in folder.glob(f".storage-{token}*"):
                 path.unlink(missing_ok=True)
@@ -123,8 +123,8 @@ class RayExecutor(Executor):
         try:
             self._ray.init(address=address, log_to_driver=False, logging_level="ERROR")
         except (ConnectionError, RuntimeError, ValueError) as error:
-            told = str(error).strip().partition("\n")[0]
-            raise InputError(f"no Ray cluster at '{address}': {told}", "one that is running", start) from error
+            reason = str(error).strip().partition("\n")[0]
+            raise InputError(f"no Ray cluster at '{address}': {reason}", "one that is running", start) from error
 
     def _resource(self, name: str) -> float:
         return float(self._ray.cluster_resources().get(name, 0.0))
@@ -132,15 +132,15 @@ class RayExecutor(Executor):
     def _nodes(self) -> list[Mapping[str, Any]]:
         return [node for node in self._ray.nodes() if node["Alive"]]
 
-    def _seen_by(self, node: Mapping[str, Any], file: Path, scenes: Sequence[Path]) -> Mapping[str, Any] | None:
+    def _ask(self, node: Mapping[str, Any], file: Path, scenes: Sequence[Path]) -> Mapping[str, Any] | None:
         """What a node sees of a file and of scenes; None where it is gone meanwhile."""
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
         there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
-        look = self._ray.remote(_look).options(num_cpus=0, max_retries=0, scheduling_strategy=there)
-        question = look.remote(str(file), [str(path) for path in scenes])
+        inspect = self._ray.remote(_inspect_node).options(num_cpus=0, max_retries=0, scheduling_strategy=there)
+        question = inspect.remote(str(file), [str(path) for path in scenes])
         try:
-            seen: Mapping[str, Any] = self._ray.get(question, timeout=_ANSWER)
+            report: Mapping[str, Any] = self._ray.get(question, timeout=_ANSWER)
         except self._ray.exceptions.RayError as error:
             lost = (self._ray.exceptions.TaskUnschedulableError, self._ray.exceptions.NodeDiedError)
             if isinstance(error, lost) and self._is_gone(node):
@@ -151,7 +151,7 @@ class RayExecutor(Executor):
                 f"coliags_plugin {__version__} on every node",
                 "Install it there in the Python that runs `ray start`",
             ) from error
-        return seen
+        return report
 
     def _is_gone(self, node: Mapping[str, Any]) -> bool:
         """Whether a node that runs no tasks is dead, as Ray finds out after a while."""
@@ -168,32 +168,34 @@ class RayExecutor(Executor):
         except self._ray.exceptions.TaskCancelledError:
             return TaskOutcome("stopped")
         except self._ray.exceptions.RayError as error:
-            told = _DEATHS.get(type(error).__name__)
-            return TaskOutcome("died", told or f"{type(error).__name__}: {_last_line(error)}")
+            reason = _DEATHS.get(type(error).__name__)
+            return TaskOutcome("died", reason or f"{type(error).__name__}: {_last_line(error)}")
 
 
-def _check_node(node: Mapping[str, Any], seen: Mapping[str, Any], file: Path, token: str) -> None:
+def _check_node(node: Mapping[str, Any], report: Mapping[str, Any], file: Path, token: str) -> None:
     """Raise InputError where a node does not see what it should."""
     name = f"node {node['NodeManagerAddress']}"
-    if seen["version"] != __version__:
-        raise InputError(f"{name} has coliags_plugin {seen['version']}", f"{__version__}, as here", "Install it there")
+    if report["version"] != __version__:
+        raise InputError(
+            f"{name} has coliags_plugin {report['version']}", f"{__version__}, as here", "Install it there"
+        )
     answer = file.with_name(f"{file.name}-{node['NodeID']}")
     read = answer.read_text(encoding="utf-8") if answer.is_file() else None
-    if seen["token"] != token or read != token:
+    if report["token"] != token or read != token:
         raise InputError(
-            f"{name} does not see {file.parent}: {seen['error'] or 'it is another folder there'}",
+            f"{name} does not see {file.parent}: {report['error'] or 'it is another folder there'}",
             "an --output on storage that all machines share, under the same path",
             "Choose a folder on a network file system",
         )
-    if seen["missing"]:
+    if report["missing"]:
         raise InputError(
-            f"{name} does not see the scenes {', '.join(seen['missing'])}",
+            f"{name} does not see the scenes {', '.join(report['missing'])}",
             "scenes on storage that all machines share, under the same paths",
             "Copy them there, or name their folder with --data",
         )
 
 
-def _look(file: str, scenes: Sequence[str]) -> dict[str, Any]:
+def _inspect_node(file: str, scenes: Sequence[str]) -> dict[str, Any]:
     """On a node: read a token, write it into a file beside it, and look for scenes."""
     import ray
 
@@ -202,8 +204,8 @@ def _look(file: str, scenes: Sequence[str]) -> dict[str, Any]:
     try:
         token = path.read_text(encoding="utf-8")
         path.with_name(f"{path.name}-{node}").write_text(token, encoding="utf-8")
-    except OSError as found:
-        error = found.strerror or str(found)
+    except OSError as problem:
+        error = problem.strerror or str(problem)
     missing = [scene for scene in scenes if not Path(scene).is_dir()]
     return {"version": __version__, "token": token, "error": error, "missing": missing}
 

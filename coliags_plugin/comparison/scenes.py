@@ -72,23 +72,23 @@ def find_scenes(names: Sequence[str], data: Path | None = None) -> list[SceneSou
         InputError: A name is unknown, scenes are missing that cannot be made, a folder holds another phantom, or two
             scenes have one name.
     """
-    found: list[SceneSource] = []
+    sources: list[SceneSource] = []
     benchmarks: set[str] = set()
     for name in names:
         benchmark, scene = _benchmark(name)
         if benchmark is not None:
             benchmarks.add(benchmark.name)
-            found += _scenes_of(benchmark, scene, data or SCENES / benchmark.name)
+            sources += _scenes_of(benchmark, scene, data or SCENES / benchmark.name)
         else:
-            found.append(_folder(name))
+            sources.append(_folder(name))
     if data is not None and len(benchmarks) != 1:
         many = ", ".join(sorted(benchmarks)) or "none"
         raise InputError(f"--data {data} with these benchmarks: {many}", "one benchmark, whose scenes are there")
-    twice = [name for name, count in Counter(source.name for source in found).items() if count > 1]
+    twice = [name for name, count in Counter(source.name for source in sources).items() if count > 1]
     if twice:
         raise InputError(f"more than one scene is named {', '.join(twice)}", "scenes of different names")
-    _check_there(found)
-    return found
+    _check_there(sources)
+    return sources
 
 
 def make_phantoms(sources: Sequence[SceneSource], progress: Progress | None = None) -> None:
@@ -179,9 +179,9 @@ def _check_same_phantom(source: SceneSource) -> None:
     wanted = source.phantom_record or {}
     differing = [key for key in PhantomSettings.model_fields if settings.get(key) != wanted.get(key)]
     if differing:
-        seen = ", ".join(f"{key} {settings.get(key)!r} instead of {wanted.get(key)!r}" for key in differing)
+        differences = ", ".join(f"{key} {settings.get(key)!r} instead of {wanted.get(key)!r}" for key in differing)
         raise InputError(
-            f"{source.path} is another phantom than the benchmark's: {seen}",
+            f"{source.path} is another phantom than the benchmark's: {differences}",
             "the benchmark's phantom, or no folder",
             "Remove it, or choose another --data",
         )

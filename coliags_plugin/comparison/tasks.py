@@ -80,10 +80,10 @@ class Task:
         """Environment of the worker process: this package, and the number of threads of every library that asks."""
         count = str(self.threads)
         package = str(Path(__file__).resolve().parents[2])
-        found = os.pathsep.join(filter(None, [package, inherited.get("PYTHONPATH")]))
+        search_path = os.pathsep.join(filter(None, [package, inherited.get("PYTHONPATH")]))
         names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
         # A short spin of waiting threads, as on the command line (coliags_plugin.cli.main).
-        own = {**self.variables, **dict.fromkeys(names, count), "PYTHONPATH": found}
+        own = {**self.variables, **dict.fromkeys(names, count), "PYTHONPATH": search_path}
         return {"GOMP_SPINCOUNT": "10000", **inherited, **own}
 
 
@@ -113,8 +113,8 @@ def read_outcome(returncode: int, printed: str) -> TaskOutcome:
         printed: Its standard output.
     """
     try:
-        told: dict[str, Any] = json.loads(printed.strip().splitlines()[-1])
-        return TaskOutcome(**told)
+        values: dict[str, Any] = json.loads(printed.strip().splitlines()[-1])
+        return TaskOutcome(**values)
     except (IndexError, ValueError, TypeError):
         return TaskOutcome("died", _how_it_died(returncode))
 

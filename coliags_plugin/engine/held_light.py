@@ -1,4 +1,4 @@
-"""Lamps that stay where they are, for baking what they light."""
+"""Other light for a trained run: another lamp, the same light everywhere, or a lamp that stays where it is."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from dataclasses import replace
 
 import torch
 
-from coliags_plugin.contracts import GaussianField
+from coliags_plugin.config.registry import fields
+from coliags_plugin.contracts import GaussianField, LitField
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.render_output import OPAQUE_ALPHA, RenderOutput
 from coliags_plugin.engine.model import Model
-from coliags_plugin.lighting.lamps import FlattenedLight, HeldLight, LightOfCamera
+from coliags_plugin.engine.trained import TrainedRun
+from coliags_plugin.lighting.lamps import FlattenedLight, HeldLight, Lamp, LightOfCamera
 from coliags_plugin.renderers.splatting import SplattingRenderer
 
 #: Approximate number of training cameras, evenly spaced, that the flattened light is the median of.
@@ -109,3 +111,36 @@ def splatting_of(model: Model) -> SplattingRenderer:
     if not isinstance(model.renderer, SplattingRenderer):
         raise InputError(f"renderer {type(model.renderer).__name__}", "one of this package's splatting renderers")
     return model.renderer
+
+
+def relight(trained: TrainedRun, lamp: Lamp) -> TrainedRun:
+    """The run under another lamp; it shares the parameters.
+
+    Raises:
+        InputError: The run's field does not model the lamp apart from the tissue.
+    """
+    model = trained.model
+    if not isinstance(model.field, LitField):
+        lit = ", ".join(name for name in fields if issubclass(fields.get(name), LitField))
+        raise InputError(
+            f"another lamp for method '{trained.method}', whose field '{trained.config.field.name}' has the light in "
+            "its colours",
+            f"a method with one of these fields: {lit}",
+            "Train such a method, for instance pr-endo",
+        )
+    lit_model = Model(model.field.with_lamp(lamp), model.renderer, model.view_modules, model.near_plane).eval()
+    return replace(trained, model=lit_model, lamp=lamp)
+
+
+def flatten(trained: TrainedRun) -> TrainedRun:
+    """The run in the same light everywhere: at the median distance and angle of what the training cameras see.
+
+    View modules are left out, so that no gain is applied; it shares the parameters.
+
+    Raises:
+        InputError: The method does not make Gaussians that are drawn by this package.
+    """
+    splatting_of(trained.model)
+    gaussians_of(trained.model)
+    cameras = [frame.camera for frame in trained.scene.train]
+    return replace(trained, held=held_light("flattened", trained.model, cameras))

@@ -59,9 +59,9 @@ def motion(before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"]) ->
     corners = cv2.goodFeaturesToTrack(_equalised(before), _CORNERS, 0.01, 8)
     if corners is None or len(corners) < _FEWEST:
         return float("inf")
-    moved, found = _followed(before, after, corners)
+    moved, tracked = _followed(before, after, corners)
     back, again = _followed(after, before, moved)
-    kept = found & again & (np.linalg.norm(back - corners, axis=2)[:, 0] < _RETURN)
+    kept = tracked & again & (np.linalg.norm(back - corners, axis=2)[:, 0] < _RETURN)
     if kept.sum() < _FEWEST:
         return float("inf")
     lengths = np.linalg.norm(moved - corners, axis=2)[kept, 0]

@@ -48,8 +48,8 @@ def sharp_frames(sharpness: Sequence[float], settings: FrameSettings) -> tuple[l
     some = [index for index in best if values[index] > 0.0]
     dropped |= dict.fromkeys(set(best) - set(some), EMPTY)
     kept = []
-    for place, index in enumerate(some):
-        around = some[max(0, place - _NEIGHBOURS) : place + _NEIGHBOURS + 1]
+    for position, index in enumerate(some):
+        around = some[max(0, position - _NEIGHBOURS) : position + _NEIGHBOURS + 1]
         if values[index] < settings.least_sharpness * np.median(values[around]):
             dropped[index] = BLURRED
         else:

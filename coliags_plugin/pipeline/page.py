@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from urllib.parse import quote
 
-from coliags_plugin.pipeline.record import Record
+from coliags_plugin.pipeline.stages import Record
 from coliags_plugin.reporting.html_page import write_html
 from coliags_plugin.reporting.model import Bullet, Bullets, Column, Page, Section, Table
 from coliags_plugin.reporting.numbers import duration

@@ -15,13 +15,12 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.locks import locked
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.datamanagers.recognition import find_format, recognised
-from coliags_plugin.pipeline import filmed, trained
+from coliags_plugin.pipeline import capture_stages, training_stages
+from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.frame_sources import frame_source
 from coliags_plugin.pipeline.page import write_index
-from coliags_plugin.pipeline.record import LOCK_FILE, Record
 from coliags_plugin.pipeline.settings import FrameSettings, ReconstructionSettings
-from coliags_plugin.pipeline.stages import Outcome, Stage, run_stages
-from coliags_plugin.pipeline.workplace import Workplace
+from coliags_plugin.pipeline.stages import LOCK_FILE, Record, Stage, StageOutcome, run_stages
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 
 log = logging.getLogger(__name__)
@@ -68,8 +67,8 @@ def reconstruct(
     else:
         _refuse_unused(source, settings, mask)
     Record.of(out)  # refuses another folder before anything is written
-    place = Workplace(out, source, settings, mask, data_format, device, progress, anonymous)
-    stages = stages_of(place)
+    context = StageContext(out, source, settings, mask, data_format, device, progress, anonymous)
+    stages = stages_of(context)
     with locked(out / LOCK_FILE, out):
         record = Record.of(out)
         record.write()  # so that the folder is known for one from now on, whatever happens in the first stage
@@ -78,34 +77,33 @@ def reconstruct(
     return record
 
 
-def stages_of(place: Workplace) -> list[Stage]:
+def stages_of(context: StageContext) -> list[Stage]:
     """The stages for a source, in order."""
-    settings = place.settings
-    source: Mapping[str, Any] = {"source": _identity(place.source)}
+    settings = context.settings
     size = {"size": settings.size}
     stages: list[Stage] = []
 
-    def add(
-        name: str, work: Callable[[Workplace], Outcome], options: Mapping[str, Any], outputs: tuple[str, ...]
-    ) -> None:
-        stages.append(Stage(name, {**options, **({} if stages else source)}, partial(work, place), outputs))
+    def add(work: Callable[[StageContext], StageOutcome], name: str, options: Mapping[str, Any], *outputs: str) -> None:
+        source = {} if stages else {"source": _identity(context.source)}
+        stages.append(Stage(name, {**options, **source}, partial(work, context), outputs))
 
-    if place.data_format is None:
-        mask = None if place.mask is None else _identity(place.mask)
-        add("frames", filmed.make_frames, {"frames": settings.frames.model_dump(), "mask": mask}, ("frames",))
+    if context.data_format is None:
+        mask = None if context.mask is None else _identity(context.mask)
+        add(capture_stages.make_frames, "frames", {"frames": settings.frames.model_dump(), "mask": mask}, "frames")
         posing = {"diameter": settings.diameter, "sfm": settings.sfm.model_dump()}
-        add("poses", filmed.make_poses, posing, ("poses",))
-    add("check", filmed.check_data, size, ("check.html", "check.json"))
-    if place.estimates_depth:
-        add("depth", filmed.estimate_depth, {**size, "depth": settings.depth.model_dump()}, ("depth", ".depth.work"))
-    method = trained.method_for(place)
+        add(capture_stages.make_poses, "poses", posing, "poses")
+    add(capture_stages.check_data, "check", size, "check.html", "check.json")
+    if context.estimates_depth:
+        depth = {**size, "depth": settings.depth.model_dump()}
+        add(capture_stages.estimate_depth, "depth", depth, "depth", ".depth.work")
+    method = training_stages.method_for(context)
     load_method(method)  # an unknown method is found out before the work starts
     training = {"method": method, "steps": settings.steps, "seed": settings.seed}
-    add("train", trained.train, training, ("run",))
-    add("evaluate", trained.evaluate, {}, ("run/eval",))
-    add("mesh", trained.mesh, {"mesh": settings.mesh.model_dump()}, ("run/mesh",))
-    add("coverage", trained.coverage, {"coverage": settings.coverage.model_dump()}, ("run/coverage",))
-    add("report", trained.report, {}, ("report.html",))
+    add(training_stages.train, "train", training, "run")
+    add(training_stages.evaluate, "evaluate", {}, "run/eval")
+    add(training_stages.mesh, "mesh", {"mesh": settings.mesh.model_dump()}, "run/mesh")
+    add(training_stages.coverage, "coverage", {"coverage": settings.coverage.model_dump()}, "run/coverage")
+    add(training_stages.report, "report", {}, "report.html")
     return stages
 
 

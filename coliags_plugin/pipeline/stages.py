@@ -1,23 +1,122 @@
-"""Runs the stages of a reconstruction one after the other, and leaves out those that are done."""
+"""Stages of a reconstruction, run one after the other; a record in the folder says which are done."""
 
 from __future__ import annotations
 
+import json
 import logging
+import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+from coliags_plugin._version import __version__
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.pipeline.record import Record, StageRecord
+from coliags_plugin.core.files import write_json
+from coliags_plugin.core.json_files import json_text, parse_json
 from coliags_plugin.reporting.numbers import duration
 
 log = logging.getLogger(__name__)
 
+#: Name of the file, and version of its schema.
+RECORD_FILE, _FORMAT = "reconstruction.json", 1
+#: Lock that a process holds while it works in the folder.
+LOCK_FILE = ".lock"
+
 
 @dataclass(frozen=True)
-class Outcome:
+class StageRecord:
+    """A stage that was begun.
+
+    Attributes:
+        options: What it depends on, as JSON.
+        state: ``begun``, ``failed`` for its input, or ``done``.
+        summary: What came out, in one line.
+        seconds: Of the attempt that ended, wall-clock.
+        files: What it made, relative to the folder, and what each is.
+    """
+
+    options: Mapping[str, Any]
+    state: Literal["begun", "failed", "done"] = "begun"
+    summary: str = ""
+    seconds: float = 0.0
+    files: Mapping[str, str] = field(default_factory=dict)
+
+
+class Record:
+    """The record in a folder, written after every change.
+
+    Args:
+        folder: The reconstruction.
+        stages: By their names.
+    """
+
+    def __init__(self, folder: Path, stages: Mapping[str, StageRecord] | None = None) -> None:
+        self.folder, self.stages = folder, dict(stages or {})
+
+    @classmethod
+    def of(cls, folder: Path) -> Record:
+        """The record of a folder; empty for one that is new or empty.
+
+        Raises:
+            InputError: The folder holds something else, or the record is damaged.
+        """
+        file = folder / RECORD_FILE
+        if file.is_file():
+            try:
+                content = parse_json(json_text(file))
+                return cls(folder, {name: StageRecord(**stage) for name, stage in content["stages"].items()})
+            except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+                raise InputError(
+                    f"cannot read {file}: {error}", "what `coliags reconstruct` wrote", "Choose another --out"
+                ) from error
+        if folder.exists() and (not folder.is_dir() or any(not _is_ours(path) for path in folder.iterdir())):
+            raise InputError(
+                f"{folder} already exists and is no reconstruction",
+                "a new or empty folder, or one that `coliags reconstruct` made",
+                "Choose another --out",
+            )
+        return cls(folder)
+
+    def put(self, name: str, stage: StageRecord) -> None:
+        """Set a stage, in the place it has."""
+        self.stages[name] = stage
+        self.write()
+
+    def forget(self, names: Sequence[str], outputs: Sequence[str]) -> None:
+        """Forget stages and remove what they made.
+
+        Args:
+            names: Of the stages.
+            outputs: Files and folders of theirs, relative to the folder.
+        """
+        self.stages = {name: stage for name, stage in self.stages.items() if name not in names}
+        self.write()
+        for output in outputs:
+            path = self.folder / output
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+
+    def write(self) -> None:
+        """Write the file atomically.
+
+        Raises:
+            InputError: The folder cannot be written.
+        """
+        stages = {name: asdict(stage) for name, stage in self.stages.items()}
+        write_json(self.folder / RECORD_FILE, {"format": _FORMAT, "version": __version__, "stages": stages})
+
+
+def _is_ours(path: Path) -> bool:
+    """Whether a file is there before the record is: the lock, or what a kill has left of writing the record."""
+    return path.name == LOCK_FILE or path.name.startswith(f".{RECORD_FILE}.")
+
+
+@dataclass(frozen=True)
+class StageOutcome:
     """What a stage has made.
 
     Attributes:
@@ -42,7 +141,7 @@ class Stage:
 
     name: str
     options: Mapping[str, Any]
-    run: Callable[[], Outcome]
+    run: Callable[[], StageOutcome]
     outputs: Sequence[str] = ()
 
 
@@ -92,7 +191,7 @@ def run_stages(stages: Sequence[Stage], record: Record, overwrite: bool = False)
 
 def _check_options(stages: Sequence[Stage], record: Record, overwrite: bool) -> None:
     """Refuse, or remove, what was made with other options."""
-    for place, stage in enumerate(stages):
+    for number, stage in enumerate(stages):
         known = record.stages.get(stage.name)
         if known is None or known.options == _plain(stage.options):
             continue
@@ -102,7 +201,7 @@ def _check_options(stages: Sequence[Stage], record: Record, overwrite: bool) -> 
                 "the options that it was begun with",
                 f"Choose another --out, or pass --overwrite to repeat {stage.name} and what follows it",
             )
-        later = stages[place:]
+        later = stages[number:]
         record.forget([other.name for other in later], [output for other in later for output in other.outputs])
         return
 
@@ -115,19 +214,16 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
 
 
 def _leaves(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    found: list[tuple[str, Any]] = []
+    leaves: list[tuple[str, Any]] = []
     for key, value in values.items():
-        found += _leaves(value, f"{prefix}{key}.") if isinstance(value, Mapping) else [(f"{prefix}{key}", value)]
-    return found
+        leaves += _leaves(value, f"{prefix}{key}.") if isinstance(value, Mapping) else [(f"{prefix}{key}", value)]
+    return leaves
 
 
-def _plain(value: Any) -> Any:
-    """The value as it is read back from JSON."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    return str(value) if isinstance(value, Path) else value
+def _plain(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options as they are read back from JSON."""
+    values: dict[str, Any] = json.loads(json.dumps(options, default=str))
+    return values
 
 
 def _failed(error: InputError, stage: Stage, before: Sequence[Stage]) -> InputError:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import re
+import subprocess
+import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
+import torch
 
 from coliags_plugin.comparison import compare
 from coliags_plugin.comparison.compare import ExecutionOptions, carry_out, make_request
@@ -21,6 +26,8 @@ TINY = (
     *("schedule.log_every=1", "strategy.statistics_from=0", "strategy.growth_from=2", "strategy.every=3"),
     *("strategy.gradient_threshold=1e-6", "strategy.pixels_per_birth=100"),
 )
+#: The same, saved often.
+OFTEN = (*TINY, "schedule.checkpoint_every=10")
 
 
 class InlineExecutor(Executor):
@@ -76,3 +83,35 @@ def trainings(folder: Path) -> dict[str, list[int]]:
         ]
         for path in sorted((folder / "logs").rglob("*.log"))
     }
+
+
+def start_compare(methods, wall, folder, steps, *words, stderr=subprocess.PIPE):
+    """``coliags compare`` as a process, alone in its group; each run on one CPU thread."""
+    argv = ["compare", *methods, "--scenes", wall, "--output", folder, "--steps", steps, "--threads", 1, *words]
+    sets = [word for each in OFTEN for word in ("--set", each)]
+    command = [sys.executable, "-c", "from coliags_plugin.cli import main; main()", *map(str, argv)]
+    return subprocess.Popen([*command, "--device", "cpu", *sets], stderr=stderr, text=True, start_new_session=True)
+
+
+def undisturbed_hashes(methods, wall, folder, steps):
+    """Hashes of a comparison that nobody disturbs, each run on one CPU thread."""
+    torch.set_num_threads(1)
+    assert not compare_inline(methods, [wall], folder, steps=steps, overrides=OFTEN).failures
+    return hashes(folder)
+
+
+def until(what, value):
+    """Wait until a function of no argument returns something true, and return that."""
+    end = time.monotonic() + 300.0
+    while not (result := value()):
+        assert time.monotonic() < end, f"no {what}"
+        time.sleep(0.005)
+    return result
+
+
+def check_logs(folder, steps):
+    """Every run has logged every step once, and went on from further and further steps."""
+    for run, begun in trainings(folder).items():
+        log = (folder / "runs" / run / "metrics.jsonl").read_text(encoding="utf-8")
+        assert [json.loads(line)["step"] for line in log.splitlines()] == list(range(1, steps + 1))
+        assert begun[0] == 0 and begun == sorted(set(begun)), f"{run} was begun at {begun}"

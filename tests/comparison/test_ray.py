@@ -6,29 +6,33 @@ All nodes share one disk, so that these tests do not show that run folders trave
 
 from __future__ import annotations
 
-import json
 import os
 import signal
-import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
-import torch
 
 import coliags_plugin as cp
 from coliags_plugin.comparison.ray_executor import RayExecutor
 from coliags_plugin.config.assignments import parse_assignments
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.engine.run_folder import RunFolder
 from tests.commands import refused
-from tests.comparison.small import TINY, compare_inline, hashes, trainings
+from tests.comparison.small import (
+    OFTEN,
+    TINY,
+    check_logs,
+    hashes,
+    start_compare,
+    trainings,
+    undisturbed_hashes,
+    until,
+)
 from tests.scenes import write_wall
 
 STEPS = 300
 METHODS = ("coliags", "scaffold-gs-depth", "scaffold-gs", "scaffold-gs-distance")
-OFTEN = (*TINY, "schedule.checkpoint_every=10")
-DEADLINE = 300.0
 
 
 def test_ray_that_is_not_installed_is_told_how_to_get(tmp_path, capsys, monkeypatch):
@@ -80,20 +84,15 @@ def wall(tmp_path):
 
 @pytest.fixture
 def undisturbed(wall, tmp_path):
-    torch.set_num_threads(1)
-    done = compare_inline(METHODS, [wall], tmp_path / "undisturbed", steps=STEPS, overrides=OFTEN)
-    assert not done.failures
-    return hashes(tmp_path / "undisturbed")
+    return undisturbed_hashes(METHODS, wall, tmp_path / "undisturbed", STEPS)
 
 
 def driver(wall, folder, address):
-    """``coliags compare --executor ray`` as a process, alone in its group; its messages go to a file beside."""
-    words = ["compare", *METHODS, "--scenes", wall, "--output", folder, "--steps", STEPS, "--threads", 1]
-    words += ["--executor", "ray", "--ray-address", address, "--device", "cpu"]
-    sets = [word for each in OFTEN for word in ("--set", each)]
-    command = [sys.executable, "-c", "from coliags_plugin.cli import main; main()", *map(str, words), *sets]
+    """``coliags compare --executor ray``; its messages go to a file beside."""
     with messages_of(folder).open("w") as messages:
-        return subprocess.Popen(command, stderr=messages, start_new_session=True)
+        return start_compare(
+            METHODS, wall, folder, STEPS, "--executor", "ray", "--ray-address", address, stderr=messages
+        )
 
 
 def messages_of(folder):
@@ -104,26 +103,12 @@ def told_by(folder):
     return messages_of(folder).read_text()
 
 
-def until(what, value):
-    """Wait until a function of no argument returns something true, and return that."""
-    end = time.monotonic() + DEADLINE
-    while not (found := value()):
-        assert time.monotonic() < end, f"no {what}"
-        time.sleep(0.01)
-    return found
-
-
-def steps_of(run):
-    log = run / "metrics.jsonl"
-    return len(log.read_text(encoding="utf-8").splitlines()) if log.is_file() else 0
-
-
 def under_way(folder):
     """A process that has taken some steps of a run and has not ended; None where there is none."""
     for lock in folder.glob("runs/wall/*/.s0-*.lock"):
         run = lock.with_name(lock.name[1:].removesuffix(".lock"))
         text = lock.read_text(encoding="utf-8").split()
-        if len(text) > 1 and 20 < steps_of(run) < STEPS and is_running(int(text[1])):
+        if len(text) > 1 and 20 < RunFolder(run).logged_step < STEPS and is_running(int(text[1])):
             return int(text[1])
     return None
 
@@ -150,10 +135,7 @@ def node_of(process, nodes):
 def check(folder, undisturbed):
     """Every result is that of the undisturbed comparison, and no step was kept twice or lost."""
     assert hashes(folder) == undisturbed
-    for run, begun in trainings(folder).items():
-        log = [json.loads(line)["step"] for line in (folder / "runs" / run / "metrics.jsonl").read_text().splitlines()]
-        assert log == list(range(1, STEPS + 1))
-        assert begun[0] == 0 and begun == sorted(set(begun)), f"{run} was begun at {begun}"
+    check_logs(folder, STEPS)
     assert not list(folder.rglob(".storage-*")) and not list((folder / "failures").rglob("*.json"))
 
 
@@ -219,11 +201,11 @@ def test_a_folder_that_a_node_does_not_see(cluster, wall, tmp_path, monkeypatch)
     assert not list(tmp_path.glob(".storage-*"))
     with pytest.raises(InputError, match=r"node .* does not see the scenes .*/gone\. Expected scenes on storage"):
         executor.check(tmp_path, [wall, tmp_path / "gone"])
-    seen = RayExecutor._seen_by
+    seen = RayExecutor._ask
 
     def elsewhere(self, node, file, scenes):
         return seen(self, node, Path("/proc/1/nowhere") / file.name, scenes)
 
-    monkeypatch.setattr(RayExecutor, "_seen_by", elsewhere)
+    monkeypatch.setattr(RayExecutor, "_ask", elsewhere)
     with pytest.raises(InputError, match=r"node .* does not see .*No such file.*storage that all machines share"):
         executor.check(tmp_path, [wall])

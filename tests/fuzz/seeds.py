@@ -11,8 +11,7 @@ import cv2
 import numpy as np
 import open3d
 
-from coliags_plugin.api.exchange import import_splats
-from coliags_plugin.api.training import train
+from coliags_plugin.api.training import import_splats, train
 from coliags_plugin.config.registry import pose_formats
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.export.splats.files import write_splats

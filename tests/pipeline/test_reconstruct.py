@@ -19,15 +19,15 @@ from coliags_plugin.geometry.poses.alignment import align
 from coliags_plugin.geometry.poses.association import associate
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.outputs.video import write_video
-from coliags_plugin.pipeline import filmed, trained
-from coliags_plugin.pipeline.stages import Outcome
+from coliags_plugin.pipeline import capture_stages, training_stages
+from coliags_plugin.pipeline.stages import StageOutcome
 from tests import commands
 from tests.pipeline.films import blurred, film, write_images
 from tests.textured_tube import INTRINSICS, tube_frames, write_tube
 
-FILMED, TRAINED = ("make_poses", "check_data", "estimate_depth"), ("train", "evaluate", "mesh", "coverage", "report")
+CAPTURE, TRAINING = ("make_poses", "check_data", "estimate_depth"), ("train", "evaluate", "mesh", "coverage", "report")
 
-_COVERAGE = trained.coverage
+_COVERAGE = training_stages.coverage
 
 
 class Killed(BaseException):
@@ -40,15 +40,15 @@ def done(monkeypatch):
     names: list[str] = []
 
     def faked(name):
-        def work(place):
+        def work(context):
             names.append(name)
-            return Outcome(f"{name} done", {name: "a file"})
+            return StageOutcome(f"{name} done", {name: "a file"})
 
         return work
 
-    write = filmed.make_frames
-    monkeypatch.setattr(filmed, "make_frames", lambda place: (names.append("make_frames"), write(place))[1])
-    for module, functions in ((filmed, FILMED), (trained, TRAINED)):
+    write = capture_stages.make_frames
+    monkeypatch.setattr(capture_stages, "make_frames", lambda context: (names.append("make_frames"), write(context))[1])
+    for module, functions in ((capture_stages, CAPTURE), (training_stages, TRAINING)):
         for function in functions:
             monkeypatch.setattr(module, function, faked(function))
     return names
@@ -63,7 +63,7 @@ def video(tmp_path):
 def test_stages_of_a_video(done, video, tmp_path, capsys):
     argv = ("reconstruct", video, "--out", tmp_path / "out", "--steps", 50, "--diameter", 40)
     assert commands.run(*argv) == 0
-    assert done == ["make_frames", *FILMED, *TRAINED]
+    assert done == ["make_frames", *CAPTURE, *TRAINING]
     printed = capsys.readouterr().out
     assert printed.splitlines()[0].startswith("frames: 15 of 15 frames, 160 x 120 px")
     assert f"{tmp_path / 'out' / 'frames' / 'images'}: frames of use, PNG" in printed
@@ -77,15 +77,15 @@ def test_stages_of_a_video(done, video, tmp_path, capsys):
     message = commands.refused(capsys, *argv[:-3], 60, *argv[-2:])
     assert "stage train was made with steps 50, not 60" in message
     assert commands.run(*argv[:-3], 60, *argv[-2:], "--overwrite") == 0
-    assert done == [*TRAINED]
+    assert done == [*TRAINING]
 
 
 def test_a_killed_reconstruction_goes_on(done, video, tmp_path, monkeypatch):
-    def killed(place):
+    def killed(context):
         raise Killed
 
     with monkeypatch.context() as patched, pytest.raises(Killed):
-        patched.setattr(filmed, "estimate_depth", killed)
+        patched.setattr(capture_stages, "estimate_depth", killed)
         cp.reconstruct(video, tmp_path / "out")
     record = json.loads((tmp_path / "out" / "reconstruction.json").read_text())
     assert {name: stage["state"] for name, stage in record["stages"].items()} == {
@@ -96,7 +96,7 @@ def test_a_killed_reconstruction_goes_on(done, video, tmp_path, monkeypatch):
     }
     done.clear()
     cp.reconstruct(video, tmp_path / "out")
-    assert done == ["estimate_depth", *TRAINED]
+    assert done == ["estimate_depth", *TRAINING]
 
 
 def test_another_video_is_noticed(done, video, tmp_path):
@@ -110,7 +110,7 @@ def test_a_scene_with_poses_needs_neither_frames_nor_poses(done, tmp_path):
     scene = write_tube(tmp_path / "tube", 6, 3.0)
     cp.reconstruct(scene, tmp_path / "out")
     with_depth = any(path.name.startswith("depth") for path in scene.iterdir())
-    assert done == ["check_data", *([] if with_depth else ["estimate_depth"]), *TRAINED]
+    assert done == ["check_data", *([] if with_depth else ["estimate_depth"]), *TRAINING]
     with pytest.raises(InputError, match=r"tube has poses, and settings of diameter, frames are given"):
         cp.reconstruct(scene, tmp_path / "other", settings={"diameter": 40.0, "frames.every": 2})
 
@@ -119,7 +119,7 @@ def test_coverage_is_left_out_where_it_cannot_be_measured_but_not_where_it_canno
     done, tmp_path, monkeypatch, caplog
 ):
     scene = write_tube(tmp_path / "tube", 6, 3.0)
-    monkeypatch.setattr(trained, "coverage", _COVERAGE)
+    monkeypatch.setattr(training_stages, "coverage", _COVERAGE)
     monkeypatch.setattr("coliags_plugin.geometry.meshes.files.read_mesh", lambda path: None)
 
     def failing(error):

@@ -7,8 +7,7 @@ import json
 import pytest
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.pipeline.record import LOCK_FILE, RECORD_FILE, Record
-from coliags_plugin.pipeline.stages import Outcome, Stage, run_stages
+from coliags_plugin.pipeline.stages import LOCK_FILE, RECORD_FILE, Record, Stage, StageOutcome, run_stages
 
 
 class Killed(BaseException):
@@ -34,7 +33,7 @@ class Workshop:
         if name == self.kill:
             raise Killed
         self.done.append(name)
-        return Outcome(f"{name} is there", {f"{name}.txt": "a file"})
+        return StageOutcome(f"{name} is there", {f"{name}.txt": "a file"})
 
     def run(self, overwrite=False, **options):
         self.done = []

@@ -7,8 +7,8 @@ import logging
 from coliags_plugin.config.method_config import method_name
 from coliags_plugin.core.errors import InputError, InterruptedRunError, NotWritableError
 from coliags_plugin.geometry.meshes.files import MESH_FORMATS
-from coliags_plugin.pipeline.stages import Outcome
-from coliags_plugin.pipeline.workplace import Workplace
+from coliags_plugin.pipeline.context import StageContext
+from coliags_plugin.pipeline.stages import StageOutcome
 
 log = logging.getLogger(__name__)
 
@@ -16,13 +16,13 @@ log = logging.getLogger(__name__)
 _SAVE_SECONDS, _KEPT = 60.0, 2
 
 
-def method_for(place: Workplace) -> str:
+def method_for(context: StageContext) -> str:
     """Name of the method to train: the one given, or else by what is known of the depth."""
-    given = place.settings.method
-    return given or ("coliags-estimated-depth" if place.estimates_depth or place.has_estimates else "coliags")
+    given = context.settings.method
+    return given or ("coliags-estimated-depth" if context.estimates_depth or context.has_estimates else "coliags")
 
 
-def train(place: Workplace) -> Outcome:
+def train(context: StageContext) -> StageOutcome:
     """Train, or go on from the newest checkpoint.
 
     Raises:
@@ -32,13 +32,15 @@ def train(place: Workplace) -> Outcome:
     from coliags_plugin.engine.training import TrainingRequest, open_training
     from coliags_plugin.reconstruction.depth.scene import training_options
 
-    settings = place.settings
+    settings = context.settings
     steps = f"schedule.steps={settings.steps}"
-    options = [*training_options(place.open_posed()), steps]
-    data_format = None if place.estimates_depth else place.data_format
-    request = TrainingRequest(method_for(place), place.scene, options, settings.seed, data_format, place.anonymous)
-    folder = RunFolder(place.run)
-    with open_training(request, folder, place.device, "continue") as trainer:
+    options = [*training_options(context.open_posed()), steps]
+    data_format = None if context.estimates_depth else context.data_format
+    request = TrainingRequest(
+        method_for(context), context.scene, options, settings.seed, data_format, context.anonymous
+    )
+    folder = RunFolder(context.run)
+    with open_training(request, folder, context.device, "continue") as trainer:
         try:
             trainer.train(_SAVE_SECONDS, _KEPT)
         except InterruptedRunError as error:
@@ -48,37 +50,39 @@ def train(place: Workplace) -> Outcome:
             ) from error
     rows = folder.log_rows()
     last = f", {rows[-1]['psnr']:.2f} dB in the last view" if rows else ""
-    return Outcome(f"{method_name(request.method)}, {trainer.steps} steps{last}", {"run": "the trained run"})
+    return StageOutcome(f"{method_name(request.method)}, {trainer.steps} steps{last}", {"run": "the trained run"})
 
 
-def evaluate(place: Workplace) -> Outcome:
+def evaluate(context: StageContext) -> StageOutcome:
     """Evaluate the held-out frames."""
     from coliags_plugin.engine import evaluator
     from coliags_plugin.engine.trained import load_trained
     from coliags_plugin.results.reading import RESULT_FILE, read_result
 
-    trained = load_trained(place.run, place.device, place.scene)
+    trained = load_trained(context.run, context.device, context.scene)
     folder = evaluator.evaluate(trained, trained.config.protocol)
     result = read_result(folder / RESULT_FILE)
     values = [(name, result.mean(name)) for name in ("psnr", "ssim")]
     shown = ", ".join(f"{name.upper()} {value:.4g}" for name, value in values if value is not None)
-    return Outcome(f"held-out frames: {shown}", {str(folder.relative_to(place.out)): "metrics and rendered frames"})
+    return StageOutcome(
+        f"held-out frames: {shown}", {str(folder.relative_to(context.out)): "metrics and rendered frames"}
+    )
 
 
-def mesh(place: Workplace) -> Outcome:
+def mesh(context: StageContext) -> StageOutcome:
     """Fuse the rendered depth into a mesh."""
     from coliags_plugin.engine.trained import load_trained
     from coliags_plugin.surface.meshing.writing import mesh_run
 
-    trained = load_trained(place.run, place.device, place.scene)
-    made = mesh_run(trained, place.run / "mesh", place.settings.mesh, overwrite=True)
+    trained = load_trained(context.run, context.device, context.scene)
+    made = mesh_run(trained, context.run / "mesh", context.settings.mesh, overwrite=True)
     area = made.mesh.areas.sum()
     shown = f"{area / 100.0:.1f} cm²" if trained.scene.is_metric else f"{area:,.0f} square units"
     files = {f"run/mesh/mesh.{kind}": f"the surface as {kind.upper()}" for kind in MESH_FORMATS}
-    return Outcome(f"{len(made.mesh):,} triangles, {shown}", files)
+    return StageOutcome(f"{len(made.mesh):,} triangles, {shown}", files)
 
 
-def coverage(place: Workplace) -> Outcome:
+def coverage(context: StageContext) -> StageOutcome:
     """Coverage stage: measure the share of the wall seen in the video; skipped where it cannot be measured.
 
     Raises:
@@ -88,33 +92,33 @@ def coverage(place: Workplace) -> Outcome:
     from coliags_plugin.surface.coverage.page import summary
     from coliags_plugin.surface.coverage.writing import measure_scene
 
-    scene = place.open_posed()
+    scene = context.open_posed()
     if not scene.is_metric:
-        return Outcome("left out, as the unit of length is unknown (--diameter gives one)")
-    folder = place.run / "coverage"
+        return StageOutcome("left out, as the unit of length is unknown (--diameter gives one)")
+    folder = context.run / "coverage"
     try:
         made = measure_scene(
-            scene, read_mesh(place.run / "mesh" / "mesh.ply"), folder, place.settings.coverage, overwrite=True
+            scene, read_mesh(context.run / "mesh" / "mesh.ply"), folder, context.settings.coverage, overwrite=True
         )
     except NotWritableError:
         raise
     except InputError as error:
         log.warning("no coverage: %s", error)
-        return Outcome(f"left out: {error}")
+        return StageOutcome(f"left out: {error}")
     what = "what was seen and missed, for research use only"
-    return Outcome(
+    return StageOutcome(
         "; ".join(" ".join(line.split()).rstrip(";") for line in summary(made.coverage, made.evaluation)),
         {"run/coverage/coverage.html": what, "run/coverage/coverage.ply": "the same on the mesh"},
     )
 
 
-def report(place: Workplace) -> Outcome:
+def report(context: StageContext) -> StageOutcome:
     """Write the report of the run."""
     from coliags_plugin.comparison.report.content import Choices
     from coliags_plugin.comparison.report.report import write_report
     from coliags_plugin.engine.run_folder import RunFolder
 
-    protocol = RunFolder(place.run).method().config.protocol
-    title = f"Reconstruction of {place.source.name}"
-    write_report([place.run], place.out / "report.html", ("html",), Choices(title=title), protocol)
-    return Outcome("report.html", {"report.html": "views, metrics, training, provenance"})
+    protocol = RunFolder(context.run).method().config.protocol
+    title = f"Reconstruction of {context.source.name}"
+    write_report([context.run], context.out / "report.html", ("html",), Choices(title=title), protocol)
+    return StageOutcome("report.html", {"report.html": "views, metrics, training, provenance"})

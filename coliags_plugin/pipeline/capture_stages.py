@@ -6,10 +6,10 @@ import logging
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
+from coliags_plugin.pipeline.context import StageContext
 from coliags_plugin.pipeline.frame_sources import frame_source
 from coliags_plugin.pipeline.frames import FEWEST, IMAGES, read_lens_mask, write_frames
-from coliags_plugin.pipeline.stages import Outcome
-from coliags_plugin.pipeline.workplace import Workplace
+from coliags_plugin.pipeline.stages import StageOutcome
 
 log = logging.getLogger(__name__)
 
@@ -20,26 +20,26 @@ UNKNOWN_MEDIAN_DEPTH = 30.0
 _MOST = 0.7
 
 
-def make_frames(place: Workplace) -> Outcome:
+def make_frames(context: StageContext) -> StageOutcome:
     """Write the frames of use, and their mask."""
-    source = frame_source(place.source)
-    summary = write_frames(source, place.frames, place.settings.frames, place.mask, place.progress)
-    return Outcome(
+    source = frame_source(context.source)
+    summary = write_frames(source, context.frames, context.settings.frames, context.mask, context.progress)
+    return StageOutcome(
         summary,
         {"frames/images": "frames of use, PNG", "frames/frames.json": "which frames were dropped, and why"},
     )
 
 
-def make_poses(place: Workplace) -> Outcome:
+def make_poses(context: StageContext) -> StageOutcome:
     """Estimate poses and points by structure from motion, and write them as a scene."""
     from coliags_plugin.reconstruction.structure.image_files import list_images
     from coliags_plugin.reconstruction.structure.model_scale import millimetres, scaled
     from coliags_plugin.reconstruction.structure.sfm import reconstruct
     from coliags_plugin.reconstruction.structure.sfm_scene import write_sfm_scene
 
-    mask = read_lens_mask(place.frames)
-    found = reconstruct(list_images(place.frames / IMAGES), place.settings.sfm, mask, place.progress)
-    posed, count = len(found.registered), len(found.images)
+    mask = read_lens_mask(context.frames)
+    model = reconstruct(list_images(context.frames / IMAGES), context.settings.sfm, mask, context.progress)
+    posed, count = len(model.registered), len(model.images)
     if posed < FEWEST:
         raise InputError(
             f"{posed} of {count} frames have poses",
@@ -49,43 +49,45 @@ def make_poses(place: Workplace) -> Outcome:
         )
     if posed < _MOST * count:
         log.warning("only %d of %d frames have poses: the rest of the video is not reconstructed", posed, count)
-    factor = millimetres(found, place.settings.diameter)
-    scene = scaled(found, UNKNOWN_MEDIAN_DEPTH / found.median_depth if factor is None else factor)
-    write_sfm_scene(place.posed, scene, mask, overwrite=True, unit="unknown" if factor is None else "mm")
+    factor = millimetres(model, context.settings.diameter)
+    scene = scaled(model, UNKNOWN_MEDIAN_DEPTH / model.median_depth if factor is None else factor)
+    write_sfm_scene(context.posed, scene, mask, overwrite=True, unit="unknown" if factor is None else "mm")
     unit = (
         f"unit of length unknown (--diameter gives one): the median depth is made {UNKNOWN_MEDIAN_DEPTH:g}"
         if factor is None
-        else f"unit mm, by a diameter of {place.settings.diameter:g} mm; median depth {scene.median_depth:.3g} mm"
+        else f"unit mm, by a diameter of {context.settings.diameter:g} mm; median depth {scene.median_depth:.3g} mm"
     )
-    return Outcome(f"{found.summary()}; {unit}", {"poses": "scene in COLMAP's layout: images, poses, points"})
+    return StageOutcome(f"{model.summary()}; {unit}", {"poses": "scene in COLMAP's layout: images, poses, points"})
 
 
-def check_data(place: Workplace) -> Outcome:
+def check_data(context: StageContext) -> StageOutcome:
     """Check that images, poses and calibration agree. What is suspect is said, and does not stop."""
     from coliags_plugin.checks.data.check import check_scene
     from coliags_plugin.checks.data.page import check_page, verdict
     from coliags_plugin.reporting.html_page import write_html
 
-    scene = place.open_posed()
+    scene = context.open_posed()
     check = check_scene(
-        scene, place.progress, (lambda: place.open_posed(stored_size=True)) if scene.is_resized else None
+        scene, context.progress, (lambda: context.open_posed(stored_size=True)) if scene.is_resized else None
     )
-    if place.anonymous:
+    if context.anonymous:
         check = check.anonymous()
-    write_html(check_page(check), place.out / "check.html")
-    write_json(place.out / "check.json", check.as_json())
+    write_html(check_page(check), context.out / "check.html")
+    write_json(context.out / "check.json", check.as_json())
     for finding in check.findings:
         log.warning("suspect: %s (%s). %s", finding.what, finding.evidence, finding.do)
-    return Outcome(
+    return StageOutcome(
         verdict(check),
         {"check.html": "consistency of images, poses and calibration", "check.json": "the same as JSON"},
     )
 
 
-def estimate_depth(place: Workplace) -> Outcome:
+def estimate_depth(context: StageContext) -> StageOutcome:
     """Estimate dense depth with its confidence; goes on where a kill has left it."""
     from coliags_plugin.reconstruction.depth.scene import DepthRequest, estimate_scene
 
-    request = DepthRequest(place.settings.depth)
-    summary = estimate_scene(place.open_posed(), place.estimated, request, overwrite=True, progress=place.progress)
-    return Outcome(summary, {"depth": "scene in nerfstudio's layout: images, poses, depth, confidence, points"})
+    request = DepthRequest(context.settings.depth)
+    summary = estimate_scene(
+        context.open_posed(), context.estimated, request, overwrite=True, progress=context.progress
+    )
+    return StageOutcome(summary, {"depth": "scene in nerfstudio's layout: images, poses, depth, confidence, points"})

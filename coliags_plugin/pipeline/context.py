@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Workplace:
+class StageContext:
     """What every stage is given.
 
     Attributes:
