@@ -11,7 +11,6 @@ from scipy.spatial import cKDTree
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
-from coliags_plugin.surface.coverage.visibility import RayCaster
 
 #: Spacing of the centreline's points, mm.
 STEP = 1.0
@@ -74,9 +73,7 @@ class Centreline:
         return np.asarray(np.cos(angle) * frame[:, 0] + np.sin(angle) * frame[:, 1])
 
 
-def find_centreline(
-    mesh: TriangleMesh, cameras_to_world: Float[np.ndarray, "T 4 4"], caster: RayCaster | None = None
-) -> Centreline:
+def find_centreline(mesh: TriangleMesh, cameras_to_world: Float[np.ndarray, "T 4 4"]) -> Centreline:
     """Follow the lumen both ways from the middle of the camera's path, as far as there is wall around it.
 
     In strides of 2 mm, the curve is drawn to the middle of the ring of wall around it; it goes straight on where less
@@ -87,19 +84,17 @@ def find_centreline(
     Args:
         mesh: The wall, world frame, mm; holes do not matter.
         cameras_to_world: Poses inside the tube, OpenCV axes. [T, 4, 4]
-        caster: Of the mesh, where there is one already.
 
     Raises:
         InputError: There is not enough wall around the cameras to be a tube.
     """
-    caster = caster or RayCaster(mesh)
     poses = np.asarray(cameras_to_world, np.float64)
     centers = poses[:, :3, 3]
     axis = _unit(poses[:, :3, 2].mean(axis=0))
     start = centers[np.argmin(np.linalg.norm(centers - np.median(centers, axis=0), axis=1))]
-    start, direction = _settled(caster, start, axis)
-    ahead = _followed(caster, start, direction)
-    behind = _followed(caster, start, -direction)
+    start, direction = _settled(mesh, start, axis)
+    ahead = _followed(mesh, start, direction)
+    behind = _followed(mesh, start, -direction)
     if len(ahead) + len(behind) < 5:
         raise InputError(
             "there is not enough wall around the cameras to find the lumen's centreline",
@@ -153,37 +148,37 @@ def find_section(
     return LumenSection(first + float(half[0]), first + float(half[-1]) + 1.0)
 
 
-def _settled(caster: RayCaster, start: Array, axis: Array) -> tuple[Array, Array]:
+def _settled(mesh: TriangleMesh, start: Array, axis: Array) -> tuple[Array, Array]:
     """A place in the middle of the lumen near a camera, and the lumen's direction there.
 
     The direction goes from the middle of the wall that lies 30 degrees behind to the middle of that 30 degrees ahead.
     """
     direction = axis
     for _ in range(4):
-        _, hits = _ring(caster, start, direction, tilts=(-30.0, 30.0))
+        _, hits = _ring(mesh, start, direction, tilts=(-30.0, 30.0))
         behind, ahead = hits.reshape(2, _RING, 3)
         both = np.isfinite(behind).all(axis=1) & np.isfinite(ahead).all(axis=1)
         if both.mean() >= _SHARE:
             direction = _unit(direction + 0.5 * _unit((ahead[both] - behind[both]).mean(axis=0)))
-        share, middle = _middle(caster, start, direction)
+        share, middle = _middle(mesh, start, direction)
         if share >= _SHARE:
             start = start + _TOWARDS_MIDDLE * (middle - start)
     return start, direction
 
 
-def _followed(caster: RayCaster, start: Array, direction: Array) -> Array:
+def _followed(mesh: TriangleMesh, start: Array, direction: Array) -> Array:
     """Points from a start, without it, as far as the wall reaches. [K, 3]"""
     points, last_good = [start], 0
     while len(points) * _STRIDE < _LONGEST:
         here = points[-1] + _STRIDE * direction
-        share, middle = _middle(caster, here, direction)
+        share, middle = _middle(mesh, here, direction)
         if share >= _SHARE:
             here = here + _TOWARDS_MIDDLE * (middle - here)
             last_good = len(points)
         elif (len(points) - last_good) * _STRIDE > _PATIENCE:
             break
         # A wall ahead ends the lumen: the dome of a closed end.
-        _, reach = caster.cast(here, direction[None])
+        _, reach = mesh.rays.cast(here, direction[None])
         if reach[0] < _STRIDE:
             break
         stride = here - points[max(0, len(points) - 4)]
@@ -192,9 +187,9 @@ def _followed(caster: RayCaster, start: Array, direction: Array) -> Array:
     return np.asarray(points[1 : last_good + 1]).reshape(-1, 3)
 
 
-def _middle(caster: RayCaster, place: Array, direction: Array) -> tuple[float, Array]:
+def _middle(mesh: TriangleMesh, place: Array, direction: Array) -> tuple[float, Array]:
     """Share of a ring around a place that is wall, and the ring's middle; gaps are bridged."""
-    radius, _ = _ring(caster, place, direction)
+    radius, _ = _ring(mesh, place, direction)
     there = np.isfinite(radius)
     if not there.any():
         return 0.0, place
@@ -208,13 +203,13 @@ def _middle(caster: RayCaster, place: Array, direction: Array) -> tuple[float, A
     return float(there.mean()), place + offset / weight.sum()
 
 
-def _ring(caster: RayCaster, place: Array, direction: Array, tilts: tuple[float, ...] = (0.0,)) -> tuple[Array, Array]:
+def _ring(mesh: TriangleMesh, place: Array, direction: Array, tilts: tuple[float, ...] = (0.0,)) -> tuple[Array, Array]:
     """Distances to the wall and hits all round, at each tilt towards the direction; NaN where there is none."""
     across, other = _across(direction)
     angle = np.arange(_RING)[:, None] * (2.0 * np.pi / _RING)
     outward = np.cos(angle) * across + np.sin(angle) * other
     rays = np.concatenate([np.cos(np.radians(tilt)) * outward + np.sin(np.radians(tilt)) * direction for tilt in tilts])
-    _, distance = caster.cast(place, rays)
+    _, distance = mesh.rays.cast(place, rays)
     distance = np.where(distance <= _WIDEST, distance, np.nan).astype(np.float64)
     return distance, place + distance[:, None] * rays
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
+from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.geometry.meshes.truth import TrueSurface
 from coliags_plugin.surface.coverage.centreline import LumenSection, find_centreline, find_section
 from coliags_plugin.surface.coverage.levels import Level
@@ -17,7 +18,7 @@ from coliags_plugin.surface.coverage.measure import WallCoverage
 from coliags_plugin.surface.coverage.regions import neighbours
 from coliags_plugin.surface.coverage.scores import CoverageScores, score_unseen
 from coliags_plugin.surface.coverage.views import CoverageView
-from coliags_plugin.surface.coverage.visibility import RayCaster, RayGrids, facing_cameras, see_faces
+from coliags_plugin.surface.coverage.visibility import RayGrids, facing_cameras, see_faces
 
 #: Farthest that a triangle of the measured wall may be from the true one that it stands for, mm: the tolerance of
 #: the F-score of meshes.
@@ -78,8 +79,7 @@ def evaluate_coverage(coverage: WallCoverage, truth: TrueSurface, views: Sequenc
     mesh = facing_cameras(truth.mesh, views, coverage.settings)
     seen = truth.seen if truth.seen_by else see_faces(mesh, views, coverage.settings).seen
     poses = np.stack([np.asarray(view.camera_to_world, np.float64) for view in views])
-    caster = RayCaster(mesh)
-    line = find_centreline(mesh, poses, caster)
+    line = find_centreline(mesh, poses)
     arc, clock, _ = line.unroll(mesh.centers)
     along = (arc >= line.arc[0]) & (arc <= line.arc[-1])
     section = find_section(arc[along], mesh.areas[along], seen[along])
@@ -94,7 +94,7 @@ def evaluate_coverage(coverage: WallCoverage, truth: TrueSurface, views: Sequenc
     draws = [scored(_random_cells(arc, clock, share, generator)) for _ in range(_DRAWS)]
     return CoverageEvaluation(
         surface=scored(~_carried_over(coverage, mesh.centers, mesh.normals)),
-        rays=scored(~_confirmed(coverage, caster, views, len(mesh))),
+        rays=scored(~_confirmed(coverage, mesh, views)),
         all_unseen=scored(np.ones(len(mesh), bool)),
         random=_mean(draws),
         section=section,
@@ -117,22 +117,19 @@ def _carried_over(
     return called
 
 
-def _confirmed(
-    coverage: WallCoverage, caster: RayCaster, views: Sequence[CoverageView], count: int
-) -> Bool[np.ndarray, "F"]:
+def _confirmed(coverage: WallCoverage, mesh: TriangleMesh, views: Sequence[CoverageView]) -> Bool[np.ndarray, "F"]:
     """Whether a viewing ray that hits a true triangle meets the reconstructed wall at about the same distance. [F]"""
-    own = RayCaster(coverage.mesh.part(~coverage.guessed))
-    grids, farthest = RayGrids(coverage.settings.rays), coverage.settings.max_distance
-    seen = np.zeros(count, bool)
+    own = coverage.mesh.part(~coverage.guessed)
+    grids, max_depth = RayGrids(coverage.settings.rays), coverage.settings.max_distance
+    confirmed = np.zeros(len(mesh), bool)
     for view in views:
-        grid = grids.of(view)
-        rays = np.einsum("nc,dc->nd", grid.directions, view.camera_to_world[:3, :3].astype(np.float32))
-        triangle, true = caster.cast(view.center, rays)
-        hit = np.flatnonzero((triangle >= 0) & (true <= farthest))
-        _, measured = own.cast(view.center, rays[hit])
+        rays = grids.of(view).world_rays(view)
+        triangle, true = mesh.rays.cast(view.center, rays)
+        hit = np.flatnonzero((triangle >= 0) & (true <= max_depth))
+        _, measured = own.rays.cast(view.center, rays[hit])
         close = np.abs(measured - true[hit]) < _SAME_DISTANCE * true[hit]
-        seen[triangle[hit[close]]] = True
-    return seen
+        confirmed[triangle[hit[close]]] = True
+    return confirmed
 
 
 def _random_cells(

@@ -16,7 +16,7 @@ from coliags_plugin.surface.coverage.regions import large_regions, near_pairs, n
 from coliags_plugin.surface.coverage.settings import CoverageSettings
 from coliags_plugin.surface.coverage.tube import TubeGrid, guessed_wall, wall_around
 from coliags_plugin.surface.coverage.views import CoverageView
-from coliags_plugin.surface.coverage.visibility import FaceViews, RayCaster, facing_cameras, see_faces
+from coliags_plugin.surface.coverage.visibility import FaceViews, facing_cameras, see_faces
 
 #: Guessed wall continues a region of reconstructed wall whose centroids are as near as this, mm.
 _TOUCHING = 2.0
@@ -122,9 +122,8 @@ def measure_coverage(
     mesh = facing_cameras(mesh, views, settings)
     face_views = see_faces(mesh, views, settings, progress)
     poses = np.stack([np.asarray(view.camera_to_world, np.float64) for view in views])
-    caster = RayCaster(mesh)
-    line = find_centreline(mesh, poses, caster)
-    guess = guessed_wall(wall_around(caster, line))
+    line = find_centreline(mesh, poses)
+    guess = guessed_wall(wall_around(mesh, line))
     whole, guessed = _joined(mesh, guess)
     seen = _extended(face_views, len(guess))
     level = classify(seen, settings)
@@ -132,7 +131,7 @@ def measure_coverage(
     # Beyond the ends of the centreline nothing was guessed, so that the share of wall seen there says nothing.
     along = (arc >= line.arc[0]) & (arc <= line.arc[-1])
     section = find_section(arc[along], whole.areas[along], seen.seen[along])
-    grid = wall_around(RayCaster(whole), line)
+    grid = wall_around(whole, line)
     missed = (level == Level.UNSEEN) & section.holds(arc)
     pairs = np.concatenate(
         [neighbours(whole), near_pairs(whole.centers, missed & guessed, missed & ~guessed, _TOUCHING)]

@@ -10,7 +10,6 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, percentile_fi
 
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.surface.coverage.centreline import STEP, Centreline
-from coliags_plugin.surface.coverage.visibility import RayCaster
 
 #: Clock angles of the grid.
 CLOCKS = 180
@@ -48,11 +47,11 @@ class TubeGrid:
         return np.asarray(self.triangle >= 0)
 
 
-def wall_around(caster: RayCaster, line: Centreline) -> TubeGrid:
+def wall_around(mesh: TriangleMesh, line: Centreline) -> TubeGrid:
     """Cast rays outwards from a centreline."""
     origins = np.repeat(line.points, CLOCKS, axis=0)
     directions = np.concatenate([line.directions(index, _clocks()) for index in range(len(line.points))])
-    triangle, distance = caster.cast(origins, directions)
+    triangle, distance = mesh.rays.cast(origins, directions)
     hit = (triangle >= 0) & (distance <= _WIDEST)
     shape = (len(line.points), CLOCKS)
     radius = np.where(hit, distance, np.nan).astype(np.float64)

@@ -86,6 +86,10 @@ class RayGrid:
         angles = _pixel_angles(lens, pixels[cells], directions)
         return cls((width, height), cells, directions.astype(np.float32), angles.astype(np.float32))
 
+    def world_rays(self, view: CoverageView) -> Float32[np.ndarray, "R 3"]:
+        """The directions in the world of a view's pose. [R, 3]"""
+        return np.einsum("nc,dc->nd", self.directions, view.camera_to_world[:3, :3].astype(np.float32))
+
     @cached_property
     def narrowest_cosine(self) -> float:
         """Cosine of the widest angle of a ray to the optical axis."""

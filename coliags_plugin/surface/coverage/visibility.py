@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float32, Int
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress
@@ -50,13 +50,13 @@ class FaceViews:
 
 @dataclass(frozen=True)
 class RayHits:
-    """Rays of one frame that hit a triangle within the range.
+    """Rays of one frame that hit a triangle within the range. All [N].
 
     Attributes:
-        triangle: What they hit. [N]
-        ray: Indices among the rays of the grid. [N]
-        distance: mm. [N]
-        cosine: Of the angle between ray and normal, 1 where perpendicular to the surface. [N]
+        triangle: What they hit.
+        ray: Their indices among the rays of the grid.
+        distance: mm.
+        cosine: Of the angle between ray and normal, 1 where perpendicular to the surface.
     """
 
     triangle: Int[np.ndarray, "N"]
@@ -65,73 +65,44 @@ class RayHits:
     cosine: Float32[np.ndarray, "N"]
 
 
-class RayCaster:
-    """First hits of rays on a mesh.
+def view_hits(
+    mesh: TriangleMesh, view: CoverageView, grid: RayGrid, max_depth: float, both_sides: bool = False
+) -> RayHits:
+    """What the rays of a view hit first, from the front.
 
     Args:
-        mesh: At least one triangle.
-
-    Raises:
-        InputError: The mesh is empty, or open3d cannot be imported.
+        mesh: The surface.
+        view: The frame.
+        grid: Rays of its lens.
+        max_depth: z-depth up to which surface counts, mm.
+        both_sides: Also triangles seen from behind; their cosines are negative.
     """
+    rays = grid.world_rays(view)
+    triangle, z_depth = mesh.rays.cast(view.center, rays)
+    hit = np.flatnonzero((triangle >= 0) & (z_depth <= max_depth))
+    length = np.linalg.norm(grid.directions[hit], axis=1)
+    cosine = -np.einsum("nc,nc->n", rays[hit], mesh.normals[triangle[hit]].astype(np.float32)) / length
+    kept = np.flatnonzero(cosine > -np.inf if both_sides else cosine > 0.0)
+    hit = hit[kept]
+    return RayHits(triangle[hit], hit, (z_depth[hit] * length[kept]).astype(np.float32), cosine[kept])
 
-    def __init__(self, mesh: TriangleMesh) -> None:
-        if not len(mesh):
-            raise InputError("a mesh without triangles", "the surface that the camera filmed")
-        self._rays = mesh.rays
-        self._normals, self._centers = mesh.normals.astype(np.float32), mesh.centers
 
-    def cast(
-        self, origins: Float[np.ndarray, "N 3"] | Float[np.ndarray, "3"], directions: Float[np.ndarray, "N 3"]
-    ) -> tuple[Int[np.ndarray, "N"], Float32[np.ndarray, "N"]]:
-        """Triangle that each ray hits first, -1 without a hit, and how many lengths of the ray it is away. [N], [N]"""
-        return self._rays.cast(origins, directions)
-
-    def distance(self, points: Float[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N"]:
-        """Distance of points to the surface, mm. [N]"""
-        return self._rays.distance(points)
-
-    def seen_by(self, view: CoverageView, grid: RayGrid, farthest: float, both_sides: bool = False) -> RayHits:
-        """What a view sees.
-
-        Args:
-            view: The frame.
-            grid: Rays of its lens.
-            farthest: z-depth at which surface still counts as seen, mm.
-            both_sides: Also triangles seen from behind; their cosines are negative.
-        """
-        rotation = view.camera_to_world[:3, :3].astype(np.float32)
-        rays = np.einsum("nc,dc->nd", grid.directions, rotation)
-        triangle, z_depth = self.cast(view.center, rays)
-        hit = np.flatnonzero((triangle >= 0) & (z_depth <= farthest))
-        length = np.linalg.norm(grid.directions[hit], axis=1)
-        cosine = -np.einsum("nc,nc->n", rays[hit], self._normals[triangle[hit]]) / length
-        kept = np.flatnonzero(cosine > -np.inf if both_sides else cosine > 0.0)
-        hit = hit[kept]
-        return RayHits(triangle[hit], hit, (z_depth[hit] * length[kept]).astype(np.float32), cosine[kept])
-
-    def centroids_seen_by(
-        self, view: CoverageView, grid: RayGrid, triangles: Int[np.ndarray, "K"], farthest: float
-    ) -> RayHits:
-        """Which of some triangles a view sees by their centroids.
-
-        Args:
-            view: The frame.
-            grid: Rays of its lens, of which the nearest stands for each centroid.
-            triangles: The triangles. [K]
-            farthest: z-depth at which surface still counts as seen, mm.
-        """
-        offset = self._centers[triangles] - view.center
-        local = offset @ view.camera_to_world[:3, :3]
-        distance = np.linalg.norm(offset, axis=1)
-        cosine = -np.einsum("nc,nc->n", offset, self._normals[triangles]) / np.maximum(distance, 1e-9)
-        ahead = (local[:, 2] > grid.narrowest_cosine * distance) & (local[:, 2] <= farthest) & (cosine > 0.0)
-        kept = np.flatnonzero(ahead)
-        rays = grid.nearest(view.lens, view.lens.project(local[kept]))
-        kept, rays = kept[rays >= 0], rays[rays >= 0]
-        blocked = self._rays.blocked(view.center, offset[kept])
-        kept, rays = kept[~blocked], rays[~blocked]
-        return RayHits(triangles[kept], rays, distance[kept].astype(np.float32), cosine[kept].astype(np.float32))
+def _visible_centroids(
+    mesh: TriangleMesh, view: CoverageView, grid: RayGrid, triangles: Int[np.ndarray, "K"], max_depth: float
+) -> RayHits:
+    """Which of some triangles a view sees by their centroids; the nearest ray of its grid stands for each."""
+    offset = mesh.centers[triangles] - view.center
+    local = offset @ view.camera_to_world[:3, :3]
+    distance = np.linalg.norm(offset, axis=1)
+    normals = mesh.normals[triangles].astype(np.float32)
+    cosine = -np.einsum("nc,nc->n", offset, normals) / np.maximum(distance, 1e-9)
+    ahead = (local[:, 2] > grid.narrowest_cosine * distance) & (local[:, 2] <= max_depth) & (cosine > 0.0)
+    kept = np.flatnonzero(ahead)
+    rays = grid.nearest(view.lens, view.lens.project(local[kept]))
+    kept, rays = kept[rays >= 0], rays[rays >= 0]
+    blocked = mesh.rays.blocked(view.center, offset[kept])
+    kept, rays = kept[~blocked], rays[~blocked]
+    return RayHits(triangles[kept], rays, distance[kept].astype(np.float32), cosine[kept].astype(np.float32))
 
 
 def facing_cameras(
@@ -150,9 +121,10 @@ def facing_cameras(
     settings = settings or CoverageSettings()
     if not views:
         raise InputError("a recording without frames", "one frame or more")
-    caster, grids = RayCaster(mesh), RayGrids(_PROBE_RAYS)
+    _check_not_empty(mesh)
+    grids = RayGrids(_PROBE_RAYS)
     probes = views[:: max(1, len(views) // _PROBE_FRAMES)]
-    hits = [caster.seen_by(view, grids.of(view), settings.max_distance, both_sides=True) for view in probes]
+    hits = [view_hits(mesh, view, grids.of(view), settings.max_distance, both_sides=True) for view in probes]
     cosines = np.concatenate([each.cosine for each in hits])
     if not len(cosines):
         raise InputError(
@@ -187,17 +159,24 @@ def see_faces(
         InputError: The mesh is empty, or open3d cannot be imported.
     """
     settings = settings or CoverageSettings()
-    caster, grids, tally = RayCaster(mesh), RayGrids(settings.rays), _Tally(len(mesh))
+    _check_not_empty(mesh)
+    grids, tally = RayGrids(settings.rays), _Tally(len(mesh))
     for number, view in enumerate(views):
         grid = grids.of(view)
-        tally.add(number, caster.seen_by(view, grid, settings.max_distance), grid, view, settings)
+        tally.add(number, view_hits(mesh, view, grid, settings.max_distance), grid, view, settings)
         if progress is not None:
             progress("cast viewing rays", number + 1, len(views))
-    between = np.flatnonzero(~tally.seen)
+    between = np.flatnonzero(tally.counts[0] == 0)
     for number, view in enumerate(views):
         grid = grids.of(view)
-        tally.add(number, caster.centroids_seen_by(view, grid, between, settings.max_distance), grid, view, settings)
+        hits = _visible_centroids(mesh, view, grid, between, settings.max_distance)
+        tally.add(number, hits, grid, view, settings)
     return tally.result()
+
+
+def _check_not_empty(mesh: TriangleMesh) -> None:
+    if not len(mesh):
+        raise InputError("a mesh without triangles", "the surface that the camera filmed")
 
 
 class RayGrids:
@@ -213,38 +192,26 @@ class RayGrids:
 
     def of(self, view: CoverageView) -> RayGrid:
         """The grid of a view's lens and mask."""
-        if self._last is not None:
-            other, grid = self._last
-            if other.lens == view.lens and (other.mask is view.mask or _same(other.mask, view.mask)):
-                return grid
-        grid = RayGrid.of(view.lens, view.mask, self._most)
-        self._last = view, grid
-        return grid
+        if self._last is None or self._last[0].lens != view.lens or not _same(self._last[0].mask, view.mask):
+            self._last = view, RayGrid.of(view.lens, view.mask, self._most)
+        return self._last[1]
 
 
 def _same(one: Bool[np.ndarray, "H W"] | None, other: Bool[np.ndarray, "H W"] | None) -> bool:
-    return one is not None and other is not None and np.array_equal(one, other)
+    return one is other or (one is not None and other is not None and np.array_equal(one, other))
 
 
 class _Tally:
-    """Sums and extremes over frames."""
+    """Counts and extremes over frames, of each triangle."""
 
     def __init__(self, faces: int) -> None:
-        self._counts = np.zeros((3, faces), np.int32)
-        self._distance = np.full(faces, np.inf, np.float32)
-        self._cosine = np.full(faces, -1.0, np.float32)
-        self._fineness = np.full(faces, -1.0, np.float32)
-        self._brightness = np.full(faces, -1.0, np.float32)
-        self._best = np.full(faces, -1, np.int32)
+        self.counts = np.zeros((3, faces), np.int32)
+        self.distance = np.full(faces, np.inf, np.float32)
+        self.cosine, self.fineness, self.brightness = np.full((3, faces), -1.0, np.float32)
+        self.best = np.full(faces, -1, np.int32)
 
-    def add(
-        self,
-        number: int,
-        hits: RayHits,
-        grid: RayGrid,
-        view: CoverageView,
-        settings: CoverageSettings,
-    ) -> None:
+    def add(self, number: int, hits: RayHits, grid: RayGrid, view: CoverageView, settings: CoverageSettings) -> None:
+        """Count what frame ``number`` sees."""
         face = hits.triangle
         if not len(face):
             return
@@ -252,37 +219,22 @@ class _Tally:
         if view.read_image is not None:
             brightness = grid.brightness(view.read_image())[hits.ray]
             clear &= brightness >= settings.dark
-            np.maximum.at(self._brightness, face, brightness)
+            np.maximum.at(self.brightness, face, brightness)
         good = clear & (hits.cosine >= np.cos(np.radians(settings.grazing)))
-        for count, chosen in zip(self._counts, (face, face[clear], face[good]), strict=True):
+        for count, chosen in zip(self.counts, (face, face[clear], face[good]), strict=True):
             count[np.unique(chosen)] += 1
-        np.minimum.at(self._distance, face, hits.distance)
-        np.maximum.at(self._cosine, face, hits.cosine)
+        np.minimum.at(self.distance, face, hits.distance)
+        np.maximum.at(self.cosine, face, hits.cosine)
         # A pixel covers solid angle * distance^2 / cosine of the surface.
         patch = grid.pixel_angles[hits.ray] * hits.distance**2
-        fineness = np.sqrt(hits.cosine / np.maximum(patch, np.finfo(np.float32).tiny))
-        before = self._fineness.copy()
-        np.maximum.at(self._fineness, face, fineness)
-        self._best[self._fineness > before] = number
-
-    @property
-    def seen(self) -> Bool[np.ndarray, "F"]:
-        return np.asarray(self._counts[0] > 0)
+        before = self.fineness.copy()
+        np.maximum.at(self.fineness, face, np.sqrt(hits.cosine / np.maximum(patch, np.finfo(np.float32).tiny)))
+        self.best[self.fineness > before] = number
 
     def result(self) -> FaceViews:
-        seen = self.seen
-
-        def known(values: np.ndarray, there: np.ndarray) -> Float32[np.ndarray, "F"]:
-            return np.where(there, values, np.nan).astype(np.float32)
-
-        incidence = np.degrees(np.arccos(np.clip(self._cosine, -1.0, 1.0)))
-        return FaceViews(
-            self._counts[0],
-            self._counts[1],
-            self._counts[2],
-            known(self._distance, seen),
-            known(incidence, seen),
-            known(self._fineness, seen),
-            known(self._brightness, self._brightness >= 0.0),
-            self._best,
-        )
+        """Counts and extremes, NaN where there are none."""
+        seen = self.counts[0] > 0
+        incidence = np.degrees(np.arccos(np.clip(self.cosine, -1.0, 1.0)))
+        extremes = [np.where(seen, values, np.nan) for values in (self.distance, incidence, self.fineness)]
+        extremes.append(np.where(self.brightness >= 0.0, self.brightness, np.nan))
+        return FaceViews(*self.counts, *(values.astype(np.float32) for values in extremes), self.best)

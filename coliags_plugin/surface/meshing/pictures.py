@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -52,21 +51,29 @@ def comparison_picture(mesh: TriangleMesh, truth: TrueSurface, cameras: Sequence
         truth: Its unseen part is grey.
         cameras: Views from within, in order.
     """
-    rows = []
-    views = [("inside", _resized(camera)) for camera in cameras]
+    views = [("inside", camera.resized(round(camera.width * _HEIGHT / camera.height), _HEIGHT)) for camera in cameras]
     width = max((camera.width for _, camera in views), default=_HEIGHT)
     views += [("outside", camera) for camera in outside_cameras(truth.mesh.part(truth.seen), width)]
-    drawn = _Surface(truth.mesh), _Surface(mesh)
-    for number, (name, camera) in enumerate(views, start=1):
-        images = [
-            drawn[0].picture(
-                camera, lambda points, hit: distance_colors(mesh.rays.nearest(points)[0], truth.seen[hit])
-            ),
-            drawn[1].picture(camera, lambda points, hit: distance_colors(truth.mesh.rays.nearest(points)[0])),
-            drawn[1].picture(camera, lambda points, hit: drawn[1].colors(hit)),
-        ]
-        labels = (f"{name} {number}: true, mm to the mesh", "mesh, mm to the true surface", "mesh, colour")
-        rows.append(side_by_side(images, labels))
+
+    def missed(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+        return distance_colors(mesh.rays.nearest(points)[0], truth.seen[triangles])
+
+    def wrong(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+        return distance_colors(truth.mesh.rays.nearest(points)[0])
+
+    def plain(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+        """Mean colours of triangles; light grey where there are none. [N, 3]"""
+        if mesh.colors is None:
+            return np.full((len(triangles), 3), 200, np.uint8)
+        return np.asarray(mesh.colors[mesh.triangles[triangles]].mean(axis=1))
+
+    rows = [
+        side_by_side(
+            [_drawn(truth.mesh, camera, missed), _drawn(mesh, camera, wrong), _drawn(mesh, camera, plain)],
+            (f"{name} {number}: true, mm to the mesh", "mesh, mm to the true surface", "mesh, colour"),
+        )
+        for number, (name, camera) in enumerate(views, start=1)
+    ]
     bar = color_bar((0.0, DEPTH_ERROR_LIMIT_MM), "mm", width=max(row.shape[1] for row in rows))
     return stacked([*rows, bar])
 
@@ -82,43 +89,28 @@ def outside_cameras(mesh: TriangleMesh, width: int) -> list[Camera]:
     longest, middle, shortest = np.linalg.svd(mesh.centers[:: max(1, len(mesh) // 5000)] - center)[2]
     radius = float(np.linalg.norm(mesh.centers - center, axis=1).max())
     focal = 0.48 * min(width, _HEIGHT) / np.tan(np.radians(10.0))  # the radius is seen at 10 degrees
-    made = []
+    cameras = []
     for forward in (shortest, middle):
         pose = torch.eye(4, dtype=torch.float64)
         down = np.cross(forward, longest)
         pose[:3, :3] = torch.from_numpy(np.stack([longest, down, forward], axis=1))
         pose[:3, 3] = torch.from_numpy(center - forward * radius / np.sin(np.radians(10.0)))
-        made.append(Camera(focal, focal, width / 2, _HEIGHT / 2, width, _HEIGHT, pose))
-    return made
+        cameras.append(Camera(focal, focal, width / 2, _HEIGHT / 2, width, _HEIGHT, pose))
+    return cameras
 
 
-def _resized(camera: Camera) -> Camera:
-    """The view at the height of the pictures."""
-    return camera.resized(round(camera.width * _HEIGHT / camera.height), _HEIGHT)
-
-
-class _Surface:
-    """A mesh to draw."""
-
-    def __init__(self, mesh: TriangleMesh) -> None:
-        self._mesh = mesh
-
-    def picture(self, camera: Camera, color: Any) -> UInt8[np.ndarray, "H W 3"]:
-        """What a camera sees, coloured by a function of the points hit and their triangles, and lit from the camera."""
-        camera = camera.to("cpu", torch.float64)
-        center, directions = camera.center.float().numpy(), camera.rays().reshape(-1, 3).float().numpy()
-        triangles, z = self._mesh.rays.cast(center, directions)
-        hit = triangles >= 0
-        image = np.full((len(directions), 3), _SURROUNDINGS, np.uint8)
-        if hit.any():
-            toward = directions[hit] / np.linalg.norm(directions[hit], axis=1, keepdims=True)
-            facing = np.abs((self._mesh.normals[triangles[hit]] * toward).sum(axis=1))
-            colors = color(center + z[hit, None] * directions[hit], triangles[hit])
-            image[hit] = np.rint(colors * (_AMBIENT + (1.0 - _AMBIENT) * facing)[:, None])
-        return image.reshape(camera.height, camera.width, 3)
-
-    def colors(self, triangles: np.ndarray) -> np.ndarray:
-        """Mean colours of triangles; light grey where there are none. [N, 3]"""
-        if self._mesh.colors is None:
-            return np.full((len(triangles), 3), 200, np.uint8)
-        return np.asarray(self._mesh.colors[self._mesh.triangles[triangles]].mean(axis=1))
+def _drawn(
+    mesh: TriangleMesh, camera: Camera, color: Callable[[np.ndarray, np.ndarray], np.ndarray]
+) -> UInt8[np.ndarray, "H W 3"]:
+    """A mesh as a camera sees it, lit from there, coloured by a function of the points hit and their triangles."""
+    camera = camera.to("cpu", torch.float64)
+    center, directions = camera.center.float().numpy(), camera.rays().reshape(-1, 3).float().numpy()
+    triangles, z = mesh.rays.cast(center, directions)
+    hit = triangles >= 0
+    image = np.full((len(directions), 3), _SURROUNDINGS, np.uint8)
+    if hit.any():
+        toward = directions[hit] / np.linalg.norm(directions[hit], axis=1, keepdims=True)
+        facing = np.abs((mesh.normals[triangles[hit]] * toward).sum(axis=1))
+        colors = color(center + z[hit, None] * directions[hit], triangles[hit])
+        image[hit] = np.rint(colors * (_AMBIENT + (1.0 - _AMBIENT) * facing)[:, None])
+    return image.reshape(camera.height, camera.width, 3)

@@ -14,7 +14,6 @@ from coliags_plugin.surface.coverage.map import draw_map
 from coliags_plugin.surface.coverage.measure import measure_coverage
 from coliags_plugin.surface.coverage.settings import CoverageSettings
 from coliags_plugin.surface.coverage.tube import guessed_wall, wall_around
-from coliags_plugin.surface.coverage.visibility import RayCaster
 
 FEW_RAYS = CoverageSettings(rays=20_000)
 
@@ -72,7 +71,7 @@ def test_a_hole_is_closed_where_the_cylinder_was():
     whole = tube(radius=15.0)
     mesh = without(whole, (30.0, 42.0), (60.0, 120.0))
     line = find_centreline(mesh, poses(path(0.0, 5.0)))
-    guess = guessed_wall(wall_around(RayCaster(mesh), line))
+    guess = guessed_wall(wall_around(mesh, line))
     # The grid may reach over the edge of the hole by a cell, 1 mm along and 2 degrees around.
     window = 12.0 * 15.0 * np.pi / 3.0
     middle = np.abs(guess.vertices[:, 2] - 36.0) < 12.0
@@ -88,7 +87,7 @@ def test_behind_a_fold_the_guess_returns_to_the_wall():
         return 18.0 - 8.0 * np.exp(-(np.abs((z - 30.0) / 1.5) ** 3)) * np.ones_like(angle)
 
     mesh = without(tube(radius=fold, spacing=0.5), (30.5, 45.0), (-1.0, 361.0))
-    guess = guessed_wall(wall_around(RayCaster(mesh), find_centreline(mesh, poses(path(0.0, 5.0)))))
+    guess = guessed_wall(wall_around(mesh, find_centreline(mesh, poses(path(0.0, 5.0)))))
     beyond = (guess.vertices[:, 2] > 38.0) & (guess.vertices[:, 2] < 45.0)
     assert np.allclose(np.hypot(*guess.vertices[beyond, :2].T), 18.0, atol=1.5)
 
