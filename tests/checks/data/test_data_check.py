@@ -93,40 +93,32 @@ def test_a_sound_scene_is_not_suspected(scene):
     assert check.depth.nearest < check.depth.median < check.depth.farthest <= 100.0
 
 
-@pytest.mark.parametrize(
-    "reading",
-    ["world-to-camera", "rotation transposed", "translation of opposite sign", "camera axes y up, z backward"],
-)
+@pytest.mark.parametrize("reading", sorted(CHANGES.keys() - {"given", "no motion"}))
 def test_poses_in_another_convention_are_called_by_it(scene, reading):
     # Each of these changes undoes itself.
     wrong = changed(scene, pose=CHANGES[reading])
     assert f"read as: {reading}" in whats(wrong)
+    if reading != "camera axes y up, z backward":
+        assert "poses agree with the images when read as" in whats(changed(wrong, depth=lambda depth: None))
 
 
-@pytest.mark.parametrize("reading", ["world-to-camera", "rotation transposed", "translation of opposite sign"])
-def test_so_they_are_without_depth(scene, reading):
-    sound, wrong = (
-        changed(scene, pose=lambda pose, name=name: CHANGES[name](pose), depth=lambda depth: None)
-        for name in ("given", reading)
-    )
-    assert whats(sound) == ""
-    assert "poses agree with the images when read as" in whats(wrong)
+def test_sound_poses_without_depth_are_not_suspected(scene):
+    assert whats(changed(scene, depth=lambda depth: None)) == ""
 
 
-@pytest.mark.parametrize(("factor", "told"), [(0.001, "0.001 times"), (0.5, "0.5 times"), (25.4, "25.4 times")])
-def test_depth_in_another_unit_than_poses(scene, factor, told):
-    wrong = changed(scene, depth=lambda depth: depth * factor)
-    found = whats(wrong)
-    assert "depth and poses are in different units" in found
-    measured = float(found.split("depth seems to be ")[1].split(" times")[0])
-    assert measured == pytest.approx(factor, rel=0.1), told
+@pytest.mark.parametrize("factor", [0.001, 0.5, 25.4])
+def test_depth_in_another_unit_than_poses(scene, factor):
+    findings = whats(changed(scene, depth=lambda depth: depth * factor))
+    assert "depth and poses are in different units" in findings
+    measured = float(findings.split("depth seems to be ")[1].split(" times")[0])
+    assert measured == pytest.approx(factor, rel=0.1)
 
 
 def test_everything_in_metres(scene):
     metres = changed(scene, pose=lambda pose: scaled_translation(pose, 1e-3), depth=lambda depth: depth * 1e-3)
-    found = whats(metres)
-    assert "depth looks like metres" in found
-    assert "different units" not in found
+    findings = whats(metres)
+    assert "depth looks like metres" in findings
+    assert "different units" not in findings
     unknown = replace(metres, provenance={**metres.provenance, "unit": "unknown"})
     assert [finding.what for finding in check_scene(unknown).findings] == ["depth is beside the near plane"]
 
@@ -165,9 +157,9 @@ def test_a_jump_a_standstill_black_and_repeated_images(scene):
 
 def test_constant_and_unknown_depth(scene):
     flat = changed(scene, depth=lambda depth: torch.full_like(depth, 30.0))
-    found = whats(flat)
-    assert found.startswith("depth is the same everywhere: ")
-    assert "; " not in found
+    findings = whats(flat)
+    assert findings.startswith("depth is the same everywhere: ")
+    assert "; " not in findings
     noise = torch.rand(128, 160, generator=torch.Generator().manual_seed(0))
     dummy = changed(scene, depth=lambda depth: 30.0 + 0.1 * noise)
     assert "different units" not in whats(dummy)
@@ -202,11 +194,8 @@ def paused(frames: list[Frame], pauses=(6, 15), length=40, jitter=0.002) -> Scen
         pose[:3, 3] += torch.from_numpy(rng.normal(size=3) * jitter)
         noise = torch.from_numpy(rng.integers(0, 2, frame.image.shape, dtype=np.uint8))
         camera = replace(frame.camera, camera_to_world=pose)
-        video.append(
-            replace(
-                frame, name=f"{len(video):04d}", index=len(video), camera=camera, depth=None, image=frame.image + noise
-            )
-        )
+        name, index, image = f"{len(video):04d}", len(video), frame.image + noise
+        video.append(replace(frame, name=name, index=index, camera=camera, depth=None, image=image))
     return Scene("paused", video, {}, PointCloud(torch.zeros(0, 3)), {})
 
 

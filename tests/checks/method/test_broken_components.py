@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 
 import pytest
-import torch
 
 from coliags_plugin.checks.method.check import CHECKS, check_method
 from coliags_plugin.config import registry
@@ -70,12 +69,6 @@ BROKEN = [
     (["losses.colour={name: CountsMaskedPixels, weight: 1.0}"], "ignored pixels", "masked pixels: colour"),
     (["renderer={name: SwapsPixels, samples: 16}"], "pixels", "rgb of single pixels"),
 ]  # fmt: skip
-
-
-@pytest.fixture(autouse=True)
-def one_thread(two_threads):
-    """On so few pixels a second thread costs more than it gains."""
-    torch.set_num_threads(1)
 
 
 @pytest.fixture(autouse=True)

@@ -46,23 +46,14 @@ def test_small_parts_go_and_large_ones_stay():
     assert fuse_run(run, settings).vertices[:, 2].min() > 16
 
 
-def test_what_is_masked_is_not_fused():
+@pytest.mark.parametrize("what", ["mask", "depth_at_least"])
+def test_what_is_masked_or_clipped_by_the_sensor_is_not_fused(what):
     scene = wall_scene(9, 160, 120)
-    mask = torch.ones(120, 160, dtype=torch.bool)
-    mask[:, :80] = False
-    masked = replace(scene, train=[replace(frame, mask=mask) for frame in scene.train])
+    left = torch.arange(160).expand(120, 160) < 80
+    value = ~left if what == "mask" else torch.where(left, 15.0, torch.nan)
+    spoilt = replace(scene, train=[replace(frame, **{what: value}) for frame in scene.train])
     settings = MeshSettings(voxel_size=0.3)
-    half, whole = (fuse_run(exact_run(scene=s), settings).areas.sum() for s in (masked, scene))
-    assert 0.4 < half / whole < 0.65
-
-
-def test_where_the_sensor_clipped_nothing_is_fused():
-    scene = wall_scene(9, 160, 120)
-    bound = torch.full((120, 160), torch.nan)
-    bound[:, :80] = 15.0
-    clipped = replace(scene, train=[replace(frame, depth_at_least=bound) for frame in scene.train])
-    settings = MeshSettings(voxel_size=0.3)
-    half, whole = (fuse_run(exact_run(scene=s), settings).areas.sum() for s in (clipped, scene))
+    half, whole = (fuse_run(exact_run(scene=s), settings).areas.sum() for s in (spoilt, scene))
     assert 0.4 < half / whole < 0.65
 
 
@@ -107,20 +98,13 @@ def test_flattened_colours_are_those_of_a_held_light(monkeypatch):
     assert mesh.areas.sum() == pytest.approx(plain.areas.sum()) and len(np.unique(plain.colors)) > 1
 
 
-def test_one_view_is_refused():
-    scene = wall_scene(9, 32, 24)
+def test_too_few_views_and_methods_without_depth_are_refused():
+    scene = wall_scene(9, 160, 120)
     with pytest.raises(InputError, match="1 training view"):
         fuse_run(exact_run(scene=replace(scene, train=scene.train[:1])))
-
-
-def test_a_method_without_depth_is_refused():
+    assert len(fuse_run(exact_run(scene=replace(scene, train=scene.train[:2]))))
     with pytest.raises(InputError, match="meshing with median depth"):
         fuse_run(exact_run(depth=False))
-
-
-def test_two_views_are_enough():
-    scene = wall_scene(9, 160, 120)
-    assert len(fuse_run(exact_run(scene=replace(scene, train=scene.train[:2]))))
 
 
 def test_incidence_on_a_wall():
