@@ -233,8 +233,11 @@ class _Tally:
 
     def result(self) -> FaceViews:
         """Counts and extremes, NaN where there are none."""
-        seen = self.counts[0] > 0
+        frames, clear, good = self.counts
         incidence = np.degrees(np.arccos(np.clip(self.cosine, -1.0, 1.0)))
-        extremes = [np.where(seen, values, np.nan) for values in (self.distance, incidence, self.fineness)]
-        extremes.append(np.where(self.brightness >= 0.0, self.brightness, np.nan))
-        return FaceViews(*self.counts, *(values.astype(np.float32) for values in extremes), self.best)
+        distance, incidence, fineness = (
+            np.where(frames > 0, values, np.nan).astype(np.float32)
+            for values in (self.distance, incidence, self.fineness)
+        )
+        brightness = np.where(self.brightness >= 0.0, self.brightness, np.nan).astype(np.float32)
+        return FaceViews(frames, clear, good, distance, incidence, fineness, brightness, self.best)
