@@ -185,17 +185,7 @@ def make_request(
     steps: int | None = None,
     overrides: Sequence[str] = (),
 ) -> Request:
-    """What is asked for, checked as far as names and numbers go.
-
-    Args:
-        methods: Names of methods, paths of method configs, or variants of methods.
-        scenes: Benchmarks, ``BENCHMARK/SCENE``, paths of benchmark files, or folders of scenes.
-        data: Folder of the benchmark's scenes; None: ``scenes/BENCHMARK``.
-        seeds: Runs of every cell, with the seeds 0, 1, ...
-        protocol: Name of the evaluation protocol.
-        splits: Splits, each a cell of its own; empty: each scene's own.
-        steps: Length of all runs; None: each method's own.
-        overrides: ``key.path=value`` changes of all methods.
+    """What is asked for, checked as far as names and numbers go; arguments as in :func:`coliags_plugin.compare`.
 
     Raises:
         InputError: A name is unknown or there twice, or a number is not valid.

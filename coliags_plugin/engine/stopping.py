@@ -12,7 +12,8 @@ from typing import Any
 logger = logging.getLogger(__name__)
 
 #: Ctrl-C, what clusters send before they kill, and what a terminal sends when it is closed.
-STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_HANGUP = getattr(signal, "SIGHUP", None)  # not on Windows
+STOPPING = tuple(filter(None, (signal.SIGINT, signal.SIGTERM, _HANGUP)))
 
 
 @contextmanager
@@ -37,8 +38,8 @@ def deferred_stop() -> Iterator[Callable[[], bool]]:
         yield lambda: False
         return
     before = {number: signal.getsignal(number) for number in STOPPING}
-    if before[signal.SIGHUP] is signal.SIG_IGN:
-        del before[signal.SIGHUP]
+    if before.get(_HANGUP) is signal.SIG_IGN:
+        del before[_HANGUP]
     try:
         for number in before:
             signal.signal(number, remember)

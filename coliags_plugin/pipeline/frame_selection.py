@@ -1,4 +1,4 @@
-"""Choice of the frames of a video that are sharp."""
+"""Sharpness of frames, motion between them, and the choice of those that are of use."""
 
 from __future__ import annotations
 
@@ -6,11 +6,19 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float32, UInt8
 
 from coliags_plugin.core.morphology import dilated
 from coliags_plugin.pipeline.settings import FrameSettings
 
+#: Larger side of the images that are measured, pixels.
+_SIDE = 480
+#: Brightness (of 255) of highlights, whose edges are sharp in any frame, and pixels about them that do not count.
+_HIGHLIGHT, _HIGHLIGHT_MARGIN = 240, 5
+#: Corners that are followed, at most, and fewest for a motion.
+_CORNERS, _FEWEST = 200, 12
+#: Largest distance between a corner and where following it there and back ends, pixels.
+_RETURN = 0.5
 #: Neighbours to either side, of the frames left by thinning, that a frame's sharpness is compared with.
 _NEIGHBOURS = 10
 #: Brightness (of 255) that a pixel outside of the lens's image never exceeds, and pixels by which that is widened.
@@ -74,3 +82,72 @@ def lens_mask(brightest: UInt8[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"] | 
     outside = np.isin(labels, rim[rim > 0]) & (dark > 0)
     share = float(outside.mean())
     return ~dilated(outside, _MARGIN) if _BORDER[0] <= share <= _BORDER[1] else None
+
+
+def reduced(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w"]:
+    """The grey image at the size at which frames are measured."""
+    import cv2
+
+    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    factor = _SIDE / max(gray.shape)
+    if factor >= 1.0:
+        return gray
+    size = (max(1, round(gray.shape[1] * factor)), max(1, round(gray.shape[0] * factor)))
+    return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA))
+
+
+def sharpness(gray: UInt8[np.ndarray, "h w"]) -> float:
+    """Root mean square of the Laplacian of the smoothed image, relative to its mean brightness; 0 for a black image.
+
+    Highlights do not count: they are sharp in a blurred frame too. Comparable between frames of one video only.
+
+    Args:
+        gray: By :func:`reduced`. [h, w]
+    """
+    import cv2
+
+    size = 2 * _HIGHLIGHT_MARGIN + 1
+    highlight = cv2.dilate((gray >= _HIGHLIGHT).astype(np.uint8), np.ones((size, size), np.uint8)) > 0
+    counted = ~highlight
+    brightness = float(gray[counted].mean()) if counted.any() else 0.0
+    if brightness == 0.0:
+        return 0.0
+    edges = cv2.Laplacian(cv2.GaussianBlur(gray.astype(np.float32), (0, 0), 1.0), cv2.CV_32F)
+    return float(np.sqrt(np.mean(np.square(edges[counted])))) / brightness
+
+
+def motion(before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"]) -> float:
+    """Median displacement of corners between two frames, as a share of the larger side; infinity if too few are found.
+
+    Args:
+        before: By :func:`reduced`. [h, w]
+        after: Likewise.
+    """
+    import cv2
+
+    corners = cv2.goodFeaturesToTrack(_equalised(before), _CORNERS, 0.01, 8)
+    if corners is None or len(corners) < _FEWEST:
+        return float("inf")
+    moved, tracked = _followed(before, after, corners)
+    back, again = _followed(after, before, moved)
+    kept = tracked & again & (np.linalg.norm(back - corners, axis=2)[:, 0] < _RETURN)
+    if kept.sum() < _FEWEST:
+        return float("inf")
+    lengths = np.linalg.norm(moved - corners, axis=2)[kept, 0]
+    return float(np.median(lengths)) / max(before.shape)
+
+
+def _followed(
+    before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"], corners: Float32[np.ndarray, "N 1 2"]
+) -> tuple[Float32[np.ndarray, "N 1 2"], Bool[np.ndarray, "N"]]:
+    import cv2
+
+    moved, status, _ = cv2.calcOpticalFlowPyrLK(_equalised(before), _equalised(after), corners, None)
+    return moved, status[:, 0] > 0
+
+
+def _equalised(gray: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
+    """Local contrast enhanced: the colon's wall is smooth, and the lamp's brightness changes."""
+    import cv2
+
+    return np.asarray(cv2.createCLAHE(4.0, (8, 8)).apply(gray))

@@ -14,8 +14,16 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, write_json
 from coliags_plugin.core.images import write_image, write_mask
 from coliags_plugin.core.progress import Progress
-from coliags_plugin.pipeline.frame_measures import motion, reduced, sharpness
-from coliags_plugin.pipeline.frame_selection import RESTING, THINNED, interval, lens_mask, sharp_frames
+from coliags_plugin.pipeline.frame_selection import (
+    RESTING,
+    THINNED,
+    interval,
+    lens_mask,
+    motion,
+    reduced,
+    sharp_frames,
+    sharpness,
+)
 from coliags_plugin.pipeline.frame_sources import FrameSource
 from coliags_plugin.pipeline.settings import FrameSettings
 from coliags_plugin.reconstruction.structure.image_files import read_mask

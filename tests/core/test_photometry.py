@@ -11,7 +11,7 @@ import torch
 from coliags_plugin.api.scenes import load_scene
 from coliags_plugin.config.components import make_component
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.engine.true_light import find_true_light
+from coliags_plugin.engine.light_map import find_true_light
 from coliags_plugin.lighting.photometry import fit_light
 from coliags_plugin.modules.gain import FrameGain
 from coliags_plugin.phantom.generate import generate

@@ -12,8 +12,7 @@ import torch
 import coliags_plugin
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud
-from coliags_plugin.engine.light_map import light_map
-from coliags_plugin.engine.true_light import TrueLight, find_true_light
+from coliags_plugin.engine.light_map import TrueLight, find_true_light, light_map
 from tests.commands import refused, run
 from tests.scenes import write_wall
 

@@ -1,13 +1,25 @@
-"""Choice of sharp frames, and masks of lenses."""
+"""Sharpness, motion, choice of sharp frames, and masks of lenses."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coliags_plugin.pipeline.frame_selection import BLURRED, EMPTY, THINNED, lens_mask, sharp_frames
+from coliags_plugin.pipeline.frame_selection import (
+    BLURRED,
+    EMPTY,
+    THINNED,
+    lens_mask,
+    motion,
+    reduced,
+    sharp_frames,
+    sharpness,
+)
 from coliags_plugin.pipeline.settings import FrameSettings
+from tests.pipeline.films import WIDTH, blurred, film
 
 SHARPNESS = st.lists(st.floats(0.0, 1.0), min_size=1, max_size=60)
 
@@ -35,9 +47,9 @@ def test_sharpness_is_compared_with_neighbours_as_the_view_changes():
 
 
 @given(SHARPNESS, st.integers(2, 30))
-def test_every_frame_is_kept_or_dropped_and_no_more_than_asked_for(sharpness, at_most):
-    kept, dropped = sharp_frames(sharpness, FrameSettings(at_most=at_most))
-    assert sorted([*kept, *dropped]) == list(range(len(sharpness)))
+def test_every_frame_is_kept_or_dropped_and_no_more_than_asked_for(values, at_most):
+    kept, dropped = sharp_frames(values, FrameSettings(at_most=at_most))
+    assert sorted([*kept, *dropped]) == list(range(len(values)))
     assert kept == sorted(kept)
     assert len(kept) <= at_most
 
@@ -55,3 +67,45 @@ def test_the_mask_of_a_round_lens():
 def test_a_full_image_needs_no_mask():
     assert lens_mask(np.full((120, 160), 90, np.uint8)) is None
     assert lens_mask(np.full((120, 160), 2, np.uint8)) is None  # a black video
+
+
+def test_blur_lowers_sharpness():
+    image = film([0])[0]
+    values = [sharpness(reduced(image if sigma == 0 else blurred(image, sigma))) for sigma in (0, 1, 2, 4)]
+    assert values == sorted(values, reverse=True)
+    assert values[-1] < 0.3 * values[0]
+
+
+def test_brightness_does_not_change_sharpness():
+    gray = reduced(film([0])[0])
+    assert sharpness(gray // 2) == pytest.approx(sharpness(gray), rel=0.03)
+    assert sharpness(np.zeros((40, 60), np.uint8)) == 0.0
+    assert sharpness(np.full((40, 60), 100, np.uint8)) == 0.0
+
+
+def test_highlights_do_not_make_a_blurred_frame_sharp():
+    image = blurred(film([0])[0])
+    before = sharpness(reduced(image))
+    image[50:54, 60:66] = 255
+    assert sharpness(reduced(image)) == pytest.approx(before, rel=0.05)
+
+
+def test_large_frames_are_reduced():
+    assert reduced(np.zeros((1080, 1350, 3), np.uint8)).shape == (384, 480)
+
+
+@pytest.mark.parametrize("shift", [0, 1, 3, 8])
+def test_motion_is_the_shift(shift):
+    before, after = (reduced(frame) for frame in film([20, 20 + shift]))
+    assert motion(before, after) * WIDTH == pytest.approx(shift, abs=0.1)
+
+
+def test_motion_under_a_brighter_lamp():
+    before, after = (reduced(frame) for frame in film([20, 22]))
+    assert motion(before, cv2.convertScaleAbs(after, alpha=0.7)) * WIDTH == pytest.approx(2, abs=0.3)
+
+
+def test_motion_of_another_scene_or_of_none_is_unknown():
+    one, other = reduced(film([0])[0]), reduced(film([0], seed=1)[0])
+    assert motion(one, other) > 0.02
+    assert motion(np.full((100, 100), 80, np.uint8), one[:100, :100]) == float("inf")
