@@ -21,7 +21,7 @@ from coliags_plugin.geometry.meshes.files import read_mesh
 from coliags_plugin.geometry.meshes.truth import read_true_surface
 from coliags_plugin.geometry.poses import colmap
 from coliags_plugin.geometry.poses.alignment import align
-from coliags_plugin.geometry.poses.association import Matches
+from coliags_plugin.geometry.poses.association import FrameMatches
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.outputs.video import write_video
 from coliags_plugin.reconstruction.structure.image_files import list_images
@@ -38,7 +38,7 @@ def errors(phantom: Path, out: Path) -> dict[str, float]:
     truth = Trajectory(np.load(phantom / "truth" / "camera_to_world.npy"))
     names = found.names or ()
     places = np.array([int(re.findall(r"\d+", Path(name).stem)[0]) for name in names])
-    aligned = align(found, truth, Matches(np.arange(len(places)), places, "name"), with_scale=True)
+    aligned = align(found, truth, FrameMatches(np.arange(len(places)), places, "name"), with_scale=True)
     mesh = read_mesh(out / "run" / "mesh" / "mesh.ply")
     moved = replace(mesh, vertices=aligned.transform.points(mesh.vertices.astype(np.float64)).astype(np.float32))
     compared = compare_meshes(moved, read_true_surface(phantom))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 from urllib.parse import urlsplit
@@ -53,7 +54,8 @@ def download(url: str, target: Path, sha256: str, progress: Progress, otherwise:
                     _fetch(url, part, sha256, progress, otherwise)
                     os.replace(part, target)
             finally:
-                lock.unlink()
+                with suppress(OSError):  # on Windows a locked file
+                    lock.unlink()
     except OSError as error:
         raise not_writable(part.parent, error) from error
 

@@ -97,12 +97,12 @@ def _is_whole_png(data: bytes) -> bool:
 
     OpenCV accepts truncated files, and allocates whatever length a chunk states.
     """
-    place = len(_PNG)
-    while place + _CHUNK <= len(data):
-        length, kind = int.from_bytes(data[place : place + 4], "big"), data[place + 4 : place + 8]
-        place += _CHUNK + length
+    position = len(_PNG)
+    while position + _CHUNK <= len(data):
+        length, kind = int.from_bytes(data[position : position + 4], "big"), data[position + 4 : position + 8]
+        position += _CHUNK + length
         if kind == b"IEND":
-            return place <= len(data)
+            return position <= len(data)
     return False
 
 

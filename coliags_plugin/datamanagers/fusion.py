@@ -13,7 +13,7 @@ from torch import Tensor
 from coliags_plugin.core import bounds
 from coliags_plugin.core.arrays import read_arrays
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.ply_vertices import read_vertices
+from coliags_plugin.core.ply import read_vertices
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame, PointCloud
 from coliags_plugin.datamanagers.reading.parallel import parallel_map

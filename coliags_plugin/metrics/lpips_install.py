@@ -47,7 +47,7 @@ class Published:
         """Path of what the URL gives, in the folder of weights."""
         return self.known[self.sha256]
 
-    def place(self, sha256: str) -> str | None:
+    def path_of(self, sha256: str) -> str | None:
         """Path in the folder of weights of a file with this checksum; None where it is not known."""
         return next((path for digits, path in self.known.items() if sha256.startswith(digits)), None)
 
@@ -123,11 +123,11 @@ def _missing(nets: Sequence[str], folder: Path | None) -> list[tuple[str, int]]:
     """Net and index in its pair of every file that is not there, linear heads first; warns of unknown ones there."""
     missing = []
     for net in nets:
-        found = search(net) if folder is None else weights_in(net, [folder])
-        for index, file in enumerate(found):
+        files = search(net) if folder is None else weights_in(net, [folder])
+        for index, file in enumerate(files):
             if file is None:
                 missing.append((net, index))
-            elif SOURCES[net][index].place(digest := file_sha256(file)) is None:
+            elif SOURCES[net][index].path_of(digest := file_sha256(file)) is None:
                 _log.warning("%s is not the published file: its SHA-256 is %s", file, digest)
     return sorted(missing, key=lambda item: -item[1])
 
@@ -143,32 +143,32 @@ def _download(missing: Sequence[tuple[str, int]], target: Path, progress: Progre
 
 
 def _copy(missing: Sequence[tuple[str, int]], origin: Path, target: Path) -> list[Path]:
-    found = [(SOURCES[net][index], weights_in(net, [origin])[index]) for net, index in missing]
-    lacking = [published for published, file in found if file is None]
+    files = [(SOURCES[net][index], weights_in(net, [origin])[index]) for net, index in missing]
+    lacking = [published for published, file in files if file is None]
     if lacking:
         raise InputError(
             f"{origin} has no {', '.join(published.path for published in lacking)}",
             "",
             f"Download {', '.join(published.url for published in lacking)} into it, or choose another --net",
         )
-    copies = [(file, target / _place(published, file)) for published, file in found if file is not None]
-    for file, place in copies:
-        atomic_copy(file, place)
-    return [place for _, place in copies]
+    copies = [(file, target / _path(published, file)) for published, file in files if file is not None]
+    for file, path in copies:
+        atomic_copy(file, path)
+    return [path for _, path in copies]
 
 
-def _place(published: Published, file: Path) -> str:
+def _path(published: Published, file: Path) -> str:
     """Where a file belongs in the folder of weights.
 
     Raises:
         InputError: It is not a published one.
     """
     digest = file_sha256(file)
-    place = published.place(digest)
-    if place is None:
+    path = published.path_of(digest)
+    if path is None:
         raise InputError(
             f"{file} has the SHA-256 {digest}",
             " or ".join(f"{digits}{'...' if len(digits) < len(digest) else ''}" for digits in published.known),
             f"Download {published.url} again",
         )
-    return place
+    return path

@@ -42,11 +42,11 @@ def find_weights(net: str, folder: str | Path | None = None) -> tuple[Path, Path
     if backbone is None or heads is None:
         missing = [
             f"{what} ({name})"
-            for what, name, found in (
+            for what, name, file in (
                 ("backbone", BACKBONE_FILES[net][0], backbone),
                 ("linear heads", f"v0.1/{net}.pth", heads),
             )
-            if found is None
+            if file is None
         ]
         command = "coliags weights lpips" + ("" if net in DEFAULT_NETS else f" --net {net}")
         # Recorded with results, which are to be the same on every machine: no folders here.
@@ -65,8 +65,8 @@ def search(net: str, folder: str | Path | None = None) -> tuple[Path | None, Pat
 def weights_in(net: str, folders: Iterable[Path]) -> tuple[Path | None, Path | None]:
     """Backbone and linear heads in the first of some folders that has them; None for what is missing."""
     folders = list(folders)
-    backbone = next((file for place in folders for file in _backbones(net, place)), None)
-    return backbone, next((file for place in folders for file in _heads(net, place)), None)
+    backbone = next((file for folder in folders for file in _backbones(net, folder)), None)
+    return backbone, next((file for folder in folders for file in _heads(net, folder)), None)
 
 
 def default_folder() -> Path:

@@ -1,10 +1,91 @@
-"""PLY files, read back by Open3D."""
+"""PLY files: written ones are read by open3d; vertices in every form are read whole or not at all."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from coliags_plugin.core.ply import point_properties, write_ply
+from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.ply import point_properties, read_vertices, write_ply
+from coliags_plugin.datamanagers.fusion import load_points
+
+FIELDS = [("x", "f4"), ("y", "f4"), ("z", "f8"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("label", "i2")]
+WORDS = {"f4": "float", "f8": "double", "u1": "uchar", "i2": "short"}
+FORMATS = {"<": "binary_little_endian", ">": "binary_big_endian", "a": "ascii"}
+
+
+def vertices(order: str = "<") -> np.ndarray:
+    rng = np.random.default_rng(0)
+    made = np.empty(5, [(name, order + kind) for name, kind in FIELDS])
+    for name, kind in FIELDS:
+        made[name] = rng.normal(size=5) if kind[0] == "f" else rng.integers(0, 255, 5)
+    return made
+
+
+def header(form: str, count: int = 5, more: str = "") -> str:
+    properties = "".join(f"property {WORDS[kind]} {name}\n" for name, kind in FIELDS)
+    return f"ply\nformat {form} 1.0\ncomment a\nelement vertex {count}\n{properties}{more}end_header\n"
+
+
+@pytest.mark.parametrize("order", FORMATS)
+@pytest.mark.parametrize("faces", [False, True])
+def test_every_form(tmp_path, order, faces):
+    made = vertices("<" if order == "a" else order)
+    more = "element face 1\nproperty list uchar int vertex_indices\n" if faces else ""
+    body = made.tobytes() + faces * b"\x03" + faces * bytes(12)
+    if order == "a":
+        body = "".join(" ".join(repr(value.item()) for value in row) + "\n" for row in made).encode() + b"3 0 1 2\n"
+    (tmp_path / "p.ply").write_bytes(header(FORMATS[order], more=more).encode() + body)
+    found = read_vertices(tmp_path / "p.ply")
+    assert list(found) == [name for name, _ in FIELDS]
+    for name, kind in FIELDS:
+        assert found[name].dtype == np.dtype(kind)
+        np.testing.assert_array_equal(found[name], made[name])
+    points = load_points(tmp_path / "p.ply")
+    np.testing.assert_array_equal(points.positions[:, 0], made["x"])
+    np.testing.assert_array_equal(points.colors[:, 2], made["blue"])
+
+
+def test_colours_may_be_shares(tmp_path):
+    text = "ply\nformat ascii 1.0\nelement vertex 1\n"
+    text += "".join(f"property float {name}\n" for name in ("x", "y", "z", "red", "green", "blue"))
+    (tmp_path / "p.ply").write_text(f"{text}end_header\n1 2 3 0.5 1.5 nan\n")
+    assert load_points(tmp_path / "p.ply").colors.tolist() == [[128, 255, 0]]
+
+
+def test_open3d_agrees(tmp_path):
+    import open3d
+
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(np.random.default_rng(1).normal(size=(40, 3))))
+    cloud.colors = open3d.utility.Vector3dVector(np.random.default_rng(2).random((40, 3)))
+    for ascii_ in (True, False):
+        open3d.io.write_point_cloud(str(tmp_path / "p.ply"), cloud, write_ascii=ascii_)
+        points, back = load_points(tmp_path / "p.ply"), open3d.io.read_point_cloud(str(tmp_path / "p.ply"))
+        np.testing.assert_allclose(points.positions, np.asarray(back.points), atol=1e-6)
+        np.testing.assert_array_equal(points.colors, np.rint(np.asarray(back.colors) * 255))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", r"\(0 bytes\) has no PLY header"),
+        (b"plenty of text", "has no PLY header"),
+        (header("binary_little_endian").encode() + vertices().tobytes()[:-1], "says it has 5 vertices, but holds 4"),
+        (header("ascii").encode() + b"1 2 3 4 5 6 7\n", "says it has 5 vertices, but holds 1"),
+        (header("ascii", 1).encode() + b"1 2 3\n", "a vertex row that is not numbers"),
+        (header("ascii", 1).encode() + b"1 2 3 4 five 6 7\n", "a vertex row that is not numbers"),
+        (header("binary").encode(), "header line 'format binary 1.0'"),
+        (header("ascii").replace("format ascii 1.0\n", "").encode(), "names no format"),
+        (header("ascii").replace("float x", "half x").encode(), "header line 'property half x'"),
+        (header("ascii").replace("float x", "float u").encode(), "but no x"),
+        (header("ascii").replace("vertex", "face").encode(), "does not begin with vertices"),
+        (header("ascii").replace("float x", "list uchar int x").encode(), "vertices of plain numbers"),
+    ],
+)
+def test_refused(tmp_path, content, message):
+    (tmp_path / "p.ply").write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        read_vertices(tmp_path / "p.ply")
 
 
 def test_points_with_and_without_colours(tmp_path):

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.c3vd_endogslam.files import PARAMS, PreparedFiles
 from coliags_plugin.datamanagers.recording import check_pose_count
-from coliags_plugin.geometry.poses.c3vd import Poses, read_poses
+from coliags_plugin.geometry.poses.c3vd import C3vdPoses, read_poses
 from coliags_plugin.geometry.poses.endogslam import EndoGslamParams, image_indices
 from coliags_plugin.geometry.poses.rigid import inverse, rigid, rotation_angles_deg
 
@@ -100,7 +100,9 @@ def load_poses(files: PreparedFiles, params: EndoGslamParams | None, source: Pos
     )
 
 
-def _mapped(files: PreparedFiles, slam: _Slam | None, file: Poses | None, facts: Mapping[str, Any]) -> SequencePoses:
+def _mapped(
+    files: PreparedFiles, slam: _Slam | None, file: C3vdPoses | None, facts: Mapping[str, Any]
+) -> SequencePoses:
     """Poses in EndoGSLAM's world."""
     if slam is None:
         raise InputError(
@@ -123,7 +125,7 @@ def _mapped(files: PreparedFiles, slam: _Slam | None, file: Poses | None, facts:
     return SequencePoses(camera_to_world, np.eye(4), from_file, {**facts, "world": "first camera, as mapped"})
 
 
-def _align_slam(path: Path, params: EndoGslamParams, files: PreparedFiles, file: Poses | None) -> _Slam:
+def _align_slam(path: Path, params: EndoGslamParams, files: PreparedFiles, file: C3vdPoses | None) -> _Slam:
     count, poses = len(files.images), len(params.camera_to_world)
     indices = image_indices(poses, count)
     if indices is None:

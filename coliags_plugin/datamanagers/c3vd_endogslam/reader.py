@@ -11,7 +11,7 @@ from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import Intrinsics
-from coliags_plugin.core.ply_vertices import read_vertices
+from coliags_plugin.core.ply import read_vertices
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.c3vd_endogslam.files import (
     PARAMS,

@@ -5,22 +5,23 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.datamanagers.colmap.binary import check_complete
 from coliags_plugin.datamanagers.colmap.lens import ColmapLens
 from coliags_plugin.geometry.poses import colmap as colmap_poses
-
-if TYPE_CHECKING:
-    import pycolmap
+from coliags_plugin.geometry.poses.colmap_files import (
+    ColmapCamera,
+    model_suffix,
+    read_cameras,
+    read_images,
+    read_points,
+)
 
 #: Folders that may hold a model; numbered sub-folders come before the folder itself.
 _MODEL_FOLDERS = ("sparse", "colmap/sparse", ".")
-_SUFFIXES = (".bin", ".txt")
 _PARTS = ("cameras", "images", "points3D")
 #: Panoramic camera models, which cannot be undistorted to a pinhole image.
 _PANORAMIC = frozenset({"EQUIRECTANGULAR"})
@@ -34,7 +35,7 @@ class RegisteredImage:
         name: Path relative to the folder of images.
         camera: COLMAP's camera ID.
         observed: Observed keypoints, pixels, centres at integers + 0.5. [K, 2]
-        points: Their points: rows of :attr:`Model.positions`. [K]
+        points: Their points: rows of :attr:`SparseModel.positions`. [K]
     """
 
     name: str
@@ -44,7 +45,7 @@ class RegisteredImage:
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class SparseModel:
     """A sparse model, in its own world frame and unit.
 
     Attributes:
@@ -79,70 +80,53 @@ def find_models(scene: Path) -> list[Path]:
         parent = scene / name
         numbered = [] if name == "." or not parent.is_dir() else [p for p in parent.iterdir() if p.name.isdecimal()]
         candidates = [*sorted(numbered, key=lambda path: int(path.name)), parent]
-        if found := [path for path in candidates if _suffix(path) is not None]:
+        if found := [path for path in candidates if model_suffix(path, _PARTS) is not None]:
             return found
     return []
 
 
-def read_model(folder: Path) -> Model:
+def read_model(folder: Path) -> SparseModel:
     """Read a binary or text model; binary if both exist.
 
     Raises:
         InputError: The folder holds none; a file is damaged; poses are invalid (see
             :func:`coliags_plugin.geometry.poses.colmap.read`); or a camera cannot be undistorted to a pinhole.
     """
-    suffix = _suffix(folder)
+    suffix = model_suffix(folder, _PARTS)
     if suffix is None:
         raise InputError(
             f"{folder} holds no COLMAP model",
             "a folder with cameras, images and points3D, all .bin or all .txt",
             "Give the model's folder with --set datamanager.model=FOLDER",
         )
-    if suffix == ".bin":
-        check_complete(folder)
-    trajectory = colmap_poses.read(folder)
     files = tuple(folder / f"{part}{suffix}" for part in _PARTS)
-
-    import pycolmap
-
-    try:
-        model = pycolmap.Reconstruction()
-        (model.read_binary if suffix == ".bin" else model.read_text)(str(folder))
-    except (ValueError, IndexError, KeyError, RuntimeError, MemoryError) as error:
-        reason = str(error).splitlines()[0].strip() if str(error).strip() else type(error).__name__
-        raise InputError(
-            f"{folder} cannot be read: {reason}",
-            f"{', '.join(file.name for file in files)}, complete and of one model",
-            "Copy all of them again",
-        ) from error
-
-    points = sorted(model.points3D.items())
-    row = {number: index for index, (number, _) in enumerate(points)}
-    by_name = {image.name: image for image in model.images.values()}
+    trajectory = colmap_poses.read(folder)
+    cameras, points = read_cameras(files[0]), read_points(files[2])
+    rows = {point.number: row for row, point in enumerate(points)}
+    by_name = {image.name: image for image in read_images(files[1])}
     images = []
     for name in trajectory.names or ():
         image = by_name[name]
-        seen = image.get_observation_points2D()
-        # COLMAP's reader does not check that observed points exist.
-        if gone := [point.point3D_id for point in seen if point.point3D_id not in row]:
+        if missing := [number for number in image.points.tolist() if number not in rows]:
             raise InputError(
-                f"{files[2]} has {len(row)} points, but not {gone[0]}, which {name} observes",
+                f"{files[2]} has {len(rows)} points, but not {missing[0]}, which {name} observes",
                 "all points of the model",
                 f"{files[2].name} is cut short or of another model: copy it again",
             )
-        observed = np.array([(point.x(), point.y()) for point in seen], np.float64).reshape(-1, 2)
-        rows = np.array([row[point.point3D_id] for point in seen], np.int64)
-        images.append(RegisteredImage(name, image.camera_id, observed, rows))
+        if image.camera not in cameras:
+            raise InputError(f"{files[0]} has no camera {image.camera}, which {name} is of", "all cameras of the model")
+        observed = np.array([rows[number] for number in image.points.tolist()], np.int64)
+        images.append(RegisteredImage(name, image.camera, image.observed, observed))
     used = sorted({image.camera for image in images})
-    return Model(
+    return SparseModel(
         folder,
         files,
         images,
         trajectory.camera_to_world,
-        {number: _lens(model.cameras[number], files[0]) for number in used},
-        np.array([point.xyz for _, point in points], np.float64).reshape(-1, 3),
-        np.array([point.color for _, point in points], np.uint8).reshape(-1, 3),
-        np.array([point.track.length() for _, point in points], np.int64),
+        {number: _lens(cameras[number], files[0]) for number in used},
+        np.array([point.position for point in points], np.float64).reshape(-1, 3),
+        np.array([point.color for point in points], np.uint8).reshape(-1, 3),
+        np.array([point.track_length for point in points], np.int64),
     )
 
 
@@ -155,25 +139,18 @@ def sidecar_file(folder: Path, name: str, suffixes: Sequence[str]) -> Path | Non
     return None
 
 
-def _suffix(folder: Path) -> str | None:
-    for suffix in _SUFFIXES:
-        if all((folder / f"{part}{suffix}").is_file() for part in _PARTS):
-            return suffix
-    return None
-
-
-def _lens(camera: pycolmap.Camera, file: Path) -> ColmapLens:
-    name, params = camera.model_name, tuple(float(value) for value in camera.params)
-    if name in _PANORAMIC:
+def _lens(camera: ColmapCamera, file: Path) -> ColmapLens:
+    lens = ColmapLens(width=camera.width, height=camera.height, model=camera.model, params=camera.params)
+    if camera.model in _PANORAMIC:
         raise InputError(
-            f"{file}: camera {camera.camera_id} is {name}",
+            f"{file}: camera {camera.number} is {camera.model}",
             "a camera whose images can be undistorted to a pinhole's",
             "Cut the panoramas into pinhole images first",
         )
-    sizes = camera.width, camera.height, camera.focal_length_x, camera.focal_length_y
-    if not np.all(np.isfinite(params)) or min(sizes) <= 0:
+    finite = np.all(np.isfinite(camera.params))
+    if not finite or min(camera.width, camera.height, *lens.focal_lengths) <= 0:
         raise InputError(
-            f"{file}: camera {camera.camera_id} is {camera.width} x {camera.height} with {params}",
+            f"{file}: camera {camera.number} is {camera.width} x {camera.height} with {camera.params}",
             "finite parameters, size and focal length above 0",
         )
-    return ColmapLens(width=camera.width, height=camera.height, model=name, params=params)
+    return lens

@@ -37,9 +37,13 @@ class ColmapLens(MappedLens):
         return pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
 
     @property
+    def focal_lengths(self) -> tuple[float, float]:
+        """Along columns and rows, pixels."""
+        return self._camera.focal_length_x, self._camera.focal_length_y
+
+    @property
     def _calibrated_pinhole(self) -> tuple[float, float, float, float]:
-        camera = self._camera
-        return camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y
+        return *self.focal_lengths, self._camera.principal_point_x, self._camera.principal_point_y
 
     def _bent(self, tangents: Array) -> Array:
         points = np.concatenate([tangents, np.ones((len(tangents), 1))], axis=1)

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud, SparseDepth
-from coliags_plugin.datamanagers.colmap.files import Model, RegisteredImage, find_models, read_model, sidecar_file
+from coliags_plugin.datamanagers.colmap.files import RegisteredImage, SparseModel, find_models, read_model, sidecar_file
 from coliags_plugin.datamanagers.colmap.lens import PINHOLES
 from coliags_plugin.datamanagers.reading.depth_formats import depth_format
 from coliags_plugin.datamanagers.reading.files import (
@@ -162,7 +162,7 @@ class ColmapDataManager(RecordedDataManager):
         return found[0]
 
     def _sparse_depth(
-        self, model: Model, image: RegisteredImage, camera_to_world: np.ndarray, rectification: Rectification
+        self, model: SparseModel, image: RegisteredImage, camera_to_world: np.ndarray, rectification: Rectification
     ) -> SparseDepth | None:
         """z-depth of the image's points at their projections (not at the observed keypoints)."""
         settings, lens = self.settings, model.cameras[image.camera]
@@ -183,7 +183,7 @@ class ColmapDataManager(RecordedDataManager):
             torch.from_numpy(pixels[kept].astype(np.float32)), torch.from_numpy(local[kept, 2].astype(np.float32))
         )
 
-    def _points(self, model: Model) -> PointCloud:
+    def _points(self, model: SparseModel) -> PointCloud:
         positions = (model.positions * self.settings.scale).astype(np.float32)
         return PointCloud(torch.from_numpy(positions), torch.from_numpy(model.colors))
 
@@ -194,7 +194,7 @@ def _first_of_each(numbers: np.ndarray) -> np.ndarray:
     return first
 
 
-def _image_paths(folder: Path, model: Model, outside: bool) -> list[Path]:
+def _image_paths(folder: Path, model: SparseModel, outside: bool) -> list[Path]:
     if not folder.is_dir():
         raise InputError(
             f"no folder {folder}", "the images that the model was made from", "Set datamanager.images_folder"
@@ -211,7 +211,7 @@ def _image_paths(folder: Path, model: Model, outside: bool) -> list[Path]:
     return paths
 
 
-def _depths(folder: Path, model: Model) -> list[Path | None]:
+def _depths(folder: Path, model: SparseModel) -> list[Path | None]:
     """Depth files of all images, or of none."""
     if not folder.is_dir():
         return [None] * len(model.images)

@@ -21,7 +21,7 @@ from coliags_plugin.datamanagers.reading.files import DEPTH_SUFFIXES, IMAGE_SUFF
 from coliags_plugin.datamanagers.reading.images import size_of
 from coliags_plugin.datamanagers.reading.json_numbers import read_number
 from coliags_plugin.geometry.poses import tum
-from coliags_plugin.geometry.poses.colmap import read_text_cameras
+from coliags_plugin.geometry.poses.colmap import read_pinholes
 from coliags_plugin.geometry.poses.text import shortened
 from coliags_plugin.geometry.poses.trajectory import natural_order
 
@@ -275,7 +275,7 @@ def _read_intrinsics_txt(path: Path, image: Path) -> CameraFile:
 
 
 def _read_cameras_txt(path: Path, image: Path) -> CameraFile:
-    cameras = list(read_text_cameras(path).values())
+    cameras = list(read_pinholes(path).values())
     if len(cameras) != 1:
         raise InputError(f"{path} has {len(cameras)} cameras", "one, PINHOLE or SIMPLE_PINHOLE")
     camera = cameras[0]

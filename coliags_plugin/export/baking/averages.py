@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.fields.explicit_gaussians import ExplicitGaussians, ExplicitGaussiansSettings
+from coliags_plugin.lighting.lamps import HeldLight
 from coliags_plugin.renderers.splatting import SplattingRenderer
 
 #: A Gaussian is kept whose blending weights add up to so many pixels over the views, and which is on average at least
@@ -42,10 +45,11 @@ class GaussianAverages:
     Args:
         elements: Of the field, E.
         per_element: Slots of each.
+        scales: Of each Gaussian: three, two for surfels.
         device: Of the Gaussians.
     """
 
-    def __init__(self, elements: int, per_element: int, device: torch.device) -> None:
+    def __init__(self, elements: int, per_element: int, scales: int, device: torch.device) -> None:
         self._per_element = per_element
         slots = elements * per_element
 
@@ -53,15 +57,15 @@ class GaussianAverages:
             return torch.zeros(shape, device=device)
 
         self._weights, self._opacities, self._element_weights = zeros(slots), zeros(slots), zeros(elements)
-        self._means, self._log_scales, self._rotations = zeros(slots, 3), zeros(slots, 3), zeros(slots, 4, 4)
+        self._means, self._log_scales, self._rotations = zeros(slots, 3), zeros(slots, scales), zeros(slots, 4, 4)
         self._colors = zeros(slots, 3)
 
     def add(self, gaussians: Gaussians, weights: Float[Tensor, "N"]) -> None:
         """Add a view.
 
         Args:
-            gaussians: Of the view, with three scales each.
-            weights: Their :func:`blending_weights`. [N]
+            gaussians: Of the view.
+            weights: Their :func:`blending_weights`, or others. [N]
         """
         slots = gaussians.source_index
         elements = slots // self._per_element
@@ -76,24 +80,38 @@ class GaussianAverages:
         self._log_scales.index_add_(0, slots, weights[:, None] * gaussians.scales.log())
         self._rotations.index_add_(0, slots, weights[:, None, None] * products)
 
+    def visible(self) -> Int[Tensor, "N"]:
+        """Slots of the Gaussians that are visible in a view, ascending. [N]"""
+        visible = (self._weights >= _LEAST_WEIGHT) & (self._mean_opacities() >= _LEAST_OPACITY)
+        return visible.nonzero().squeeze(1)
+
     def kept(self) -> Int[Tensor, "N"]:
-        """Slots of the Gaussians that are visible in a view, ascending. [N]
+        """The same, at least one. [N]
 
         Raises:
             InputError: There are none.
         """
-        visible = (self._weights >= _LEAST_WEIGHT) & (self._mean_opacities() >= _LEAST_OPACITY)
-        if not visible.any():
+        visible = self.visible()
+        if not len(visible):
             raise InputError("no Gaussian of this run is visible in a training view", "a trained run")
-        return visible.nonzero().squeeze(1)
+        return visible
 
-    def colors(self, kept: Int[Tensor, "N"]) -> Float[Tensor, "N 3"]:
-        """Mean colours. [N, 3]
+    def gaussians(self, kept: Int[Tensor, "N"]) -> Gaussians:
+        """The averages, of no view in particular.
 
         Args:
             kept: Slots. [N]
         """
-        return self._colors[kept] / self._weights[kept][:, None]
+        weights = self._weights[kept][:, None]
+        return Gaussians(
+            means=self._means[kept] / weights,
+            quats_wxyz=torch.linalg.eigh(self._rotations[kept]).eigenvectors[:, :, -1],
+            scales=(self._log_scales[kept] / weights).exp(),
+            opacities=self._mean_opacities()[kept],
+            colors=self._colors[kept] / weights,
+            source_index=kept,
+            visible_sources=kept,
+        )
 
     def _mean_opacities(self) -> Float[Tensor, "L"]:
         shown = self._element_weights.repeat_interleave(self._per_element)
@@ -108,13 +126,31 @@ class GaussianAverages:
         """
         degree = round(harmonics.shape[1] ** 0.5) - 1
         made = ExplicitGaussians(ExplicitGaussiansSettings(sh_degree=degree), len(kept)).to(kept.device)
-        weights = self._weights[kept][:, None]
+        mean = self.gaussians(kept)
         with torch.no_grad():
-            made.means.copy_(self._means[kept] / weights)
-            made.scales.copy_(self._log_scales[kept] / weights)
-            made.quats.copy_(torch.linalg.eigh(self._rotations[kept]).eigenvectors[:, :, -1])
-            made.opacities.copy_(torch.logit(self._mean_opacities()[kept].clamp(1e-4, 1.0 - 1e-4)))
+            made.means.copy_(mean.means)
+            made.scales.copy_(self._log_scales[kept] / self._weights[kept][:, None])
+            made.quats.copy_(mean.quats_wxyz)
+            made.opacities.copy_(torch.logit(mean.opacities.clamp(1e-4, 1.0 - 1e-4)))
             made.sh0.copy_(harmonics[:, :1])
             made.shN.copy_(harmonics[:, 1:])
             made.degree.fill_(degree)
         return made
+
+
+@torch.no_grad()
+def mean_gaussians(field: GaussianField, cameras: Sequence[Camera], light: HeldLight | None = None) -> Gaussians:
+    """The Gaussians of a field for no view in particular: averages over views, weighted by their opacities there.
+
+    Args:
+        field: What is decoded.
+        cameras: From where; at least one.
+        light: What lights it; None: the lamp of each camera, so that colours are of the average light.
+    """
+    views = [field.gaussians(c) if light is None else field.gaussians_in_light(c, light) for c in cameras]
+    slots = max((int(view.source_index.max()) + 1 for view in views if len(view)), default=0)
+    per_element, scales = field.slots_per_element, views[0].scales.shape[1]
+    averages = GaussianAverages(-(-slots // per_element), per_element, scales, views[0].means.device)
+    for view in views:
+        averages.add(view, view.opacities)
+    return averages.gaussians(averages.visible())

@@ -11,10 +11,9 @@ from coliags_plugin.engine.held_light import gaussians_of, splatting_of
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.export.baking.averages import GaussianAverages, blending_weights
-from coliags_plugin.export.baking.cameras import adjusted_camera
 from coliags_plugin.export.baking.explicit import cloud_of_field
 from coliags_plugin.export.baking.harmonics import SeenColors, fit_harmonics
-from coliags_plugin.export.baking.refinement import loses_much, refine
+from coliags_plugin.export.baking.refinement import adjusted_camera, needs_refinement, refine
 from coliags_plugin.export.splats.cloud import SplatCloud
 from coliags_plugin.fields.explicit_gaussians import ExplicitGaussians
 from coliags_plugin.fields.spherical_harmonics import MAX_DEGREE
@@ -44,13 +43,13 @@ def bake(trained: TrainedRun, light: HeldLight) -> tuple[SplatCloud, dict[str, A
     """
     views = trained.scene.train[:: -(-len(trained.scene.train) // _VIEWS)]
     field = _averaged(trained, views, light)
-    steps = refine(field, trained, light) if loses_much(field, trained, light) else 0
+    steps = refine(field, trained, light) if needs_refinement(field, trained, light) else 0
     return cloud_of_field(field), {"views": len(views), "refinement_steps": steps}
 
 
 def _averaged(trained: TrainedRun, views: list[Frame], light: HeldLight) -> ExplicitGaussians:
     field, renderer = gaussians_of(trained.model), splatting_of(trained.model)
-    averages = GaussianAverages(field.element_count, field.slots_per_element, trained.device)
+    averages = GaussianAverages(field.element_count, field.slots_per_element, 3, trained.device)
     seen: list[SeenColors] = []
     every = -(-len(views) // _COLOR_VIEWS)
     with ProgressReport("bake: average over views", len(views)) as progress:
@@ -64,4 +63,4 @@ def _averaged(trained: TrainedRun, views: list[Frame], light: HeldLight) -> Expl
                 seen.append(SeenColors.of(gaussians, weights, camera))
             progress.update(index + 1)
     kept = averages.kept()
-    return averages.field(kept, fit_harmonics(seen, kept, averages.colors(kept), MAX_DEGREE))
+    return averages.field(kept, fit_harmonics(seen, kept, averages.gaussians(kept).colors, MAX_DEGREE))

@@ -97,5 +97,5 @@ def _summary(rows: list[dict[str, dict[str, float]]]) -> dict[str, Any]:
 
 def _means(rows: list[dict[str, dict[str, float]]], part: str) -> Mapping[str, float]:
     """Means of the metrics that some frame has, over the frames that have them."""
-    found = {name: [row[part][name] for row in rows if name in row[part]] for name in _METRICS}
-    return {name: sum(values) / len(values) for name, values in found.items() if values}
+    values_by_name = {name: [row[part][name] for row in rows if name in row[part]] for name in _METRICS}
+    return {name: sum(values) / len(values) for name, values in values_by_name.items() if values}

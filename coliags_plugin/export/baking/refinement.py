@@ -18,7 +18,6 @@ from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.randomness import generators
 from coliags_plugin.engine.rendering import render_view
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.export.baking.cameras import adjusted_camera
 from coliags_plugin.fields.explicit_gaussians import ExplicitGaussians
 from coliags_plugin.lighting.lamps import HeldLight
 
@@ -112,7 +111,7 @@ def _some_frames(frames: list[Frame]) -> list[Frame]:
 
 
 @torch.no_grad()
-def loses_much(field: ExplicitGaussians, trained: TrainedRun, light: HeldLight) -> bool:
+def needs_refinement(field: ExplicitGaussians, trained: TrainedRun, light: HeldLight) -> bool:
     """Whether baked Gaussians miss training frames in the held light by more than the run does.
 
     Args:
@@ -138,3 +137,11 @@ def _target(trained: TrainedRun, frame: Frame, light: HeldLight) -> _Target:
     held = render_held(trained.model, camera, light, _WANTS)
     missed = placed.rgb - render_view(trained, placed, ("rgb", "alpha")).rgb
     return _Target(camera, held.rgb + missed, held["depth_accumulated"], placed.mask)
+
+
+def adjusted_camera(trained: TrainedRun, frame: Frame) -> Camera:
+    """Camera of a training frame, as the run's view modules adjust it, float32 on the run's device."""
+    camera = frame.camera.to(trained.device)
+    for module in trained.model.view_modules.values():
+        camera = module.adjust_camera(camera, frame.view(trained=True))
+    return camera.to(dtype=torch.float32)

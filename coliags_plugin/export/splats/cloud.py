@@ -1,4 +1,4 @@
-"""Gaussians of a file: a world frame, plain numbers, colours as spherical harmonics."""
+"""Gaussians of a file or of a browser: a world frame, plain numbers, colours as spherical harmonics."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float32
 
 from coliags_plugin.core import bounds
+from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.rotations import rotation_matrices
 from coliags_plugin.fields.spherical_harmonics import Y0
 
 #: Opacities are kept this far from 0 and 1, where their logits would be infinite.
@@ -17,7 +20,7 @@ OPACITY_MARGIN = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class SplatCloud:
-    """Gaussians or surfels in the world frame and scene units (mm for C3VD), as files hold them.
+    """Gaussians or surfels in the world frame and scene units (mm for C3VD), for all views.
 
     The colour seen along a direction is max(0, 0.5 + sum of coefficients times basis), in display sRGB, with the order
     and the signs of 3DGS.
@@ -67,23 +70,52 @@ class SplatCloud:
         inside = np.clip(self.opacities.astype(np.float64), OPACITY_MARGIN, 1.0 - OPACITY_MARGIN)
         return np.log(inside / (1.0 - inside)).astype(np.float32)
 
+    @property
+    def covariances(self) -> Float32[np.ndarray, "N 3 3"]:
+        """Covariance matrices, squared scene units. [N, 3, 3]"""
+        turns = rotation_matrices(torch.from_numpy(self.quats_wxyz)).numpy()
+        axes = turns[:, :, : self.scales.shape[1]] * self.scales[:, None]
+        return axes @ axes.transpose(0, 2, 1)
+
+    @classmethod
+    def of(cls, gaussians: Gaussians) -> SplatCloud:
+        """Gaussians of a view, or of none in particular, with harmonics of degree 0.
+
+        Args:
+            gaussians: Of any device; those with a number that is not finite are left out.
+        """
+        parts = (gaussians.means, gaussians.quats_wxyz, gaussians.scales, gaussians.opacities, gaussians.colors)
+        means, quats, scales, opacities, colors = (part.detach().cpu().float().numpy() for part in parts)
+        cloud = cls(means, quats, scales, opacities, harmonics_of_colors(colors))
+        return cloud.part(cloud._finite())
+
     def part(self, kept: Bool[np.ndarray, "N"]) -> SplatCloud:
         """Some of the Gaussians.
 
         Args:
             kept: True for those to keep. [N]
         """
-        rows = (self.means, self.quats_wxyz, self.scales, self.opacities, self.harmonics)
-        return SplatCloud(*(values[kept] for values in rows))
+        return SplatCloud(*(values[kept] for values in vars(self).values()))
+
+    def concat(self, others: SplatCloud) -> SplatCloud:
+        """These Gaussians and others, of as many scales and harmonics."""
+        pairs = zip(vars(self).values(), vars(others).values(), strict=True)
+        return SplatCloud(*(np.concatenate(pair) for pair in pairs))
+
+    def _finite(self) -> Bool[np.ndarray, "N"]:
+        """Which have a rotation and finite numbers only. [N]"""
+        finite = [np.isfinite(part).all(axis=tuple(range(1, part.ndim))) for part in vars(self).values()]
+        with np.errstate(over="ignore", invalid="ignore"):
+            turned = np.square(self.quats_wxyz.astype(np.float64)).sum(axis=1) > 1e-24
+        return np.all([*finite, turned], axis=0)
 
     def usable(self) -> Bool[np.ndarray, "N"]:
         """Which Gaussians are finite, have a rotation, and lie and extend within the bounds of lengths. [N]"""
-        values = (self.means, self.quats_wxyz, self.scales, self.opacities[:, None], self.harmonics)
-        finite = np.all([np.isfinite(part).all(axis=tuple(range(1, part.ndim))) for part in values], axis=0)
-        with np.errstate(over="ignore", invalid="ignore"):
+        usable = self._finite()
+        with np.errstate(invalid="ignore"):
             for lengths in (self.means, self.scales):
-                finite &= (np.abs(lengths) <= bounds.LENGTH).all(axis=1)
-            return finite & (np.square(self.quats_wxyz.astype(np.float64)).sum(axis=1) > 1e-24)
+                usable &= (np.abs(lengths) <= bounds.LENGTH).all(axis=1)
+        return usable
 
     def with_thickness(self, share: float) -> SplatCloud:
         """Surfels as flat Gaussians; Gaussians unchanged.

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.ply import write_ply
-from coliags_plugin.core.ply_vertices import read_vertices
+from coliags_plugin.core.ply import read_vertices, write_ply
 from coliags_plugin.export.splats.cloud import SplatCloud, sigmoid
 from coliags_plugin.fields.spherical_harmonics import MAX_DEGREE
 

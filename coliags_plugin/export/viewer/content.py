@@ -20,11 +20,12 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.held_light import flattened_light, gaussians_of
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.export.viewer.baking import bake, baking_cameras
+from coliags_plugin.export.baking.averages import mean_gaussians
+from coliags_plugin.export.splats.cloud import SplatCloud
 from coliags_plugin.export.viewer.decoding import ViewDecoder
 from coliags_plugin.export.viewer.merging import merged_to
-from coliags_plugin.export.viewer.pictures import Pictures
-from coliags_plugin.export.viewer.splats import Splats, wire_unit
+from coliags_plugin.export.viewer.pictures import FramePictures
+from coliags_plugin.export.viewer.splats import shown, wire_unit
 from coliags_plugin.lighting.lamps import HeldLight
 from coliags_plugin.outputs.image_files import as_array
 
@@ -32,14 +33,18 @@ logger = logging.getLogger(__name__)
 
 #: Distance of the point that the browser's camera turns about, where nothing is in view: as a share of the extent.
 _DEFAULT_DISTANCE = 1.0
+#: Training views that are decoded for the Gaussians of no view in particular, at most.
+VIEWS = 16
 #: Gaussians beside a view, at most: they are seen only until the next decoding.
 MOST_BESIDE = 40_000
 #: Share of the Gaussians that are near enough to need no smaller cells when they are merged.
 _NEAR_SHARE = 0.2
 
+_NOTHING = SplatCloud(*(np.zeros((0, *shape), np.float32) for shape in ((3,), (4,), (3,), (), (1, 3))))
+
 
 @dataclass(frozen=True)
-class Content:
+class ViewerContent:
     """A run, ready to be shown.
 
     Attributes:
@@ -55,21 +60,21 @@ class Content:
 
     trained: TrainedRun
     frames: list[Frame]
-    baked: Splats
+    baked: SplatCloud
     decoder: ViewDecoder | None
-    pictures: Pictures
+    pictures: FramePictures
     unit: float
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     @classmethod
-    def of(cls, trained: TrainedRun) -> Content:
+    def of(cls, trained: TrainedRun) -> ViewerContent:
         """Bake the Gaussians of a run, where its method has any."""
         gaussian_field = trained.model.field
-        baked, decoder = none_at_all(), None
+        baked, decoder = _NOTHING, None
         if isinstance(gaussian_field, GaussianField):
             logger.info("decoding the Gaussians of %s", trained.method)
             cameras = [frame.camera.to(trained.device) for frame in trained.scene.train]
-            baked = Splats.of(bake(gaussian_field, baking_cameras(cameras)))
+            baked = shown(mean_gaussians(gaussian_field, spread(cameras)))
             beside = merged_to(baked, MOST_BESIDE, distances(baked, cameras))
             decoder = ViewDecoder(gaussian_field, beside, trained.device)
         else:
@@ -77,15 +82,15 @@ class Content:
                 "method '%s' has no Gaussians to draw in the browser: there are cameras, meshes and rendered pictures",
                 trained.method,
             )
-        return cls(trained, trained.scene.video, baked, decoder, Pictures(trained), wire_unit(baked))
+        return cls(trained, trained.scene.video, baked, decoder, FramePictures(trained), wire_unit(baked))
 
-    def relit_evenly(self) -> Content:
+    def relit_evenly(self) -> ViewerContent:
         """The same, its Gaussians baked under the flattened light, where their colours know a lamp."""
         if not self.knows_lamp:
             return self
         field = gaussians_of(self.trained.model)
         cameras = [frame.camera.to(self.trained.device) for frame in self.trained.scene.train]
-        return replace(self, baked=Splats.of(bake(field, baking_cameras(cameras), self.flattened)))
+        return replace(self, baked=shown(mean_gaussians(field, spread(cameras), self.flattened)))
 
     @property
     def knows_lamp(self) -> bool:
@@ -112,7 +117,7 @@ class Content:
     def look_distance(self) -> float:
         """Distance of the point that the browser's camera turns about: the median depth in the first view."""
         camera = self.first_camera
-        centers = torch.as_tensor(self.baked.centers, dtype=torch.float64)
+        centers = torch.as_tensor(self.baked.means, dtype=torch.float64)
         depth, seen = camera.to("cpu", torch.float64).sees(centers)
         if seen.any():
             return float(depth[seen].median())
@@ -134,7 +139,7 @@ class Content:
         return min(self.first_camera.near_plane, 0.02 * self.look_distance)
 
 
-def distances(splats: Splats, cameras: Sequence[Camera]) -> Float[np.ndarray, "N"]:
+def distances(splats: SplatCloud, cameras: Sequence[Camera]) -> Float[np.ndarray, "N"]:
     """Distance of each splat to the nearest camera, the nearest fifth counted alike. [N]
 
     Args:
@@ -142,18 +147,14 @@ def distances(splats: Splats, cameras: Sequence[Camera]) -> Float[np.ndarray, "N
         cameras: At least one.
     """
     centers = np.stack([as_array(camera.center).astype(np.float64) for camera in cameras])
-    found = np.asarray(cKDTree(centers).query(splats.centers)[0])
-    return np.maximum(found, np.quantile(found, _NEAR_SHARE)) if len(found) else found
+    nearest = np.asarray(cKDTree(centers).query(splats.means)[0])
+    return np.maximum(nearest, np.quantile(nearest, _NEAR_SHARE)) if len(nearest) else nearest
 
 
-def none_at_all() -> Splats:
-    """No splats."""
-    return Splats(
-        np.zeros((0, 3), np.float32),
-        np.zeros((0, 3, 3), np.float32),
-        np.zeros((0, 3), np.uint8),
-        np.zeros(0, np.float32),
-    )
+def spread(cameras: Sequence[Camera]) -> list[Camera]:
+    """At most :data:`VIEWS` of the cameras, evenly spaced in their order."""
+    count = min(VIEWS, len(cameras))
+    return [cameras[index * len(cameras) // count] for index in range(count)]
 
 
 def vertical_fov(camera: Camera) -> float:

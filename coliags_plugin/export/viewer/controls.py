@@ -7,7 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 from jaxtyping import Float
 
-from coliags_plugin.export.viewer.content import Content, mesh_files
+from coliags_plugin.export.viewer.content import ViewerContent, mesh_files
 from coliags_plugin.export.viewer.layers import add_cameras, add_mesh
 from coliags_plugin.export.viewer.pictures import Picture
 from coliags_plugin.geometry.meshes.files import read_mesh
@@ -40,7 +40,7 @@ class Controls:
         listener: Told of changes.
     """
 
-    def __init__(self, client: Any, content: Content, listener: Listener) -> None:
+    def __init__(self, client: Any, content: ViewerContent, listener: Listener) -> None:
         self._content = content
         self._client = client
         self._listener = listener

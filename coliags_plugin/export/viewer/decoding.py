@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float
 
 from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.export.viewer.splats import Splats
+from coliags_plugin.export.splats.cloud import SplatCloud
+from coliags_plugin.export.viewer.splats import shown
 from coliags_plugin.lighting.lamps import HeldLight
 
 #: How much wider than the view, on every side, Gaussians are decoded, so that a small turn shows no gap.
@@ -29,13 +30,13 @@ class ViewDecoder:
         device: Of the field.
     """
 
-    def __init__(self, field: GaussianField, beside: Splats, device: torch.device) -> None:
+    def __init__(self, field: GaussianField, beside: SplatCloud, device: torch.device) -> None:
         self.beside = beside
         self._field = field
         self._device = device
 
     @torch.no_grad()
-    def of(self, camera: Camera, light: HeldLight | None = None) -> Splats:
+    def of(self, camera: Camera, light: HeldLight | None = None) -> SplatCloud:
         """Gaussians with their colours, and, of anchor methods, their shapes, as this camera sees them.
 
         Args:
@@ -43,8 +44,8 @@ class ViewDecoder:
             light: What lights them; None: the lamp on the camera.
         """
         wide = widened(camera).to(self._device)
-        seen = Splats.of(self._field.gaussians(wide) if light is None else self._field.gaussians_in_light(wide, light))
-        return seen.and_also(self.beside.part(~in_view(self.beside.centers, wide)))
+        seen = shown(self._field.gaussians(wide) if light is None else self._field.gaussians_in_light(wide, light))
+        return seen.concat(self.beside.part(~in_view(self.beside.means, wide)))
 
 
 def widened(camera: Camera) -> Camera:

@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.export.viewer.content import Content, aspect, vertical_fov
+from coliags_plugin.export.viewer.content import ViewerContent, aspect, vertical_fov
 from coliags_plugin.export.viewer.library import import_viser
 from coliags_plugin.geometry.meshes.files import encode_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
@@ -29,7 +29,7 @@ _COLOR = (30, 120, 200)
 _AMBIENT, _HEADLIGHT = 1.4, 1.8
 
 
-def add_cameras(scene: Any, content: Content, chosen: Callable[[int], None] | None = None) -> list[Any]:
+def add_cameras(scene: Any, content: ViewerContent, chosen: Callable[[int], None] | None = None) -> list[Any]:
     """Add a frustum with its picture for the frames of the video, or for every n-th of many.
 
     Args:

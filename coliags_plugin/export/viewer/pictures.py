@@ -39,7 +39,7 @@ class Picture:
     caption: str
 
 
-class Pictures:
+class FramePictures:
     """What can be shown of a frame: its render, errors and depth, as far as the run and its scene have them.
 
     Args:

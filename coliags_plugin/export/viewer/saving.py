@@ -12,12 +12,13 @@ from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.export.viewer.content import Content
+from coliags_plugin.export.splats.cloud import SplatCloud
+from coliags_plugin.export.viewer.content import ViewerContent
 from coliags_plugin.export.viewer.layers import add_cameras
 from coliags_plugin.export.viewer.library import import_viser, start_server, stop_server
 from coliags_plugin.export.viewer.merging import merged_to
 from coliags_plugin.export.viewer.serving import set_start
-from coliags_plugin.export.viewer.splats import Splats, on_wire
+from coliags_plugin.export.viewer.splats import on_wire
 from coliags_plugin.outputs.page import refuse_folder
 
 logger = logging.getLogger(__name__)
@@ -65,7 +66,7 @@ def scene_page(trained: TrainedRun, largest: int = LARGEST_PAGE) -> str:
             "Write pictures with `coliags render`, or a mesh with `coliags mesh`",
         )
     import_viser()
-    content = Content.of(trained).relit_evenly()
+    content = ViewerContent.of(trained).relit_evenly()
     splats, page = fitting_page(content, largest)
     if len(splats) < len(content.baked):
         logger.warning(
@@ -75,7 +76,7 @@ def scene_page(trained: TrainedRun, largest: int = LARGEST_PAGE) -> str:
     return page
 
 
-def fitting_page(content: Content, largest: int) -> tuple[Splats, str]:
+def fitting_page(content: ViewerContent, largest: int) -> tuple[SplatCloud, str]:
     """The Gaussians of a run, merged into fewer where their page would be too large, and the page.
 
     Raises:
@@ -94,7 +95,7 @@ def fitting_page(content: Content, largest: int) -> tuple[Splats, str]:
     raise InputError(f"a page of {largest} bytes", f"more than {empty} bytes, what an empty one takes")
 
 
-def _page(content: Content, splats: Splats) -> str:
+def _page(content: ViewerContent, splats: SplatCloud) -> str:
     server = start_server("127.0.0.1", 0)
     try:
         set_start(server, content)
@@ -109,7 +110,7 @@ def _page(content: Content, splats: Splats) -> str:
     )
 
 
-def _caption(content: Content, splats: Splats) -> str:
+def _caption(content: ViewerContent, splats: SplatCloud) -> str:
     """What is seen, at the bottom of the page."""
     text = f"{content.title}, step {content.trained.step}"
     if content.knows_lamp:

@@ -14,7 +14,7 @@ import numpy as np
 from typing_extensions import Self
 
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.export.viewer.content import Content, vertical_fov
+from coliags_plugin.export.viewer.content import ViewerContent, vertical_fov
 from coliags_plugin.export.viewer.layers import pose
 from coliags_plugin.export.viewer.library import import_viser, start_server, stop_server
 from coliags_plugin.export.viewer.session import Session
@@ -45,7 +45,7 @@ class Viewer:
         self._threads: list[threading.Thread] = []
         self._lock = threading.Lock()
         try:
-            self.content = Content.of(trained)
+            self.content = ViewerContent.of(trained)
             set_start(self._server, self.content)
         except BaseException:
             stop_server(self._server)
@@ -110,7 +110,7 @@ class Viewer:
             session.close()
 
 
-def set_start(server: Any, content: Content) -> None:
+def set_start(server: Any, content: ViewerContent) -> None:
     """Let browsers start at the first training frame, upright there, before black, with a plain panel and no lights.
 
     Args:

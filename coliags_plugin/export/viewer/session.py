@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,11 +15,11 @@ from torch import Tensor
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.rotations import rotation_matrices
-from coliags_plugin.export.viewer.content import Content, vertical_fov
+from coliags_plugin.export.splats.cloud import SplatCloud
+from coliags_plugin.export.viewer.content import ViewerContent, vertical_fov
 from coliags_plugin.export.viewer.controls import FLATTENED, Controls
 from coliags_plugin.export.viewer.layers import add_headlight, pose
-from coliags_plugin.export.viewer.pacing import Pace
-from coliags_plugin.export.viewer.splats import BYTES_PER_SPLAT, Splats, on_wire
+from coliags_plugin.export.viewer.splats import BYTES_PER_SPLAT, on_wire
 
 logger = logging.getLogger(__name__)
 
@@ -50,6 +51,54 @@ class Update:
         )
 
 
+class Pace:
+    """Decides when work wanted by a moving camera is due: once it rests, and not too often.
+
+    Thread-safe.
+
+    Args:
+        rest: Seconds without a movement after which the camera rests.
+        every: Least seconds between the end of one piece of work and the start of the next.
+        clock: Seconds, ascending.
+    """
+
+    def __init__(self, rest: float, every: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self.rest = rest
+        self.every = every
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._wanted_from: float | None = None
+        self._ended = -float("inf")
+
+    def moved(self) -> None:
+        """The camera has moved: the work is wanted, once it rests."""
+        with self._lock:
+            self._wanted_from = self._clock() + self.rest
+
+    def want(self) -> None:
+        """The work is wanted without a movement, as after a change of options."""
+        with self._lock:
+            if self._wanted_from is None:
+                self._wanted_from = self._clock()
+
+    def wait(self) -> float | None:
+        """Seconds until the work is due, 0 if it is; None where none is wanted."""
+        with self._lock:
+            if self._wanted_from is None:
+                return None
+            return max(0.0, max(self._wanted_from, self._ended + self.every) - self._clock())
+
+    def begin(self) -> None:
+        """The work begins: what is wanted from now on is wanted anew."""
+        with self._lock:
+            self._wanted_from = None
+
+    def end(self) -> None:
+        """The work has ended."""
+        with self._lock:
+            self._ended = self._clock()
+
+
 class Session:
     """A browser's splats, controls and pictures, kept up to date by a thread of its own.
 
@@ -60,7 +109,7 @@ class Session:
         content: What is shown.
     """
 
-    def __init__(self, client: Any, content: Content) -> None:
+    def __init__(self, client: Any, content: ViewerContent) -> None:
         self._client = client
         self._content = content
         self._pace = Pace(REST, EVERY)
@@ -156,7 +205,7 @@ class Session:
             splats = decoder.of(self._camera(), light)
         self._send(splats.part(splats.opacities >= self.controls.least_opacity), time.perf_counter() - began)
 
-    def _send(self, splats: Splats, decoding: float) -> None:
+    def _send(self, splats: SplatCloud, decoding: float) -> None:
         began = time.perf_counter()
         arguments, unit = on_wire(splats, self._content.unit), self._content.unit
         if self._splats is None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +12,14 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.glb import GlbArray, encode_glb
 from coliags_plugin.core.open3d_library import import_open3d
-from coliags_plugin.core.ply import point_properties, write_ply
+from coliags_plugin.core.ply import point_properties, read_triangles, write_ply
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.geometry.meshes.obj import decode_obj, encode_obj
-from coliags_plugin.geometry.meshes.ply import read_ply_mesh
 
 #: Suffixes of the formats.
 MESH_FORMATS = ("ply", "obj", "glb")
 
+_COLORS = ("red", "green", "blue")
 #: glTF's number of a primitive of triangles.
 _TRIANGLES = 4
 
@@ -51,7 +50,7 @@ def read_flagged_mesh(path: Path) -> tuple[TriangleMesh, Int[np.ndarray, "F"] | 
     if suffix == "obj":
         mesh, textures = decode_obj(path)
     else:
-        mesh = read_ply_mesh(path) if suffix == "ply" else _through_open3d(path)
+        mesh = _read_ply(path) if suffix == "ply" else _read_glb(path)
     if not len(mesh):
         raise InputError(f"{path} has no triangles", "a mesh", "Check that it is a mesh, not a cloud of points")
     if not (np.abs(mesh.vertices) <= bounds.LENGTH).all():  # neither NaN
@@ -69,8 +68,11 @@ def write_mesh(path: Path, mesh: TriangleMesh) -> None:
     Raises:
         InputError: Another suffix, or the folder cannot be written.
     """
-    writers: dict[str, Callable[[Path, TriangleMesh], None]] = {"ply": _write_ply, "obj": _write_obj, "glb": _write_glb}
-    writers[_suffix(path)](path, mesh)
+    suffix = _suffix(path)
+    if suffix == "ply":
+        write_ply(path, point_properties(mesh.vertices, mesh.colors), mesh.triangles)
+    else:
+        atomic_write(path, encode_obj(mesh) if suffix == "obj" else encode_mesh(mesh))
 
 
 def _suffix(path: Path) -> str:
@@ -80,7 +82,15 @@ def _suffix(path: Path) -> str:
     return suffix
 
 
-def _through_open3d(path: Path) -> TriangleMesh:
+def _read_ply(path: Path) -> TriangleMesh:
+    columns, triangles = read_triangles(path)
+    colored = all(name in columns and columns[name].dtype == np.uint8 for name in _COLORS)
+    with np.errstate(over="ignore"):
+        vertices = np.stack([columns[name] for name in "xyz"], axis=1).astype(np.float32)
+    return TriangleMesh(vertices, triangles, np.stack([columns[name] for name in _COLORS], axis=1) if colored else None)
+
+
+def _read_glb(path: Path) -> TriangleMesh:
     open3d = import_open3d("reads meshes")
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         read = open3d.io.read_triangle_mesh(str(path))
@@ -92,18 +102,6 @@ def _through_open3d(path: Path) -> TriangleMesh:
     if len(colors):
         colors = _encoded(colors / 255.0)
     return TriangleMesh(vertices, triangles.astype(np.int64), colors if len(colors) else None)
-
-
-def _write_ply(path: Path, mesh: TriangleMesh) -> None:
-    write_ply(path, point_properties(mesh.vertices, mesh.colors), mesh.triangles)
-
-
-def _write_obj(path: Path, mesh: TriangleMesh) -> None:
-    atomic_write(path, encode_obj(mesh))
-
-
-def _write_glb(path: Path, mesh: TriangleMesh) -> None:
-    atomic_write(path, encode_mesh(mesh))
 
 
 def encode_mesh(mesh: TriangleMesh) -> bytes:

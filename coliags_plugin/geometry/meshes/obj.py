@@ -79,15 +79,15 @@ def _corners(path: Path, faces: list[str]) -> tuple[np.ndarray, np.ndarray | Non
             return quick
         for face in faces:
             fields = [corner.split("/") for corner in face.split()]
-            places = [int(field[0]) for field in fields]
+            indices = [int(field[0]) for field in fields]
             texture = int(fields[0][1]) if len(fields[0]) > 1 and fields[0][1] else 0
-            for second, third in pairwise(places[1:]):
-                vertices.append((places[0], second, third))
+            for second, third in pairwise(indices[1:]):
+                vertices.append((indices[0], second, third))
                 textures.append(texture)
-        corners, found = np.array(vertices, np.int64).reshape(-1, 3), np.array(textures, np.int64)
+        corners, flags = np.array(vertices, np.int64).reshape(-1, 3), np.array(textures, np.int64)
     except (ValueError, IndexError, OverflowError) as error:
         raise InputError(f"{path} has a face that is not indices", "an OBJ file") from error
-    return corners, found if len(found) and found.all() else None
+    return corners, flags if len(flags) and flags.all() else None
 
 
 def _triangles_alike(faces: list[str]) -> tuple[np.ndarray, np.ndarray | None] | None:

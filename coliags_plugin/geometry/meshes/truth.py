@@ -42,7 +42,7 @@ def find_true_surface(scene: Path) -> Path | None:
     Args:
         scene: The folder.
     """
-    return next((scene / place for place in _PLACES if (scene / place).is_file()), None)
+    return next((scene / name for name in _PLACES if (scene / name).is_file()), None)
 
 
 def read_true_surface(path: Path, any_frame: bool = False) -> TrueSurface:
@@ -60,10 +60,10 @@ def read_true_surface(path: Path, any_frame: bool = False) -> TrueSurface:
         InputError: There is no mesh, or a file is damaged or does not belong to it.
     """
     if path.is_dir():
-        found = find_true_surface(path)
-        if found is None:
+        surface = find_true_surface(path)
+        if surface is None:
             raise InputError(f"{path} has no true surface", f"{' or '.join(_PLACES)} in it, or the path of a mesh")
-        path = found
+        path = surface
     mesh, textures = read_flagged_mesh(path)
     flags = path.parent / "mesh_seen.npz"
     if path.suffix.lower() == ".ply" and flags.is_file():

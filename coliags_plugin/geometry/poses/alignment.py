@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.geometry.poses.association import Matches
+from coliags_plugin.geometry.poses.association import FrameMatches
 from coliags_plugin.geometry.poses.rigid import inverse, rigid, rotation_angles_deg
 from coliags_plugin.geometry.poses.similarity import Similarity, umeyama
 from coliags_plugin.geometry.poses.trajectory import Trajectory
@@ -57,7 +57,7 @@ class Alignment:
         relative_rotation_errors_deg: RPE over ``delta`` matched frames, degrees. [M - delta]
     """
 
-    matches: Matches
+    matches: FrameMatches
     transform: Similarity
     world_rotation: WorldRotation
     with_scale: bool
@@ -136,7 +136,7 @@ class Alignment:
 
 
 def align(
-    estimate: Trajectory, reference: Trajectory, matches: Matches, with_scale: bool = False, delta: int = 1
+    estimate: Trajectory, reference: Trajectory, matches: FrameMatches, with_scale: bool = False, delta: int = 1
 ) -> Alignment:
     """Align the matched frames of an estimate with a reference, and compute the errors.
 

@@ -21,7 +21,7 @@ FEWEST_MATCHES = 3
 
 
 @dataclass(frozen=True, eq=False)
-class Matches:
+class FrameMatches:
     """Matched frames of two trajectories.
 
     Attributes:
@@ -40,7 +40,7 @@ class Matches:
         return len(self.first)
 
 
-def associate(first: Trajectory, second: Trajectory, match: Match = "auto", tolerance: float = 0.02) -> Matches:
+def associate(first: Trajectory, second: Trajectory, match: Match = "auto", tolerance: float = 0.02) -> FrameMatches:
     """Match the frames of two trajectories.
 
     Args:
@@ -65,7 +65,7 @@ def associate(first: Trajectory, second: Trajectory, match: Match = "auto", tole
         pairs, why_not = _ASSOCIATIONS[by](first, second, tolerance)
         if len(pairs) >= FEWEST_MATCHES:
             order = np.argsort(pairs[:, 0])
-            return Matches(pairs[order, 0], pairs[order, 1], by, tuple(tried))
+            return FrameMatches(pairs[order, 0], pairs[order, 1], by, tuple(tried))
         tried.append(f"by {by}: {why_not or f'{len(pairs)} frames match'}")
     training = image_indices(len(first), len(second))
     fits_training = match == "auto" and training is not None and len(first) != len(second)
@@ -121,8 +121,8 @@ def _by_name(first: Trajectory, second: Trajectory, tolerance: float) -> _Pairs:
         if repeated:
             return _NO_PAIRS, f"'{min(repeated)}' names several frames"
         if common:
-            places = {name: index for index, name in enumerate(others)}
-            return np.array([(index, places[name]) for index, name in enumerate(names) if name in common]), ""
+            indices = {name: index for index, name in enumerate(others)}
+            return np.array([(index, indices[name]) for index, name in enumerate(names) if name in common]), ""
     return _NO_PAIRS, "no name in common"
 
 

@@ -18,7 +18,7 @@ from coliags_plugin.geometry.poses.trajectory import Trajectory
 
 
 @dataclass(frozen=True)
-class Poses:
+class C3vdPoses:
     """The poses of one file.
 
     Attributes:
@@ -32,7 +32,7 @@ class Poses:
     evidence: dict[str, Any]
 
 
-def read_poses(path: Path) -> Poses:
+def read_poses(path: Path) -> C3vdPoses:
     """Read ``pose.txt`` or ``camera_pose.txt``: sixteen numbers per line, separated by commas or blanks.
 
     The web page calls the files row-major, but they are column-major (docs/layouts/c3vd.md 4). So the order is
@@ -71,7 +71,7 @@ def read_poses(path: Path) -> Poses:
     )
     rotations, centers = camera_to_world[:, :3, :3], camera_to_world[:, :3, 3]
     steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
-    return Poses(
+    return C3vdPoses(
         camera_to_world,
         "column-major" if column_major else "row-major",
         {

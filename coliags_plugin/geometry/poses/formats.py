@@ -43,7 +43,7 @@ def format_of(path: Path, name: str | None = None) -> Format:
         if known.recognise is not None and known.recognise(path):
             return known
     if path.is_dir():
-        held = sorted(found.name for found in path.iterdir())
+        held = sorted(entry.name for entry in path.iterdir())
         shown = f"{', '.join(held[:3])}{f' and {len(held) - 3} more' if len(held) > 3 else ''}" if held else "nothing"
         raise InputError(f"{path} holds {shown}", "the folder of a COLMAP model, or a pose file inside a folder")
     count = count_first_numbers(path)

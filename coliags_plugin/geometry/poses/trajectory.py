@@ -117,8 +117,8 @@ def refuse_repeated(names: Sequence[str], place: str) -> None:
 
 def _natural(name: str) -> tuple[list[tuple[int, int, str]], str]:
     # Numbers before words; the name itself last, to order 01 and 1.
-    found = re.findall(r"\d+|\D+", name)
-    digits = [part.lstrip("0") if part.isdecimal() else None for part in found]
+    parts = re.findall(r"\d+|\D+", name)
+    digits = [part.lstrip("0") if part.isdecimal() else None for part in parts]
     # By length and then by digits is the order of numbers, also of those too long for int().
-    pairs = zip(found, digits, strict=True)
+    pairs = zip(parts, digits, strict=True)
     return [(1, 0, part) if number is None else (0, len(number), number) for part, number in pairs], name

@@ -72,7 +72,7 @@ def test_blending_weights_add_up_to_alpha():
 
 def test_averages_of_the_same_gaussians_are_these():
     gaussians = some_gaussians()
-    averages = GaussianAverages(12, 1, torch.device("cpu"))
+    averages = GaussianAverages(12, 1, 3, torch.device("cpu"))
     for flip in (1.0, -1.0, 2.5):  # a quaternion and its negative are the same rotation
         averages.add(replace(gaussians, quats_wxyz=flip * gaussians.quats_wxyz), torch.rand(12) + 0.1)
     field = averages.field(averages.kept(), torch.zeros(12, 16, 3))
@@ -80,7 +80,7 @@ def test_averages_of_the_same_gaussians_are_these():
     torch.testing.assert_close(field.means, gaussians.means)
     torch.testing.assert_close(field.scales.exp(), gaussians.scales)
     torch.testing.assert_close(field.opacities.sigmoid(), gaussians.opacities)
-    torch.testing.assert_close(averages.colors(averages.kept()), gaussians.colors)
+    torch.testing.assert_close(averages.gaussians(averages.kept()).colors, gaussians.colors)
     expected = rotation_matrices(gaussians.quats_wxyz)
     torch.testing.assert_close(rotation_matrices(field.quats), expected, atol=1e-5, rtol=0)
 
@@ -90,7 +90,7 @@ def test_a_child_that_is_absent_from_a_view_counts_as_transparent():
     both = replace(gaussians, opacities=torch.tensor([0.8, 0.6]))
     first = Gaussians(*(value[:1] for value in (both.means, both.quats_wxyz, both.scales, both.opacities, both.colors)),
                       source_index=torch.tensor([0]), visible_sources=torch.tensor([0]))  # fmt: skip
-    averages = GaussianAverages(1, 2, torch.device("cpu"))
+    averages = GaussianAverages(1, 2, 3, torch.device("cpu"))
     averages.add(both, torch.tensor([3.0, 1.0]))
     averages.add(first, torch.tensor([4.0]))
     field = averages.field(averages.kept(), torch.zeros(2, 1, 3))
@@ -100,7 +100,7 @@ def test_a_child_that_is_absent_from_a_view_counts_as_transparent():
 
 
 def test_nothing_visible_is_an_error():
-    averages = GaussianAverages(3, 1, torch.device("cpu"))
+    averages = GaussianAverages(3, 1, 3, torch.device("cpu"))
     averages.add(some_gaussians(3), torch.zeros(3))
     with pytest.raises(InputError, match="visible"):
         averages.kept()

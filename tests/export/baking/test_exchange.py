@@ -100,14 +100,14 @@ def test_refinement_comes_nearer_to_the_frames(runs, monkeypatch):
             shown = trained.model.renderer.draw(baked.gaussians(camera), camera, ("rgb", "alpha")).rgb
         return float((shown - frame.rgb).square().mean())
 
-    assert not refinement.loses_much(baked, trained, light)
+    assert not refinement.needs_refinement(baked, trained, light)
     before = error()
     monkeypatch.setattr(refinement, "STEPS", 40)
     assert refinement.refine(baked, trained, light) == 40
     assert error() < 0.9 * before
     with torch.no_grad():
         baked.sh0 += 1.0
-    assert refinement.loses_much(baked, trained, light)
+    assert refinement.needs_refinement(baked, trained, light)
 
 
 def test_surfels_are_exported_thin_and_come_back_as_surfels(runs, scene, tmp_path):

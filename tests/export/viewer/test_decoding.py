@@ -7,54 +7,47 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from coliags_plugin.export.viewer.baking import VIEWS, bake, baking_cameras
+from coliags_plugin.export.baking.averages import mean_gaussians
+from coliags_plugin.export.viewer.content import VIEWS, spread
 from coliags_plugin.export.viewer.decoding import MARGIN, ViewDecoder, in_view, widened
-from coliags_plugin.export.viewer.splats import Splats
+from coliags_plugin.export.viewer.splats import shown
 from tests.export.viewer.made import Scripted, some_gaussians
 from tests.scenes import camera_at
 
 CAMERA = camera_at(0.0, 0.0, -12.0)
 
 
-def test_baked_light_is_the_mean_over_the_views_that_drew_it():
+def test_gaussians_of_no_view_are_means_weighted_by_opacity():
     one = some_gaussians(4)
     slots = torch.tensor([5, 0, 9, 2])
     first = replace(one, source_index=slots, opacities=torch.tensor([0.2, 0.4, 0.6, 0.8]))
-    second = replace(
-        *(first,),
-        opacities=torch.tensor([0.6, 0.1, 0.1, 0.1]),
-        colors=1.0 - one.colors,
-        scales=2.0 * one.scales,
-    )
-    third = replace(second, **{name: getattr(second, name)[:1] for name in ("means", "quats_wxyz", "scales")})
-    third = replace(third, opacities=second.opacities[:1], colors=second.colors[:1], source_index=slots[:1])
-    baked = bake(Scripted(first, second, third), [CAMERA] * 3)
-    order = baked.source_index.argsort()
-    assert baked.source_index[order].tolist() == [0, 2, 5, 9]
-    place = baked.source_index.tolist().index(5)
-    color = (0.2 * first.colors[0] + 1.2 * second.colors[0]) / 1.4
-    torch.testing.assert_close(baked.colors[place], color)
-    torch.testing.assert_close(baked.opacities[place], torch.tensor(1.4 / 3))
-    torch.testing.assert_close(baked.scales[place], second.scales[0])  # most opaque there
-    other = baked.source_index.tolist().index(0)
-    torch.testing.assert_close(baked.opacities[other], torch.tensor(0.25))
-    torch.testing.assert_close(baked.scales[other], first.scales[1])
+    changed = {"colors": 1.0 - one.colors, "scales": 2.0 * one.scales, "quats_wxyz": -one.quats_wxyz}
+    second = replace(first, opacities=torch.tensor([0.6, 0.1, 0.1, 0.1]), **changed)
+    mean = mean_gaussians(Scripted(first, second), [CAMERA] * 2)
+    assert mean.source_index.tolist() == [0, 2, 5, 9]
+    row, weights = 2, torch.tensor([[0.2], [0.6]]) / 0.8  # slot 5, the first of both
+    torch.testing.assert_close(mean.colors[row], weights[0] * first.colors[0] + weights[1] * second.colors[0])
+    torch.testing.assert_close(mean.opacities[row], torch.tensor((0.2**2 + 0.6**2) / 0.8))
+    torch.testing.assert_close(mean.scales[row], first.scales[0] * 2.0**0.75)
+    turned = (mean.quats_wxyz[row] @ torch.nn.functional.normalize(one.quats_wxyz[0], dim=0)).abs()
+    torch.testing.assert_close(turned, torch.tensor(1.0))
 
 
 def test_views_that_see_nothing_change_nothing():
-    some, nothing = some_gaussians(3), some_gaussians(0)
-    baked = bake(Scripted(nothing, some, nothing), [CAMERA] * 3)
-    torch.testing.assert_close(baked.means, some.means)
-    assert len(bake(Scripted(nothing), [CAMERA])) == 0
+    some, nothing = some_gaussians(3, scales=2), some_gaussians(0, scales=2)
+    mean = mean_gaussians(Scripted(nothing, some, nothing), [CAMERA] * 3)
+    torch.testing.assert_close(mean.means, some.means)
+    torch.testing.assert_close(mean.scales, some.scales)
+    assert len(mean_gaussians(Scripted(nothing), [CAMERA])) == 0
 
 
-def test_cameras_to_bake_from_are_spread_over_all():
+def test_cameras_to_decode_from_are_spread_over_all():
     cameras = [camera_at(float(index), 0.0, 0.0) for index in range(100)]
-    chosen = baking_cameras(cameras)
+    chosen = spread(cameras)
     assert len(chosen) == VIEWS and chosen[0] is cameras[0]
     steps = np.diff([float(camera.center[0]) for camera in chosen])
     assert set(steps) <= {6.0, 7.0}
-    assert baking_cameras(cameras[:5]) == cameras[:5]
+    assert spread(cameras[:5]) == cameras[:5]
 
 
 def test_in_view_is_what_projects_into_the_image():
@@ -72,12 +65,12 @@ def test_the_widened_camera_sees_more_by_the_margin():
 
 
 def test_a_view_shows_what_is_decoded_for_it_and_the_baked_beside_it():
-    everywhere = Splats.of(some_gaussians(500))
+    everywhere = shown(some_gaussians(500))
     seen = some_gaussians(7, seed=1)
     field = Scripted(seen)
-    shown = ViewDecoder(field, everywhere, torch.device("cpu")).of(CAMERA)
-    beside = ~in_view(everywhere.centers, widened(CAMERA))
+    drawn = ViewDecoder(field, everywhere, torch.device("cpu")).of(CAMERA)
+    beside = ~in_view(everywhere.means, widened(CAMERA))
     assert 0 < beside.sum() < 500
-    np.testing.assert_array_equal(shown.centers[:7], seen.means.numpy())
-    np.testing.assert_array_equal(shown.centers[7:], everywhere.centers[beside])
+    np.testing.assert_array_equal(drawn.means[:7], seen.means.numpy())
+    np.testing.assert_array_equal(drawn.means[7:], everywhere.means[beside])
     assert field.cameras[0].fx == CAMERA.fx / MARGIN

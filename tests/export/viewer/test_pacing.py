@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coliags_plugin.export.viewer.pacing import Pace
+from coliags_plugin.export.viewer.session import Pace
 
 
 class Clock:

@@ -13,13 +13,13 @@ from tests.commands import refused, run
 
 pytest.importorskip("viser")
 
-from coliags_plugin.export.viewer.content import Content
+from coliags_plugin.export.viewer.content import ViewerContent
 from coliags_plugin.export.viewer.saving import LARGEST_PAGE, fitting_page, save_page, scene_page
 
 
 @pytest.fixture(scope="module")
 def content(anchors):
-    return Content.of(anchors.load())
+    return ViewerContent.of(anchors.load())
 
 
 def test_the_command_writes_a_page_that_needs_no_network(anchors, tmp_path, capsys):

@@ -15,7 +15,7 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.export.viewer import serving
 from coliags_plugin.export.viewer.decoding import in_view, widened
-from coliags_plugin.export.viewer.splats import Splats
+from coliags_plugin.export.viewer.splats import shown
 from coliags_plugin.geometry.meshes.files import read_mesh, write_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.outputs.image_files import as_array
@@ -76,11 +76,11 @@ def test_splats_come_at_once_and_then_as_seen_from_the_camera(viewer):
     content = viewer.content
     with connected(viewer) as (client, camera):
         first = splats_of(client.wait_for("GaussianSplatsMessage")["props"]["buffer"])
-        np.testing.assert_allclose(first["centers"] * content.unit, content.decoder.beside.centers, rtol=1e-5)
+        np.testing.assert_allclose(first["centers"] * content.unit, content.decoder.beside.means, rtol=1e-5)
         second = newest(client)
-    seen = Splats.of(content.trained.model.field.gaussians(widened(session_camera(camera))))
-    np.testing.assert_allclose(second["centers"][: len(seen)] * content.unit, seen.centers, atol=1e-4)
-    np.testing.assert_allclose(second["rgba"][: len(seen), :3], seen.colors, atol=1)
+    seen = shown(content.trained.model.field.gaussians(widened(session_camera(camera))))
+    np.testing.assert_allclose(second["centers"][: len(seen)] * content.unit, seen.means, atol=1e-4)
+    np.testing.assert_allclose(second["rgba"][: len(seen), :3], 255 * seen.colors, atol=1)
     rest = second["centers"][len(seen) :] * content.unit
     assert not in_view(rest, widened(session_camera(camera))).any()
 
@@ -105,11 +105,11 @@ def test_flattened_light_is_the_exchange_packages(viewer):
     with connected(viewer) as (client, camera):
         newest(client)
         client.set("Light", "flattened")
-        shown = newest(client)
+        drawn = newest(client)
     field, placed = content.trained.model.field, widened(session_camera(camera))
-    seen = Splats.of(field.gaussians_in_light(placed, content.flattened))
-    np.testing.assert_allclose(shown["rgba"][: len(seen), :3], seen.colors, atol=1)
-    assert (np.abs(seen.colors.astype(int) - Splats.of(field.gaussians(placed)).colors) > 2).any()
+    seen = shown(field.gaussians_in_light(placed, content.flattened))
+    np.testing.assert_allclose(drawn["rgba"][: len(seen), :3], 255 * seen.colors, atol=1)
+    assert (np.abs(seen.colors - shown(field.gaussians(placed)).colors) > 2 / 255).any()
 
 
 def test_the_threshold_leaves_out_the_fainter_ones(viewer):

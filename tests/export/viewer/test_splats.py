@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from coliags_plugin.export.viewer.splats import Splats, on_wire, wire_unit
+from coliags_plugin.export.viewer.splats import on_wire, shown, wire_unit
 from tests.export.viewer.made import some_gaussians
 
 
@@ -25,7 +25,7 @@ def true_covariances(gaussians):
 @pytest.mark.parametrize("scales", [2, 3])
 def test_covariances(scales):
     gaussians = some_gaussians(20, scales)
-    np.testing.assert_allclose(Splats.of(gaussians).covariances, true_covariances(gaussians), atol=1e-6)
+    np.testing.assert_allclose(shown(gaussians).covariances, true_covariances(gaussians), atol=1e-6)
 
 
 def test_what_is_not_finite_is_left_out():
@@ -33,7 +33,7 @@ def test_what_is_not_finite_is_left_out():
     gaussians.means[1, 2] = torch.nan
     gaussians.scales[2, 0] = torch.inf
     gaussians.opacities[4] = torch.nan
-    np.testing.assert_array_equal(Splats.of(gaussians).centers, gaussians.means[[0, 3, 5]].numpy())
+    np.testing.assert_array_equal(shown(gaussians).means, gaussians.means[[0, 3, 5]].numpy())
 
 
 @given(st.floats(-12, 12))
@@ -41,31 +41,31 @@ def test_half_precision_holds_scenes_of_every_unit_of_length(exponent):
     """A scene in other units looks the same: covariances keep half a percent, and undo their unit exactly."""
     factor = 10.0**exponent
     gaussians = some_gaussians(30)
-    scaled = Splats.of(replace(gaussians, means=gaussians.means * factor, scales=gaussians.scales * factor))
+    scaled = shown(replace(gaussians, means=gaussians.means * factor, scales=gaussians.scales * factor))
     unit = wire_unit(scaled)
     sent = on_wire(scaled, unit)
     halves = sent["covariances"].astype(np.float16).astype(np.float64) * unit**2
     expected = true_covariances(gaussians) * factor**2
     np.testing.assert_allclose(halves, expected, atol=5e-3 * np.abs(expected).max())
-    np.testing.assert_allclose(sent["centers"] * unit, scaled.centers, rtol=1e-6)
+    np.testing.assert_allclose(sent["centers"] * unit, scaled.means, rtol=1e-6)
 
 
 def test_millimetres_stay_near_millimetres():
     """Splats of a tenth of a millimetre are sent in units near a millimetre."""
     gaussians = some_gaussians(100)
-    assert wire_unit(Splats.of(replace(gaussians, scales=0.125 * torch.ones(100, 3)))) == 1.0
+    assert wire_unit(shown(replace(gaussians, scales=0.125 * torch.ones(100, 3)))) == 1.0
 
 
 def test_too_large_ones_become_smaller_but_keep_their_shape():
     gaussians = some_gaussians(50)
     gaussians.scales[7] *= 1e6
-    splats = Splats.of(gaussians)
+    splats = shown(gaussians)
     sent = on_wire(splats, wire_unit(splats))["covariances"]
     assert np.isfinite(sent.astype(np.float16)).all()
     shape = splats.covariances[7] / splats.covariances[7].max()
     np.testing.assert_allclose(sent[7] / sent[7].max(), shape, atol=1e-5)
 
 
-def test_none_at_all():
-    empty = Splats.of(some_gaussians(0))
+def test_no_splats():
+    empty = shown(some_gaussians(0))
     assert wire_unit(empty) == 1.0 and on_wire(empty, 1.0)["centers"].shape == (0, 3)

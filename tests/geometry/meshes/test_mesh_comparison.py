@@ -12,9 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.geometry.meshes.comparison import Score, angles_between, compare_meshes
+from coliags_plugin.geometry.meshes.comparison import Score, angles_between, compare_meshes, sample_surface
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
-from coliags_plugin.geometry.meshes.sampling import sample_surface
 from coliags_plugin.geometry.meshes.truth import TrueSurface
 
 COUNT = 100_000

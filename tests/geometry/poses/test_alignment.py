@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.poses import c3vd, nerfstudio
 from coliags_plugin.geometry.poses.alignment import ErrorStatistics, align
-from coliags_plugin.geometry.poses.association import Matches, associate
+from coliags_plugin.geometry.poses.association import FrameMatches, associate
 from coliags_plugin.geometry.poses.rigid import rigid
 from coliags_plugin.geometry.poses.similarity import Similarity, umeyama
 from coliags_plugin.geometry.poses.trajectory import Trajectory
@@ -423,7 +423,7 @@ def test_what_cannot_be_matched_says_what_was_tried():
 def test_matched_frames_alone_are_aligned():
     reference = winding(10)
     estimate = Trajectory(moved(reference, some_transform(1)).camera_to_world[[7, 2, 5, 0]])
-    matches = Matches(np.arange(4), np.array([7, 2, 5, 0]), "index")
+    matches = FrameMatches(np.arange(4), np.array([7, 2, 5, 0]), "index")
     assert align(estimate, reference, matches).ate.max < 1e-9
 
 
