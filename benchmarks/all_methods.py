@@ -82,8 +82,8 @@ def main(options: Options) -> None:
         if not (options.out / f"{name}.json").is_file():
             complete(name, max(1, round(slowest / seconds_per_step(name, options))), options)
     runs = [options.out / name for name in (*methods, *timed)]
-    cells = read_study(runs).cells
-    rows = [row(run, cell.result, options) for run, cell in zip(runs, cells, strict=True)]
+    results = [run.result for run in read_study(runs).runs]
+    rows = [row(run, result, options) for run, result in zip(runs, results, strict=True)]
     header = ", ".join(f"{key}: {value}" for key, value in describe_machine().items())
     text = f"{header}; {options.jobs} runs at a time\n\n{markdown_table(rows)}\n"
     (options.out / "table.txt").write_text(text, encoding="utf-8")

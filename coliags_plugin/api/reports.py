@@ -11,6 +11,7 @@ from coliags_plugin.core.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
     from coliags_plugin.comparison.compare import FinishedComparison
+    from coliags_plugin.reporting.model import Section
 
 #: What a report can be written as.
 Format = Literal["html", "markdown", "latex", "csv"]
@@ -55,7 +56,7 @@ def report(
             cannot be written.
     """
     from coliags_plugin.comparison.compare import FinishedComparison
-    from coliags_plugin.comparison.report.content import Choices
+    from coliags_plugin.comparison.report.page import Choices
     from coliags_plugin.comparison.report.report import SUFFIXES, write_report
 
     parts = [of] if isinstance(of, (Run, FinishedComparison, str, Path)) else of
@@ -68,14 +69,15 @@ def report(
         if each not in SUFFIXES:
             raise InputError(f"no format '{each}'", f"one of {', '.join(SUFFIXES)}", did_you_mean(each, SUFFIXES))
     file = Path(f"report{SUFFIXES[wanted[0]]}") if output is None else Path(output)
-    section = _scene_section(scene) if scene is not None and "html" in wanted else ""
-    choices = Choices(columns, reference, title, note)
-    return write_report(paths, file, wanted, choices, protocol, frames, methods, section, anonymous)
+    section = _scene_section(scene) if scene is not None and "html" in wanted else None
+    choices = Choices(columns, reference, title, note, frames)
+    return write_report(paths, file, wanted, choices, protocol, methods, section, anonymous)
 
 
-def _scene_section(of: Run | str | Path) -> str:
-    from coliags_plugin.comparison.report.scene_section import scene_section
+def _scene_section(of: Run | str | Path) -> Section:
     from coliags_plugin.export.viewer.saving import scene_page
+    from coliags_plugin.reporting.model import Section, Template
 
     run = of if isinstance(of, Run) else Run(of)
-    return scene_section(scene_page(run.load()), f"{run.method} on {run.scene_name}, seed {run.seed}")
+    values = {"page": scene_page(run.load()), "name": f"{run.method} on {run.scene_name}, seed {run.seed}"}
+    return Section("Scene", [Template("scene.html", values)], screen_only=True)

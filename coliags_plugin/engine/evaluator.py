@@ -26,9 +26,10 @@ from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.engine.truth import match_truth
 from coliags_plugin.outputs.colormaps import DEPTH_ERROR_LIMIT_MM, colorize_depth_error
 from coliags_plugin.outputs.image_files import eight_bit, write_depth_tiff, write_png
-from coliags_plugin.outputs.light_charts import LIGHT_FILE
+from coliags_plugin.results.light import LIGHT_FILE
 from coliags_plugin.results.reading import RESULT_FILE, write_result
-from coliags_plugin.results.summaries import means_summary, per_frame_table
+from coliags_plugin.results.summaries import means_summary
+from coliags_plugin.results.tables import per_frame_table
 
 logger = logging.getLogger(__name__)
 

@@ -21,8 +21,9 @@ from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.lighting.beams import SpreadLaw, beam
 from coliags_plugin.lighting.tone_curve import encode
-from coliags_plugin.outputs.light_charts import LIGHT_FILE, light_charts, light_facts
-from coliags_plugin.outputs.page import fact_list, write_page
+from coliags_plugin.reporting.html_page import write_html
+from coliags_plugin.reporting.model import Fact, Figures, Page, Section
+from coliags_plugin.results.light import LIGHT_FILE, light_charts, light_facts
 
 #: Largest angle to the optical axis that is shown, degrees, and number of points of a curve.
 _MAX_ANGLE, _POINTS = 60.0, 61
@@ -223,10 +224,10 @@ def write_light_map(trained: TrainedRun, folder: Path) -> None:
         )
     record = found.record
     write_json(folder / LIGHT_FILE, record)
-    facts = {"method": trained.method, "scene": trained.scene.name, "step": str(trained.step), **light_facts(record)}
-    header = f"<h1>Light of {trained.method} on {trained.scene.name}</h1>{fact_list(facts)}"
-    sections = [f"<section><h2>{title}</h2>{chart}</section>" for title, chart in light_charts(record).items()]
-    write_page(folder / "light.html", "Light", header, sections)
+    facts = [Fact("method", trained.method), Fact("scene", trained.scene.name), Fact("step", trained.step)]
+    charts = Section("Curves", [Figures(light_charts(record))])
+    title = f"Light of {trained.method} on {trained.scene.name}"
+    write_html(Page(title, [charts], [*facts, *light_facts(record)]), folder / "light.html")
 
 
 def _relative(

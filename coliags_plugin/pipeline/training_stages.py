@@ -114,7 +114,7 @@ def coverage(context: StageContext) -> StageOutcome:
 
 def report(context: StageContext) -> StageOutcome:
     """Write the report of the run."""
-    from coliags_plugin.comparison.report.content import Choices
+    from coliags_plugin.comparison.report.page import Choices
     from coliags_plugin.comparison.report.report import write_report
     from coliags_plugin.engine.run_folder import RunFolder
 

@@ -20,7 +20,7 @@ from coliags_plugin._version import __version__
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.outputs.charts import color_bar_svg, line_chart, style_classes
-from coliags_plugin.reporting.model import Block, ColorBar, EncodedImage, Figure, Image, Page, Template
+from coliags_plugin.reporting.model import Block, Chart, ColorBar, EncodedImage, Figure, Image, Page, Template
 from coliags_plugin.reporting.numbers import DASH, counted, sentence, unit_text
 
 #: Largest page, bytes; pictures that have no room in it are written into a folder beside it.
@@ -30,25 +30,26 @@ _ASSETS = Path(__file__).with_name("assets")
 _SUFFIXES = {"image/jpeg": ".jpg", "image/png": ".png", "image/webp": ".webp"}
 #: Names of pictures beside a page; nothing else is ever removed.
 _NAME = re.compile(r"[0-9a-f]{20}\.(jpg|png|webp)")
-#: Where the page says how many pictures are beside it.
+#: Bytes of a note, and where it is: how many pictures are beside the page.
+_NOTE_ROOM = 500
 _BESIDE = "<!-- pictures beside the page -->"
 #: Where a picture's address will be.
 _PLACEHOLDER = re.compile(r"picture:([0-9a-f]{20})")
 
 
-def write_html(page: Page, output: Path, limit: int = PAGE_LIMIT) -> None:
+def write_html(page: Page, output: Path, limit: int | None = None) -> None:
     """Write a page, and the pictures for which it has no room into a folder beside it.
 
     Args:
         page: What to write.
         output: The file; an existing one is replaced.
-        limit: Largest page, bytes, unless the text alone is larger.
+        limit: Largest page, bytes, unless the text alone is larger; None: :data:`PAGE_LIMIT`.
 
     Raises:
         InputError: ``output`` is a folder, or a file cannot be written.
     """
     refuse_folder(output)
-    atomic_write(output, html_text(page, output, limit))
+    atomic_write(output, html_text(page, output, PAGE_LIMIT if limit is None else limit))
 
 
 def html_text(page: Page, output: Path | None = None, limit: int = PAGE_LIMIT) -> str:
@@ -93,7 +94,7 @@ def _filled(pictures: dict[str, EncodedImage], file: str, **values: object) -> M
 
 def _with_pictures(text: str, pictures: dict[str, EncodedImage], output: Path | None = None, limit: int = 0) -> str:
     """A text with the addresses of its pictures: data URIs while there is room, then files beside the output."""
-    room = limit - len(text.encode())
+    room = limit - len(text.encode()) - _NOTE_ROOM
     folder = None if output is None else output.with_name(f"{output.stem}_files")
     beside: dict[str, str] = {}
 
@@ -141,20 +142,23 @@ def _environment() -> Environment:
 
 def _drawn(figures: Sequence[Figure]) -> list[tuple[Figure, Markup]]:
     """Figures with their SVG, without charts that have no point to draw."""
-    return [(figure, Markup(svg)) for figure in figures if (svg := _svg(figure)) is not None]
+    return [(figure, Markup(_svg(figure))) for figure in figures if not isinstance(figure, Chart) or figure.has_points]
 
 
-def _svg(figure: Figure) -> str | None:
-    """SVG of a chart or colour bar; empty for pictures, None for charts without a point."""
+def _svg(figure: Figure) -> str:
+    """SVG of a chart or colour bar; empty for pictures."""
     if isinstance(figure, Image):
         return ""
     if isinstance(figure, ColorBar):
         return color_bar_svg(figure.limits, figure.unit, figure.color_map, figure.label, figure.name)
-    names, markers = figure.x_names, figure.markers
-    chart = line_chart(
-        figure.series, figure.x_label, figure.y_label, log_y=figure.log_y, x_names=names, markers=markers
+    return line_chart(
+        figure.series,
+        figure.x_label,
+        figure.y_label,
+        log_y=figure.log_y,
+        x_names=figure.x_names,
+        markers=figure.markers,
     )
-    return chart or None
 
 
 def _remove_former(folder: Path, kept: set[str]) -> None:

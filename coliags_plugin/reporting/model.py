@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -268,6 +269,15 @@ class Chart:
     group: str = ""
 
     kind: ClassVar[str] = "chart"
+
+    @property
+    def has_points(self) -> bool:
+        """Whether any point of it can be drawn."""
+        return any(
+            math.isfinite(x) and math.isfinite(y) and (y > 0.0 or not self.log_y)
+            for line in self.series
+            for x, y in zip(line.x, line.y, strict=True)
+        )
 
     @property
     def names(self) -> list[tuple[int, str]]:

@@ -12,7 +12,9 @@ from pydantic import BaseModel, ConfigDict, model_validator
 from typing_extensions import Self
 
 from coliags_plugin.core.errors import InputError, did_you_mean
-from coliags_plugin.results.display import Table, Value, value_text
+from coliags_plugin.reporting.display import DisplayTable
+from coliags_plugin.reporting.model import Column, Value, value_text
+from coliags_plugin.reporting.numbers import Direction
 
 #: Of the schema below; incremented whenever a reader of the older version would misread a newer file.
 VERSION = 1
@@ -26,7 +28,6 @@ SEEN_SUFFIX = "_seen"
 TRUTH_SUFFIX = "-truth"
 
 Format = Literal["coliags-result"]
-Direction = Literal["higher", "lower"]
 
 #: Marks a results file.
 FORMAT: Format = "coliags-result"
@@ -258,7 +259,7 @@ class Result(_Part):
             f"protocol {self.protocol.name} v{self.protocol.version}"
         )
 
-    def table(self) -> Table:
+    def table(self) -> DisplayTable:
         """Means of the metrics that a test set has, over every test set, with the reasons of those that are missing."""
         rows: list[dict[str, Value]] = [
             {"metric": name, "unit": metric.unit, **{key: part.mean(name) for key, part in self.sets.items()}}
@@ -267,18 +268,15 @@ class Result(_Part):
         ]
         reasons = {name: reason for part in self.sets.values() for name, reason in part.reasons.items()}
         without = {each: [name for name in reasons if reasons[name] == each] for each in reasons.values()}
-        return Table(
+        warnings = {name: part.transparency_warning for name, part in self.sets.items()}
+        sets = [Column(name, f"{name} ({len(part.frames)} frames)") for name, part in self.sets.items()]
+        return DisplayTable(
             self.title,
-            ("metric", "unit", *self.sets),
+            [Column("metric"), Column("unit"), *sets],
             rows,
-            {key: f"{key} ({len(part.frames)} frames)" for key, part in self.sets.items()},
             [
                 *(f"{self._not_shown(names)}: {reason}" for reason, names in without.items()),
-                *(
-                    f"warning, {name}: {text}"
-                    for name, part in self.sets.items()
-                    if (text := part.transparency_warning)
-                ),
+                *(f"warning, {name}: {text}" for name, text in warnings.items() if text),
             ],
         )
 

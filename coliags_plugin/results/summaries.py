@@ -1,9 +1,7 @@
-"""Summaries of a result: the content of ``metrics.json`` and ``per_frame.csv``."""
+"""Summaries of a result: the content of ``metrics.json``, and facts in words."""
 
 from __future__ import annotations
 
-import csv
-import io
 from typing import Any
 
 from coliags_plugin.results.record import SEEN_SUFFIX, Result
@@ -37,18 +35,6 @@ def means_summary(result: Result) -> dict[str, Any]:
 
 def _over_seen_pixels(name: str, result: Result) -> bool:
     return name.endswith(SEEN_SUFFIX) and name.removesuffix(SEEN_SUFFIX) in result.metrics
-
-
-def per_frame_table(result: Result) -> str:
-    """Content of ``per_frame.csv``: one line per frame and one column per metric, empty where a frame has none."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["set", "frame", *result.metrics])
-    for set_name, part in result.sets.items():
-        for index, frame in enumerate(part.frames):
-            values = (part.values[name][index] if name in part.values else None for name in result.metrics)
-            writer.writerow([set_name, frame, *("" if value is None else repr(value) for value in values)])
-    return text.getvalue()
 
 
 def facts(result: Result) -> dict[str, str]:

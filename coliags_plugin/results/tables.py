@@ -1,19 +1,42 @@
-"""Long tables of results: one row per run, test set, frame and metric."""
+"""Tables of single frames: wide, with one row per frame; and long, with one row per run, test set, frame and metric."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.results.record import Result
 
 
-class Row(NamedTuple):
+def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Rows below a heading as CSV: numbers with all their digits, None empty."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(head)
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def frame_rows(result: Result, metrics: Iterable[str]) -> Iterator[list[Any]]:
+    """Test set and name of every frame with its metrics; None where it lacks one."""
+    names = list(metrics)
+    for set_name, part in result.sets.items():
+        for index, frame in enumerate(part.frames):
+            values = (part.values[name][index] if name in part.values else None for name in names)
+            yield [set_name, frame, *values]
+
+
+def per_frame_table(result: Result) -> str:
+    """Content of ``per_frame.csv``: one line per frame and one column per metric, empty where a frame has none."""
+    return csv_text(["set", "frame", *result.metrics], frame_rows(result, result.metrics))
+
+
+class FrameValue(NamedTuple):
     """One value of one frame.
 
     Attributes:
@@ -45,14 +68,14 @@ class Row(NamedTuple):
     unit: str
 
 
-def rows(result: Result) -> Iterator[Row]:
+def rows(result: Result) -> Iterator[FrameValue]:
     """The rows of a result."""
     run = (result.key, result.method, result.scene.name, result.scene.split, result.seed)
     protocol = (result.protocol.name, result.protocol.version)
     for set_name, part in result.sets.items():
         for metric, values in part.values.items():
             for frame, value in zip(part.frames, values, strict=True):
-                yield Row(*run, *protocol, set_name, frame, metric, value, result.metrics[metric].unit)
+                yield FrameValue(*run, *protocol, set_name, frame, metric, value, result.metrics[metric].unit)
 
 
 def write_csv(path: Path, results: Sequence[Result]) -> None:
@@ -61,12 +84,7 @@ def write_csv(path: Path, results: Sequence[Result]) -> None:
     Raises:
         InputError: The file cannot be written.
     """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(Row._fields)
-    for result in results:
-        writer.writerows(rows(result))
-    atomic_write(path, text.getvalue())
+    atomic_write(path, csv_text(FrameValue._fields, (row for result in results for row in rows(result))))
 
 
 def write_parquet(path: Path, results: Sequence[Result]) -> None:
@@ -84,10 +102,10 @@ def write_parquet(path: Path, results: Sequence[Result]) -> None:
             "an installation with the extra `tables`",
             "pip install 'coliags_plugin[tables]', or use --format csv",
         ) from error
-    types = dict.fromkeys(Row._fields, pyarrow.string())
+    types = dict.fromkeys(FrameValue._fields, pyarrow.string())
     types |= {"seed": pyarrow.int64(), "protocol_version": pyarrow.int64(), "value": pyarrow.float64()}
-    found = [row._asdict() for result in results for row in rows(result)]
-    table = pyarrow.Table.from_pylist(found, schema=pyarrow.schema(list(types.items())))
+    values = [row._asdict() for result in results for row in rows(result)]
+    table = pyarrow.Table.from_pylist(values, schema=pyarrow.schema(list(types.items())))
     buffer = io.BytesIO()
     parquet.write_table(table, buffer)
     atomic_write(path, buffer.getvalue())

@@ -17,7 +17,7 @@ from coliags_plugin.results.finding import find_results
 from coliags_plugin.results.nerfbaselines import nerfbaselines_result
 from coliags_plugin.results.reading import write_result
 from coliags_plugin.results.record import CostRecord, MetricRecord, ProtocolRecord
-from coliags_plugin.results.tables import Row, rows, write_csv, write_parquet
+from coliags_plugin.results.tables import FrameValue, rows, write_csv, write_parquet
 from tests.commands import refused, run
 from tests.results.made import METRICS, made_result, made_set
 
@@ -97,8 +97,8 @@ def test_there_is_one_row_per_value():
     assert len(found) == 3 * 2 + 3 * 1
     assert len({(row.set, row.frame, row.metric) for row in found}) == len(found)
     run = ("f" * 16, "ablations/none", "wall", "every-8th", 0, "mine", 3)
-    assert found[0] == Row(*run, "test", "0000", "psnr", 30.0, "dB")
-    assert found[-1] == Row(*run, "rotation", "r", "depth_mse", 1e-300, "mm^2")
+    assert found[0] == FrameValue(*run, "test", "0000", "psnr", 30.0, "dB")
+    assert found[-1] == FrameValue(*run, "rotation", "r", "depth_mse", 1e-300, "mm^2")
 
 
 def test_csv_keeps_every_digit_and_leaves_missing_values_empty(tmp_path):
@@ -119,7 +119,7 @@ def test_parquet_holds_the_same_rows(tmp_path):
     assert table.to_pylist() == expected
     types = {field.name: str(field.type) for field in table.schema}
     numbers = {"seed": "int64", "protocol_version": "int64", "value": "double"}
-    assert types == {**dict.fromkeys(Row._fields, "string"), **numbers}
+    assert types == {**dict.fromkeys(FrameValue._fields, "string"), **numbers}
 
 
 def test_parquet_of_no_value_at_all_has_the_columns(tmp_path):

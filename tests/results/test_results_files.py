@@ -18,7 +18,8 @@ from coliags_plugin.results.hashing import ArraysHash, metrics_sha256
 from coliags_plugin.results.identity import result_key
 from coliags_plugin.results.reading import read_result, write_result
 from coliags_plugin.results.record import VERSION, MetricRecord, ProfileRecord, Result
-from coliags_plugin.results.summaries import means_summary, per_frame_table
+from coliags_plugin.results.summaries import means_summary
+from coliags_plugin.results.tables import per_frame_table
 from tests.results.made import METRICS, made_result, made_set, numbers, results
 
 quick = settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -327,3 +328,23 @@ def test_a_config_and_its_json_have_the_same_key():
     config = {"size": (1, 2), "far": math.inf}
     read = json.loads(json.dumps({"size": [1, 2], "far": "Infinity"}))
     assert result_key(**{**KEY, "config": config}) == result_key(**{**KEY, "config": read})
+
+
+def test_means_of_a_result():
+    result = made_result({"test": made_set(), "rotation": made_set(("a",), (20.0,), (None,))})
+    assert result.mean("psnr") == 30.75 and result.mean("psnr", "rotation") == 20.0
+    assert result.mean("lpips") is None and result.mean("depth_mse", "rotation") is None
+    with pytest.raises(InputError, match=r"no metric 'pnsr'.*Did you mean 'psnr'"):
+        result.mean("pnsr")
+    with pytest.raises(InputError, match=r"no test set 'rotatoin'.*Did you mean 'rotation'"):
+        result.mean("psnr", "rotatoin")
+
+
+def test_a_result_in_one_line_and_as_a_table():
+    result = made_result({"test": made_set(), "rotation": made_set(("a",), (20.0,), (None,))})
+    assert repr(result) == "coliags on wall, seed 0, 60 steps, protocol paper v1: psnr 30.75 dB, depth_mse 0.25 mm^2"
+    table = result.table()
+    assert table.rows[0] == {"metric": "psnr", "unit": "dB", "test": 30.75, "rotation": 20.0}
+    assert list(table.notes) == ["not shown: lpips: no weights"]
+    assert "test (2 frames)  rotation (1 frames)" in str(result) == str(table)
+    assert result._repr_html_() == table._repr_html_()

@@ -5,28 +5,28 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from coliags_plugin.comparison.report.study import Cell, Study
+from coliags_plugin.comparison.report.study import Study, StudyRun
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.outputs.page import leaves
+from coliags_plugin.reporting.model import leaves
 from coliags_plugin.results.record import Result
 
 
-def refuse_incomparable(cells: Sequence[Cell]) -> None:
+def refuse_incomparable(runs: Sequence[StudyRun]) -> None:
     """Refuse results that do not belong into one table.
 
     Raises:
         InputError: Two results have different protocols or versions of one; two of one scene and split have different
             sizes, training frames, test frames or true images; or a method shares no scene with the others.
     """
-    first: dict[tuple[str, str], Cell] = {}
-    for cell in cells:
-        _refuse_protocols(cells[0], cell)
-        scene = cell.result.scene
-        _refuse_scenes(first.setdefault((scene.name, scene.split), cell), cell)
-    _refuse_isolated(cells)
+    first: dict[tuple[str, str], StudyRun] = {}
+    for run in runs:
+        _refuse_protocols(runs[0], run)
+        scene = run.result.scene
+        _refuse_scenes(first.setdefault((scene.name, scene.split), run), run)
+    _refuse_isolated(runs)
 
 
-def _refuse_protocols(first: Cell, other: Cell) -> None:
+def _refuse_protocols(first: StudyRun, other: StudyRun) -> None:
     one, two = first.result.protocol, other.result.protocol
     if (one.name, one.version) != (two.name, two.version):
         raise InputError(
@@ -37,7 +37,7 @@ def _refuse_protocols(first: Cell, other: Cell) -> None:
         )
 
 
-def _refuse_scenes(first: Cell, other: Cell) -> None:
+def _refuse_scenes(first: StudyRun, other: StudyRun) -> None:
     one, two = first.result, other.result
     both = f"{_title(first)} and {_title(other)}"
     if one.scene.size != two.scene.size:
@@ -65,23 +65,23 @@ def _refuse_scenes(first: Cell, other: Cell) -> None:
             )
 
 
-def _refuse_isolated(cells: Sequence[Cell]) -> None:
+def _refuse_isolated(runs: Sequence[StudyRun]) -> None:
     """Refuse a method that no other one can be compared with."""
-    places: dict[str, set[tuple[str, str]]] = {}
-    for cell in cells:
-        places.setdefault(cell.method, set()).add((cell.result.scene.name, cell.result.scene.split))
-    for method, own in places.items():
-        others = {place for other, found in places.items() if other != method for place in found}
+    scenes: dict[str, set[tuple[str, str]]] = {}
+    for run in runs:
+        scenes.setdefault(run.method, set()).add((run.result.scene.name, run.result.scene.split))
+    for method, own in scenes.items():
+        others = {each for other, theirs in scenes.items() if other != method for each in theirs}
         if not others or own & others:
             continue
         if {scene for scene, _ in own} & {scene for scene, _ in others}:
-            one, two = ("', '".join(sorted({split for _, split in found})) for found in (own, others))
+            one, two = ("', '".join(sorted({split for _, split in each})) for each in (own, others))
             raise InputError(
                 f"{method} was trained on split '{one}', the other methods on split '{two}'",
                 "one split for every method",
                 "Train on the same split",
             )
-        one, two = (", ".join(sorted({scene for scene, _ in found})) for found in (own, others))
+        one, two = (", ".join(sorted({scene for scene, _ in each})) for each in (own, others))
         raise InputError(
             f"no scene in common: {method} has {one}, the other methods have {two}",
             "methods on the same scenes",
@@ -89,8 +89,8 @@ def _refuse_isolated(cells: Sequence[Cell]) -> None:
         )
 
 
-def _title(cell: Cell) -> str:
-    return f"{cell.method} on {cell.scene} ({cell.stamp})"
+def _title(run: StudyRun) -> str:
+    return f"{run.method} on {run.scene} ({run.stamp})"
 
 
 def _first_difference(one: Mapping[str, Sequence[str]], two: Mapping[str, Sequence[str]]) -> str:
@@ -105,8 +105,8 @@ def _first_difference(one: Mapping[str, Sequence[str]], two: Mapping[str, Sequen
 
 def cautions(study: Study) -> list[str]:
     """Differences between the results that limit their comparison, and scenes that methods lack."""
-    results = [cell.result for cell in study.cells]
-    found = [
+    results = [run.result for run in study.runs]
+    texts = [
         *_missing_scenes(study),
         *_unpaired_seeds(study),
         *_steps(study),
@@ -115,52 +115,53 @@ def cautions(study: Study) -> list[str]:
     ]
     for key, what in (("package_version", "versions of the package"), ("git", "states of the source")):
         if len({str(result.software[key]) for result in results if result.software.get(key) is not None}) > 1:
-            found.append(f"The runs come from different {what}.")
+            texts.append(f"The runs come from different {what}.")
     sizes = dict.fromkeys(result.scene.size for result in results)
     if len(sizes) > 1:
         each = ", ".join(f"{width} x {height}" for width, height in sizes)
-        found.append(f"The scenes have images of different sizes: {each} px.")
+        texts.append(f"The scenes have images of different sizes: {each} px.")
     differing = [
-        key for scene in study.scenes() for key in _differing_data([r for r in results if r.scene.name == scene])
+        key for scene in study.scenes for key in _differing_data([r for r in results if r.scene.name == scene])
     ]
     if differing:
-        found.append(f"Runs of one scene record different data, see Provenance: {', '.join(dict.fromkeys(differing))}.")
-    return found
+        texts.append(f"Runs of one scene record different data, see Provenance: {', '.join(dict.fromkeys(differing))}.")
+    return texts
 
 
 def _missing_scenes(study: Study) -> list[str]:
-    found = []
+    missing = []
     for split in dict.fromkeys(part.split for part in study.parts):
         parts = [part for part in study.parts if part.split == split]
-        scenes = list(dict.fromkeys(scene for part in parts for scene in study.scenes(part)))
+        scenes = list(dict.fromkeys(scene for part in parts for scene in part.scenes))
         for method in study.methods:
-            lacking = [scene for scene in scenes if not any(study.runs(part, scene, method) for part in parts)]
+            lacking = [scene for scene in scenes if not any(part.runs(scene, method) for part in parts)]
             if lacking:
-                found.append(
+                missing.append(
                     f"{method} has no result of {', '.join(lacking)}: means and tests are over the scenes that the "
                     "compared methods have in common."
                 )
-    return found
+    return missing
 
 
 def _unpaired_seeds(study: Study) -> list[str]:
     seeds: dict[tuple[str, str], dict[str, set[int]]] = {}
-    for cell in study.cells:
-        place = (cell.scene, cell.result.scene.split)
-        seeds.setdefault(place, {}).setdefault(cell.method, set()).add(cell.result.seed)
-    found = []
+    for run in study.runs:
+        by_method = seeds.setdefault((run.scene, run.result.scene.split), {})
+        by_method.setdefault(run.method, set()).add(run.result.seed)
+    differing = []
     for (scene, _), methods in seeds.items():
         if len({frozenset(own) for own in methods.values()}) > 1:
             each = "; ".join(f"{method}: {', '.join(map(str, sorted(own)))}" for method, own in methods.items())
-            found.append(f"{scene} ({each})")
-    if not found:
+            differing.append(f"{scene} ({each})")
+    if not differing:
         return []
-    more = f" and {len(found) - 1} more" if len(found) > 1 else ""
-    return [f"The methods were trained with different seeds on {found[0]}{more}; a mean over more seeds varies less."]
+    more = f" and {len(differing) - 1} more" if len(differing) > 1 else ""
+    first = differing[0]
+    return [f"The methods were trained with different seeds on {first}{more}; a mean over more seeds varies less."]
 
 
 def _steps(study: Study) -> list[str]:
-    steps = {method: sorted({cell.result.steps for cell in own}) for method, own in study.by_method.items()}
+    steps = {method: sorted({run.result.steps for run in own}) for method, own in study.by_method.items()}
     if len({tuple(own) for own in steps.values()}) == 1 and all(len(own) == 1 for own in steps.values()):
         return []
     each = ", ".join(f"{method} {' or '.join(f'{count:,}' for count in own)}" for method, own in steps.items())
@@ -169,7 +170,7 @@ def _steps(study: Study) -> list[str]:
 
 def _untrained_views(study: Study) -> list[str]:
     """Cautions on how view modules treat held-out views (gains, pose corrections), if the methods differ in it."""
-    by_method = {method: cells[0].result.provenance.get("untrained_views") for method, cells in study.by_method.items()}
+    by_method = {method: runs[0].result.provenance.get("untrained_views") for method, runs in study.by_method.items()}
     treated = {method: dict(own) if isinstance(own, Mapping) else {} for method, own in by_method.items()}
     if all(own == treated[study.methods[0]] for own in treated.values()):
         return []
@@ -178,9 +179,9 @@ def _untrained_views(study: Study) -> list[str]:
 
 def _transparent(study: Study) -> list[str]:
     return [
-        f"{cell.method} on {cell.scene}, set {name}: {part.transparency_warning}."
-        for cell in study.cells
-        for name, part in cell.result.sets.items()
+        f"{run.method} on {run.scene}, set {name}: {part.transparency_warning}."
+        for run in study.runs
+        for name, part in run.result.sets.items()
         if part.transparency_warning
     ]
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from coliags_plugin.comparison.plan_file import FAILURES, PLAN_FILE, RESULTS, RUNS, PlannedCell, read_plan
-from coliags_plugin.comparison.report.study import Cell, Failure
+from coliags_plugin.comparison.report.study import MissingResult, StudyRun
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import json_text, parse_json, read_json
 from coliags_plugin.results.reading import RESULT_FILE, read_result
@@ -19,11 +19,11 @@ _SEED = re.compile(r"s(\d+)-")
 
 
 @dataclass(frozen=True)
-class FoundResult:
+class ResultSource:
     """A results file and what it holds."""
 
     file: Path
-    cell: Cell
+    run: StudyRun
 
 
 def is_comparison(folder: Path) -> bool:
@@ -31,7 +31,7 @@ def is_comparison(folder: Path) -> bool:
     return (folder / PLAN_FILE).is_file() or (folder / RESULTS).is_dir() or any(folder.glob(_CELL))
 
 
-def read_comparison(folder: Path, protocol: str) -> tuple[list[FoundResult], list[Failure]]:
+def read_comparison(folder: Path, protocol: str) -> tuple[list[ResultSource], list[MissingResult]]:
     """Results and failures of one protocol: those of the plan, in its order; all that are there without a plan.
 
     Raises:
@@ -39,69 +39,68 @@ def read_comparison(folder: Path, protocol: str) -> tuple[list[FoundResult], lis
     """
     plan = read_plan(folder)
     if plan is not None:
-        return _planned(folder, plan.cells, protocol)
+        return _read_planned(folder, plan.cells, protocol)
     if (folder / RESULTS).is_dir():
-        return _unplanned(folder / RESULTS, folder / RUNS, protocol), list(_failures(folder))
-    return _unplanned(folder, None, protocol), []
+        return _read_unplanned(folder / RESULTS, folder / RUNS, protocol), list(_read_failures(folder))
+    return _read_unplanned(folder, None, protocol), []
 
 
-def read_file(file: Path, stamp: str, run: Path | None = None) -> FoundResult:
+def read_file(file: Path, stamp: str, run: Path | None = None) -> ResultSource:
     """A results file under the name of its method."""
     result = read_result(file)
-    return FoundResult(file, Cell(result.method, result, stamp, run))
+    return ResultSource(file, StudyRun(result.method, result, stamp, run))
 
 
-def _planned(folder: Path, cells: Sequence[PlannedCell], protocol: str) -> tuple[list[FoundResult], list[Failure]]:
-    found, failures = [], []
+def _read_planned(
+    folder: Path, cells: Sequence[PlannedCell], protocol: str
+) -> tuple[list[ResultSource], list[MissingResult]]:
+    sources, missing = [], []
     runs: dict[str, Path] = {}  # by key: what is the same as another method under a second name has no run of its own
-    for entry in cells:
-        if entry.protocol != protocol:
-            continue
+    for entry in (entry for entry in cells if entry.protocol == protocol):
         file = folder / entry.result
         if file.is_file():
-            one = read_file(file, file.stem)
+            source = read_file(file, file.stem)
             own = _with_images(folder / entry.run, protocol)
             if own is not None:
-                runs[one.cell.result.key] = own
-            found.append(replace(one, cell=replace(one.cell, method=entry.method, run=own)))
+                runs[source.run.result.key] = own
+            sources.append(replace(source, run=replace(source.run, method=entry.method, run=own)))
         else:
             failure = folder / FAILURES / Path(entry.result).relative_to(RESULTS)
-            reason = _reason(failure) if failure.is_file() else None
-            failures.append(Failure(entry.scene, entry.method, entry.seed, reason))
+            reason = _failure_reason(failure) if failure.is_file() else None
+            missing.append(MissingResult(entry.scene, entry.method, entry.seed, reason))
     _refuse_other_protocols(folder, protocol, {entry.protocol for entry in cells})
-    return [one if one.cell.run else _with_run(one, runs) for one in found], failures
+    with_runs = [replace(one.run, run=one.run.run or runs.get(one.run.result.key)) for one in sources]
+    return [replace(one, run=run) for one, run in zip(sources, with_runs, strict=True)], missing
 
 
-def _with_run(found: FoundResult, runs: Mapping[str, Path]) -> FoundResult:
-    return replace(found, cell=replace(found.cell, run=runs.get(found.cell.result.key)))
-
-
-def _unplanned(folder: Path, runs: Path | None, protocol: str) -> list[FoundResult]:
+def _read_unplanned(folder: Path, runs: Path | None, protocol: str) -> list[ResultSource]:
     """The name of a method's folder tells variants of one method apart."""
-    found, protocols = [], set()
+    sources, protocols = [], set()
     for file in sorted(folder.glob(_CELL)):
-        one = read_file(file, file.stem)
-        result, directory = one.cell.result, file.parent.name
+        source = read_file(file, file.stem)
+        result, directory = source.run.result, file.parent.name
         protocols.add(result.protocol.name)
         if result.protocol.name != protocol:
             continue
         method = result.method if result.method.replace("/", "-") == directory else directory
-        run = None if runs is None else _run_of(runs / file.parent.relative_to(folder), file.stem, result.key, protocol)
-        found.append(replace(one, cell=replace(one.cell, method=method, run=run)))
+        own = (
+            None if runs is None else _find_run(runs / file.parent.relative_to(folder), file.stem, result.key, protocol)
+        )
+        sources.append(replace(source, run=replace(source.run, method=method, run=own)))
     _refuse_other_protocols(folder, protocol, protocols)
-    return found
+    return sources
 
 
-def _refuse_other_protocols(folder: Path, protocol: str, found: set[str]) -> None:
-    if found and protocol not in found:
+def _refuse_other_protocols(folder: Path, protocol: str, protocols: set[str]) -> None:
+    if protocols and protocol not in protocols:
         raise InputError(
-            f"{folder} has results of protocol {', '.join(sorted(found))} only",
+            f"{folder} has results of protocol {', '.join(sorted(protocols))} only",
             f"some of '{protocol}'",
-            f"Pass --protocol {min(found)}",
+            f"Pass --protocol {min(protocols)}",
         )
 
 
-def _run_of(folder: Path, stem: str, key: str, protocol: str) -> Path | None:
+def _find_run(folder: Path, stem: str, key: str, protocol: str) -> Path | None:
     """The run whose evaluation has the key; runs have keys of their own in their names."""
     seed = stem.partition("-")[0]
     for run in sorted(folder.glob(f"{seed}-*")):
@@ -119,16 +118,16 @@ def _with_images(run: Path, protocol: str) -> Path | None:
     return run if (run / "eval" / protocol / "renders").is_dir() else None
 
 
-def _failures(folder: Path) -> Iterator[Failure]:
+def _read_failures(folder: Path) -> Iterator[MissingResult]:
     """Cells that failed and have no result."""
     for file in sorted((folder / FAILURES).glob(_CELL)):
         place = file.relative_to(folder / FAILURES)
         seed = _SEED.match(file.name)
         if seed is not None and not (folder / RESULTS / place).is_file():
-            yield Failure(place.parts[0], place.parts[1], int(seed.group(1)), _reason(file))
+            yield MissingResult(place.parts[0], place.parts[1], int(seed.group(1)), _failure_reason(file))
 
 
-def _reason(file: Path) -> str:
+def _failure_reason(file: Path) -> str:
     record = read_json(file, "the reason of a failure")
     reason = record.get("reason") if isinstance(record, dict) else None
     return str(reason or "no reason was recorded")

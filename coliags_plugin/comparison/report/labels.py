@@ -4,71 +4,60 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
-from coliags_plugin.comparison.report.study import Cell
+from coliags_plugin.comparison.report.study import StudyRun
 from coliags_plugin.results.identity import training_config
 
 
-def told_apart(cells: Sequence[Cell]) -> list[Cell]:
-    """The cells with labels under which every method has one config and one run per scene, split and seed.
+def disambiguate_labels(runs: Sequence[StudyRun]) -> list[StudyRun]:
+    """The runs with labels under which every method has one config and one run per scene, split and seed.
 
     Runs of one config that differ in seed share a label. Where a method has several configs or several runs of one
     seed, its label is followed by what tells them apart: steps, the stamp of the run, or a hash of the config.
     """
     groups: dict[str, list[int]] = {}
-    for index, cell in enumerate(cells):
-        groups.setdefault(cell.method, []).append(index)
-    labelled = list(cells)
+    for index, run in enumerate(runs):
+        groups.setdefault(run.method, []).append(index)
+    labelled = list(runs)
     for own in groups.values():
-        group = [cells[index] for index in own]
-        if not _clear(group):
-            for index, label in zip(own, _distinct(group), strict=True):
+        group = [runs[index] for index in own]
+        if not _is_one_method(group):
+            for index, label in zip(own, _distinct_labels(group), strict=True):
                 labelled[index] = replace(labelled[index], method=label)
     return labelled
 
 
-def _clear(cells: Sequence[Cell]) -> bool:
-    """Whether cells of one label are one method: one config on each scene and split, and one run per seed."""
+def _is_one_method(runs: Sequence[StudyRun]) -> bool:
+    """Whether runs of one label are one method: one config on each scene and split, and one run per seed."""
     configs: dict[tuple[str, str], str] = {}
-    seen = set()
-    for cell in cells:
-        scene = cell.result.scene
-        place, config = (scene.name, scene.split), _config_hash(cell)
-        if configs.setdefault(place, config) != config or (place, cell.result.seed) in seen:
+    seeds = set()
+    for run in runs:
+        scene = run.result.scene
+        key, config = (scene.name, scene.split), _config_hash(run)
+        if configs.setdefault(key, config) != config or (key, run.result.seed) in seeds:
             return False
-        seen.add((place, cell.result.seed))
+        seeds.add((key, run.result.seed))
     return True
 
 
-def _distinct(cells: Sequence[Cell]) -> list[str]:
-    one_scene = len({cell.scene for cell in cells}) == 1
-    ways: list[Callable[[Cell], str]] = [_steps, _stamp, _config] if one_scene else [_steps, _config, _stamp]
-    for way in ways:
-        labels = [f"{cell.method} · {way(cell)}" for cell in cells]
-        groups = ([cell for cell, own in zip(cells, labels, strict=True) if own == label] for label in set(labels))
-        if all(map(_clear, groups)):
+def _distinct_labels(runs: Sequence[StudyRun]) -> list[str]:
+    one_scene = len({run.scene for run in runs}) == 1
+    steps, stamps = [f"{run.result.steps:,} steps" for run in runs], [run.stamp for run in runs]
+    configs = [f"config {_config_hash(run)[:8]}" for run in runs]
+    for suffixes in (steps, stamps, configs) if one_scene else (steps, configs, stamps):
+        labels = [f"{run.method} · {suffix}" for run, suffix in zip(runs, suffixes, strict=True)]
+        groups = ([run for run, own in zip(runs, labels, strict=True) if own == label] for label in set(labels))
+        if all(map(_is_one_method, groups)):
             return labels
-    labels = [f"{cell.method} · {cell.stamp}" for cell in cells]
+    labels = [f"{run.method} · {run.stamp}" for run in runs]
     return [
         f"{label} ({labels[: index + 1].count(label)})" if labels.count(label) > 1 else label
         for index, label in enumerate(labels)
     ]
 
 
-def _steps(cell: Cell) -> str:
-    return f"{cell.result.steps:,} steps"
-
-
-def _stamp(cell: Cell) -> str:
-    return cell.stamp
-
-
-def _config(cell: Cell) -> str:
-    return f"config {_config_hash(cell)[:8]}"
-
-
-def _config_hash(cell: Cell) -> str:
-    text = json.dumps([training_config(cell.result.config), cell.result.steps], sort_keys=True)
+def _config_hash(run: StudyRun) -> str:
+    text = json.dumps([training_config(run.result.config), run.result.steps], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()

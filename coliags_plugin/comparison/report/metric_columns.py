@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from coliags_plugin.comparison.report.published import published_for
 from coliags_plugin.comparison.report.study import Part, Study
-from coliags_plugin.comparison.report.tables import Column
 from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.reporting.model import Column
 from coliags_plugin.results.record import MAIN_SET, SEEN_SUFFIX
 
 #: Shown unless the reader chooses others.
@@ -36,7 +36,6 @@ _NAMES = {
     "sparse_depth_median": "Sparse depth, median",
     "sparse_depth_p90": "Sparse depth, 90th percentile",
 }
-_SET_TITLES = {"test": "held out along the path", "rotation": "beyond the path"}
 
 
 def metric_title(metric: str) -> str:
@@ -44,24 +43,6 @@ def metric_title(metric: str) -> str:
     base = metric.removesuffix(SEEN_SUFFIX)
     title = _NAMES.get(base) or base.replace("_", " ").capitalize()
     return f"{title}, seen pixels" if metric != base else title
-
-
-def set_title(set_name: str) -> str:
-    """Title of a test set."""
-    known = _SET_TITLES.get(set_name)
-    return f"{set_name}: {known}" if known else set_name
-
-
-def part_title(study: Study, part: Part) -> str:
-    """Title of a test set, with its split where the study has several."""
-    several = len({each.split for each in study.parts}) > 1
-    return f"{set_title(part.set_name)}, split {part.split}" if several else set_title(part.set_name)
-
-
-def part_name(study: Study, part: Part) -> str:
-    """Short name of a part, for identifiers."""
-    several = len({each.split for each in study.parts}) > 1
-    return f"{part.set_name}-{part.split}" if several else part.set_name
 
 
 def check_columns(study: Study, chosen: Sequence[str]) -> None:
@@ -76,48 +57,51 @@ def check_columns(study: Study, chosen: Sequence[str]) -> None:
             raise InputError(f"--columns {name}: no such metric", f"of {', '.join(known)}", did_you_mean(name, known))
 
 
-def metric_columns(study: Study, part: Part, chosen: Sequence[str] = ()) -> list[Column]:
+def metric_columns(part: Part, chosen: Sequence[str] = ()) -> list[Column]:
     """Columns of a part: every metric that it has, or that no part has; those not chosen are there, but not shown.
 
     Unless chosen, metrics that have no value in the part, nor a published one, are not shown either.
 
     Args:
-        study: The results.
         part: Test set and split.
         chosen: Metrics to show, in this order, before the others; empty: :data:`DEFAULT_COLUMNS`.
     """
-    own = [name for name in study.metrics if not _belongs_elsewhere(study, part, name)]
-    wanted = own if ALL_COLUMNS in chosen else chosen or _default_columns(study, part)
+    metrics = part.study.metrics
+    own = [name for name in metrics if not _belongs_elsewhere(part, name)]
+    wanted = own if ALL_COLUMNS in chosen else chosen or _default_columns(part)
     shown = [name for name in wanted if name in own]
-    ordered = dict.fromkeys([*shown, *own])
     return [
-        Column(name, metric_title(name), study.metrics[name].unit, study.metrics[name].direction, name in shown)
-        for name in ordered
+        Column(name, metric_title(name), metrics[name].unit, metrics[name].direction, name in shown)
+        for name in dict.fromkeys([*shown, *own])
     ]
 
 
-def _default_columns(study: Study, part: Part) -> list[str]:
-    default = DEFAULT_COLUMNS if part.set_name == MAIN_SET else _BEYOND_THE_PATH
-    published = published_for(study, part)
-    kept = set() if published is None else {name for numbers in published.methods.values() for name in numbers}
-    empty = set(empty_metrics(study, part)) - kept
-    return [name for name in (_available(study, part, name) for name in default) if name not in empty]
-
-
-def empty_metrics(study: Study, part: Part) -> list[str]:
+def empty_metrics(part: Part) -> list[str]:
     """Metrics that no result has a value of in this part."""
-    return [name for name in study.metrics if not any(study.values(part, name).values())]
+    return [name for name in part.study.metrics if not _has_values(part, name)]
 
 
-def _available(study: Study, part: Part, metric: str) -> str:
+def _default_columns(part: Part) -> list[str]:
+    default = DEFAULT_COLUMNS if part.set_name == MAIN_SET else _BEYOND_THE_PATH
+    published = published_for(part)
+    kept = set() if published is None else {name for numbers in published.methods.values() for name in numbers}
+    empty = set(empty_metrics(part)) - kept
+    return [name for name in (_available(part, name) for name in default) if name not in empty]
+
+
+def _has_values(part: Part, metric: str) -> bool:
+    return any(part.values(metric).values())
+
+
+def _available(part: Part, metric: str) -> str:
     """A default column, or what stands for it where it is empty."""
     other = _INSTEAD.get(metric, metric)
-    return metric if any(study.values(part, metric).values()) or not any(study.values(part, other).values()) else other
+    return metric if _has_values(part, metric) or not _has_values(part, other) else other
 
 
-def _belongs_elsewhere(study: Study, part: Part, metric: str) -> bool:
+def _belongs_elsewhere(part: Part, metric: str) -> bool:
     """Whether a metric over the seen pixels is that of other parts only."""
     if not metric.endswith(SEEN_SUFFIX):
         return False
-    having = {other for other in study.parts if any(study.values(other, metric).values())}
+    having = [other for other in part.study.parts if _has_values(other, metric)]
     return bool(having) and part not in having

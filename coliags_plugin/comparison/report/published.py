@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from coliags_plugin.comparison.report.study import Part, Study
+from coliags_plugin.comparison.report.study import Part
 from coliags_plugin.results.record import MAIN_SET, Result
 
 _METHODS = ("REIM-NeRF", "2DGS", "Gaussian Pancakes", "3DGS", "Scaffold-GS", "PR-Endo", "ColIAGS")
@@ -90,11 +90,11 @@ _ENDOGSLAM_SEQUENCES = 10
 _ROTATECOLON_FRAMES = (381, 223)
 
 
-def published_for(study: Study, part: Part) -> PublishedBenchmark | None:
+def published_for(part: Part) -> PublishedBenchmark | None:
     """Published numbers of the benchmark that a part is; None where it is another, or not all of it."""
     if part.set_name != MAIN_SET:
         return None
-    by_name = {cell.scene: cell.result for cell in study.cells if study.record(cell, part) is not None}
+    by_name = {run.scene: run.result for run in part.study.runs if part.record(run) is not None}
     scenes = [*by_name.values()]
     tests: tuple[tuple[PublishedBenchmark, Callable[[list[Result]], bool]], ...] = (
         (_C3VD, _is_c3vd),

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from coliags_plugin.comparison.report.comparability import refuse_incomparable
-from coliags_plugin.comparison.report.comparison_folders import FoundResult, is_comparison, read_comparison, read_file
-from coliags_plugin.comparison.report.labels import told_apart
-from coliags_plugin.comparison.report.study import Cell, Failure, Study
+from coliags_plugin.comparison.report.comparison_folders import ResultSource, is_comparison, read_comparison, read_file
+from coliags_plugin.comparison.report.labels import disambiguate_labels
+from coliags_plugin.comparison.report.study import MissingResult, Study, StudyRun
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.results.reading import RESULT_FILE
 from coliags_plugin.results.record import TRUTH_SUFFIX
@@ -28,42 +28,41 @@ def read_study(paths: Sequence[Path], protocol: str = "paper", methods: Sequence
     """
     if not paths:
         raise InputError("no results", "run folders, results files or the folder of a comparison", "Name at least one")
-    failures: list[Failure] = []
-    found: list[FoundResult] = []
+    missing: list[MissingResult] = []
+    sources: list[ResultSource] = []
     for path in paths:
         if not path.is_dir():
-            found.append(read_file(path, path.stem))
+            sources.append(read_file(path, path.stem))
         elif is_comparison(path):
             results, failed = read_comparison(path, protocol)
-            found += results
-            failures += failed
+            sources += results
+            missing += failed
         else:
-            found.append(_read_run(path, protocol))
-    _refuse_twice(found)
-    cells = [one.cell for one in found]
-    if not cells:
-        raise _nothing_yet(paths, failures)
-    labelled = told_apart(cells)
+            sources.append(_read_run(path, protocol))
+    _refuse_twice(sources)
+    if not sources:
+        raise _nothing_yet(paths, missing)
+    runs = disambiguate_labels([source.run for source in sources])
     if methods:
-        labelled, failures = _only(methods, labelled, failures)
-    refuse_incomparable(labelled)
-    return Study(tuple(labelled), tuple(failures))
+        runs, missing = _only(methods, runs, missing)
+    refuse_incomparable(runs)
+    return Study(tuple(runs), tuple(missing))
 
 
 def _only(
-    methods: Sequence[str], cells: Sequence[Cell], failures: Sequence[Failure]
-) -> tuple[list[Cell], list[Failure]]:
+    methods: Sequence[str], runs: Sequence[StudyRun], missing: Sequence[MissingResult]
+) -> tuple[list[StudyRun], list[MissingResult]]:
     """Results and failures of some methods, in their order."""
-    known = list(dict.fromkeys([cell.method for cell in cells] + [failure.method for failure in failures]))
+    known = list(dict.fromkeys([run.method for run in runs] + [one.method for one in missing]))
     for name in methods:
         if name not in known:
             those = ", ".join(known)
             raise InputError(f"no method '{name}' among the results", f"one of {those}", did_you_mean(name, known))
-    kept = [cell for name in dict.fromkeys(methods) for cell in cells if name == cell.method]
-    return kept, [failure for failure in failures if failure.method in methods]
+    kept = [run for name in dict.fromkeys(methods) for run in runs if name == run.method]
+    return kept, [one for one in missing if one.method in methods]
 
 
-def _read_run(folder: Path, protocol: str) -> FoundResult:
+def _read_run(folder: Path, protocol: str) -> ResultSource:
     evaluation = folder / "eval" / protocol
     file = evaluation / RESULT_FILE
     if file.is_file():
@@ -89,20 +88,21 @@ def _read_run(folder: Path, protocol: str) -> FoundResult:
     )
 
 
-def _refuse_twice(found: Iterable[FoundResult]) -> None:
-    seen: set[Path] = set()
-    for one in found:
-        if one.file.resolve() in seen:
-            raise InputError(f"{one.cell.run or one.file} is given twice", "each result once")
-        seen.add(one.file.resolve())
+def _refuse_twice(sources: Iterable[ResultSource]) -> None:
+    files: set[Path] = set()
+    for source in sources:
+        file = source.file.resolve()
+        if file in files:
+            raise InputError(f"{source.run.run or source.file} is given twice", "each result once")
+        files.add(file)
 
 
-def _nothing_yet(paths: Sequence[Path], failures: Sequence[Failure]) -> InputError:
+def _nothing_yet(paths: Sequence[Path], missing: Sequence[MissingResult]) -> InputError:
     where = ", ".join(map(str, paths))
-    if failures:
-        first = failures[0]
+    if missing:
+        first = missing[0]
         return InputError(
-            f"none of the {len(failures)} cells of {where} has a result; {first.method} on {first.scene}: "
+            f"none of the {len(missing)} cells of {where} has a result; {first.method} on {first.scene}: "
             f"{first.reason or 'not finished'}",
             "at least one",
         )

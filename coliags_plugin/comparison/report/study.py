@@ -1,22 +1,25 @@
-"""What a report is made of: results of methods on scenes, and the cells that failed."""
+"""What a report is made of: results of methods on scenes, and cells of a comparison without a result."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
 from coliags_plugin.core.anonymity import without_places
 from coliags_plugin.results.record import MAIN_SET, SEEN_SUFFIX, MetricRecord, ProtocolRecord, Result, SetRecord
+from coliags_plugin.results.spread import BySeed
+
+_SET_TITLES = {"test": "held out along the path", "rotation": "beyond the path"}
 
 
 @dataclass(frozen=True)
-class Cell:
+class StudyRun:
     """One evaluated run.
 
     Attributes:
-        method: Name in the report, see :mod:`coliags_plugin.comparison.report.labels`.
+        method: Name in the report, see :func:`coliags_plugin.comparison.report.labels.disambiguate_labels`.
         result: Its results file.
         stamp: Name of its run folder or results file.
         run: The run folder with the images of this evaluation; None where only the results file is there.
@@ -37,14 +40,14 @@ class Cell:
         """Folder of its images."""
         return None if self.run is None else self.run / "eval" / self.result.evaluation_name
 
-
-def _without_places(result: Result) -> Result:
-    kept = {name: without_places(getattr(result, name)) for name in ("config", "software", "provenance")}
-    return result.model_copy(update=kept)
+    @property
+    def title(self) -> str:
+        """Method, scene and seed."""
+        return f"{self.method} on {self.scene}, seed {self.result.seed}"
 
 
 @dataclass(frozen=True)
-class Failure:
+class MissingResult:
     """A cell of a comparison that has no result, and why; None where it has not been finished yet."""
 
     scene: str
@@ -59,10 +62,69 @@ class Part:
 
     split: str
     set_name: str
+    study: Study = field(compare=False, repr=False)
 
+    @property
+    def title(self) -> str:
+        """Title of the test set, with its split where the study has several."""
+        known = _SET_TITLES.get(self.set_name)
+        title = f"{self.set_name}: {known}" if known else self.set_name
+        return f"{title}, split {self.split}" if self.study.several_splits else title
 
-#: Values of a metric by method, scene and seed.
-MetricValues = dict[str, dict[str, dict[int, float]]]
+    @property
+    def name(self) -> str:
+        """Short name, for identifiers."""
+        return f"{self.set_name}-{self.split}" if self.study.several_splits else self.set_name
+
+    @cached_property
+    def scenes(self) -> list[str]:
+        """Scenes with a result, in the order given."""
+        return list(dict.fromkeys(run.scene for run in self.study.runs if self.record(run) is not None))
+
+    def record(self, run: StudyRun) -> SetRecord | None:
+        """What a run has of it."""
+        return run.result.sets.get(self.set_name) if run.result.scene.split == self.split else None
+
+    def runs(self, scene: str, method: str) -> list[StudyRun]:
+        """Runs of a method on a scene, by seed."""
+        own = self.study.by_method.get(method, [])
+        matches = [run for run in own if run.scene == scene and self.record(run) is not None]
+        return sorted(matches, key=lambda run: run.result.seed)
+
+    def frames(self, scene: str) -> Sequence[str]:
+        """Names of a scene's frames, the same for every method."""
+        records = (self.record(run) for run in self.study.runs if run.scene == scene)
+        return next((record.frames for record in records if record is not None), ())
+
+    def values(self, metric: str) -> dict[str, BySeed]:
+        """Means over the frames, by method, scene and seed; empty where a method has none."""
+        values: dict[str, dict[str, dict[int, float]]] = {method: {} for method in self.study.methods}
+        for run in self.study.runs:
+            record = self.record(run)
+            mean = None if record is None else record.mean(metric)
+            if mean is not None:
+                values[run.method].setdefault(run.scene, {})[run.result.seed] = mean
+        return dict(values)
+
+    def frame_means(self, scene: str, method: str, metric: str) -> dict[str, float]:
+        """A metric of every frame of a scene that has it, mean over the seeds that have it."""
+        by_frame: dict[str, list[float]] = {}
+        for run in self.runs(scene, method):
+            record = run.result.sets[self.set_name]
+            for frame, value in zip(record.frames, record.values.get(metric, ()), strict=False):
+                if value is not None:
+                    by_frame.setdefault(frame, []).append(value)
+        return {frame: sum(values) / len(values) for frame, values in by_frame.items()}
+
+    def reason(self, method: str, metric: str, scene: str | None = None) -> str:
+        """Why a metric is unavailable, as the first result without it says."""
+        runs = [run for run in self.study.by_method.get(method, []) if scene in (None, run.scene)]
+        records = [record for run in runs if (record := self.record(run)) is not None]
+        if not records:
+            return "no result"
+        names = (metric, metric.removesuffix(SEEN_SUFFIX))
+        reasons = (record.reasons.get(name) for record in records for name in names)
+        return next(filter(None, reasons), "no reason was recorded")
 
 
 @dataclass(frozen=True)
@@ -70,25 +132,25 @@ class Study:
     """Comparable results; see :func:`coliags_plugin.comparison.report.comparability.refuse_incomparable`.
 
     Attributes:
-        cells: At least one.
-        failures: Cells without a result.
+        runs: At least one.
+        missing: Cells without a result.
     """
 
-    cells: tuple[Cell, ...]
-    failures: tuple[Failure, ...] = ()
+    runs: tuple[StudyRun, ...]
+    missing: tuple[MissingResult, ...] = ()
 
     def anonymous(self) -> Study:
         """The same without absolute paths."""
-        cells = tuple(replace(cell, result=_without_places(cell.result)) for cell in self.cells)
-        return Study(cells, tuple(replace(one, reason=without_places(one.reason)) for one in self.failures))
+        runs = tuple(replace(run, result=_without_places(run.result)) for run in self.runs)
+        return Study(runs, tuple(replace(one, reason=without_places(one.reason)) for one in self.missing))
 
     @cached_property
-    def by_method(self) -> dict[str, list[Cell]]:
+    def by_method(self) -> dict[str, list[StudyRun]]:
         """Results of every method, in the order given."""
-        found: dict[str, list[Cell]] = {}
-        for cell in self.cells:
-            found.setdefault(cell.method, []).append(cell)
-        return found
+        by_method: dict[str, list[StudyRun]] = {}
+        for run in self.runs:
+            by_method.setdefault(run.method, []).append(run)
+        return by_method
 
     @property
     def methods(self) -> list[str]:
@@ -98,72 +160,35 @@ class Study:
     @cached_property
     def parts(self) -> list[Part]:
         """Every split and test set; the split's own set first."""
-        found = dict.fromkeys(
-            Part(cell.result.scene.split, set_name) for cell in self.cells for set_name in cell.result.sets
-        )
-        splits = list(dict.fromkeys(part.split for part in found))
-        return sorted(found, key=lambda part: (splits.index(part.split), part.set_name != MAIN_SET))
+        parts = dict.fromkeys(Part(run.result.scene.split, name, self) for run in self.runs for name in run.result.sets)
+        splits = list(dict.fromkeys(part.split for part in parts))
+        return sorted(parts, key=lambda part: (splits.index(part.split), part.set_name != MAIN_SET))
+
+    @property
+    def several_splits(self) -> bool:
+        """Whether results are of different splits."""
+        return len({run.result.scene.split for run in self.runs}) > 1
 
     @property
     def protocol(self) -> ProtocolRecord:
         """The protocol of all results."""
-        return self.cells[0].result.protocol
+        return self.runs[0].result.protocol
 
     @cached_property
     def metrics(self) -> dict[str, MetricRecord]:
         """Every metric, in the protocol's order, each followed by the same over the seen pixels."""
-        found: dict[str, MetricRecord] = {}
-        for cell in self.cells:
-            found |= {name: metric for name, metric in cell.result.metrics.items() if name not in found}
-        bases = dict.fromkeys(name.removesuffix(SEEN_SUFFIX) for name in found)
-        ordered = [name for base in bases for name in (base, base + SEEN_SUFFIX) if name in found]
-        return {name: found[name] for name in ordered}
+        metrics: dict[str, MetricRecord] = {}
+        for run in self.runs:
+            metrics |= {name: metric for name, metric in run.result.metrics.items() if name not in metrics}
+        bases = dict.fromkeys(name.removesuffix(SEEN_SUFFIX) for name in metrics)
+        return {name: metrics[name] for base in bases for name in (base, base + SEEN_SUFFIX) if name in metrics}
 
-    def scenes(self, part: Part | None = None) -> list[str]:
-        """Scenes with a result, of one part or of all, in the order given."""
-        return list(
-            dict.fromkeys(cell.scene for cell in self.cells if part is None or self.record(cell, part) is not None)
-        )
+    @property
+    def scenes(self) -> list[str]:
+        """Scenes with a result, in the order given."""
+        return list(dict.fromkeys(run.scene for run in self.runs))
 
-    def runs(self, part: Part, scene: str, method: str) -> list[Cell]:
-        """Results of a method on a scene, by seed."""
-        own = self.by_method.get(method, [])
-        found = [cell for cell in own if cell.scene == scene and self.record(cell, part) is not None]
-        return sorted(found, key=lambda cell: cell.result.seed)
 
-    def frames(self, part: Part, scene: str) -> Sequence[str]:
-        """Names of a scene's frames, the same for every method."""
-        for cell in self.cells:
-            record = self.record(cell, part) if cell.scene == scene else None
-            if record is not None:
-                return record.frames
-        return ()
-
-    def record(self, cell: Cell, part: Part) -> SetRecord | None:
-        """What a cell has of a part."""
-        return cell.result.sets.get(part.set_name) if cell.result.scene.split == part.split else None
-
-    def values(self, part: Part, metric: str) -> MetricValues:
-        """Means over the frames, by method, scene and seed; empty where a method has none."""
-        values: MetricValues = {method: {} for method in self.methods}
-        for cell in self.cells:
-            record = self.record(cell, part)
-            mean = None if record is None else record.mean(metric)
-            if mean is not None:
-                values[cell.method].setdefault(cell.scene, {})[cell.result.seed] = mean
-        return values
-
-    def reason(self, part: Part, method: str, metric: str, scene: str | None = None) -> str:
-        """Why a metric is unavailable, as the first result without it says."""
-        records = [
-            record
-            for cell in self.by_method.get(method, [])
-            if scene in (None, cell.scene) and (record := self.record(cell, part)) is not None
-        ]
-        if not records:
-            return "no result"
-        for record in records:
-            reason = record.reasons.get(metric) or record.reasons.get(metric.removesuffix(SEEN_SUFFIX))
-            if reason:
-                return reason
-        return "no reason was recorded"
+def _without_places(result: Result) -> Result:
+    kept = {name: without_places(getattr(result, name)) for name in ("config", "software", "provenance")}
+    return result.model_copy(update=kept)

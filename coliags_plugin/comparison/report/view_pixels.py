@@ -11,17 +11,18 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 
-from coliags_plugin.comparison.report.study import Cell
+from coliags_plugin.comparison.report.study import StudyRun
 from coliags_plugin.comparison.report.view_selection import ChosenFrame
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
+from coliags_plugin.outputs.colormaps import depth_error, rgb_error
 from coliags_plugin.outputs.image_files import read_depth_tiff
 
 #: Wider images are reduced by an integer factor, to limit the size of the report, px.
 _WIDEST = 640
 
 Rgb = UInt8[np.ndarray, "H W 3"]
-Depth = Float[np.ndarray, "H W"]
+Map = Float[np.ndarray, "H W"]
 
 
 @dataclass(frozen=True)
@@ -29,18 +30,25 @@ class ViewPixels:
     """A frame and its renderings.
 
     Attributes:
+        frame: The frame.
+        runs: One run of every method.
         truth: Camera image.
         true_depth: mm, NaN where unknown; None where the frame has none.
         renders: One per run.
-        depths: One per run, mm; None where there is none to compare.
+        errors: Absolute errors, one per run: of depth, mm, NaN where the truth is unknown, and None where there is
+            none to compare; of colours, levels of 255, where no run has depth to compare.
+        of_depth: Whether errors are those of depth.
         expected: Expected depth, one per run, NaN where pixels are nearly transparent; None where there is none.
     """
 
+    frame: ChosenFrame
+    runs: Sequence[StudyRun]
     truth: Rgb
-    true_depth: Depth | None
+    true_depth: Map | None
     renders: Sequence[Rgb]
-    depths: Sequence[Depth | None]
-    expected: Sequence[Depth | None]
+    errors: Sequence[Map | None]
+    of_depth: bool
+    expected: Sequence[Map | None]
 
 
 def reduction(width: int) -> int:
@@ -48,7 +56,7 @@ def reduction(width: int) -> int:
     return math.ceil(width / _WIDEST)
 
 
-def read_pixels(frame: ChosenFrame, runs: Sequence[Cell]) -> ViewPixels:
+def read_pixels(frame: ChosenFrame, runs: Sequence[StudyRun]) -> ViewPixels:
     """Read a frame of some runs of one scene.
 
     Args:
@@ -60,24 +68,30 @@ def read_pixels(frame: ChosenFrame, runs: Sequence[Cell]) -> ViewPixels:
     """
     truth = _read(read_rgb, runs[0], "truth", frame, ".png")
     shape, factor = truth.shape[:2], reduction(truth.shape[1])
+
+    def depths(kind: str) -> list[Map | None]:
+        whole = (_read_depth(run, kind, frame, shape) for run in runs)
+        return [None if depth is None else _reduced_map(depth, factor) for depth in whole]
+
+    reduced_truth = _reduced_rgb(truth, factor)
     renders = [_reduced_rgb(_read(read_rgb, run, "renders", frame, ".png", shape), factor) for run in runs]
-    truths = (_read_depth(run, "true_depth", frame, shape) for run in runs)
-    true_depth = next((depth for depth in truths if depth is not None), None)
-    depths: list[Depth | None] = [None] * len(runs)
+    true_depth = next((depth for depth in depths("true_depth") if depth is not None), None)
+    errors: list[Map | None] = []
     if true_depth is not None:
-        found = [_read_depth(run, "depth", frame, shape) for run in runs]
-        depths = [None if depth is None else _reduced_map(depth, factor) for depth in found]
-    found = [_read_depth(run, "expected_depth", frame, shape) for run in runs]
-    return ViewPixels(
-        truth=_reduced_rgb(truth, factor),
-        true_depth=None if true_depth is None else _reduced_map(true_depth, factor),
-        renders=renders,
-        depths=depths,
-        expected=[None if depth is None else _reduced_map(depth, factor) for depth in found],
-    )
+        errors = [None if depth is None else _depth_error(depth, true_depth) for depth in depths("depth")]
+    of_depth = any(error is not None for error in errors)
+    if not of_depth:
+        errors = [(rgb_error(render, reduced_truth) * 255.0).astype(np.float32) for render in renders]
+    expected = depths("expected_depth")
+    return ViewPixels(frame, runs, reduced_truth, true_depth, renders, errors, of_depth, expected)
 
 
-def _path(run: Cell, kind: str, frame: ChosenFrame, suffix: str) -> Path:
+def _depth_error(depth: Map, truth: Map) -> Map:
+    error, known = depth_error(depth, truth)
+    return np.where(known, error, np.nan).astype(np.float32)
+
+
+def _path(run: StudyRun, kind: str, frame: ChosenFrame, suffix: str) -> Path:
     if run.evaluation is None:
         raise ValueError(f"{run.method} has no run folder")
     return run.evaluation / kind / frame.part.set_name / f"{frame.name}{suffix}"
@@ -85,7 +99,7 @@ def _path(run: Cell, kind: str, frame: ChosenFrame, suffix: str) -> Path:
 
 def _read(
     reader: Callable[[Path], np.ndarray],
-    run: Cell,
+    run: StudyRun,
     kind: str,
     frame: ChosenFrame,
     suffix: str,
@@ -106,7 +120,7 @@ def _read(
     return pixels
 
 
-def _read_depth(run: Cell, kind: str, frame: ChosenFrame, shape: tuple[int, ...]) -> np.ndarray | None:
+def _read_depth(run: StudyRun, kind: str, frame: ChosenFrame, shape: tuple[int, ...]) -> np.ndarray | None:
     if not _path(run, kind, frame, ".tiff").is_file():
         return None
     return _read(read_depth_tiff, run, kind, frame, ".tiff", shape)

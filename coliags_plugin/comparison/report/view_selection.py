@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
-from coliags_plugin.comparison.report.frame_values import frame_means
 from coliags_plugin.comparison.report.metric_columns import metric_title
 from coliags_plugin.comparison.report.study import Part, Study
 from coliags_plugin.core.errors import InputError
@@ -48,33 +46,26 @@ def choose_frames(study: Study, reference: str, count: int) -> list[ChosenFrame]
         raise InputError(f"{count} frames to show", "at least one")
     return [
         chosen
-        for scene in study.scenes()
+        for scene in study.scenes
         for part in study.parts
-        if scene in study.scenes(part)
-        for chosen in _of_set(study, part, scene, reference, count)
+        if scene in part.scenes
+        for chosen in _choose_of_set(part, scene, reference, count)
     ]
 
 
-def _of_set(study: Study, part: Part, scene: str, reference: str, count: int) -> list[ChosenFrame]:
-    names = study.frames(part, scene)
-    spread = evenly(len(names), count)
-    reasons = _worst(study, part, scene, reference, names)
+def _choose_of_set(part: Part, scene: str, reference: str, count: int) -> list[ChosenFrame]:
+    names, worst_by = part.frames(scene), dict[int, list[str]]()
+    for metric in _WORST_OF:
+        values = part.frame_means(scene, reference, metric)
+        if len(values) > 1:
+            sign = 1.0 if part.study.metrics[metric].direction == "higher" else -1.0
+            worst = min(values, key=lambda frame: sign * values[frame])
+            worst_by.setdefault(names.index(worst), []).append(metric_title(metric))
+    reasons = {position: f"worst {' and '.join(metrics)} of {reference}" for position, metrics in worst_by.items()}
     return [
         ChosenFrame(part, scene, position, names[position], reasons.get(position, ""))
-        for position in sorted({*spread, *reasons})
+        for position in sorted({*evenly(len(names), count), *reasons})
     ]
-
-
-def _worst(study: Study, part: Part, scene: str, reference: str, names: Sequence[str]) -> dict[int, str]:
-    """Positions of the reference's worst frames, and by what they are."""
-    found: dict[int, list[str]] = {}
-    for metric in _WORST_OF:
-        values = frame_means(study, part, scene, reference, metric)
-        if len(values) > 1:
-            sign = 1.0 if study.metrics[metric].direction == "higher" else -1.0
-            worst = min(values, key=lambda frame: sign * values[frame])
-            found.setdefault(names.index(worst), []).append(metric_title(metric))
-    return {position: f"worst {' and '.join(metrics)} of {reference}" for position, metrics in found.items()}
 
 
 def evenly(length: int, count: int) -> list[int]:

@@ -1,215 +1,222 @@
-"""The views that a report shows, drawn: images, and errors on one scale for the whole report."""
+"""Held-out views: a slider between two methods, and every method beside the truth, with errors on one scale."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from itertools import groupby
+from typing import Any
 
 import numpy as np
 
-from coliags_plugin.comparison.report.study import Cell, Study
+from coliags_plugin.comparison.report.metric_columns import metric_title
+from coliags_plugin.comparison.report.study import Part, Study, StudyRun
 from coliags_plugin.comparison.report.view_pixels import ViewPixels, read_pixels, reduction
 from coliags_plugin.comparison.report.view_selection import ChosenFrame, choose_frames
 from coliags_plugin.outputs.axis_ticks import linear_ticks, round_up
-from coliags_plugin.outputs.colormaps import (
-    colorize_depth,
-    colorize_error,
-    common_limits,
-    depth_error,
-    rgb_error,
-)
+from coliags_plugin.outputs.colormaps import colorize_depth, colorize_error, common_limits, hatch
 from coliags_plugin.outputs.image_files import encode_jpeg, encode_webp
+from coliags_plugin.reporting.model import ColorBar, EncodedImage, Paragraph, Section, Template
+from coliags_plugin.reporting.numbers import column_decimals, number_text, unit_text
 
 #: Percentile of the errors shown at which the common scale ends, before rounding up.
-SCALE_PERCENTILE = 95.0
+_SCALE_PERCENTILE = 95.0
 _SMALLEST_SCALE = 1e-6
 #: Errors of an image that enter the percentile.
 _SAMPLED = 20_000
+#: Metrics shown under an image, where available.
+_CAPTION_METRICS = ("psnr", "psnr_seen", "ssim", "ssim_seen", "depth_mae", "depth_mae_seen", "depth_mse")
+#: Metrics by which views can be sorted.
+_SORTED_BY = ("psnr", "ssim", "lpips", "depth_mse", "depth_mse_inner", "depth_median_error")
 
-ErrorKind = Literal["depth", "rgb"]
-
-
-@dataclass(frozen=True)
-class EncodedImage:
-    """An encoded image.
-
-    Attributes:
-        mime: For instance ``image/jpeg``.
-        data: The file's bytes.
-        width: px.
-        height: px.
-    """
-
-    mime: str
-    data: bytes
-    width: int
-    height: int
+#: A picture with its alternative text, or what is said instead of one.
+_Tile = tuple[EncodedImage | None, str]
 
 
 @dataclass(frozen=True)
-class MethodView:
-    """Rendering, error map and expected depth of one method.
-
-    ``error`` is None where there is no depth to compare, ``depth`` of runs evaluated by a version that had none.
-    """
-
-    cell: Cell
-    render: EncodedImage
-    error: EncodedImage | None
-    depth: EncodedImage | None
-
-
-@dataclass(frozen=True)
-class View:
-    """One frame: truth, its depth where it has one, and the methods' renderings."""
-
-    frame: ChosenFrame
-    error_kind: ErrorKind
-    truth: EncodedImage
-    depth: EncodedImage | None
-    methods: Sequence[MethodView]
-
-
-@dataclass(frozen=True)
-class Scales:
+class _Scales:
     """Colour scales that all views share.
 
     Attributes:
         depth_error: Upper end, mm; None where no depth is compared.
         rgb_error: Upper end, levels of 255; None where depth is compared everywhere.
         depth: Range of the true depth, or else of the expected depth, scene units; None without depth.
-        expected: Whether expected depth is shown.
         unit: Of depths.
-        reduction: Largest integer factor by which images are reduced.
     """
 
     depth_error: float | None
     rgb_error: float | None
     depth: tuple[float, float] | None
-    expected: bool
     unit: str
-    reduction: int
+
+    @property
+    def bars(self) -> list[ColorBar]:
+        """The scales with names."""
+        bars = []
+        if self.depth_error is not None:
+            bars.append(ColorBar((0.0, self.depth_error), self.unit, "error", "|depth error|", "error-scale"))
+        if self.rgb_error is not None:
+            limits = (0.0, self.rgb_error)
+            bars.append(ColorBar(limits, "levels of 255", "error", "|colour error|", "colour-error-scale"))
+        if self.depth is not None:
+            bars.append(ColorBar(self.depth, self.unit, "depth", "depth", "depth-scale"))
+        return bars
 
 
-@dataclass(frozen=True)
-class _ReadView:
-    """A frame as read, its errors not coloured yet: NaN where the truth is unknown."""
-
-    frame: ChosenFrame
-    error_kind: ErrorKind
-    truth: EncodedImage
-    true_depth: np.ndarray | None
-    cells: Sequence[Cell]
-    renders: Sequence[EncodedImage]
-    errors: Sequence[np.ndarray | None]
-    expected: Sequence[np.ndarray | None]
-
-
-class Views:
-    """Views of a study: read at once, for the common scales; drawn one by one.
+def view_section(study: Study, reference: str, count: int) -> Section:
+    """Section of held-out views; says so where there are no images.
 
     Args:
         study: The results; those without run folders are left out.
-        reference: Method whose worst frames are shown.
+        reference: Method by whose metrics views are sorted, and whose worst frames are shown.
         count: Evenly spread frames per scene and set.
 
     Raises:
         InputError: ``count`` is not positive, or an image is missing, damaged or of another size.
     """
-
-    def __init__(self, study: Study, reference: str, count: int) -> None:
-        chosen = [(frame, _runs_with_images(study, frame)) for frame in choose_frames(study, reference, count)]
-        self._read = [_read_view(frame, runs) for frame, runs in chosen if runs]
-        self.scales = Scales(
-            depth_error=self._limit("depth"),
-            rgb_error=self._limit("rgb"),
-            depth=_depth_limits(view.true_depth for view in self._read if view.true_depth is not None)
-            or _expected_limits(depth for view in self._read for depth in view.expected if depth is not None),
-            expected=any(depth is not None for view in self._read for depth in view.expected),
-            unit=_unit(study),
-            reduction=max((reduction(view.cells[0].result.scene.size[0]) for view in self._read), default=1),
-        )
-
-    @property
-    def figures(self) -> int:
-        """Number of figures: the truth and every method of each view."""
-        return sum(1 + len(view.cells) for view in self._read)
-
-    def drawn(self) -> Iterable[View]:
-        """The views in the order of scenes, sets and video."""
-        return map(self._draw, self._read)
-
-    def _limit(self, kind: ErrorKind) -> float | None:
-        views = [view for view in self._read if view.error_kind == kind]
-        return error_limit([error for view in views for error in view.errors if error is not None]) if views else None
-
-    def _draw(self, view: _ReadView) -> View:
-        limit = self.scales.depth_error if view.error_kind == "depth" else self.scales.rgb_error
-        errors = [
-            None if error is None else _webp(colorize_error(error, ~np.isnan(error), limit or 1.0))
-            for error in view.errors
-        ]
-        scale = self.scales.depth
-        depths = [
-            None if depth is None or scale is None else _webp(colorize_depth(depth, scale, hatched=True))
-            for depth in view.expected
-        ]
-        methods = [MethodView(*each) for each in zip(view.cells, view.renders, errors, depths, strict=True)]
-        depth = None
-        if view.true_depth is not None and self.scales.depth is not None:
-            depth = _webp(colorize_depth(view.true_depth, self.scales.depth))
-        return View(view.frame, view.error_kind, view.truth, depth, methods)
-
-
-def _read_view(frame: ChosenFrame, runs: Sequence[Cell]) -> _ReadView:
-    pixels = read_pixels(frame, runs)
-    kind: ErrorKind = "depth" if any(depth is not None for depth in pixels.depths) else "rgb"
-    return _ReadView(
-        frame=frame,
-        error_kind=kind,
-        truth=_jpeg(pixels.truth),
-        true_depth=pixels.true_depth,
-        cells=runs,
-        renders=[_jpeg(render) for render in pixels.renders],
-        errors=_depth_errors(pixels) if kind == "depth" else _rgb_errors(pixels),
-        expected=pixels.expected,
+    title = "Held-out views"
+    chosen = [(frame, _runs_with_images(study, frame)) for frame in choose_frames(study, reference, count)]
+    views = [read_pixels(frame, runs) for frame, runs in chosen if runs]
+    if not views:
+        text = "No images: only results files are here, without the run folders."
+        return Section(title, [Paragraph(text)], screen_only=True)
+    scales = _Scales(
+        depth_error=_scale_end([view for view in views if view.of_depth]),
+        rgb_error=_scale_end([view for view in views if not view.of_depth]),
+        depth=_depth_limits(view.true_depth for view in views if view.true_depth is not None)
+        or _expected_limits([depth for view in views for depth in view.expected if depth is not None]),
+        unit=_depth_unit(study),
     )
+    scenes = [
+        (scene, [(part.title, [_view(view, scales, reference) for view in same]) for part, same in groupby(own, _part)])
+        for scene, own in groupby(views, lambda view: view.frame.scene)
+    ]
+    values = {
+        "bars": scales.bars,
+        "hatch": _webp(hatch(14, 34)) if scales.depth is not None else None,
+        "reference": reference,
+        "orders": {name: metric_title(name) for name in _SORTED_BY if name in study.metrics},
+        "scenes": scenes,
+    }
+    explanation = Paragraph(_explanation(study, views, scales, reference))
+    return Section(title, [explanation, Template("views.html", values)], screen_only=True, name="views")
 
 
-def _depth_errors(pixels: ViewPixels) -> list[np.ndarray | None]:
-    """Absolute errors, mm."""
-    errors: list[np.ndarray | None] = []
-    for depth in pixels.depths:
-        if depth is None or pixels.true_depth is None:
-            errors.append(None)
-            continue
-        error, known = depth_error(depth, pixels.true_depth)
-        errors.append(np.where(known, error, np.nan).astype(np.float32))
-    return errors
-
-
-def _rgb_errors(pixels: ViewPixels) -> list[np.ndarray | None]:
-    """Absolute errors, levels of 255."""
-    return [(rgb_error(render, pixels.truth) * 255.0).astype(np.float32) for render in pixels.renders]
-
-
-def _runs_with_images(study: Study, frame: ChosenFrame) -> list[Cell]:
+def _runs_with_images(study: Study, frame: ChosenFrame) -> list[StudyRun]:
     """One run of every method: that of the first seed with images."""
-    by_method = ([cell for cell in study.runs(frame.part, frame.scene, m) if cell.run] for m in study.methods)
+    by_method = ([run for run in frame.part.runs(frame.scene, method) if run.run] for method in study.methods)
     return [runs[0] for runs in by_method if runs]
+
+
+def _part(view: ViewPixels) -> Part:
+    return view.frame.part
+
+
+def _explanation(study: Study, views: Sequence[ViewPixels], scales: _Scales, reference: str) -> str:
+    factor = max(reduction(view.runs[0].result.scene.size[0]) for view in views)
+    texts = [f"Frames spread along each video, and the worst of {reference}."]
+    if scales.depth_error is not None:
+        texts.append("Under each rendering, its absolute depth error.")
+    if scales.rgb_error is not None:
+        texts.append("Views without true depth show the absolute colour error, the mean of red, green and blue.")
+    if any(depth is not None for view in views for depth in view.expected):
+        texts.append("Below it the expected depth, hatched where alpha is below 0.5.")
+    texts.append(
+        "One scale serves every method, frame and scene of this page; it ends at the smallest 1, 2 or 5 times a power "
+        f"of ten below which {_SCALE_PERCENTILE:.0f} % of all errors shown lie. Errors beyond it, and missing depth "
+        "where the truth has one, take its last colour."
+    )
+    if factor > 1:
+        texts.append(f"Images are shown at 1/{factor} of their size.")
+    if len({run.result.seed for run in study.runs}) > 1:
+        texts.append("Of several seeds, the first is shown.")
+    return " ".join([*texts, "Photographs are JPEG here; the run folders keep them as PNG."])
+
+
+def _view(view: ViewPixels, scales: _Scales, reference: str) -> dict[str, Any]:
+    """Values of a view for the template.
+
+    The script sorts by ``data``: the position along the video, and for each metric a number that is larger the worse
+    the reference is.
+    """
+    frame, where = view.frame, f"frame {view.frame.name}"
+    metrics = frame.part.study.metrics
+    runs = frame.part.runs(frame.scene, reference)
+    values = _frame_values(frame, runs[0]) if runs else {}
+    signs = {name: -1.0 if metrics[name].direction == "higher" else 1.0 for name in values}
+    truth = _jpeg(view.truth)
+    tiles: list[_Tile] = [(truth, f"{where}, true image")]
+    if view.true_depth is not None and scales.depth is not None:
+        tiles.append((_webp(colorize_depth(view.true_depth, scales.depth)), f"{where}, true depth"))
+        caption = ["above: camera image", "below: true depth"]
+    else:
+        tiles.append((None, "no true depth"))
+        caption = []
+    return {
+        "title": f"{frame.scene} · {frame.part.set_name} · {frame.name}",
+        "where": where,
+        "count": f"{frame.position + 1} of {len(frame.part.frames(frame.scene))}"
+        + (f" · {frame.why}" if frame.why else ""),
+        "data": {
+            "position": frame.position,
+            **{name.replace("_", "-"): signs[name] * values[name] for name in _SORTED_BY if name in values},
+        },
+        "size": truth,
+        "cells": [("truth", None, tiles, caption), *_method_cells(view, scales, where)],
+    }
+
+
+def _method_cells(
+    view: ViewPixels, scales: _Scales, where: str
+) -> Iterable[tuple[str, int | None, list[_Tile], list[str]]]:
+    """Name, style, pictures and caption of every method."""
+    limit = (scales.depth_error if view.of_depth else scales.rgb_error) or 1.0
+    kind = "depth" if view.of_depth else "colour"
+    for run, render, error, expected in zip(view.runs, view.renders, view.errors, view.expected, strict=True):
+        name = run.method
+        tiles: list[_Tile] = [(_jpeg(render), f"{where}, rendered by {name}")]
+        if error is None:
+            tiles.append((None, "no depth to compare"))
+        else:
+            drawn = _webp(colorize_error(error, ~np.isnan(error), limit))
+            tiles.append((drawn, f"{where}, absolute {kind} error of {name}"))
+            if expected is not None and scales.depth is not None:
+                drawn = _webp(colorize_depth(expected, scales.depth, hatched=True))
+                tiles.append((drawn, f"{where}, expected depth of {name}"))
+        yield name, view.frame.part.study.methods.index(name), tiles, _caption(view.frame, run)
+
+
+def _caption(frame: ChosenFrame, run: StudyRun) -> list[str]:
+    values, metrics = _frame_values(frame, run), frame.part.study.metrics
+    shown = [name for name in _CAPTION_METRICS if name in values]
+    if "depth_mae" in shown and "depth_mse" in shown:
+        shown.remove("depth_mse")
+    texts = []
+    for name in shown:
+        unit = metrics[name].unit
+        number = number_text(values[name], column_decimals(unit, [values[name]]))
+        texts.append(f"{metric_title(name)} {number} {unit_text(unit)}".rstrip())
+    return texts or ["no metrics for this frame"]
+
+
+def _frame_values(frame: ChosenFrame, run: StudyRun) -> dict[str, float]:
+    """Metrics of a frame of one run."""
+    record = frame.part.record(run)
+    values = {} if record is None else {name: own[frame.position] for name, own in record.values.items()}
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _scale_end(views: Sequence[ViewPixels]) -> float | None:
+    return error_limit([error for view in views for error in view.errors if error is not None]) if views else None
 
 
 def error_limit(errors: Sequence[np.ndarray]) -> float:
     """The 95th percentile of all finite errors together, rounded up to 1, 2 or 5 times a power of ten."""
-    pooled = np.concatenate([_sampled(values.ravel()) for values in errors]) if errors else np.zeros(0)
+    samples = [values.ravel()[:: math.ceil(values.size / _SAMPLED) or 1] for values in errors]
+    pooled = np.concatenate(samples) if samples else np.zeros(0)
     finite = pooled[np.isfinite(pooled)]
-    return round_up(max(float(np.percentile(finite, SCALE_PERCENTILE)), _SMALLEST_SCALE)) if finite.size else 1.0
-
-
-def _sampled(values: np.ndarray) -> np.ndarray:
-    return values[:: math.ceil(values.size / _SAMPLED) or 1]
+    return round_up(max(float(np.percentile(finite, _SCALE_PERCENTILE)), _SMALLEST_SCALE)) if finite.size else 1.0
 
 
 def _depth_limits(depths: Iterable[np.ndarray]) -> tuple[float, float] | None:
@@ -225,20 +232,19 @@ def _depth_limits(depths: Iterable[np.ndarray]) -> tuple[float, float] | None:
     return math.floor(low / step) * step, math.ceil(high / step) * step
 
 
-def _expected_limits(depths: Iterable[np.ndarray]) -> tuple[float, float] | None:
-    found = [*depths]
-    return common_limits(found) if found else None
+def _expected_limits(depths: Sequence[np.ndarray]) -> tuple[float, float] | None:
+    return common_limits(depths) if depths else None
 
 
-def _unit(study: Study) -> str:
+def _depth_unit(study: Study) -> str:
     """Unit of depths: that of the metrics that are lengths."""
     units = {metric.unit for metric in study.metrics.values()}
     return "units" if any(unit.startswith("units") for unit in units) else "mm"
 
 
 def _jpeg(rgb: np.ndarray) -> EncodedImage:
-    return EncodedImage("image/jpeg", encode_jpeg(rgb), rgb.shape[1], rgb.shape[0])
+    return EncodedImage(encode_jpeg(rgb), "image/jpeg", rgb.shape[1], rgb.shape[0])
 
 
 def _webp(rgb: np.ndarray) -> EncodedImage:
-    return EncodedImage("image/webp", encode_webp(rgb), rgb.shape[1], rgb.shape[0])
+    return EncodedImage(encode_webp(rgb), "image/webp", rgb.shape[1], rgb.shape[0])

@@ -19,7 +19,7 @@ from coliags_plugin.export.viewer.library import import_viser, start_server, sto
 from coliags_plugin.export.viewer.merging import merged_to
 from coliags_plugin.export.viewer.serving import set_start
 from coliags_plugin.export.viewer.splats import on_wire
-from coliags_plugin.outputs.page import refuse_folder
+from coliags_plugin.reporting.html_page import refuse_folder
 
 logger = logging.getLogger(__name__)
 

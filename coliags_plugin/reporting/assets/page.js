@@ -1,4 +1,4 @@
-// Choosing in a report: columns, order of rows and views, axis of the curves, and a slider between two methods.
+// Choosing on a page: columns, order of rows and views, axis of the curves, and a slider between two methods.
 // The page is complete without it.
 "use strict";
 
@@ -190,6 +190,13 @@
     slide();
   }
 
+  // ---- Scenes are loaded once they are opened.
+
+  function scene(details) {
+    const frame = details.querySelector("iframe");
+    details.addEventListener("toggle", () => (frame.srcdoc ||= frame.dataset.page));
+  }
+
   const tables = all("table.results");
   tables.forEach(sortable);
   for (const family of new Set(tables.map(familyOf))) {
@@ -199,4 +206,5 @@
   all("[data-switch=curves]").forEach(curveSwitch);
   all(".sorter").forEach(viewSorter);
   all(".compare").forEach(comparator);
+  all("details.scene").forEach(scene);
 })();

@@ -12,14 +12,14 @@ import cv2
 import numpy as np
 import pytest
 
-from coliags_plugin.comparison.report import html_report
-from coliags_plugin.comparison.report.content import Choices
+from coliags_plugin.comparison.report.page import Choices
 from coliags_plugin.comparison.report.report import write_report
 from coliags_plugin.comparison.report.view_selection import evenly
 from coliags_plugin.comparison.report.views import error_limit
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.outputs.colormaps import color_table, hatch
 from coliags_plugin.outputs.image_files import write_depth_tiff, write_png
+from coliags_plugin.reporting import html_page
 from tests.comparison.report.made import FRAMES, HEIGHT, WIDTH, made_scenes, result_of, write_comparison, write_run
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
@@ -145,7 +145,7 @@ def test_views_are_spread_over_each_set_and_the_worst_are_among_them(tmp_path):
     psnr = (30.0, 29.0, 31.0, 20.0, 30.0)
     depth = (0.1, 0.5, 0.1, 0.1, 0.1)
     result = result_of("coliags", values={"psnr": psnr, "depth_mse": depth})
-    page = report(tmp_path, [write_run(tmp_path / "run", result)], frames=2)
+    page = report(tmp_path, [write_run(tmp_path / "run", result)], choices=Choices(frames=2))
     found = re.findall(r"frame (\d{4}) (\d of \d)(?: · (worst [\w ]+ of coliags))?", page.words)
     assert found == [
         ("0004", "1 of 5", ""),
@@ -239,8 +239,8 @@ def test_pictures_beyond_the_limit_stand_beside_the_page(tmp_path, monkeypatch):
         for method in ("coliags", "3dgs")
     ]
     whole = report(tmp_path, runs)
-    limit = (tmp_path / "out" / "report.html").stat().st_size - 50_000
-    monkeypatch.setattr(html_report, "PAGE_LIMIT", limit)
+    limit = (tmp_path / "out" / "report.html").stat().st_size - 80_000
+    monkeypatch.setattr(html_page, "PAGE_LIMIT", limit)
     page = report(tmp_path, runs)
     assert limit - 100_000 < (tmp_path / "out" / "report.html").stat().st_size <= limit
     folder = tmp_path / "out" / "report_files"
@@ -249,7 +249,7 @@ def test_pictures_beyond_the_limit_stand_beside_the_page(tmp_path, monkeypatch):
     assert beside == {f"report_files/{file.name}" for file in folder.iterdir()}
     assert len(beside) > 2 and sum(source.startswith("data:") for source in sources) > 5
     assert len(sources) == len([attributes for attributes in whole.all("img") if "src" in attributes])
-    assert "pictures are in the folder report_files beside this page" in page.words
+    assert "pictures in the folder report_files beside this page" in page.words
     # A smaller report of that name leaves no pictures of the former, and no other file is touched.
     monkeypatch.undo()
     (folder / "notes.txt").write_text("mine")
@@ -327,7 +327,7 @@ def test_every_scene_of_a_comparison_is_folded(tmp_path):
     folder = write_comparison(tmp_path / "c", results)
     for result in results:
         write_run(folder / f"runs/{result.scene.name}/{result.method}/s0-{result.key[:8]}", result)
-    page = report(tmp_path, [folder], frames=1)
+    page = report(tmp_path, [folder], choices=Choices(frames=1))
     assert len(page.images("rendered by")) == 2 * len(page.all("article")) == 16
     summaries = [text for text in page.text if text.startswith("scene-")]
     assert summaries.count("scene-1") >= 3  # views, curves, tables
@@ -380,7 +380,7 @@ def refuses(tmp_path, runs, match, **options):
 
 
 def test_what_is_missing_is_refused(tmp_path, two_runs):
-    refuses(tmp_path, two_runs, "at least one", frames=0)
+    refuses(tmp_path, two_runs, "at least one", choices=Choices(frames=0))
     refuses(tmp_path, two_runs, "no such metric", choices=Choices(columns=("x",)))
     (two_runs[0] / "eval/paper/renders/test/0004.png").unlink()
     refuses(tmp_path, two_runs, r"renders/test/0004\.png is missing")

@@ -7,12 +7,9 @@ import json
 import pytest
 
 from coliags_plugin.comparison.report.sources import read_study
-from coliags_plugin.comparison.report.study import Part
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.results.reading import write_result
 from tests.comparison.report.made import FRAMES, made_scenes, result_of, write_comparison, write_run
-
-TEST, ROTATION = Part("every-8th", "test"), Part("every-8th", "rotation")
 
 
 def refuses(paths, match, **options):
@@ -36,7 +33,7 @@ def test_an_evaluation_against_the_truth_is_asked_for_by_name(tmp_path):
     )
     (run / "eval" / "paper").rename(run / "eval" / "paper-truth")
     write_result(run / "eval" / "paper-truth" / "result.json", against)
-    (cell,) = read_study([run], protocol="paper-truth").cells
+    (cell,) = read_study([run], protocol="paper-truth").runs
     assert cell.evaluation == run / "eval" / "paper-truth" and (cell.evaluation / "renders").is_dir()
 
 
@@ -47,10 +44,10 @@ def test_a_run_a_file_and_a_comparison_are_read_alike(tmp_path):
     folder = write_comparison(tmp_path / "comparison", [result])
     for path in (run, file, folder, folder / "results"):
         study = read_study([path])
-        assert [cell.result for cell in study.cells] == [result]
-        assert study.failures == ()
-    assert read_study([run]).cells[0].run == run
-    assert read_study([file]).cells[0].run is None
+        assert [cell.result for cell in study.runs] == [result]
+        assert study.missing == ()
+    assert read_study([run]).runs[0].run == run
+    assert read_study([file]).runs[0].run is None
     mixed = read_study([run, written(tmp_path, other)])
     assert mixed.methods == ["coliags", "3dgs"]
 
@@ -60,11 +57,11 @@ def test_a_comparison_finds_its_runs_by_the_results_key(tmp_path):
     result = result_of("coliags")
     folder = write_comparison(tmp_path, [result])
     write_run(folder / "runs/cecum/coliags/s0-11111111", result.model_copy(update={"key": "another"}))
-    assert read_study([folder]).cells[0].run is None
+    assert read_study([folder]).runs[0].run is None
     run = write_run(folder / "runs/cecum/coliags/s0-22222222", result)
-    assert read_study([folder]).cells[0].run == run
+    assert read_study([folder]).runs[0].run == run
     (run / "eval/paper/result.json").write_text("{")
-    assert read_study([folder]).cells[0].run is None
+    assert read_study([folder]).runs[0].run is None
 
 
 def test_some_methods_alone_in_the_order_asked_for(tmp_path):
@@ -72,7 +69,7 @@ def test_some_methods_alone_in_the_order_asked_for(tmp_path):
     folder = write_comparison(tmp_path, results, [("cecum", "3dgs", 2, "no memory"), ("cecum", "2dgs", 2, "no memory")])
     study = read_study([folder], methods=["3dgs", "coliags"])
     assert study.methods == ["3dgs", "coliags"]
-    assert [failure.method for failure in study.failures] == ["3dgs"]
+    assert [failure.method for failure in study.missing] == ["3dgs"]
     refuses([folder], "no method '3dg' .* Did you mean '3dgs'", methods=["3dg"])
 
 
@@ -89,7 +86,7 @@ def test_failures_are_kept_unless_there_is_a_result(tmp_path):
     repeated = folder / "failures/cecum/coliags" / f"s0-{result.key[:8]}.json"
     repeated.parent.mkdir()
     repeated.write_text(json.dumps({"reason": "once"}))
-    (failure,) = read_study([folder]).failures
+    (failure,) = read_study([folder]).missing
     assert (failure.scene, failure.method, failure.seed, failure.reason) == failed
 
 
@@ -117,8 +114,8 @@ def test_the_plan_gives_order_runs_and_what_is_not_finished(tmp_path):
     failed.rename(failed.with_name("s0-00000000.json"))
     study = read_study([folder])
     assert study.methods == ["scaffold-gs", "coliags"]  # without the result that the plan no longer has
-    assert [cell.run is None for cell in study.cells] == [True, False]
-    assert [(f.method, f.seed, f.reason) for f in study.failures] == [
+    assert [cell.run is None for cell in study.runs] == [True, False]
+    assert [(f.method, f.seed, f.reason) for f in study.missing] == [
         ("2dgs", 0, "no memory"),
         ("3dgs", 1, None),
     ]
@@ -135,7 +132,7 @@ def test_a_method_under_a_second_name_shows_the_run_of_the_first(tmp_path):
     folder = write_comparison(tmp_path, [second, first, other])
     plan(folder, [second, first, other])
     run = write_run(folder / f"runs/cecum/coliags/s0-{first.key[:8]}", first)
-    assert [cell.run for cell in read_study([folder]).cells] == [run, run, None]
+    assert [cell.run for cell in read_study([folder]).runs] == [run, run, None]
 
 
 def test_nothing_is_refused(tmp_path):
@@ -201,9 +198,9 @@ def test_what_cannot_be_compared_is_refused(study_of):
 def test_another_scene_may_have_another_size_and_other_sets(study_of):
     results = [result_of(method, **options) for method in ("a", "b") for options in ({}, OTHER_SCENE)]
     study = study_of(results)
-    assert study.scenes() == ["cecum", "sigmoid"]
-    assert study.scenes(ROTATION) == ["cecum"]
-    assert study.parts == [TEST, ROTATION]
+    assert study.scenes == ["cecum", "sigmoid"]
+    assert study.parts[1].scenes == ["cecum"]
+    assert [(part.split, part.set_name) for part in study.parts] == [("every-8th", "test"), ("every-8th", "rotation")]
 
 
 OTHER_SCENE = {"scene": "sigmoid", "size": (32, 24), "frames": {"test": ("0",)}}
@@ -223,16 +220,17 @@ def test_splits_are_parts_of_their_own(study_of):
 
 def test_values_by_method_scene_and_seed(study_of):
     study = study_of([result_of("a", psnr=30.0), result_of("a", seed=1, psnr=32.0), result_of("b", psnr=20.0)])
-    assert study.values(TEST, "psnr") == {"a": {"cecum": {0: 30.0, 1: 32.0}}, "b": {"cecum": {0: 20.0}}}
-    assert study.values(TEST, "lpips") == {"a": {}, "b": {}}
-    assert study.values(ROTATION, "psnr_seen")["b"] == {"cecum": {0: 22.0}}
+    test, rotation = study.parts
+    assert test.values("psnr") == {"a": {"cecum": {0: 30.0, 1: 32.0}}, "b": {"cecum": {0: 20.0}}}
+    assert test.values("lpips") == {"a": {}, "b": {}}
+    assert rotation.values("psnr_seen")["b"] == {"cecum": {0: 22.0}}
     assert list(study.metrics)[:2] == ["psnr", "psnr_seen"]
-    assert study.reason(TEST, "a", "lpips_seen") == "no VGG weights & none to be had"
-    assert study.reason(TEST, "a", "unheard") == "no reason was recorded"
+    assert test.reason("a", "lpips_seen") == "no VGG weights & none to be had"
+    assert test.reason("a", "unheard") == "no reason was recorded"
 
 
 def labels(study):
-    return [cell.method for cell in study.cells]
+    return [cell.method for cell in study.runs]
 
 
 def test_seeds_of_one_config_are_one_method(study_of):

@@ -7,24 +7,26 @@ from html.parser import HTMLParser
 
 import pytest
 
-from coliags_plugin.comparison.report import html_blocks, latex, markdown
-from coliags_plugin.comparison.report.blocks import Folded
-from coliags_plugin.comparison.report.content import Choices, make_content
+from coliags_plugin.comparison.report.page import Choices, text_page
 from coliags_plugin.comparison.report.sources import read_study
-from coliags_plugin.comparison.report.tables import DASH, Column, Entry, Row, Table
+from coliags_plugin.reporting.html_page import html_blocks
+from coliags_plugin.reporting.latex import latex_table, latex_text
+from coliags_plugin.reporting.markdown import markdown_table, markdown_text
+from coliags_plugin.reporting.model import Column, Folded, Table, TableCell
+from coliags_plugin.reporting.numbers import DASH
 from tests.comparison.report.made import made_scenes, write_comparison
 
 NASTY = r"a_b & 50 % <of> {x} $y$ #1 ~ ^ \z | *c* `d`"
 
 
 @pytest.fixture(scope="module")
-def content(tmp_path_factory):
+def page(tmp_path_factory):
     methods = {"coliags": 2.0, "scaffold-gs": 0.5, "ablations/none": 0.0}
     folder = write_comparison(tmp_path_factory.mktemp("comparison"), made_scenes(methods, seeds=2)[:-2])
-    return make_content(read_study([folder]), Choices(note=NASTY))
+    return text_page(read_study([folder]), Choices(note=NASTY))
 
 
-def tables_of(content):
+def tables_of(page):
     found = []
 
     def collect(blocks):
@@ -34,7 +36,7 @@ def tables_of(content):
             elif isinstance(block, Folded):
                 collect(block.blocks)
 
-    for section in content.sections:
+    for section in page.sections:
         collect(section.blocks)
     return found
 
@@ -42,10 +44,10 @@ def tables_of(content):
 def model_cells(table):
     """What every rendering must say: label, and value, spread, stars, rank and footnote of every entry."""
     shown = table.only_shown()
-    marks = {text: note.mark for text, note in shown.footnotes().items()}
+    marks = {text: note.mark for text, note in shown.footnotes.items()}
     return [
-        [row.label, *((e.text or DASH, e.spread, e.stars, _place(e), marks.get(e.note, "")) for e in row.entries)]
-        for row in shown.rows
+        [row[0].text, *((c.text or DASH, c.spread, c.stars, _place(c), marks.get(c.note, "")) for c in row[1:])]
+        for row in shown.cells
     ]
 
 
@@ -143,37 +145,37 @@ class Cells(HTMLParser):
         ]
 
 
-def test_the_report_has_every_kind_of_table(content):
-    names = [table.name for table in tables_of(content)]
+def test_the_report_has_every_kind_of_table(page):
+    names = [table.name for table in tables_of(page)]
     for name in ("summary-test", "summary-rotation", "lead-test-psnr", "seeds-test", "costs", "scene-scene-3-test"):
         assert name in names
     assert len(names) == len(set(names))
 
 
-def test_all_formats_have_the_same_numbers(content):
-    tables = tables_of(content)
-    assert sum(entry.stars != "" for table in tables for row in table.rows for entry in row.entries) > 10
+def test_all_formats_have_the_same_numbers(page):
+    tables = tables_of(page)
+    assert sum(cell.stars != "" for table in tables for row in table.cells for cell in row) > 10
     for table in tables:
         expected = model_cells(table)
-        assert markdown_cells(markdown.markdown_table(table)) == expected
-        assert latex_cells(latex.latex_table(table)) == expected
-        assert Cells(html_blocks.html_table(table)).cells == expected
+        assert markdown_cells(markdown_table(table)) == expected
+        assert latex_cells(latex_table(table)) == expected
+        assert Cells(html_blocks([table])).cells == expected
 
 
-def test_whole_reports_hold_every_table(content):
-    text, tex = markdown.markdown_report(content), latex.latex_report(content)
-    for table in tables_of(content):
-        assert markdown.markdown_table(table) in text
-        assert latex.latex_table(table) in tex
-    assert tex.count(r"\begin{table}") == tex.count(r"\end{tabular}") == len(tables_of(content))
-    assert len(set(re.findall(r"\\label\{(.*?)\}", tex))) == len(tables_of(content))
+def test_whole_reports_hold_every_table(page):
+    text, tex = markdown_text(page), latex_text(page)
+    for table in tables_of(page):
+        assert markdown_table(table) in text
+        assert latex_table(table) in tex
+    assert tex.count(r"\begin{table}") == tex.count(r"\end{tabular}") == len(tables_of(page))
+    assert len(set(re.findall(r"\\label\{(.*?)\}", tex))) == len(tables_of(page))
 
 
-def test_latex_lines_are_commands_tables_or_comments(content):
+def test_latex_lines_are_commands_tables_or_comments(page):
     """Nothing but comments stands between the tables, so that the file can be included anywhere."""
-    outside = re.sub(r"\\begin\{table\}.*?\\end\{table\}", "", latex.latex_report(content), flags=re.DOTALL)
+    outside = re.sub(r"\\begin\{table\}.*?\\end\{table\}", "", latex_text(page), flags=re.DOTALL)
     assert all(not line or line.startswith("%") for line in outside.splitlines())
-    inside = re.findall(r"\\begin\{table\}.*?\\end\{table\}", latex.latex_report(content), flags=re.DOTALL)
+    inside = re.findall(r"\\begin\{table\}.*?\\end\{table\}", latex_text(page), flags=re.DOTALL)
     for table in inside:
         assert table.count("{") - table.count(r"\{") == table.count("}") - table.count(r"\}")
         assert (table.count("$") - table.count(r"\$")) % 2 == 0
@@ -184,10 +186,9 @@ def test_latex_lines_are_commands_tables_or_comments(content):
 
 
 def test_nasty_names_survive():
-    table = Table(
-        NASTY, "Method", (Column("x", NASTY, "mm^2", "lower"),), (Row(NASTY, (Entry("1", 1.0, note=NASTY),)),)
-    )
-    assert markdown_cells(markdown.markdown_table(table))[0][0] == NASTY
-    tex = latex.latex_table(table)
+    columns = [Column("method", "Method"), Column("x", NASTY, "mm^2", "lower")]
+    table = Table(NASTY, columns, [{"method": NASTY, "x": TableCell("1", 1.0, note=NASTY)}])
+    assert markdown_cells(markdown_table(table))[0][0] == NASTY
+    tex = latex_table(table)
     assert r"a\_b \& 50 \% $<$of$>$ \{x\} \$y\$ \#1 \textasciitilde{} \textasciicircum{} \textbackslash{}z $|$" in tex
-    assert Cells(html_blocks.html_table(table)).cells[0][0] == NASTY
+    assert Cells(html_blocks([table])).cells[0][0] == NASTY

@@ -1,4 +1,4 @@
-"""The text of a report: summaries, what is missing, statistics, published numbers, costs."""
+"""The page of a report: summaries, what is missing, statistics, published numbers, costs."""
 
 from __future__ import annotations
 
@@ -9,16 +9,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coliags_plugin.comparison.report.blocks import Folded, Paragraph
-from coliags_plugin.comparison.report.content import Choices, make_content
-from coliags_plugin.comparison.report.cost_table import duration
-from coliags_plugin.comparison.report.frame_values import per_frame_csv
+from coliags_plugin.comparison.report.frame_tables import per_frame_csv
+from coliags_plugin.comparison.report.leads import p_text
+from coliags_plugin.comparison.report.page import Choices, text_page
 from coliags_plugin.comparison.report.published import _C3VD_FRAMES
 from coliags_plugin.comparison.report.sources import read_study
-from coliags_plugin.comparison.report.statistics_text import p_text
-from coliags_plugin.comparison.report.study import Failure
-from coliags_plugin.comparison.report.tables import Table
+from coliags_plugin.comparison.report.study import MissingResult
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.reporting.model import Fact, Folded, Paragraph, Table, as_cell
 from coliags_plugin.results.hashing import metrics_sha256
 from coliags_plugin.results.record import MetricRecord
 from tests.comparison.report.made import FRAMES, NO_LPIPS, made_scenes, result_of, write_comparison
@@ -31,35 +29,39 @@ def blocks_of(section):
             yield from blocks_of(block)
 
 
-def tables(content):
-    return {b.name: b for section in content.sections for b in blocks_of(section) if isinstance(b, Table)}
+def tables(page):
+    return {b.name: b for section in page.sections for b in blocks_of(section) if isinstance(b, Table)}
+
+
+def label(row):
+    return as_cell(next(iter(row.values()))).text
 
 
 def entries(table, key):
-    index = [column.key for column in table.columns].index(key)
-    return {row.label: row.entries[index] for row in table.rows}
+    assert key in [column.key for column in table.columns]
+    return {label(row): as_cell(row.get(key)) for row in table.rows}
 
 
-def paragraphs(content):
-    return " ".join(block.text for block in blocks_of(content.metrics) if isinstance(block, Paragraph))
+def paragraphs(page):
+    return " ".join(block.text for block in blocks_of(page.sections[0]) if isinstance(block, Paragraph))
 
 
 def of(study_of, results, **choices):
-    return make_content(study_of(results), Choices(**choices))
+    return text_page(study_of(results), Choices(**choices))
 
 
 def test_facts_and_title(study_of):
-    content = of(study_of, [result_of("coliags"), result_of("3dgs")])
-    assert content.title == "2 methods compared on cecum"
-    facts = dict(content.facts)
+    page = of(study_of, [result_of("coliags"), result_of("3dgs")])
+    assert page.title == "2 methods compared on cecum"
+    facts = {fact.name: fact.text for fact in page.facts}
     assert facts["Methods"] == "coliags, 3dgs"
     assert facts["Held-out frames"] == "5 test: held out along the path; 2 rotation: beyond the path"
     assert facts["Image size"] == "16 \N{MULTIPLICATION SIGN} 12 px"
     assert facts["Protocol"] == "paper, version 1"
     assert facts["Evaluated with"] == "coliags_plugin 0.1.0"
-    assert content.description == "as in the <paper>"
+    assert facts["How the metrics are computed"] == "as in the <paper>"
     assert of(study_of, [result_of("coliags")], title="Mine", note="40 steps").title == "Mine"
-    assert of(study_of, made_scenes({"coliags": 0}, scenes=14)).facts[0] == ("Scenes", "14")
+    assert of(study_of, made_scenes({"coliags": 0}, scenes=14)).facts[0] == Fact("Scenes", "14")
 
 
 # Summary
@@ -73,16 +75,16 @@ def test_lpips_of_another_net_where_there_is_no_vgg(study_of):
     metrics = {**ours.metrics, "lpips_squeeze": ours.metrics["lpips"]}
     squeezed = ours.model_copy(update={"metrics": metrics, "sets": sets, "metrics_sha256": metrics_sha256(sets)})
     both = tables(of(study_of, [squeezed]))
-    assert [column.key for column in both["summary-test"].columns if column.shown][2] == "lpips_squeeze"
+    assert [column.key for column in both["summary-test"].columns if column.shown][3] == "lpips_squeeze"
     assert not {"lpips", "lpips_squeeze"} & {c.key for c in both["summary-rotation"].columns if c.shown}
     chosen = tables(of(study_of, [squeezed], columns=["lpips"]))["summary-test"]
-    assert [column.key for column in chosen.columns if column.shown] == ["lpips"]
+    assert [column.key for column in chosen.columns[1:] if column.shown] == ["lpips"]
 
 
 def test_the_summary_of_one_scene_is_the_mean_of_its_frames(study_of):
-    content = of(study_of, [result_of("coliags", psnr=32.126, depth=0.5), result_of("3dgs", psnr=30.0, depth=1.0)])
-    table = tables(content)["summary-test"]
-    assert [column.key for column in table.columns if column.shown] == [
+    page = of(study_of, [result_of("coliags", psnr=32.126, depth=0.5), result_of("3dgs", psnr=30.0, depth=1.0)])
+    table = tables(page)["summary-test"]
+    assert [column.key for column in table.columns[1:] if column.shown] == [
         "psnr", "ssim", "depth_mse", "depth_mse_inner", "depth_median_error",
     ]  # fmt: skip
     assert f"Not shown, without values: LPIPS: {NO_LPIPS}" in table.notes
@@ -91,10 +93,10 @@ def test_the_summary_of_one_scene_is_the_mean_of_its_frames(study_of):
     assert [(e.text, e.rank) for e in entries(table, "depth_mse").values()] == [("0.250", 1), ("1.000", 2)]
     assert {e.note for e in entries(table, "lpips").values()} == {f"LPIPS: {NO_LPIPS}"}
     assert table.count == "5 frames"
-    rotation = tables(content)["summary-rotation"]
-    assert [column.key for column in rotation.columns][:2] == ["psnr", "psnr_seen"]
+    rotation = tables(page)["summary-rotation"]
+    assert [column.key for column in rotation.columns][1:3] == ["psnr", "psnr_seen"]
     assert "psnr_seen" not in [column.key for column in table.columns]
-    assert content.scenes is None
+    assert [section.title for section in page.text_sections] == ["Metrics", "Costs"]
 
 
 def test_the_summary_of_many_scenes_is_the_mean_over_scenes(study_of):
@@ -122,15 +124,15 @@ def test_seeds_of_one_scene_spread_over_seeds(study_of):
 
 def test_a_missing_scene_is_left_out_for_all(study_of):
     results = made_scenes({"coliags": 2.0, "3dgs": 0.0, "2dgs": 1.0})
-    content = of(study_of, [r for r in results if (r.method, r.scene.name) != ("3dgs", "scene-5")])
-    table = tables(content)["summary-test"]
+    page = of(study_of, [r for r in results if (r.method, r.scene.name) != ("3dgs", "scene-5")])
+    table = tables(page)["summary-test"]
     others = [r.sets["test"].mean("psnr") for r in results if r.method == "coliags" and r.scene.name != "scene-5"]
     assert entries(table, "psnr")["coliags"].value == pytest.approx(np.mean(others))
     assert "Means over 7 of 8 scenes, without scene-5, which not every method has" in table.notes
-    assert any(caution.startswith("3dgs has no result of scene-5") for caution in content.cautions)
-    lead = tables(content)["lead-test-psnr"]
+    assert any(caution.startswith("3dgs has no result of scene-5") for caution in page.cautions)
+    lead = tables(page)["lead-test-psnr"]
     assert [e.text for e in entries(lead, "scenes").values()] == ["7", "8"]
-    missing = entries(tables(content)["scene-scene-5-test"], "psnr")["3dgs"]
+    missing = entries(tables(page)["scene-scene-5-test"], "psnr")["3dgs"]
     assert (missing.text, missing.note) == ("", "3dgs: no result")
 
 
@@ -138,8 +140,8 @@ def test_a_metric_missing_on_a_scene_leaves_it_out_of_that_column(study_of):
     """A scene without depth: it counts for PSNR, and for no depth metric."""
     results = made_scenes({"coliags": 2.0, "3dgs": 0.0}, scenes=3)
     flat = [result_of(method, "flat", depth=None) for method in ("coliags", "3dgs")]
-    content = of(study_of, [*results, *flat])
-    table = tables(content)["summary-test"]
+    page = of(study_of, [*results, *flat])
+    table = tables(page)["summary-test"]
     left_out = [note for note in table.notes if "which not every method has" in note]
     assert left_out == [
         "Depth MSE; Depth MSE, inner; Depth median error; Depth AbsRel: "
@@ -148,13 +150,13 @@ def test_a_metric_missing_on_a_scene_leaves_it_out_of_that_column(study_of):
     assert entries(table, "depth_mse")["coliags"].note == (
         "Depth MSE: not available for flat; the frame has no true depth"
     )
-    scene = entries(tables(content)["scene-flat-test"], "depth_mse")["3dgs"]
+    scene = entries(tables(page)["scene-flat-test"], "depth_mse")["3dgs"]
     assert (scene.text, scene.note) == ("", "Depth MSE: the frame has no true depth")
 
 
 def test_a_mean_over_some_frames_says_so(study_of):
-    content = of(study_of, [result_of("coliags", values={"ssim": (0.9, None, 0.8, 0.7, 0.6)})])
-    entry = entries(tables(content)["summary-test"], "ssim")["coliags"]
+    page = of(study_of, [result_of("coliags", values={"ssim": (0.9, None, 0.8, 0.7, 0.6)})])
+    entry = entries(tables(page)["summary-test"], "ssim")["coliags"]
     assert (entry.text, entry.rank) == ("0.7500", None)
     assert entry.note == "SSIM: mean over 4 of 5 frames; no reason was recorded"
 
@@ -173,7 +175,7 @@ def test_columns_are_chosen(study_of):
 
     def shown(**choices):
         table = tables(of(study_of, results, **choices))["summary-test"]
-        return [column.key for column in table.columns if column.shown]
+        return [column.key for column in table.columns[1:] if column.shown]
 
     assert shown(columns=("depth_abs_rel", "psnr")) == ["depth_abs_rel", "psnr"]
     assert len(shown(columns=("all",))) == 7
@@ -211,12 +213,12 @@ def test_reference(study_of):
 )  # fmt: skip
 def test_what_the_statistics_can_say(study_of, scenes, rivals, said):
     methods = {"coliags": 9.0} | {f"rival-{index}": 0.0 for index in range(rivals)}
-    content = of(study_of, made_scenes(methods, scenes))
-    assert said in paragraphs(content)
-    table = tables(content)["summary-test"]
+    page = of(study_of, made_scenes(methods, scenes))
+    assert said in paragraphs(page)
+    table = tables(page)["summary-test"]
     stars = {entry.stars for label, entry in entries(table, "psnr").items() if label != "coliags"}
     assert stars == ({"*"} if "No" not in said else {""})
-    lead = tables(content).get("lead-test-psnr")
+    lead = tables(page).get("lead-test-psnr")
     assert (lead is None) == (scenes == 1)
     if lead is not None:
         keys = [column.key for column in lead.columns]
@@ -226,12 +228,12 @@ def test_what_the_statistics_can_say(study_of, scenes, rivals, said):
 
 def test_a_rival_with_few_scenes_is_not_tested(study_of):
     results = made_scenes({"coliags": 2.0, "3dgs": 0.0, "2dgs": 1.0})
-    content = of(study_of, [r for r in results if r.method != "2dgs" or r.scene.name < "scene-4"])
-    lead = tables(content)["lead-test-psnr"]
+    page = of(study_of, [r for r in results if r.method != "2dgs" or r.scene.name < "scene-4"])
+    lead = tables(page)["lead-test-psnr"]
     assert entries(lead, "wilcoxon")["2dgs"].note == "fewer than 6 scenes in common"
     assert entries(lead, "wilcoxon")["3dgs"].text == ".0078"
     assert entries(lead, "smallest")["3dgs"].text == ".00781"
-    assert "for 1 rival" in paragraphs(content)
+    assert "for 1 rival" in paragraphs(page)
 
 
 @pytest.mark.parametrize(
@@ -264,7 +266,7 @@ def test_metrics_at_points_are_shown_where_there_is_no_true_depth(study_of):
     metrics = {**result.metrics, "sparse_depth_median": MetricRecord(unit="%", direction="lower")}
     changed = result.model_copy(update={"sets": sets, "metrics": metrics, "metrics_sha256": metrics_sha256(sets)})
     table = tables(of(study_of, [changed]))["summary-test"]
-    shown = [column.key for column in table.columns if column.shown]
+    shown = [column.key for column in table.columns[1:] if column.shown]
     assert "sparse_depth_median" in shown and not any(name.startswith("depth") for name in shown)
     (note,) = [note for note in table.notes if "estimated depth is no truth" in note]
     assert note.startswith("Not shown, without values: Depth MSE; ")
@@ -305,20 +307,19 @@ def test_what_modules_make_of_held_out_views_is_said_where_methods_differ(study_
 
 def test_failed_cells_are_listed(tmp_path):
     failed = [("cecum", "3dgs", 0, "ran out of memory"), ("sigmoid", "3dgs", 1, "")]
-    content = make_content(read_study([write_comparison(tmp_path, [result_of("coliags")], failed)]), Choices())
-    rows = tables(content)["failed"].rows
-    assert [[row.label, *(entry.text for entry in row.entries)] for row in rows] == [
-        ["3dgs", "cecum", "0", "ran out of memory"],
-        ["3dgs", "sigmoid", "1", "no reason was recorded"],
+    page = text_page(read_study([write_comparison(tmp_path, [result_of("coliags")], failed)]), Choices())
+    rows = tables(page)["failed"].rows
+    assert [list(row.values()) for row in rows] == [
+        ["3dgs", "cecum", 0, "ran out of memory"],
+        ["3dgs", "sigmoid", 1, "no reason was recorded"],
     ]
 
 
 def test_unfinished_cells_are_counted(study_of):
-    failures = tuple(Failure(scene, "3dgs", 0, None) for scene in "pq")
-    study = replace(study_of([result_of("coliags")]), failures=failures)
-    content = make_content(study, Choices())
-    assert "failed" not in tables(content)
-    assert Paragraph("2 cells not finished: 3dgs (2).") in content.failures.blocks
+    missing = tuple(MissingResult(scene, "3dgs", 0, None) for scene in "pq")
+    page = text_page(replace(study_of([result_of("coliags")]), missing=missing), Choices())
+    assert "failed" not in tables(page)
+    assert Paragraph("2 cells not finished: 3dgs (2).") in page.sections[1].blocks
 
 
 # Published numbers
@@ -348,15 +349,16 @@ def c3vd_sequences(method="coliags", **changes):
 
 def published(study_of, results):
     table = tables(of(study_of, results))["summary-test"]
-    return {row.label: row for row in table.rows if row.published}, table
+    rows = [row for row in table.cells if row[0].published]
+    return {row[0].text: row[1:] for row in rows}, table
 
 
 def test_c3vd_has_the_published_numbers_beside_ours(study_of):
     rows, table = published(study_of, c3vd_sequences())
     assert len(rows) == 7
-    assert [entry.text for entry in rows["ColIAGS, published"].entries[:4]] == ["36.30", "0.91", "0.15", "0.042"]
-    assert all(entry.rank is None for row in rows.values() for entry in row.entries)
-    assert [row.published for row in table.rows] == [False] + [True] * 7
+    assert [entry.text for entry in rows["ColIAGS, published"][:4]] == ["36.30", "0.91", "0.15", "0.042"]
+    assert all(entry.rank is None for row in rows.values() for entry in row)
+    assert [row[0].published for row in table.cells] == [False] + [True] * 7
     assert any("as printed in the paper of ColIAGS for C3VD, 22 sequences" in note for note in table.notes)
 
 
@@ -376,13 +378,13 @@ def test_endogslam_and_rotatecolon(study_of):
     names = list(_C3VD_FRAMES)[:10]
     options = {"split": "endogslam", "frames": {"test": ("7",)}, "data": {"dataset": "c3vd-endogslam"}}
     rows, _ = published(study_of, [result_of("coliags", name, **options) for name in names])
-    assert [entry.text for entry in rows["ColIAGS, published"].entries[:4]] == ["35.58", "0.91", "0.23", "0.122"]
+    assert [entry.text for entry in rows["ColIAGS, published"][:4]] == ["35.58", "0.91", "0.23", "0.122"]
     phantoms = [result_of("coliags", f"phantom-{index}", **options) for index in range(10)]
     assert published(study_of, phantoms)[0] == {}
     frames = tuple(str(index) for index in range(223))
     options = {"split": "all-train", "frames": {"test": frames}, "train": tuple(map(str, range(381)))}
     rows, _ = published(study_of, [result_of("coliags", depth=None, data={"dataset": "rotatecolon"}, **options)])
-    ours = [entry.text for entry in rows["ColIAGS, published"].entries]
+    ours = [entry.text for entry in rows["ColIAGS, published"]]
     assert ours[:4] == ["23.29", "0.90", "0.21", ""]
 
 
@@ -419,16 +421,9 @@ def test_costs_on_different_devices_are_not_ranked(study_of, change):
 
 
 def test_a_cost_that_was_not_measured(study_of):
-    content = of(study_of, [result_of("a", cost={"train_seconds": None, "gaussians": None})])
-    assert entries(tables(content)["costs"], "train_seconds")["a"].note == "Training: not measured"
-    assert "a radiance field" in entries(tables(content)["costs"], "gaussians")["a"].note
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"), [(0.26, "0.3 s"), (59.0, "59.0 s"), (61.0, "1 min 01 s"), (7322.0, "2 h 02 min")]
-)
-def test_duration(seconds, text):
-    assert duration(seconds) == text
+    page = of(study_of, [result_of("a", cost={"train_seconds": None, "gaussians": None})])
+    assert entries(tables(page)["costs"], "train_seconds")["a"].note == "Training: not measured"
+    assert "a radiance field" in entries(tables(page)["costs"], "gaussians")["a"].note
 
 
 # Frames

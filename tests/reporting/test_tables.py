@@ -1,4 +1,4 @@
-"""The table model: decimals, ranks, footnotes."""
+"""Tables and numbers: decimals, ranks, footnotes, durations."""
 
 from __future__ import annotations
 
@@ -6,16 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coliags_plugin.comparison.report.tables import (
-    Column,
-    Entry,
-    Footnote,
-    Row,
-    Table,
-    counted,
-    number_text,
-    numeric_entries,
-)
+from coliags_plugin.reporting.model import Column, Footnote, Table, TableCell, ranked_cells
+from coliags_plugin.reporting.numbers import counted, duration, file_size, number_text, plain
 
 
 @pytest.mark.parametrize(
@@ -33,20 +25,20 @@ from coliags_plugin.comparison.report.tables import (
     ],
 )
 def test_ranks(direction, values, ranks):
-    assert [entry.rank for entry in numeric_entries(values, "dB", direction)] == ranks
+    assert [cell.rank for cell in ranked_cells(values, "dB", direction)] == ranks
 
 
 @given(st.lists(st.none() | st.floats(-100, 100), max_size=8), st.sampled_from(["higher", "lower"]))
 def test_ranks_follow_the_printed_values(values, direction):
-    entries = numeric_entries(values, "dB", direction)
-    ranked = [entry for entry in entries if entry.rank is not None]
-    assert [entry.value is None for entry in entries] == [value is None for value in values]
+    cells = ranked_cells(values, "dB", direction)
+    ranked = [cell for cell in cells if cell.rank is not None]
+    assert [cell.value is None for cell in cells] == [value is None for value in values]
     sign = -1 if direction == "higher" else 1
     for one in ranked:
         for other in ranked:
             assert (one.rank < other.rank) == (sign * float(one.text) < sign * float(other.text))
     assert len(ranked) != 1
-    assert not ranked or min(entry.rank for entry in ranked) == 1
+    assert not ranked or min(cell.rank for cell in ranked) == 1
 
 
 @pytest.mark.parametrize(
@@ -62,12 +54,12 @@ def test_ranks_follow_the_printed_values(values, direction):
     ],
 )
 def test_decimals(unit, values, printed):
-    assert [entry.text for entry in numeric_entries(values, unit, "lower")] == printed
+    assert [cell.text for cell in ranked_cells(values, unit, "lower")] == printed
 
 
 def test_spreads_have_the_decimals_of_their_values():
-    entries = numeric_entries([30.0, None], "dB", "higher", [0.126, 3.0])
-    assert [entry.spread for entry in entries] == ["0.13", ""]
+    cells = ranked_cells([30.0, None], "dB", "higher", [0.126, 3.0])
+    assert [cell.spread for cell in cells] == ["0.13", ""]
 
 
 def test_no_negative_zero():
@@ -76,21 +68,38 @@ def test_no_negative_zero():
 
 
 def test_equal_footnotes_share_a_mark_and_hidden_columns_have_none():
-    columns = (Column("a", "A"), Column("b", "B", shown=False), Column("c", "C"))
-    rows = (
-        Row("one", (Entry(note="x"), Entry(note="hidden"), Entry(note="y"))),
-        Row("two", (Entry(note="y"), Entry("1", 1.0), Entry(note="x"))),
-    )
-    table = Table("T", "Method", columns, rows)
-    assert table.footnotes() == {
-        "x": Footnote("a", ("a", "c")),
-        "y": Footnote("b", ("c", "a")),
-        "hidden": Footnote("c", ("b",)),
-    }
+    columns = [Column("a", "A"), Column("b", "B", shown=False), Column("c", "C")]
+    rows = [
+        {"a": TableCell(note="x"), "b": TableCell(note="hidden"), "c": TableCell(note="y")},
+        {"a": TableCell(note="y"), "b": 1.0, "c": TableCell(note="x")},
+    ]
+    table = Table("T", columns, rows)
+    assert list(table.footnotes.values()) == [
+        Footnote("a", "x", ("a", "c")),
+        Footnote("b", "y", ("c", "a")),
+        Footnote("c", "hidden", ("b",)),
+    ]
     shown = table.only_shown()
     assert [column.key for column in shown.columns] == ["a", "c"]
-    assert [note.mark for note in shown.footnotes().values()] == ["a", "b"]
+    assert [note.mark for note in shown.footnotes.values()] == ["a", "b"]
 
 
 def test_counted():
     assert [counted(1, "frame"), counted(0, "frame"), counted(1200, "scene")] == ["1 frame", "0 frames", "1,200 scenes"]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0.26, "0.3 s"), (59.0, "59.0 s"), (59.97, "1 min 00 s"), (61.0, "1 min 01 s"), (7322.0, "2 h 02 min")],
+)
+def test_duration(seconds, text):
+    assert duration(seconds) == text
+
+
+def test_file_size():
+    assert [file_size(size) for size in (4e5, 9.9e8, 3.44e9)] == ["0 MB", "990 MB", "3.4 GB"]
+
+
+def test_plain():
+    values = (None, True, 0.25, -0.0, 3, "x", [1, 2.5], list(range(9)), {"a": 1})
+    assert [*map(plain, values)] == ["", "yes", "0.25", "0", "3", "x", "1, 2.5", "0, 1, …, 8 (9)", "1 entries"]

@@ -1,0 +1,174 @@
+"""A reference's lead over its rivals: tables of tests, intervals and effect sizes, and what they can say."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from coliags_plugin.comparison.report.metric_columns import metric_columns
+from coliags_plugin.comparison.report.metric_tables import shared_scenes
+from coliags_plugin.comparison.report.study import Part, Study
+from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.reporting.model import Column, Table, TableCell
+from coliags_plugin.reporting.numbers import column_decimals, counted, number_text, unit_text
+from coliags_plugin.results.comparisons import LEVELS, RivalComparison, compare_with_rivals
+from coliags_plugin.results.paired import FEWEST_SCENES, RESAMPLES, smallest_p
+from coliags_plugin.results.spread import spread
+
+#: The reference where it is among the methods.
+PREFERRED = "coliags"
+#: What the columns of a table of leads are.
+EXPLANATION = (
+    "Lead: by how much the reference is better, mean over the scenes that both methods have; seeds are averaged "
+    f"first. 95 % interval: percentile bootstrap of the lead over scenes, {RESAMPLES:,} resamples. Smallest p: what "
+    "the two-sided Wilcoxon signed-rank test of so many scenes can give. Holm: adjusted for the number of rivals. "
+    "Cohen's d: of paired samples, the mean lead over its standard deviation. Rank-biserial: matched-pairs "
+    "correlation, 1 where the reference is better on every scene."
+)
+_SMALLEST_PRINTED = 1e-4
+
+
+def choose_reference(study: Study, chosen: str | None) -> str:
+    """The method that the others are compared with: the one chosen, else ``coliags``, else the best.
+
+    Raises:
+        InputError: The chosen one is not among the methods.
+    """
+    if chosen is None:
+        return PREFERRED if PREFERRED in study.methods else _best_method(study.parts[0])
+    if chosen not in study.methods:
+        known = ", ".join(study.methods)
+        raise InputError(
+            f"--reference {chosen}: no such method", f"one of {known}", did_you_mean(chosen, study.methods)
+        )
+    return chosen
+
+
+def _best_method(part: Part) -> str:
+    """The method that is best by the first metric; the first one where none has a value."""
+    column = metric_columns(part)[0]
+    values = part.values(column.key)
+    shared = shared_scenes(values)
+    means = {method: spread(by_scene, shared).mean for method, by_scene in values.items() if by_scene and shared}
+    sign = 1.0 if column.direction == "higher" else -1.0
+    return max(means, key=lambda method: sign * means[method]) if means else part.study.methods[0]
+
+
+def compare(part: Part, column: Column, reference: str) -> list[RivalComparison]:
+    """The reference compared with every other method by one metric; empty where it has no value."""
+    values = part.values(column.key)
+    if column.direction is None or not values[reference]:
+        return []
+    rivals = {method: by_scene for method, by_scene in values.items() if by_scene}
+    return compare_with_rivals(rivals, reference, column.direction == "higher")
+
+
+def lead_table(part: Part, column: Column, compared: Sequence[RivalComparison], reference: str) -> Table:
+    """Lead of the reference by one metric over each rival, with tests where there are enough scenes."""
+    unit = unit_text(column.unit)
+    columns = [
+        Column("over", "Over", words=True),
+        Column("scenes", "Scenes"),
+        Column("lead", "Lead", column.unit),
+        Column("better", "Better on"),
+    ]
+    if any(row.tests for row in compared):
+        columns += [
+            Column("interval", "95 % interval", column.unit),
+            Column("smallest", "Smallest p"),
+            Column("wilcoxon", "Wilcoxon p"),
+            Column("wilcoxon_holm", "Holm"),
+            Column("t_test", "t-test p"),
+            Column("t_test_holm", "Holm"),
+            Column("cohen_dz", "Cohen's d"),
+            Column("rank_biserial", "Rank-biserial"),
+        ]
+    decimals = column_decimals(column.unit, [row.lead for row in compared])
+    untested = dict.fromkeys(
+        [each.key for each in columns[4:]], TableCell(note=f"fewer than {FEWEST_SCENES} scenes in common")
+    )
+    return Table(
+        title=f"{column.title}: lead of {reference}",
+        columns=columns,
+        rows=[
+            {
+                "over": TableCell(row.rival, style=part.study.methods.index(row.rival)),
+                "scenes": len(row.scenes),
+                "lead": TableCell(note="no scene in common") if row.lead is None else _signed(row.lead, decimals),
+                "better": TableCell(f"{row.better_on} of {len(row.scenes)}", row.better_on),
+                **(untested if row.tests is None else _test_cells(row, decimals)),
+            }
+            for row in compared
+        ],
+        count=part.title + (f", {unit}" if unit else ""),
+        name=f"lead-{part.name}-{column.key}",
+    )
+
+
+def _test_cells(row: RivalComparison, decimals: int) -> dict[str, TableCell]:
+    if row.tests is None:
+        return {}
+    tests, scenes = row.tests, len(row.scenes)
+    low, high = (_signed(end, decimals) for end in tests.interval)
+    undefined = TableCell(note="all differences are equal")
+    return {
+        "interval": TableCell(f"{low.text} to {high.text}", low.value),
+        "smallest": TableCell(smallest_p_text(scenes), smallest_p(scenes)),
+        "wilcoxon": TableCell(p_text(tests.wilcoxon), tests.wilcoxon),
+        "wilcoxon_holm": TableCell(p_text(tests.wilcoxon_holm), tests.wilcoxon_holm, stars=row.stars),
+        "t_test": undefined if tests.t_test is None else TableCell(p_text(tests.t_test), tests.t_test),
+        "t_test_holm": undefined
+        if tests.t_test_holm is None
+        else TableCell(p_text(tests.t_test_holm), tests.t_test_holm),
+        "cohen_dz": undefined if tests.cohen_dz is None else _signed(tests.cohen_dz, 2),
+        "rank_biserial": _signed(tests.rank_biserial, 2),
+    }
+
+
+def _signed(value: float, decimals: int) -> TableCell:
+    text = number_text(value, decimals)
+    return TableCell(f"+{text}" if value > 0 and text.strip("0.") else text, value)
+
+
+def statistics_text(compared: Sequence[RivalComparison], reference: str, chosen: bool) -> list[str]:
+    """Sentences on the unit, the number of scenes and the smallest possible p; or why no test is run.
+
+    Args:
+        compared: The reference with each rival, by one metric.
+        reference: Its name.
+        chosen: Whether it was chosen beforehand, not for being the best.
+    """
+    most = max((len(row.scenes) for row in compared), default=0)
+    if not most:
+        return []
+    if most < FEWEST_SCENES:
+        return [
+            f"No test is run: {counted(most, 'scene')} cannot tell methods apart. The unit is the scene, not the "
+            f"frame, and of {counted(most, 'difference')} the two-sided Wilcoxon test cannot give less than p = "
+            f"{smallest_p_text(most)}; tests are run from {FEWEST_SCENES} scenes on "
+            f"(p = {smallest_p_text(FEWEST_SCENES)})."
+        ]
+    rivals = sum(row.tests is not None for row in compared)
+    text = [
+        f"Paired over {counted(most, 'scene')}: the unit is the scene, not the frame. The smallest p that the "
+        f"two-sided Wilcoxon signed-rank test can give is {smallest_p_text(most)}, or "
+        f"{smallest_p_text(most, rivals)} after Holm's adjustment for {counted(rivals, 'rival')}."
+    ]
+    if min(1.0, rivals * smallest_p(most)) >= LEVELS[0]:
+        needed = next(count for count in range(most, 100) if rivals * smallest_p(count) < LEVELS[0])
+        text.append(f"No star is possible, as that is not below {p_text(LEVELS[0])}; it takes {needed} scenes.")
+    if not chosen:
+        text.append(
+            f"{reference} is the reference because it came out best, so that the p-values are too small: choose one "
+            "beforehand, with --reference."
+        )
+    return text
+
+
+def p_text(p: float, digits: int = 2) -> str:
+    """A p-value with significant digits, without a leading zero; ``1`` and ``< .0001`` at the ends."""
+    return "< .0001" if p < _SMALLEST_PRINTED else f"{p:.{digits}g}".removeprefix("0")
+
+
+def smallest_p_text(scenes: int, rivals: int = 1) -> str:
+    """The smallest p that so many scenes can give, adjusted for so many rivals."""
+    return p_text(min(1.0, rivals * smallest_p(scenes)), digits=3)

@@ -1,0 +1,187 @@
+"""The page of a report, made of a study."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from coliags_plugin.comparison.report.charts import light_section, profile_section, training_blocks
+from coliags_plugin.comparison.report.comparability import cautions
+from coliags_plugin.comparison.report.costs import cost_table
+from coliags_plugin.comparison.report.frame_tables import frame_section
+from coliags_plugin.comparison.report.leads import (
+    EXPLANATION,
+    PREFERRED,
+    choose_reference,
+    compare,
+    lead_table,
+    statistics_text,
+)
+from coliags_plugin.comparison.report.metric_columns import check_columns, metric_columns
+from coliags_plugin.comparison.report.metric_tables import scene_table, seed_table, summary_table
+from coliags_plugin.comparison.report.provenance import provenance_section
+from coliags_plugin.comparison.report.published import published_for
+from coliags_plugin.comparison.report.study import MissingResult, Part, Study
+from coliags_plugin.comparison.report.views import view_section
+from coliags_plugin.reporting.model import Block, Column, Fact, Folded, Page, Paragraph, Section, Table
+from coliags_plugin.reporting.numbers import counted
+
+_TIMES = "\N{MULTIPLICATION SIGN}"
+#: Scenes listed by name; of more, only their number is given.
+_LISTED = 12
+
+
+@dataclass(frozen=True)
+class Choices:
+    """What the reader of a report chooses.
+
+    Attributes:
+        columns: Metrics to show, in this order; empty: the default ones.
+        reference: Method that the others are compared with; None: ``coliags``, or the best where it is not there.
+        title: Heading; None: made from methods and scenes.
+        note: Remark under the heading.
+        frames: Held-out views to show per scene and test set, beside the worst ones.
+    """
+
+    columns: Sequence[str] = ()
+    reference: str | None = None
+    title: str | None = None
+    note: str | None = None
+    frames: int = 4
+
+
+def text_page(study: Study, choices: Choices) -> Page:
+    """The page without what only a screen shows.
+
+    Raises:
+        InputError: A chosen column or the reference does not exist.
+    """
+    check_columns(study, choices.columns)
+    reference = choose_reference(study, choices.reference)
+    return Page(
+        title=choices.title if choices.title is not None else _title(study),
+        sections=[
+            _metrics(study, choices, reference),
+            _missing(study.missing),
+            Section("Costs", [cost_table(study)]),
+            _scenes(study, choices),
+        ],
+        facts=[*_facts(study), Fact("How the metrics are computed", study.protocol.description, wide=True)],
+        note=choices.note or "",
+        cautions=cautions(study),
+    )
+
+
+def screen_page(text: Page, study: Study, choices: Choices, scene: Section | None = None) -> Page:
+    """The whole page, for HTML.
+
+    Args:
+        text: The page without views, charts and provenance.
+        study: The results.
+        choices: What its reader chose.
+        scene: Section with a scene to fly through.
+
+    Raises:
+        InputError: A choice is not possible, or an image, a training log or a record of light is missing or damaged.
+    """
+    reference = choose_reference(study, choices.reference)
+    metrics, missing, costs, scenes = text.sections
+    sections = [
+        metrics,
+        missing,
+        view_section(study, reference, choices.frames),
+        *([] if scene is None else [scene]),
+        profile_section(study),
+        light_section(study),
+        Section("Training", [*costs.blocks, *training_blocks(study)]),
+        scenes,
+        frame_section(study, choices.columns, reference),
+        provenance_section(study),
+    ]
+    return replace(text, sections=sections)
+
+
+def _title(study: Study) -> str:
+    scenes = study.scenes
+    where = scenes[0] if len(scenes) == 1 else counted(len(scenes), "scene")
+    if len(study.methods) == 1:
+        return f"{study.methods[0]} on {where}"
+    return f"{len(study.methods)} methods compared on {where}"
+
+
+def _facts(study: Study) -> list[Fact]:
+    scenes, results = study.scenes, [run.result for run in study.runs]
+    sizes = dict.fromkeys(result.scene.size for result in results)
+    versions = dict.fromkeys(str(result.software.get("package_version") or "") for result in results)
+    seeds = sorted({result.seed for result in results})
+    frames = {part.title: sum(len(part.frames(scene)) for scene in part.scenes) for part in study.parts}
+    splits = dict.fromkeys(part.split for part in study.parts)
+    facts = {
+        "Scene" if len(scenes) == 1 else "Scenes": ", ".join(scenes) if len(scenes) <= _LISTED else str(len(scenes)),
+        "Methods": ", ".join(study.methods),
+        "Seeds" if len(seeds) > 1 else "Seed": ", ".join(map(str, seeds)),
+        "Split": ", ".join(filter(None, splits)),
+        "Held-out frames": "; ".join(f"{count} {title}" for title, count in frames.items()),
+        "Image size": ", ".join(f"{width} {_TIMES} {height} px" for width, height in sizes),
+        "Protocol": f"{study.protocol.name}, version {study.protocol.version}",
+        "Evaluated with": ", ".join(f"coliags_plugin {version}" for version in versions if version),
+    }
+    return [Fact(name, value) for name, value in facts.items()]
+
+
+def _metrics(study: Study, choices: Choices, reference: str) -> Section:
+    text = "Means over the frames of each set."
+    if len(study.scenes) > 1:
+        text = "Means over the scenes of each set, of each the mean over its frames."
+    text += " ↑ higher is better, ↓ lower is better."
+    if len(study.methods) > 1:
+        text += " Best in bold, second underlined, by the printed digits; equal values share a rank."
+    blocks: list[Block] = [Paragraph(text)]
+    for part in study.parts:
+        # What holds for several parts is said once.
+        blocks += [block for block in _part_blocks(part, choices, reference) if block not in blocks]
+    return Section("Metrics", blocks)
+
+
+def _part_blocks(part: Part, choices: Choices, reference: str) -> list[Block]:
+    columns = metric_columns(part, choices.columns)
+    compared = {column.key: compare(part, column, reference) for column in columns}
+    blocks: list[Block] = [summary_table(part, columns, compared, published_for(part))]
+    shown = [column for column in columns if column.shown and compared[column.key]]
+    if shown:
+        chosen = choices.reference is not None or reference == PREFERRED
+        blocks += [Paragraph(text) for text in statistics_text(compared[shown[0].key], reference, chosen)]
+    if shown and len(part.scenes) > 1:
+        leads = [lead_table(part, column, compared[column.key], reference) for column in shown]
+        blocks.append(Folded(f"Lead of {reference} over each method, {part.title}", [Paragraph(EXPLANATION), *leads]))
+    seeds = seed_table(part, columns)
+    return blocks if seeds is None else [*blocks, Folded(seeds.title, [seeds])]
+
+
+def _scenes(study: Study, choices: Choices) -> Section:
+    tables: dict[str, list[Table]] = {scene: [] for scene in study.scenes}
+    for part in study.parts if len(tables) > 1 else ():
+        columns = metric_columns(part, choices.columns)
+        for scene in part.scenes:
+            tables[scene].append(scene_table(part, columns, scene))
+    return Section("Every scene", [Folded(scene, own) for scene, own in tables.items() if own])
+
+
+def _missing(missing: Sequence[MissingResult]) -> Section:
+    blocks: list[Block] = [Paragraph("Means and tests leave these out.")] if missing else []
+    unfinished = Counter(one.method for one in missing if one.reason is None)
+    if unfinished:
+        each = ", ".join(f"{method} ({count})" for method, count in unfinished.items())
+        blocks.append(Paragraph(f"{counted(unfinished.total(), 'cell')} not finished: {each}."))
+    failed = [one for one in missing if one.reason is not None]
+    if failed:
+        columns = [
+            Column("method", "Method", words=True),
+            Column("scene", "Scene", words=True),
+            Column("seed", "Seed"),
+            Column("reason", "Reason", words=True),
+        ]
+        rows = [{"method": one.method, "scene": one.scene, "seed": one.seed, "reason": one.reason} for one in failed]
+        blocks.append(Table("Failed", columns, rows, count=counted(len(rows), "cell"), name="failed"))
+    return Section("Cells without a result", blocks)
