@@ -17,7 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import tyro
-from machine import markdown_table, write_results
+from machine import show
 from scipy.optimize import least_squares
 
 from coliags_plugin.core.images import read_rgb
@@ -190,7 +190,7 @@ def main(options: Options) -> None:
         error = np.linalg.norm(cost(values).reshape(-1, 2), axis=1)
         place = " ".join(f"{value:.4g}" for value in values)
         rows.append({"reading": name, "origin, scale": place, "cost": round(total, 1), "median px": np.median(error)})
-    print(markdown_table(rows))
+    show(rows, options.json)
     flat = readings["no affine part"]
     generator = np.random.default_rng(0)
     stretches = np.unique(tracks.stretch)
@@ -214,7 +214,6 @@ def main(options: Options) -> None:
         print(f"roll of {name}: {np.degrees(np.arctan2(ray[1], ray[0])):+.3f} degrees")
     print(f"free roll: {rolls[0]:+.3f} degrees, standard deviation {spread.std():.3f} over resampled stretches")
     print(f"{len(tracks.stretch)} tracks, {len(tracks.track)} observations, {len(stretches)} stretches")
-    write_results(options.json, rows)
 
 
 if __name__ == "__main__":

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import os
 import resource
-import subprocess
-import sys
 import tempfile
 import time
 from dataclasses import dataclass
@@ -16,9 +14,8 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from machine import describe_machine, markdown_table, write_results
+from machine import numbers_of, peak_mib, show, size_of
 
-MIB = 1024.0
 #: Different images; the sequence repeats them.
 ORIGINALS = 9
 
@@ -77,30 +74,19 @@ def load(scene: Path, keep_pixels: bool) -> tuple[float, float, float]:
     return before, peak_mib(), seconds
 
 
-def peak_mib() -> float:
-    """Peak resident memory of this process, MiB.
-
-    Not from getrusage: its figure begins with that of the process that started this one.
-    """
-    status = Path("/proc/self/status").read_text(encoding="utf-8")
-    return next(float(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")) / MIB
-
-
 def main(options: Options) -> None:
     """Run, print a table, and write JSON where asked."""
     if options.child is not None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (options.open_files, options.open_files))
         print(*load(options.child, options.keep_pixels))
         return
-    width, height = (int(part) for part in options.size.split("x"))
+    width, height = size_of(options.size)
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         scene = write_sequence(Path(folder), options.frames, width, height)
         for keep in (True, False):
             case = ["--child", str(scene), "--keep-pixels" if keep else "--no-keep-pixels"]
-            command = [sys.executable, __file__, *case, "--open-files", str(options.open_files)]
-            printed = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout.split()
-            before, peak, seconds = map(float, printed[-3:])
+            before, peak, seconds = numbers_of(__file__, *case, "--open-files", str(options.open_files))
             rows.append(
                 {
                     "keep_pixels": keep,
@@ -112,9 +98,7 @@ def main(options: Options) -> None:
                     "peak_mib": peak,
                 }
             )
-    print(", ".join(f"{key}: {value}" for key, value in describe_machine().items()), end="\n\n")
-    print(markdown_table(rows))
-    write_results(options.json, rows)
+    show(rows, options.json)
 
 
 if __name__ == "__main__":

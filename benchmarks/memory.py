@@ -5,18 +5,13 @@ python benchmarks/memory.py --anchors 20000,100000 --renderers torch,cpu --json 
 
 from __future__ import annotations
 
-import resource
-import subprocess
-import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 import tyro
-from machine import describe_machine, markdown_table, write_results
-
-MIB = 1024.0
+from machine import numbers_of, peak_mib, show, size_of
 
 
 @dataclass(frozen=True)
@@ -45,14 +40,14 @@ def train(options: Options) -> tuple[float, float]:
     from coliags_plugin.engine.run_folder import RunFolder
     from coliags_plugin.engine.trainer import Trainer
 
-    width, height = (int(part) for part in options.size.split("x"))
+    width, height = size_of(options.size)
     scene = tube_scene(int(options.anchors), frames=4, width=width, height=height)
     method = load_method("coliags", [f"renderer.name={options.renderers}", "field.voxel_size=0.01"])
     trainer = Trainer(method, scene, "tube", RunFolder(Path(tempfile.gettempdir())), 0, torch.device("cpu"))
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / MIB
+    before = peak_mib()
     for _ in range(options.steps):
         trainer.take_step()
-    return before, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / MIB
+    return before, peak_mib()
 
 
 def main(options: Options) -> None:
@@ -64,13 +59,9 @@ def main(options: Options) -> None:
     for anchors in options.anchors.split(","):
         for renderer in options.renderers.split(","):
             case = ["--anchors", anchors, "--renderers", renderer, "--steps", str(options.steps)]
-            command = [sys.executable, __file__, "--child", *case, "--size", options.size]
-            printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
-            before, peak = map(float, printed[-2:])
+            before, peak = numbers_of(__file__, "--child", *case, "--size", options.size)
             rows.append({"renderer": renderer, "anchors": int(anchors), "before_mib": before, "peak_mib": peak})
-    print(", ".join(f"{key}: {value}" for key, value in describe_machine().items()), end="\n\n")
-    print(markdown_table(rows))
-    write_results(options.json, rows)
+    show(rows, options.json)
 
 
 if __name__ == "__main__":

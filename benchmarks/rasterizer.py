@@ -26,9 +26,9 @@ os.environ.setdefault("GOMP_SPINCOUNT", "10000")
 
 import torch
 import tyro
-from machine import CLOCKS, describe_machine, markdown_table, write_results
+from machine import CLOCKS, show
 from train_stages import Handed
-from workload import camera, lining, wall
+from tube import camera, lining, wall
 
 from coliags_plugin.config.components import make_component
 from coliags_plugin.config.registry import REGISTRIES
@@ -182,9 +182,7 @@ def main(options: Options) -> None:
             ratios = {"faster, forward": first_forward / forward, "faster, both": first_both / both}
             ratios[f"both, of {primitives[0]}"] = both / medians[name, primitives[0]][1]
             shown.append({**row, **ratios, "turns": len(cases[name, primitive].both)})
-    print(", ".join(f"{key}: {value}" for key, value in describe_machine().items()), end="\n\n")
-    print(markdown_table(shown))
-    write_results(options.json, rows)
+    show(rows, options.json, shown)
 
 
 if __name__ == "__main__":

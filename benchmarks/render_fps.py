@@ -13,7 +13,7 @@ from pathlib import Path
 
 import torch
 import tyro
-from machine import describe_machine, markdown_table, write_results
+from machine import show, size_of
 from tube import tube_scene
 
 from coliags_plugin.config.components import make_component
@@ -43,7 +43,7 @@ class Options:
 @torch.no_grad()
 def main(options: Options) -> None:
     """Run, print a table, and write JSON where asked."""
-    width, height = (int(part) for part in options.size.split("x"))
+    width, height = size_of(options.size)
     device = choose_device(options.device)
     rows = []
     for anchors in map(int, options.anchors.split(",")):
@@ -63,9 +63,7 @@ def main(options: Options) -> None:
         for name in names:
             seconds = statistics.median(times[name])
             rows.append({"renderer": name, "anchors": anchors, "ms": 1e3 * seconds, "frames_per_s": 1 / seconds})
-    print(", ".join(f"{key}: {value}" for key, value in describe_machine().items()), end="\n\n")
-    print(markdown_table(rows))
-    write_results(options.json, rows)
+    show(rows, options.json)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from typing import Any
 
 import torch
 import tyro
-from machine import describe_machine, markdown_table, write_results
+from machine import show, size_of
 from torch import Tensor
 from tube import tube_scene
 
@@ -138,7 +138,7 @@ def timed_step(trainer: Trainer, clock: Clock) -> int:
 
 def main(options: Options) -> None:
     """Run, print a table, and write JSON where asked."""
-    width, height = (int(part) for part in options.size.split("x"))
+    width, height = size_of(options.size)
     device = choose_device(options.device)
     rows = []
     for anchors in map(int, options.anchors.split(",")):
@@ -160,9 +160,7 @@ def main(options: Options) -> None:
             total = statistics.median(map(sum, zip(*clocks[name].times.values(), strict=True)))
             row = {"renderer": name, "anchors": anchors, "gaussians": int(statistics.median(drawn[name]))}
             rows.append({**row, "step_ms": total, **{f"{stage} ms": value for stage, value in medians.items()}})
-    print(", ".join(f"{key}: {value}" for key, value in describe_machine().items()), end="\n\n")
-    print(markdown_table(rows))
-    write_results(options.json, rows)
+    show(rows, options.json)
 
 
 if __name__ == "__main__":

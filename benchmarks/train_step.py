@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 import torch
 import tyro
-from machine import CLOCKS, describe_machine, markdown_table, write_results
+from machine import CLOCKS, show, size_of
 from tube import tube_scene
 
 from coliags_plugin.config.method_config import LoadedMethod, load_method
@@ -56,7 +56,7 @@ class Options:
 
 def trainer_of(method: LoadedMethod, points: int, options: Options) -> Trainer:
     """A trainer on the tube, at the chosen share of its run."""
-    width, height = (int(part) for part in options.size.split("x"))
+    width, height = size_of(options.size)
     scene = tube_scene(points, width=width, height=height)
     folder = RunFolder(Path(tempfile.gettempdir()))
     trainer = Trainer(method, scene, "tube", folder, 0, choose_device(options.device))
@@ -108,9 +108,7 @@ def main(options: Options) -> None:
         shares = [own / first for own, first in zip(times[name], times[names[0]], strict=True)]
         medians = {"step ms": statistics.median(times[name]), f"of {names[0]}": statistics.median(shares)}
         rows.append({"method": name, "gaussians": seen[name] or "none", **medians})
-    print(", ".join(f"{key}: {value}" for key, value in describe_machine().items()), end="\n\n")
-    print(markdown_table(rows))
-    write_results(options.json, rows)
+    show(rows, options.json)
 
 
 def _wait(trainer: Trainer) -> None:

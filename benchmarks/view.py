@@ -14,7 +14,7 @@ from typing import Annotated
 
 import torch
 import tyro
-from machine import describe_machine, markdown_table, write_results
+from machine import show
 from tube import tube_scene
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
@@ -48,9 +48,7 @@ def main(options: Options) -> None:
     """Print a table of medians."""
     torch.set_num_threads(options.threads)
     rows = [timed(*field, options.repeats) for field in fields(options)]
-    print(", ".join(f"{key}: {value}" for key, value in describe_machine().items()), end="\n\n")
-    print(markdown_table(rows))
-    write_results(options.json, rows)
+    show(rows, options.json)
 
 
 def fields(options: Options) -> list[tuple[str, GaussianField, list[Camera]]]:
