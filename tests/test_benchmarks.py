@@ -68,7 +68,7 @@ def test_a_training_curve_and_its_figure(run, method, tmp_path):
 
 
 def test_frames_a_second(run):
-    table = run("render_fps", "--anchors", 300, "--frames", 1, *SIZE, "--renderers", "cpu")
+    table = run("render_fps", "--anchors", 300, "--frames", 3, *SIZE, "--renderers", "cpu")
     assert "| frames_per_s |" in table and "| cpu | 300 |" in table
 
 

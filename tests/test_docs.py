@@ -12,7 +12,7 @@ import tarfile
 from functools import cache
 from pathlib import Path
 from runpy import run_path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 import yaml
@@ -175,11 +175,8 @@ def parsed(argv: list[str], monkeypatch: pytest.MonkeyPatch) -> Any:
     return caught[0] if caught else None
 
 
-#: Subcommands that running text names alone.
-ALONE = (
-    *("train", "eval", "render", "mesh", "export", "import", "coverage", "view", "reconstruct"),
-    *("report", "compare", "ablate", "phantom", "config", "check", "poses"),
-)
+#: Subcommands, which running text names alone.
+ALONE = {get_args(part)[1].name for part in get_args(cli.Command)}
 #: Methods that docs/example_package adds; tests/test_third_party_package.py trains them.
 OF_THE_EXAMPLE = {path.stem for path in (DOCS / "example_package").rglob("*.yaml")}
 

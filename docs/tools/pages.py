@@ -14,13 +14,18 @@ from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "coliags_plugin"
+DOCS = ROOT / "docs"
 #: Pages of the repository's root, by their place in the site.
 FROM_ROOT = {"index.md": "README.md", "contributing.md": "CONTRIBUTING.md", "changelog.md": "CHANGELOG.md"}
 STYLE = ".md-typeset td:first-child code { white-space: nowrap; }\n"
 
 
 def on_config(config: Any, **_: Any) -> Any:
-    """Called by mkdocs first: a section of the reference for each package."""
+    """Called by mkdocs first: pages of whole folders, and a section of the reference for each package."""
+    for section in config.nav:
+        ((title, pages),) = section.items()
+        if isinstance(pages, str) and pages.endswith("/*"):
+            section[title] = sorted(str(page.relative_to(DOCS)) for page in DOCS.glob(f"{pages}.md"))
     parts: dict[str, list[str]] = {}
     for name in modules():
         parts.setdefault(".".join(name.split(".")[:2]), []).append(f"reference/{name}.md")
