@@ -10,8 +10,6 @@ import pytest
 import torch
 import tyro
 
-from coliags_plugin.phantom.generate import generate
-from coliags_plugin.phantom.settings import PhantomSettings
 from tests.scenes import write_wall
 
 pytestmark = pytest.mark.thorough

@@ -278,8 +278,7 @@ OPTION_TABLES = [
 
 def own_fields(settings: type[Settings]) -> dict[str, Any]:
     """The fields that a page lists: for formats, those not shared with the others, or of another default."""
-    is_format = issubclass(settings, SceneSettings) and settings is not SceneSettings
-    shared = SceneSettings.model_fields if is_format else {}
+    shared = SceneSettings.model_fields if issubclass(settings, SceneSettings) else {}
     return {
         name: field
         for name, field in settings.model_fields.items()
