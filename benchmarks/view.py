@@ -22,10 +22,11 @@ from websockets.typing import Subprotocol
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.export.viewer.baking import bake, baking_cameras
+from coliags_plugin.export.baking.averages import mean_gaussians
+from coliags_plugin.export.viewer.content import spread
 from coliags_plugin.export.viewer.decoding import ViewDecoder
 from coliags_plugin.export.viewer.library import import_viser, start_server, stop_server
-from coliags_plugin.export.viewer.splats import BYTES_PER_SPLAT, Splats, on_wire, wire_unit
+from coliags_plugin.export.viewer.splats import BYTES_PER_SPLAT, on_wire, shown, wire_unit
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ _LEAST_BYTES = 8
 def timed(name: str, field: GaussianField, cameras: list[Camera], repeats: int) -> dict[str, str | float]:
     """Medians of one field."""
     viser = import_viser()
-    baked = Splats.of(bake(field, baking_cameras(cameras)))
+    baked = shown(mean_gaussians(field, spread(cameras)))
     decoder, unit = ViewDecoder(field, baked.part(baked.opacities > 1.0), torch.device("cpu")), wire_unit(baked)
     decoding, sending, counts = [], [], []
     server = start_server("127.0.0.1", 0)
