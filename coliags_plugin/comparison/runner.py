@@ -146,9 +146,10 @@ class _CellQueue:
 
     @property
     def steps(self) -> int:
-        """Steps of training that are over, in all cells; those of a failed one count as over."""
+        """Steps that are over in all cells: all of a failed cell, and the last one of a cell with its evaluation."""
         over = [cell.steps for cell in self._cells if self._phases[cell.identity] in ("done", "failed")]
-        return sum(over) + sum(self._config.folder.run(cell).logged_step for cell in self._running.values())
+        running = self._running.values()
+        return sum(over) + sum(min(self._config.folder.run(cell).logged_step, cell.steps - 1) for cell in running)
 
     @property
     def counts(self) -> str:

@@ -49,18 +49,6 @@ def _check_method(run: RunFolder, name: str) -> None:
         raise InputError(f"{run.path} is a run of method '{owner}'", f"one of '{name}'")
 
 
-def resumed_seed(run: RunFolder, asked: int | None) -> int:
-    """Seed of a run.
-
-    Raises:
-        InputError: Another one was asked for.
-    """
-    seed: int = run.provenance()["seed"]
-    if asked not in (None, seed):
-        raise InputError(f"--seed {asked} for {run.path}, which was started with seed {seed}", "no --seed, or that one")
-    return seed
-
-
 def check_same_run(run: RunFolder, method: LoadedMethod, scene: Scene, scene_path: str) -> None:
     """Refuse to resume with another method, other settings (the schedule apart) or other data.
 

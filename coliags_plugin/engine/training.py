@@ -12,9 +12,10 @@ from typing import Literal
 import torch
 
 from coliags_plugin.core.anonymity import without_places
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.data_formats import load_method_for, load_scene
 from coliags_plugin.engine.evaluator import check_evaluable
-from coliags_plugin.engine.resuming import resumed_method, resumed_seed
+from coliags_plugin.engine.resuming import resumed_method
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.scoring import Scorer
 from coliags_plugin.engine.trainer import Trainer
@@ -90,7 +91,10 @@ def open_training(
         overrides, data_format = ((), None) if if_exists == "continue" else (request.overrides, request.data_format)
         name = request.method_name or request.method
         method = resumed_method(folder, name, request.data, overrides, data_format)
-        seed = resumed_seed(folder, request.seed)
+        seed = int(folder.provenance()["seed"])
+        if request.seed not in (None, seed):
+            begun = f"{folder.path}, which was started with seed {seed}"
+            raise InputError(f"--seed {request.seed} for {begun}", "no --seed, or that one")
     else:
         folder.check_free(if_exists == "overwrite")
         method = load_method_for(request.data, request.method, request.overrides, request.data_format)

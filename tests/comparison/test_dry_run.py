@@ -71,3 +71,9 @@ def test_every_cell_that_begins_and_ends_is_told(wall, tmp_path, caplog):
         "[2/2] bare scaffold-gs seed 0: done",
     ]
     assert told[1].startswith("[1/2] bare coliags seed 0: failed: ")
+
+
+def test_progress_ends_with_the_last_cell_not_with_its_last_step(wall, tmp_path, capsys):
+    compare_inline(["coliags", "scaffold-gs"], [wall], tmp_path / "new")
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("compare")]
+    assert len(lines) == 1 and lines[0].startswith("compare 6/6, took") and lines[0].endswith("2 done")
