@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from typing import Any, Protocol
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from coliags_plugin.reporting.numbers import duration
 
 #: Between plain lines, seconds.
 PLAIN_LINE_EVERY = 10.0
@@ -39,8 +42,9 @@ def open_display(
     """
     if console.is_terminal:
         return TerminalBar(console, title, total, start)
-    counted = Counted(title, total, start)
-    return NotebookLine(counted) if console.is_jupyter else PlainLines(console, counted, plain_every)
+    if console.is_jupyter:
+        return TextDisplay(title, total, start, NOTEBOOK_LINE_EVERY, NotebookLine().show, at_once=True)
+    return TextDisplay(title, total, start, plain_every, lambda text: console.print(text, highlight=False))
 
 
 class TerminalBar:
@@ -68,65 +72,43 @@ class TerminalBar:
         self._bar.stop()
 
 
-class Counted:
-    """Text of a count with the time.
+class TextDisplay:
+    """A line of text now and then, and one at the end.
 
     Args:
         title: What is being done.
         total: Where the count ends.
         start: Where it begins.
+        every: Between lines, seconds.
+        show: Shows a line.
+        at_once: Whether the first line is shown at once.
     """
 
-    def __init__(self, title: str, total: int, start: int) -> None:
-        self.title, self.total, self.first = title, total, start
-        self.began = time.monotonic()
-
-    def text(self, done: int, facts: str) -> str:
-        """For instance ``train 3dgs 20/100, 40 s to go  loss 0.1``; at the end the time it took."""
-        seconds = time.monotonic() - self.began
-        left = seconds / max(1, done - self.first) * (self.total - done)
-        timing = f"took {seconds:.0f} s" if done == self.total else f"{left:.0f} s to go"
-        return f"{self.title} {done}/{self.total}, {timing}  {facts}".rstrip()
-
-
-class PlainLines:
-    """A line every so many seconds, and one at the end."""
-
-    def __init__(self, console: Console, counted: Counted, every: float) -> None:
-        self._console, self._counted, self._every = console, counted, every
-        self._last = counted.began
+    def __init__(
+        self, title: str, total: int, start: int, every: float, show: Callable[[str], None], at_once: bool = False
+    ) -> None:
+        self._title, self._total, self._start, self._every, self._show = title, total, start, every, show
+        self._began = time.monotonic()
+        self._last = -math.inf if at_once else self._began
 
     def update(self, done: int, facts: str) -> None:
         """See :class:`Display`."""
         now = time.monotonic()
-        if now - self._last >= self._every or done == self._counted.total:
+        if now - self._last >= self._every or done == self._total:
             self._last = now
-            self._console.print(self._counted.text(done, facts), highlight=False)
+            self._show(self._line(done, facts, now - self._began))
 
     def close(self) -> None:
         """See :class:`Display`."""
+
+    def _line(self, done: int, facts: str, seconds: float) -> str:
+        """For instance ``train 3dgs 20/100, 40.0 s to go  loss 0.1``; at the end the time it took."""
+        left = seconds / max(1, done - self._start) * (self._total - done)
+        timing = f"took {duration(seconds)}" if done == self._total else f"{duration(left)} to go"
+        return f"{self._title} {done}/{self._total}, {timing}  {facts}".rstrip()
 
 
 class NotebookLine:
-    """One line that changes, of which a saved notebook keeps the last state."""
-
-    def __init__(self, counted: Counted) -> None:
-        self._counted = counted
-        self._last = -math.inf
-        self._text = NotebookText()
-
-    def update(self, done: int, facts: str) -> None:
-        """See :class:`Display`."""
-        now = time.monotonic()
-        if now - self._last >= NOTEBOOK_LINE_EVERY or done == self._counted.total:
-            self._last = now
-            self._text.show(self._counted.text(done, facts))
-
-    def close(self) -> None:
-        """See :class:`Display`."""
-
-
-class NotebookText:
     """Text in the output of a notebook's cell that can be replaced."""
 
     def __init__(self) -> None:

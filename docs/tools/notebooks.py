@@ -18,7 +18,7 @@ NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 #: For one cell, seconds.
 PATIENCE = 1800
 #: What a report of progress ends with.
-TIMES = re.compile(r", took \d+ s\b")
+TIMES = re.compile(r", took (\d+ min )?[\d.]+ s\b")
 
 
 def main() -> None:

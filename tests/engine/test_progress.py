@@ -48,7 +48,7 @@ def test_what_takes_long_is(clock, capsys):
     assert said[-1].startswith("fuse 10/10")
     assert len(said) == 2 * 4
     # Six seconds a step: what was done before the first word does not count as done in no time.
-    assert "36 s to go" in said[0]
+    assert "36.0 s to go" in said[0]
 
 
 def test_reading_a_small_scene_says_nothing(tmp_path, capsys):
@@ -82,6 +82,6 @@ def test_a_notebook_shows_one_line_that_changes(clock, monkeypatch, capsys):
         clock[0] += 0.01
         display.update(done, f"loss {done}")
     display.close()
-    assert shown.text == "train 1000/1000, took 10 s  loss 1000"
+    assert shown.text == "train 1000/1000, took 10.0 s  loss 1000"
     assert 15 <= shown.changes <= 22  # two a second
     assert capsys.readouterr() == ("", "")
