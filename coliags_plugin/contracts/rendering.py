@@ -169,7 +169,7 @@ class ViewModule(nn.Module, ABC):
         return camera
 
     def shade(self, output: RenderOutput, view: View | None) -> RenderOutput:
-        """The output as the camera would have recorded it, for instance with its gain.
+        """The output as the camera would have recorded it, for instance with its gain; changes nothing in the module.
 
         Args:
             output: Rendered, and shaded by the modules before this one: a view or, unless :attr:`whole_image`, some of
@@ -177,6 +177,16 @@ class ViewModule(nn.Module, ABC):
             view: See :meth:`adjust_camera`.
         """
         return output
+
+    def after_step(self, view: View, output: RenderOutput) -> None:
+        """Called after a training step, for every view drawn in it, by modules that learn otherwise than by gradients.
+
+        What it changes must be a buffer, so that checkpoints restore it.
+
+        Args:
+            view: The training frame.
+            output: What :meth:`shade` was given in the step.
+        """
 
 
 class GainModule(ViewModule):

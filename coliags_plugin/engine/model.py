@@ -62,7 +62,18 @@ class Model(nn.Module):
         pixels: Tensor | None = None,
         generator: torch.Generator | None = None,
     ) -> RenderOutput:
-        """Render a view.
+        """Render a view; arguments as in :meth:`render_stages`."""
+        return self.render_stages(camera, wants, view, pixels, generator)[-1]
+
+    def render_stages(
+        self,
+        camera: Camera,
+        wants: Sequence[str],
+        view: View | None,
+        pixels: Tensor | None,
+        generator: torch.Generator | None,
+    ) -> list[RenderOutput]:
+        """A view as rendered, and as shaded by each module in turn: what a module is given, and at last the result.
 
         Args:
             camera: Camera before adjustment by view modules.
@@ -77,12 +88,12 @@ class Model(nn.Module):
             camera = module.adjust_camera(camera, view)
         needed = tuple(dict.fromkeys([*wants, *(name for module in modules for name in sorted(module.wants))]))
         if generator is None:
-            output = self.renderer.render(self.field, camera, needed, pixels)
+            stages = [self.renderer.render(self.field, camera, needed, pixels)]
         else:
-            output = self.renderer.render_in_training(self.field, camera, needed, pixels, generator)
+            stages = [self.renderer.render_in_training(self.field, camera, needed, pixels, generator)]
         for module in modules:
-            output = module.shade(output, view)
-        return output
+            stages.append(module.shade(stages[-1], view))
+        return stages
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Parameters by group: the field's under their own names, a module's as ``<module>.<group>``."""

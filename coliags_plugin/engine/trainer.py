@@ -17,7 +17,7 @@ from coliags_plugin.core.errors import InterruptedRunError, NotFiniteError, Noth
 from coliags_plugin.core.files import atomic_write
 from coliags_plugin.core.masked import masked_mean
 from coliags_plugin.core.render_output import RenderOutput, Splats, concatenate_pixels
-from coliags_plugin.core.scenes import Frame, Scene, Target, concatenate_targets
+from coliags_plugin.core.scenes import Frame, Scene, Target, View, concatenate_targets
 from coliags_plugin.engine import checkpoints
 from coliags_plugin.engine.compatibility import check_components
 from coliags_plugin.engine.costs import CostMeter, TrainingCost
@@ -187,7 +187,7 @@ class Trainer:
         step = self.step + 1
         self.model.field.before_step(step, self.schedule)
         self.strategy.before_step(step, self.model.field, self.optimizers)
-        output, target = self._render(self.sampler.next())
+        output, target, views = self._render(self.sampler.next())
         seen = TrainingStep(output, target, self.model, step, self.schedule)
         active = {key: loss for key, loss in self.losses.items() if loss.settings.active(step, self.schedule)}
         terms = {key: loss(seen) for key, loss in active.items()}
@@ -208,6 +208,9 @@ class Trainer:
         done = self.strategy.after_backward(seen, self.optimizers)
         self.optimizers.step(step)
         done = done | self.strategy.after_step(seen, self.optimizers)
+        for view, stages in views:
+            for module, given in zip(self.model.view_modules.values(), stages, strict=False):
+                module.after_step(view, given)
         self.step = step
         drawn = output.splats
         return {
@@ -219,16 +222,17 @@ class Trainer:
             **done,
         }
 
-    def _render(self, draws: list[Draw]) -> tuple[RenderOutput, Target]:
-        """Rendered output and target of the drawn frames."""
-        outputs, targets = [], []
+    def _render(self, draws: list[Draw]) -> tuple[RenderOutput, Target, list[tuple[View, list[RenderOutput]]]]:
+        """Rendered output and target of the drawn frames, and the stages of each (:meth:`Model.render_stages`)."""
+        views, targets = [], []
         for draw in draws:
             frame = self.frames[draw.frame].to(self.device)
             view = frame.view(trained=True)
             generator = self.generators["rendering"]
-            outputs.append(self.model.render(frame.camera, self.wants, view, draw.pixels, generator))
+            views.append((view, self.model.render_stages(frame.camera, self.wants, view, draw.pixels, generator)))
             targets.append(frame.target if draw.pixels is None else frame.target_at(draw.pixels))
-        return concatenate_pixels(outputs), concatenate_targets(targets)
+        output = concatenate_pixels([stages[-1] for _, stages in views])
+        return output, concatenate_targets(targets), views
 
     def save(self) -> None:
         """Write a checkpoint of the current step."""

@@ -124,10 +124,13 @@ class FrameGain(GainModule):
 
     def shade(self, output: RenderOutput, view: View | None) -> RenderOutput:
         """Multiply the colours."""
-        row = self.frames.row(view)
-        if self.metering is not None and row is not None and self.training and output.rgb.requires_grad:
-            self.metering.remember(row, output.rgb)
         return replace(output, rgb=output.rgb * self.gain(view) * self._metered(output.rgb, view))
+
+    def after_step(self, view: View, output: RenderOutput) -> None:
+        """Keep the brightness of a training frame, for metering."""
+        row = self.frames.row(view)
+        if self.metering is not None and row is not None:
+            self.metering.remember(row, output.rgb)
 
     @torch.no_grad()
     def _metered(self, rgb: Float[Tensor, "H W 3"], view: View | None) -> float:

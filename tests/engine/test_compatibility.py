@@ -215,7 +215,7 @@ def test_metres_on_purpose_train_and_see_an_image(tmp_path, method, option):
     assert trainer.method.config.near_plane == 0.0001
     trainer.start()
     row = trainer.take_step()
-    output, _ = trainer._render(trainer.sampler.next())
+    output, *_ = trainer._render(trainer.sampler.next())
     assert row["gaussians"] > 100 and output.alpha.mean() > 0.3
 
 

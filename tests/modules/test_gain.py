@@ -116,9 +116,9 @@ def test_known_gains_are_found(tmp_path):
     assert (found / expected - 1).abs().max() < 0.01
 
 
-def rendering(level, *, in_training=False):
+def rendering(level):
     """A rendering of one grey level."""
-    return RenderOutput(torch.full((24, 32, 3), level, requires_grad=in_training), torch.ones(24, 32), None, {})
+    return RenderOutput(torch.full((24, 32, 3), level), torch.ones(24, 32), None, {})
 
 
 def exposed(frames=33, answer=-0.6, gap=1):
@@ -129,7 +129,7 @@ def exposed(frames=33, answer=-0.6, gap=1):
     module = FrameGain.from_scene(scene, FrameGainSettings(untrained="metered"), torch.Generator())
     levels = torch.tensor([0.5 + 0.2 * math.sin(0.9 * index) for index in kept])
     for frame, level in zip(scene.train, levels, strict=True):
-        module.shade(rendering(float(level), in_training=True), frame.view(trained=True))
+        module.after_step(frame.view(trained=True), rendering(float(level)))
     brightness = levels.double().log()
     gains = answer * (brightness - brightness.mean())
     with torch.no_grad():
@@ -172,10 +172,9 @@ def test_brightness_is_kept_from_training_alone():
     before = module.metering.brightness.clone()
     train, held_out = scene.train[3].view(trained=True), scene.test_sets["test"][0].view(trained=False)
     module.shade(rendering(0.9), train)
-    module.shade(rendering(0.9, in_training=True), held_out)
-    module.eval().shade(rendering(0.9, in_training=True), train)
+    module.after_step(held_out, rendering(0.9))
     assert torch.equal(module.metering.brightness, before)
-    module.train().shade(rendering(0.9, in_training=True), train)
+    module.after_step(train, rendering(0.9))
     before[3] = 0.9
     torch.testing.assert_close(module.metering.brightness, before)
 
