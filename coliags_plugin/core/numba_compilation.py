@@ -8,12 +8,22 @@ import pickle
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import numba
+import numpy.typing as npt
 from numba.core.caching import FunctionCache
 
-_Function = TypeVar("_Function", bound=Callable[..., Any])
+if TYPE_CHECKING:
+    from numba.core.base import BaseContext
+    from numba.core.codegen import Codegen
+    from numba.core.compiler import CompileResult
+    from numba.core.typing import Signature
+
+#: An array of a kernel; the kernel says of which type and shape.
+Array: TypeAlias = npt.NDArray[Any]
+
+_Function = TypeVar("_Function", bound=Callable[..., object])
 
 _logger = logging.getLogger(__name__)
 #: What a cache may raise when its folder is full, unreadable or holds damaged files.
@@ -55,7 +65,7 @@ class _KernelCache(FunctionCache):
     - A message is logged before compilation.
     """
 
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
+    def load_overload(self, sig: Signature, target_context: BaseContext) -> CompileResult | None:
         try:
             found = super().load_overload(sig, target_context)
         except _CACHE_ERRORS as error:
@@ -65,13 +75,13 @@ class _KernelCache(FunctionCache):
             _announce(f"kept in {self.cache_path}")
         return found
 
-    def save_overload(self, sig: Any, data: Any) -> None:
+    def save_overload(self, sig: Signature, data: CompileResult) -> None:
         try:
             super().save_overload(sig, data)
         except _CACHE_ERRORS as error:
             _logger.warning("kernel cache in %s cannot be written (%s)", self.cache_path, error)
 
-    def _index_key(self, sig: Any, codegen: Any) -> Any:
+    def _index_key(self, sig: Signature, codegen: Codegen) -> tuple[object, ...]:
         return (*super()._index_key(sig, codegen), _fingerprint(Path(self._py_func.__code__.co_filename).parent))
 
 

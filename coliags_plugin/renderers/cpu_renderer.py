@@ -83,7 +83,7 @@ def render_gaussians(
         InputError: An output is unknown or not of these Gaussians; a tensor is of the wrong shape, dtype or device; a
             Gaussian is not finite, has a quaternion of length 0 or a negative scale; the camera cannot be used.
     """
-    from coliags_plugin.renderers.numba_kernels import autograd, layout, pipeline
+    from coliags_plugin.renderers.numba_kernels import autograd, pipeline
     from coliags_plugin.renderers.numba_kernels.gaussian_pipeline import GaussianPipeline
     from coliags_plugin.renderers.numba_kernels.surfel_pipeline import SurfelPipeline
 
@@ -99,7 +99,7 @@ def render_gaussians(
     channels = [name for name in wants if name in gaussians.features]
     try:
         means2d, radii, images, features = autograd.render(
-            layout.Parameters(*(getattr(gaussians, name) for name in _SHAPES)),
+            [getattr(gaussians, name) for name in _SHAPES],
             [gaussians.features[name] for name in channels],
             pose,
             view,
@@ -112,10 +112,10 @@ def render_gaussians(
             "less than 2^31",
             "Check their scales",
         ) from None
-    by_name: dict[str, Tensor] = {name: getattr(images, image) for image, name in _IMAGES.items()}
+    by_name = {name: images[image] for image, name in _IMAGES.items()}
     by_name |= dict(zip(channels, features, strict=True))
     maps = {name: by_name[name] for name in wants if name not in ("rgb", "alpha")}
-    return RenderOutput(images.rgb, images.alpha, camera, maps, Splats(gaussians, means2d, radii))
+    return RenderOutput(by_name["rgb"], by_name["alpha"], camera, maps, Splats(gaussians, means2d, radii))
 
 
 def _view_table(camera: Camera, pose: Tensor, settings: CpuRendererSettings) -> np.ndarray:

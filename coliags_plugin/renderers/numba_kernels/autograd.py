@@ -7,31 +7,31 @@ less cancellation than from those of the projections.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
+from torch.autograd.function import FunctionCtx, once_differentiable
 
+from coliags_plugin.core.numba_compilation import Array
 from coliags_plugin.renderers.numba_kernels import layout
-from coliags_plugin.renderers.numba_kernels.pipeline import Array, Pipeline
+from coliags_plugin.renderers.numba_kernels.pipeline import Pipeline
 
 
 def render(
-    gaussians: layout.Parameters, features: Sequence[Tensor], pose: Tensor, pipeline: Pipeline
-) -> tuple[Tensor, Tensor, layout.Images, list[Tensor]]:
+    gaussians: Iterable[Tensor], features: Sequence[Tensor], pose: Tensor, pipeline: Pipeline
+) -> tuple[Tensor, Tensor, dict[str, Tensor], list[Tensor]]:
     """Render one view; differentiable, once, in all tensors.
 
     Args:
-        gaussians: Float32 tensors on the CPU, checked for shape.
+        gaussians: Float32 tensors on the CPU, checked for shape, in the order of ``layout.Parameters``.
         features: Further channels to composite, likewise. [N, C] each
         pose: camera_to_world; its values are those that the pipeline was made with.
         pipeline: A new pipeline.
 
     Returns:
-        means2d, which holds its gradient after ``backward``; radii; the images, None where not wanted; and the features'
+        means2d, which holds its gradient after ``backward``; radii; the images by the names of ``layout.Images``, None where not wanted; and the features'
         images, [H, W, C] each.
 
     Raises:
@@ -46,14 +46,14 @@ def render(
     if features:
         drawn = _CompositeFeatures.apply(means2d, links, torch.cat(list(features), dim=1), pipeline)  # type: ignore[no-untyped-call]
         channels = list(torch.split(drawn, [feature.shape[1] for feature in features], dim=-1))
-    return means2d, radii, layout.Images(*images), channels
+    return means2d, radii, dict(zip(layout.Images._fields, images, strict=True)), channels
 
 
 class _Project(torch.autograd.Function):
     """Gaussians -> projected centres, links, radii."""
 
     @staticmethod
-    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(ctx: FunctionCtx, *arguments: Tensor | Pipeline) -> tuple[Tensor, Tensor, Tensor]:
         *gaussians, _, pipeline = arguments
         means2d, radii, links = (torch.from_numpy(array) for array in pipeline.project(_flat_gaussians(gaussians)))
         ctx.save_for_backward(*gaussians)
@@ -64,7 +64,9 @@ class _Project(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, of_means2d: Tensor | None, sums: Tensor | None, of_radii: None) -> tuple[Tensor | None, ...]:
+    def backward(
+        ctx: FunctionCtx, of_means2d: Tensor | None, sums: Tensor | None, of_radii: None
+    ) -> tuple[Tensor | None, ...]:
         gaussians = _flat_gaussians(ctx.saved_tensors)
         derivatives, of_pose = ctx.pipeline.project_backward(gaussians, _array(of_means2d), _array(sums))
         means, quats, scales, opacities, colors = (torch.from_numpy(array) for array in derivatives)
@@ -77,7 +79,7 @@ class _Composite(torch.autograd.Function):
     """Projected centres and links -> images."""
 
     @staticmethod
-    def forward(ctx: Any, means2d: Tensor, links: Tensor, pipeline: Pipeline) -> tuple[Tensor | None, ...]:
+    def forward(ctx: FunctionCtx, means2d: Tensor, links: Tensor, pipeline: Pipeline) -> tuple[Tensor | None, ...]:
         arrays = pipeline.composite()
         images = layout.Images(*(None if array is None else torch.from_numpy(array) for array in arrays))
         ctx.pipeline = pipeline
@@ -88,7 +90,7 @@ class _Composite(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *given: Tensor | None) -> tuple[Tensor | None, ...]:
+    def backward(ctx: FunctionCtx, *given: Tensor | None) -> tuple[Tensor | None, ...]:
         if all(gradient is None for gradient in given):
             return None, None, None
         of_means2d, sums = ctx.pipeline.composite_backward(layout.Images(*map(_array, given)))
@@ -99,14 +101,14 @@ class _CompositeFeatures(torch.autograd.Function):
     """Projected centres, links and features -> the features' images, after :class:`_Composite`."""
 
     @staticmethod
-    def forward(ctx: Any, means2d: Tensor, links: Tensor, features: Tensor, pipeline: Pipeline) -> Tensor:
+    def forward(ctx: FunctionCtx, means2d: Tensor, links: Tensor, features: Tensor, pipeline: Pipeline) -> Tensor:
         ctx.save_for_backward(features)
         ctx.pipeline = pipeline
         return torch.from_numpy(pipeline.composite_features(np.asarray(features.detach().contiguous())))
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, given: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: FunctionCtx, given: Tensor) -> tuple[Tensor | None, ...]:
         (features,) = ctx.saved_tensors
         of_means2d, sums, of_features = ctx.pipeline.composite_features_backward(
             np.asarray(features.detach().contiguous()), np.asarray(given.contiguous())
@@ -118,6 +120,6 @@ def _array(tensor: Tensor | None) -> Array | None:
     return None if tensor is None else tensor.detach().contiguous().numpy()
 
 
-def _flat_gaussians(tensors: Any) -> layout.Parameters:
+def _flat_gaussians(tensors: Iterable[Tensor]) -> layout.Parameters:
     arrays: list[Array] = [np.asarray(tensor.detach().contiguous()).reshape(-1) for tensor in tensors]
     return layout.Parameters(*arrays)

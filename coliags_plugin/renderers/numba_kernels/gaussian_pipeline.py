@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from coliags_plugin.core.numba_compilation import Array
 from coliags_plugin.renderers.numba_kernels import layout, sweep_backward, sweep_forward
-from coliags_plugin.renderers.numba_kernels.pipeline import Array, Layer, Pipeline, Run
+from coliags_plugin.renderers.numba_kernels.pipeline import Layer, Pipeline, Run
 from coliags_plugin.renderers.numba_kernels.projection import project
 from coliags_plugin.renderers.numba_kernels.projection_backward import gather, project_backward
 

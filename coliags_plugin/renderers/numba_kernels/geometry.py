@@ -5,11 +5,13 @@ Sixteen Gaussians at a time; a vector in space is a tuple of three lanes.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from coliags_plugin.core.numba_compilation import inline
 from coliags_plugin.renderers.numba_kernels import layout
 from coliags_plugin.renderers.numba_kernels.lanes import (
+    LaneMask,
+    Vector,
     add,
     at_least,
     at_most,
@@ -49,24 +51,24 @@ class Projected(NamedTuple):
         local_x, local_y: The same for a step along the local axes: rows of J C^T R.
     """
 
-    in_front: Any
-    offset: Any
-    x: Any
-    y: Any
-    z: Any
-    inverse_z: Any
-    slope_x: Any
-    slope_y: Any
-    follows_x: Any
-    follows_y: Any
-    rotation: Any
-    quaternion: Any
-    inverse_norm: Any
-    squared_norm: Any
-    image_x: Any
-    image_y: Any
-    local_x: Any
-    local_y: Any
+    in_front: LaneMask
+    offset: tuple[Vector, ...]
+    x: Vector
+    y: Vector
+    z: Vector
+    inverse_z: Vector
+    slope_x: Vector
+    slope_y: Vector
+    follows_x: LaneMask
+    follows_y: LaneMask
+    rotation: tuple[tuple[Vector, ...], ...]
+    quaternion: tuple[Vector, ...]
+    inverse_norm: Vector
+    squared_norm: Vector
+    image_x: tuple[Vector, ...]
+    image_y: tuple[Vector, ...]
+    local_x: tuple[Vector, ...]
+    local_y: tuple[Vector, ...]
 
 
 @inline

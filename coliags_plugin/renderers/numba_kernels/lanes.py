@@ -14,12 +14,20 @@ so what is compiled has no loop over them. Tables are flat, contiguous float32 a
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, TypeAlias
 
 from llvmlite import ir
 from numba.core import types
 from numba.core.datamodel import models
 from numba.extending import intrinsic, register_model
+
+if TYPE_CHECKING:
+    from numba.core.base import BaseContext
+    from numba.core.datamodel import DataModelManager
+    from numba.core.typing import Context, Signature
+
+#: Signature of an intrinsic and what builds its instructions; None where it does not take such operands.
+Intrinsic: TypeAlias = "tuple[Signature, Callable[..., ir.Value]] | None"
 
 #: Numbers in a vector; pixels of a block.
 WIDTH = 16
@@ -53,6 +61,9 @@ class LaneMask(types.Type):
         super().__init__(name="LaneMask")
 
 
+#: Numbers in a kernel.
+Vector: TypeAlias = Lanes | DoubleLanes
+
 lanes = Lanes()
 double_lanes = DoubleLanes()
 lane_mask = LaneMask()
@@ -60,30 +71,30 @@ lane_mask = LaneMask()
 
 @register_model(Lanes)
 class _LanesModel(models.PrimitiveModel):
-    def __init__(self, dmm: Any, fe_type: Any) -> None:
+    def __init__(self, dmm: DataModelManager, fe_type: types.Type) -> None:
         super().__init__(dmm, fe_type, _LANES)
 
 
 @register_model(DoubleLanes)
 class _DoubleLanesModel(models.PrimitiveModel):
-    def __init__(self, dmm: Any, fe_type: Any) -> None:
+    def __init__(self, dmm: DataModelManager, fe_type: types.Type) -> None:
         super().__init__(dmm, fe_type, _DOUBLES)
 
 
 @register_model(LaneMask)
 class _LaneMaskModel(models.PrimitiveModel):
-    def __init__(self, dmm: Any, fe_type: Any) -> None:
+    def __init__(self, dmm: DataModelManager, fe_type: types.Type) -> None:
         super().__init__(dmm, fe_type, _MASK)
 
 
 # --- building instructions --------------------------------------------------------------------------------------------
 
 
-def _constant(values: Sequence[float], kind: Any = _LANES) -> Any:
+def _constant(values: Sequence[float], kind: ir.Type = _LANES) -> ir.Value:
     return ir.Constant(kind, [ir.Constant(kind.element, value) for value in values])
 
 
-def _call(builder: ir.IRBuilder, name: str, *arguments: Any) -> Any:
+def _call(builder: ir.IRBuilder, name: str, *arguments: ir.Value) -> ir.Value:
     """Call an LLVM intrinsic whose operands and result are all lanes, or all double lanes."""
     kind = arguments[0].type
     name += ".v16f64" if kind == _DOUBLES else ".v16f32"
@@ -93,13 +104,13 @@ def _call(builder: ir.IRBuilder, name: str, *arguments: Any) -> Any:
     return builder.call(function, arguments)
 
 
-def _shuffle(builder: ir.IRBuilder, a: Any, b: Any, picks: Sequence[int | None]) -> Any:
+def _shuffle(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, picks: Sequence[int | None]) -> ir.Value:
     """Lanes of ``a``, counted from 0, and of ``b``, counted on from there; None for a lane that does not matter."""
     elements = [ir.Constant(_INT, ir.Undefined if pick is None else pick) for pick in picks]
     return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_INT, len(picks)), elements))
 
 
-def _repeat(builder: ir.IRBuilder, scalar: Any) -> Any:
+def _repeat(builder: ir.IRBuilder, scalar: ir.Value) -> ir.Value:
     kind = ir.VectorType(scalar.type, WIDTH)
     first = builder.insert_element(ir.Constant(kind, ir.Undefined), scalar, ir.Constant(_INT, 0))
     return _shuffle(builder, first, first, [0] * WIDTH)
@@ -127,7 +138,7 @@ def _result_type(operands: Sequence[types.Type]) -> types.Type:
     return double_lanes if any(isinstance(kind, DoubleLanes) for kind in _elements(operands)) else lanes
 
 
-def _as_lanes(builder: ir.IRBuilder, value: Any, numba_type: types.Type, kind: types.Type = lanes) -> Any:
+def _as_lanes(builder: ir.IRBuilder, value: ir.Value, numba_type: types.Type, kind: types.Type = lanes) -> ir.Value:
     """A number or lanes, as lanes or double lanes."""
     wide = isinstance(kind, DoubleLanes)
     if isinstance(numba_type, Lanes):
@@ -155,14 +166,16 @@ def _tuple_length(operands: Sequence[types.Type]) -> int | None:
     return lengths.pop() if len(lengths) == 1 else None
 
 
-def _element(builder: ir.IRBuilder, value: Any, numba_type: types.Type, index: int, kind: types.Type = lanes) -> Any:
+def _element(
+    builder: ir.IRBuilder, value: ir.Value, numba_type: types.Type, index: int, kind: types.Type = lanes
+) -> ir.Value:
     """One element of a tuple, or what stands for all of them, as lanes or double lanes."""
     if isinstance(numba_type, types.BaseTuple):
         return _as_lanes(builder, builder.extract_value(value, index), numba_type[index], kind)
     return _as_lanes(builder, value, numba_type, kind)
 
 
-def _pack(builder: ir.IRBuilder, vectors: Sequence[Any]) -> Any:
+def _pack(builder: ir.IRBuilder, vectors: Sequence[ir.Value]) -> ir.Value:
     """LLVM's form of numba's tuple of lanes."""
     kind = vectors[0].type if vectors else _LANES
     packed = ir.Constant(ir.ArrayType(kind, len(vectors)), ir.Undefined)
@@ -175,22 +188,31 @@ def _tuple_of_lanes(length: int) -> types.Type:
     return types.UniTuple(lanes, length)
 
 
-def _address(context: Any, builder: ir.IRBuilder, table_type: Any, table: Any, index: Any, kind: Any = _LANES) -> Any:
+def _address(
+    context: BaseContext,
+    builder: ir.IRBuilder,
+    table_type: types.Type,
+    table: ir.Value,
+    index: ir.Value,
+    kind: ir.Type = _LANES,
+) -> ir.Value:
     data = context.make_array(table_type)(context, builder, table).data
     return builder.bitcast(builder.gep(data, [index]), kind.as_pointer())
 
 
-def _read(builder: ir.IRBuilder, address: Any) -> Any:
+def _read(builder: ir.IRBuilder, address: ir.Value) -> ir.Value:
     value = builder.load(address)
     value.align = 4
     return value
 
 
-def _write(builder: ir.IRBuilder, value: Any, address: Any) -> None:
+def _write(builder: ir.IRBuilder, value: ir.Value, address: ir.Value) -> None:
     builder.store(value, address).align = 4
 
 
-def _lanewise(name: str, arity: int, emit: Callable[..., Any], result: types.Type | None = None) -> Any:
+def _lanewise(
+    name: str, arity: int, emit: Callable[..., ir.Value], result: types.Type | None = None
+) -> Callable[..., Intrinsic]:
     """An operation on numbers, lane by lane.
 
     Args:
@@ -200,7 +222,7 @@ def _lanewise(name: str, arity: int, emit: Callable[..., Any], result: types.Typ
         result: Type of the result, of one element where operands are tuples; None for that of the operands.
     """
 
-    def typed(*operands: types.Type) -> Any:
+    def typed(*operands: types.Type) -> ir.Value:
         length = _tuple_length(operands)
         if any(isinstance(operand, types.BaseTuple) for operand in operands) != (length is not None):
             return None
@@ -208,7 +230,9 @@ def _lanewise(name: str, arity: int, emit: Callable[..., Any], result: types.Typ
             return None
         kind = _result_type(operands)
 
-        def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+        def generate(
+            context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+        ) -> ir.Value:
             pairs = list(zip(arguments, signature.args, strict=True))
             if length is None:
                 return emit(builder, *(_as_lanes(builder, *pair, kind) for pair in pairs))
@@ -221,7 +245,7 @@ def _lanewise(name: str, arity: int, emit: Callable[..., Any], result: types.Typ
         return (given if length is None else types.UniTuple(given, length))(*operands), generate
 
     # numba reads the number of operands from the signature.
-    by_arity: dict[int, Callable[..., Any]] = {
+    by_arity: dict[int, Callable[..., Intrinsic]] = {
         1: lambda typingctx, a: typed(a),
         2: lambda typingctx, a, b: typed(a, b),
         3: lambda typingctx, a, b, c: typed(a, b, c),
@@ -230,12 +254,12 @@ def _lanewise(name: str, arity: int, emit: Callable[..., Any], result: types.Typ
     return intrinsic(by_arity[arity])
 
 
-def _comparison(name: str, symbol: str) -> Any:
+def _comparison(name: str, symbol: str) -> ir.Value:
     return _lanewise(name, 2, lambda builder, a, b: builder.fcmp_ordered(symbol, a, b), lane_mask)
 
 
-def _of_masks(name: str, emit: Callable[..., Any]) -> Any:
-    def typed(typingctx: Any, a: types.Type, b: types.Type) -> Any:
+def _of_masks(name: str, emit: Callable[..., ir.Value]) -> Callable[..., Intrinsic]:
+    def typed(typingctx: Context, a: types.Type, b: types.Type) -> Intrinsic:
         if not (isinstance(a, LaneMask) and isinstance(b, LaneMask)):
             return None
         return lane_mask(a, b), lambda context, builder, signature, arguments: emit(builder, *arguments)
@@ -291,14 +315,16 @@ either = _of_masks("either", lambda builder, a, b: builder.or_(a, b))
 
 
 @intrinsic
-def select(typingctx: Any, mask: Any, chosen: Any, other: Any) -> Any:
+def select(typingctx: Context, mask: types.Type, chosen: types.Type, other: types.Type) -> Intrinsic:
     """``chosen`` where the mask holds, else ``other``."""
     length = _tuple_length((chosen, other))
     if not isinstance(mask, LaneMask):
         return None
     kind = _result_type((chosen, other))
 
-    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+    def generate(
+        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+    ) -> ir.Value:
         pairs = list(zip(arguments[1:], signature.args[1:], strict=True))
         if length is None:
             return builder.select(arguments[0], *(_as_lanes(builder, *pair, kind) for pair in pairs))
@@ -314,24 +340,28 @@ def select(typingctx: Any, mask: Any, chosen: Any, other: Any) -> Any:
 
 
 @intrinsic
-def from_bits(typingctx: Any, flags: Any) -> Any:
+def from_bits(typingctx: Context, flags: types.Type) -> Intrinsic:
     """The mask that :func:`bits` turns into this integer."""
     if not isinstance(flags, types.Integer):
         return None
 
-    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+    def generate(
+        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+    ) -> ir.Value:
         return builder.bitcast(builder.trunc(arguments[0], ir.IntType(WIDTH)), _MASK)
 
     return lane_mask(types.int64), generate
 
 
 @intrinsic
-def bits(typingctx: Any, mask: Any) -> Any:
+def bits(typingctx: Context, mask: types.Type) -> Intrinsic:
     """The mask as an integer, lane 0 in the lowest bit."""
     if not isinstance(mask, LaneMask):
         return None
 
-    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+    def generate(
+        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+    ) -> ir.Value:
         return builder.zext(builder.bitcast(arguments[0], ir.IntType(WIDTH)), ir.IntType(64))
 
     return types.int64(mask), generate
@@ -352,7 +382,7 @@ _EXP2_COEFFICIENTS = (
 )
 
 
-def _emit_exp2(builder: ir.IRBuilder, power: Any) -> Any:
+def _emit_exp2(builder: ir.IRBuilder, power: ir.Value) -> ir.Value:
     bias = _constant([_ROUNDING_BIAS] * WIDTH)
     biased = builder.fadd(power, bias)
     fraction = builder.fsub(power, builder.fsub(biased, bias))
@@ -372,24 +402,28 @@ exp2 = _lanewise("exp2", 1, _emit_exp2)
 
 
 @intrinsic
-def load(typingctx: Any, table: Any, index: Any) -> Any:
+def load(typingctx: Context, table: types.Type, index: types.Type) -> Intrinsic:
     """Sixteen numbers from ``table[index]`` on."""
     if not _is_table(table):
         return None
 
-    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+    def generate(
+        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+    ) -> ir.Value:
         return _read(builder, _address(context, builder, signature.args[0], *arguments))
 
     return lanes(table, types.intp), generate
 
 
 @intrinsic
-def store(typingctx: Any, table: Any, index: Any, value: Any) -> Any:
+def store(typingctx: Context, table: types.Type, index: types.Type, value: types.Type) -> Intrinsic:
     """Sixteen numbers to ``table[index]`` and on."""
     if not (_is_table(table) and _is_numeric(value)):
         return None
 
-    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+    def generate(
+        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+    ) -> ir.Value:
         address = _address(context, builder, signature.args[0], *arguments[:2])
         _write(builder, _as_lanes(builder, arguments[2], signature.args[2]), address)
         return context.get_dummy_value()
@@ -397,12 +431,14 @@ def store(typingctx: Any, table: Any, index: Any, value: Any) -> Any:
     return types.none(table, types.intp, value), generate
 
 
-def _prefetching(name: str, writes: int) -> Any:
-    def typed(typingctx: Any, table: Any, index: Any) -> Any:
+def _prefetching(name: str, writes: int) -> ir.Value:
+    def typed(typingctx: Context, table: types.Type, index: types.Type) -> Intrinsic:
         if not _is_table(table):
             return None
 
-        def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+        def generate(
+            context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+        ) -> ir.Value:
             address = _address(context, builder, signature.args[0], *arguments, ir.IntType(8))
             kind = ir.FunctionType(ir.VoidType(), [address.type, _INT, _INT, _INT])
             function = builder.module.declare_intrinsic("llvm.prefetch", [address.type], kind)
@@ -423,36 +459,42 @@ prefetch_to_write = _prefetching("prefetch_to_write", 1)
 
 
 @intrinsic
-def broadcast(typingctx: Any, table: Any, index: Any) -> Any:
+def broadcast(typingctx: Context, table: types.Type, index: types.Type) -> Intrinsic:
     """``table[index]`` in all lanes."""
     if not _is_table(table):
         return None
 
-    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+    def generate(
+        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+    ) -> ir.Value:
         return _repeat(builder, _read(builder, _address(context, builder, signature.args[0], *arguments, _FLOAT)))
 
     return lanes(table, types.intp), generate
 
 
 @intrinsic
-def number(typingctx: Any, table: Any, index: Any) -> Any:
+def number(typingctx: Context, table: types.Type, index: types.Type) -> Intrinsic:
     """``table[index]``, without asking whether the index counts from the end."""
     if not _is_table(table):
         return None
 
-    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+    def generate(
+        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+    ) -> ir.Value:
         return _read(builder, _address(context, builder, signature.args[0], *arguments, _FLOAT))
 
     return types.float32(table, types.intp), generate
 
 
 @intrinsic
-def load_all(typingctx: Any, table: Any, index: Any, like: Any) -> Any:
+def load_all(typingctx: Context, table: types.Type, index: types.Type, like: types.Type) -> Intrinsic:
     """As many vectors, one behind the other from ``table[index]`` on, as the tuple ``like`` is long."""
     if not (_is_table(table) and isinstance(like, types.BaseTuple)):
         return None
 
-    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+    def generate(
+        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+    ) -> ir.Value:
         address = _address(context, builder, signature.args[0], *arguments[:2])
         places = [builder.gep(address, [ir.Constant(_INT, place)]) for place in range(len(like))]
         return _pack(builder, [_read(builder, place) for place in places])
@@ -461,12 +503,14 @@ def load_all(typingctx: Any, table: Any, index: Any, like: Any) -> Any:
 
 
 @intrinsic
-def store_all(typingctx: Any, table: Any, index: Any, values: Any) -> Any:
+def store_all(typingctx: Context, table: types.Type, index: types.Type, values: types.Type) -> Intrinsic:
     """A tuple of vectors, one behind the other, to ``table[index]`` and on."""
     if not (_is_table(table) and isinstance(values, types.BaseTuple)):
         return None
 
-    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+    def generate(
+        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+    ) -> ir.Value:
         address = _address(context, builder, signature.args[0], *arguments[:2])
         for place in range(len(values)):
             vector = _element(builder, arguments[2], signature.args[2], place)
@@ -477,12 +521,14 @@ def store_all(typingctx: Any, table: Any, index: Any, values: Any) -> Any:
 
 
 @intrinsic
-def broadcast_all(typingctx: Any, table: Any, index: Any, like: Any) -> Any:
+def broadcast_all(typingctx: Context, table: types.Type, index: types.Type, like: types.Type) -> Intrinsic:
     """Consecutive numbers from ``table[index]`` on, each in all lanes of its vector; as many as ``like`` is long."""
     if not (_is_table(table) and isinstance(like, types.BaseTuple)):
         return None
 
-    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+    def generate(
+        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+    ) -> ir.Value:
         address = _address(context, builder, signature.args[0], *arguments[:2], _FLOAT)
         places = [builder.gep(address, [ir.Constant(_INT, place)]) for place in range(len(like))]
         return _pack(builder, [_repeat(builder, _read(builder, place)) for place in places])
@@ -491,13 +537,15 @@ def broadcast_all(typingctx: Any, table: Any, index: Any, like: Any) -> Any:
 
 
 @intrinsic
-def load_columns(typingctx: Any, table: Any, index: Any, like: Any) -> Any:
+def load_columns(typingctx: Context, table: types.Type, index: types.Type, like: types.Type) -> Intrinsic:
     """The columns of a matrix with sixteen rows, as many columns as ``like`` is long, which starts at ``index``."""
     if not (_is_table(table) and isinstance(like, types.BaseTuple)):
         return None
     columns = len(like)
 
-    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+    def generate(
+        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+    ) -> ir.Value:
         address = _address(context, builder, signature.args[0], *arguments[:2])
         places = [builder.gep(address, [ir.Constant(_INT, place)]) for place in range(columns)]
         if columns == WIDTH:
@@ -511,13 +559,15 @@ def load_columns(typingctx: Any, table: Any, index: Any, like: Any) -> Any:
 
 
 @intrinsic
-def store_columns(typingctx: Any, table: Any, index: Any, values: Any) -> Any:
+def store_columns(typingctx: Context, table: types.Type, index: types.Type, values: types.Type) -> Intrinsic:
     """The columns of a matrix with sixteen rows, written row by row from ``table[index]`` on."""
     if not (_is_table(table) and isinstance(values, types.BaseTuple)):
         return None
     columns = len(values)
 
-    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+    def generate(
+        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+    ) -> ir.Value:
         address = _address(context, builder, signature.args[0], *arguments[:2])
         vectors = [_element(builder, arguments[2], signature.args[2], column) for column in range(columns)]
         if columns == WIDTH:
@@ -538,7 +588,7 @@ def store_columns(typingctx: Any, table: Any, index: Any, values: Any) -> Any:
     return types.none(table, types.intp, values), generate
 
 
-def _transposed(builder: ir.IRBuilder, rows: Sequence[Any]) -> list[Any]:
+def _transposed(builder: ir.IRBuilder, rows: Sequence[ir.Value]) -> list[ir.Value]:
     """The columns of a 16 x 16 matrix from its rows, or the rows from its columns."""
     low = [lane for pair in range(8) for lane in (pair, WIDTH + pair)]
     high = [lane for pair in range(8, 16) for lane in (pair, WIDTH + pair)]
@@ -552,12 +602,14 @@ def _transposed(builder: ir.IRBuilder, rows: Sequence[Any]) -> list[Any]:
 
 
 @intrinsic
-def repeat(typingctx: Any, value: Any, like: Any) -> Any:
+def repeat(typingctx: Context, value: types.Type, like: types.Type) -> Intrinsic:
     """A number, as many times as the tuple ``like`` is long, each time in all lanes."""
     if not (_is_scalar(value) and isinstance(like, types.BaseTuple)):
         return None
 
-    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+    def generate(
+        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+    ) -> ir.Value:
         return _pack(builder, [_as_lanes(builder, arguments[0], signature.args[0])] * len(like))
 
     return _tuple_of_lanes(len(like))(value, like), generate
@@ -567,14 +619,16 @@ def repeat(typingctx: Any, value: Any, like: Any) -> Any:
 
 
 @intrinsic
-def dot(typingctx: Any, a: Any, b: Any, start: Any) -> Any:
+def dot(typingctx: Context, a: types.Type, b: types.Type, start: types.Type) -> Intrinsic:
     """``start`` plus the sum of the products of two tuples of lanes of one length."""
     length = _tuple_length((a, b))
     if length is None or not _is_numeric(start):
         return None
     kind = _result_type((a, b, start))
 
-    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+    def generate(
+        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+    ) -> ir.Value:
         total = _as_lanes(builder, arguments[2], signature.args[2], kind)
         for index in range(length):
             factors = (_element(builder, arguments[k], signature.args[k], index, kind) for k in range(2))
@@ -585,12 +639,14 @@ def dot(typingctx: Any, a: Any, b: Any, start: Any) -> Any:
 
 
 @intrinsic
-def lane_sums(typingctx: Any, vectors: Any) -> Any:
+def lane_sums(typingctx: Context, vectors: types.Type) -> Intrinsic:
     """Lane i of the result is the sum of all lanes of vector i of a tuple of at most sixteen; the rest is anything."""
     if not (isinstance(vectors, types.BaseTuple) and len(vectors) <= WIDTH):
         return None
 
-    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+    def generate(
+        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+    ) -> ir.Value:
         parts = [_element(builder, arguments[0], signature.args[0], index) for index in range(len(vectors))]
         return _summed(builder, parts)
 
@@ -598,12 +654,16 @@ def lane_sums(typingctx: Any, vectors: Any) -> Any:
 
 
 @intrinsic
-def store_lane_sums(typingctx: Any, table: Any, index: Any, further: Any, vectors: Any) -> Any:
+def store_lane_sums(
+    typingctx: Context, table: types.Type, index: types.Type, further: types.Type, vectors: types.Type
+) -> Intrinsic:
     """The sums of all lanes of each vector of a tuple: sixteen to ``table[index]`` and on, any others from ``further`` on."""
     if not (_is_table(table) and isinstance(vectors, types.BaseTuple)):
         return None
 
-    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+    def generate(
+        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+    ) -> ir.Value:
         parts = [_element(builder, arguments[3], signature.args[3], place) for place in range(len(vectors))]
         address = _address(context, builder, signature.args[0], *arguments[:2])
         _write(builder, _summed(builder, parts[:WIDTH]), address)
@@ -616,7 +676,7 @@ def store_lane_sums(typingctx: Any, table: Any, index: Any, further: Any, vector
     return types.none(table, types.intp, types.intp, vectors), generate
 
 
-def _summed(builder: ir.IRBuilder, parts: list[Any]) -> Any:
+def _summed(builder: ir.IRBuilder, parts: list[ir.Value]) -> ir.Value:
     """The sums of all lanes of at most sixteen vectors."""
     undefined = ir.Constant(_LANES, ir.Undefined)
     run = WIDTH
@@ -636,50 +696,56 @@ def _summed(builder: ir.IRBuilder, parts: list[Any]) -> Any:
 
 
 @intrinsic
-def lane_columns(typingctx: Any) -> Any:
+def lane_columns(typingctx: Context) -> Intrinsic:
     """0, 1, 2, 3 four times over: column of a lane's pixel in a block of 4 x 4, or of a block in a tile."""
     values = [float(lane % 4) for lane in range(WIDTH)]
     return lanes(), lambda context, builder, signature, arguments: _constant(values)
 
 
 @intrinsic
-def lane_rows(typingctx: Any) -> Any:
+def lane_rows(typingctx: Context) -> Intrinsic:
     """Each of 0, 1, 2, 3 four times: row of a lane's pixel in a block of 4 x 4. Also the row of a block in a tile."""
     values = [float(lane // 4) for lane in range(WIDTH)]
     return lanes(), lambda context, builder, signature, arguments: _constant(values)
 
 
 @intrinsic
-def lane(typingctx: Any, vector: Any, index: Any) -> Any:
+def lane(typingctx: Context, vector: types.Type, index: types.Type) -> Intrinsic:
     """One of the sixteen numbers."""
     if not isinstance(vector, Lanes):
         return None
 
-    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+    def generate(
+        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+    ) -> ir.Value:
         return builder.extract_element(*arguments)
 
     return types.float32(vector, types.intp), generate
 
 
 @intrinsic
-def lowest_bit(typingctx: Any, flags: Any) -> Any:
+def lowest_bit(typingctx: Context, flags: types.Type) -> Intrinsic:
     """Place of the lowest bit set in an integer that is not 0."""
     if not isinstance(flags, types.Integer):
         return None
 
-    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+    def generate(
+        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+    ) -> ir.Value:
         return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
 
     return types.int64(types.int64), generate
 
 
 @intrinsic
-def bit_count(typingctx: Any, flags: Any) -> Any:
+def bit_count(typingctx: Context, flags: types.Type) -> Intrinsic:
     """How many bits are set in an integer."""
     if not isinstance(flags, types.Integer):
         return None
 
-    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+    def generate(
+        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+    ) -> ir.Value:
         return builder.ctpop(arguments[0])
 
     return types.int64(types.int64), generate

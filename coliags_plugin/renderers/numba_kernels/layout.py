@@ -7,7 +7,9 @@ group. Tiles are 16 x 16 pixels, blocks 4 x 4: one vector again.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
+
+from coliags_plugin.core.numba_compilation import Array
 
 #: Edge of a tile, pixels.
 TILE = 16
@@ -93,11 +95,11 @@ class Parameters(NamedTuple):
         colors: [3 for each Gaussian]
     """
 
-    means: Any
-    quats: Any
-    scales: Any
-    opacities: Any
-    colors: Any
+    means: Array
+    quats: Array
+    scales: Array
+    opacities: Array
+    colors: Array
 
 
 class Extras(NamedTuple):
@@ -138,11 +140,11 @@ class Projections(NamedTuple):
         parcels: Gaussians drawn, -1 where one cannot be used; and tiles within their bounds. [2 for each parcel]
     """
 
-    records: Any
-    depths: Any
-    bounds: Any
-    drawn: Any
-    parcels: Any
+    records: Array
+    depths: Array
+    bounds: Array
+    drawn: Array
+    parcels: Array
 
 
 class Pairs(NamedTuple):
@@ -155,12 +157,12 @@ class Pairs(NamedTuple):
         tile_counts: How many there are of each stretch and tile. [tiles for each stretch]
     """
 
-    gaussian: Any
-    tile: Any
-    blocks: Any
-    begins: Any
-    ends: Any
-    tile_counts: Any
+    gaussian: Array
+    tile: Array
+    blocks: Array
+    begins: Array
+    ends: Array
+    tile_counts: Array
 
 
 class Bins(NamedTuple):
@@ -176,13 +178,13 @@ class Bins(NamedTuple):
         reached: End of the entries of each tile that any pixel gets to see; known after the forward sweep. [tiles]
     """
 
-    keys: Any
-    entry_counts: Any
-    stretch_entries: Any
-    cells: Any
-    starts: Any
-    order: Any
-    reached: Any
+    keys: Array
+    entry_counts: Array
+    stretch_entries: Array
+    cells: Array
+    starts: Array
+    order: Array
+    reached: Array
 
 
 class Images(NamedTuple):
@@ -194,18 +196,18 @@ class Images(NamedTuple):
             and only surfels have a distortion.
     """
 
-    rgb: Any
-    alpha: Any
-    depth: Any
-    inverse_depth: Any
-    expected: Any
-    normals: Any
-    median: Any
-    distortion: Any
+    rgb: Array
+    alpha: Array
+    depth: Array
+    inverse_depth: Array
+    expected: Array
+    normals: Array
+    median: Array
+    distortion: Array
 
 
 class Scratch(NamedTuple):
     """Working memory of the sweeps, per thread."""
 
-    numbers: Any
-    integers: Any
+    numbers: Array
+    integers: Array

@@ -8,14 +8,12 @@ from contextlib import contextmanager
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
+from coliags_plugin.core.numba_compilation import Array
 from coliags_plugin.renderers.numba_kernels import binning, layout, sorting
 from coliags_plugin.renderers.numba_kernels.buffers import ArenaPool, Results
 from coliags_plugin.renderers.numba_kernels.threads import Crew
-
-Array = npt.NDArray[Any]
 
 #: Pieces of work per thread where their costs differ.
 _PIECES = 8

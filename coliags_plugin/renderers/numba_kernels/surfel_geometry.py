@@ -6,12 +6,14 @@ that of the projection does not matter. Sixteen surfels at a time; a vector in s
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from coliags_plugin.core.numba_compilation import inline
 from coliags_plugin.renderers.numba_kernels import layout
 from coliags_plugin.renderers.numba_kernels.geometry import cross, rotation_rows
 from coliags_plugin.renderers.numba_kernels.lanes import (
+    LaneMask,
+    Vector,
     add,
     at_least,
     both,
@@ -51,21 +53,21 @@ class Placed(NamedTuple):
             where edge-on.
     """
 
-    in_front: Any
-    offset: Any
-    x: Any
-    y: Any
-    z: Any
-    inverse_z: Any
-    quaternion: Any
-    inverse_norm: Any
-    first: Any
-    second: Any
-    normal: Any
-    height: Any
-    of_first: Any
-    of_second: Any
-    of_z: Any
+    in_front: LaneMask
+    offset: tuple[Vector, ...]
+    x: Vector
+    y: Vector
+    z: Vector
+    inverse_z: Vector
+    quaternion: tuple[Vector, ...]
+    inverse_norm: Vector
+    first: tuple[Vector, ...]
+    second: tuple[Vector, ...]
+    normal: tuple[Vector, ...]
+    height: Vector
+    of_first: tuple[Vector, ...]
+    of_second: tuple[Vector, ...]
+    of_z: tuple[Vector, ...]
 
 
 @inline

@@ -8,7 +8,7 @@ low-pass filter, so that log2(alpha) = log2(opacity) - min(e^2 + f^2, |d|^2).
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from coliags_plugin.renderers.numba_kernels import layout
 
@@ -68,10 +68,10 @@ class Measures(NamedTuple):
         distortion: Squared differences of reciprocal depths.
     """
 
-    depth: Any
-    inverse_depth: Any
-    median: Any
-    distortion: Any
+    depth: tuple[object, ...]
+    inverse_depth: tuple[object, ...]
+    median: tuple[object, ...]
+    distortion: tuple[object, ...]
 
 
 #: Of a sweep over feature channels.

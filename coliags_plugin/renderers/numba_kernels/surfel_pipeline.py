@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from coliags_plugin.core.numba_compilation import Array
 from coliags_plugin.renderers.numba_kernels import (
     layout,
     surfel_layout,
     surfel_sweep_backward,
     surfel_sweep_forward,
 )
-from coliags_plugin.renderers.numba_kernels.pipeline import Array, Layer, Pipeline, Run
+from coliags_plugin.renderers.numba_kernels.pipeline import Layer, Pipeline, Run
 from coliags_plugin.renderers.numba_kernels.surfel_projection import project_surfels
 from coliags_plugin.renderers.numba_kernels.surfel_projection_backward import gather_surfels, project_surfels_backward
 

@@ -6,20 +6,28 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import TYPE_CHECKING
 
 from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
+from coliags_plugin.renderers.numba_kernels.lanes import Intrinsic
+
+if TYPE_CHECKING:
+    from numba.core.base import BaseContext
+    from numba.core.typing import Context, Signature
+
 
 @intrinsic
-def take(typingctx: Any, counters: Any, index: Any, amount: Any) -> Any:
+def take(typingctx: Context, counters: types.Type, index: types.Type, amount: types.Type) -> Intrinsic:
     """Atomically add to ``counters[index]`` and return the previous value."""
     if not (isinstance(counters, types.Array) and counters.dtype == types.int64 and counters.ndim == 1):
         return None
 
-    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Sequence[Any]) -> Any:
+    def generate(
+        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
+    ) -> ir.Value:
         table, place, amount = arguments
         data = context.make_array(signature.args[0])(context, builder, table).data
         return builder.atomic_rmw("add", builder.gep(data, [place]), amount, "monotonic")
@@ -49,7 +57,7 @@ class Crew:
         self.turn = threading.Lock()
         self._threads = ThreadPoolExecutor(max_workers=max(1, os.cpu_count() or 1), thread_name_prefix="splatting")
 
-    def run(self, size: int, kernel: Callable[..., Any], *arguments: Any) -> None:
+    def run(self, size: int, kernel: Callable[..., None], *arguments: object) -> None:
         """Run a kernel on ``size`` threads, including the calling one."""
         helpers = [self._threads.submit(kernel, *arguments) for _ in range(size - 1)]
         try:

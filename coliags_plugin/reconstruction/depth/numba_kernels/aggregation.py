@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from coliags_plugin.core.numba_compilation import kernel, part
+from coliags_plugin.core.numba_compilation import Array, kernel, part
 
 
 @part
-def _path_step(cost: Any, before: Any, least: Any, jump: Any, small: Any, into: Any, total: Any) -> Any:
+def _path_step(cost: Array, before: Array, least: float, jump: float, small: float, into: Array, total: Array) -> float:
     """One step of a path: Hirschmueller's recurrence. Returns the least value of ``into``."""
     count = len(cost)
     lowest = np.float32(np.inf)
@@ -28,7 +26,9 @@ def _path_step(cost: Any, before: Any, least: Any, jump: Any, small: Any, into: 
 
 
 @kernel
-def aggregate(cost: Any, guide: Any, small: Any, large: Any, contrast: Any, total: Any) -> None:
+def aggregate(
+    cost: Array, guide: Array, small: np.float32, large: np.float32, contrast: np.float32, total: Array
+) -> None:
     """Sum of the path costs over eight directions.
 
     Args:
@@ -89,7 +89,7 @@ def aggregate(cost: Any, guide: Any, small: Any, large: Any, contrast: Any, tota
 
 
 @kernel
-def pick(total: Any, cost: Any, rivals: Any, index: Any, match: Any, margin: Any) -> None:
+def pick(total: Array, cost: Array, rivals: int, index: Array, match: Array, margin: Array) -> None:
     """The hypothesis of the least aggregated cost, to a part of a step by a parabola.
 
     Args:

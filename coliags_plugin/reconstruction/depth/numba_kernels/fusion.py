@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from coliags_plugin.core.numba_compilation import kernel
+from coliags_plugin.core.numba_compilation import Array, kernel
 
 
 @kernel
 def reproject(
-    depth: Any,
-    other: Any,
-    weight: Any,
-    turn: Any,
-    shift: Any,
-    back: Any,
-    origin: Any,
-    steps: Any,
-    tolerance: Any,
-    found: Any,
-    trust: Any,
+    depth: Array,
+    other: Array,
+    weight: Array,
+    turn: Array,
+    shift: Array,
+    back: Array,
+    origin: np.float32,
+    steps: int,
+    tolerance: np.float32,
+    found: Array,
+    trust: Array,
 ) -> None:
     """Where the rays of one camera meet the depth map of another, by fixed-point iteration from a first guess.
 
@@ -81,15 +79,15 @@ def reproject(
 
 @kernel
 def vote(
-    depth: Any,
-    own: Any,
-    candidates: Any,
-    trusts: Any,
-    tolerance: Any,
-    fused: Any,
-    votes: Any,
-    against: Any,
-    spread: Any,
+    depth: Array,
+    own: Array,
+    candidates: Array,
+    trusts: Array,
+    tolerance: np.float32,
+    fused: Array,
+    votes: Array,
+    against: Array,
+    spread: Array,
 ) -> None:
     """Weighted median of the densest group of the candidates.
 

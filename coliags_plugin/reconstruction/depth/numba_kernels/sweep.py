@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from coliags_plugin.core.numba_compilation import kernel, part
+from coliags_plugin.core.numba_compilation import Array, kernel, part
 
 
 @part
-def _warp(base: Any, ratio: Any, image: Any, usable: Any, turn: Any, shift: Any, out: Any, seen: Any) -> None:
+def _warp(
+    base: Array, ratio: float, image: Array, usable: Array, turn: Array, shift: Array, out: Array, seen: Array
+) -> None:
     """Sample a neighbour's image at the surface ``base * ratio`` of the reference, bilinearly."""
     height, width = base.shape
     rows, columns = image.shape
@@ -43,7 +43,9 @@ def _warp(base: Any, ratio: Any, image: Any, usable: Any, turn: Any, shift: Any,
 
 
 @part
-def _correlate(reference: Any, warped: Any, seen: Any, radius: Any, floor: Any, least: Any, out: Any) -> None:
+def _correlate(
+    reference: Array, warped: Array, seen: Array, radius: int, floor: float, least: float, out: Array
+) -> None:
     """ZNCC of two images in square windows, of their common pixels; NaN where these are too few.
 
     Sums run along columns, then along rows. ``floor`` is added to both variances.
@@ -105,18 +107,18 @@ def _correlate(reference: Any, warped: Any, seen: Any, radius: Any, floor: Any, 
 
 @kernel
 def sweep(
-    base: Any,
-    ratios: Any,
-    reference: Any,
-    usable: Any,
-    images: Any,
-    masks: Any,
-    turns: Any,
-    shifts: Any,
-    radius: Any,
-    floor: Any,
-    share: Any,
-    cost: Any,
+    base: Array,
+    ratios: Array,
+    reference: Array,
+    usable: Array,
+    images: Array,
+    masks: Array,
+    turns: Array,
+    shifts: Array,
+    radius: int,
+    floor: float,
+    share: float,
+    cost: Array,
 ) -> None:
     """Costs of the hypotheses ``base * ratios[d]``: one minus the mean of the best correlations with the neighbours.
 
