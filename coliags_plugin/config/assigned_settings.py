@@ -28,13 +28,14 @@ def settings_of(kind: type[S], assignments: Sequence[str], prefix: str = "") -> 
     tree = override_all(Node({}, "options"), assignments)
     try:
         # Merged with the defaults, as a nested part's defaults may differ from its class's.
-        return kind.model_validate(_upon(kind().model_dump(), tree.plain()))
+        return kind.model_validate(deep_merge(kind().model_dump(), tree.plain()))
     except ValidationError as error:
         key, message, value = first_error(error)
         raise InputError(f"--set {prefix}{key}: {message} (got {value!r})") from error
 
 
-def _upon(base: Any, over: Any) -> Any:
+def deep_merge(base: Any, over: Any) -> Any:
+    """``over`` merged into ``base``, mapping by mapping; other values are replaced."""
     if not isinstance(base, dict) or not isinstance(over, dict):
         return over
-    return {**base, **{key: _upon(base.get(key), value) for key, value in over.items()}}
+    return {**base, **{key: deep_merge(base.get(key), value) for key, value in over.items()}}

@@ -5,10 +5,13 @@ from coliags_plugin.contracts.evaluation import Comparison, Metric, Protocol
 from coliags_plugin.contracts.fields import (
     Field,
     GaussianField,
+    LampAware,
     LitField,
     RadianceField,
     RadianceLevel,
     RadianceSamples,
+    gaussians_under,
+    knows_lamp,
 )
 from coliags_plugin.contracts.heads import AppearanceHead, GeometryHead, Head
 from coliags_plugin.contracts.losses import Loss, LossSettings
@@ -34,6 +37,7 @@ __all__ = [
     "GaussianField",
     "GeometryHead",
     "Head",
+    "LampAware",
     "LitField",
     "Loss",
     "LossSettings",
@@ -51,5 +55,7 @@ __all__ = [
     "TrainedModel",
     "TrainingStep",
     "ViewModule",
+    "gaussians_under",
+    "knows_lamp",
     "log_linear",
 ]

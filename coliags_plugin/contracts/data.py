@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar, Generic
 
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Scene
-from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.settings import Settings, SettingsT
 
 
-class DataManager(ABC):
+class DataManager(ABC, Generic[SettingsT]):
     """Reader of one dataset format: a folder on disk -> :class:`Scene`. Never writes into the dataset."""
 
     Settings: ClassVar[type[Settings]]
     #: Whether it reads a format of its own; False where it stands for whichever data manager recognises a folder.
     has_format: ClassVar[bool] = True
 
-    def __init__(self, settings: Any) -> None:
+    def __init__(self, settings: SettingsT) -> None:
         self.settings = settings
 
     @classmethod

@@ -5,14 +5,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Generic
 
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.settings import Settings, SettingsT
 
 
 @dataclass(frozen=True)
@@ -43,14 +43,14 @@ class Comparison:
     true_point_depth: Float[Tensor, "K"] | None = None
 
 
-class Metric(ABC):
+class Metric(ABC, Generic[SettingsT]):
     """One number from a :class:`Comparison`."""
 
     Settings: ClassVar[type[Settings]]
     higher_is_better: ClassVar[bool]
     unit: ClassVar[str]
 
-    def __init__(self, settings: Any) -> None:
+    def __init__(self, settings: SettingsT) -> None:
         self.settings = settings
 
     @abstractmethod

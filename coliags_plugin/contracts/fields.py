@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Generic
 
 import torch
 from jaxtyping import Float
@@ -16,11 +16,11 @@ from coliags_plugin.contracts.schedule import Schedule
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.scenes import Scene
-from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.settings import Settings, SettingsT
 from coliags_plugin.lighting.lamps import HeldLight, Lamp
 
 
-class Field(nn.Module, ABC):
+class Field(nn.Module, ABC, Generic[SettingsT]):
     """Trainable scene representation: a :class:`GaussianField` or a :class:`RadianceField`."""
 
     Settings: ClassVar[type[Settings]]
@@ -36,12 +36,12 @@ class Field(nn.Module, ABC):
 
     @classmethod
     @abstractmethod
-    def from_scene(cls, scene: Scene, settings: Any, generator: torch.Generator) -> Self:
+    def from_scene(cls, scene: Scene, settings: SettingsT, generator: torch.Generator) -> Self:
         """A new field, initialised from the scene's points."""
 
     @classmethod
     @abstractmethod
-    def from_state(cls, state: Mapping[str, Tensor], settings: Any) -> Self:
+    def from_state(cls, state: Mapping[str, Tensor], settings: SettingsT) -> Self:
         """The field of a checkpoint, of any number of elements."""
 
     @abstractmethod
@@ -58,6 +58,19 @@ class Field(nn.Module, ABC):
         """Learned numbers that have a meaning of their own, for the record of a run; default: none."""
         return {}
 
+    @property
+    def feature_channels(self) -> frozenset[str]:
+        """Names of the feature channels of its Gaussians, each of which is an output; default: none."""
+        return frozenset()
+
+    @property
+    def normals_and_references(self) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]] | None:
+        """Normals of the Gaussians and those that they should have, for losses; default: None, without such.
+
+        World frame, of either sign; the first are differentiable. [N, 3], [N, 3]
+        """
+        return None
+
     def before_step(self, step: int, schedule: Schedule) -> None:
         """Called before each training step, counted from 1, by fields that change over the run.
 
@@ -65,23 +78,13 @@ class Field(nn.Module, ABC):
         """
 
 
-class GaussianField(Field):
+class GaussianField(Field[SettingsT]):
     """:class:`Camera` -> :class:`Gaussians`, for splatting renderers."""
 
     @property
     def slots_per_element(self) -> int:
         """Gaussians that an element may yield: ``source_index`` divided by it is the element."""
         return 1
-
-    @property
-    def feature_channels(self) -> frozenset[str]:
-        """Names of the feature channels of its Gaussians, each of which is an output."""
-        return frozenset()
-
-    @property
-    def knows_lamp(self) -> bool:
-        """Whether colours depend on where the lamp is, so that :meth:`gaussians_in_light` changes them."""
-        return False
 
     @abstractmethod
     def gaussians(self, camera: Camera) -> Gaussians:
@@ -91,9 +94,18 @@ class GaussianField(Field):
         """:meth:`gaussians` in a training step: with noise from the generator where there is any; default: without."""
         return self.gaussians(camera)
 
+
+class LampAware(ABC):
+    """Mixin of Gaussian fields whose colours may depend on where the lamp is."""
+
+    @property
+    def knows_lamp(self) -> bool:
+        """Whether colours depend on where the lamp is, so that :meth:`gaussians_in_light` changes them."""
+        return True
+
+    @abstractmethod
     def gaussians_in_light(self, camera: Camera, light: HeldLight) -> Gaussians:
-        """:meth:`gaussians` with the lamp held instead of moving with the camera; default: of fields without a lamp."""
-        return self.gaussians(camera)
+        """:meth:`GaussianField.gaussians` with the lamp held instead of moving with the camera."""
 
     def attenuation(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N C"] | None:
         """Factor of the light's law on colours, of all channels or each; default: None, without a law. [N, C]
@@ -104,7 +116,25 @@ class GaussianField(Field):
         return None
 
 
-class LitField(GaussianField):
+def gaussians_under(field: GaussianField, camera: Camera, light: HeldLight | None) -> Gaussians:
+    """The Gaussians that a camera sees, lit by a held light where their colours depend on the lamp.
+
+    Args:
+        field: The field.
+        camera: The view.
+        light: None: the lamp moves with the camera.
+    """
+    if light is None or not isinstance(field, LampAware):
+        return field.gaussians(camera)
+    return field.gaussians_in_light(camera, light)
+
+
+def knows_lamp(field: Field) -> bool:
+    """Whether the colours of a field depend on where a lamp is that can be held."""
+    return isinstance(field, LampAware) and field.knows_lamp
+
+
+class LitField(GaussianField[SettingsT], LampAware):
     """Gaussian field that models the lamp apart from the tissue, so that the lamp can be exchanged after training."""
 
     @abstractmethod
@@ -157,7 +187,7 @@ class RadianceLevel(ABC):
         return self.query(positions, directions, camera).density
 
 
-class RadianceField(Field, RadianceLevel):
+class RadianceField(Field[SettingsT], RadianceLevel):
     """Density and colour in space, for renderers that sample along rays."""
 
     primitive: ClassVar[str] = "radiance"

@@ -59,10 +59,10 @@ class AppearanceHead(Head):
 
     @property
     def uses_normals(self) -> bool:
-        """Whether :meth:`forward` and :meth:`lit` are given the normals of the wall; default: not."""
+        """Whether :meth:`forward` and :meth:`apply_light` are given the normals of the wall; default: not."""
         return False
 
-    def expect(self, distances: Float[Tensor, "D"]) -> None:
+    def init_from_distances(self, distances: Float[Tensor, "D"]) -> None:
         """Adapt the initial parameters to the distances of the scene, before training.
 
         Args:
@@ -95,7 +95,7 @@ class AppearanceHead(Head):
             RGB in (0, 1). [V, K, 3]
         """
 
-    def lit(
+    def apply_light(
         self,
         colors: Float[Tensor, "N 3"],
         positions: Float[Tensor, "N 3"],

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar
+from typing import ClassVar, Generic
 
 from jaxtyping import Float
 from pydantic import Field as Option
 from pydantic import model_validator
 from torch import Tensor
-from typing_extensions import Self
+from typing_extensions import Self, TypeVar
 
 from coliags_plugin.contracts.schedule import Schedule, log_linear
 from coliags_plugin.contracts.training import TrainedModel, TrainingStep
 from coliags_plugin.core.settings import Settings, refuse_zero_ends
 
+#: Settings of a loss.
+LossSettingsT = TypeVar("LossSettingsT", bound="LossSettings", default="LossSettings")
 
-class Loss(ABC):
+
+class Loss(ABC, Generic[LossSettingsT]):
     """One scalar term of the loss; its weight and schedule are settings, applied by the engine."""
 
     Settings: ClassVar[type[LossSettings]]
@@ -29,7 +32,7 @@ class Loss(ABC):
     #: Whether it reads ``output.splats``, which only splatting renderers deliver.
     needs_splats: ClassVar[bool] = False
 
-    def __init__(self, settings: Any) -> None:
+    def __init__(self, settings: LossSettingsT) -> None:
         self.settings = settings
 
     @property
@@ -37,7 +40,7 @@ class Loss(ABC):
         """Outputs beyond rgb and alpha that the renderer must deliver."""
         return frozenset()
 
-    def check(self, model: TrainedModel) -> None:  # noqa: B027 (optional)
+    def check(self, model: TrainedModel) -> None:
         """Check, before training, that the model has what the term reads.
 
         Raises:

@@ -5,17 +5,21 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Generic
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
-from typing_extensions import Self
+from typing_extensions import Self, TypeVar
 
+from coliags_plugin.contracts.fields import Field
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Scene, View
-from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.settings import Settings, SettingsT
+
+#: Field that a renderer draws.
+RenderedT = TypeVar("RenderedT", bound=Field, default=Any)
 
 
 @dataclass(frozen=True)
@@ -26,7 +30,7 @@ class Availability:
     reason: str
 
 
-class Renderer(ABC):
+class Renderer(ABC, Generic[SettingsT, RenderedT]):
     """Field + Camera -> RenderOutput, with declared primitives, outputs and devices that the engine checks."""
 
     Settings: ClassVar[type[Settings]]
@@ -38,7 +42,7 @@ class Renderer(ABC):
     #: Whether it can render some pixels of a view; splatting renderers draw whole images.
     renders_pixels: ClassVar[bool] = False
 
-    def __init__(self, settings: Any) -> None:
+    def __init__(self, settings: SettingsT) -> None:
         self.settings = settings
 
     @classmethod
@@ -79,7 +83,7 @@ class Renderer(ABC):
     @abstractmethod
     def render(
         self,
-        field: Any,
+        field: RenderedT,
         camera: Camera,
         wants: Sequence[str] = ("rgb", "alpha"),
         pixels: Int[Tensor, "P 2"] | None = None,
@@ -99,7 +103,7 @@ class Renderer(ABC):
 
     def render_in_training(
         self,
-        field: Any,
+        field: RenderedT,
         camera: Camera,
         wants: Sequence[str],
         pixels: Int[Tensor, "P 2"] | None,
@@ -108,7 +112,7 @@ class Renderer(ABC):
         """:meth:`render` in a training step: with random samples from the generator where there are any."""
         return self.render(field, camera, wants, pixels)
 
-    def check_field(self, field: Any, near_plane: float) -> None:  # noqa: B027 (optional)
+    def check_field(self, field: RenderedT, near_plane: float) -> None:
         """Check, before training, that the renderer's options fit a field and the near plane of its cameras.
 
         Args:
@@ -120,7 +124,7 @@ class Renderer(ABC):
         """
 
 
-class ViewModule(nn.Module, ABC):
+class ViewModule(nn.Module, ABC, Generic[SettingsT]):
     """Per-view module: adjusts the camera before and the output after rendering; may learn parameters per frame."""
 
     Settings: ClassVar[type[Settings]]
@@ -140,7 +144,7 @@ class ViewModule(nn.Module, ABC):
 
     @classmethod
     @abstractmethod
-    def from_scene(cls, scene: Scene, settings: Any, generator: torch.Generator) -> Self:
+    def from_scene(cls, scene: Scene, settings: SettingsT, generator: torch.Generator) -> Self:
         """A new module for the scene's training frames, into which a checkpoint's state can be loaded.
 
         Raises:
@@ -189,7 +193,7 @@ class ViewModule(nn.Module, ABC):
         """
 
 
-class GainModule(ViewModule):
+class GainModule(ViewModule[SettingsT]):
     """Base class of view modules with an exposure gain per training frame, by which colours are multiplied."""
 
     @property
@@ -202,7 +206,7 @@ class GainModule(ViewModule):
         """Logarithm of every training frame's gain, for all colours or for each of three. [F, C]"""
 
 
-class ResponseModule(ViewModule):
+class ResponseModule(ViewModule[SettingsT]):
     """Base class of view modules with a response curve of the camera, shared by all frames."""
 
     @abstractmethod

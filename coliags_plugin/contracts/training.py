@@ -5,21 +5,28 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Generic
 from typing import Protocol as TypingProtocol
 
 import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
+from typing_extensions import TypeVar
 
+from coliags_plugin.contracts.fields import Field
+from coliags_plugin.contracts.rendering import ViewModule
 from coliags_plugin.contracts.schedule import Schedule
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Target
-from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.settings import Settings, SettingsT
+
+#: Field, or what a strategy uses of one.
+FieldT = TypeVar("FieldT", default=Any)
+FieldT_co = TypeVar("FieldT_co", covariant=True, default=Field)
 
 
 @dataclass(frozen=True)
-class TrainingStep:
+class TrainingStep(Generic[FieldT_co]):
     """One training step, as passed to losses and strategies.
 
     Attributes:
@@ -32,20 +39,20 @@ class TrainingStep:
 
     output: RenderOutput
     target: Target
-    model: TrainedModel
+    model: TrainedModel[FieldT_co]
     step: int
     schedule: Schedule
 
 
-class TrainedModel(TypingProtocol):
+class TrainedModel(TypingProtocol[FieldT_co]):
     """Interface of the model that losses and strategies may use."""
 
     @property
-    def field(self) -> Any:
+    def field(self) -> FieldT_co:
         """The :class:`Field`."""
 
     @property
-    def view_modules(self) -> Mapping[str, Any]:
+    def view_modules(self) -> Mapping[str, ViewModule]:
         """View modules by their names in the method config."""
 
 
@@ -79,7 +86,7 @@ class ParameterRows(TypingProtocol):
         """Replace the values of a group and reset their moments. [M, ...]"""
 
 
-class Strategy(ABC):
+class Strategy(ABC, Generic[SettingsT, FieldT]):
     """Densification and pruning of a field between optimizer steps, with its own counters.
 
     Args:
@@ -95,7 +102,7 @@ class Strategy(ABC):
     #: Attributes that are tensors of counters, saved with a checkpoint.
     counters: ClassVar[tuple[str, ...]] = ()
 
-    def __init__(self, settings: Any, generator: torch.Generator, schedule: Schedule, extent: float) -> None:
+    def __init__(self, settings: SettingsT, generator: torch.Generator, schedule: Schedule, extent: float) -> None:
         self.settings = settings
         self.generator = generator
         self.schedule = schedule
@@ -105,10 +112,10 @@ class Strategy(ABC):
     def plan(self) -> str:
         """One sentence for the log: the steps at which it grows or prunes, or why it will not."""
 
-    def before_step(self, step: int, field: Any, rows: ParameterRows) -> None:  # noqa: B027 (optional)
+    def before_step(self, step: int, field: FieldT, rows: ParameterRows) -> None:
         """Called before step ``step`` renders."""
 
-    def after_backward(self, step: TrainingStep, rows: ParameterRows) -> dict[str, int]:
+    def after_backward(self, step: TrainingStep[FieldT], rows: ParameterRows) -> dict[str, int]:
         """Called after ``backward`` and before the optimisers step.
 
         Returns:
@@ -116,7 +123,7 @@ class Strategy(ABC):
         """
         return {}
 
-    def after_step(self, step: TrainingStep, rows: ParameterRows) -> dict[str, int]:
+    def after_step(self, step: TrainingStep[FieldT], rows: ParameterRows) -> dict[str, int]:
         """Called after the optimisers have stepped; returns like :meth:`after_backward`."""
         return {}
 
@@ -143,7 +150,7 @@ class Draw:
     pixels: Int[Tensor, "P 2"] | None = None
 
 
-class Sampler(ABC):
+class Sampler(ABC, Generic[SettingsT]):
     """Sequence of the frames, or pixel batches, that training steps render.
 
     Args:
@@ -159,7 +166,7 @@ class Sampler(ABC):
     #: Whether its steps see whole images; losses with ``whole_image`` need that.
     whole_images: ClassVar[bool]
 
-    def __init__(self, settings: Any, sizes: Sequence[tuple[int, int]], generator: torch.Generator) -> None:
+    def __init__(self, settings: SettingsT, sizes: Sequence[tuple[int, int]], generator: torch.Generator) -> None:
         self.settings = settings
         self.sizes = sizes
         self.generator = generator

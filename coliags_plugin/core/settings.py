@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
+from typing_extensions import TypeVar
 
 from coliags_plugin.core.errors import InputError, did_you_mean
 
@@ -65,6 +66,10 @@ class Settings(BaseModel):
                 ],
             )
         return data
+
+
+#: Settings of a component's base class.
+SettingsT = TypeVar("SettingsT", bound=Settings, default=Any)
 
 
 def _is_huge(value: Any) -> bool:

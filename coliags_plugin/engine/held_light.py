@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 
 from coliags_plugin.config.registry import fields
-from coliags_plugin.contracts import GaussianField, LitField
+from coliags_plugin.contracts import GaussianField, LitField, gaussians_under
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.render_output import OPAQUE_ALPHA, RenderOutput
@@ -88,7 +88,7 @@ def render_held(model: Model, camera: Camera, light: HeldLight, wants: Sequence[
         wants: Names of outputs.
     """
     camera, field, renderer = model.placed(camera), gaussians_of(model), splatting_of(model)
-    return renderer.draw(field.gaussians_in_light(camera, light), camera, wants)
+    return renderer.draw(gaussians_under(field, camera, light), camera, wants)
 
 
 def gaussians_of(model: Model) -> GaussianField:

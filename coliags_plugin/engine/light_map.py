@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from coliags_plugin.contracts import GainModule, GaussianField, ResponseModule
+from coliags_plugin.contracts import GainModule, LampAware, ResponseModule
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.json_files import read_json
@@ -159,7 +159,7 @@ def light_map(trained: TrainedRun) -> LightMap | None:
     parts = model.view_modules.values()
     gain = next((part for part in parts if isinstance(part, GainModule)), None)
     curve = next((part for part in parts if isinstance(part, ResponseModule)), None)
-    field = model.field if isinstance(model.field, GaussianField) else None
+    field = model.field if isinstance(model.field, LampAware) else None
     depths = scene.depths_in_view().double()
     if len(depths) == 0:
         return None

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from coliags_plugin.config.method_config import MethodConfig
-from coliags_plugin.contracts import Field, GaussianField, Renderer, ViewModule
+from coliags_plugin.contracts import Field, Renderer, ViewModule
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import NEAR_PLANE
@@ -119,7 +119,7 @@ class Model(nn.Module):
     @property
     def feature_channels(self) -> frozenset[str]:
         """Names of the field's feature channels."""
-        return self.field.feature_channels if isinstance(self.field, GaussianField) else frozenset()
+        return self.field.feature_channels
 
     def check_outputs(self, wants: Sequence[str], asking: str) -> None:
         """Refuse outputs that the renderer does not have for this field, wanted by a caller or a view module.

@@ -15,7 +15,7 @@ class FrameSamplerSettings(Settings):
     """No options."""
 
 
-class FrameSampler(Sampler):
+class FrameSampler(Sampler[FrameSamplerSettings]):
     """One whole frame per step, each once per round in random order (docs/methods.md 4)."""
 
     Settings: ClassVar[type[Settings]] = FrameSamplerSettings
@@ -33,7 +33,7 @@ class PixelSamplerSettings(Settings):
     frames: int = Field(default=4, ge=1)  # that they are taken from, as evenly as can be
 
 
-class PixelSampler(Sampler):
+class PixelSampler(Sampler[PixelSamplerSettings]):
     """Random pixels of a few frames per step, each frame once per round in random order."""
 
     Settings: ClassVar[type[Settings]] = PixelSamplerSettings

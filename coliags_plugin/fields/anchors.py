@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from typing_extensions import Self
 
 from coliags_plugin.config.components import AppearanceHeadNode, GeometryHeadNode
-from coliags_plugin.contracts import GaussianField
+from coliags_plugin.contracts import GaussianField, LampAware
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.point_normals import wall_normals
@@ -42,7 +42,7 @@ class AnchorFieldSettings(Settings):
     voxel_pixels: float = Option(default=2.0, gt=0)
 
 
-class AnchorField(GaussianField):
+class AnchorField(GaussianField[AnchorFieldSettings], LampAware):
     """Anchors with features; two heads decode each visible one into its children (paper, II-A2 and II-C).
 
     Differs from the released ColIAGS code where that is defective (docs/methods.md 6): voxels are of a size that
@@ -69,7 +69,7 @@ class AnchorField(GaussianField):
     voxel_size: Tensor
     spacing: Tensor
 
-    def __init__(self, settings: Any, anchor_count: int, generator: torch.Generator) -> None:
+    def __init__(self, settings: AnchorFieldSettings, anchor_count: int, generator: torch.Generator) -> None:
         super().__init__()
         self.settings = settings
         self.register_buffer("anchors", torch.zeros(anchor_count, 3))
@@ -85,7 +85,7 @@ class AnchorField(GaussianField):
         self.register_buffer("normals", torch.zeros(anchor_count, 3) if self.appearance_head.uses_normals else None)
 
     @classmethod
-    def from_scene(cls, scene: Scene, settings: Any, generator: torch.Generator) -> Self:
+    def from_scene(cls, scene: Scene, settings: AnchorFieldSettings, generator: torch.Generator) -> Self:
         """Merge the scene's points into one anchor per voxel.
 
         Raises:
@@ -113,13 +113,13 @@ class AnchorField(GaussianField):
         with torch.no_grad():
             field.scalings.copy_(log_scales[:, None].expand(-1, 6))
             cameras = [frame.camera for frame in scene.train[:: max(1, len(scene.train) // _DISTANCE_CAMERAS)]]
-            field.appearance_head.expect(torch.cat([field._distances(camera) for camera in cameras]))
+            field.appearance_head.init_from_distances(torch.cat([field._distances(camera) for camera in cameras]))
         field.appearance_head.prepare(scene)
         logger.info("%d points in voxels of %.3g scene units make %d anchors", len(scene.points), size, len(anchors))
         return field
 
     @classmethod
-    def from_state(cls, state: Mapping[str, Tensor], settings: Any) -> Self:
+    def from_state(cls, state: Mapping[str, Tensor], settings: AnchorFieldSettings) -> Self:
         """The field of a checkpoint, of any number of anchors."""
         field = cls(settings, len(state["anchors"]), torch.Generator())
         field.load_state_dict(state)
@@ -216,7 +216,7 @@ class AnchorField(GaussianField):
             quats_wxyz=nn.functional.normalize(covariances[:, 3:], dim=1),
             scales=scales[:, 3:] * covariances[:, :3].sigmoid(),
             opacities=opacities.reshape(-1).index_select(0, slots),
-            colors=self.appearance_head.lit(drawn, means, normals, camera, light),
+            colors=self.appearance_head.apply_light(drawn, means, normals, camera, light),
             source_index=(visible.index_select(0, parents) - parents) * self.settings.children + slots,
             visible_sources=visible,
         )

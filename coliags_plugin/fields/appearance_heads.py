@@ -77,7 +77,7 @@ class PlainAppearanceHead(AppearanceHead):
         return self.sees_distance
 
     @torch.no_grad()
-    def expect(self, distances: Float[Tensor, "D"]) -> None:
+    def init_from_distances(self, distances: Float[Tensor, "D"]) -> None:
         """Initialise the biases so that each hidden unit's kink is at a distance of the scene (docs/methods.md 3.4).
 
         Drawn about zero, units see millimetres that outweigh all other inputs: those with a negative weight for the

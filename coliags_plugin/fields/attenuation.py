@@ -56,7 +56,9 @@ class AttenuatedAppearanceHead(AppearanceHead):
 
     reference: Tensor
 
-    def __init__(self, settings: Any, features: int, children: int, generator: torch.Generator) -> None:
+    def __init__(
+        self, settings: AttenuatedAppearanceSettings, features: int, children: int, generator: torch.Generator
+    ) -> None:
         super().__init__()
         self.settings = settings
         self.head: AppearanceHead = settings.head.target(settings.head.settings, features, children, generator)
@@ -73,9 +75,9 @@ class AttenuatedAppearanceHead(AppearanceHead):
         return self._knows_incidence or self.head.uses_normals
 
     @torch.no_grad()
-    def expect(self, distances: Float[Tensor, "D"]) -> None:
+    def init_from_distances(self, distances: Float[Tensor, "D"]) -> None:
         """Take the median distance as the reference."""
-        self.head.expect(distances)
+        self.head.init_from_distances(distances)
         if len(distances):
             self.reference.copy_(distances.median())
 
@@ -165,7 +167,7 @@ class AttenuatedAppearanceHead(AppearanceHead):
         incidences = None if normals is None else (normals * rays).sum(1).abs() / distances
         return self.law(distances, depths / distances, incidences)
 
-    def lit(
+    def apply_light(
         self,
         colors: Float[Tensor, "N 3"],
         positions: Float[Tensor, "N 3"],

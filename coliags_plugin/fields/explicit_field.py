@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float
 from pydantic import Field as Option
 from torch import Tensor, nn
-from typing_extensions import Self
+from typing_extensions import Self, TypeVar
 
 from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.cameras import Camera
@@ -31,7 +31,11 @@ class ExplicitFieldSettings(Settings):
     )  # neighbours from which normals of the initial points are estimated, as references; null: no such normals
 
 
-class ExplicitField(GaussianField):
+#: Settings of a field of explicit Gaussians.
+ExplicitT = TypeVar("ExplicitT", bound=ExplicitFieldSettings, default=ExplicitFieldSettings)
+
+
+class ExplicitField(GaussianField[ExplicitT]):
     """One Gaussian per initial point, each with its own mean, covariance and opacity; subclasses add their colours."""
 
     elements: ClassVar[str] = "gaussians"
@@ -40,7 +44,7 @@ class ExplicitField(GaussianField):
     #: Trained scales of a Gaussian.
     scale_count: ClassVar[int] = 3
 
-    def __init__(self, settings: Any, count: int) -> None:
+    def __init__(self, settings: ExplicitT, count: int) -> None:
         super().__init__()
         self.settings = settings
         self.means = nn.Parameter(torch.zeros(count, 3))
@@ -50,7 +54,7 @@ class ExplicitField(GaussianField):
         self.references: ReferenceNormals | None = None
 
     @classmethod
-    def from_scene(cls, scene: Scene, settings: Any, generator: torch.Generator) -> Self:
+    def from_scene(cls, scene: Scene, settings: ExplicitT, generator: torch.Generator) -> Self:
         """An isotropic Gaussian at every initial point, scaled to the distance of its neighbours.
 
         Raises:
@@ -68,7 +72,7 @@ class ExplicitField(GaussianField):
         return field
 
     @classmethod
-    def from_state(cls, state: Mapping[str, Tensor], settings: Any) -> Self:
+    def from_state(cls, state: Mapping[str, Tensor], settings: ExplicitT) -> Self:
         """The field of a checkpoint, of any number of Gaussians."""
         field = cls(settings, len(state["means"]))
         if settings.normal_neighbours is not None:
@@ -100,9 +104,9 @@ class ExplicitField(GaussianField):
         return shortest_axes(self.quats, self.scales)
 
     @property
-    def reference_normals(self) -> Float[Tensor, "N 3"] | None:
-        """Normal of the initial point nearest to each Gaussian at its birth, of either sign; None without. [N, 3]"""
-        return None if self.references is None else self.references.of_rows
+    def normals_and_references(self) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]] | None:
+        """Shortest axes, and the normals of the initial points nearest to each Gaussian at its birth. [N, 3], [N, 3]"""
+        return None if self.references is None else (self.normals(), self.references.of_rows)
 
     @torch.no_grad()
     def _visible(self, camera: Camera) -> Tensor:

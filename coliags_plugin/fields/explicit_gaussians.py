@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from pydantic import Field as Option
@@ -25,7 +25,7 @@ class ExplicitGaussiansSettings(ExplicitFieldSettings):
     sh_every: int = Option(default=1000, ge=1)  # steps between increases of the active degree from 0
 
 
-class ExplicitGaussians(ExplicitField):
+class ExplicitGaussians(ExplicitField[ExplicitGaussiansSettings]):
     """Explicit Gaussians whose colours are spherical harmonics of the viewing direction."""
 
     Settings: ClassVar[type[Settings]] = ExplicitGaussiansSettings
@@ -34,14 +34,14 @@ class ExplicitGaussians(ExplicitField):
 
     degree: Tensor
 
-    def __init__(self, settings: Any, count: int) -> None:
+    def __init__(self, settings: ExplicitGaussiansSettings, count: int) -> None:
         super().__init__(settings, count)
         self.sh0 = nn.Parameter(torch.zeros(count, 1, 3))
         self.shN = nn.Parameter(torch.zeros(count, (settings.sh_degree + 1) ** 2 - 1, 3))
         self.register_buffer("degree", torch.zeros((), dtype=torch.int64))
 
     @classmethod
-    def from_scene(cls, scene: Scene, settings: Any, generator: torch.Generator) -> Self:
+    def from_scene(cls, scene: Scene, settings: ExplicitGaussiansSettings, generator: torch.Generator) -> Self:
         """An isotropic Gaussian at every initial point, with its colour.
 
         Raises:

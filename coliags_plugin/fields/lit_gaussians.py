@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import logging
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -67,7 +67,7 @@ class LitGaussiansSettings(ExplicitFieldSettings):
         return self
 
 
-class LitGaussians(ExplicitField, LitField):
+class LitGaussians(ExplicitField[LitGaussiansSettings], LitField[LitGaussiansSettings]):
     """Flat Gaussians whose colour is the light of a lamp that they reflect (docs/rivals/pr-endo.md).
 
     Attributes:
@@ -87,7 +87,7 @@ class LitGaussians(ExplicitField, LitField):
     extent: Tensor
     network_on: Tensor
 
-    def __init__(self, settings: Any, count: int) -> None:
+    def __init__(self, settings: LitGaussiansSettings, count: int) -> None:
         super().__init__(settings, count)
         self.lamp = Lamp()
         self.albedos = nn.Parameter(torch.zeros(count, 3))
@@ -101,7 +101,7 @@ class LitGaussians(ExplicitField, LitField):
         self.register_buffer("network_on", torch.zeros((), dtype=torch.bool))
 
     @classmethod
-    def from_scene(cls, scene: Scene, settings: Any, generator: torch.Generator) -> Self:
+    def from_scene(cls, scene: Scene, settings: LitGaussiansSettings, generator: torch.Generator) -> Self:
         """A disc at every initial point, of its colour.
 
         Raises:
@@ -154,11 +154,6 @@ class LitGaussians(ExplicitField, LitField):
 
     def _max_log_scale(self) -> Tensor:
         return (self.settings.max_scale_share * self.extent).log()
-
-    @property
-    def knows_lamp(self) -> bool:
-        """Always."""
-        return True
 
     def gaussians(self, camera: Camera) -> Gaussians:
         """The Gaussians in the camera's view with the light they reflect towards it."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -45,7 +45,7 @@ class ReimNerfSettings(Settings):
         return self
 
 
-class ReimNerf(RadianceField):
+class ReimNerf(RadianceField[ReimNerfSettings]):
     """Two networks from position to density, and from position, direction and lamp position to colour.
 
     After Psychogyios et al., "Realistic Endoscopic Illumination Modeling for NeRF-Based Data Generation" (MICCAI 2023).
@@ -60,7 +60,7 @@ class ReimNerf(RadianceField):
 
     bounds: Tensor
 
-    def __init__(self, settings: Any, generator: torch.Generator) -> None:
+    def __init__(self, settings: ReimNerfSettings, generator: torch.Generator) -> None:
         super().__init__()
         self.settings = settings
         self.normalisation = SceneNormalisation()
@@ -69,7 +69,7 @@ class ReimNerf(RadianceField):
         self.fine_network = RadianceMLP(settings, generator)
 
     @classmethod
-    def from_scene(cls, scene: Scene, settings: Any, generator: torch.Generator) -> Self:
+    def from_scene(cls, scene: Scene, settings: ReimNerfSettings, generator: torch.Generator) -> Self:
         """Fresh networks, normalised by the scene's initial points.
 
         Raises:
@@ -89,7 +89,7 @@ class ReimNerf(RadianceField):
         return field
 
     @classmethod
-    def from_state(cls, state: Mapping[str, Tensor], settings: Any) -> Self:
+    def from_state(cls, state: Mapping[str, Tensor], settings: ReimNerfSettings) -> Self:
         """The field of a checkpoint."""
         field = cls(settings, torch.Generator())
         field.load_state_dict(state)

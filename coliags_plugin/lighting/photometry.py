@@ -42,7 +42,7 @@ _LARGEST_OFFSET, _LARGEST_STEP, _DIFFERENCE, _CONVERGED = 0.3, 0.08, 0.002, 0.00
 #: The last three of the exponents and the albedo; and most iterations.
 _LARGEST_CHANGE, _SMALL_CHANGE, _CHANGE_CONVERGED, _ITERATIONS = 0.3, 0.01, 0.01, 12
 #: Share of the residuals' deviation with a lamp at the lens above which it stays there.
-_NOT_BETTER = 0.975
+_MAX_RESIDUAL_RATIO = 0.975
 
 
 @dataclass(frozen=True)
@@ -216,7 +216,7 @@ def _lamp(seen: _Observations) -> tuple[Float[Tensor, "6"], Float[Tensor, "F"]]:
     scale = float(seen.sights.norm(dim=-1)[usable].median())
     at_lens, fit = _descend(seen, scale, seen.logs.new_tensor([0.0, 0.0, 0.0, *_START]), range(3, 6))
     beside, better = _descend(seen, scale, at_lens, range(6))
-    if better.deviation < _NOT_BETTER * fit.deviation:
+    if better.deviation < _MAX_RESIDUAL_RATIO * fit.deviation:
         return beside, better.log_gains
     return at_lens, fit.log_gains
 

@@ -17,7 +17,7 @@ class AttributeVarianceSettings(LossSettings):
     attribute: str  # feature channel of the field, for instance albedo
 
 
-class AttributeVarianceLoss(Loss):
+class AttributeVarianceLoss(Loss[AttributeVarianceSettings]):
     """Variance of a feature channel over the Gaussians drawn, averaged over its components (docs/rivals/pr-endo.md)."""
 
     Settings: ClassVar[type[LossSettings]] = AttributeVarianceSettings

@@ -25,7 +25,7 @@ def refuse_without_channel(model: TrainedModel, channel: str, loss: str) -> None
     Raises:
         InputError: See above.
     """
-    known = sorted(getattr(model.field, "feature_channels", ()))
+    known = sorted(model.field.feature_channels)
     if channel not in known:
         raise InputError(
             f"loss '{loss}' reads channel '{channel}' of the Gaussians, and the field has {', '.join(known) or 'none'}",

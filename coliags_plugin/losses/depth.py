@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from pydantic import Field
 from torch import Tensor
+from typing_extensions import TypeVar
 
 from coliags_plugin.contracts import Loss, LossSettings, TrainingStep
 from coliags_plugin.core.errors import InputError
@@ -36,7 +37,11 @@ class DepthHuberSettings(DepthL1Settings):
     delta: float = Field(default=0.2, gt=0.0, description="Difference at which the loss becomes linear, scene units.")
 
 
-class DepthLoss(Loss):
+#: Settings of a depth loss.
+DepthLossT = TypeVar("DepthLossT", bound=DepthL1Settings, default=DepthL1Settings)
+
+
+class DepthLoss(Loss[DepthLossT]):
     """Mean penalty of D - D_true over the valid pixels of known depth, weighted by its confidence if it is estimated.
 
     For ``inverse_depth_accumulated`` (E = sum w/z, what the authors' code of the paper trains on) D = 1/E where E > 0.
@@ -83,7 +88,7 @@ class DepthL1Loss(DepthLoss):
         return differences.abs()
 
 
-class DepthHuberLoss(DepthLoss):
+class DepthHuberLoss(DepthLoss[DepthHuberSettings]):
     """Mean Huber loss of the depth: x^2 / 2 for |x| up to ``delta``, beyond it delta (|x| - delta / 2).
 
     Used by Gaussian Pancakes and PR-Endo (docs/rivals/gaussian-pancakes.md).

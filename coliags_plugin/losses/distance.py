@@ -29,7 +29,7 @@ class DistanceL1Settings(LossSettings):
     seed: int = Field(default=0, ge=0, description="Seed of that draw.")
 
 
-class DistanceL1Loss(Loss):
+class DistanceL1Loss(Loss[DistanceL1Settings]):
     """Mean |t - t_true| over the drawn valid pixels of known depth, t = |r| sum w z = sum w t_i (REIM-NeRF).
 
     Weighted by the confidence of the depth if it is estimated. |r| is the length of the pixel's ray per z-depth. Which

@@ -30,7 +30,7 @@ class EstimatedDepthSettings(LossSettings):
     )
 
 
-class EstimatedDepthLoss(Loss):
+class EstimatedDepthLoss(Loss[EstimatedDepthSettings]):
     """Mean of max(c, floor) h(|D - z| / z) over the valid pixels of known depth z of confidence c.
 
     h is Huber's function with slope 1 beyond ``delta`` (docs/methods.md 4.6). Relative to z, it needs no unit of

@@ -33,7 +33,7 @@ class MSESettings(LossSettings):
     )
 
 
-class MSELoss(Loss):
+class MSELoss(Loss[MSESettings]):
     """Mean squared difference over valid pixels and channels, as of NeRF."""
 
     Settings: ClassVar[type[LossSettings]] = MSESettings

@@ -18,7 +18,7 @@ class SmoothGainSettings(LossSettings):
     module: str = Field(default="exposure", description="Name of the view module 'gain' in the method config.")
 
 
-class SmoothGainLoss(Loss):
+class SmoothGainLoss(Loss[SmoothGainSettings]):
     """Mean squared change of slope of the log gain over time, per frame of the video (docs/methods.md 4.7).
 
     Slopes are those between training frames that follow each other; 0 with fewer than three.
@@ -32,6 +32,9 @@ class SmoothGainLoss(Loss):
         Raises:
             InputError: See above.
         """
+        self._gains(model)
+
+    def _gains(self, model: TrainedModel) -> GainModule:
         module = model.view_modules.get(self.settings.module)
         if not isinstance(module, GainModule):
             known = [name for name, part in model.view_modules.items() if isinstance(part, GainModule)]
@@ -40,10 +43,11 @@ class SmoothGainLoss(Loss):
                 f"the name of a module 'gain', one of {', '.join(known)}" if known else "a module 'gain'",
                 did_you_mean(self.settings.module, known),
             )
+        return module
 
     def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
         """The unweighted term."""
-        module: GainModule = step.model.view_modules[self.settings.module]
+        module = self._gains(step.model)
         log_gains = module.log_gains()
         if len(log_gains) < 3:
             return log_gains.sum() * 0.0

@@ -32,7 +32,7 @@ class SparseDepthSettings(LossSettings):
     )
 
 
-class SparseDepthLoss(Loss):
+class SparseDepthLoss(Loss[SparseDepthSettings]):
     """Mean |D(p) - z|, or |D(p) - z| / z, over the points p of a frame whose z-depth is known (docs/methods.md 4.5).
 
     After DS-NeRF (Deng et al., "Depth-supervised NeRF: Fewer Views and Faster Training for Free", CVPR 2022). D is

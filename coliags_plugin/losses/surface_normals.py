@@ -18,7 +18,7 @@ class SurfaceNormalsSettings(LossSettings):
     every: int = Field(default=1, ge=1)  # steps: the term is 0 at steps that are not a multiple of this
 
 
-class SurfaceNormalsLoss(Loss):
+class SurfaceNormalsLoss(Loss[SurfaceNormalsSettings]):
     """Mean 1 - |<n, n_ref>| over all Gaussians: n the shortest axis, n_ref the normal of the nearest initial point.
 
     The choice of the axis is not differentiated (docs/rivals/gaussian-pancakes.md).
@@ -32,7 +32,7 @@ class SurfaceNormalsLoss(Loss):
         Raises:
             InputError: See above.
         """
-        if getattr(model.field, "reference_normals", None) is None:
+        if model.field.normals_and_references is None:
             raise InputError(
                 "loss term 'surface-normals' compares Gaussians with normals of the initial points, and the field has "
                 "none",
@@ -42,8 +42,8 @@ class SurfaceNormalsLoss(Loss):
 
     def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
         """The unweighted term, from 0 (all aligned) to 1."""
-        if step.step % self.settings.every:
+        normals = step.model.field.normals_and_references
+        if step.step % self.settings.every or normals is None:
             return step.output.alpha.new_zeros(())
-        field = step.model.field
-        cosines = (field.normals() * field.reference_normals).sum(1)
-        return (1.0 - cosines.abs()).mean()
+        own, references = normals
+        return (1.0 - (own * references).sum(1).abs()).mean()

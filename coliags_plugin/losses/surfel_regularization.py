@@ -19,7 +19,7 @@ class NormalConsistencySettings(LossSettings):
     depth: Literal["depth_expected", "depth_median"] = "depth_expected"  # rendered depth that normals are computed from
 
 
-class NormalConsistencyLoss(Loss):
+class NormalConsistencyLoss(Loss[NormalConsistencySettings]):
     """Mean 1 - alpha <N, n> over the valid pixels, without gradient in alpha.
 
     N is the output ``normals`` and n the normal of the rendered depth map, 0 at the image border and next to pixels

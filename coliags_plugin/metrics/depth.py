@@ -15,18 +15,18 @@ from torch import Tensor
 
 from coliags_plugin.contracts import Comparison, Metric
 from coliags_plugin.core.errors import UnavailableError
-from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.settings import Settings, SettingsT
 from coliags_plugin.metrics.depth_steps import depth_steps, dilated
 
 
-class DepthSettings(Settings):
+class DepthMetricSettings(Settings):
     """No options."""
 
 
-class DepthMetric(Metric):
+class DepthMetric(Metric[SettingsT]):
     """Base class of the depth metrics: pixel selection and the reasons for an unavailable value."""
 
-    Settings: ClassVar[type[Settings]] = DepthSettings
+    Settings: ClassVar[type[Settings]] = DepthMetricSettings
     higher_is_better: ClassVar[bool] = False
     unit: ClassVar[str] = "mm"
 
@@ -59,7 +59,7 @@ class DepthMetric(Metric):
         """The metric over the selected pixels, whose depths are in mm."""
 
 
-class DepthMSE(DepthMetric):
+class DepthMSE(DepthMetric[SettingsT]):
     """Mean squared error, the paper's Depth MSE.
 
     Dominated by the few pixels beside depth steps; read it together with the other depth metrics.
@@ -81,7 +81,7 @@ class DepthMSEInnerSettings(Settings):
     )
 
 
-class DepthMSEInner(DepthMSE):
+class DepthMSEInner(DepthMSE[DepthMSEInnerSettings]):
     """Mean squared error of the pixels away from depth steps, so without silhouettes."""
 
     Settings: ClassVar[type[Settings]] = DepthMSEInnerSettings

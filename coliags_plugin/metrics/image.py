@@ -17,7 +17,7 @@ class PSNRSettings(Settings):
     """No options."""
 
 
-class PSNR(Metric):
+class PSNR(Metric[PSNRSettings]):
     """Peak signal-to-noise ratio, 10 log10(1 / mse), the mse over all channels of the valid pixels together.
 
     (The authors' in-training report averages one PSNR per channel instead; docs/methods.md 2.4.)
@@ -45,7 +45,7 @@ class SSIMSettings(Settings):
     """No options."""
 
 
-class SSIM(Metric):
+class SSIM(Metric[SSIMSettings]):
     """Structural similarity by :func:`coliags_plugin.core.ssim.ssim`; ignored pixels do not enter the windows."""
 
     Settings: ClassVar[type[Settings]] = SSIMSettings

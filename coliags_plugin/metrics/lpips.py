@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -38,7 +38,7 @@ class LPIPSSettings(Settings):
     weights: str | None = Field(default=None, description="A folder searched for weights before the default ones.")
 
 
-class LPIPS(Metric):
+class LPIPS(Metric[LPIPSSettings]):
     """LPIPS v0.1 (Zhang et al. 2018; docs/methods.md 2.4) without torchvision.
 
     Ignored pixels are black in both images, as outside an endoscope's aperture, and the distance is averaged over the
@@ -49,7 +49,7 @@ class LPIPS(Metric):
     higher_is_better: ClassVar[bool] = False
     unit: ClassVar[str] = ""
 
-    def __init__(self, settings: Any) -> None:
+    def __init__(self, settings: LPIPSSettings) -> None:
         super().__init__(settings)
         if settings.weights is not None and not Path(settings.weights).expanduser().is_dir():
             raise InputError(f"lpips: weights = '{settings.weights}' is not a folder", "a folder with LPIPS weights")

@@ -18,7 +18,7 @@ class SparseDepthErrorSettings(Settings):
     quantile: float = Field(default=0.5, ge=0.0, le=1.0, description="0.5: the median.")
 
 
-class SparseDepthError(Metric):
+class SparseDepthError(Metric[SparseDepthErrorSettings]):
     """A quantile of |D(p) - z| / z over a frame's points p of known depth z, in percent."""
 
     Settings: ClassVar[type[Settings]] = SparseDepthErrorSettings

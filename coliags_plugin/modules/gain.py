@@ -35,7 +35,7 @@ class FrameGainSettings(Settings):
     max_gain: float = Field(default=8.0, gt=1.0)  # gains are at least 1 / max_gain and at most max_gain
 
 
-class FrameGain(GainModule):
+class FrameGain(GainModule[FrameGainSettings]):
     """Learned factor on the rendered colours for each training frame.
 
     Colours and gains are only known up to a common factor, which ``reference`` settles. Free cameras have the mean
@@ -53,7 +53,7 @@ class FrameGain(GainModule):
     fitted: Tensor
     rate: Tensor
 
-    def __init__(self, settings: Any, scene: Scene) -> None:
+    def __init__(self, settings: FrameGainSettings, scene: Scene) -> None:
         super().__init__()
         self.settings = settings
         self.frames = FrameRows(scene)
@@ -64,7 +64,7 @@ class FrameGain(GainModule):
         self.register_buffer("rate", torch.ones(()))
 
     @classmethod
-    def from_scene(cls, scene: Scene, settings: Any, generator: torch.Generator) -> Self:
+    def from_scene(cls, scene: Scene, settings: FrameGainSettings, generator: torch.Generator) -> Self:
         """Module with gains of 1.
 
         Raises:

@@ -29,7 +29,7 @@ class PoseCorrectionSettings(Settings):
     untrained: Literal["interpolate", "given"] = "interpolate"
 
 
-class PoseCorrection(ViewModule):
+class PoseCorrection(ViewModule[PoseCorrectionSettings]):
     """Learned rotation and translation of each training camera, in world axes.
 
     It turns about the point on its optical axis at the median depth of the scene's points in view. About its own
@@ -46,7 +46,7 @@ class PoseCorrection(ViewModule):
 
     Settings: ClassVar[type[Settings]] = PoseCorrectionSettings
 
-    def __init__(self, settings: Any, scene: Scene) -> None:
+    def __init__(self, settings: PoseCorrectionSettings, scene: Scene) -> None:
         super().__init__()
         self.settings = settings
         self.frames = FrameRows(scene)
@@ -56,7 +56,7 @@ class PoseCorrection(ViewModule):
         self.translation = nn.Parameter(torch.zeros(len(self.frames), 3))
 
     @classmethod
-    def from_scene(cls, scene: Scene, settings: Any, generator: torch.Generator) -> Self:
+    def from_scene(cls, scene: Scene, settings: PoseCorrectionSettings, generator: torch.Generator) -> Self:
         """Module with zero corrections.
 
         Raises:

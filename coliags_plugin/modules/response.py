@@ -29,7 +29,7 @@ class ResponseSettings(Settings):
     segments: int = Field(default=8, ge=1, le=64)  # of equal length between the knee and 1.5, each of one slope
 
 
-class CameraResponse(ResponseModule):
+class CameraResponse(ResponseModule[ResponseSettings]):
     """Learned increasing curve from colours to pixel values, one for all frames and colours (docs/methods.md 4.9).
 
     Cameras compress what is bright. A gain of a frame multiplies colours before that, so in a method config this module
@@ -42,13 +42,13 @@ class CameraResponse(ResponseModule):
 
     Settings: ClassVar[type[Settings]] = ResponseSettings
 
-    def __init__(self, settings: Any) -> None:
+    def __init__(self, settings: ResponseSettings) -> None:
         super().__init__()
         self.settings = settings
         self.log_slope = nn.Parameter(torch.zeros(settings.segments))
 
     @classmethod
-    def from_scene(cls, scene: Scene, settings: Any, generator: torch.Generator) -> Self:
+    def from_scene(cls, scene: Scene, settings: ResponseSettings, generator: torch.Generator) -> Self:
         """A response module that starts as the identity curve."""
         return cls(settings)
 

@@ -39,15 +39,13 @@ class CpuRendererSettings(CutSettings):
     """Options of :class:`CpuRenderer`: those of the torch renderer, with its defaults."""
 
 
-class CpuRenderer(SplattingRenderer):
+class CpuRenderer(SplattingRenderer[CpuRendererSettings]):
     """CPU renderer of float32 3D Gaussians and surfels: ``docs/rendering.md``, section "The cpu backend"."""
 
     Settings = CpuRendererSettings
     primitives: ClassVar[frozenset[str]] = frozenset({"gaussians3d", "surfels"})
     devices: ClassVar[frozenset[str]] = frozenset({"cpu"})
     name: ClassVar[str] = "cpu"
-
-    settings: CpuRendererSettings
 
     @classmethod
     def availability(cls) -> Availability:

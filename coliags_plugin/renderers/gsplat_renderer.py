@@ -45,15 +45,13 @@ class GsplatRendererSettings(SplattingSettings):
     """
 
 
-class GsplatRenderer(SplattingRenderer):
+class GsplatRenderer(SplattingRenderer[GsplatRendererSettings]):
     """Renderer of 3D Gaussians on CUDA, in float32. See ``docs/rendering.md``."""
 
     Settings = GsplatRendererSettings
     primitives: ClassVar[frozenset[str]] = frozenset({"gaussians3d"})
     devices: ClassVar[frozenset[str]] = frozenset({"cuda"})
     name: ClassVar[str] = "gsplat"
-
-    settings: GsplatRendererSettings
 
     @classmethod
     def availability(cls) -> Availability:

@@ -9,6 +9,7 @@ from typing import ClassVar
 import pydantic
 import torch
 from torch import Tensor
+from typing_extensions import TypeVar
 
 from coliags_plugin.contracts import GaussianField, Renderer
 from coliags_plugin.core.cameras import Camera
@@ -56,7 +57,11 @@ class CutSettings(SplattingSettings):
         return self.distortion_far * near_plane / (self.distortion_far - near_plane)
 
 
-class SplattingRenderer(Renderer):
+#: Settings of a splatting renderer.
+SplattingT = TypeVar("SplattingT", bound=SplattingSettings, default=SplattingSettings)
+
+
+class SplattingRenderer(Renderer[SplattingT, GaussianField]):
     """Base class of renderers that splat a :class:`GaussianField` into whole images."""
 
     outputs: ClassVar[frozenset[str]] = frozenset(OUTPUTS) - SURFEL_OUTPUTS

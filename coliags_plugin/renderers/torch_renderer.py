@@ -36,15 +36,13 @@ class TorchRendererSettings(CutSettings):
     """Edge of a tile, pixels. Changes the speed, and the result by rounding only."""
 
 
-class TorchRenderer(SplattingRenderer):
+class TorchRenderer(SplattingRenderer[TorchRendererSettings]):
     """Reference renderer of 3D Gaussians and surfels, on any device, in float32 or float64: ``docs/rendering.md``."""
 
     Settings = TorchRendererSettings
     primitives: ClassVar[frozenset[str]] = frozenset({"gaussians3d", "surfels"})
     devices: ClassVar[frozenset[str]] = frozenset({"cpu", "cuda"})
     name: ClassVar[str] = "torch"
-
-    settings: TorchRendererSettings
 
     @classmethod
     def availability(cls) -> Availability:

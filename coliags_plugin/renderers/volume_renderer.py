@@ -64,7 +64,7 @@ class VolumeRendererSettings(Settings):
         return self
 
 
-class VolumeRenderer(Renderer):
+class VolumeRenderer(Renderer[VolumeRendererSettings, RadianceField]):
     """Volume renderer of radiance fields, for whole images or selected pixels (docs/rendering.md)."""
 
     Settings: ClassVar[type[Settings]] = VolumeRendererSettings
@@ -72,8 +72,6 @@ class VolumeRenderer(Renderer):
     outputs: ClassVar[frozenset[str]] = _COMPOSITED | {name + _COARSE for name in _COMPOSITED} | {"ray_lengths"}
     devices: ClassVar[frozenset[str]] = frozenset({"cpu", "cuda"})
     renders_pixels: ClassVar[bool] = True
-
-    settings: VolumeRendererSettings
 
     @classmethod
     def availability(cls) -> Availability:

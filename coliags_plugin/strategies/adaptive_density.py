@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar, Protocol
+from typing import ClassVar, Protocol
 
 import torch
 from pydantic import Field
@@ -61,14 +61,16 @@ class ExplicitRows(Protocol):
         """Called after rows were removed from the parameters. [N]"""
 
 
-class AdaptiveDensity(Strategy):
+class AdaptiveDensity(Strategy[AdaptiveDensitySettings, ExplicitRows]):
     """Clones small and splits large Gaussians whose image gradients stay large; prunes faint and oversized ones."""
 
     Settings: ClassVar[type[Settings]] = AdaptiveDensitySettings
     serves: ClassVar[frozenset[str] | None] = frozenset({"gaussians"})
     counters: ClassVar[tuple[str, ...]] = ("gradient_sum", "drawn", "largest_radius")
 
-    def __init__(self, settings: Any, generator: torch.Generator, schedule: Schedule, extent: float) -> None:
+    def __init__(
+        self, settings: AdaptiveDensitySettings, generator: torch.Generator, schedule: Schedule, extent: float
+    ) -> None:
         super().__init__(settings, generator, schedule, extent)
         self.until = schedule.at(settings.until)
         self.events = schedule.events(settings.densify_from, settings.until, settings.every)
@@ -92,11 +94,11 @@ class AdaptiveDensity(Strategy):
         return f"this run {densifying}, and {resetting}"
 
     @torch.no_grad()
-    def after_backward(self, step: TrainingStep, rows: ParameterRows) -> dict[str, int]:
+    def after_backward(self, step: TrainingStep[ExplicitRows], rows: ParameterRows) -> dict[str, int]:
         """Accumulate statistics; at event steps densify, prune, and reset opacities."""
         if step.step >= self.until:
             return {}
-        field: ExplicitRows = step.model.field
+        field = step.model.field
         if len(self.drawn) != len(field.means):
             self._forget(field.means)
         self._count(step.output)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar, Protocol
+from typing import ClassVar, Protocol
 
 import torch
 from pydantic import Field
@@ -60,7 +60,7 @@ class Anchors(Protocol):
         """Positions of the children, scene units. [M, K, 3]"""
 
 
-class AnchorGrowth(Strategy):
+class AnchorGrowth(Strategy[AnchorGrowthSettings, Anchors]):
     """Adds anchors where children's image gradients stay large and removes anchors that stay transparent.
 
     Statistics and thresholds are Scaffold-GS's; the grid cells, the initialisation of new anchors and the limit per
@@ -72,7 +72,9 @@ class AnchorGrowth(Strategy):
     serves: ClassVar[frozenset[str] | None] = frozenset({"anchors"})
     counters: ClassVar[tuple[str, ...]] = ("opacity_sum", "seen", "gradient_sum", "drawn")
 
-    def __init__(self, settings: Any, generator: torch.Generator, schedule: Schedule, extent: float) -> None:
+    def __init__(
+        self, settings: AnchorGrowthSettings, generator: torch.Generator, schedule: Schedule, extent: float
+    ) -> None:
         super().__init__(settings, generator, schedule, extent)
         self.statistics_from = schedule.at(settings.statistics_from)
         self.until = schedule.at(settings.until)
@@ -93,11 +95,11 @@ class AnchorGrowth(Strategy):
         return f"this run grows and prunes anchors every {every} steps from step {events[0]} to {events[-1]}"
 
     @torch.no_grad()
-    def after_backward(self, step: TrainingStep, rows: ParameterRows) -> dict[str, int]:
+    def after_backward(self, step: TrainingStep[Anchors], rows: ParameterRows) -> dict[str, int]:
         """Accumulate statistics; at event steps grow and prune."""
         if not self.statistics_from < step.step < self.until:
             return {}
-        field: Anchors = step.model.field
+        field = step.model.field
         children = field.offsets.shape[1]
         self._resize(len(field.anchors), children, field.anchors.device)
         self._count(step.output, children)

@@ -12,7 +12,7 @@ class NoStrategySettings(Settings):
     """No options."""
 
 
-class NoStrategy(Strategy):
+class NoStrategy(Strategy[NoStrategySettings]):
     """Neither grows nor prunes."""
 
     Settings: ClassVar[type[Settings]] = NoStrategySettings

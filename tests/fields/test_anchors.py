@@ -275,7 +275,7 @@ def test_few_units_start_dead():
     dead = {}
     for start in ("scene_distances", "pytorch"):
         head = IMIAAppearanceHead(IMIAAppearanceSettings(bias_init=start), 32, 10, generator.manual_seed(1))
-        head.expect(distances)
+        head.init_from_distances(distances)
         inputs = torch.cat(
             [torch.zeros(500, 32), head.embed(directions, distances[:, None], directions[:, 2:].abs())], dim=1
         )

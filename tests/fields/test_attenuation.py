@@ -31,7 +31,7 @@ def make_field(appearance):
 
 def test_the_factor_is_the_law_about_the_median_distance():
     head = make_head(distance_exponent=-0.8, cosine_exponent=1.5)
-    head.expect(torch.tensor([10.0, 20.0, 70.0]))
+    head.init_from_distances(torch.tensor([10.0, 20.0, 70.0]))
     distances, cosines = torch.tensor([20.0, 40.0, 10.0]), torch.tensor([1.0, 0.9, 0.5])
     expected = [1.0, 2.0**-0.8 * 0.9**1.5, 2.0**0.8 * 0.5**1.5]
     torch.testing.assert_close(head.law(distances, cosines)[:, 0], torch.tensor(expected))
@@ -53,14 +53,14 @@ def test_distance_and_angle_are_those_at_the_lamp():
     torch.testing.assert_close(head.offset, torch.tensor([0.0, -4.0, -3.0]))
     local = torch.tensor([[0.0, 0.0, 9.0], [3.0, -4.0, 9.0]])  # the second is 3 mm beside the lamp's axis
     points = camera.center + local @ camera.camera_to_world[:3, :3].T
-    lit = head.lit(torch.full((2, 3), 0.5), points, None, camera, None)
+    lit = head.apply_light(torch.full((2, 3), 0.5), points, None, camera, None)
     expected = [length**-0.9 * 12 / length for length in (math.hypot(4, 12), math.hypot(3, 12))]
     torch.testing.assert_close(lit[:, 0], 0.5 * torch.tensor(expected))
 
 
 def test_a_held_light_takes_the_place_of_the_lamp():
     head = make_head(cosine_exponent=2.0)
-    lit = head.lit(torch.ones(3, 3), torch.rand(3, 3), None, camera_at(0, 0, 0), FlattenedLight(4.0, 0.5))
+    lit = head.apply_light(torch.ones(3, 3), torch.rand(3, 3), None, camera_at(0, 0, 0), FlattenedLight(4.0, 0.5))
     torch.testing.assert_close(lit, torch.full((3, 3), 4.0**-0.9 * 0.25))
 
 
@@ -70,12 +70,12 @@ def test_incidence_counts_on_either_side_of_the_wall_and_not_under_a_flattened_l
     normals = torch.tensor([[0.6, 0.0, 0.8], [-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])  # the last at a right angle
     axes = camera.camera_to_world[:3, :3]
     points, turned = camera.center + local @ axes.T, normals @ axes.T
-    lit = head.lit(torch.ones(3, 3), points, turned, camera, None)
+    lit = head.apply_light(torch.ones(3, 3), points, turned, camera, None)
     torch.testing.assert_close(lit[:, 0], torch.tensor([0.8, 0.6, 0.1]).sqrt())
-    torch.testing.assert_close(lit, head.lit(torch.ones(3, 3), points, -turned, camera, None))
-    flattened = head.lit(torch.ones(3, 3), points, turned, camera, FlattenedLight(4.0, 0.5))
+    torch.testing.assert_close(lit, head.apply_light(torch.ones(3, 3), points, -turned, camera, None))
+    flattened = head.apply_light(torch.ones(3, 3), points, turned, camera, FlattenedLight(4.0, 0.5))
     torch.testing.assert_close(flattened, torch.ones(3, 3))
-    beside = head.lit(torch.ones(3, 3), points, turned, camera_at(0, 0, 0), LightOfCamera(camera))
+    beside = head.apply_light(torch.ones(3, 3), points, turned, camera_at(0, 0, 0), LightOfCamera(camera))
     torch.testing.assert_close(beside, lit)
     torch.testing.assert_close(head.attenuation(local), torch.ones(3, 1))
 
@@ -94,7 +94,7 @@ def test_the_lamp_stays_within_its_bounds_and_nothing_overflows():
         head.lamp_offset.fill_(1e6)
     assert head.offset.abs().max() <= MAX_OFFSET
     points = torch.tensor([[MAX_OFFSET, MAX_OFFSET, MAX_OFFSET], [0.0, 0.0, 0.0], [0.0, 0.0, -5.0]])
-    lit = head.lit(torch.ones(3, 3), points, None, camera_at(0, 0, 0).to("cpu", torch.float32), None)
+    lit = head.apply_light(torch.ones(3, 3), points, None, camera_at(0, 0, 0).to("cpu", torch.float32), None)
     lit.sum().backward()
     assert lit.isfinite().all() and head.exponents.grad.isfinite().all() and head.lamp_offset.grad.isfinite().all()
 
@@ -123,13 +123,13 @@ def test_the_law_of_a_lamp_is_found():
     points = torch.rand(2000, 3, generator=generator) * torch.tensor([16.0, 16.0, 40.0]) + torch.tensor([-8.0, -8, 5])
     distances = (points - torch.tensor([0.0, 0.0, -3.6])).norm(dim=1)
     true = 0.5 * (distances / 20.0) ** (-2 / 2.2) * ((points[:, 2] + 3.6) / distances) ** (1.2 / 2.2)
-    head.expect(torch.tensor([20.0]))
+    head.init_from_distances(torch.tensor([20.0]))
     albedo = torch.tensor(0.3, requires_grad=True)
     fit = torch.optim.LBFGS([head.exponents, head.lamp_offset, albedo], max_iter=200, line_search_fn="strong_wolfe")
 
     def error() -> torch.Tensor:
         fit.zero_grad()
-        lit = head.lit(albedo.expand(2000, 3), points, None, camera, None)
+        lit = head.apply_light(albedo.expand(2000, 3), points, None, camera, None)
         value = (lit[:, 0].log() - true.log()).square().mean()
         value.backward()
         return value

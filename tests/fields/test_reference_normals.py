@@ -73,18 +73,18 @@ def test_new_gaussians_take_the_normal_of_the_nearest_initial_point_and_keep_it(
 def test_fields_carry_them_through_checkpoints():
     component = make_component("fields", {"name": "gaussians", "normal_neighbours": 10})
     field = component.target.from_scene(wall_scene(), component.settings, torch.Generator())
-    torch.testing.assert_close(field.reference_normals[:, 2].abs(), torch.ones(len(field.means)))
+    torch.testing.assert_close(field.references.of_rows[:, 2].abs(), torch.ones(len(field.means)))
     field.rows_kept(torch.arange(len(field.means)) % 3 == 0)
     with torch.no_grad():
         for name in field.row_parameters:
             setattr(field, name, torch.nn.Parameter(getattr(field, name)[::3]))
     other = type(field).from_state(field.state_dict(), field.settings)
-    assert torch.equal(other.reference_normals, field.reference_normals)
+    assert torch.equal(other.references.of_rows, field.references.of_rows)
     assert torch.equal(other.references.points, field.references.points)
 
 
 def test_without_neighbours_there_are_none():
     component = make_component("fields", "gaussians")
     field = component.target.from_scene(wall_scene(), component.settings, torch.Generator())
-    assert field.reference_normals is None
+    assert field.references is None
     assert not any(name.startswith("references") for name in field.state_dict())

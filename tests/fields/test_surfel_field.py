@@ -56,4 +56,4 @@ def test_from_state_restores_any_number():
 
 def test_references_work_for_surfels_too():
     field = make(normal_neighbours=8)
-    assert field.reference_normals.shape == (field.element_count, 3)
+    assert field.references.of_rows.shape == (field.element_count, 3)

@@ -187,8 +187,8 @@ def test_reference_normals_follow_their_gaussians():
     count = len(marks)
     kept = [row for row in range(count) if row not in (2, 5)]
     # Cloned from 3, and two parts of 5, whose nearest initial points lie around it.
-    assert field.reference_normals[: count - 2, 0].tolist() == kept
-    assert field.reference_normals[count - 2, 0] == 3
+    assert field.references.of_rows[: count - 2, 0].tolist() == kept
+    assert field.references.of_rows[count - 2, 0] == 3
     nearest = torch.cdist(field.means[-2:].detach(), field.references.points).argmin(1)
-    assert field.reference_normals[-2:, 0].tolist() == nearest.tolist()
-    assert len(field.reference_normals) == len(field.means)
+    assert field.references.of_rows[-2:, 0].tolist() == nearest.tolist()
+    assert len(field.references.of_rows) == len(field.means)

@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 
+from coliags_plugin.contracts import gaussians_under
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.held_light import gaussians_of, splatting_of
 from coliags_plugin.engine.progress import ProgressReport
@@ -56,7 +57,7 @@ def _averaged(trained: TrainedRun, views: list[Frame], light: HeldLight) -> Expl
         for index, frame in enumerate(views):
             camera = adjusted_camera(trained, frame)
             with torch.no_grad():
-                gaussians = field.gaussians_in_light(camera, light)
+                gaussians = gaussians_under(field, camera, light)
             weights = blending_weights(renderer, gaussians, camera)
             averages.add(gaussians, weights)
             if index % every == 0:

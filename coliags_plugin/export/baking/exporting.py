@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from coliags_plugin.contracts import GaussianField
+from coliags_plugin.contracts import GaussianField, knows_lamp
 from coliags_plugin.core.checksums import file_sha256
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
@@ -76,7 +76,7 @@ def export_run(
         cloud = cloud_of_field(field)
     else:
         baked_in = held_light(light, trained.model, [frame.camera for frame in trained.scene.train])
-        held = baked_in if field.knows_lamp else None
+        held = baked_in if knows_lamp(field) else None
         cloud, facts = bake(trained, baked_in)
         baking = {"light": held and {"name": light, **held.described}, **facts}
     cloud = _checked(cloud.with_thickness(THICKNESS_SHARE), trained)

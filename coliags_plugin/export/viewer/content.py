@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from coliags_plugin.contracts import GaussianField
+from coliags_plugin.contracts import GaussianField, knows_lamp
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.held_light import flattened_light, gaussians_of
@@ -95,8 +95,7 @@ class ViewerContent:
     @property
     def knows_lamp(self) -> bool:
         """Whether the light can be held."""
-        field = self.trained.model.field
-        return isinstance(field, GaussianField) and field.knows_lamp
+        return knows_lamp(self.trained.model.field)
 
     @property
     def title(self) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from coliags_plugin.contracts import GaussianField
+from coliags_plugin.contracts import GaussianField, gaussians_under
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.export.splats.cloud import SplatCloud
 from coliags_plugin.export.viewer.splats import shown
@@ -44,7 +44,7 @@ class ViewDecoder:
             light: What lights them; None: the lamp on the camera.
         """
         wide = widened(camera).to(self._device)
-        seen = shown(self._field.gaussians(wide) if light is None else self._field.gaussians_in_light(wide, light))
+        seen = shown(gaussians_under(self._field, wide, light))
         return seen.concat(self.beside.part(~in_view(self.beside.means, wide)))
 
 
