@@ -12,6 +12,7 @@ import torch
 from coliags_plugin._version import __version__
 from coliags_plugin.checks.results import CheckResult
 from coliags_plugin.config import registry
+from coliags_plugin.config.auto import is_auto
 from coliags_plugin.config.components import make_component
 from coliags_plugin.core.errors import InputError, UnavailableError
 from coliags_plugin.engine.devices import choose_device
@@ -61,7 +62,7 @@ def _library(name: str, module: str) -> CheckResult:
 
 def _renderer(name: str) -> CheckResult:
     component, title = make_component("renderers", name), f"renderer {name}"
-    if component.target.alternatives(component.settings):
+    if is_auto(component.kind, component.name):
         try:
             chosen = choose_renderer(component, "gaussians3d", choose_device("auto"))
         except InputError as error:

@@ -6,7 +6,6 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
 
 from coliags_plugin._version import __version__
 from coliags_plugin.comparison.cells import CellKeys, ComparisonCell, Variant
@@ -14,7 +13,7 @@ from coliags_plugin.comparison.scenes import SceneSource
 from coliags_plugin.config import registry
 from coliags_plugin.config.components import Component
 from coliags_plugin.config.method_config import MethodConfig, load_method
-from coliags_plugin.engine.data_formats import load_method_for
+from coliags_plugin.engine.data_formats import data_manager, load_method_for
 from coliags_plugin.results.identity import result_key, training_key
 
 #: The fingerprint of a scene that is not there, as recorded when it was; None where it never was.
@@ -128,8 +127,7 @@ class _Fingerprints:
             return self._recorded(scene)
         key = (str(scene.path), component.name, component.settings.model_dump_json())
         if key not in self._known:
-            manager: Any = component.target(component.settings)
-            self._known[key] = manager.fingerprint(scene.path)
+            self._known[key] = data_manager(component, scene.path).fingerprint(scene.path)
         return self._known[key]
 
 

@@ -22,16 +22,34 @@ from coliags_plugin.core.errors import InputError, did_you_mean
 PLUGIN_PATH_VARIABLE = "COLIAGS_PLUGIN_PATH"
 
 
+class Resolver:
+    """What the name ``auto`` stands for; its options are those common to the components it may be resolved to.
+
+    Args:
+        options: ``"module:Class"`` of the options.
+        description: What is chosen, for lists of components.
+    """
+
+    def __init__(self, options: str, description: str) -> None:
+        self._options = options
+        self.__doc__ = description
+
+    @property
+    def Settings(self) -> Any:
+        """The class of the options, imported on first use."""
+        return _load(self._options)
+
+
 class Registry:
     """The components of one kind.
 
     Args:
         kind: Plural noun, for instance ``"renderers"``.
-        builtins: Name to ``"module:Class"``.
+        builtins: Name to ``"module:Class"`` or resolver.
         noun: Singular of the kind, for errors.
     """
 
-    def __init__(self, kind: str, builtins: Mapping[str, str], noun: str) -> None:
+    def __init__(self, kind: str, builtins: Mapping[str, object], noun: str) -> None:
         self.kind = kind
         self.noun = noun
         self._targets: dict[str, Any] = {}
@@ -150,7 +168,10 @@ def _plugin_files(path_list: str) -> dict[str, dict[str, dict[str, Any]]]:
 datamanagers = Registry(
     "datamanagers",
     {
-        "auto": "coliags_plugin.datamanagers.auto:AutoDataManager",
+        "auto": Resolver(
+            "coliags_plugin.datamanagers.scene_settings:SceneSettings",
+            "Reader of any scene, by the one data manager that recognises its folder (docs/data.md 1).",
+        ),
         "c3vd": "coliags_plugin.datamanagers.c3vd.reader:C3VDDataManager",
         "c3vd-endogslam": "coliags_plugin.datamanagers.c3vd_endogslam.reader:C3VDEndoGSLAMDataManager",
         "c3vd-v2": "coliags_plugin.datamanagers.c3vd_v2.reader:C3VDv2DataManager",
@@ -194,7 +215,10 @@ appearance_heads = Registry(
 renderers = Registry(
     "renderers",
     {
-        "auto": "coliags_plugin.renderers.auto:AutoRenderer",
+        "auto": Resolver(
+            "coliags_plugin.renderers.splatting:AutoSettings",
+            "First renderer of ``prefer`` that can render the field; a run records which it is and why.",
+        ),
         "cpu": "coliags_plugin.renderers.cpu_renderer:CpuRenderer",
         "gsplat": "coliags_plugin.renderers.gsplat_renderer:GsplatRenderer",
         "torch": "coliags_plugin.renderers.torch_renderer:TorchRenderer",

@@ -15,8 +15,6 @@ class DataManager(ABC, Generic[SettingsT]):
     """Reader of one dataset format: a folder on disk -> :class:`Scene`. Never writes into the dataset."""
 
     Settings: ClassVar[type[Settings]]
-    #: Whether it reads a format of its own; False where it stands for whichever data manager recognises a folder.
-    has_format: ClassVar[bool] = True
 
     def __init__(self, settings: SettingsT) -> None:
         self.settings = settings

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Generic
 
@@ -58,11 +58,6 @@ class Renderer(ABC, Generic[SettingsT, RenderedT]):
             primitive: Of the field.
         """
         return cls.outputs
-
-    @classmethod
-    def alternatives(cls, settings: Any) -> Sequence[Mapping[str, Any]]:
-        """Configs of the renderers to choose from, in order of preference; empty where it renders by itself."""
-        return ()
 
     @classmethod
     def obstacle(cls, primitive: str, device: torch.device) -> str:

@@ -6,6 +6,7 @@ import logging
 from pathlib import Path
 
 from coliags_plugin.config import registry
+from coliags_plugin.config.auto import candidates
 from coliags_plugin.core.errors import InputError
 
 log = logging.getLogger(__name__)
@@ -13,7 +14,7 @@ log = logging.getLogger(__name__)
 
 def formats() -> list[str]:
     """Names of all data managers that read a format of their own."""
-    return [name for name in registry.datamanagers if registry.datamanagers.get(name).has_format]
+    return candidates("datamanagers")
 
 
 def find_format(path: Path) -> str:

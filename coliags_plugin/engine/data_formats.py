@@ -11,7 +11,8 @@ from pydantic import ValidationError
 from pydantic_core import PydanticCustomError
 
 from coliags_plugin.config import registry
-from coliags_plugin.config.components import make_component
+from coliags_plugin.config.auto import is_auto, resolved
+from coliags_plugin.config.components import Component, make_component
 from coliags_plugin.config.method_config import LoadedMethod, MethodConfig, load_method, method_tree
 from coliags_plugin.config.yaml_tree import Node, override_all
 from coliags_plugin.contracts import DataManager
@@ -46,7 +47,7 @@ def load_method_for(
         InputError: No such method or format, or the config is not valid, or see :func:`find_format`.
     """
     named = method_tree(method, overrides).find(["datamanager", "name"]).value
-    if named in registry.datamanagers and not registry.datamanagers.get(named).has_format:
+    if is_auto("datamanagers", named):
         return load_method(method, overrides, data_format or find_format(path))
     chosen = [] if data_format is None else [f"datamanager.name={data_format}"]
     return load_method(method, [*chosen, *overrides])
@@ -58,10 +59,20 @@ def load_scene(config: MethodConfig, path: Path) -> Scene:
     Raises:
         InputError: It cannot be read.
     """
-    component = config.datamanager
     with progress_callback(after=READING_IS_LONG) as progress:
-        scene: Scene = component.target(component.settings).load(path, progress)
+        scene = data_manager(config.datamanager, path).load(path, progress)
     return scene.with_near_plane(config.near_plane)
+
+
+def data_manager(component: Component, path: Path) -> DataManager:
+    """The data manager of a config; of ``auto``, the one that recognises the folder.
+
+    Raises:
+        InputError: See :func:`find_format`.
+    """
+    chosen = resolved(component, lambda: find_format(path))
+    manager: DataManager = chosen.target(chosen.settings)
+    return manager
 
 
 def open_scene(

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 
 from coliags_plugin.config import registry
-from coliags_plugin.config.components import Component, named_component
+from coliags_plugin.config.auto import candidates, is_auto, with_options
+from coliags_plugin.config.components import Component
 from coliags_plugin.contracts import Renderer
 from coliags_plugin.core.errors import InputError
 
@@ -24,7 +23,7 @@ class ChosenRenderer:
 
 
 def choose_renderer(component: Component, primitive: str, device: torch.device) -> ChosenRenderer:
-    """Make the renderer of a config, or the first of its alternatives that can render the field.
+    """Make the renderer of a config; of ``auto``, the first preferred one that can render the field.
 
     Args:
         component: The config's renderer node.
@@ -32,44 +31,30 @@ def choose_renderer(component: Component, primitive: str, device: torch.device) 
         device: Of the field.
 
     Raises:
-        InputError: It, or each of its alternatives, cannot render this field on this device.
+        InputError: It, or each that ``auto`` prefers, cannot render this field on this device.
     """
-    alternatives = component.target.alternatives(component.settings)
-    if not alternatives:
-        obstacle = component.target.obstacle(primitive, device)
-        if obstacle:
-            raise InputError(
-                f"renderer '{component.name}' {obstacle}",
-                "a renderer that can serve the field",
-                _others(primitive, device),
-            )
-        return ChosenRenderer(component.name, component.target(component.settings), "named by the config")
-    return choose_among(component.name, alternatives, primitive, device)
+    if is_auto(component.kind, component.name):
+        return _first_of(component, primitive, device)
+    obstacle = component.target.obstacle(primitive, device)
+    if obstacle:
+        raise InputError(
+            f"renderer '{component.name}' {obstacle}",
+            "a renderer that can serve the field",
+            _others(primitive, device),
+        )
+    return ChosenRenderer(component.name, component.target(component.settings), "named by the config")
 
 
-def choose_among(
-    chooser: str, configs: Sequence[Mapping[str, Any]], primitive: str, device: torch.device
-) -> ChosenRenderer:
-    """Make the first of several renderers that can render a field.
-
-    Args:
-        chooser: Registered name of the renderer that they are alternatives of.
-        configs: Name and options of each renderer, the most preferred first.
-        primitive: Of the field.
-        device: Of the field.
-
-    Raises:
-        InputError: None of them can.
-    """
+def _first_of(auto: Component, primitive: str, device: torch.device) -> ChosenRenderer:
     refused: list[str] = []
-    for config in configs:
-        candidate = named_component("renderers", dict(config), f"renderer {chooser}, prefer")
+    for name in auto.settings.model_dump()["prefer"]:
+        candidate = with_options(auto, name)
         obstacle = candidate.target.obstacle(primitive, device)
         if not obstacle:
-            found = candidate.target.availability().reason
-            reason = "; ".join([*refused, f"{chooser} chose {candidate.name}: {found}"])
-            return ChosenRenderer(candidate.name, candidate.target(candidate.settings), reason)
-        refused.append(f"{candidate.name} {obstacle}")
+            available = candidate.target.availability().reason
+            reason = "; ".join([*refused, f"{auto.name} chose {name}: {available}"])
+            return ChosenRenderer(name, candidate.target(candidate.settings), reason)
+        refused.append(f"{name} {obstacle}")
     raise InputError(
         f"no renderer can serve: {'; '.join(refused)}",
         f"one for {primitive} on {device.type}",
@@ -79,6 +64,6 @@ def choose_among(
 
 def _others(primitive: str, device: torch.device) -> str:
     """Hint that names the renderers of a primitive on a device; empty without any."""
-    classes = {name: registry.renderers.get(name) for name in registry.renderers}
+    classes = {name: registry.renderers.get(name) for name in candidates("renderers")}
     able = [name for name, found in classes.items() if primitive in found.primitives and device.type in found.devices]
     return f"Set --set renderer=NAME, NAME being {' or '.join(able)}" if able else ""

@@ -20,6 +20,15 @@ from coliags_plugin.core.settings import Settings
 from coliags_plugin.renderers.checks import check_primitive
 
 
+class AutoSettings(Settings):
+    """Order of preference, and options common to all splatting renderers."""
+
+    prefer: tuple[str, ...] = ("gsplat", "cpu", "torch")
+    """Names of renderers, the most preferred first."""
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Background RGB."""
+
+
 class SplattingSettings(Settings):
     """Options common to all splatting renderers; the defaults are 3DGS's (docs/methods.md 2.1, 2.2)."""
 

@@ -8,7 +8,7 @@ from coliags_plugin.config import registry
 from coliags_plugin.config.components import make_component
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.recognition import find_format
-from coliags_plugin.engine.data_formats import load_method_for, open_scene
+from coliags_plugin.engine.data_formats import data_manager, load_method_for, open_scene
 from coliags_plugin.phantom.generate import generate
 from coliags_plugin.phantom.settings import phantom_settings
 from tests.scenes import write_wall
@@ -50,8 +50,6 @@ def test_nothing_and_two_things_are_refused(wall, tmp_path, monkeypatch):
         find_format(tmp_path)
 
     class Claims:
-        has_format = True
-
         @classmethod
         def recognise(cls, path):
             return "everything is mine"
@@ -63,9 +61,10 @@ def test_nothing_and_two_things_are_refused(wall, tmp_path, monkeypatch):
 
 def test_auto_passes_on_what_was_set(wall):
     auto = make_component("datamanagers", {"name": "auto", "points_count": 77})
-    scene = auto.target(auto.settings).load(wall)
+    manager = data_manager(auto, wall)
+    scene = manager.load(wall)
     assert scene.provenance["dataset"] == "c3vd" and len(scene.points) == 77
-    assert auto.target(auto.settings).fingerprint(wall) == scene.provenance["fingerprint"]
+    assert manager.fingerprint(wall) == scene.provenance["fingerprint"]
 
 
 def test_options_of_the_folders_own_format_may_be_set(wall):

@@ -11,8 +11,6 @@ from coliags_plugin.contracts import Availability
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.devices import choose_device
 from coliags_plugin.renderers.choice import choose_renderer
-from tests.engine.test_model import Held
-from tests.renderers.test_torch_renderer import pinhole, random_gaussians
 
 CPU = torch.device("cpu")
 
@@ -59,11 +57,3 @@ def test_missing_cuda_is_named():
     with pytest.raises(InputError, match="torch finds none"):
         choose_device("cuda")
     assert choose_device("auto") == CPU
-
-
-def test_auto_renders_like_the_renderer_it_chooses():
-    field, camera = Held(random_gaussians(40, 0)), pinhole(24, 20, 30.0, 30.0)
-    component = make_component("renderers", {"name": "auto", "prefer": ("torch",), "background": (0.1, 0.2, 0.3)})
-    named = make_component("renderers", {"name": "torch", "background": (0.1, 0.2, 0.3)})
-    ours, theirs = (node.target(node.settings).render(field, camera) for node in (component, named))
-    assert torch.equal(ours.rgb, theirs.rgb)

@@ -500,7 +500,6 @@ def test_the_registered_component_renders_surfels_with_their_own_outputs():
     assert "surfels" in renderer_class.primitives
     assert renderer_class.outputs_of("surfels") == set(OUTPUTS)
     assert renderer_class.outputs_of("gaussians3d") == renderer_class.outputs == set(OUTPUTS) - {"distortion"}
-    assert registry.renderers.get("auto").outputs_of("surfels") == set(OUTPUTS)
     gaussians, camera = smooth_scene()
     model = Model(Surfels(gaussians), TorchRenderer(TorchRendererSettings()), {})
     assert "distortion" in model.outputs
