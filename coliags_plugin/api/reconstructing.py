@@ -42,7 +42,7 @@ def reconstruct(
         InputError: The video or a setting is not valid, or a stage cannot be done; what was done before stands.
         InterruptedRunError: Ctrl-C in training, after the state was saved.
     """
-    from coliags_plugin.config.assigned_settings import settings_of
+    from coliags_plugin.config.assignments import settings_of
     from coliags_plugin.engine.devices import choose_device
     from coliags_plugin.engine.progress import progress_callback
     from coliags_plugin.pipeline.reconstruct import reconstruct as run

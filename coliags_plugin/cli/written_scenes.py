@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from coliags_plugin.config.assigned_settings import settings_of
+from coliags_plugin.config.assignments import settings_of
 from coliags_plugin.core.errors import InputError
 
 if TYPE_CHECKING:

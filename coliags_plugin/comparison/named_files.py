@@ -8,8 +8,7 @@ from typing import TypeVar
 from pydantic import ValidationError
 
 from coliags_plugin.config.method_files import BENCHMARKS, method_folder
-from coliags_plugin.config.origins import errors_with_origins
-from coliags_plugin.config.yaml_tree import read_tree
+from coliags_plugin.config.yaml_tree import errors_with_origins, read_tree
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.settings import Settings
 

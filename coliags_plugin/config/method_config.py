@@ -22,8 +22,15 @@ from coliags_plugin.config.components import (
 )
 from coliags_plugin.config.method_files import method_files
 from coliags_plugin.config.moved_options import with_moved_options
-from coliags_plugin.config.origins import errors_with_origins
-from coliags_plugin.config.yaml_tree import Node, dump, dump_inline, merge, parse_assignment, read_tree
+from coliags_plugin.config.yaml_tree import (
+    Node,
+    dump,
+    dump_inline,
+    errors_with_origins,
+    merge,
+    parse_assignment,
+    read_tree,
+)
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.intrinsics import NEAR_PLANE
 from coliags_plugin.core.settings import Settings, refuse_zero_ends

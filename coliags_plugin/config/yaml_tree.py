@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from pydantic import ValidationError
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.text_files import whole_text
@@ -276,3 +277,27 @@ def _lists(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_lists(item) for item in value]
     return value
+
+
+#: Errors of this package, with messages of their own.
+_TELLING = frozenset({"no_name", "unknown_key", "unknown_component", "no_settings", "value_error", "zero_end"})
+
+
+def errors_with_origins(error: ValidationError, tree: Node, what: str = "config") -> list[str]:
+    """One line per problem: where the value was written, its key, and what is wrong with it.
+
+    Args:
+        error: What validation raised.
+        tree: What was validated.
+        what: Name of the whole, for problems without a key.
+    """
+    lines = []
+    for item in error.errors():
+        path = [key for key in item["loc"] if isinstance(key, str)]
+        message = item["msg"].removeprefix("Value error, ")
+        if item["type"] == "missing":
+            message = "is missing"
+        elif item["type"] not in _TELLING:
+            message = f"{message}, got {item['input']!r}"
+        lines.append(f"{tree.find(path).origin}: {'.'.join(path) or what}: {message.strip()}")
+    return lines

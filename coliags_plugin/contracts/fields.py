@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Generic
+from typing import ClassVar, Generic
 
 import torch
 from jaxtyping import Float
@@ -15,6 +15,7 @@ from typing_extensions import Self
 from coliags_plugin.contracts.schedule import Schedule
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings, SettingsT
 from coliags_plugin.lighting.lamps import HeldLight, Lamp
@@ -54,7 +55,7 @@ class Field(nn.Module, ABC, Generic[SettingsT]):
         return 1.0
 
     @property
-    def learned(self) -> dict[str, Any]:
+    def learned(self) -> JsonObject:
         """Learned numbers that have a meaning of their own, for the record of a run; default: none."""
         return {}
 

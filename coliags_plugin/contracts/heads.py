@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.lighting.lamps import HeldLight
@@ -123,6 +124,6 @@ class AppearanceHead(Head):
         return None
 
     @property
-    def learned(self) -> dict[str, Any]:
+    def learned(self) -> JsonObject:
         """Learned numbers that have a meaning of their own, for the record of a run; default: none."""
         return {}

@@ -14,6 +14,7 @@ from typing_extensions import Self, TypeVar
 
 from coliags_plugin.contracts.fields import Field
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Scene, View
 from coliags_plugin.core.settings import Settings, SettingsT
@@ -154,7 +155,7 @@ class ViewModule(nn.Module, ABC, Generic[SettingsT]):
         """Trainable parameters; a method config's ``optimizers`` puts the module's own name and a dot in front."""
 
     @property
-    def learned(self) -> dict[str, Any]:
+    def learned(self) -> JsonObject:
         """Learned numbers that have a meaning of their own, for the record of a run; default: none."""
         return {}
 

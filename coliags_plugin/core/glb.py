@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Shaped
 
+from coliags_plugin.core.json_files import JsonObject
+
 _MAGIC, _VERSION, _JSON_CHUNK, _BINARY_CHUNK = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 #: glTF's numbers of types, and names of shapes by their channels.
 _COMPONENTS = {"|u1": 5121, "<u4": 5125, "<f4": 5126}
@@ -35,10 +37,10 @@ class GlbArray:
     normalized: bool = False
     bounds: bool = False
 
-    def accessor(self, view: int) -> dict[str, Any]:
+    def accessor(self, view: int) -> JsonObject:
         """Its description."""
         stored = self.values.dtype.newbyteorder("<")
-        made: dict[str, Any] = {
+        made: JsonObject = {
             "bufferView": view,
             "componentType": _COMPONENTS[stored.str],
             "count": len(self.values),
@@ -66,7 +68,7 @@ def encode_glb(document: Mapping[str, Any], arrays: Sequence[GlbArray], extras: 
         views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(data), "target": target})
         chunks.append(data)
         offset += len(data)
-    asset: dict[str, Any] = {"version": "2.0", "generator": "coliags_plugin"}
+    asset: JsonObject = {"version": "2.0", "generator": "coliags_plugin"}
     if extras:
         asset["extras"] = {"comment": extras}
     whole = {

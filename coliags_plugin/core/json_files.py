@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeAlias
 
 from coliags_plugin.core import bounds
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.text_files import whole_text
+
+#: Plain values by name, as in a JSON file.
+JsonObject: TypeAlias = dict[str, Any]
 
 
 def read_json(path: Path, expected: str, do: str = "", finite: bool = False) -> Any:

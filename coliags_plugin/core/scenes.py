@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.pixel_ids import pixel_ids
 
 
@@ -223,7 +224,7 @@ class Scene:
     train: list[Frame]
     test_sets: dict[str, list[Frame]]
     points: PointCloud
-    provenance: dict[str, Any] = field(default_factory=dict)
+    provenance: JsonObject = field(default_factory=dict)
 
     @property
     def video(self) -> list[Frame]:

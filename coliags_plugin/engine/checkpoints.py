@@ -8,7 +8,6 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from pydantic import BaseModel, ConfigDict, NonNegativeInt
@@ -21,7 +20,7 @@ from coliags_plugin.contracts import Renderer, Sampler, Strategy
 from coliags_plugin.core.checksums import differing_files, write_checksums
 from coliags_plugin.core.errors import InputError, NotFiniteError
 from coliags_plugin.core.files import atomic_folder, write_json
-from coliags_plugin.core.json_files import json_text, parse_json
+from coliags_plugin.core.json_files import JsonObject, json_text, parse_json
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.scratch import final_place
 from coliags_plugin.engine.costs import TrainingCost
@@ -105,7 +104,7 @@ def save_checkpoint(
     tensors |= {f"generator/{name}": generator.get_state() for name, generator in generators.items()}
     _check_finite(tensors, step)
     target = checkpoint_folder(folder, step)
-    state: dict[str, Any] = {"format": FORMAT, "step": step, "method": method, "frame_queue": sampler.queue}
+    state: JsonObject = {"format": FORMAT, "step": step, "method": method, "frame_queue": sampler.queue}
     if cost is not None:
         state["cost"] = cost.model_dump()
     with atomic_folder(target, overwrite=True) as scratch:

@@ -16,7 +16,7 @@ from torch import Tensor
 from coliags_plugin.contracts import GainModule, LampAware, ResponseModule
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
-from coliags_plugin.core.json_files import read_json
+from coliags_plugin.core.json_files import JsonObject, read_json
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.lighting.beams import SpreadLaw, beam
@@ -142,10 +142,10 @@ class LightMap:
     colors: Float[Tensor, "P"]
     response: Float[Tensor, "P"] | None
     true_response: Float[Tensor, "P"] | None
-    numbers: dict[str, Any]
+    numbers: JsonObject
 
     @property
-    def record(self) -> dict[str, Any]:
+    def record(self) -> JsonObject:
         """Plain values, for ``light.json``."""
         curves = {name: value for name, value in vars(self).items() if name not in ("times", "numbers")}
         plain = {name: None if values is None else values.tolist() for name, values in curves.items()}
@@ -178,7 +178,7 @@ def light_map(trained: TrainedRun) -> LightMap | None:
     gains = None if gain is None else _centred(gain.log_gains().cpu().double()).exp()
     true_gains = None if truth is None or gains is None else _true_gains(truth, scene)
     colors = torch.linspace(0.0, _MAX_COLOR, _POINTS, dtype=torch.float64)
-    numbers: dict[str, Any] = {"learned": model.learned, "reference_distance": middle, "unit": scene.length_unit}
+    numbers: JsonObject = {"learned": model.learned, "reference_distance": middle, "unit": scene.length_unit}
     if truth is not None:
         numbers["truth"] = {
             "distance_exponent": truth.distance_exponent,

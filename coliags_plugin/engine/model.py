@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -14,6 +13,7 @@ from coliags_plugin.contracts import Field, Renderer, ViewModule
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import NEAR_PLANE
+from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Scene, View
 
@@ -103,7 +103,7 @@ class Model(nn.Module):
         return groups
 
     @property
-    def learned(self) -> dict[str, Any]:
+    def learned(self) -> JsonObject:
         """Learned numbers that have a meaning of their own: ``field``, and those of modules under their names.
 
         Parts without any are left out.

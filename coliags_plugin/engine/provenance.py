@@ -6,12 +6,12 @@ import math
 import platform
 import subprocess
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from coliags_plugin._version import __version__
 from coliags_plugin.config.method_config import LoadedMethod
+from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.model import Model
 from coliags_plugin.renderers.choice import ChosenRenderer
@@ -25,7 +25,7 @@ def run_provenance(
     device: torch.device,
     chosen: ChosenRenderer,
     model: Model,
-) -> dict[str, Any]:
+) -> JsonObject:
     """What a run is and was made with.
 
     Args:
@@ -58,7 +58,7 @@ def run_provenance(
     }
 
 
-def software() -> dict[str, Any]:
+def software() -> JsonObject:
     """Versions, and the git state where the package runs from a checkout."""
     return {
         "package_version": __version__,

@@ -16,7 +16,7 @@ from typing import Any
 from coliags_plugin.config.method_config import LoadedMethod, load_method
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder, atomic_write, not_writable, write_json
-from coliags_plugin.core.json_files import parse_json, read_json
+from coliags_plugin.core.json_files import JsonObject, parse_json, read_json
 from coliags_plugin.core.locks import locked
 from coliags_plugin.results.record import TRUTH_SUFFIX
 
@@ -128,7 +128,7 @@ class RunFolder:
             raise InputError(f"{path} is not a run folder", "a folder with config.yaml and provenance.json")
         return folder
 
-    def create(self, config_yaml: str, provenance: dict[str, Any], overwrite: bool) -> None:
+    def create(self, config_yaml: str, provenance: JsonObject, overwrite: bool) -> None:
         """Create the folder atomically with config and provenance.
 
         Raises:
@@ -142,7 +142,7 @@ class RunFolder:
         with atomic_folder(self.path, overwrite=True) as scratch:
             RunFolder(scratch).rewrite(config_yaml, provenance)
 
-    def rewrite(self, config_yaml: str, provenance: dict[str, Any]) -> None:
+    def rewrite(self, config_yaml: str, provenance: JsonObject) -> None:
         """Write config and provenance again."""
         write_json(self.provenance_file, provenance)
         atomic_write(self.config_file, config_yaml)
@@ -168,13 +168,13 @@ class RunFolder:
         """The run's resolved config."""
         return load_method(str(self.config_file.resolve()))
 
-    def provenance(self) -> dict[str, Any]:
+    def provenance(self) -> JsonObject:
         """Content of the provenance file.
 
         Raises:
             InputError: The file is damaged.
         """
-        found: dict[str, Any] = read_json(self.provenance_file, "what `coliags train` wrote", finite=True)
+        found: JsonObject = read_json(self.provenance_file, "what `coliags train` wrote", finite=True)
         return found
 
     def identity(self) -> RunIdentity:
@@ -229,7 +229,7 @@ class RunFolder:
         rows = filter(None, map(_log_row, reversed(_last_lines(self.log_file))))
         return int(next(rows, {"step": 0})["step"])
 
-    def log_rows(self, until: float = math.inf) -> list[dict[str, Any]]:
+    def log_rows(self, until: float = math.inf) -> list[JsonObject]:
         """Rows of the training log up to a step, without lines that a kill cut short; none without a log.
 
         Raises:
@@ -264,7 +264,7 @@ def checkpoint_step(checkpoint: Path) -> int:
     return int(checkpoint.name.split("-")[1])
 
 
-def _log_row(line: str) -> dict[str, Any] | None:
+def _log_row(line: str) -> JsonObject | None:
     """A row of the training log; None where the line is damaged."""
     try:
         row = parse_json(line)

@@ -9,6 +9,7 @@ import torch
 
 from coliags_plugin._version import __version__
 from coliags_plugin.contracts import Metric
+from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.engine.checkpoints import checkpoint_folder
 from coliags_plugin.engine.costs import RenderMeter, TrainingCost, seconds_to_psnr
@@ -80,11 +81,11 @@ def run_result(
     )
 
 
-def _fingerprint_of(truth: Truth | None) -> dict[str, Any]:
+def _fingerprint_of(truth: Truth | None) -> JsonObject:
     return {} if truth is None else {"truth": truth.scene.provenance.get("fingerprint")}
 
 
-def _described(truth: Truth, own: Scene) -> dict[str, Any]:
+def _described(truth: Truth, own: Scene) -> JsonObject:
     return {
         "scene": truth.scene.name,
         "matched_by": truth.matched_by,
@@ -146,7 +147,7 @@ def _cost(trained: TrainedRun, meter: RenderMeter) -> CostRecord:
     )
 
 
-def _deviations(step: int, configured: int, provenance: Mapping[str, Any]) -> dict[str, Any]:
+def _deviations(step: int, configured: int, provenance: Mapping[str, Any]) -> JsonObject:
     """How a run differs from one that goes through as configured, with this version; empty where it does not."""
     lengths = ("steps", "written_for")
     jumps = [

@@ -5,7 +5,11 @@ from __future__ import annotations
 import json
 import logging
 import math
+import signal
+import threading
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -15,6 +19,7 @@ from coliags_plugin.config.method_config import LoadedMethod
 from coliags_plugin.contracts import Draw, Loss, Sampler, Schedule, Strategy, TrainingStep
 from coliags_plugin.core.errors import InterruptedRunError, NotFiniteError, NothingDrawnError
 from coliags_plugin.core.files import atomic_write
+from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.masked import masked_mean
 from coliags_plugin.core.render_output import RenderOutput, Splats, concatenate_pixels
 from coliags_plugin.core.scenes import Frame, Scene, Target, View, concatenate_targets
@@ -29,7 +34,6 @@ from coliags_plugin.engine.provenance import run_provenance
 from coliags_plugin.engine.randomness import generators
 from coliags_plugin.engine.resuming import check_same_run, record_schedule, resume_command
 from coliags_plugin.engine.run_folder import RunFolder
-from coliags_plugin.engine.stopping import deferred_stop
 from coliags_plugin.renderers.choice import ChosenRenderer, choose_renderer
 
 logger = logging.getLogger(__name__)
@@ -174,7 +178,7 @@ class Trainer:
                         f"{resume_command(self.run, self.method.name, self.scene_path)}"
                     )
 
-    def take_step(self) -> dict[str, Any]:
+    def take_step(self) -> JsonObject:
         """Train on the next frame.
 
         Returns:
@@ -248,7 +252,7 @@ class Trainer:
             self.costs.cost(),
         )
 
-    def provenance(self) -> dict[str, Any]:
+    def provenance(self) -> JsonObject:
         """Provenance of the run."""
         return run_provenance(self.method, self.scene, self.scene_path, self.seed, self.device, self.chosen, self.model)
 
@@ -281,7 +285,7 @@ class Trainer:
     def _optimizers(self) -> Optimizers:
         return Optimizers(self.model, self.method.config.optimizers, self.steps, self.scene.extent)
 
-    def _cut_log(self) -> list[dict[str, Any]]:
+    def _cut_log(self) -> list[JsonObject]:
         """Remove log rows of steps after the checkpoint, which will be repeated; those that stay."""
         if not self.run.log_file.is_file():
             return []
@@ -318,3 +322,41 @@ def _resident(frames: list[Frame], device: torch.device) -> list[Frame]:
     tensors = [(f.image, f.depth, f.depth_at_least, f.mask, f.seen, f.depth_confidence) for f in frames]
     size = sum(tensor.nbytes for group in tensors for tensor in group if tensor is not None)
     return [frame.to(device) for frame in frames] if size < torch.cuda.mem_get_info(device)[0] / 2 else frames
+
+
+#: Ctrl-C, what clusters send before they kill, and what a terminal sends when it is closed.
+_HANGUP = getattr(signal, "SIGHUP", None)  # not on Windows
+STOPPING = tuple(filter(None, (signal.SIGINT, signal.SIGTERM, _HANGUP)))
+
+
+@contextmanager
+def deferred_stop() -> Iterator[Callable[[], bool]]:
+    """Defer :data:`STOPPING` signals: the yielded function tells whether one has come; a second one stops at once.
+
+    SIGHUP stays ignored where it is, as under nohup.
+
+    Raises:
+        KeyboardInterrupt: On the second signal.
+    """
+    asked = False
+
+    def remember(number: int, frame: Any) -> None:
+        nonlocal asked
+        if asked:
+            raise KeyboardInterrupt
+        asked = True
+        logger.info("%s: stopping after this step; once more to stop at once", signal.Signals(number).name)
+
+    if threading.current_thread() is not threading.main_thread():  # signals arrive at the main thread only
+        yield lambda: False
+        return
+    before = {number: signal.getsignal(number) for number in STOPPING}
+    if before.get(_HANGUP) is signal.SIG_IGN:
+        del before[_HANGUP]
+    try:
+        for number in before:
+            signal.signal(number, remember)
+        yield lambda: asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Int
@@ -16,6 +16,7 @@ from coliags_plugin.config.components import AppearanceHeadNode, GeometryHeadNod
 from coliags_plugin.contracts import GaussianField, LampAware
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
+from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.point_normals import wall_normals
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
@@ -151,7 +152,7 @@ class AnchorField(GaussianField[AnchorFieldSettings], LampAware):
         return self.appearance_head.knows_lamp
 
     @property
-    def learned(self) -> dict[str, Any]:
+    def learned(self) -> JsonObject:
         """The numbers of the appearance head."""
         return self.appearance_head.learned
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from coliags_plugin.config.components import AppearanceHeadNode
 from coliags_plugin.contracts import AppearanceHead
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.lighting.lamps import HeldLight
@@ -185,7 +186,7 @@ class AttenuatedAppearanceHead(AppearanceHead):
         return colors * self._along(rays, rays @ camera.optical_axis, facing)
 
     @property
-    def learned(self) -> dict[str, Any]:
+    def learned(self) -> JsonObject:
         """The law's numbers."""
         names = ("distance_exponent", "cosine_exponent", "incidence_exponent")
         return {

@@ -1,4 +1,4 @@
-"""Explicit 3D Gaussians with spherical harmonics, as in 3D Gaussian Splatting."""
+"""Explicit Gaussians with spherical harmonics, as in 3D and 2D Gaussian Splatting."""
 
 from __future__ import annotations
 
@@ -76,3 +76,22 @@ class ExplicitGaussians(ExplicitField[ExplicitGaussiansSettings]):
             source_index=visible,
             visible_sources=visible,
         )
+
+
+class Surfels(ExplicitGaussians):
+    """Explicit Gaussians on discs, with two scales each; their normals are the third axes of their rotations."""
+
+    primitive: ClassVar[str] = "surfels"
+    scale_count: ClassVar[int] = 2
+
+    @classmethod
+    def from_scene(cls, scene: Scene, settings: ExplicitGaussiansSettings, generator: torch.Generator) -> Self:
+        """A round surfel at every initial point, with its colour; quaternions are uniform in [0, 1)^4.
+
+        Raises:
+            InputError: The scene has no points, or too few for reference normals.
+        """
+        field = super().from_scene(scene, settings, generator)
+        with torch.no_grad():
+            field.quats.copy_(torch.rand(field.quats.shape, generator=generator))
+        return field

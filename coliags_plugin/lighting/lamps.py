@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
@@ -13,6 +13,7 @@ from pydantic import Field as Option
 from torch import Tensor
 
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.settings import Settings
 
 #: Shortest distance to a lamp, scene units.
@@ -32,7 +33,7 @@ class Lamp(Settings):
     intensity: float = Option(default=1.0, ge=0.0, allow_inf_nan=False)  # factor of the trained intensity
 
     @property
-    def described(self) -> dict[str, Any]:
+    def described(self) -> JsonObject:
         """Plain values, for a record."""
         return self.model_dump()
 
@@ -75,7 +76,7 @@ class HeldLight(ABC):
 
     @property
     @abstractmethod
-    def described(self) -> dict[str, Any]:
+    def described(self) -> JsonObject:
         """Plain values, for a record."""
 
     @abstractmethod
@@ -99,7 +100,7 @@ class LightOfCamera(HeldLight):
     camera: Camera
 
     @property
-    def described(self) -> dict[str, Any]:
+    def described(self) -> JsonObject:
         """The pose of the camera."""
         return {"camera_to_world": self.camera.camera_to_world.tolist()}
 
@@ -128,7 +129,7 @@ class FlattenedLight(HeldLight):
     cosine: float
 
     @property
-    def described(self) -> dict[str, Any]:
+    def described(self) -> JsonObject:
         """Distance and cosine."""
         return {"distance": self.distance, "cosine": self.cosine}
 

@@ -16,7 +16,6 @@ from torch import Tensor
 from coliags_plugin.contracts import Comparison, Metric
 from coliags_plugin.core.errors import UnavailableError
 from coliags_plugin.core.settings import Settings, SettingsT
-from coliags_plugin.metrics.depth_steps import depth_steps, dilated
 
 
 class DepthMetricSettings(Settings):
@@ -139,3 +138,32 @@ class DepthAbsRel(DepthMetric):
         if (truth <= 0).any():
             raise UnavailableError("a true depth of 0 mm makes the relative error infinite")
         return ((rendered - truth).abs() / truth).mean()
+
+
+def depth_steps(depth: Float[Tensor, "H W"], known: Bool[Tensor, "H W"], relative_step: float) -> Bool[Tensor, "H W"]:
+    """Mask of pixels whose 3x3 window holds a depth step: (max - min) / min of its known depths above a threshold.
+
+    Unknown pixels make no step themselves; two known surfaces on either side of one do. [H, W]
+
+    Args:
+        depth: z-depth, mm. [H, W]
+        known: True where the depth is known. [H, W]
+        relative_step: Threshold, for instance 0.12.
+    """
+    farthest = _window_max(torch.where(known, depth, -torch.inf), 1)
+    nearest = -_window_max(torch.where(known, -depth, -torch.inf), 1)
+    return farthest - nearest > relative_step * nearest
+
+
+def dilated(marked: Bool[Tensor, "H W"], reach: int) -> Bool[Tensor, "H W"]:
+    """The mask dilated by ``reach`` rows and columns. [H, W]"""
+    return _window_max(marked.to(torch.float32), reach) > 0
+
+
+def _window_max(values: Float[Tensor, "H W"], reach: int) -> Float[Tensor, "H W"]:
+    """Maximum over the square window around every pixel; pixels outside the image do not count. [H, W]"""
+    from kornia.morphology import dilation
+
+    square = torch.ones(2 * reach + 1, 2 * reach + 1, dtype=values.dtype, device=values.device)
+    largest: Tensor = dilation(values[None, None], square, max_val=torch.finfo(values.dtype).max)
+    return largest[0, 0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from typing_extensions import Self
 
 from coliags_plugin.contracts import GainModule
+from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Scene, View
 from coliags_plugin.core.settings import Settings
@@ -140,7 +141,7 @@ class FrameGain(GainModule[FrameGainSettings]):
         return math.exp(self.metering.correction(self.log_gains(), rgb, *self.frames.neighbours(view)))
 
     @property
-    def learned(self) -> dict[str, Any]:
+    def learned(self) -> JsonObject:
         """Gains by training frame, and the names of frames whose gain is at a bound."""
         log_gains = self.log_gains().detach()
         reached = (log_gains.abs() >= math.log(self.settings.max_gain)).any(dim=1).tolist()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -13,6 +13,7 @@ from typing_extensions import Self
 
 from coliags_plugin.contracts import ViewModule
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.scenes import Scene, View
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.modules.frame_rows import FrameRows
@@ -110,7 +111,7 @@ class PoseCorrection(ViewModule[PoseCorrectionSettings]):
         return self.rotation - self.rotation.mean(0), self.translation - self.translation.mean(0)
 
     @property
-    def learned(self) -> dict[str, Any]:
+    def learned(self) -> JsonObject:
         """Root mean square of the corrections over the training frames."""
         rotation, translation = (values.detach().square().sum(1).mean().sqrt() for values in self.corrections())
         return {"rotation_degrees": math.degrees(rotation), "translation": float(translation)}

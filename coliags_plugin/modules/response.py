@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from typing_extensions import Self
 
 from coliags_plugin.contracts import ResponseModule
+from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Scene, View
 from coliags_plugin.core.settings import Settings
@@ -81,7 +82,7 @@ class CameraResponse(ResponseModule[ResponseSettings]):
         return replace(output, rgb=self.curve(output.rgb))
 
     @property
-    def learned(self) -> dict[str, Any]:
+    def learned(self) -> JsonObject:
         """Points of the curve: colours, and the pixel values that they become."""
         colors = torch.linspace(self.settings.knee, _TOP, self.settings.segments + 1)
         values = self.curve(colors.to(self.log_slope)).detach()

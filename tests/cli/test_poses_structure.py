@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from coliags_plugin.cli.poses.triangulate import _held_out
-from coliags_plugin.config.assigned_settings import settings_of
+from coliags_plugin.config.assignments import settings_of
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.scenes import PointCloud, Scene
 from coliags_plugin.datamanagers.units import read_unit

@@ -9,7 +9,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from skimage.metrics import mean_squared_error
 
 from coliags_plugin.core.errors import UnavailableError
-from coliags_plugin.metrics.depth_steps import depth_steps, dilated
+from coliags_plugin.metrics.depth import depth_steps, dilated
 
 ALL = ["depth_mse", "depth_mse_inner", "depth_rmse", "depth_mae", "depth_median_error", "depth_abs_rel"]
 

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coliags_plugin.metrics.quantization import through_8_bit, through_16_bit
+from coliags_plugin.metrics.protocols import through_8_bit, through_16_bit
 
 
 def one(value):

@@ -9,7 +9,7 @@ from coliags_plugin.config.components import make_component
 from coliags_plugin.contracts import Schedule
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput, Splats
-from coliags_plugin.strategies.births import Births, one_per_free_cell
+from coliags_plugin.strategies.anchor_growth import Births, one_per_free_cell
 from tests.scenes import wall_scene
 from tests.strategies.steps import after_backward, stepped_optimizers
 

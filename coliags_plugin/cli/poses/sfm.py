@@ -45,7 +45,7 @@ class Sfm:
     def run(self) -> None:
         """Reconstruct, write the scene and print a summary."""
         from coliags_plugin.cli.written_scenes import next_commands, refuse_output
-        from coliags_plugin.config.assigned_settings import settings_of
+        from coliags_plugin.config.assignments import settings_of
         from coliags_plugin.core.errors import InputError
         from coliags_plugin.engine.progress import progress_callback
         from coliags_plugin.reconstruction.structure.image_files import list_images, masks_for

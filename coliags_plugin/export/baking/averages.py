@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from coliags_plugin.contracts import GaussianField
+from coliags_plugin.contracts import GaussianField, gaussians_under
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
@@ -147,7 +147,7 @@ def mean_gaussians(field: GaussianField, cameras: Sequence[Camera], light: HeldL
         cameras: From where; at least one.
         light: What lights it; None: the lamp of each camera, so that colours are of the average light.
     """
-    views = [field.gaussians(c) if light is None else field.gaussians_in_light(c, light) for c in cameras]
+    views = [gaussians_under(field, camera, light) for camera in cameras]
     slots = max((int(view.source_index.max()) + 1 for view in views if len(view)), default=0)
     per_element, scales = field.slots_per_element, views[0].scales.shape[1]
     averages = GaussianAverages(-(-slots // per_element), per_element, scales, views[0].means.device)
