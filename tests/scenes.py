@@ -21,6 +21,13 @@ def camera_at(x: float, y: float, z: float, width: int = 32, height: int = 24, y
     return Camera(0.9 * width, 0.85 * width, 0.52 * width, 0.47 * height, width, height, c2w)
 
 
+def plain_frame(image: torch.Tensor, depth: torch.Tensor | None = None, mask: torch.Tensor | None = None) -> Frame:
+    """A frame of these pixels, of a camera at the origin."""
+    height, width = image.shape[:2]
+    camera = Camera(100.0, 100.0, width / 2, height / 2, width, height, torch.eye(4))
+    return Frame("0007", 7, image, camera, depth, mask)
+
+
 def wall_color(points: torch.Tensor) -> torch.Tensor:
     """A smooth pattern on the wall z = 20, RGB in (0, 1)."""
     x, y = points[..., 0], points[..., 1]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from pydantic import ValidationError
 
@@ -16,7 +16,7 @@ from coliags_plugin.core.settings import Settings, first_error
 EXAMPLE = "key.path=value, for instance field.geometry_head.frequencies=8"
 
 
-def parse_assignments(texts: Iterable[str], option: str = "--set", expected: str = EXAMPLE) -> dict[str, Any]:
+def parse_assignments(texts: Iterable[str], option: str = "--set", expected: str = EXAMPLE) -> dict[str, object]:
     """Values by key path, read as YAML; of a key that is there twice the last one counts, in its place.
 
     Args:
@@ -27,7 +27,7 @@ def parse_assignments(texts: Iterable[str], option: str = "--set", expected: str
     Raises:
         InputError: A text has no ``=``.
     """
-    values: dict[str, Any] = {}
+    values: dict[str, object] = {}
     for text in texts:
         key, equals, value = text.partition("=")
         if not equals:
@@ -37,7 +37,7 @@ def parse_assignments(texts: Iterable[str], option: str = "--set", expected: str
     return values
 
 
-def assignments(settings: Mapping[str, Any] | None) -> tuple[str, ...]:
+def assignments(settings: Mapping[str, object] | None) -> tuple[str, ...]:
     """``key.path=value`` texts, in the settings' order; what :func:`parse_assignments` reads as the same settings.
 
     Args:
@@ -53,9 +53,9 @@ def assignments(settings: Mapping[str, Any] | None) -> tuple[str, ...]:
     return tuple(f"{key}={dump_inline(_plain(value, key))}" for key, value in settings.items())
 
 
-def _plain(value: Any, key: str) -> Any:
+def _plain(value: object, key: str) -> object:
     """The value as YAML has it."""
-    if getattr(value, "ndim", None) == 0:
+    if hasattr(value, "item") and getattr(value, "ndim", None) == 0:
         value = value.item()  # a number of NumPy
     if isinstance(value, Path):
         return str(value)
@@ -93,7 +93,7 @@ def settings_of(kind: type[S], assignments: Sequence[str], prefix: str = "") -> 
         raise InputError(f"--set {prefix}{key}: {message} (got {value!r})") from error
 
 
-def deep_merge(base: Any, over: Any) -> Any:
+def deep_merge(base: object, over: object) -> object:
     """``over`` merged into ``base``, mapping by mapping; other values are replaced."""
     if not isinstance(base, dict) or not isinstance(over, dict):
         return over

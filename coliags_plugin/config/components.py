@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any
@@ -35,7 +35,7 @@ class Component:
         return REGISTRIES[self.kind].get(self.name)
 
 
-def make_component(kind: str, node: Any) -> Component:
+def make_component(kind: str, node: object) -> Component:
     """Validate ``{"name": ..., options...}``, or a bare name, into a component.
 
     Raises:
@@ -61,7 +61,7 @@ def make_component(kind: str, node: Any) -> Component:
     return Component(kind, node["name"], settings_class.model_validate(options))
 
 
-def named_component(kind: str, node: Any, asking: str) -> Component:
+def named_component(kind: str, node: Mapping[str, object], asking: str) -> Component:
     """Validate a node outside method configs into a component.
 
     Args:
@@ -81,11 +81,11 @@ def named_component(kind: str, node: Any, asking: str) -> Component:
         raise InputError(f"{asking}: option '{key}' of '{node['name']}': {message}") from error
 
 
-def _dump(component: Component) -> dict[str, Any]:
+def _dump(component: Component) -> dict[str, object]:
     return {"name": component.name, **component.settings.model_dump()}
 
 
-def _validator(kind: str) -> Callable[[Any], Component]:
+def _validator(kind: str) -> Callable[[object], Component]:
     return partial(make_component, kind)
 
 

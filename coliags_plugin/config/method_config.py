@@ -12,6 +12,7 @@ from typing_extensions import Self
 
 from coliags_plugin.config import registry
 from coliags_plugin.config.components import (
+    Component,
     DataManagerNode,
     FieldNode,
     LossNode,
@@ -86,7 +87,7 @@ class MethodConfig(Settings):
 
     @field_validator("losses", "optimizers", "modules", mode="before")
     @classmethod
-    def _null_removes(cls, entries: Any) -> Any:
+    def _null_removes(cls, entries: object) -> object:
         return (
             {key: value for key, value in entries.items() if value is not None}
             if isinstance(entries, dict)
@@ -95,7 +96,7 @@ class MethodConfig(Settings):
 
     @field_validator("modules")
     @classmethod
-    def _names_without_dots(cls, modules: dict[str, Any]) -> dict[str, Any]:
+    def _names_without_dots(cls, modules: dict[str, Component]) -> dict[str, Component]:
         for name in modules:
             if not name.isidentifier():
                 raise ValueError(f"module name '{name}': expected letters, digits and underscores")

@@ -52,13 +52,13 @@ class Registry:
     def __init__(self, kind: str, builtins: Mapping[str, object], noun: str) -> None:
         self.kind = kind
         self.noun = noun
-        self._targets: dict[str, Any] = {}
+        self._targets: dict[str, object] = {}
         self._sources: dict[str, str] = {}
         self._complete = False
         for name, target in builtins.items():
             self.register(name, target, source="built in")
 
-    def register(self, name: str, target: Any, source: str = "registered") -> None:
+    def register(self, name: str, target: object, source: str = "registered") -> None:
         """Add one component.
 
         Args:
@@ -137,7 +137,7 @@ def _load(target: str) -> Any:
     return getattr(import_module(module), attribute)
 
 
-def _is_components(found: Any) -> TypeGuard[dict[str, dict[str, Any]]]:
+def _is_components(found: object) -> TypeGuard[dict[str, dict[str, object]]]:
     return (
         isinstance(found, dict)
         and set(found) <= set(REGISTRIES)
@@ -146,8 +146,8 @@ def _is_components(found: Any) -> TypeGuard[dict[str, dict[str, Any]]]:
 
 
 @cache
-def _plugin_files(path_list: str) -> dict[str, dict[str, dict[str, Any]]]:
-    found: dict[str, dict[str, dict[str, Any]]] = {}
+def _plugin_files(path_list: str) -> dict[str, dict[str, dict[str, object]]]:
+    found: dict[str, dict[str, dict[str, object]]] = {}
     for path in filter(None, path_list.split(os.pathsep)):
         if not Path(path).is_file():
             raise InputError(

@@ -39,7 +39,7 @@ class Node:
             return {key: child.plain() for key, child in self.value.items()}
         return self.value
 
-    def find(self, path: Sequence[Any]) -> Node:
+    def find(self, path: Sequence[object]) -> Node:
         """The deepest node on a path that exists."""
         node = self
         for key in path:
@@ -93,7 +93,7 @@ _Loader.add_implicit_resolver(
 class _Dumper(yaml.SafeDumper):
     """Safe dumper that quotes text which either version of YAML would take for something else."""
 
-    def ignore_aliases(self, data: Any) -> bool:
+    def ignore_aliases(self, data: object) -> bool:
         """Write what is there twice twice."""
         return True
 
@@ -141,7 +141,7 @@ def parse_tree(text: str, source: str) -> Node:
     return tree
 
 
-def parse_value(text: str) -> Any:
+def parse_value(text: str) -> object:
     """The value of ``--set key=VALUE``, read as YAML."""
     try:
         return _tuples(yaml.load(text, _Loader))
@@ -187,7 +187,7 @@ def _convert(loader: _Loader, node: yaml.Node, source: str) -> Node:
     return Node(children, origin)
 
 
-def _tuples(value: Any) -> Any:
+def _tuples(value: object) -> object:
     if isinstance(value, list):
         return tuple(_tuples(item) for item in value)
     if isinstance(value, dict):
@@ -236,7 +236,7 @@ def parse_assignment(assignment: str) -> Node:
     return node
 
 
-def _nodes(value: Any, origin: str) -> Node:
+def _nodes(value: object, origin: str) -> Node:
     """A plain value as a tree of nodes, all of one origin."""
     if not isinstance(value, dict):
         return Node(value, origin)
@@ -254,24 +254,24 @@ def override_all(tree: Node, assignments: Iterable[str]) -> Node:
     return tree
 
 
-def dump(plain: Any) -> str:
+def dump(plain: object) -> str:
     """YAML text of plain data, keys in their own order, the innermost collections on one line."""
     return _dumped(plain, flow=None, width=1000)
 
 
-def dump_inline(plain: Any) -> str:
+def dump_inline(plain: object) -> str:
     """YAML text of plain data as it stands behind ``key=``, which :func:`parse_value` reads."""
     return _dumped([plain], flow=True, width=math.inf).strip()[1:-1]  # a list, so that no end of document is written
 
 
-def _dumped(plain: Any, flow: bool | None, width: float) -> str:
+def _dumped(plain: object, flow: bool | None, width: float) -> str:
     text: str = yaml.dump(
         _lists(plain), Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=flow, width=width
     )
     return text
 
 
-def _lists(value: Any) -> Any:
+def _lists(value: object) -> object:
     if isinstance(value, dict):
         return {key: _lists(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -13,7 +13,7 @@ import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING
 
 from coliags_plugin.core.errors import InputError, NotWritableError
 from coliags_plugin.core.scratch import (
@@ -160,7 +160,7 @@ def write_arrays(target: Path, arrays: Mapping[str, np.ndarray]) -> None:
     atomic_write(target, data.getvalue())
 
 
-def write_json(target: Path, data: Any) -> None:
+def write_json(target: Path, data: object) -> None:
     """Write indented JSON atomically; NaN and infinity are refused, as the JSON standard has neither."""
     atomic_write(target, json.dumps(data, indent=2, allow_nan=False) + "\n")
 

@@ -29,8 +29,10 @@ class Settings(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _refuse_huge_integers(cls, data: Any) -> Any:
-        huge = [key for key, value in data.items() if _is_huge(value)] if isinstance(data, dict) else []
+    def _refuse_huge_integers(cls, data: object) -> object:
+        if not isinstance(data, dict):
+            return data
+        huge = [key for key, value in data.items() if _is_huge(value)]
         if huge:
             problem = PydanticCustomError("huge_integer", "an integer of more than 64 bits")
             raise ValidationError.from_exception_data(
@@ -40,7 +42,7 @@ class Settings(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _refuse_unknown_keys(cls, data: Any) -> Any:
+    def _refuse_unknown_keys(cls, data: object) -> object:
         if not isinstance(data, dict):
             return data
         unknown = [key for key in data if key not in cls.model_fields]
@@ -72,14 +74,14 @@ class Settings(BaseModel):
 SettingsT = TypeVar("SettingsT", bound=Settings, default=Any)
 
 
-def _is_huge(value: Any) -> bool:
+def _is_huge(value: object) -> bool:
     """Whether a value is, or has, an integer that no array can hold."""
     if isinstance(value, (tuple, list)):
         return any(map(_is_huge, value))
     return isinstance(value, int) and value.bit_length() > _INTEGER_BITS
 
 
-def validated(kind: type[Model], values: Mapping[str, Any], what: str) -> Model:
+def validated(kind: type[Model], values: Mapping[str, object], what: str) -> Model:
     """Settings of plain values by name.
 
     Args:
@@ -97,7 +99,7 @@ def validated(kind: type[Model], values: Mapping[str, Any], what: str) -> Model:
         raise InputError(f"{what} '{key}' = {value!r}: {message}") from error
 
 
-def first_error(error: ValidationError) -> tuple[str, str, Any]:
+def first_error(error: ValidationError) -> tuple[str, str, object]:
     """Dotted key, message and rejected value of the first problem that a validation found."""
     first = error.errors()[0]
     return ".".join(str(part) for part in first["loc"]), first["msg"], first["input"]

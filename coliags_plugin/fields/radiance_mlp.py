@@ -17,7 +17,7 @@ class RadianceMLP(nn.Module):
     """NeRF's network, whose colour layer may also see where the light is.
 
     Args:
-        settings: Widths and numbers of frequencies: :class:`coliags_plugin.fields.reim_nerf.ReimNerfSettings`.
+        settings: Widths and numbers of frequencies: :class:`coliags_plugin.fields.reim_nerf.ReimNerfFieldSettings`.
         generator: Draws the initial weights.
     """
 

@@ -25,7 +25,7 @@ from coliags_plugin.fields.radiance_mlp import RadianceMLP
 logger = logging.getLogger(__name__)
 
 
-class ReimNerfSettings(Settings):
+class ReimNerfFieldSettings(Settings):
     """Options of REIM-NeRF's field (docs/rivals/reim-nerf.md); the coarse and the fine network are alike."""
 
     layers: int = Option(default=8, ge=1)  # of the trunk, from position to density
@@ -45,7 +45,7 @@ class ReimNerfSettings(Settings):
         return self
 
 
-class ReimNerf(RadianceField[ReimNerfSettings]):
+class ReimNerf(RadianceField[ReimNerfFieldSettings]):
     """Two networks from position to density, and from position, direction and lamp position to colour.
 
     After Psychogyios et al., "Realistic Endoscopic Illumination Modeling for NeRF-Based Data Generation" (MICCAI 2023).
@@ -56,11 +56,11 @@ class ReimNerf(RadianceField[ReimNerfSettings]):
         bounds: Distances between which rays are sampled, scene units. [2]
     """
 
-    Settings: ClassVar[type[Settings]] = ReimNerfSettings
+    Settings: ClassVar[type[Settings]] = ReimNerfFieldSettings
 
     bounds: Tensor
 
-    def __init__(self, settings: ReimNerfSettings, generator: torch.Generator) -> None:
+    def __init__(self, settings: ReimNerfFieldSettings, generator: torch.Generator) -> None:
         super().__init__()
         self.settings = settings
         self.normalisation = SceneNormalisation()
@@ -69,7 +69,7 @@ class ReimNerf(RadianceField[ReimNerfSettings]):
         self.fine_network = RadianceMLP(settings, generator)
 
     @classmethod
-    def from_scene(cls, scene: Scene, settings: ReimNerfSettings, generator: torch.Generator) -> Self:
+    def from_scene(cls, scene: Scene, settings: ReimNerfFieldSettings, generator: torch.Generator) -> Self:
         """Fresh networks, normalised by the scene's initial points.
 
         Raises:
@@ -89,7 +89,7 @@ class ReimNerf(RadianceField[ReimNerfSettings]):
         return field
 
     @classmethod
-    def from_state(cls, state: Mapping[str, Tensor], settings: ReimNerfSettings) -> Self:
+    def from_state(cls, state: Mapping[str, Tensor], settings: ReimNerfFieldSettings) -> Self:
         """The field of a checkpoint."""
         field = cls(settings, torch.Generator())
         field.load_state_dict(state)

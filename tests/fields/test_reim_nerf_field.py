@@ -17,7 +17,7 @@ from coliags_plugin.engine.trainer import Trainer
 from coliags_plugin.fields.embedding import cosine_embedding
 from coliags_plugin.fields.normalisation import surface_distances
 from coliags_plugin.fields.radiance_mlp import RadianceMLP
-from coliags_plugin.fields.reim_nerf import ReimNerf, ReimNerfSettings
+from coliags_plugin.fields.reim_nerf import ReimNerf, ReimNerfFieldSettings
 from coliags_plugin.renderers.volume_renderer import VolumeRenderer, VolumeRendererSettings
 from tests.renderers.test_volume_renderer import sphere_scene
 from tests.scenes import camera_at, wall_scene
@@ -36,7 +36,7 @@ def generator(seed=0):
 
 
 def make(scene=None, **options):
-    settings = ReimNerfSettings(**{**SMALL, **options})
+    settings = ReimNerfFieldSettings(**{**SMALL, **options})
     return ReimNerf.from_scene(scene or wall_scene(), settings, generator())
 
 
@@ -44,7 +44,7 @@ def make(scene=None, **options):
 
 
 def test_published_layers_and_parameters():
-    network = RadianceMLP(ReimNerfSettings(), generator())
+    network = RadianceMLP(ReimNerfFieldSettings(), generator())
     assert [layer.in_features for layer in network.trunk] == [63, 256, 256, 256, 256 + 63, 256, 256, 256]
     assert network.color.in_features == 256 + 27 + 27 and network.color.out_features == 128
     by_hand = (63 + 1) * 256 + 6 * (256 + 1) * 256 + (256 + 63 + 1) * 256  # trunk
@@ -52,14 +52,14 @@ def test_published_layers_and_parameters():
     assert sum(value.numel() for value in network.parameters()) == by_hand == 599_300
     bound = math.sqrt(6 / (256 + 256))
     assert 0.98 * bound < network.trunk[1].weight.abs().max() <= bound and not network.trunk[1].bias.any()
-    plain = RadianceMLP(ReimNerfSettings(light=False), generator())
+    plain = RadianceMLP(ReimNerfFieldSettings(light=False), generator())
     assert plain.color.in_features == 256 + 27
 
 
 @pytest.mark.parametrize("light", [True, False])
 def test_the_network_is_that_of_a_plain_forward_pass(light):
     """As it is usually written: everything concatenated, one layer after the other."""
-    settings = ReimNerfSettings(**SMALL, light=light)
+    settings = ReimNerfFieldSettings(**SMALL, light=light)
     network = RadianceMLP(settings, generator()).double()
     with torch.no_grad():
         for value in network.parameters():
@@ -170,7 +170,7 @@ def test_scenes_that_will_not_do_are_refused(tmp_path, change, message):
 
 def test_other_refusals(tmp_path):
     with pytest.raises(ValidationError, match="skip 3 with layers 3"):
-        ReimNerfSettings(layers=3, skip=3)
+        ReimNerfFieldSettings(layers=3, skip=3)
     with pytest.raises(InputError, match="'depth' needs depth, and no training frame"):
         trainer(tmp_path / "run", scene=wall_scene(depth=False))
     with pytest.raises(InputError, match=r"start at 500 and end at"):

@@ -5,10 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput, Splats
-from coliags_plugin.core.scenes import Frame
+from tests.scenes import plain_frame
 
 
 def _output(rgb, scales=None, alpha=None, **maps):
@@ -22,12 +21,6 @@ def _output(rgb, scales=None, alpha=None, **maps):
     return RenderOutput(rgb, torch.ones(rgb.shape[:2]) if alpha is None else alpha, None, maps, splats)
 
 
-def _frame(image, depth=None, mask=None):
-    height, width = image.shape[:2]
-    camera = Camera(100.0, 100.0, width / 2, height / 2, width, height, torch.eye(4))
-    return Frame("0007", 7, image, camera, depth, mask)
-
-
 @pytest.fixture
 def make_output():
     """A RenderOutput of these colours, scales, alpha and maps."""
@@ -37,4 +30,4 @@ def make_output():
 @pytest.fixture
 def make_frame():
     """A Frame of this image, depth and mask."""
-    return _frame
+    return plain_frame

@@ -16,6 +16,7 @@ from coliags_plugin.core.masked import masked_mean, weighted_mean
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import concatenate_targets
 from tests.losses.terms import make
+from tests.scenes import plain_frame
 
 HEIGHT, WIDTH = 7, 9
 WEIGHTED = ("depth-l1", "depth-huber", "distance-l1")
@@ -117,14 +118,14 @@ def test_it_is_hubers_loss_of_the_relative_error(case):
 @settings(max_examples=30, deadline=None)
 @given(scale=st.floats(1e-3, 1e3), shift=st.floats(-0.6, 0.6), floor=st.floats(0, 1))
 def test_it_does_not_depend_on_the_unit(scale, shift, floor):
-    from tests.losses.conftest import _frame, _output
+    from tests.losses.conftest import _output
 
     image, depth = torch.zeros(2, 3, 3, dtype=torch.uint8), torch.linspace(5, 80, 6, dtype=torch.float64).view(2, 3)
     confidence = torch.linspace(0, 1, 6).view(2, 3)
 
     def term(unit):
         output = _output(torch.zeros(2, 3, 3), depth_accumulated=unit * depth * (1 + shift))
-        frame = replace(_frame(image, unit * depth), depth_confidence=confidence)
+        frame = replace(plain_frame(image, unit * depth), depth_confidence=confidence)
         return make("estimated-depth", floor=floor)(output, frame).item()
 
     weight = confidence.clamp_min(floor).mean().item()

@@ -8,10 +8,9 @@ import torch
 
 from coliags_plugin.config import registry
 from coliags_plugin.contracts import Comparison
-from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.render_output import RenderOutput
-from coliags_plugin.core.scenes import Frame
 from coliags_plugin.metrics import lpips_weights
+from tests.scenes import plain_frame
 
 
 def _make(name, **options):
@@ -32,12 +31,6 @@ def _depths(depth, true_depth, valid=None):
 
 def _output(rgb, **maps):
     return RenderOutput(rgb, torch.ones(rgb.shape[:2]), None, maps)
-
-
-def _frame(image, depth=None, mask=None):
-    height, width = image.shape[:2]
-    camera = Camera(100.0, 100.0, width / 2, height / 2, width, height, torch.eye(4))
-    return Frame("0007", 7, image, camera, depth, mask)
 
 
 @pytest.fixture
@@ -67,7 +60,7 @@ def make_output():
 @pytest.fixture
 def make_frame():
     """A Frame of this image, depth and mask."""
-    return _frame
+    return plain_frame
 
 
 @pytest.fixture
