@@ -11,7 +11,7 @@ DEMO_FLAGS := --data $(DEMO)/phantom --steps $(DEMO_STEPS) --overwrite
 
 demo: install
 	@echo "1/5  a synthetic colon with exact depth, poses and light ..."
-	@$(BIN)/coliags phantom $(DEMO)/phantom --seed 0 --overwrite
+	@$(BIN)/coliags phantom --output $(DEMO)/phantom --seed 0 --overwrite
 	@echo "2/5  ColIAGS, $(DEMO_STEPS) steps: about a minute on two cores ..."
 	@$(BIN)/coliags train coliags --output $(DEMO)/coliags $(DEMO_FLAGS)
 	@echo "3/5  Scaffold-GS with the same depth supervision, as many steps: about a minute ..."

@@ -19,10 +19,10 @@ import yaml
 
 from coliags_plugin import cli
 from coliags_plugin.checks.method.check import CHECKS
-from coliags_plugin.cli.check import Check
-from coliags_plugin.cli.config import Config
-from coliags_plugin.cli.phantom import Phantom
-from coliags_plugin.cli.train import Train
+from coliags_plugin.cli.check import CheckCommand
+from coliags_plugin.cli.config import ConfigCommand
+from coliags_plugin.cli.phantom import PhantomCommand
+from coliags_plugin.cli.train import TrainCommand
 from coliags_plugin.config.method_config import MethodConfig, OptimizerSettings, ScheduleSettings, load_method
 from coliags_plugin.config.registry import REGISTRIES, datamanagers
 from coliags_plugin.core.render_output import OUTPUTS
@@ -184,12 +184,12 @@ OF_THE_EXAMPLE = {path.stem for path in (DOCS / "example_package").rglob("*.yaml
 @pytest.mark.parametrize(("page", "command"), commands(), ids=lambda value: value.replace("/", "."))
 def test_commands_parse(page, command, monkeypatch, capsys):
     words = shlex.split(command, comments=True)
-    argv = words[words.index("coliags") + 1 :]
+    argv = words[words.index("coliags") + 1 : words.index(">") if ">" in words else None]
     if len(argv) == 1 and argv[0] in ALONE:
         argv.append("--help")  # the subcommand's name alone, in running text
     found = parsed(argv, monkeypatch)
     if (
-        isinstance(found, (Train, Config, Check))
+        isinstance(found, (TrainCommand, ConfigCommand, CheckCommand))
         and found.method not in OF_THE_EXAMPLE
         and not found.method.endswith(".yaml")
     ):
@@ -197,7 +197,7 @@ def test_commands_parse(page, command, monkeypatch, capsys):
         format_of_page = [f"datamanager.name={Path(page).stem}"] if "layouts" in page else []
         overrides = [*format_of_page, *found.set]
         assert load_method(found.method, overrides).config
-    if isinstance(found, Phantom):
+    if isinstance(found, PhantomCommand):
         made = []
         monkeypatch.setattr("coliags_plugin.phantom.generate.generate", lambda *a, **k: made.append(a))
         found.run()

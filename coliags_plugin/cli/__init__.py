@@ -9,55 +9,58 @@ from typing import Annotated
 
 import tyro
 
-from coliags_plugin.cli.ablate import Ablate
-from coliags_plugin.cli.check import Check
-from coliags_plugin.cli.compare import Compare
-from coliags_plugin.cli.config import Config
-from coliags_plugin.cli.coverage import Coverage
-from coliags_plugin.cli.data import Data
-from coliags_plugin.cli.depth import Depth
-from coliags_plugin.cli.doctor import Doctor
-from coliags_plugin.cli.evaluate import Evaluate
-from coliags_plugin.cli.export import Export
-from coliags_plugin.cli.import_splats import Import
-from coliags_plugin.cli.list import List
-from coliags_plugin.cli.mesh import Mesh
-from coliags_plugin.cli.phantom import Phantom
-from coliags_plugin.cli.poses import Poses
-from coliags_plugin.cli.reconstruct import Reconstruct
-from coliags_plugin.cli.render import Render
-from coliags_plugin.cli.report import Report
-from coliags_plugin.cli.results import Results
+from coliags_plugin.cli.ablate import AblateCommand
+from coliags_plugin.cli.arguments import renamed_argument
+from coliags_plugin.cli.check import CheckCommand
+from coliags_plugin.cli.compare import CompareCommand
+from coliags_plugin.cli.config import ConfigCommand
+from coliags_plugin.cli.coverage import CoverageCommand
+from coliags_plugin.cli.data import DataCommand
+from coliags_plugin.cli.depth import DepthCommand
+from coliags_plugin.cli.doctor import DoctorCommand
+from coliags_plugin.cli.evaluate import EvaluateCommand
+from coliags_plugin.cli.export import ExportCommand
+from coliags_plugin.cli.import_splats import ImportCommand
+from coliags_plugin.cli.list import ListCommand
+from coliags_plugin.cli.mesh import MeshCommand
+from coliags_plugin.cli.phantom import PhantomCommand
+from coliags_plugin.cli.poses import PosesCommand
+from coliags_plugin.cli.reconstruct import ReconstructCommand
+from coliags_plugin.cli.render import RenderCommand
+from coliags_plugin.cli.report import ReportCommand
+from coliags_plugin.cli.results import ResultsCommand
 from coliags_plugin.cli.run import run_command
-from coliags_plugin.cli.train import Train
-from coliags_plugin.cli.view import View
-from coliags_plugin.cli.weights import Weights
+from coliags_plugin.cli.train import TrainCommand
+from coliags_plugin.cli.view import ViewCommand
+from coliags_plugin.cli.weights import WeightsCommand
 
 Command = (
-    Annotated[Reconstruct, tyro.conf.subcommand("reconstruct")]
-    | Annotated[Phantom, tyro.conf.subcommand("phantom")]
-    | Annotated[Train, tyro.conf.subcommand("train")]
-    | Annotated[Evaluate, tyro.conf.subcommand("eval")]
-    | Annotated[Render, tyro.conf.subcommand("render")]
-    | Annotated[Coverage, tyro.conf.subcommand("coverage")]
-    | Annotated[Mesh, tyro.conf.subcommand("mesh")]
-    | Annotated[Export, tyro.conf.subcommand("export")]
-    | Annotated[Import, tyro.conf.subcommand("import")]
-    | Annotated[View, tyro.conf.subcommand("view")]
-    | Annotated[Compare, tyro.conf.subcommand("compare")]
-    | Annotated[Ablate, tyro.conf.subcommand("ablate")]
-    | Annotated[Report, tyro.conf.subcommand("report")]
-    | Annotated[Results, tyro.conf.subcommand("results")]
-    | Annotated[Poses, tyro.conf.subcommand("poses")]
-    | Annotated[List, tyro.conf.subcommand("list")]
-    | Annotated[Config, tyro.conf.subcommand("config")]
-    | Annotated[Data, tyro.conf.subcommand("data")]
-    | Annotated[Depth, tyro.conf.subcommand("depth")]
-    | Annotated[Check, tyro.conf.subcommand("check")]
-    | Annotated[Weights, tyro.conf.subcommand("weights")]
-    | Annotated[Doctor, tyro.conf.subcommand("doctor")]
+    Annotated[ReconstructCommand, tyro.conf.subcommand("reconstruct")]
+    | Annotated[PhantomCommand, tyro.conf.subcommand("phantom")]
+    | Annotated[TrainCommand, tyro.conf.subcommand("train")]
+    | Annotated[EvaluateCommand, tyro.conf.subcommand("eval")]
+    | Annotated[RenderCommand, tyro.conf.subcommand("render")]
+    | Annotated[CoverageCommand, tyro.conf.subcommand("coverage")]
+    | Annotated[MeshCommand, tyro.conf.subcommand("mesh")]
+    | Annotated[ExportCommand, tyro.conf.subcommand("export")]
+    | Annotated[ImportCommand, tyro.conf.subcommand("import")]
+    | Annotated[ViewCommand, tyro.conf.subcommand("view")]
+    | Annotated[CompareCommand, tyro.conf.subcommand("compare")]
+    | Annotated[AblateCommand, tyro.conf.subcommand("ablate")]
+    | Annotated[ReportCommand, tyro.conf.subcommand("report")]
+    | Annotated[ResultsCommand, tyro.conf.subcommand("results")]
+    | Annotated[PosesCommand, tyro.conf.subcommand("poses")]
+    | Annotated[ListCommand, tyro.conf.subcommand("list")]
+    | Annotated[ConfigCommand, tyro.conf.subcommand("config")]
+    | Annotated[DataCommand, tyro.conf.subcommand("data")]
+    | Annotated[DepthCommand, tyro.conf.subcommand("depth")]
+    | Annotated[CheckCommand, tyro.conf.subcommand("check")]
+    | Annotated[WeightsCommand, tyro.conf.subcommand("weights")]
+    | Annotated[DoctorCommand, tyro.conf.subcommand("doctor")]
 )
 
+#: Exit status for arguments that cannot be parsed.
+_USAGE_ERROR = 2
 DESCRIPTION = "Gaussian splatting for colonoscopy: training, evaluation and comparison of reconstruction methods."
 
 
@@ -75,6 +78,10 @@ def main(argv: Sequence[str] | None = None) -> None:
             args=argv,
             config=(tyro.conf.FlagCreatePairsOff,),
         )
+    except SystemExit as refused:
+        if refused.code == _USAGE_ERROR and (hint := renamed_argument(sys.argv[1:] if argv is None else argv)):
+            print(f"coliags: {hint}", file=sys.stderr)
+        raise
     except BrokenPipeError:  # the reader of the help has closed the pipe, as `head` does
         sys.stderr.close()
         sys.exit(1)

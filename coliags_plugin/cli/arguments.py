@@ -1,27 +1,64 @@
-"""Argument types and parsers shared by several commands."""
+"""Argument types that several commands share, each with its help, and parsers of their texts."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
 from coliags_plugin.core.errors import InputError
 
-#: ``--set key=value``, repeatable.
-Assignments = Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="KEY=VALUE"), tyro.conf.UseAppendAction]
+_PATH = tyro.conf.arg(metavar="PATH")
 
-#: ``--light key=value``, repeatable.
-LampOptions = Annotated[tuple[str, ...], tyro.conf.arg(name="light", metavar="KEY=VALUE"), tyro.conf.UseAppendAction]
-#: ``--channel NAME``, repeatable.
-Channels = Annotated[tuple[str, ...], tyro.conf.arg(name="channel", metavar="NAME"), tyro.conf.UseAppendAction]
-
-OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH")]
+OptionalPath = Annotated[Path | None, _PATH]
 OptionalText = Annotated[str | None, tyro.conf.arg(metavar="TEXT")]
-#: Name of a data manager; None: recognised from the files.
-DataFormat = Annotated[str | None, tyro.conf.arg(name="format", metavar="NAME")]
 OptionalInt = Annotated[int | None, tyro.conf.arg(metavar="INT")]
+OptionalFloat = Annotated[float | None, tyro.conf.arg(metavar="MM")]
+
+#: ``--output`` or ``-o``: the one spelling of where a command writes.
+Output = Annotated[Path, tyro.conf.arg(aliases=("-o",), metavar="PATH")]
+OptionalOutput = Annotated[Path | None, tyro.conf.arg(aliases=("-o",), metavar="PATH")]
+#: ``--set key=value``, repeatable.
+Assignments = Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE"), tyro.conf.UseAppendAction]
+
+RunFolder = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="Run folder.")]
+SceneFolder = Annotated[Path, tyro.conf.arg(help="The scene's folder.")]
+#: Name of a data manager; None: recognised from the files.
+DataFormat = Annotated[
+    str | None,
+    tyro.conf.arg(
+        metavar="NAME", help="Dataset format (`coliags list datamanagers`); default: recognised from the files."
+    ),
+]
+MovedData = Annotated[
+    Path | None, tyro.conf.arg(metavar="PATH", help="The scene's folder, where it has moved since training.")
+]
+Device = Annotated[Literal["auto", "cpu", "cuda"], tyro.conf.arg(help="Device to compute on.")]
+Overwrite = Annotated[bool, tyro.conf.arg(help="Replace the output where it exists.")]
+AnonymousRun = Annotated[
+    bool,
+    tyro.conf.arg(
+        help="Keep absolute paths out of the run's files (docs/security.md 4); eval and others then need --data."
+    ),
+]
+AsJson = Annotated[bool, tyro.conf.arg(help="Print the summary as JSON.")]
+
+
+def renamed_argument(argv: Sequence[str]) -> str:
+    """What stands today for an argument of an older release among some that could not be parsed; empty without one."""
+    options = {word.partition("=")[0] for word in argv}
+    for old in ("--out", "--save"):
+        if old in options:
+            return f"{old} is now --output, or -o"
+    is_positional = list(argv[:1]) == ["phantom"] or list(argv[:2]) == ["poses", "convert"]
+    if is_positional and not options & {"--output", "-o"}:
+        return "what is written is now named by --output, or -o"
+    if any(option == "--json" and path.endswith(".json") for option, path in pairwise(argv)):
+        return "--json prints the summary, and takes no file: write `--json > FILE`"
+    return ""
 
 
 def parse_size(text: str) -> tuple[int, int]:

@@ -6,32 +6,33 @@ import logging
 import shutil
 import sys
 import tempfile
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import tyro
 
-from coliags_plugin.cli.arguments import Assignments, DataFormat, OptionalPath
+from coliags_plugin.cli.arguments import AsJson, Assignments, DataFormat, OptionalPath
+from coliags_plugin.cli.summaries import print_summary
 
 
 @dataclass(frozen=True)
-class Check:
+class CheckCommand:
     """Check that a method trains, resumes, renders and fails as it should, on the CPU; exit status 1 if not."""
 
     method: tyro.conf.Positional[str]
     """Name of a method (`coliags list methods`) or path of a YAML file."""
-    data: OptionalPath = None
-    """A scene's folder; default: a small phantom."""
-    format: DataFormat = None
-    """Dataset format (`coliags list datamanagers`); default: recognised from the files."""
     steps: int = 20
     """Length of the runs; schedules are scaled to it."""
-    set: Assignments = ()
-    """Change a value of the method config, as for train."""
     keep: bool = False
     """Keep the folder with the phantom and the runs, and print its path."""
     traceback: bool = False
     """Print the whole traceback of every exception."""
+    set: Assignments = ()
+    """Change a value of the method config, as for train."""
+    format: DataFormat = None
+    data: OptionalPath = None
+    """A scene's folder; default: a small phantom."""
+    json: AsJson = False
 
     def run(self) -> None:
         """Print one line per check, then a summary."""
@@ -56,10 +57,11 @@ class Check:
         results = []
         for result in check_method(self.method, folder, self.set, self.data, self.format, self.steps):
             results.append(result)
-            print(line(result, width, encoding), flush=True)
-        print(summary(results))
+            if not self.json:
+                print(line(result, width, encoding), flush=True)
+        text = summary(results)
         if self.traceback:
-            print("".join(tracebacks(results, encoding)))
-        if self.keep:
-            print(folder)
+            text += "\n" + "".join(tracebacks(results, encoding))
+        facts = {"checks": [asdict(result) for result in results]}
+        print_summary(text, facts, written=[folder] if self.keep else [], as_json=self.json)
         return any(result.status == "failed" for result in results)

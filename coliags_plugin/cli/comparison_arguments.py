@@ -5,48 +5,46 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from coliags_plugin.cli.arguments import Assignments, OptionalInt, OptionalPath, OptionalText
+from coliags_plugin.cli.arguments import (
+    AsJson,
+    Assignments,
+    Device,
+    OptionalInt,
+    OptionalPath,
+    OptionalText,
+    Output,
+)
+from coliags_plugin.cli.summaries import coliags, print_summary
 
 if TYPE_CHECKING:
     from coliags_plugin.comparison.cells import Variant
-
-Scenes = Annotated[tuple[str, ...], tyro.conf.arg(metavar="SCENE...")]
-Splits = Annotated[tuple[str, ...], tyro.conf.arg(metavar="SPLIT...")]
-Executors = Annotated[str, tyro.conf.arg(metavar="local|ray")]
 
 
 @dataclass(frozen=True, kw_only=True)
 class ComparisonArguments:
     """Scenes, options of the runs, and how they are carried out."""
 
-    scenes: Scenes
+    scenes: Annotated[tuple[str, ...], tyro.conf.arg(metavar="SCENE...")]
     """Benchmarks (`coliags list benchmarks`), BENCHMARK/SCENE, paths of benchmark files, or folders of scenes."""
-    output: Path
+    output: Output
     """Folder of the comparison; one that is there is extended."""
-    data: OptionalPath = None
-    """Folder of the benchmark's scenes; default scenes/BENCHMARK. Phantoms that are missing are made there."""
     seeds: int = 1
     """Runs of every method on every scene, with the seeds 0, 1, ..."""
     protocol: str = "paper"
     """Evaluation protocol (`coliags list protocols`)."""
     steps: OptionalInt = None
     """Training steps of all runs; default: each method's own."""
-    splits: Splits = ()
+    splits: Annotated[tuple[str, ...], tyro.conf.arg(metavar="SPLIT...")] = ()
     """Splits, each trained apart, for instance every-8th block; default: the scene's own."""
-    set: Assignments = ()
-    """Change a value of every method config, as for train."""
     jobs: OptionalInt = None
     """Runs at a time; default: one per CPU, or per GPU."""
     threads: OptionalInt = None
     """CPU threads of each run; default: the CPUs divided by the runs at a time."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Device to compute on."""
-    executor: Executors = "local"
+    executor: Annotated[str, tyro.conf.arg(metavar="local|ray")] = "local"
     """Where the runs are: processes on this machine, or on a Ray cluster (`pip install "coliags_plugin[sweep]"`)."""
     ray_address: OptionalText = None
     """HOST:PORT of the Ray cluster's head; default: RAY_ADDRESS, or the cluster of this machine."""
@@ -54,9 +52,15 @@ class ComparisonArguments:
     """How often a run is resumed whose process was killed or crashed."""
     dry_run: bool = False
     """Only print what would be done: every cell with its state, and the disk that is needed."""
+    set: Assignments = ()
+    """Change a value of every method config, as for train."""
+    data: OptionalPath = None
+    """Folder of the benchmark's scenes; default scenes/BENCHMARK. Phantoms that are missing are made there."""
+    device: Device = "auto"
+    json: AsJson = False
 
     def carry_out(self, methods: Sequence[str | Variant]) -> None:
-        """Compare, print a summary and the folder; exit with status 1 if a cell failed."""
+        """Compare and print a summary; exit with status 1 if a cell failed."""
         from coliags_plugin.comparison.compare import ExecutionOptions, carry_out, dry_run, make_request
         from coliags_plugin.comparison.folder import ComparisonFolder
 
@@ -66,10 +70,20 @@ class ComparisonArguments:
         options = ExecutionOptions(self.jobs, self.threads, self.device, self.executor, self.ray_address, self.retries)
         folder = ComparisonFolder(self.output)
         if self.dry_run:
-            print(dry_run(request, folder, options).table())
+            planned = dry_run(request, folder, options)
+            cells = [{"cell": each.cell.title, "state": each.state, "bytes": each.size} for each in planned.cells]
+            facts = {"cells": cells, "bytes": planned.size, "free_bytes": planned.free}
+            print_summary(str(planned.table()), facts, as_json=self.json)
             return
         done = carry_out(request, folder, options)
-        print(done.table())
-        print(done.folder)
+        table = done.table()
+        facts = {
+            "cells": len(done.cells),
+            "done": len(done.results),
+            "failed": [vars(failure) for failure in done.failures],
+            "methods": table.rows,
+        }
+        report = [coliags("report", done.folder)] if done.results else []
+        print_summary(str(table), facts, written=[done.folder], then=report, as_json=self.json)
         if done.failures:
             sys.exit(1)

@@ -11,7 +11,7 @@ from coliags_plugin.cli.arguments import Assignments
 
 
 @dataclass(frozen=True)
-class Config:
+class ConfigCommand:
     """Show a method config with everything inherited and every default filled in."""
 
     action: tyro.conf.Positional[Literal["show"]]

@@ -5,38 +5,34 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Literal
 
 import tyro
 
-from coliags_plugin.cli.arguments import Assignments, DataFormat, OptionalPath
+from coliags_plugin.cli.arguments import AsJson, Assignments, DataFormat, OptionalPath, SceneFolder
+from coliags_plugin.cli.summaries import print_summary, train_command
 
 
 @dataclass(frozen=True)
-class Data:
+class DataCommand:
     """Describe a scene and check that images, poses, depth and calibration agree; exit status 1 if suspect."""
 
     action: tyro.conf.Positional[Literal["check"]]
     """What to do."""
-    scene: tyro.conf.Positional[Path]
-    """The scene's folder."""
-    format: DataFormat = None
-    """Dataset format (`coliags list datamanagers`); default: recognised from the files."""
+    scene: tyro.conf.Positional[SceneFolder]
     html: OptionalPath = None
     """Also write an HTML page with images and the trajectory."""
-    json: OptionalPath = None
-    """Also write the results as JSON."""
-    anonymous: bool = False
-    """Keep absolute paths out of the page and the JSON (docs/security.md 4)."""
     set: Assignments = ()
     """An option of the data manager, for instance split=block."""
+    format: DataFormat = None
+    anonymous: bool = False
+    """Keep absolute paths out of the page and the JSON (docs/security.md 4)."""
+    json: AsJson = False
 
     def run(self) -> None:
         """Run the checks and print the results."""
         from coliags_plugin.checks.data.check import check_scene
         from coliags_plugin.checks.data.page import check_page, verdict
-        from coliags_plugin.core.files import write_json
         from coliags_plugin.engine.data_formats import open_scene
         from coliags_plugin.engine.progress import progress_callback
         from coliags_plugin.reporting.html_page import write_html
@@ -49,11 +45,17 @@ class Data:
         if self.anonymous:
             check = check.anonymous()
         page = check_page(check)
-        print(page_text(page), verdict(check), sep="\n\n")
         if self.html is not None:
             write_html(page, self.html)
-            print(self.html.resolve())
-        if self.json is not None:
-            write_json(self.json, check.as_json())
+        chosen = [f"datamanager.{key}" for key in self.set]
+        chosen += [] if self.format is None else [f"datamanager.name={self.format}"]
+        is_ready = check.depth is not None and not check.findings
+        print_summary(
+            f"{page_text(page)}\n\n{verdict(check)}",
+            check.as_json(),
+            written=[] if self.html is None else [self.html],
+            then=[train_command(self.scene, assignments=chosen)] if is_ready else [],
+            as_json=self.json,
+        )
         if check.findings:
             sys.exit(1)

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import sys
+from dataclasses import asdict, dataclass
+
+from coliags_plugin.cli.arguments import AsJson
+from coliags_plugin.cli.summaries import print_summary
 
 
 @dataclass(frozen=True)
-class Doctor:
+class DoctorCommand:
     """Report versions and devices, which renderer would be used and why, and where the weights of LPIPS are."""
+
+    json: AsJson = False
 
     def run(self) -> None:
         """Print the results; exit with status 1 where a requirement is missing."""
-        import sys
-
         from coliags_plugin.checks.installation import check_installation
 
         results = check_installation()
-        for result in results:
-            print(f"{'ok ' if result.status == 'passed' else 'BAD'} {result.name:<34} {result.detail}")
-        if any(result.status == "failed" for result in results):
+        lines = [f"{'BAD' if each.status == 'failed' else 'ok '} {each.name:<34} {each.detail}" for each in results]
+        print_summary("\n".join(lines), {"checks": [asdict(each) for each in results]}, as_json=self.json)
+        if any(each.status == "failed" for each in results):
             sys.exit(1)

@@ -3,35 +3,38 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
 
-import tyro
-
-from coliags_plugin.cli.arguments import OptionalPath, OptionalText
+from coliags_plugin.cli.arguments import AsJson, Device, MovedData, OptionalPath, OptionalText, RunFolder
+from coliags_plugin.cli.summaries import coliags, print_summary
 
 
 @dataclass(frozen=True)
-class Evaluate:
+class EvaluateCommand:
     """Evaluate a run on its held-out frames under a protocol."""
 
-    path: tyro.conf.Positional[Path]
-    """Run folder."""
+    path: RunFolder
     protocol: OptionalText = None
     """Protocol by name (`coliags list protocols`); default: the method config's."""
-    data: OptionalPath = None
-    """The scene's folder, where it has moved since training."""
     truth: OptionalPath = None
     """A scene of the same frames and poses with true depth, to evaluate against instead of the run's own, for runs
     trained on estimated depth; results go into eval/PROTOCOL-truth."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Device to compute on."""
+    data: MovedData = None
+    device: Device = "auto"
+    json: AsJson = False
 
     def run(self) -> None:
-        """Evaluate, print a table, and print the path of the metrics."""
+        """Evaluate and print a table."""
         from coliags_plugin.api.runs import load_run
+        from coliags_plugin.results.summaries import means_summary
 
         run = load_run(self.path, data=self.data, device=self.device)
         result = run.evaluate(self.protocol, truth=self.truth)
-        print(result)
-        print(run.folder.evaluations / result.evaluation_name / "metrics.json")
+        name = result.evaluation_name
+        shown = () if name == "paper" else ("--protocol", name)
+        print_summary(
+            str(result),
+            means_summary(result),
+            written=[run.folder.evaluations / name / "metrics.json"],
+            then=[coliags("report", self.path, *shown)],
+            as_json=self.json,
+        )

@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from coliags_plugin.cli.arguments import Assignments, OptionalText, parse_size, parse_vector
+from coliags_plugin.cli.arguments import (
+    AsJson,
+    Assignments,
+    OptionalText,
+    Output,
+    Overwrite,
+    parse_size,
+    parse_vector,
+)
+from coliags_plugin.cli.summaries import print_summary, train_command
 
 
 @dataclass(frozen=True)
-class Phantom:
+class PhantomCommand:
     """Generate a synthetic, physically lit colon with exact ground truth, in the layout of a dataset."""
 
-    output: tyro.conf.Positional[Path]
+    output: Output
     """Folder to create."""
     seed: int = 0
     """Random seed of the whole phantom."""
-    layout: Annotated[str, tyro.conf.arg(metavar="NAME")] = "c3vd"
-    """Files and folders to write (`coliags list phantom_layouts`)."""
     trajectory: Literal["pullback", "rotation", "inspection"] = "pullback"
     """Withdrawal along the lumen, mostly rotation in place, or a withdrawal that approaches spots of the wall."""
     frames: int = 120
@@ -39,11 +45,13 @@ class Phantom:
     """Extra test views rotated by 15 to 30 degrees; none in layouts that cannot store them."""
     set: Assignments = ()
     """Any other phantom setting, for instance roughness=0.4 (docs/phantom.md 6 lists them)."""
-    overwrite: bool = False
-    """Replace the output folder where it exists."""
+    layout: Annotated[str, tyro.conf.arg(metavar="NAME")] = "c3vd"
+    """Files and folders to write (`coliags list phantom_layouts`)."""
+    overwrite: Overwrite = False
+    json: AsJson = False
 
     def run(self) -> None:
-        """Generate the dataset and print its path."""
+        """Generate the dataset."""
         from coliags_plugin.api.scenes import make_phantom
         from coliags_plugin.config.assignments import parse_assignments
 
@@ -63,4 +71,5 @@ class Phantom:
         if self.light_offset is not None:
             options["light_offset"] = parse_vector("--light-offset", self.light_offset)
         options |= parse_assignments(self.set, expected="KEY=VALUE")
-        print(make_phantom(self.output, **options))
+        made = make_phantom(self.output, **options)
+        print_summary(facts={"settings": options}, written=[made], then=[train_command(made)], as_json=self.json)

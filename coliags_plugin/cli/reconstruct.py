@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 
-from coliags_plugin.cli.arguments import Assignments, OptionalInt, OptionalPath, OptionalText
+from coliags_plugin.cli.arguments import (
+    AsJson,
+    Assignments,
+    Device,
+    OptionalFloat,
+    OptionalInt,
+    OptionalPath,
+    OptionalText,
+    Output,
+    parse_size,
+)
+from coliags_plugin.cli.summaries import print_summary, view_command
 
 
 @dataclass(frozen=True)
-class Reconstruct:
+class ReconstructCommand:
     """Reconstruct a colon from a video alone: frames, poses, depth, training, mesh, coverage and report.
 
     Each stage is kept: repeated, the command goes on with what is missing, also after a kill.
@@ -20,14 +31,14 @@ class Reconstruct:
 
     video: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="VIDEO")]
     """Video file, folder of images ordered by the numbers in their names, or folder of a scene with poses."""
-    out: Path
+    output: Output
     """Folder of the results."""
     camera: OptionalText = None
     """A known camera, scaled to the frames (c3vd: whole frames of C3VD; c3vd-undistorted), or a camera model of COLMAP;
     default: found from the frames."""
     params: Annotated[OptionalText, tyro.conf.arg(metavar="P1,P2,...")] = None
     """Parameters of COLMAP's model, for the frames' size, pixel centres at integers + 0.5; default: estimated."""
-    diameter: Annotated[float | None, tyro.conf.arg(metavar="MM")] = None
+    diameter: OptionalFloat = None
     """The colon's typical inner diameter, which gives lengths in mm, roughly; default: their unit stays unknown."""
     every: OptionalInt = None
     """Use the sharpest of every n frames; default: such that at most 200 are left."""
@@ -39,20 +50,19 @@ class Reconstruct:
     """Method to train; default: coliags-estimated-depth, or coliags for a scene with depth."""
     steps: OptionalInt = None
     """Training steps; default 2000."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Device to compute on."""
     set: Assignments = ()
     """Any setting of a stage, for instance frames.least_motion=0, sfm.max_ratio=0.9 or depth.agreement=0.03
     (docs/reconstruct.md)."""
+    device: Device = "auto"
     overwrite: bool = False
     """Repeat the stages that were made with other options, and what follows them."""
     anonymous: bool = False
     """Keep absolute paths out of what is written (docs/security.md 4)."""
+    json: AsJson = False
 
     def run(self) -> None:
         """Run the stages that are not done, and print what there is."""
         from coliags_plugin.api.reconstructing import reconstruct
-        from coliags_plugin.cli.arguments import parse_size
         from coliags_plugin.config.assignments import parse_assignments
         from coliags_plugin.pipeline.page import PAGE_FILE
 
@@ -70,16 +80,22 @@ class Reconstruct:
         settings = {key: value for key, value in given.items() if value is not None}
         record = reconstruct(
             self.video,
-            self.out,
+            self.output,
             settings={**settings, **parse_assignments(self.set)},
             mask=self.mask,
             device=self.device,
             overwrite=self.overwrite,
             anonymous=self.anonymous,
         )
-        for name, stage in record.stages.items():
-            print(f"{name}: {stage.summary}")
-        for stage in record.stages.values():
-            for path, what in stage.files.items():
-                print(f"{self.out / path}: {what}")
-        print(self.out / PAGE_FILE)
+        stages = record.stages
+        lines = [f"{name}: {stage.summary}" for name, stage in stages.items()]
+        lines += [
+            f"{self.output / path}: {content}" for stage in stages.values() for path, content in stage.files.items()
+        ]
+        print_summary(
+            "\n".join(lines),
+            {"stages": {name: asdict(stage) for name, stage in stages.items()}},
+            written=[self.output / PAGE_FILE],
+            then=[view_command(self.output / "run")],
+            as_json=self.json,
+        )

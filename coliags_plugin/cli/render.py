@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
 
-from coliags_plugin.cli.arguments import Channels, LampOptions, OptionalPath
+from coliags_plugin.cli.arguments import AsJson, Device, MovedData, OptionalOutput, Overwrite, RunFolder
+from coliags_plugin.cli.summaries import print_summary, view_command
 
 
 @dataclass(frozen=True)
-class Render:
+class RenderCommand:
     """Render rgb, depth and error images of a run, and a video along its trajectory."""
 
-    path: tyro.conf.Positional[Path]
-    """Run folder."""
-    output: OptionalPath = None
+    path: RunFolder
+    output: OptionalOutput = None
     """Folder to create; default RUN/renders, with --light or --flatten RUN/relit."""
     frames: str = "test"
     """Which frames: train, all, or the name of a test set."""
@@ -30,7 +29,7 @@ class Render:
     is absorbed. Pictures are hatched where alpha is below 0.5."""
     depth_tiff: bool = False
     """Also write depth as float32 TIFF, scene units: depth_tiff/."""
-    light: LampOptions = ()
+    light: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE"), tyro.conf.UseAppendAction] = ()
     """Render under another lamp, for methods that model it: offset=[X,Y,Z] from the camera in its axes (mm),
     turn=[A,B] about its x and y axes (degrees), power=P (exponent of the cosine to the lamp's axis), intensity=F
     (factor)."""
@@ -38,17 +37,15 @@ class Render:
     """Render every wall point as at one distance and angle from the lamp, without gain: default folder RUN/relit."""
     light_map: bool = False
     """Also write the light that the method has learned, beside a phantom's: light.html and light.json."""
-    channel: Channels = ()
+    channel: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME"), tyro.conf.UseAppendAction] = ()
     """Also write a feature channel of the method's Gaussians, for instance albedo."""
-    data: OptionalPath = None
-    """The scene's folder, where it has moved since training."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Device to compute on."""
-    overwrite: bool = False
-    """Replace the output folder where it exists."""
+    data: MovedData = None
+    device: Device = "auto"
+    overwrite: Overwrite = False
+    json: AsJson = False
 
     def run(self) -> None:
-        """Render and print the output folder."""
+        """Render, and print the output folder."""
         from coliags_plugin.api.runs import load_run
         from coliags_plugin.config.assignments import parse_assignments
         from coliags_plugin.core.errors import InputError
@@ -61,16 +58,15 @@ class Render:
             run = run.relight(**lamp)
         if self.flatten:
             run = run.flatten()
-        print(
-            run.write_renders(
-                self.output,
-                self.frames,
-                video=self.video,
-                fps=self.fps,
-                channels=self.channel,
-                depth_kind=self.depth_kind,
-                depth_tiff=self.depth_tiff,
-                light_map=self.light_map,
-                overwrite=self.overwrite,
-            )
+        folder = run.write_renders(
+            self.output,
+            self.frames,
+            video=self.video,
+            fps=self.fps,
+            channels=self.channel,
+            depth_kind=self.depth_kind,
+            depth_tiff=self.depth_tiff,
+            light_map=self.light_map,
+            overwrite=self.overwrite,
         )
+        print_summary(written=[folder], then=[view_command(self.path, self.data)], as_json=self.json)

@@ -8,26 +8,18 @@ from typing import Annotated, Literal
 
 import tyro
 
-from coliags_plugin.cli.arguments import OptionalPath, OptionalText
-
-#: ``--format NAME``, repeatable.
-Formats = Annotated[
-    tuple[Literal["html", "markdown", "latex", "csv", "all"], ...],
-    tyro.conf.arg(name="format"),
-    tyro.conf.UseAppendAction,
-]
+from coliags_plugin.cli.arguments import AsJson, OptionalOutput, OptionalPath, OptionalText
+from coliags_plugin.cli.summaries import print_summary
 
 
 @dataclass(frozen=True)
-class Report:
+class ReportCommand:
     """Compare evaluated methods: tables with statistics, held-out views, errors, curves and costs."""
 
     paths: tyro.conf.Positional[tuple[Path, ...]]
     """Evaluated run folders, results files (`eval/PROTOCOL/result.json`), or the folder of a `coliags compare`."""
-    output: OptionalPath = None
+    output: OptionalOutput = None
     """File to write; with several formats, its suffix is replaced by that of each; default: report.html, .md, ..."""
-    format: Formats = ()
-    """What to write, repeatable: html (default), markdown, latex (booktabs), csv (every frame), or all."""
     methods: OptionalText = None
     """Names of methods to show, in this order, separated by commas; default: all."""
     columns: OptionalText = None
@@ -43,10 +35,13 @@ class Report:
     """Heading; default: methods and scenes."""
     note: OptionalText = None
     """A remark shown at the top."""
-    anonymous: bool = False
-    """Leave out absolute paths that results hold (docs/security.md 4)."""
     scene: OptionalPath = None
     """Run folder whose scene the HTML page lets its reader fly through, offline; needs the extra `viewer`."""
+    format: Annotated[tuple[Literal["html", "markdown", "latex", "csv", "all"], ...], tyro.conf.UseAppendAction] = ()
+    """What to write, repeatable: html (default), markdown, latex (booktabs), csv (every frame), or all."""
+    anonymous: bool = False
+    """Leave out absolute paths that results hold (docs/security.md 4)."""
+    json: AsJson = False
 
     def run(self) -> None:
         """Write the report and print the paths."""
@@ -68,8 +63,7 @@ class Report:
             scene=self.scene,
             anonymous=self.anonymous,
         )
-        for file in files:
-            print(file.resolve())
+        print_summary(written=[file.resolve() for file in files], as_json=self.json)
 
 
 def _listed(text: str | None) -> tuple[str, ...]:

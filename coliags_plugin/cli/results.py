@@ -8,38 +8,46 @@ from typing import Annotated, Literal
 
 import tyro
 
+from coliags_plugin.cli.arguments import AsJson, Output
+from coliags_plugin.cli.summaries import print_summary
+
 
 @dataclass(frozen=True)
-class Show:
+class ResultsShowCommand:
     """Show results: what was run, means of the metrics, and what it cost."""
 
     path: tyro.conf.Positional[Path]
     """Results file, or a run folder, or a folder to search for results files."""
+    json: AsJson = False
 
     def run(self) -> None:
         """Print a table for each."""
         from coliags_plugin.results.finding import find_results
-        from coliags_plugin.results.summaries import facts
+        from coliags_plugin.results.summaries import facts, means_summary
 
-        for result in find_results([self.path]):
-            print(result)
-            for name, text in facts(result).items():
-                print(f"{name:<16}{text}")
+        results = find_results([self.path])
+        texts = [
+            "\n".join([str(result), *(f"{name:<16}{text}" for name, text in facts(result).items())])
+            for result in results
+        ]
+        summaries = {"results": [{**means_summary(result), "facts": facts(result)} for result in results]}
+        print_summary("\n".join(texts), summaries, as_json=self.json)
 
 
 @dataclass(frozen=True)
-class Export:
+class ResultsExportCommand:
     """Export results as a long table of every frame's metrics, or in the form of nerfbaselines' results files."""
 
     paths: tyro.conf.Positional[tuple[Path, ...]]
     """Results files, run folders, or folders to search for results files."""
-    output: Path
+    output: Output
     """File to write; for nerfbaselines a folder."""
     format: Literal["csv", "parquet", "nerfbaselines"] = "csv"
     """Form; parquet needs the extra `tables`."""
+    json: AsJson = False
 
     def run(self) -> None:
-        """Write the files and print their paths."""
+        """Write the files."""
         from coliags_plugin.core.errors import InputError
         from coliags_plugin.results.finding import find_results
         from coliags_plugin.results.nerfbaselines import write_nerfbaselines
@@ -56,15 +64,17 @@ class Export:
             write = write_csv if self.format == "csv" else write_parquet
             write(self.output, results)
             files = [self.output]
-        for file in files:
-            print(file.resolve())
+        print_summary(written=[file.resolve() for file in files], as_json=self.json)
 
 
-Subcommand = Annotated[Show, tyro.conf.subcommand("show")] | Annotated[Export, tyro.conf.subcommand("export")]
+Subcommand = (
+    Annotated[ResultsShowCommand, tyro.conf.subcommand("show")]
+    | Annotated[ResultsExportCommand, tyro.conf.subcommand("export")]
+)
 
 
 @dataclass(frozen=True)
-class Results:
+class ResultsCommand:
     """Show results files, and export them as tables."""
 
     subcommand: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Subcommand]]

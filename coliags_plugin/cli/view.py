@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
 
-import tyro
-
-from coliags_plugin.cli.arguments import OptionalPath
+from coliags_plugin.cli.arguments import AsJson, Device, MovedData, OptionalOutput, RunFolder
+from coliags_plugin.cli.summaries import print_summary
 
 
 @dataclass(frozen=True)
-class View:
+class ViewCommand:
     """Show a run in a browser: Gaussians, cameras, meshes, recorded and rendered pictures. Needs the extra `viewer`."""
 
-    path: tyro.conf.Positional[Path]
-    """Run folder."""
+    path: RunFolder
+    output: OptionalOutput = None
+    """Write the scene to this file instead, as a self-contained HTML page of at most 5 MB, which opens offline."""
     host: str = "127.0.0.1"
     """Name or address to listen on; 0.0.0.0: all of this machine, for anyone who can reach it. From another machine,
     better: ssh -L 8080:localhost:8080 THIS_MACHINE, and open http://localhost:8080 there."""
@@ -24,20 +22,17 @@ class View:
     """Port to listen on; 0: any free one."""
     open: bool = True
     """Open a browser, where there is a display."""
-    save: OptionalPath = None
-    """Write the scene as a self-contained page of at most 5 MB instead, which opens offline."""
-    data: OptionalPath = None
-    """The scene's folder, where it has moved since training."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Device to compute on."""
+    data: MovedData = None
+    device: Device = "auto"
+    json: AsJson = False
 
     def run(self) -> None:
-        """Serve the run until Ctrl-C, or write the page and print its path."""
+        """Serve the run until Ctrl-C, or write the page."""
         from coliags_plugin.api.runs import load_run
 
         run = load_run(self.path, data=self.data, device=self.device)
-        if self.save is not None:
-            print(run.save_view(self.save))
+        if self.output is not None:
+            print_summary(written=[run.save_view(self.output)], as_json=self.json)
             return
         try:
             with run.view(host=self.host, port=self.port) as viewer:

@@ -11,7 +11,7 @@ from coliags_plugin.cli.arguments import OptionalPath
 
 
 @dataclass(frozen=True)
-class Weights:
+class WeightsCommand:
     """Download the weights that LPIPS needs, or copy them; nothing else in this package downloads."""
 
     metric: tyro.conf.Positional[Literal["lpips"]]

@@ -187,7 +187,7 @@ class RecordedDataManager(DataManager):
             raise NoPointsError(
                 f"{path} has neither depth files nor {missing}",
                 "depth or points for the initial Gaussians",
-                f"Create a scene with points: coliags poses triangulate {shlex.quote(str(path))} --out FOLDER; or put "
+                f"Create a scene with points: coliags poses triangulate {shlex.quote(str(path))} -o FOLDER; or put "
                 f"{missing} (world of the poses) there; or set initial_points: file and points_file",
             )
         points = subsampled(own(), settings.points_count, generator, recording.points_source)

@@ -58,7 +58,9 @@ def reconstruct(
     """
     made, read = out.resolve(), source.resolve()
     if made == read or made in read.parents or (source.is_dir() and read in made.parents):
-        raise InputError(f"--out {out}, and the input is {source}", "a folder apart from the input", "Choose another")
+        raise InputError(
+            f"--output {out}, and the input is {source}", "a folder apart from the input", "Choose another"
+        )
     if mask is not None and not mask.is_file():
         raise InputError(f"no file {mask}", "an image, black where pixels are ignored", "Check --mask")
     data_format = find_format(source) if source.is_dir() and recognised(source) else None

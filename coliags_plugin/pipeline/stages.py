@@ -69,13 +69,13 @@ class Record:
                 return cls(folder, {name: StageRecord(**stage) for name, stage in content["stages"].items()})
             except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
                 raise InputError(
-                    f"cannot read {file}: {error}", "what `coliags reconstruct` wrote", "Choose another --out"
+                    f"cannot read {file}: {error}", "what `coliags reconstruct` wrote", "Choose another --output"
                 ) from error
         if folder.exists() and (not folder.is_dir() or any(not _is_ours(path) for path in folder.iterdir())):
             raise InputError(
                 f"{folder} already exists and is no reconstruction",
                 "a new or empty folder, or one that `coliags reconstruct` made",
-                "Choose another --out",
+                "Choose another --output",
             )
         return cls(folder)
 
@@ -199,7 +199,7 @@ def _check_options(stages: Sequence[Stage], record: Record, overwrite: bool) -> 
             raise InputError(
                 f"{record.folder}: stage {stage.name} was made with {_differences(known.options, stage.options)}",
                 "the options that it was begun with",
-                f"Choose another --out, or pass --overwrite to repeat {stage.name} and what follows it",
+                f"Choose another --output, or pass --overwrite to repeat {stage.name} and what follows it",
             )
         later = stages[number:]
         record.forget([other.name for other in later], [output for other in later for output in other.outputs])

@@ -71,7 +71,7 @@ _BUILT_IN = {name: registry.losses._targets[name] for name in ("l1", "d-ssim")}
 def test_what_is_kept_can_be_looked_at(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     assert run("check", "3dgs", "--data", write_wall(tmp_path / "wall", frames=17), *SMALL, "--keep") == 0
-    folder = Path(capsys.readouterr().out.splitlines()[-1])
+    folder = Path(capsys.readouterr().out.splitlines()[-1].removeprefix("written: "))
     assert (folder / "run" / "eval" / "paper" / "metrics.json").is_file()
     assert not (folder / "phantom").exists()
 

@@ -160,7 +160,9 @@ def test_moved_data_are_found_by_option(trained, scene, tmp_path, capsys):
 def test_eval_against_another_scene(trained, scene, tmp_path, capsys):
     copy = Path(shutil.copytree(scene, tmp_path / "true"))
     assert run("eval", trained, "--truth", copy) == 0
-    assert capsys.readouterr().out.rstrip().endswith("eval/paper-truth/metrics.json")
+    shown = capsys.readouterr().out.splitlines()
+    assert shown[-2] == f"written: {trained / 'eval/paper-truth/metrics.json'}"
+    assert shown[-1] == f"next:    coliags report {trained} --protocol paper-truth"
     own, against = (
         json.loads((trained / f"eval/{name}/metrics.json").read_text()) for name in ("paper", "paper-truth")
     )
@@ -180,8 +182,10 @@ def test_resume_from_the_command_line(scene, tmp_path):
 
 def test_default_run_folder_and_resume_of_the_newest(scene, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert run("train", "ablations/depth", "--data", scene, "--steps", 1, *SETS) == 0
-    printed = Path(capsys.readouterr().out.strip())
+    assert run("train", "ablations/depth", "--data", scene, "--steps", 1, "--json", *SETS) == 0
+    told = json.loads(capsys.readouterr().out)
+    printed = Path(told["written"][0])
+    assert told["step"] == 1 and told["next"] == [f"coliags eval {printed}"]
     assert printed.parts[:3] == ("runs", "wall", "depth")
     assert run("train", "ablations/depth", "--data", scene, "--steps", 2, "--resume", *SETS) == 0
     assert (printed / "checkpoints" / "step-000002").is_dir()
@@ -207,7 +211,7 @@ def test_list_and_config_and_doctor(capsys):
 
 def test_phantom_trains(tmp_path):
     coarse = [part for s in ("mesh_spacing=3.0", "texture_spacing=1.0") for part in ("--set", s)]
-    argv = ("phantom", tmp_path / "p", "--size", "48x38", "--frames", 9, "--rotation-views", 2, *coarse)
+    argv = ("phantom", "-o", tmp_path / "p", "--size", "48x38", "--frames", 9, "--rotation-views", 2, *coarse)
     assert run(*argv) == 0
     assert run("train", "coliags", "--data", tmp_path / "p", "--output", tmp_path / "r", "--steps", 2) == 0
     assert run("eval", tmp_path / "r") == 0
@@ -256,7 +260,7 @@ def test_output_that_is_a_file(capsys, scene, tmp_path):
     (tmp_path / "file").write_text("x")
     argv = ("train", "coliags", "--data", scene, "--output", tmp_path / "file" / "run", "--steps", 1, *SETS)
     assert "cannot write" in refused(capsys, *argv)
-    assert "cannot write" in refused(capsys, "phantom", tmp_path / "file" / "phantom", "--frames", 9)
+    assert "cannot write" in refused(capsys, "phantom", "-o", tmp_path / "file" / "phantom", "--frames", 9)
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
@@ -333,7 +337,7 @@ def test_report_before_eval(capsys, trained, tmp_path):
     ],
 )
 def test_bad_phantoms(capsys, tmp_path, argv):
-    refused(capsys, "phantom", tmp_path / "p", *argv)
+    refused(capsys, "phantom", "-o", tmp_path / "p", *argv)
     assert not any(tmp_path.iterdir())
 
 

@@ -25,7 +25,7 @@ def run_folder(tmp_path, monkeypatch):
 
 def test_the_mesh_of_a_run(run_folder, capsys):
     assert run("mesh", run_folder, "--voxel", 0.4, "--format", "ply", "glb", "--set", "depth=expected") == 0
-    assert capsys.readouterr().out.strip() == str(run_folder / "mesh")
+    assert f"written: {run_folder / 'mesh'}\n" in capsys.readouterr().out
     assert {path.name for path in (run_folder / "mesh").iterdir()} == {"mesh.ply", "mesh.glb", "mesh.json"}
     text = (run_folder / "mesh/mesh.json").read_text()
     assert '"voxel_size": 0.4' in text and '"depth": "expected"' in text

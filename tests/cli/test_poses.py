@@ -53,16 +53,16 @@ def test_convert_through_every_format(truth, tmp_path, capsys):
     source = truth
     for name in steps:
         target = tmp_path / f"as-{name}"
-        assert run("poses", "convert", source, target, "--to", name, *PINHOLE) == 0
-        assert capsys.readouterr().out == f"{target}\n"
+        assert run("poses", "convert", source, "-o", target, "--to", name, *PINHOLE) == 0
+        assert capsys.readouterr().out == f"written: {target}\n"
         source = target
     np.testing.assert_allclose(format_of(source).read(source).camera_to_world, spiral(), atol=1e-9)
 
 
 def test_convert_says_what_it_read_and_what_it_lost(truth, tmp_path, caplog):
     caplog.set_level("INFO")
-    assert run("poses", "convert", truth, tmp_path / "t.json", "--to", "nerfstudio") == 0
-    assert run("poses", "convert", tmp_path / "t.json", tmp_path / "t.tum", "--to", "tum") == 0
+    assert run("poses", "convert", truth, "-o", tmp_path / "t.json", "--to", "nerfstudio") == 0
+    assert run("poses", "convert", tmp_path / "t.json", "-o", tmp_path / "t.tum", "--to", "tum") == 0
     said = caplog.text
     assert "c3vd (camera-to-world matrices, column-major); 20 poses, path" in said
     assert "mean step" in said
@@ -76,7 +76,7 @@ def test_images_give_names(truth, tmp_path, capsys):
     (tmp_path / "images").mkdir()
     for index in range(20):
         write_png(tmp_path / "images" / f"{index}_color.png", np.zeros((2, 2, 3), np.uint8))
-    argv = ("poses", "convert", truth, tmp_path / "model", "--to", "colmap-text", *PINHOLE)
+    argv = ("poses", "convert", truth, "-o", tmp_path / "model", "--to", "colmap-text", *PINHOLE)
     assert run(*argv, "--images", tmp_path / "images") == 0
     assert format_named("colmap").read(tmp_path / "model").names == tuple(f"{index}_color.png" for index in range(20))
     (tmp_path / "images" / "7_color.png").unlink()
@@ -100,40 +100,44 @@ def test_images_give_names(truth, tmp_path, capsys):
     ],
 )
 def test_what_convert_refuses(truth, tmp_path, capsys, argv, message):
-    assert message in refused(capsys, "poses", "convert", truth, tmp_path / "out", *argv)
+    assert message in refused(capsys, "poses", "convert", truth, "-o", tmp_path / "out", *argv)
     assert [path.name for path in tmp_path.iterdir()] == ["pose.txt"]
 
 
 def test_convert_replaces_only_when_asked_and_never_its_input(truth, tmp_path, capsys):
     before = truth.read_bytes()
-    argv = ("poses", "convert", truth, tmp_path / "out.tum", "--to", "tum")
+    argv = ("poses", "convert", truth, "-o", tmp_path / "out.tum", "--to", "tum")
     assert run(*argv) == 0
     assert "already exists" in refused(capsys, *argv)
     assert run(*argv, "--overwrite") == 0
-    message = refused(capsys, "poses", "convert", truth, truth, "--to", "tum", "--overwrite")
+    message = refused(capsys, "poses", "convert", truth, "-o", truth, "--to", "tum", "--overwrite")
     assert "is the input itself" in message
     assert truth.read_bytes() == before
-    assert "no file or folder" in refused(capsys, "poses", "convert", tmp_path / "x", tmp_path / "y", "--to", "tum")
+    assert "no file or folder" in refused(
+        capsys, "poses", "convert", tmp_path / "x", "-o", tmp_path / "y", "--to", "tum"
+    )
 
 
 def test_align_prints_errors_and_writes_them(estimate, truth, tmp_path, capsys):
-    figures, plot = tmp_path / "out" / "figures.json", tmp_path / "out" / "plot.png"
-    assert run("poses", "align", estimate, truth, "--scale", "--json", figures, "--plot", plot) == 0
+    argv, plot = ("poses", "align", estimate, truth), tmp_path / "out" / "plot.png"
+    assert run(*argv, "--scale", "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert run(*argv, "--scale", "--plot", plot) == 0
     shown = capsys.readouterr().out
     assert "20 frames matched by index, of 20 estimated and 20 reference ones" in shown
     assert "Sim(3): rotation" in shown
-    told = json.loads(figures.read_text())
     assert told["unit"] == "mm"
     assert told["scale"] == pytest.approx(4.0, rel=0.02)
     assert 0.05 < told["ate"]["rmse"] < 0.2
     assert f"{told['ate']['rmse']:.4g}" in shown
-    assert shown.rstrip().endswith(f"{figures}\n{plot}")
+    assert shown.rstrip().endswith(f"written: {plot}")
     assert read_rgb(plot).shape == (900, 1200, 3)
     assert cv2.imread(str(plot)).std() > 1.0
-    message = refused(capsys, "poses", "align", estimate, truth, "--json", figures)
-    assert "already exists" in message
-    assert run("poses", "align", estimate, truth, "--json", figures, "--overwrite") == 0
-    assert json.loads(figures.read_text())["ate"]["rmse"] > told["ate"]["rmse"]
+    assert "already exists" in refused(capsys, *argv, "--plot", plot)
+    assert run(*argv, "--plot", plot, "--overwrite", "--json") == 0
+    without_scale = json.loads(capsys.readouterr().out)
+    assert without_scale["ate"]["rmse"] > told["ate"]["rmse"]
+    assert without_scale["written"] == [str(plot)]
 
 
 def test_align_warns_where_positions_determine_no_rotation(tmp_path, capsys, caplog):
@@ -143,12 +147,13 @@ def test_align_warns_where_positions_determine_no_rotation(tmp_path, capsys, cap
     turned = poses.copy()
     turned[:, :3, :3] = Rotation.from_euler("z", 178, degrees=True).as_matrix()
     write_trajectory(tmp_path / "turned", Trajectory(turned), "c3vd")
-    figures = tmp_path / "figures.json"
-    assert run("poses", "align", tmp_path / "turned", tmp_path / "line", "--json", figures) == 0
+    argv = ("poses", "align", tmp_path / "turned", tmp_path / "line")
+    assert run(*argv) == 0
     assert "the positions lie on a line" in caplog.text
     assert "the rotation is that by orientations about the path" in caplog.text
     assert "ATE rmse: 0 % of the path, 4 mm" in capsys.readouterr().out
-    assert json.loads(figures.read_text())["rotation_deg"]["max"] < 1e-9
+    assert run(*argv, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["rotation_deg"]["max"] < 1e-9
 
 
 @pytest.mark.parametrize(
@@ -158,12 +163,13 @@ def test_align_warns_where_positions_determine_no_rotation(tmp_path, capsys, cap
         (("--delta", 20), "over 20 frames"),
         (("--match", "name"), "not both have names"),
         (("--estimate-format", "c3vd"), "line 1"),
-        (("--json", "."), "already exists"),
-        (("--json", ".", "--overwrite"), "is a folder"),
+        (("--plot", "plot.png"), "already exists"),
+        (("--plot", "plot.png", "--overwrite"), "is a folder"),
     ],
 )
 def test_what_align_refuses(estimate, truth, tmp_path, monkeypatch, capsys, argv, message):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "plot.png").mkdir()
     assert message in refused(capsys, "poses", "align", estimate, truth, *argv)
 
 
@@ -179,7 +185,7 @@ def test_align_warns_where_names_were_passed_over(tmp_path, caplog):
 
 def test_align_with_the_truth_inside_params_npz(truth, tmp_path, capsys):
     params = tmp_path / "params.npz"
-    assert run("poses", "convert", truth, params, "--to", "endogslam", *PINHOLE) == 0
+    assert run("poses", "convert", truth, "-o", params, "--to", "endogslam", *PINHOLE) == 0
     assert run("poses", "align", params, params, "--reference-format", "endogslam-truth") == 0
     assert "20 frames matched by index" in capsys.readouterr().out
 

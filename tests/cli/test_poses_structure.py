@@ -50,16 +50,16 @@ def tube(tmp_path_factory):
 def test_triangulate_makes_a_scene_that_trains(tube, tmp_path, capsys):
     assert "coliags poses triangulate" in refused(capsys, "train", "scaffold-gs", "--data", tube)
     out = tmp_path / "out"
-    assert run("poses", "triangulate", tube, "--out", out) == 0
-    summary, place, *commands = capsys.readouterr().out.splitlines()
+    assert run("poses", "triangulate", tube, "--output", out) == 0
+    summary, *end = capsys.readouterr().out.splitlines()
     assert "points of" in summary
     assert "mean reprojection error 0." in summary
     assert "frames each" in summary
     assert "depth uncertainty" in summary
-    assert place == str(out)
-    assert commands == [
-        f"coliags depth estimate {out} --out {out}-depth",
-        f"coliags train coliags-estimated-depth --data {out}-depth",
+    assert end == [
+        f"written: {out}",
+        f"next:    coliags depth estimate {out} --output {out}-depth",
+        f"next:    coliags train coliags-estimated-depth --data {out}-depth",
     ]
     assert read_unit(out) == "mm"
     scene, source = open_scene(out), open_scene(tube)
@@ -80,7 +80,7 @@ def test_options_of_reading_and_of_triangulation(tube, tmp_path, capsys, caplog)
     out = tmp_path / "out"
     caplog.set_level("INFO")
     options = ("--set", "split=endogslam", "--set", "triangulation.min_track_length=5", "--format", "c3vd")
-    assert run("poses", "triangulate", tube, "--out", out, *options, "--set", "width=120", "--set", "height=96") == 0
+    assert run("poses", "triangulate", tube, "--output", out, *options, "--set", "width=120", "--set", "height=96") == 0
     command = capsys.readouterr().out.splitlines()[-1]
     assert command.endswith("--set datamanager.split=endogslam")
     assert "points come from the 8 training frames; the 1 test frames see none" in caplog.text
@@ -88,7 +88,7 @@ def test_options_of_reading_and_of_triangulation(tube, tmp_path, capsys, caplog)
     assert [frame.name for frame in scene.test_sets["test"]] == ["0007_color"]
     assert scene.test_sets["test"][0].sparse_depth is None
     assert scene.train[0].image.shape == (96, 120, 3)
-    argv = ("poses", "triangulate", tube, "--out", out)
+    argv = ("poses", "triangulate", tube, "--output", out)
     assert "already exists" in refused(capsys, *argv)
     assert run(*argv, "--overwrite", "--set", "split=all-train") == 0
     assert capsys.readouterr().out.splitlines()[-1].endswith("--set datamanager.split=all-train")
@@ -97,9 +97,9 @@ def test_options_of_reading_and_of_triangulation(tube, tmp_path, capsys, caplog)
 def test_features_are_detected_at_the_stored_size(tube, tmp_path, capsys, caplog):
     caplog.set_level("INFO")
     whole, half = tmp_path / "whole", tmp_path / "half"
-    assert run("poses", "triangulate", tube, "--out", whole) == 0
+    assert run("poses", "triangulate", tube, "--output", whole) == 0
     assert "detected at" not in caplog.text
-    assert run("poses", "triangulate", tube, "--out", half, "--set", "width=80", "--set", "height=64") == 0
+    assert run("poses", "triangulate", tube, "--output", half, "--set", "width=80", "--set", "height=64") == 0
     assert "features are detected at the stored size, 160 x 128" in caplog.text
     models = [pycolmap.Reconstruction(str(folder / "sparse" / "0")) for folder in (whole, half)]
     # The same points from the same images, in pixels of half the size.
@@ -127,14 +127,14 @@ def test_features_are_detected_at_the_stored_size(tube, tmp_path, capsys, caplog
         (("--set", "splitt=block"), "unknown key 'splitt'"),
         (("--set", "triangulation.min_angle"), "key.path=value"),
         (("--set", "max_frames=1", "--set", "split=all-train"), "1 frames. Expected at least two"),
-        (("--out", "tube/out"), "a folder apart from the input"),
-        (("--out", "."), "a folder apart from the input"),
+        (("--output", "tube/out"), "a folder apart from the input"),
+        (("--output", "."), "a folder apart from the input"),
         (("--format", "rgbd"), "coliags: "),
     ],
 )
 def test_what_triangulate_refuses(tube, monkeypatch, capsys, argv, message):
     monkeypatch.chdir(tube.parent)
-    assert message in refused(capsys, "poses", "triangulate", "tube", "--out", "new", *argv)
+    assert message in refused(capsys, "poses", "triangulate", "tube", "--output", "new", *argv)
     assert [path.name for path in tube.parent.iterdir()] == ["tube"]
 
 
@@ -161,26 +161,26 @@ def test_splits_are_kept_where_a_rule_tells_them(caplog):
 
 def test_sfm_makes_a_scene_that_trains_and_aligns(tube, tmp_path, capsys, caplog):
     out = tmp_path / "out"
-    assert run("poses", "sfm", tube / "images", "--out", out, *CAMERA, "--every", 2, "--max-frames", 5) == 0
-    summary, unit, place, *commands = capsys.readouterr().out.splitlines()
+    assert run("poses", "sfm", tube / "images", "--output", out, *CAMERA, "--every", 2, "--max-frames", 5) == 0
+    summary, unit, *end = capsys.readouterr().out.splitlines()
     assert summary.startswith("5 of 5 images posed")
     assert unit.startswith("unit: unknown, as images alone do not determine it; the median depth of the points is")
     assert read_unit(out) == "unknown"
     assert open_scene(out).provenance["unit"] == "unknown"
-    assert place == str(out)
-    assert commands == [
-        f"coliags depth estimate {out} --out {out}-depth",
-        f"coliags train coliags-estimated-depth --data {out}-depth",
+    assert end == [
+        f"written: {out}",
+        f"next:    coliags depth estimate {out} --output {out}-depth",
+        f"next:    coliags train coliags-estimated-depth --data {out}-depth",
     ]
     assert sorted(path.name for path in (out / "images").iterdir()) == [f"{n:04d}_color.png" for n in range(0, 9, 2)]
     command = f"coliags train coliags-sparse-depth --data {out}"
     assert trains(command, tmp_path / "run")["depth"] > 0.0
     capsys.readouterr()
-    assert run("poses", "convert", tube / "camera_pose.txt", tmp_path / "true", "--to", "colmap", "--images",
+    assert run("poses", "convert", tube / "camera_pose.txt", "-o", tmp_path / "true", "--to", "colmap", "--images",
                tube / "images", "--intrinsics", "1,1,1,1", "--size", "2x2") == 0  # fmt: skip
-    figures = tmp_path / "figures.json"
-    assert run("poses", "align", out / "sparse" / "0", tmp_path / "true", "--scale", "--json", figures) == 0
-    told = json.loads(figures.read_text())
+    capsys.readouterr()
+    assert run("poses", "align", out / "sparse" / "0", tmp_path / "true", "--scale", "--json") == 0
+    told = json.loads(capsys.readouterr().out)
     assert told["matched_by"] == "name"
     assert told["ate"]["rmse"] < 0.2
 
@@ -190,7 +190,7 @@ def test_a_known_distance_or_diameter_fixes_the_scale(tube, tmp_path, capsys, ca
     first, last = truth[0, :3, 3], truth[8, :3, 3]
     argv = ("poses", "sfm", tube / "images", *CAMERA, "--every", 4)
     known = f"0000_color.png,0008_color,{np.linalg.norm(last - first)}"
-    assert run(*argv, "--out", tmp_path / "by-distance", "--distance", known) == 0
+    assert run(*argv, "--output", tmp_path / "by-distance", "--distance", known) == 0
     assert "unit: mm, " in capsys.readouterr().out
     assert read_unit(tmp_path / "by-distance") == "mm"
     scene = open_scene(tmp_path / "by-distance", options=["split=all-train"])
@@ -198,12 +198,12 @@ def test_a_known_distance_or_diameter_fixes_the_scale(tube, tmp_path, capsys, ca
     assert np.linalg.norm(centers[2] - centers[0]) == pytest.approx(np.linalg.norm(last - first), rel=1e-5)
     assert np.linalg.norm(centers[1] - centers[0]) == pytest.approx(np.linalg.norm(truth[4, :3, 3] - first), rel=0.02)
     # The wall is ahead of so short a path: the poses are kept, in an unknown unit.
-    assert run(*argv, "--out", tmp_path / "by-diameter", "--diameter", 40) == 0
+    assert run(*argv, "--output", tmp_path / "by-diameter", "--diameter", 40) == 0
     assert "lie beside the camera's path" in caplog.text
     assert "unit: unknown" in capsys.readouterr().out
     assert read_unit(tmp_path / "by-diameter") == "unknown"
     # Points of a scene keep its unit.
-    assert run("poses", "triangulate", tmp_path / "by-diameter", "--out", tmp_path / "points", "--set",
+    assert run("poses", "triangulate", tmp_path / "by-diameter", "--output", tmp_path / "points", "--set",
                "split=all-train", "--set", "triangulation.min_share=0") == 0  # fmt: skip
     assert read_unit(tmp_path / "points") == "unknown"
 
@@ -226,12 +226,12 @@ def test_a_known_distance_or_diameter_fixes_the_scale(tube, tmp_path, capsys, ca
         (("--max-frames", "1"), "--max-frames 1"),
         (("--every", "20"), "1 images"),
         (("--mask", "tube/nothing"), "has no mask for 0000_color.png"),
-        (("--out", "tube/images"), "a folder apart from the input"),
+        (("--output", "tube/images"), "a folder apart from the input"),
     ],
 )
 def test_what_sfm_refuses(tube, monkeypatch, capsys, argv, message):
     monkeypatch.chdir(tube.parent)
-    assert message in refused(capsys, "poses", "sfm", "tube/images", "--out", "new", *argv)
+    assert message in refused(capsys, "poses", "sfm", "tube/images", "--output", "new", *argv)
     assert [path.name for path in tube.parent.iterdir()] == ["tube"]
 
 

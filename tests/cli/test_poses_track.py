@@ -48,13 +48,17 @@ def unposed(posed, tmp_path):
 
 def test_track_a_folder_without_poses_and_train_on_it(unposed, tmp_path, capsys):
     out = tmp_path / "out"
-    assert run("poses", "track", unposed, "--out", out, *FAST) == 0
+    assert run("poses", "track", unposed, "--output", out, *FAST) == 0
     said = capsys.readouterr().out.splitlines()
     assert said[0] == "6 frames, 6 tracked by hybrid; lost edges: 0 of 5"
     assert "fitness 0.9" in said[1]
     assert "inlier RMSE" in said[1]
     assert not any("own poses" in line for line in said)
-    assert said[-3:] == [str(out / "trajectory.txt"), str(out), f"coliags train coliags --data {out}"]
+    assert said[-3:] == [
+        f"written: {out / 'trajectory.txt'}",
+        f"written: {out}",
+        f"next:    coliags train coliags --data {out}",
+    ]
     # What was written is a scene whose poses are the trajectory's.
     assert find_format(out) == "rgbd"
     scene = open_scene(out)
@@ -83,7 +87,7 @@ def test_given_poses_only_judge_the_result(posed, tmp_path, capsys):
     )
     told = []
     for scene in (posed, scrambled):
-        assert run("poses", "track", scene, "--out", tmp_path / f"of-{scene.name}", *FAST) == 0
+        assert run("poses", "track", scene, "--output", tmp_path / f"of-{scene.name}", *FAST) == 0
         told.append(next(line for line in capsys.readouterr().out.splitlines() if "own poses" in line))
     one, other = (tmp_path / f"of-{name}" / "trajectory.txt" for name in ("posed", "scrambled"))
     assert one.read_bytes() == other.read_bytes()
@@ -99,7 +103,7 @@ def test_masks_stay_and_lost_frames_are_said(unposed, tmp_path, capsys, caplog):
         mask[:, :20] = 0
         cv2.imwrite(str(unposed / "masks" / path.name), mask)
     cv2.imwrite(str(unposed / "rgb" / "0003.png"), np.zeros((128, 160, 3), np.uint8))
-    assert run("poses", "track", unposed, "--out", tmp_path / "out", *FAST) == 0
+    assert run("poses", "track", unposed, "--output", tmp_path / "out", *FAST) == 0
     assert "5 tracked by hybrid; lost edges: 1 of 5" in capsys.readouterr().out
     assert "frames 3 are lost" in caplog.text
     frame = open_scene(tmp_path / "out").train[0]
@@ -110,27 +114,27 @@ def test_masks_stay_and_lost_frames_are_said(unposed, tmp_path, capsys, caplog):
 
 def test_options_of_the_data_manager_reach_it(posed, tmp_path, capsys):
     options = ("--set", "max_frames=3", "--set", "width=80", "--set", "height=64", *FAST)
-    assert run("poses", "track", posed, "--out", tmp_path / "out", *options) == 0
+    assert run("poses", "track", posed, "--output", tmp_path / "out", *options) == 0
     assert capsys.readouterr().out.startswith("3 frames")
     assert json.loads((tmp_path / "out" / "camera.json").read_text())["w"] == 80
 
 
 def test_what_is_refused(posed, unposed, tmp_path, capsys):
     out = tmp_path / "out"
-    assert "already exists" in refused(capsys, "poses", "track", posed, "--out", unposed)
-    assert "a folder apart from the input" in refused(capsys, "poses", "track", posed, "--out", posed / "out")
+    assert "already exists" in refused(capsys, "poses", "track", posed, "--output", unposed)
+    assert "a folder apart from the input" in refused(capsys, "poses", "track", posed, "--output", posed / "out")
     assert "--set tracking.method" in refused(
-        capsys, "poses", "track", posed, "--out", out, "--set", "tracking.method=icp"
+        capsys, "poses", "track", posed, "--output", out, "--set", "tracking.method=icp"
     )
-    assert "unknown key 'widht'" in refused(capsys, "poses", "track", posed, "--out", out, "--set", "widht=3")
-    assert "1 frame." in refused(capsys, "poses", "track", posed, "--out", out, "--set", "max_frames=1")
-    assert "has no depth" in refused(capsys, "poses", "track", posed, "--out", out, "--set", "depth=none")
+    assert "unknown key 'widht'" in refused(capsys, "poses", "track", posed, "--output", out, "--set", "widht=3")
+    assert "1 frame." in refused(capsys, "poses", "track", posed, "--output", out, "--set", "max_frames=1")
+    assert "has no depth" in refused(capsys, "poses", "track", posed, "--output", out, "--set", "depth=none")
     cv2.imwrite(str(unposed / "rgb" / "0002.png"), np.zeros((64, 80, 3), np.uint8))
-    assert "0002.png is 80 x 64" in refused(capsys, "poses", "track", unposed, "--out", out)
+    assert "0002.png is 80 x 64" in refused(capsys, "poses", "track", unposed, "--output", out)
     for path in (unposed / "rgb").iterdir():
         cv2.imwrite(str(path), np.zeros((128, 160, 3), np.uint8))
-    message = refused(capsys, "poses", "track", unposed, "--out", out, *FAST)
+    message = refused(capsys, "poses", "track", unposed, "--output", out, *FAST)
     assert "no two consecutive frames of 6 could be registered" in message
     shutil.rmtree(unposed / "depth")
-    assert "none of the formats" in refused(capsys, "poses", "track", unposed, "--out", out)
+    assert "none of the formats" in refused(capsys, "poses", "track", unposed, "--output", out)
     assert not out.exists()

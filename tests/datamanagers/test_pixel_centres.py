@@ -178,8 +178,8 @@ def test_conversions_of_poses_keep_the_camera(name, stored, shift, tmp_path):
     write_trajectory(tmp_path / "given.tum", Trajectory(poses()), "tum")
     k = PINHOLE
     camera = ("--intrinsics", f"{k.fx},{k.fy},{k.cx},{k.cy}", "--size", f"{k.width}x{k.height}")
-    assert run("poses", "convert", tmp_path / "given.tum", tmp_path / "poses", "--to", name, *camera) == 0
+    assert run("poses", "convert", tmp_path / "given.tum", "-o", tmp_path / "poses", "--to", name, *camera) == 0
     assert stored(tmp_path) == pytest.approx(k.cx + shift, rel=1e-6)
-    assert run("poses", "convert", tmp_path / "poses", tmp_path / "back", "--to", "nerfstudio") == 0
+    assert run("poses", "convert", tmp_path / "poses", "-o", tmp_path / "back", "--to", "nerfstudio") == 0
     for path in (tmp_path / "poses", tmp_path / "back"):
         assert vars(format_of(path).read(path).intrinsics) == pytest.approx(vars(k), rel=1e-6)

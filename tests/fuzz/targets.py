@@ -61,7 +61,7 @@ def _points(file: str) -> Callable[[Path], None]:
 
 
 def _data_check(folder: Path) -> None:
-    _command("data", "check", folder, "--json", folder / "check.json")
+    _command("data", "check", folder, "--json")
 
 
 def _command(*argv: object) -> None:
@@ -85,12 +85,12 @@ def _poses(name: str) -> Callable[[Path], None]:
         found = folder / (name if name in ("colmap", "colmap-text", "nerfstudio", "endogslam") else f"{name}.txt")
         if name in ("nerfstudio", "endogslam"):
             found /= "transforms.json" if name == "nerfstudio" else "params.npz"
-        _command("poses", "convert", found, folder / "converted.txt", "--to", "tum")
+        _command("poses", "convert", found, "-o", folder / "converted.txt", "--to", "tum")
         trajectory = format_of(found).read(found)
         geometry.check_poses(trajectory.camera_to_world)
         if trajectory.timestamps is not None and not np.isfinite(trajectory.timestamps).all():
             raise geometry.AbsurdError("timestamps")
-        _command("poses", "align", found, folder / "reference.txt", "--scale", "--json", folder / "errors.json")
+        _command("poses", "align", found, folder / "reference.txt", "--scale", "--json")
 
     return read
 

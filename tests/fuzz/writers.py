@@ -64,7 +64,7 @@ def _run(inputs: Path, place: Path) -> None:
 
 
 WRITERS: dict[str, Writer] = {
-    "phantom": Writer(lambda i, o: ("phantom", o / "phantom", *_PHANTOM, *_COARSE)),
+    "phantom": Writer(lambda i, o: ("phantom", "-o", o / "phantom", *_PHANTOM, *_COARSE)),
     "train": Writer(
         lambda i, o: ("train", "coliags", "--data", i / "scene", "--output", o / "run", "--steps", 9, *_SMALL),
         again=("--resume",),
@@ -73,10 +73,10 @@ WRITERS: dict[str, Writer] = {
     "import": Writer(lambda i, o: ("import", i / "cloud.ply", "--data", i / "scene", "--output", o / "run")),
     "eval": Writer(lambda i, o: ("eval", o / "run"), again=(), prepare=_run, within="run/eval"),
     "render": Writer(lambda i, o: ("render", i / "run", "--output", o / "renders")),
-    "mesh": Writer(lambda i, o: ("mesh", i / "opaque", "--out", o / "mesh", *_settings("voxel_size=4", "min_views=1"))),
-    "coverage": Writer(lambda i, o: ("coverage", i / "run", "--mesh", i / "mesh.ply", "--out", o / "coverage")),
+    "mesh": Writer(lambda i, o: ("mesh", i / "opaque", "-o", o / "mesh", *_settings("voxel_size=4", "min_views=1"))),
+    "coverage": Writer(lambda i, o: ("coverage", i / "run", "--mesh", i / "mesh.ply", "--output", o / "coverage")),
     "export": Writer(lambda i, o: ("export", i / "run", "--output", o / "cloud.ply")),
-    "view --save": Writer(lambda i, o: ("view", i / "run", "--save", o / "view.html"), again=()),
+    "view --output": Writer(lambda i, o: ("view", i / "run", "--output", o / "view.html"), again=()),
     "report": Writer(lambda i, o: ("report", i / "run", "--output", o / "report.html", "--format", "all"), again=()),
     "results export": Writer(lambda i, o: ("results", "export", i / "run", "--output", o / "table.csv"), again=()),
     "results export (nerfbaselines)": Writer(
@@ -89,44 +89,41 @@ WRITERS: dict[str, Writer] = {
         again=(),
         goes_on=True,
     ),
-    "poses convert (TUM)": Writer(lambda i, o: ("poses", "convert", i / "poses.txt", o / "poses.txt", "--to", "tum")),
+    "poses convert (TUM)": Writer(
+        lambda i, o: ("poses", "convert", i / "poses.txt", "-o", o / "poses.txt", "--to", "tum")
+    ),
     "poses convert (COLMAP)": Writer(
-        lambda i, o: ("poses", "convert", i / "poses.json", o / "model", "--to", "colmap")
+        lambda i, o: ("poses", "convert", i / "poses.json", "-o", o / "model", "--to", "colmap")
     ),
     "poses align": Writer(
         lambda i, o: (
             *("poses", "align", i / "poses.txt", i / "poses.json", "--match", "index"),
-            *("--json", o / "errors.json", "--plot", o / "errors.png"),
+            *("--plot", o / "errors.png"),
         ),
     ),
-    "poses triangulate": Writer(lambda i, o: ("poses", "triangulate", i / "tube", "--out", o / "tube")),
+    "poses triangulate": Writer(lambda i, o: ("poses", "triangulate", i / "tube", "--output", o / "tube")),
     "poses track": Writer(
         lambda i, o: (
-            *("poses", "track", i / "unposed", "--out", o / "tracked"),
+            *("poses", "track", i / "unposed", "--output", o / "tracked"),
             *_settings("tracking.method=hybrid", "tracking.pose_graph=false"),
         ),
     ),
     "poses sfm": Writer(
         lambda i, o: (
-            *("poses", "sfm", i / "unposed/rgb", "--out", o / "found"),
+            *("poses", "sfm", i / "unposed/rgb", "--output", o / "found"),
             *("--camera", "PINHOLE", "--params", (i / "params.txt").read_text()),
         ),
     ),
     "depth estimate": Writer(
-        lambda i, o: ("depth", "estimate", i / "tube", "--out", o / "depth", "--jobs", 1), goes_on=True
+        lambda i, o: ("depth", "estimate", i / "tube", "--output", o / "depth", "--jobs", 1), goes_on=True
     ),
     "depth check": Writer(
-        lambda i, o: (
-            *("depth", "check", i / "scene", i / "scene", "--html", o / "depth.html", "--json", o / "depth.json"),
-        ),
-        again=(),
+        lambda i, o: ("depth", "check", i / "scene", i / "scene", "--html", o / "depth.html"), again=()
     ),
-    "data check": Writer(
-        lambda i, o: ("data", "check", i / "scene", "--html", o / "data.html", "--json", o / "data.json"), again=()
-    ),
+    "data check": Writer(lambda i, o: ("data", "check", i / "scene", "--html", o / "data.html"), again=()),
     "reconstruct": Writer(
         lambda i, o: (
-            *("reconstruct", i / "scene", "--out", o / "reconstructed", "--steps", 3),
+            *("reconstruct", i / "scene", "--output", o / "reconstructed", "--steps", 3),
             *_settings("mesh.voxel_size=4"),
         ),
         again=(),
@@ -145,7 +142,7 @@ def make_inputs(folder: Path) -> None:
     from tests.textured_tube import INTRINSICS, tube_frames, write_tube
 
     folder.mkdir(parents=True)
-    _done("phantom", folder / "scene", *_PHANTOM, *_COARSE)
+    _done("phantom", "-o", folder / "scene", *_PHANTOM, *_COARSE)
     _done("train", "coliags", "--data", folder / "scene", "--output", folder / "run", "--steps", 3, *_SMALL)
     _done("eval", folder / "run")
     shutil.copy(folder / "scene/truth/mesh.ply", folder / "mesh.ply")
@@ -154,6 +151,7 @@ def make_inputs(folder: Path) -> None:
         "poses",
         "convert",
         folder / "poses.txt",
+        "-o",
         folder / "poses.json",
         "--to",
         "nerfstudio",

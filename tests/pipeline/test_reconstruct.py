@@ -61,7 +61,7 @@ def video(tmp_path):
 
 
 def test_stages_of_a_video(done, video, tmp_path, capsys):
-    argv = ("reconstruct", video, "--out", tmp_path / "out", "--steps", 50, "--diameter", 40)
+    argv = ("reconstruct", video, "--output", tmp_path / "out", "--steps", 50, "--diameter", 40)
     assert commands.run(*argv) == 0
     assert done == ["make_frames", *CAPTURE, *TRAINING]
     printed = capsys.readouterr().out
@@ -163,17 +163,17 @@ def test_bad_input_leaves_nothing(tmp_path, capsys):
     (tmp_path / "full" / "thesis.tex").touch()
     out = tmp_path / "out"
     for argv, message in (
-        ((tmp_path / "noise.mp4", "--out", out), "cannot be opened as a video by OpenCV"),
-        ((tmp_path / "empty", "--out", out), "holds 0 images"),
-        ((tmp_path / "nowhere", "--out", out), "Expected a video file, or a folder of images"),
-        ((folder, "--out", folder), "Expected a folder apart from the input"),
-        ((folder, "--out", folder / "out"), "Expected a folder apart from the input"),
-        ((folder, "--out", tmp_path / "full"), "already exists and is no reconstruction"),
-        ((folder, "--out", out, "--mask", tmp_path / "no.png"), "no file"),
-        ((folder, "--out", out, "--diameter", 0), "diameter"),
-        ((folder, "--out", out, "--set", "frames.evry=2"), "Did you mean 'every'?"),
-        ((folder, "--out", out, "--size", "big"), "--size big"),
-        ((folder, "--out", out, "--method", "coliagz"), "coliagz"),
+        ((tmp_path / "noise.mp4", "--output", out), "cannot be opened as a video by OpenCV"),
+        ((tmp_path / "empty", "--output", out), "holds 0 images"),
+        ((tmp_path / "nowhere", "--output", out), "Expected a video file, or a folder of images"),
+        ((folder, "--output", folder), "Expected a folder apart from the input"),
+        ((folder, "--output", folder / "out"), "Expected a folder apart from the input"),
+        ((folder, "--output", tmp_path / "full"), "already exists and is no reconstruction"),
+        ((folder, "--output", out, "--mask", tmp_path / "no.png"), "no file"),
+        ((folder, "--output", out, "--diameter", 0), "diameter"),
+        ((folder, "--output", out, "--set", "frames.evry=2"), "Did you mean 'every'?"),
+        ((folder, "--output", out, "--size", "big"), "--size big"),
+        ((folder, "--output", out, "--method", "coliagz"), "coliagz"),
     ):
         assert message in commands.refused(capsys, "reconstruct", *argv)
         assert not out.exists()

@@ -209,7 +209,7 @@ def test_export_of_every_form(runs, tmp_path, capsys):
     one = ("results", "export", runs / "one", "--format", "nerfbaselines", "--output", tmp_path / "one.json")
     assert run(*one) == 0
     printed = capsys.readouterr().out.splitlines()
-    assert printed[-1] == str(tmp_path / "one.json")
+    assert printed[-1] == f"written: {tmp_path / 'one.json'}"
     assert json.loads((tmp_path / "one.json").read_text())["nb_info"]["method"] == "coliags"
 
 

@@ -7,16 +7,17 @@ from typing import Annotated
 
 import tyro
 
-from coliags_plugin.cli.depth.check import CheckDepth
-from coliags_plugin.cli.depth.estimate import EstimateDepth
+from coliags_plugin.cli.depth.check import DepthCheckCommand
+from coliags_plugin.cli.depth.estimate import DepthEstimateCommand
 
 Subcommand = (
-    Annotated[EstimateDepth, tyro.conf.subcommand("estimate")] | Annotated[CheckDepth, tyro.conf.subcommand("check")]
+    Annotated[DepthEstimateCommand, tyro.conf.subcommand("estimate")]
+    | Annotated[DepthCheckCommand, tyro.conf.subcommand("check")]
 )
 
 
 @dataclass(frozen=True)
-class Depth:
+class DepthCommand:
     """Estimate the depth of posed images, or compare estimated with true depth."""
 
     subcommand: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Subcommand]]

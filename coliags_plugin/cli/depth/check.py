@@ -8,13 +8,14 @@ from typing import Annotated
 
 import tyro
 
-from coliags_plugin.cli.arguments import Assignments, OptionalPath
+from coliags_plugin.cli.arguments import AsJson, Assignments, OptionalPath
+from coliags_plugin.cli.summaries import print_summary
 
 _Format = Annotated[str | None, tyro.conf.arg(metavar="NAME")]
 
 
 @dataclass(frozen=True)
-class CheckDepth:
+class DepthCheckCommand:
     """Compare estimated with true depth: error, bias, coverage, and whether the stated confidence is right."""
 
     estimate: tyro.conf.Positional[Path]
@@ -23,20 +24,19 @@ class CheckDepth:
     """The same with true depth, dense or at single points."""
     align_scale: bool = False
     """Multiply the estimate by the median of true / estimated depth."""
+    html: OptionalPath = None
+    """Also write an HTML page with images."""
+    maps: OptionalPath = None
+    """Also write maps of the error, PNG, to this folder, which must be new or empty."""
+    set: Assignments = ()
+    """An option of both data managers, for instance max_frames=20."""
     estimate_format: _Format = None
     """Dataset format of the estimate (`coliags list datamanagers`); default: recognised from the files."""
     truth_format: _Format = None
     """Dataset format of the truth; default: recognised from the files."""
-    html: OptionalPath = None
-    """Also write an HTML page with images."""
-    json: OptionalPath = None
-    """Also write the results as JSON."""
-    maps: OptionalPath = None
-    """Also write maps of the error, PNG, to this folder, which must be new or empty."""
     anonymous: bool = False
     """Keep absolute paths out of the JSON (docs/security.md 4)."""
-    set: Assignments = ()
-    """An option of both data managers, for instance max_frames=20."""
+    json: AsJson = False
 
     def run(self) -> None:
         """Compare, and print the results."""
@@ -44,7 +44,6 @@ class CheckDepth:
         from coliags_plugin.checks.depth.page import depth_page, write_error_maps
         from coliags_plugin.checks.depth.sources import open_depth
         from coliags_plugin.core.anonymity import without_places
-        from coliags_plugin.core.files import write_json
         from coliags_plugin.engine.progress import progress_callback
         from coliags_plugin.reporting.html_page import write_html
         from coliags_plugin.reporting.terminal import page_text
@@ -54,13 +53,14 @@ class CheckDepth:
             truth = open_depth(self.truth, self.truth_format, self.set, progress)
             check = check_depth(estimate, truth, self.align_scale, progress)
         page = depth_page(check)
-        print(page_text(page))
         if self.html is not None:
             write_html(page, self.html)
-            print(self.html.resolve())
-        if self.json is not None:
-            values = check.as_json()
-            write_json(self.json, without_places(values) if self.anonymous else values)
         if self.maps is not None:
             write_error_maps(check, self.maps)
-            print(self.maps.resolve())
+        facts = check.as_json()
+        print_summary(
+            page_text(page),
+            without_places(facts) if self.anonymous else facts,
+            written=[path for path in (self.html, self.maps) if path is not None],
+            as_json=self.json,
+        )

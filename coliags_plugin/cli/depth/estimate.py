@@ -8,7 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from coliags_plugin.cli.arguments import Assignments, DataFormat, OptionalInt, OptionalPath
+from coliags_plugin.cli.arguments import AsJson, Assignments, DataFormat, OptionalInt, OptionalPath, Output, Overwrite
+from coliags_plugin.cli.summaries import print_summary, train_command
 
 #: Prefix of the options of estimation; all others are the data manager's.
 _OWN = "depth."
@@ -16,15 +17,13 @@ _OptionalLength = Annotated[float | None, tyro.conf.arg(metavar="LENGTH")]
 
 
 @dataclass(frozen=True)
-class EstimateDepth:
+class DepthEstimateCommand:
     """Estimate the dense depth of a video with known poses, with its confidence; write it as a scene to train on."""
 
     scene: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCENE")]
     """The scene's folder. Depth that it has is ignored."""
-    out: Path
+    output: Output
     """Folder to create, in nerfstudio's layout."""
-    format: DataFormat = None
-    """Dataset format (`coliags list datamanagers`); default: recognised from the files."""
     prior: OptionalPath = None
     """Folder of depth maps by image name (.png of 16 bits, .npy or .exr), in any unit, to fit instead of brightness."""
     near: _OptionalLength = None
@@ -35,19 +34,20 @@ class EstimateDepth:
     """Number of threads; default: one for each core."""
     set: Assignments = ()
     """An option of the data manager, as width=675, or of estimation, as depth.agreement=0.01 (docs/depth.md)."""
-    overwrite: bool = False
-    """Replace the output folder where it exists."""
+    format: DataFormat = None
+    overwrite: Overwrite = False
+    json: AsJson = False
 
     def run(self) -> None:
         """Estimate, or resume; write the scene and print a summary."""
-        from coliags_plugin.cli.written_scenes import refuse_output, settings_among, train_command
+        from coliags_plugin.cli.scene_outputs import refuse_output, settings_among
         from coliags_plugin.core.errors import InputError
         from coliags_plugin.engine.data_formats import open_scene
         from coliags_plugin.engine.progress import progress_callback
         from coliags_plugin.reconstruction.depth.scene import DepthRequest, estimate_scene, training_options
         from coliags_plugin.reconstruction.depth.settings import DepthSettings
 
-        refuse_output(self.out, self.scene, self.overwrite)
+        refuse_output(self.output, self.scene, self.overwrite)
         if (self.near is None) != (self.far is None):
             raise InputError("--near without --far, or the reverse", "both or neither")
         if self.jobs is not None and self.jobs < 1:
@@ -59,5 +59,6 @@ class EstimateDepth:
             scene = open_scene(self.scene, self.format, reading, progress)
             near_far = None if self.near is None or self.far is None else (self.near, self.far)
             request = DepthRequest(settings, near_far, self.prior, self.jobs)
-            summary = estimate_scene(scene, self.out, request, self.overwrite, progress)
-        print(f"{summary}\n{self.out}\n{train_command(self.out, 'coliags-estimated-depth', training_options(scene))}")
+            summary = estimate_scene(scene, self.output, request, self.overwrite, progress)
+        train = train_command(self.output, "coliags-estimated-depth", training_options(scene))
+        print_summary(str(summary), written=[self.output], then=[train], as_json=self.json)

@@ -7,23 +7,23 @@ from typing import Annotated
 
 import tyro
 
-from coliags_plugin.cli.poses.align import Align
-from coliags_plugin.cli.poses.convert import Convert
-from coliags_plugin.cli.poses.sfm import Sfm
-from coliags_plugin.cli.poses.track import Track
-from coliags_plugin.cli.poses.triangulate import Triangulate
+from coliags_plugin.cli.poses.align import PosesAlignCommand
+from coliags_plugin.cli.poses.convert import PosesConvertCommand
+from coliags_plugin.cli.poses.sfm import PosesSfmCommand
+from coliags_plugin.cli.poses.track import PosesTrackCommand
+from coliags_plugin.cli.poses.triangulate import PosesTriangulateCommand
 
 Subcommand = (
-    Annotated[Convert, tyro.conf.subcommand("convert")]
-    | Annotated[Align, tyro.conf.subcommand("align")]
-    | Annotated[Triangulate, tyro.conf.subcommand("triangulate")]
-    | Annotated[Sfm, tyro.conf.subcommand("sfm")]
-    | Annotated[Track, tyro.conf.subcommand("track")]
+    Annotated[PosesConvertCommand, tyro.conf.subcommand("convert")]
+    | Annotated[PosesAlignCommand, tyro.conf.subcommand("align")]
+    | Annotated[PosesTriangulateCommand, tyro.conf.subcommand("triangulate")]
+    | Annotated[PosesSfmCommand, tyro.conf.subcommand("sfm")]
+    | Annotated[PosesTrackCommand, tyro.conf.subcommand("track")]
 )
 
 
 @dataclass(frozen=True)
-class Poses:
+class PosesCommand:
     """Convert and compare camera poses, triangulate points, or estimate poses from images or depth."""
 
     subcommand: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Subcommand]]

@@ -8,17 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from coliags_plugin.cli.arguments import OptionalPath, OptionalText
+from coliags_plugin.cli.arguments import AsJson, OptionalPath, OptionalText, Overwrite
 from coliags_plugin.cli.poses.arguments import OptionalFormat, read_and_log
+from coliags_plugin.cli.summaries import print_summary
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from coliags_plugin.geometry.poses.alignment import Alignment
 
 
 @dataclass(frozen=True)
-class Align:
+class PosesAlignCommand:
     """Align an estimated trajectory with a reference and compute its absolute and relative errors."""
 
     estimate: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="ESTIMATE")]
@@ -33,38 +32,32 @@ class Align:
     """How frames are matched; auto: by name, else by time, else by index."""
     tolerance: float = 0.02
     """Largest difference of matched timestamps, s."""
+    unit: OptionalText = None
+    """Name of the reference's unit of length; default: mm where its format is metric."""
+    plot: OptionalPath = None
+    """PNG to write: both trajectories from above and from the side, and the errors over frames."""
     estimate_format: OptionalFormat = None
     """Format of the estimate; default: recognised from its content."""
     reference_format: OptionalFormat = None
     """Format of the reference; default: recognised from its content."""
-    unit: OptionalText = None
-    """Name of the reference's unit of length; default: mm where its format is metric."""
-    json: OptionalPath = None
-    """JSON file to write all errors to."""
-    plot: OptionalPath = None
-    """PNG to write: both trajectories from above and from the side, and the errors over frames."""
-    overwrite: bool = False
-    """Replace the files where they exist."""
+    overwrite: Overwrite = False
+    json: AsJson = False
 
     def run(self) -> None:
-        """Align, print a table and the paths of the files written."""
+        """Align, and print a table of the errors."""
         import logging
 
-        from rich.console import Console
-
         from coliags_plugin.core.errors import InputError
-        from coliags_plugin.core.files import write_json
         from coliags_plugin.geometry.poses.alignment import align
         from coliags_plugin.geometry.poses.association import associate
 
         log = logging.getLogger(__name__)
         if self.plot is not None and self.plot.suffix.lower() != ".png":
             raise InputError(f"--plot {self.plot}", "a file name that ends in .png")
-        for path in (self.json, self.plot):
-            if path is not None and path.exists() and not self.overwrite:
-                raise InputError(f"{path} already exists", "a new file", "Choose another, or pass --overwrite")
-            if path is not None and (path.is_dir() or path in (self.estimate, self.reference)):
-                raise InputError(f"{path} is a folder or one of the inputs", "another file")
+        if self.plot is not None and self.plot.exists() and not self.overwrite:
+            raise InputError(f"{self.plot} already exists", "a new file", "Choose another, or pass --overwrite")
+        if self.plot is not None and (self.plot.is_dir() or self.plot in (self.estimate, self.reference)):
+            raise InputError(f"{self.plot} is a folder or one of the inputs", "another file")
         _, estimate = read_and_log(self.estimate, self.estimate_format)
         kind, reference = read_and_log(self.reference, self.reference_format)
         unit = self.unit or kind.unit
@@ -72,25 +65,22 @@ class Align:
         if matches.skipped:
             log.warning("matched by %s, as names or times do not match (%s)", matches.by, "; ".join(matches.skipped))
         result = align(estimate, reference, matches, self.scale, self.delta)
-        print(
+        text = (
             f"{len(matches)} frames matched by {matches.by}, of {len(estimate)} estimated and {len(reference)} "
-            f"reference ones\n{_described(result, unit)}"
+            f"reference ones\n{_described(result, unit)}\n{_table(result, unit)}"
         )
-        Console().print(_table(result, unit))
         if result.ate_share is not None:
-            print(f"ATE rmse: {100.0 * result.ate_share:.3g} % of the path, {result.path_length:.4g} {unit}")
+            text += f"\nATE rmse: {100.0 * result.ate_share:.3g} % of the path, {result.path_length:.4g} {unit}"
         worlds = result.world_rotation
         if worlds.reason:
             log.warning("%s: for the rotation error, the rotation is that by %s", worlds.reason, worlds.by)
-        if self.json is not None:
-            write_json(self.json, result.to_json(unit))
-            print(self.json)
         if self.plot is not None:
             from coliags_plugin.outputs.image_files import write_png
             from coliags_plugin.outputs.trajectory_plot import plot_trajectory
 
             write_png(self.plot, plot_trajectory(result, unit))
-            print(self.plot)
+        written = [] if self.plot is None else [self.plot]
+        print_summary(text, result.to_json(unit), written=written, as_json=self.json)
 
 
 def _described(result: Alignment, unit: str) -> str:
@@ -105,19 +95,18 @@ def _described(result: Alignment, unit: str) -> str:
     )
 
 
-def _table(result: Alignment, unit: str) -> Table:
-    from rich.table import Table
+def _table(result: Alignment, unit: str) -> str:
+    from coliags_plugin.reporting.model import simple_table
+    from coliags_plugin.reporting.terminal import terminal_text
 
-    table = Table()
-    table.add_column("error")
-    for name in ("unit", "rmse", "mean", "median", "max"):
-        table.add_column(name, justify="right" if name != "unit" else "left")
     step = f"{result.delta} frame{'s' if result.delta > 1 else ''}"
-    for name, kind, spread in (
-        ("ATE", unit, result.ate),
-        ("rotation", "deg", result.rotation_deg),
-        (f"RPE over {step}", unit, result.rpe_translation),
-        (f"RPE over {step}", "deg", result.rpe_rotation_deg),
-    ):
-        table.add_row(name, kind, *(f"{value:.4g}" for value in vars(spread).values()))
-    return table
+    rows = [
+        [name, kind, *vars(spread).values()]
+        for name, kind, spread in (
+            ("ATE", unit, result.ate),
+            ("rotation", "deg", result.rotation_deg),
+            (f"RPE over {step}", unit, result.rpe_translation),
+            (f"RPE over {step}", "deg", result.rpe_rotation_deg),
+        )
+    ]
+    return terminal_text([simple_table(["error", "unit", "rmse", "mean", "median", "max"], rows)])

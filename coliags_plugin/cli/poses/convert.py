@@ -8,33 +8,34 @@ from typing import Annotated
 
 import tyro
 
-from coliags_plugin.cli.arguments import OptionalPath, OptionalText
+from coliags_plugin.cli.arguments import AsJson, OptionalPath, OptionalText, Output, Overwrite
 from coliags_plugin.cli.poses.arguments import OptionalFormat, parse_intrinsics, read_and_log
+from coliags_plugin.cli.summaries import print_summary
 
 
 @dataclass(frozen=True)
-class Convert:
+class PosesConvertCommand:
     """Write poses in another format (c3vd, tum, endogslam, colmap, colmap-text, nerfstudio)."""
 
     input: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IN")]
     """File with poses, or the folder of a COLMAP model."""
-    output: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
+    output: Output
     """File to write; for COLMAP, folder to create."""
     to: Annotated[str, tyro.conf.arg(metavar="FORMAT")]
     """Format to write."""
-    from_format: Annotated[OptionalFormat, tyro.conf.arg(name="from")] = None
-    """Format of the input; default: recognised from its content."""
     intrinsics: Annotated[OptionalText, tyro.conf.arg(metavar="FX,FY,CX,CY")] = None
     """Pinhole intrinsics of all images, px, pixel centres at integers + 0.5; default: the input's."""
     size: Annotated[OptionalText, tyro.conf.arg(metavar="WxH")] = None
     """Image size, px; with --intrinsics."""
     images: OptionalPath = None
     """Folder whose images, in natural order, give the poses their names; default: the input's names."""
-    overwrite: bool = False
-    """Replace the output where it exists."""
+    from_format: Annotated[OptionalFormat, tyro.conf.arg(name="from")] = None
+    """Format of the input; default: recognised from its content."""
+    overwrite: Overwrite = False
+    json: AsJson = False
 
     def run(self) -> None:
-        """Convert and print the output path."""
+        """Convert the poses."""
         import logging
         from dataclasses import replace
 
@@ -52,9 +53,9 @@ class Convert:
         if self.images is not None:
             trajectory = replace(trajectory, names=_image_names(self.images, len(trajectory)))
         lost = [
-            what
-            for what in ("names", "timestamps", "intrinsics")
-            if getattr(trajectory, what) is not None and what not in target.keeps
+            part
+            for part in ("names", "timestamps", "intrinsics")
+            if getattr(trajectory, part) is not None and part not in target.keeps
         ]
         write_trajectory(self.output, trajectory, self.to, self.overwrite)
         if lost:
@@ -63,7 +64,7 @@ class Convert:
             log.info("the input has no image names: using 0000.png, 0001.png, ...; --images takes the real names")
         if "timestamps" in target.keeps and trajectory.timestamps is None:
             log.info("the input has no timestamps: frame numbers are written instead")
-        print(self.output)
+        print_summary(written=[self.output], as_json=self.json)
 
 
 def _image_names(folder: Path, count: int) -> tuple[str, ...]:

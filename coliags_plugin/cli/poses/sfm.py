@@ -8,26 +8,36 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from coliags_plugin.cli.arguments import Assignments, OptionalInt, OptionalPath, OptionalText
+from coliags_plugin.cli.arguments import (
+    AsJson,
+    Assignments,
+    OptionalFloat,
+    OptionalInt,
+    OptionalPath,
+    OptionalText,
+    Output,
+    Overwrite,
+)
+from coliags_plugin.cli.summaries import depth_commands, print_summary
 
 if TYPE_CHECKING:
     from coliags_plugin.reconstruction.structure.sfm import Reconstruction
 
 
 @dataclass(frozen=True)
-class Sfm:
+class PosesSfmCommand:
     """Estimate poses, intrinsics and surface points from a video's images alone; write them as a scene."""
 
     frames: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FRAMES")]
     """Folder of images, ordered by the numbers in their names."""
-    out: Path
+    output: Output
     """Folder to create, in COLMAP's layout."""
     camera: OptionalText = None
     """A known camera, scaled to the images (c3vd: whole frames of C3VD; c3vd-undistorted), or a camera model of COLMAP,
     for instance PINHOLE or OPENCV_FISHEYE; default: the better of SIMPLE_RADIAL_FISHEYE and SIMPLE_RADIAL."""
     params: Annotated[OptionalText, tyro.conf.arg(metavar="P1,P2,...")] = None
     """Parameters of COLMAP's model in its order, pixel centres at integers + 0.5, kept fixed; default: estimated."""
-    diameter: Annotated[float | None, tyro.conf.arg(metavar="MM")] = None
+    diameter: OptionalFloat = None
     """The colon's typical inner diameter, which fixes the scale roughly; default: the scale stays unknown."""
     distance: Annotated[OptionalText, tyro.conf.arg(metavar="IMAGE,IMAGE,MM")] = None
     """Known distance between the cameras of two images, which fixes the scale."""
@@ -39,12 +49,12 @@ class Sfm:
     """Use at most the first n images."""
     set: Assignments = ()
     """An option of matching or mapping, for instance exhaustive_up_to=80 or features.max_features=2000."""
-    overwrite: bool = False
-    """Replace the output folder where it exists."""
+    overwrite: Overwrite = False
+    json: AsJson = False
 
     def run(self) -> None:
         """Reconstruct, write the scene and print a summary."""
-        from coliags_plugin.cli.written_scenes import next_commands, refuse_output
+        from coliags_plugin.cli.scene_outputs import refuse_output
         from coliags_plugin.config.assignments import settings_of
         from coliags_plugin.core.errors import InputError
         from coliags_plugin.engine.progress import progress_callback
@@ -54,7 +64,7 @@ class Sfm:
         from coliags_plugin.reconstruction.structure.sfm_scene import write_sfm_scene
         from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 
-        refuse_output(self.out, self.frames, self.overwrite)
+        refuse_output(self.output, self.frames, self.overwrite)
         if self.every < 1 or (self.max_frames is not None and self.max_frames < 2):
             raise InputError(f"--every {self.every}, --max-frames {self.max_frames}", "1 or more, and 2 or more")
         known_distance = self._known_distance()
@@ -64,12 +74,13 @@ class Sfm:
         images = list_images(self.frames)[:: self.every][: self.max_frames]
         masks = None if self.mask is None else masks_for(self.mask, images)
         with progress_callback() as progress:
-            found = reconstruct(images, settings, masks, progress)
-        factor = millimetres(found, self.diameter, known_distance)
+            model = reconstruct(images, settings, masks, progress)
+        factor = millimetres(model, self.diameter, known_distance)
         if factor is not None:
-            found = scaled(found, factor)
-        write_sfm_scene(self.out, found, masks, self.overwrite, "unknown" if factor is None else "mm")
-        print(f"{found.summary()}\n{_unit(found, factor)}\n{self.out}\n{next_commands(self.out)}")
+            model = scaled(model, factor)
+        write_sfm_scene(self.output, model, masks, self.overwrite, "unknown" if factor is None else "mm")
+        text = f"{model.summary()}\n{_unit(model, factor)}"
+        print_summary(text, written=[self.output], then=depth_commands(self.output), as_json=self.json)
 
     def _known_distance(self) -> tuple[str, str, float] | None:
         """The parts of ``--distance``."""
@@ -93,8 +104,8 @@ class Sfm:
         return first, second, length
 
 
-def _unit(found: Reconstruction, factor: float | None) -> str:
-    depth = f"the median depth of the points is {found.median_depth:.4g}"
+def _unit(model: Reconstruction, factor: float | None) -> str:
+    depth = f"the median depth of the points is {model.median_depth:.4g}"
     if factor is not None:
         return f"unit: mm, {factor:.4g} per unit of the model; {depth} mm"
     return f"unit: unknown, as images alone do not determine it; {depth} units (--diameter or --distance fix the scale)"

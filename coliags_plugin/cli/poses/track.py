@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from coliags_plugin.cli.arguments import Assignments, DataFormat
+from coliags_plugin.cli.arguments import AsJson, Assignments, DataFormat, Output, Overwrite
+from coliags_plugin.cli.summaries import print_summary, train_command
 
 if TYPE_CHECKING:
     from coliags_plugin.core.scenes import Scene
@@ -19,23 +20,22 @@ _OWN = "tracking."
 
 
 @dataclass(frozen=True)
-class Track:
+class PosesTrackCommand:
     """Estimate the poses of a video from its images and depth, ignoring given poses; write it as a scene."""
 
     scene: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCENE")]
     """A scene, or a folder with colour, depth and intrinsics but without poses."""
-    out: Path
+    output: Output
     """Folder to create, in the layout of `rgbd`."""
-    format: DataFormat = None
-    """Dataset format (`coliags list datamanagers`); default: recognised from the files."""
     set: Assignments = ()
     """An option of the data manager, as width=675, or of tracking, as tracking.method=hybrid."""
-    overwrite: bool = False
-    """Replace the output folder where it exists."""
+    format: DataFormat = None
+    overwrite: Overwrite = False
+    json: AsJson = False
 
     def run(self) -> None:
         """Track, write the scene and print a summary."""
-        from coliags_plugin.cli.written_scenes import refuse_output, settings_among, train_command
+        from coliags_plugin.cli.scene_outputs import refuse_output, settings_among
         from coliags_plugin.datamanagers.rgbd.writer import write_rgbd_scene
         from coliags_plugin.engine.data_formats import open_video
         from coliags_plugin.engine.progress import progress_callback
@@ -43,33 +43,36 @@ class Track:
         from coliags_plugin.reconstruction.odometry.settings import TrackingSettings
         from coliags_plugin.reconstruction.odometry.tracking import track
 
-        refuse_output(self.out, self.scene, self.overwrite)
+        refuse_output(self.output, self.scene, self.overwrite)
         settings, options = settings_among(TrackingSettings, self.set, _OWN)
         with progress_callback() as progress:
             scene, posed = open_video(self.scene, self.format, options, progress)
-            found = track(Video(scene.train), scene.train[0].camera.intrinsics, settings, progress)
+            tracking = track(Video(scene.train), scene.train[0].camera.intrinsics, settings, progress)
             trajectory = write_rgbd_scene(
-                self.out, scene.train, found.camera_to_world, overwrite=self.overwrite, progress=progress
+                self.output, scene.train, tracking.camera_to_world, overwrite=self.overwrite, progress=progress
             )
-        _warn_of_losses(found)
-        print("\n".join(_described(found)))
-        if posed:
-            print(_errors(found, scene))
-        print(f"{trajectory}\n{self.out}\n{train_command(self.out)}")
+        _warn_of_losses(tracking)
+        lines = [*_described(tracking), *([_errors(tracking, scene)] if posed else [])]
+        print_summary(
+            "\n".join(lines),
+            written=[trajectory, self.output],
+            then=[train_command(self.output)],
+            as_json=self.json,
+        )
 
 
-def _warn_of_losses(found: Tracking) -> None:
+def _warn_of_losses(tracking: Tracking) -> None:
     """Log a warning that names the lost frames, whose poses are guesses."""
     import logging
 
     import numpy as np
 
     log = logging.getLogger(__name__)
-    lost = np.flatnonzero(~found.tracked)
+    lost = np.flatnonzero(~tracking.tracked)
     if len(lost):
         shown = ", ".join(map(str, lost[:8])) + (f" and {len(lost) - 8} more" if len(lost) > 8 else "")
         log.warning("frames %s are lost: their poses are guesses at constant velocity", shown)
-    for before, after in found.jumps:
+    for before, after in tracking.jumps:
         log.warning(
             "no motion was found between frames %d and %d: the relative pose of the two segments is a guess",
             before,
@@ -77,23 +80,23 @@ def _warn_of_losses(found: Tracking) -> None:
         )
 
 
-def _described(found: Tracking) -> list[str]:
+def _described(tracking: Tracking) -> list[str]:
     lines = [
-        f"{len(found.tracked)} frames, {int(found.tracked.sum())} tracked by {found.term}; lost edges: "
-        f"{len(found.failed)} of {len(found.tracked) - 1}",
-        f"between neighbours: fitness {found.fitness:.3f}, inlier RMSE {found.depth_rmse:.4g} in the unit "
+        f"{len(tracking.tracked)} frames, {int(tracking.tracked.sum())} tracked by {tracking.term}; lost edges: "
+        f"{len(tracking.failed)} of {len(tracking.tracked) - 1}",
+        f"between neighbours: fitness {tracking.fitness:.3f}, inlier RMSE {tracking.depth_rmse:.4g} in the unit "
         f"of the depth (mm in C3VD), "
-        f"correlation of brightness {found.correlation:.3f}",
+        f"correlation of brightness {tracking.correlation:.3f}",
     ]
-    if found.further or found.dropped or found.refused:
+    if tracking.further or tracking.dropped or tracking.refused:
         lines.append(
-            f"pose graph: {len(found.further)} further edges, {len(found.dropped)} dropped as outliers, "
-            f"{found.refused} pairs that could not be registered"
+            f"pose graph: {len(tracking.further)} further edges, {len(tracking.dropped)} dropped as outliers, "
+            f"{tracking.refused} pairs that could not be registered"
         )
     return lines
 
 
-def _errors(found: Tracking, scene: Scene) -> str:
+def _errors(tracking: Tracking, scene: Scene) -> str:
     """Trajectory errors against the scene's own poses, which the tracking did not use."""
     import numpy as np
 
@@ -104,7 +107,7 @@ def _errors(found: Tracking, scene: Scene) -> str:
     if len(scene.train) < FEWEST_MATCHES:
         return f"against the scene's own poses: no errors for fewer than {FEWEST_MATCHES} frames"
     given = Trajectory(np.stack([frame.camera.camera_to_world.double().numpy() for frame in scene.train]))
-    estimate = Trajectory(found.camera_to_world)
+    estimate = Trajectory(tracking.camera_to_world)
     result = align(estimate, given, associate(estimate, given, "index"))
     share = result.ate_share
     of_path = "" if share is None else f" ({100.0 * share:.3g} % of the path, {result.path_length:.4g})"

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from coliags_plugin.cli.arguments import Assignments, DataFormat
+from coliags_plugin.cli.arguments import AsJson, Assignments, DataFormat, Output, Overwrite
+from coliags_plugin.cli.summaries import depth_commands, print_summary
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,46 +22,48 @@ _OWN = "triangulation."
 
 
 @dataclass(frozen=True)
-class Triangulate:
+class PosesTriangulateCommand:
     """Triangulate surface points of a posed video; write it as a scene with initial points and sparse depth."""
 
     scene: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCENE")]
     """The scene's folder."""
-    out: Path
+    output: Output
     """Folder to create, in COLMAP's layout."""
-    format: DataFormat = None
-    """Dataset format (`coliags list datamanagers`); default: recognised from the files."""
     set: Assignments = ()
     """An option of the data manager, as width=675, or of triangulation, as triangulation.min_angle=1."""
-    overwrite: bool = False
-    """Replace the output folder where it exists."""
+    format: DataFormat = None
+    overwrite: Overwrite = False
+    json: AsJson = False
 
     def run(self) -> None:
         """Triangulate the training frames, write all frames and print a summary."""
         import logging
 
-        from coliags_plugin.cli.written_scenes import next_commands, refuse_output, settings_among
+        from coliags_plugin.cli.scene_outputs import refuse_output, settings_among
         from coliags_plugin.engine.data_formats import open_scene
         from coliags_plugin.engine.progress import progress_callback
         from coliags_plugin.reconstruction.structure.colmap_scene import write_colmap_scene
         from coliags_plugin.reconstruction.structure.triangulation import TriangulationSettings, triangulate
         from coliags_plugin.reconstruction.structure.working_size import in_pixels_of
 
-        refuse_output(self.out, self.scene, self.overwrite)
+        refuse_output(self.output, self.scene, self.overwrite)
         settings, options = settings_among(TriangulationSettings, self.set, _OWN)
         with progress_callback() as progress:
             # Initial points are not needed here unless requested.
             scene = open_scene(self.scene, self.format, ["initial_points=none", *options], progress)
             detected = self._at_stored_size(scene, options) if scene.is_resized else scene.train
-            found = in_pixels_of(triangulate(detected, settings, progress), detected, scene.train)
+            points = in_pixels_of(triangulate(detected, settings, progress), detected, scene.train)
         test, split = _held_out(scene)
-        write_colmap_scene(self.out, scene.train, found, test, self.overwrite, "mm" if scene.is_metric else "unknown")
+        unit: Literal["mm", "unknown"] = "mm" if scene.is_metric else "unknown"
+        write_colmap_scene(self.output, scene.train, points, test, self.overwrite, unit)
         log = logging.getLogger(__name__)
         if test:
             log.info(
                 "points come from the %d training frames; the %d test frames see none", len(scene.train), len(test)
             )
-        print(f"{found.summary()}\n{self.out}\n{next_commands(self.out, split)}")
+        print_summary(
+            points.summary(), written=[self.output], then=depth_commands(self.output, split), as_json=self.json
+        )
 
     def _at_stored_size(self, scene: Scene, options: list[str]) -> Sequence[Frame]:
         """The training frames at the stored size, where more features are found than at a smaller one."""

@@ -291,12 +291,14 @@ def test_matches_that_opencv_cannot_explain_are_none(scene, monkeypatch):
 
 
 def test_command_says_it_all(folder, scene, tmp_path, capsys):
-    status = run("data", "check", folder, "--html", tmp_path / "check.html", "--json", tmp_path / "check.json")
+    argv = ("data", "check", folder, "--html", tmp_path / "check.html")
+    assert run(*argv) == 0
     told = capsys.readouterr().out
-    assert status == 0
     assert "nothing suspect" in told
     assert "c3vd (undistorted layout)" in told
-    facts = json.loads((tmp_path / "check.json").read_text())
+    assert told.endswith(f"written: {tmp_path / 'check.html'}\nnext:    coliags train coliags --data {folder}\n")
+    assert run(*argv, "--json") == 0
+    facts = json.loads(capsys.readouterr().out)
     assert facts["suspect"] is False
     assert facts["data"]["frames"]["train"] == 21
     page = (tmp_path / "check.html").read_text()
@@ -307,10 +309,10 @@ def test_command_says_it_all(folder, scene, tmp_path, capsys):
 def test_command_fails_on_what_is_suspect(scene, tmp_path, capsys):
     inverted = changed(scene, pose=torch.linalg.inv)
     write_frames(tmp_path / "inverted", inverted.video)
-    status = run("data", "check", tmp_path / "inverted", "--json", tmp_path / "check.json")
-    assert status == 1
+    assert run("data", "check", tmp_path / "inverted") == 1
     assert "Suspect\nposes agree with depth when read as: world-to-camera: " in capsys.readouterr().out
-    assert json.loads((tmp_path / "check.json").read_text())["suspect"] is True
+    assert run("data", "check", tmp_path / "inverted", "--json") == 1
+    assert json.loads(capsys.readouterr().out)["suspect"] is True
 
 
 def test_bad_input_of_the_command(folder, tmp_path, capsys):

@@ -201,20 +201,22 @@ def wall(tmp_path_factory):
 
 
 def test_command_writes_text_json_page_and_maps(wall, tmp_path, capsys):
-    out = ["--json", tmp_path / "d.json", "--html", tmp_path / "d.html", "--maps", tmp_path / "maps"]
-    assert run("depth", "check", wall / "estimate", wall / "truth", *out) == 0
+    argv = ("depth", "check", wall / "estimate", wall / "truth")
+    maps = ("--maps", tmp_path / "maps")
+    assert run(*argv, "--html", tmp_path / "d.html", *maps) == 0
     told = capsys.readouterr().out
     assert "9, matched by name" in told
-    facts = json.loads((tmp_path / "d.json").read_text(), parse_constant=pytest.fail)
+    assert run(*argv, "--json") == 0
+    facts = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
     # Depth is stored in steps of 0.0015 mm.
     assert facts["dense"]["errors"]["median"] == pytest.approx(0.03, abs=1e-4)
     assert len(facts["frames"]) == 9
     page = (tmp_path / "d.html").read_text()
     assert page.count("<img ") == 4 * 4
-    maps = sorted((tmp_path / "maps").iterdir())
-    assert len(maps) == 9
-    assert read_rgb(maps[0]).shape[1] >= 320
-    assert "already exists" in refused(capsys, "depth", "check", wall / "estimate", wall / "truth", *out[4:])
+    images = sorted((tmp_path / "maps").iterdir())
+    assert len(images) == 9
+    assert read_rgb(images[0]).shape[1] >= 320
+    assert "already exists" in refused(capsys, *argv, *maps)
 
 
 def test_command_refuses_bad_input(wall, tmp_path, capsys):

@@ -23,9 +23,9 @@ def content(anchors):
 
 
 def test_the_command_writes_a_page_that_needs_no_network(anchors, tmp_path, capsys):
-    assert run("view", anchors.path, "--save", tmp_path / "out" / "scene.html") == 0
+    assert run("view", anchors.path, "--output", tmp_path / "out" / "scene.html") == 0
     page = tmp_path / "out" / "scene.html"
-    assert capsys.readouterr().out.strip() == str(page)
+    assert capsys.readouterr().out.strip() == f"written: {page}"
     text = page.read_text(encoding="utf-8")
     assert len(text.encode()) < LARGEST_PAGE
     assert "<title>coliags on wall</title>" in text and "step 2; flattened light" in text
@@ -55,13 +55,13 @@ def test_too_many_gaussians_are_merged(content):
 def test_what_cannot_be_saved(anchors, tmp_path, capsys):
     with pytest.raises(InputError, match="a page of 1000 bytes"):
         save_page(anchors.load(), tmp_path / "a.html", largest=1000)
-    assert "is a folder" in refused(capsys, "view", anchors.path, "--save", tmp_path)
+    assert "is a folder" in refused(capsys, "view", anchors.path, "--output", tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_radiance_field_has_no_gaussians_to_save(run_of, tmp_path, capsys):
     radiance = run_of("reim-nerf-small", "field.width=8")
-    message = refused(capsys, "view", radiance.path, "--save", tmp_path / "a.html")
+    message = refused(capsys, "view", radiance.path, "--output", tmp_path / "a.html")
     assert "has no Gaussians to draw in a browser" in message
     assert not (tmp_path / "a.html").exists()
 

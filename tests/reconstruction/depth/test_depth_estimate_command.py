@@ -48,7 +48,7 @@ def wall(tmp_path_factory):
 def estimated(wall, tmp_path_factory):
     """The wall with estimated depth, and what was printed is discarded."""
     out = tmp_path_factory.mktemp("estimates") / "out"
-    assert run("depth", "estimate", wall, "--out", out, *OPTIONS) == 0
+    assert run("depth", "estimate", wall, "--output", out, *OPTIONS) == 0
     return out
 
 
@@ -111,12 +111,12 @@ def test_the_layout(estimated):
 def test_what_is_printed(wall, tmp_path, capsys):
     out = tmp_path / "out"
     options = (*OPTIONS, "--set", "split=endogslam", "--set", "max_frames=6", "--near", 20, "--far", 80)
-    assert run("depth", "estimate", wall, "--out", out, *options) == 0
-    summary, place, command = capsys.readouterr().out.splitlines()
+    assert run("depth", "estimate", wall, "--output", out, *options) == 0
+    summary, written, command = capsys.readouterr().out.splitlines()
     assert summary.startswith("6 frames, depth 20 to 80, ")
     assert summary.endswith(" points")
-    assert place == str(out)
-    assert command == f"coliags train coliags-estimated-depth --data {out} --set datamanager.split=endogslam"
+    assert written == f"written: {out}"
+    assert command == f"next:    coliags train coliags-estimated-depth --data {out} --set datamanager.split=endogslam"
 
 
 def test_resuming_gives_the_same_bytes(wall, estimated, tmp_path, monkeypatch, caplog):
@@ -130,13 +130,13 @@ def test_resuming_gives_the_same_bytes(wall, estimated, tmp_path, monkeypatch, c
         saved.append((stage, index))
 
     monkeypatch.setattr(WorkFolder, "save", killed)
-    assert run("depth", "estimate", wall, "--out", out, *OPTIONS[:2], "--jobs", 1) == 130
+    assert run("depth", "estimate", wall, "--output", out, *OPTIONS[:2], "--jobs", 1) == 130
     assert not out.exists()
     assert (tmp_path / ".out.work" / "swept-1").is_dir()
     again = []
     monkeypatch.setattr(WorkFolder, "save", lambda *call: (again.append(call[1:3]), save(*call))[1])
     caplog.set_level("INFO")
-    assert run("depth", "estimate", wall, "--out", out, *OPTIONS) == 0
+    assert run("depth", "estimate", wall, "--output", out, *OPTIONS) == 0
     assert "resuming" in caplog.text
     assert not set(saved) & set(again)
     assert contents(out) == contents(estimated)
@@ -147,7 +147,7 @@ def test_the_number_of_threads_does_not_matter(wall, estimated, tmp_path):
     before = cv2.getNumThreads()
     cv2.setNumThreads(8)
     try:
-        assert run("depth", "estimate", wall, "--out", tmp_path / "out", *OPTIONS[:2], "--jobs", 3) == 0
+        assert run("depth", "estimate", wall, "--output", tmp_path / "out", *OPTIONS[:2], "--jobs", 3) == 0
         assert cv2.getNumThreads() == 8
     finally:
         cv2.setNumThreads(before)
@@ -162,9 +162,9 @@ def test_work_files_of_other_options_are_not_used(wall, tmp_path, monkeypatch, c
 
     with monkeypatch.context() as patch:
         patch.setattr(Estimation, "run", killed)
-        assert run("depth", "estimate", wall, "--out", out, *OPTIONS) == 130
+        assert run("depth", "estimate", wall, "--output", out, *OPTIONS) == 130
     options = (*OPTIONS, "--set", "depth.agreement=0.03", "--set", "max_frames=5")
-    assert run("depth", "estimate", wall, "--out", out, *options) == 0
+    assert run("depth", "estimate", wall, "--output", out, *options) == 0
     assert "work files of other data or options are removed" in caplog.text
     assert len(frames_of(out)) == 5
 
@@ -185,7 +185,7 @@ def test_unit_mask_and_own_split_are_kept(estimated, tmp_path):
     (source / "transforms.json").write_text(json.dumps(content))
     write_unit(source, "unknown")
     out = tmp_path / "out"
-    assert run("depth", "estimate", source, "--out", out, *OPTIONS, "--set", "split=own") == 0
+    assert run("depth", "estimate", source, "--output", out, *OPTIONS, "--set", "split=own") == 0
     assert (out / "unit.txt").read_text() == "unknown\n"
     scene = open_scene(out, options=["split=own", "initial_points=data"])
     assert [frame.name for frame in scene.test_sets["test"]] == [frames[0].name]
@@ -198,7 +198,7 @@ def test_unit_mask_and_own_split_are_kept(estimated, tmp_path):
 
 
 def test_bad_options_are_refused(wall, tmp_path, capsys):
-    out = ("--out", tmp_path / "out")
+    out = ("--output", tmp_path / "out")
     assert "--near without --far" in refused(capsys, wall, *out, "--near", 3)
     assert "0 < near < far" in refused(capsys, wall, *out, "--near", 30, "--far", 20)
     assert "--jobs 0" in refused(capsys, wall, *out, "--jobs", 0)
@@ -206,7 +206,7 @@ def test_bad_options_are_refused(wall, tmp_path, capsys):
     assert "no such folder" in refused(capsys, wall, *out, "--prior", tmp_path / "none")
     reach = "depth.sweeps=[{reduction: 2, reach: 0.1}]"
     assert "the first has reach 0.1" in refused(capsys, wall, *out, "--set", reach)
-    assert "a folder apart from the input" in refused(capsys, wall, "--out", wall / "inside")
+    assert "a folder apart from the input" in refused(capsys, wall, "--output", wall / "inside")
     assert not (tmp_path / "out").exists()
 
 
@@ -218,7 +218,7 @@ def test_frames_of_several_sizes_are_refused():
 
 
 def test_what_gives_no_depth_is_refused(tmp_path, capsys):
-    out = ("--out", tmp_path / "out", *OPTIONS)
+    out = ("--output", tmp_path / "out", *OPTIONS)
     few = write_wall(tmp_path / "few", wall_frames(sideways(3)))
     assert "3 frames. Expected at least 4" in refused(capsys, few, *out, "--set", "split=all-train")
     still = write_wall(tmp_path / "still", wall_frames(sideways(6, 0.0)))
@@ -251,11 +251,11 @@ def noisy(frames, level, seed=0):
 def test_black_or_blurred_frames_give_no_confident_depth(tmp_path, capsys, level):
     frames = wall_frames(sideways(COUNT))
     nothing = write_wall(tmp_path / "nothing", noisy(frames, level))
-    assert "the depth range is unknown" in refused(capsys, nothing, "--out", tmp_path / "a", *OPTIONS)
+    assert "the depth range is unknown" in refused(capsys, nothing, "--output", tmp_path / "a", *OPTIONS)
     told = ("--near", 20, "--far", 80)
-    assert "no surface that 9 frames agree on" in refused(capsys, nothing, "--out", tmp_path / "a", *OPTIONS, *told)
+    assert "no surface that 9 frames agree on" in refused(capsys, nothing, "--output", tmp_path / "a", *OPTIONS, *told)
     some = write_wall(tmp_path / "some", [*frames[:4], *noisy(frames[4:5], level), *frames[5:]])
-    assert run("depth", "estimate", some, "--out", tmp_path / "b", *OPTIONS, *told) == 0
+    assert run("depth", "estimate", some, "--output", tmp_path / "b", *OPTIONS, *told) == 0
     found = frames_of(tmp_path / "b")
     assert confidence_of(tmp_path / "b", found[4].name).max() == 0.0
     assert np.isfinite(found[4].depth.numpy()).all()
@@ -268,7 +268,7 @@ def test_a_prior_by_another(wall, tmp_path):
     for frame in frames_of(wall):
         np.save(priors / f"{frame.name}.npy", 5.0 + 100.0 / wall_depth(frame.camera))
     out = tmp_path / "out"
-    assert run("depth", "estimate", wall, "--out", out, "--prior", priors, *OPTIONS, "--set", "max_frames=6") == 0
+    assert run("depth", "estimate", wall, "--output", out, "--prior", priors, *OPTIONS, "--set", "max_frames=6") == 0
     frames = frames_of(out)
     error = np.stack([np.abs(frame.depth.numpy() / wall_depth(frame.camera) - 1.0) for frame in frames])
     unknown = np.stack([confidence_of(out, frame.name) for frame in frames]) == 0.0

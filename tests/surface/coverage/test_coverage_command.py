@@ -66,9 +66,9 @@ def test_the_command_writes_a_folder(phantom, tmp_path, capsys):
     truth = read_true_surface(phantom, any_frame=True)
     wall, out = tmp_path / "wall.ply", tmp_path / "out"
     write_mesh(wall, truth.mesh.part(truth.seen))
-    assert run("coverage", phantom, "--mesh", wall, "--out", out, "--set", "rays=8000") == 0
+    assert run("coverage", phantom, "--mesh", wall, "--output", out, "--set", "rays=8000") == 0
     printed = capsys.readouterr().out
-    assert RESEARCH_USE in printed and printed.splitlines()[-1] == str(out)
+    assert RESEARCH_USE in printed and printed.splitlines()[-1] == f"written: {out}"
     found = json.loads((out / "coverage.json").read_text())
     assert sum(found["shares"].values()) == pytest.approx(1.0)
     assert found["guessed_share"] > 0.05 and found["note"] == RESEARCH_USE
@@ -81,17 +81,17 @@ def test_the_command_writes_a_folder(phantom, tmp_path, capsys):
     page = (out / "coverage.html").read_text()
     assert RESEARCH_USE in page and "http" not in page.replace("http://www.w3.org", "")
     assert (out / "map.png").is_file() and read_mesh(out / "coverage.ply").colors is not None
-    assert "already exists" in refused(capsys, "coverage", phantom, "--mesh", wall, "--out", out)
+    assert "already exists" in refused(capsys, "coverage", phantom, "--mesh", wall, "--output", out)
 
 
 def test_bad_input_is_one_clear_error(phantom, tmp_path, capsys):
     mesh, out = true_mesh(phantom), tmp_path / "out"
     for arguments, told in (
         ((phantom,), "is not a run folder"),
-        ((phantom, "--mesh", tmp_path / "none.ply", "--out", out), "none.ply"),
-        ((phantom, "--mesh", mesh, "--out", out, "--set", "farr=3"), "'farr'"),
-        ((phantom, "--mesh", mesh, "--out", out, "--truth", tmp_path), "no true surface"),
-        ((tmp_path / "gone", "--mesh", mesh, "--out", out), "gone"),
+        ((phantom, "--mesh", tmp_path / "none.ply", "--output", out), "none.ply"),
+        ((phantom, "--mesh", mesh, "--output", out, "--set", "farr=3"), "'farr'"),
+        ((phantom, "--mesh", mesh, "--output", out, "--truth", tmp_path), "no true surface"),
+        ((tmp_path / "gone", "--mesh", mesh, "--output", out), "gone"),
     ):
         assert told in refused(capsys, "coverage", *arguments), arguments
     assert not out.exists()

@@ -1,0 +1,72 @@
+"""What commands print at their end: a summary, what was written, and what to type next."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+
+def print_summary(
+    text: str = "",
+    facts: Mapping[str, Any] | None = None,
+    *,
+    written: Sequence[Path] = (),
+    then: Sequence[str] = (),
+    as_json: bool = False,
+) -> None:
+    """Print a summary for a person or, with ``--json``, for a script.
+
+    Args:
+        text: The summary as text; empty without one.
+        facts: The same as JSON values; None: the text.
+        written: Files and folders that were written.
+        then: Commands to type next.
+        as_json: Print one JSON object: the facts, ``written`` and ``next``.
+    """
+    if as_json:
+        told = ({"summary": text} if text else {}) if facts is None else facts
+        summary = {**told, "written": [str(path) for path in written], "next": list(then)}
+        print(json.dumps(summary, indent=2, allow_nan=False, default=str))
+        return
+    lines = [text] if text else []
+    lines += [f"written: {path}" for path in written]
+    lines += [f"next:    {command}" for command in then]
+    if lines:
+        print("\n".join(lines))
+
+
+def coliags(*words: object) -> str:
+    """A command to type, quoted for the shell."""
+    return shlex.join(["coliags", *map(str, words)])
+
+
+def view_command(run: Path, data: Path | None = None) -> str:
+    """The command that shows a run, whose scene may have moved to ``data``."""
+    return coliags("view", run, *(() if data is None else ("--data", data)))
+
+
+def train_command(scene: Path, method: str = "coliags", assignments: Sequence[str] = ()) -> str:
+    """The command that trains a method on a scene with options ``KEY=VALUE``."""
+    return coliags("train", method, "--data", scene, *_set(assignments))
+
+
+def depth_commands(scene: Path, assignments: Sequence[str] = ()) -> list[str]:
+    """The commands that estimate the depth of a scene with poses and points, and train on it.
+
+    Args:
+        scene: The scene.
+        assignments: Options of its data manager, ``datamanager.KEY=VALUE``.
+    """
+    with_depth = scene.with_name(f"{scene.name}-depth")
+    options = _set([assignment.removeprefix("datamanager.") for assignment in assignments])
+    return [
+        coliags("depth", "estimate", scene, "--output", with_depth, *options),
+        train_command(with_depth, "coliags-estimated-depth", assignments),
+    ]
+
+
+def _set(assignments: Sequence[str]) -> list[str]:
+    return [word for assignment in assignments for word in ("--set", assignment)]

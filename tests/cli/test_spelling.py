@@ -1,0 +1,81 @@
+"""Every command spells and orders its options alike, and ends alike."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import typing
+from pathlib import Path
+
+import pytest
+import tyro
+
+from coliags_plugin.cli import Command
+from coliags_plugin.cli.arguments import renamed_argument
+from coliags_plugin.cli.summaries import print_summary
+from tests.commands import run
+
+#: Options that come last, in this order.
+TAIL = ("set", "format", "data", "device", "overwrite", "anonymous", "json")
+#: Options that name a format otherwise.
+FORMATS = dict.fromkeys(("layout", "estimate_format", "reference_format", "truth_format", "from_format"), "format")
+
+
+def commands(union=Command) -> dict[str, type]:
+    """Every command by its name."""
+    found = {}
+    for annotated in typing.get_args(union):
+        kind, *_ = typing.get_args(annotated)
+        inner = typing.get_type_hints(kind, include_extras=True).get("subcommand")
+        if inner is None:
+            found[kind.__name__] = kind
+        else:
+            found |= commands(typing.get_args(inner)[0])
+    return found
+
+
+@pytest.mark.parametrize("kind", commands().values(), ids=commands())
+def test_options_come_in_one_order(kind):
+    hints = typing.get_type_hints(kind, include_extras=True)
+    positional = [name for name, hint in hints.items() if tyro.conf.Positional in getattr(hint, "__metadata__", ())]
+    options = [field for field in dataclasses.fields(kind) if field.name not in positional]
+    required = [field.name for field in options if field.default is dataclasses.MISSING]
+    names = [FORMATS.get(field.name, field.name) for field in options]
+    assert not {"out", "save"} & set(hints) and "output" not in positional
+    if "output" in names:
+        assert set(names[: names.index("output")]) <= {"scenes", "data"} & set(required), "the subject comes first"
+    tail = [name for name in names if name in TAIL and name not in required]
+    assert tail == sorted(tail, key=TAIL.index)
+    assert names[len(names) - len(tail) :] == tail
+
+
+def test_a_summary_for_people_and_for_scripts(capsys):
+    argv = {"written": [Path("a b")], "then": ["coliags eval 'a b'"]}
+    print_summary("two lines\nof text", {"step": 3}, **argv)
+    assert capsys.readouterr().out == "two lines\nof text\nwritten: a b\nnext:    coliags eval 'a b'\n"
+    print_summary("two lines\nof text", {"step": 3}, **argv, as_json=True)
+    assert json.loads(capsys.readouterr().out) == {"step": 3, "written": ["a b"], "next": ["coliags eval 'a b'"]}
+    print_summary("text", as_json=True)
+    assert json.loads(capsys.readouterr().out) == {"summary": "text", "written": [], "next": []}
+
+
+@pytest.mark.parametrize(
+    ("argv", "hint"),
+    [
+        ("mesh RUN --out OUT", "--out is now --output, or -o"),
+        ("reconstruct VIDEO --out=OUT", "--out is now --output, or -o"),
+        ("view RUN --save page.html", "--save is now --output, or -o"),
+        ("phantom OUT --seed 1", "what is written is now named by --output, or -o"),
+        ("poses convert IN OUT --to tum", "what is written is now named by --output, or -o"),
+        ("data check SCENE --json check.json", "write `--json > FILE`"),
+    ],
+)
+def test_old_spellings_are_refused_with_the_new_ones(argv, hint, capsys):
+    assert run(*argv.split()) == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("coliags: ") and last.endswith(hint)
+
+
+def test_other_mistakes_are_not_taken_for_old_spellings():
+    for argv in ("mesh RUN --outpu OUT", "phantom --output OUT --sed 1", "data check SCENE --json --bogus"):
+        assert not renamed_argument(argv.split())
