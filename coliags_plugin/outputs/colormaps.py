@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, UInt8
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.outputs.axis_ticks import linear_ticks, tick_label
 from coliags_plugin.outputs.image_files import as_array
+from coliags_plugin.outputs.raster_text import INK, draw_text, text_width
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -32,8 +33,6 @@ HATCH_GREYS = (150, 108)
 
 _HATCH_PERIOD = 8
 _HATCH_WIDTH = 2
-_FONT = cv2.FONT_HERSHEY_SIMPLEX
-_INK = (32, 32, 32)
 
 
 @cache
@@ -218,18 +217,16 @@ def color_bar(
     low, high = _interval(limits)
     if width < 120:
         raise InputError(f"a colour bar {width} px wide", "at least 120 px")
-    size, thickness, scale = 18, 1, 0.45
-    (unit_width, _), _ = cv2.getTextSize(unit, _FONT, scale, thickness)
-    left, right, top = 24, width - unit_width - 32, 8
+    size = 18
+    left, right, top = 24, width - text_width(unit) - 32, 8
     image = np.full((top + size + 26, width, 3), 255, np.uint8)
     image[top : top + size, left:right] = _colored(np.linspace(0.0, 1.0, right - left)[None], color_map)
     for tick in linear_ticks(low, high):
         x = left + round((tick - low) / (high - low) * (right - left - 1))
-        cv2.line(image, (x, top + size), (x, top + size + 4), _INK, 1)
+        cv2.line(image, (x, top + size), (x, top + size + 4), INK, 1)
         label = tick_label(tick)
-        (text_width, _), _ = cv2.getTextSize(label, _FONT, scale, thickness)
-        _text(image, label, (x - text_width // 2, top + size + 20), scale)
-    _text(image, unit, (right + 20, top + size - 4), scale)
+        draw_text(image, label, (x - text_width(label) // 2, top + size + 20))
+    draw_text(image, unit, (right + 20, top + size - 4))
     return image
 
 
@@ -267,7 +264,7 @@ def side_by_side(
         column[band:] = array
         # Drawn into a separate strip, so that a label cannot overlap the next one.
         strip = np.ascontiguousarray(column[:band])
-        _text(strip, _shortened(label, array.shape[1] - 4, scale), (2, 16), scale)
+        draw_text(strip, _shortened(label, array.shape[1] - 4, scale), (2, 16), scale)
         column[:band] = strip
         x += array.shape[1] + gap
     return sheet
@@ -321,12 +318,8 @@ def _same_shape(array: np.ndarray, like: np.ndarray, name: str) -> None:
         raise InputError(f"{name} has the shape {list(array.shape)}", f"{list(like.shape)}, as the truth")
 
 
-def _text(image: np.ndarray, text: str, origin: tuple[int, int], scale: float) -> None:
-    cv2.putText(image, text, origin, _FONT, scale, _INK, 1, cv2.LINE_AA)
-
-
 def _shortened(label: str, width: int, scale: float) -> str:
     text = label
-    while text and cv2.getTextSize(text, _FONT, scale, 1)[0][0] > width:
+    while text and text_width(text, scale) > width:
         text = text[:-4] + "..." if len(text) > 4 else ""
     return text

@@ -10,6 +10,7 @@ from jaxtyping import Float, UInt8
 
 from coliags_plugin.geometry.poses.alignment import Alignment
 from coliags_plugin.outputs.axis_ticks import linear_ticks, tick_label
+from coliags_plugin.outputs.raster_text import INK, draw_text
 
 #: Colours distinguishable with any colour vision, and in greyscale.
 REFERENCE_RGB = (86, 160, 211)
@@ -17,8 +18,7 @@ ESTIMATE_RGB = (213, 94, 0)
 
 #: Name, colour, width of the line and radius of the first frame's circle, px.
 _STYLES = (("reference", REFERENCE_RGB, 3, 9), ("estimate, aligned", ESTIMATE_RGB, 1, 5))
-_INK, _GRID = (32, 32, 32), (225, 225, 225)
-_FONT, _TEXT = cv2.FONT_HERSHEY_SIMPLEX, 0.45
+_GRID = (225, 225, 225)
 _WIDTH, _HEIGHT = 1200, 900
 #: Fractional bits of coordinates, so that lines do not snap to pixels.
 _BITS = 4
@@ -57,7 +57,7 @@ def plot_trajectory(alignment: Alignment, unit: str) -> UInt8[np.ndarray, "900 1
     kind = "Sim(3)" if alignment.with_scale else "SE(3)"
     spread = alignment.ate
     title = f"{len(alignment.matches)} frames, {kind}   ATE rmse {spread.rmse:.4g} {unit}, max {spread.max:.4g} {unit}"
-    _text(image, title, (70, 30), 0.55)
+    draw_text(image, title, (70, 30), 0.55)
     _legend(image)
     _views(image, paths, unit)
     charts = [
@@ -112,24 +112,24 @@ def _axes(image: np.ndarray, panel: _Panel, x_label: str, y_label: str) -> None:
     for tick in linear_ticks(left, right):
         x = round(float(panel.place(np.array([[tick, bottom]]))[0, 0]))
         cv2.line(image, (x, panel.top), (x, end_y), _GRID, 1)
-        _text(image, tick_label(tick), (x, end_y + 18), 0.4, align=0.5)
+        draw_text(image, tick_label(tick), (x, end_y + 18), 0.4, align=0.5)
     for tick in linear_ticks(min(bottom, top), max(bottom, top), 4):
         y = round(float(panel.place(np.array([[left, tick]]))[0, 1]))
         cv2.line(image, (panel.left, y), (end_x, y), _GRID, 1)
-        _text(image, tick_label(tick), (panel.left - 8, y + 4), 0.4, align=1.0)
-    cv2.rectangle(image, (panel.left, panel.top), (end_x, end_y), _INK, 1)
-    _text(image, y_label, (panel.left, panel.top - 10), _TEXT)
-    _text(image, x_label, (end_x, end_y + 36), _TEXT, align=1.0)
+        draw_text(image, tick_label(tick), (panel.left - 8, y + 4), 0.4, align=1.0)
+    cv2.rectangle(image, (panel.left, panel.top), (end_x, end_y), INK, 1)
+    draw_text(image, y_label, (panel.left, panel.top - 10))
+    draw_text(image, x_label, (end_x, end_y + 36), align=1.0)
 
 
 def _legend(image: np.ndarray) -> None:
     x = 770
     for name, color, thickness, _ in _STYLES:
         cv2.line(image, (x, 26), (x + 30, 26), color, thickness, cv2.LINE_AA)
-        _text(image, name, (x + 38, 30), _TEXT)
+        draw_text(image, name, (x + 38, 30))
         x += 130
-    cv2.circle(image, (1090, 26), 6, _INK, 1, cv2.LINE_AA)
-    _text(image, "first frame", (1102, 30), _TEXT)
+    cv2.circle(image, (1090, 26), 6, INK, 1, cv2.LINE_AA)
+    draw_text(image, "first frame", (1102, 30))
 
 
 def _line(image: np.ndarray, points: np.ndarray, color: tuple[int, int, int], thickness: int) -> None:
@@ -138,9 +138,3 @@ def _line(image: np.ndarray, points: np.ndarray, color: tuple[int, int, int], th
 
 def _fixed(points: np.ndarray) -> np.ndarray:
     return np.rint(points * (1 << _BITS)).astype(np.int32)
-
-
-def _text(image: np.ndarray, text: str, origin: tuple[int, int], scale: float, align: float = 0.0) -> None:
-    """Draw text whose start (``align`` 0), middle (0.5) or end (1) is at the origin."""
-    (width, _), _ = cv2.getTextSize(text, _FONT, scale, 1)
-    cv2.putText(image, text, (round(origin[0] - align * width), origin[1]), _FONT, scale, _INK, 1, cv2.LINE_AA)

@@ -7,12 +7,12 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from coliags_plugin.outputs.axis_ticks import linear_ticks, tick_label
+from coliags_plugin.outputs.raster_text import INK, draw_text, text_width
 from coliags_plugin.surface.coverage.centreline import STEP
 from coliags_plugin.surface.coverage.levels import GUESS_COLOR, GUESS_LABEL, Level
 from coliags_plugin.surface.coverage.measure import WallCoverage
 
-_INK, _SOFT, _GRID, _NOTHING = (32, 32, 32), (110, 110, 110), (225, 225, 225), (245, 245, 245)
-_FONT, _TEXT = cv2.FONT_HERSHEY_SIMPLEX, 0.45
+_SOFT, _GRID, _NOTHING = (110, 110, 110), (225, 225, 225), (245, 245, 245)
 #: Edges of the axes rectangle, px: left, top, and what is right of and below it.
 _LEFT, _TOP, _RIGHT, _BELOW = 70, 76, 24, 56
 #: Height of the map, and width of a millimetre of it, px; and the widest map.
@@ -40,7 +40,7 @@ def draw_map(coverage: WallCoverage) -> UInt8[np.ndarray, "H W 3"]:
     _axes(image, (first, last), width)
     for end in (coverage.section.start, coverage.section.end):
         if first < end < last:
-            cv2.line(image, (column(end), _TOP), (column(end), _TOP + _HEIGHT), _INK, 2)
+            cv2.line(image, (column(end), _TOP), (column(end), _TOP + _HEIGHT), INK, 2)
     for number, region in enumerate(coverage.regions, start=1):
         row = _TOP + round(region.clock / 360.0 * _HEIGHT)
         _tag(image, str(number), (column(region.arc), row))
@@ -80,15 +80,15 @@ def _axes(image: np.ndarray, limits: tuple[float, float], width: int) -> None:
     right, bottom = _LEFT + width, _TOP + _HEIGHT
     for tick in linear_ticks(first, last, 10):
         x = _LEFT + round((tick - first) / (last - first) * width)
-        cv2.line(image, (x, bottom), (x, bottom + 5), _INK, 1)
-        _text(image, tick_label(tick), (x, bottom + 20), align=0.5)
+        cv2.line(image, (x, bottom), (x, bottom + 5), INK, 1)
+        draw_text(image, tick_label(tick), (x, bottom + 20), align=0.5)
     for angle in range(0, 361, 90):
         y = _TOP + round(angle / 360.0 * _HEIGHT)
-        cv2.line(image, (_LEFT - 5, y), (_LEFT, y), _INK, 1)
-        _text(image, str(angle), (_LEFT - 9, y + 4), align=1.0)
-    cv2.rectangle(image, (_LEFT, _TOP), (right, bottom), _INK, 1)
-    _text(image, "along the lumen [mm]; 0: shallowest camera", (right, bottom + 44), align=1.0)
-    _text(image, "clock angle [deg]; 0: up, 90: right", (_LEFT - 60, bottom + 44))
+        cv2.line(image, (_LEFT - 5, y), (_LEFT, y), INK, 1)
+        draw_text(image, str(angle), (_LEFT - 9, y + 4), align=1.0)
+    cv2.rectangle(image, (_LEFT, _TOP), (right, bottom), INK, 1)
+    draw_text(image, "along the lumen [mm]; 0: shallowest camera", (right, bottom + 44), align=1.0)
+    draw_text(image, "clock angle [deg]; 0: up, 90: right", (_LEFT - 60, bottom + 44))
 
 
 def _legend(image: np.ndarray, coverage: WallCoverage) -> None:
@@ -99,22 +99,16 @@ def _legend(image: np.ndarray, coverage: WallCoverage) -> None:
         if not area:
             continue
         text = f"{label} {100.0 * area / total:.1f} %"
-        (width, _), _ = cv2.getTextSize(text, _FONT, _TEXT, 1)
+        width = text_width(text)
         if x + 22 + width > image.shape[1] - 8:
             x, y = _LEFT, y + 24
         cv2.rectangle(image, (x, y - 11), (x + 14, y + 3), color, -1)
-        _text(image, text, (x + 22, y))
+        draw_text(image, text, (x + 22, y))
         x += 22 + width + 26
 
 
 def _tag(image: np.ndarray, text: str, middle: tuple[int, int]) -> None:
     """A number on a white disc."""
     cv2.circle(image, middle, 11, (255, 255, 255), -1, cv2.LINE_AA)
-    cv2.circle(image, middle, 11, _INK, 1, cv2.LINE_AA)
-    _text(image, text, (middle[0], middle[1] + 5), align=0.5)
-
-
-def _text(image: np.ndarray, text: str, origin: tuple[int, int], align: float = 0.0) -> None:
-    """Draw text whose start (``align`` 0), middle (0.5) or end (1) is at the origin."""
-    (width, _), _ = cv2.getTextSize(text, _FONT, _TEXT, 1)
-    cv2.putText(image, text, (round(origin[0] - align * width), origin[1]), _FONT, _TEXT, _INK, 1, cv2.LINE_AA)
+    cv2.circle(image, middle, 11, INK, 1, cv2.LINE_AA)
+    draw_text(image, text, (middle[0], middle[1] + 5), align=0.5)
