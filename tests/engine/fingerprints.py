@@ -63,7 +63,7 @@ def fingerprint(data: Path, method: str, seed: int, changes: tuple[str, ...], fo
     """What one run ends in, and whether it ends in the same when resumed."""
     run = folder / "run"
     shutil.rmtree(run, ignore_errors=True)
-    growth = GROWTH[load_method(method).config.strategy.name]
+    growth = GROWTH.get(load_method(method).config.strategy.name, ())
     words = [word for change in (*SETTINGS, *growth, *changes) for word in ("--set", change)]
     coliags("train", method, "--data", data, "--seed", seed, "--steps", STEPS, "--output", run, *words)
     straight = digests(run)
