@@ -73,11 +73,13 @@ def table_rows(page: str, header: str) -> list[list[str]]:
 # Citations
 
 
+@cache
 def headings(page: Path) -> list[str]:
     prose = re.sub(r"^ *```.*?^ *```$", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
     return re.findall(r"^#+ (.+)$", prose, re.MULTILINE)
 
 
+@cache
 def sections(page: Path) -> set[str]:
     """Numbers that head a section; a page's title, such as "5 methods compared", heads none."""
     return {found.group() for title in headings(page)[1:] if (found := re.match(r"\d+(\.\d+)*(?= )", title))}
@@ -92,23 +94,30 @@ def cited(text: str) -> list[tuple[str, list[str]]]:
     return [(page, re.findall(number, numbers or "")) for page, numbers in re.findall(pattern, text)]
 
 
-@pytest.mark.parametrize("path", [path for path in SOURCES if path.suffix != ".md"], ids=name_of)
-def test_citations_lead_to_a_section(path):
-    for page, numbers in cited(path.read_text()):
-        target = ROOT / page
-        assert page.startswith("docs/") and target.is_file(), f"{page} is no page of the documentation"
-        assert set(numbers) <= sections(target), f"{page} has no section {', '.join(numbers)}"
+def wrong_citations(path: Path, text: str, folders: tuple[Path, ...]) -> list[str]:
+    """What a text cites that is not there: a page in none of the folders, or a section that the page lacks."""
+    wrong = []
+    for page, numbers in cited(text):
+        target = next((folder / page for folder in folders if (folder / page).is_file()), None)
+        missing = set() if target is None else set(numbers) - sections(target)
+        if target is None or missing:
+            wrong.append(f"{name_of(path)} cites {page} {', '.join(sorted(missing))}")
+    return wrong
 
 
-@pytest.mark.parametrize("path", PAGES, ids=name_of)
-def test_pages_cite_one_another_rightly(path):
-    for page, numbers in cited(path.read_text()):
-        known = [ROOT / page, path.parent / page, DOCS / page]
-        target = next((found for found in known if found.is_file()), None)
-        assert target is not None, f"{page} is not there"
-        assert set(numbers) <= sections(target), f"{page} has no section {', '.join(numbers)}"
-    for target in re.findall(r"\]\(([^)#:]+)\)", path.read_text()):
-        assert (path.parent / target).exists(), f"the link to {target} is broken"
+def test_citations_lead_to_a_section():
+    sources = [path for path in SOURCES if path.suffix != ".md"]
+    assert [wrong for path in sources for wrong in wrong_citations(path, path.read_text(), (ROOT,))] == []
+
+
+def test_pages_cite_one_another_rightly():
+    wrong = []
+    for path in PAGES:
+        text = path.read_text()
+        wrong += wrong_citations(path, text, (ROOT, path.parent, DOCS))
+        links = re.findall(r"\]\(([^)#:]+)\)", text)
+        wrong += [f"{name_of(path)} links {target}" for target in links if not (path.parent / target).exists()]
+    assert wrong == []
 
 
 def test_sections_cited_by_name_are_there():
