@@ -62,8 +62,8 @@ def fuse_depth(
         for there, number in zip(available, taken, strict=True)
     ]
     wanted = [pair for pair in zip(frames, chosen, strict=True) if len(pair[1])]
-    found = parallel_map(_fused, wanted, "fuse depth", progress)
-    positions, colors = zip(*found, strict=True)
+    fused = parallel_map(_fused, wanted, "fuse depth", progress)
+    positions, colors = zip(*fused, strict=True)
     return PointCloud(torch.from_numpy(np.concatenate(positions)), torch.from_numpy(np.concatenate(colors)))
 
 

@@ -32,9 +32,9 @@ class CentreLine:
 
     def at(self, arc: Float[np.ndarray, "N"]) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3 3"]]:
         """Points and frames at arc lengths, mm. [N, 3], [N, 3, 3]"""
-        place = np.clip(np.asarray(arc, dtype=np.float64) / _STEP, 0.0, len(self.points) - 1.001)
-        low = place.astype(int)
-        weight = place - low
+        position = np.clip(np.asarray(arc, dtype=np.float64) / _STEP, 0.0, len(self.points) - 1.001)
+        low = position.astype(int)
+        weight = position - low
         points = self.points[low] * (1.0 - weight)[:, None] + self.points[low + 1] * weight[:, None]
         mixed = self.frames[low] * (1.0 - weight)[:, None, None] + self.frames[low + 1] * weight[:, None, None]
         tangent = mixed[..., 2] / np.linalg.norm(mixed[..., 2], axis=-1, keepdims=True)

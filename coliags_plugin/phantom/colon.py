@@ -130,14 +130,14 @@ def grow_anatomy(settings: PhantomSettings) -> Anatomy:
         # Two or three of the sectors between taeniae carry a crescent; together they shape the opening.
         sectors = generator.permutation(3)[: generator.choice([2, 3])]
         tallest = generator.uniform(5.0, 8.0)
-        for place, sector in enumerate(sectors):
+        for rank, sector in enumerate(sectors):
             middle = taenia_clock + twist * station + _TAENIAE[sector] + np.pi / 3.0
             folds.append(
                 Fold(
                     arc=station + generator.uniform(-2.5, 2.5),
                     clock=float(middle + generator.normal(0.0, 0.12)),
                     half_width=generator.uniform(np.pi / 3.0, 2.0 * np.pi / 3.0),
-                    height=tallest if place == 0 else generator.uniform(5.0, max(tallest, 5.01)),
+                    height=tallest if rank == 0 else generator.uniform(5.0, max(tallest, 5.01)),
                     thickness=generator.uniform(2.2, 4.0),
                     slant=generator.uniform(-3.0, 3.0),
                     sway=(generator.uniform(0.2, 0.8), generator.uniform(0.0, 2.0 * np.pi)),

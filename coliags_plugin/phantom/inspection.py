@@ -120,9 +120,9 @@ def resting(values: Float[np.ndarray, "S K"], time: Float[np.ndarray, "T"]) -> F
 
     Between two of them it follows Perlin's quintic, whose first and second derivatives are 0 at its ends.
     """
-    place = time * (len(values) - 1)
-    low = np.minimum(place.astype(int), len(values) - 2)
-    x = (place - low)[:, None]
+    position = time * (len(values) - 1)
+    low = np.minimum(position.astype(int), len(values) - 2)
+    x = (position - low)[:, None]
     share = x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
     return np.asarray(values[low] * (1.0 - share) + values[low + 1] * share)
 

@@ -208,30 +208,30 @@ def _draw_branch(
 
     Over its first ``surfacing`` mm a vessel rises from deep in the wall.
     """
-    place, step, walked = start.copy(), 0.6, 0.0
+    current, step, walked = start.copy(), 0.6, 0.0
     wander = 0.0
     around = (canvas.shape[1] - 2 * pad) * sizes[1]
-    place[1] %= around
+    current[1] %= around
     taper = np.exp(-step / generator.uniform(22.0, 40.0))
     while width >= 0.15:
         wander = 0.8 * wander + generator.normal(0.0, 0.05)
         heading += wander + generator.normal(0.0, 0.10)
-        following = place + step * np.array([np.cos(heading), np.sin(heading)])
+        following = current + step * np.array([np.cos(heading), np.sin(heading)])
         ends = [
-            (round((point[1] / sizes[1] + pad) * 16), round(point[0] / sizes[0] * 16)) for point in (place, following)
+            (round((point[1] / sizes[1] + pad) * 16), round(point[0] / sizes[0] * 16)) for point in (current, following)
         ]
         # Vessels thinner than a texel are drawn fainter.
         thickness = max(round(width / sizes[0]), 1)
         risen = min(walked / surfacing, 1.0) if surfacing else 1.0
         shown = round(strength * risen * min(width / sizes[0], 1.0) * min(1.0, width / 0.3))
         cv2.line(canvas, ends[0], ends[1], shown, thickness, cv2.LINE_AA, 4)
-        place, walked = following, walked + step
+        current, walked = following, walked + step
         width *= taper
-        if not -0.4 * pad * sizes[1] < place[1] < around + 0.4 * pad * sizes[1]:
-            place[1] %= around
+        if not -0.4 * pad * sizes[1] < current[1] < around + 0.4 * pad * sizes[1]:
+            current[1] %= around
         if generator.uniform() < 0.05 and width > 0.22:
             side = generator.choice([-1.0, 1.0]) * generator.uniform(0.4, 0.9)
-            _draw_branch(canvas, sizes, pad, place, heading + side, 0.75 * width, int(0.9 * strength), generator)
+            _draw_branch(canvas, sizes, pad, current, heading + side, 0.75 * width, int(0.9 * strength), generator)
             heading -= 0.3 * side
             width *= 0.9
 

@@ -61,6 +61,6 @@ class SolidNoise:
         shift = self._generator.uniform(0.0, self._SIZE, 3)
         turn = (turn * (2.5 * self._SIGMA / scale)).astype(np.float32)
         # map_coordinates takes one row per coordinate; as a matrix product this takes eight times as long.
-        place = np.einsum("nc,cd->dn", points.reshape(-1, 3), turn) + shift.astype(np.float32)[:, None]
-        noise = scipy.ndimage.map_coordinates(self._volume, place, order=1, mode="grid-wrap", output=np.float32)
+        coordinates = np.einsum("nc,cd->dn", points.reshape(-1, 3), turn) + shift.astype(np.float32)[:, None]
+        noise = scipy.ndimage.map_coordinates(self._volume, coordinates, order=1, mode="grid-wrap", output=np.float32)
         return np.asarray(noise.reshape(points.shape[:-1]))

@@ -87,8 +87,8 @@ def turn_away(
     views = []
     clock = generator.uniform(0.0, 2.0 * np.pi)
     for number in range(settings.rotation_views):
-        place = (number + 0.5) / settings.rotation_views * len(training)
-        frame = training[min(int(place), len(training) - 1)]
+        position = (number + 0.5) / settings.rotation_views * len(training)
+        frame = training[min(int(position), len(training) - 1)]
         # The golden angle distributes any number of directions evenly.
         clock += np.pi * (3.0 - np.sqrt(5.0))
         turn = generator.uniform(*_ROTATION_TURN)

@@ -82,7 +82,7 @@ SIZES = {
     "reim-nerf": "transforms_train.json",
 }
 
-Rows = dict[str, tuple[Spoil, str]]
+Rows = dict[str, list[tuple[Spoil, str]]]
 #: Kinds, how to spoil one, and the pattern of the message, in which ``<3>`` is the name of image 3, ``<size>`` the file
 #: that says how large images are and ``<poses>`` the pose file.
 Row = tuple[str | Iterable[str], Callable[[Kind], Spoil], str]
@@ -115,7 +115,7 @@ def expanded(table: Mapping[str, list[Row]]) -> dict[str, Rows]:
                 kind = KINDS[name]
                 pattern = message.replace("<size>", said_size(name)).replace("<poses>", kind.poses)
                 pattern = re.sub(r"<(\d)>", lambda match, name=name: numbered(name, int(match[1])), pattern)
-                result[fault][name] = spoil(kind), pattern
+                result[fault].setdefault(name, []).append((spoil(kind), pattern))
     return result
 
 
@@ -301,9 +301,13 @@ ERRORS: dict[str, list[Row]] = {
             (*MATRICES, *TUM, *FRAMES_OF_JSON, "colmap-text"),
             lambda kind: write_text(kind.poses, RUBBISH),
             r"cannot read \S*<poses>.*Expected",
-        ),
-        (TUM, lambda kind: write_text(kind.poses, "1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1\n"), "<poses>, line 1: '1,0,0,0"),
-        (PARAMS, lambda kind: write_text(kind.params, "PK nonsense"), r"cannot read \S*params\.npz"),
+        )
+    ],
+    "a trajectory of another format": [
+        (TUM, lambda kind: write_text(kind.poses, "1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1\n"), "<poses>, line 1: '1,0,0,0")
+    ],
+    "a result that is no archive": [
+        (PARAMS, lambda kind: write_text(kind.params, "PK nonsense"), r"cannot read \S*params\.npz")
     ],
     "a number that is none": [
         (
@@ -619,9 +623,13 @@ def refused(folder: Path, name: str) -> InputError:
     return caught.value
 
 
-@pytest.mark.parametrize(("fault", "name"), [(fault, name) for fault, rows in REFUSED.items() for name in rows])
-def test_one_clear_error(copied, fault, name):
-    spoil, pattern = REFUSED[fault][name]
+def every_row(table: dict[str, Rows]) -> list[tuple[str, str, int]]:
+    return [(fault, name, row) for fault in table for name, rows in table[fault].items() for row in range(len(rows))]
+
+
+@pytest.mark.parametrize(("fault", "name", "row"), every_row(REFUSED))
+def test_one_clear_error(copied, fault, name, row):
+    spoil, pattern = REFUSED[fault][name][row]
     folder = copied(name)
     spoil(folder)
     message = str(refused(folder, name))
@@ -702,9 +710,9 @@ WARNINGS: dict[str, list[Row]] = {
 WARNED = expanded(WARNINGS)
 
 
-@pytest.mark.parametrize(("fault", "name"), [(fault, name) for fault, rows in WARNED.items() for name in rows])
-def test_one_clear_warning(copied, caplog, fault, name):
-    spoil, message = WARNED[fault][name]
+@pytest.mark.parametrize(("fault", "name", "row"), every_row(WARNED))
+def test_one_clear_warning(copied, caplog, fault, name, row):
+    spoil, message = WARNED[fault][name][row]
     folder = copied(name)
     spoil(folder)
     with caplog.at_level(logging.WARNING):
@@ -912,7 +920,7 @@ def test_the_pages_examples_are_what_is_said(copied, page, row):
     assert len(told) == len(TOLD[page])
     name, fault = TOLD[page][row]
     folder = copied(name)
-    (REFUSED[fault][name][0] if isinstance(fault, str) else fault)(folder)
+    (REFUSED[fault][name][0][0] if isinstance(fault, str) else fault)(folder)
     with pytest.raises(InputError) as caught:
         load(folder, name)
     said = str(caught.value).replace(f"{folder}/", "")

@@ -39,10 +39,6 @@ class SequenceFiles:
     poses: Path
     camera: Path | None = None
 
-    def fingerprint(self) -> str:
-        """See :func:`coliags_plugin.datamanagers.recording.fingerprint`."""
-        return fingerprint(self.folder, (*self.images, *(self.depths or ())), (self.poses, self.camera))
-
 
 class SequenceDataManager(RecordedDataManager):
     """Base class; subclasses find the files and define the rectification.
@@ -81,7 +77,7 @@ class SequenceDataManager(RecordedDataManager):
             kind=f"{files.kind} layout, {facts['pose_convention']['order']} poses",
             shots=shots,
             facts=facts,
-            fingerprint=files.fingerprint(),
+            fingerprint=fingerprint(path, (*files.images, *(files.depths or ())), (files.poses, files.camera)),
             test_sets=test_sets,
             own_points=(lambda: load_points(points)) if points.is_file() else None,
             points_source=points,

@@ -14,7 +14,6 @@ from coliags_plugin.datamanagers.reading.files import (
     paired,
     require_folder,
 )
-from coliags_plugin.datamanagers.recording import fingerprint
 from coliags_plugin.geometry.poses.c3vd import recognise as has_matrices
 
 LAYOUT = (
@@ -45,10 +44,6 @@ class PreparedFiles:
     poses: Path | None
     params: Path | None
     cloud: Path | None
-
-    def fingerprint(self) -> str:
-        """See :func:`coliags_plugin.datamanagers.recording.fingerprint`."""
-        return fingerprint(self.folder, (*self.images, *(self.depths or ()), self.cloud), (self.poses, self.params))
 
 
 def recognise(folder: Path) -> str | None:

@@ -24,7 +24,7 @@ from coliags_plugin.datamanagers.c3vd_endogslam.poses import PoseSource, Sequenc
 from coliags_plugin.datamanagers.reading.depth_formats import C3VD_DEPTH, DepthSteps
 from coliags_plugin.datamanagers.reading.images import bits_of, size_of
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
-from coliags_plugin.datamanagers.recording import Recording, Shot, check_pose_count, make_shots
+from coliags_plugin.datamanagers.recording import Recording, Shot, check_pose_count, fingerprint, make_shots
 from coliags_plugin.datamanagers.rectification import ASPECT_TOLERANCE, Rectification
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
 from coliags_plugin.datamanagers.seen_masks import ROTATION, find_seen_masks
@@ -107,7 +107,9 @@ class C3VDEndoGSLAMDataManager(RecordedDataManager):
             kind=f"{facts['layout']} layout, {self.settings.poses} poses",
             shots=shots,
             facts=facts,
-            fingerprint=files.fingerprint(),
+            fingerprint=fingerprint(
+                folder, (*files.images, *(files.depths or ()), files.cloud), (files.poses, files.params)
+            ),
             test_sets=test_sets,
             own_points=None if points_source is None else lambda: _map_points(files.cloud, params, poses),
             points_source=points_source or folder / PARAMS,

@@ -25,13 +25,13 @@ _BENDS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
 def camera_of(
-    values: Mapping[str, Any], place: str, pixel_centers: PixelCenters, stored_size: Callable[[], tuple[int, int]]
+    values: Mapping[str, Any], where: str, pixel_centers: PixelCenters, stored_size: Callable[[], tuple[int, int]]
 ) -> Lens:
     """The camera of one frame: a :class:`PinholeLens` where its images need no undistortion.
 
     Args:
         values: Keys of the file, overlaid with those of the frame.
-        place: Name of the frame in messages.
+        where: Name of the frame in messages.
         pixel_centers: Where ``cx`` and ``cy`` count pixel centres.
         stored_size: Returns width and height of the image; called only if the file has no size.
 
@@ -40,20 +40,20 @@ def camera_of(
     """
     model = values.get("camera_model") or ("OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")
     if not isinstance(model, str) or model not in _MODELS:
-        raise InputError(f"{place}: camera_model is {model}", f"one of {', '.join(_MODELS)}")
-    width, height = image_size(values, place) if "w" in values or "h" in values else stored_size()
-    fx, fy = _focal_lengths(values, place, width, height)
+        raise InputError(f"{where}: camera_model is {model}", f"one of {', '.join(_MODELS)}")
+    width, height = image_size(values, where) if "w" in values or "h" in values else stored_size()
+    fx, fy = _focal_lengths(values, where, width, height)
     # The default principal point is the image centre in either convention.
     shift = 0.0 if pixel_centers == "half" else 0.5
-    cx = read_number(values, "cx", place) + shift if "cx" in values else 0.5 * width
-    cy = read_number(values, "cy", place) + shift if "cy" in values else 0.5 * height
+    cx = read_number(values, "cx", where) + shift if "cx" in values else 0.5 * width
+    cy = read_number(values, "cy", where) + shift if "cy" in values else 0.5 * height
     if min(fx, fy, width, height) <= 0.0:
-        raise InputError(f"{place}: fl_x {fx:g}, fl_y {fy:g}, w {width}, h {height}", "numbers above 0")
-    bends = {key: read_number(values, key, place) for key in _BENDS if values.get(key)}
+        raise InputError(f"{where}: fl_x {fx:g}, fl_y {fy:g}, w {width}, h {height}", "numbers above 0")
+    bends = {key: read_number(values, key, where) for key in _BENDS if values.get(key)}
     if wrong := sorted(set(bends) - set(_MODELS[model])):
         meaning = "nerfstudio and OpenCV mean different things by k4" if wrong == ["k4"] else "it has no such term"
         raise InputError(
-            f"{place}: {model} with {wrong[0]} = {bends[wrong[0]]:g}; {meaning}",
+            f"{where}: {model} with {wrong[0]} = {bends[wrong[0]]:g}; {meaning}",
             f"{', '.join(_MODELS[model]) or 'no distortion'} alone",
             "Undistort the images, or correct camera_model",
         )
@@ -66,16 +66,16 @@ def camera_of(
     return OpenCVLens(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, k1=k1, k2=k2, p1=p1, p2=p2, k3=k3)
 
 
-def _focal_lengths(values: Mapping[str, Any], place: str, width: int, height: int) -> tuple[float, float]:
+def _focal_lengths(values: Mapping[str, Any], where: str, width: int, height: int) -> tuple[float, float]:
     """Horizontal and vertical focal length, pixels; equal if only one is given."""
     lengths: dict[str, float] = {}
     for axis, pixels in (("x", width), ("y", height)):
         if f"fl_{axis}" in values:
-            lengths[axis] = read_number(values, f"fl_{axis}", place)
+            lengths[axis] = read_number(values, f"fl_{axis}", where)
         elif f"camera_angle_{axis}" in values:
             expected = "radians, above 0 and below pi"
-            angle = read_number(values, f"camera_angle_{axis}", place, expected, above=0.0, below=math.pi)
+            angle = read_number(values, f"camera_angle_{axis}", where, expected, above=0.0, below=math.pi)
             lengths[axis] = 0.5 * pixels / math.tan(0.5 * angle)
     if not lengths:
-        raise InputError(f"{place}: neither fl_x nor camera_angle_x", "one of the two", "Add it")
+        raise InputError(f"{where}: neither fl_x nor camera_angle_x", "one of the two", "Add it")
     return lengths.get("x", lengths.get("y", 0.0)), lengths.get("y", lengths.get("x", 0.0))

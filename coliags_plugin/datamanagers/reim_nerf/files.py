@@ -145,7 +145,13 @@ def read_sequence(folder: Path, outside: bool = False) -> ReimNerfSequence:
     contents = {part: _read(file) for part, file in files.items()}
     first = contents["train"]
     for part, content in contents.items():
-        _check_same(files["train"], first, files[part], content)
+        for key in _SHARED:
+            if first.get(key) != content.get(key):
+                raise InputError(
+                    f"{files[part]}: {key} differs from {files['train'].name}",
+                    "one camera and one scale for all files",
+                    "Write all files in one run",
+                )
     lens = _lens(files["train"], first)
     scale, shift = _normalisation(files["train"], first)
     defaults = {"distmap_scale": math.pi, **first}
@@ -189,16 +195,6 @@ def _read(file: Path) -> dict[str, Any]:
     if not isinstance(frames, list) or (not frames and file.name == "transforms_train.json"):
         raise InputError(f"{file} has no frames", "'frames': [{'file_path': ..., 'transform_matrix': ...}, ...]")
     return content
-
-
-def _check_same(file: Path, first: Mapping[str, Any], other: Path, content: Mapping[str, Any]) -> None:
-    for key in _SHARED:
-        if first.get(key) != content.get(key):
-            raise InputError(
-                f"{other}: {key} differs from {file.name}",
-                "one camera and one scale for all files",
-                "Write all files in one run",
-            )
 
 
 def _lens(file: Path, content: Mapping[str, Any]) -> FisheyeLens:

@@ -37,8 +37,6 @@ EXPECTED = (
 )
 #: Where the principal point of an image may lie, as a share of its size, when nothing says which size it is for.
 _MIDDLE = (0.3, 0.7)
-
-
 #: A file stem that is a timestamp in seconds with a fraction, as TUM's, with an optional suffix.
 _TIME = re.compile(r"(\d+\.\d+)(?:_[a-z]+)?", re.IGNORECASE)
 
@@ -93,38 +91,18 @@ def find_depths(folder: Path) -> list[Path]:
     return [] if depths is None else [path for path in depths.iterdir() if path.suffix.lower() in DEPTH_SUFFIXES]
 
 
-def find_masks(folder: Path, images: Sequence[Path]) -> dict[str, Path]:
-    """Mask files by the stem of their image; empty without a folder of them.
-
-    Raises:
-        InputError: There is more than one such folder, or an image has no mask.
-    """
-    return _of_every_image(folder, MASK_FOLDERS, images, "mask")
-
-
-def find_confidences(folder: Path, images: Sequence[Path], with_depth: bool) -> dict[str, Path]:
-    """Files of the confidence in estimated depth by the stem of their image; empty without a folder of them.
+def files_of_images(folder: Path, names: tuple[str, ...], images: Sequence[Path], what: str) -> dict[str, Path]:
+    """Files of images, such as masks, by the stem of their image; empty without a folder of them.
 
     Args:
         folder: Folder of the scene.
+        names: Names that the folder of the files may have.
         images: The images.
-        with_depth: Whether they have depth.
+        what: What the files are, for the error.
 
     Raises:
-        InputError: An image has none, or there is no depth.
+        InputError: There is more than one such folder, or an image has no file in it.
     """
-    confidences = _of_every_image(folder, CONFIDENCE_FOLDERS, images, "confidence")
-    if confidences and not with_depth:
-        raise InputError(
-            f"{folder} holds confidence/, but no depth",
-            "confidence beside the depth that it is about",
-            "Add the depth, or move confidence/ away",
-        )
-    return confidences
-
-
-def _of_every_image(folder: Path, names: tuple[str, ...], images: Sequence[Path], what: str) -> dict[str, Path]:
-    """Files by the stem of their image, which must all be there if their folder is."""
     file_folder = _only(folder, names)
     if file_folder is None:
         return {}

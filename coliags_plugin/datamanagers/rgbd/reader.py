@@ -20,13 +20,14 @@ from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
 from coliags_plugin.datamanagers.rectification import Rectification
 from coliags_plugin.datamanagers.rgbd.files import (
+    CONFIDENCE_FOLDERS,
+    MASK_FOLDERS,
     CameraFile,
     by_number,
+    files_of_images,
     find_camera,
-    find_confidences,
     find_depths,
     find_images,
-    find_masks,
     find_mesh,
     find_trajectory,
     is_time,
@@ -120,9 +121,16 @@ class RGBDDataManager(RecordedDataManager):
         rectification = Rectification.of_pinhole(camera.intrinsics, camera.path, size)
         complete = len(frames.images) == len(images) == len(trajectory)
         seen = find_seen_masks(path / "truth", len(images), complete)
-        masks = find_masks(path, frames.images)
-        metric = settings.depth == "metric"
-        confidences = find_confidences(path, frames.images, with_depth=bool(depths)) if metric else {}
+        masks = files_of_images(path, MASK_FOLDERS, frames.images, "mask")
+        confidences: dict[str, Path] = {}
+        if settings.depth == "metric":
+            confidences = files_of_images(path, CONFIDENCE_FOLDERS, frames.images, "confidence")
+        if confidences and not depths:
+            raise InputError(
+                f"{path} holds confidence/, but no depth",
+                "confidence beside the depth that it is about",
+                "Add the depth, or move confidence/ away",
+            )
         shots = [
             Shot(
                 image.stem,
@@ -146,15 +154,15 @@ class RGBDDataManager(RecordedDataManager):
             "masks": len(masks),
             "depth_is_estimated": bool(confidences),
             **rectification.facts(),
-            "pose_convention": None
-            if file is None
-            else {
+            "pose_convention": None,
+        }
+        if file is not None:
+            facts["pose_convention"] = {
                 "order": "TUM: camera-to-world, quaternion with w last",
                 "poses": len(trajectory),
                 "summary": trajectory.summary(printed_unit(path)),
-            },
-        }
-        points = next((found for found in (path / POINTS_FILE, find_mesh(path)) if found and found.is_file()), None)
+            }
+        points = next((file for file in (path / POINTS_FILE, find_mesh(path)) if file and file.is_file()), None)
         return Recording(
             kind=f"TUM RGB-D, associated by {frames.facts['by']}",
             shots=shots,
@@ -218,10 +226,7 @@ class RGBDDataManager(RecordedDataManager):
                 "Rename them, or set depth: none",
             )
         kept = np.flatnonzero(complete)
-        dropped = {
-            "without_pose": int((~posed).sum()),
-            "without_depth": int((posed & ~complete).sum()),
-        }
+        dropped = {"without_pose": int((~posed).sum()), "without_depth": int((posed & ~complete).sum())}
         if sum(dropped.values()):
             log.warning(
                 "%s: of %d images %d have no pose and %d no depth within %g s; they are left out",

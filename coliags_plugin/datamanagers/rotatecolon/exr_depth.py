@@ -53,7 +53,7 @@ def read_exr_channel(path: Path, channel: str) -> Float32[np.ndarray, "H W"]:
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             # OpenEXR returns no parts for a damaged file.
-            channels = {name: found.pixels for part in file.parts for name, found in part.channels.items()}
+            channels = {name: stored.pixels for part in file.parts for name, stored in part.channels.items()}
     except (OSError, RuntimeError, ValueError) as error:
         raise _damaged(path) from error
     if not channels:
