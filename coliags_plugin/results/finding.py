@@ -24,17 +24,17 @@ def find_results(paths: Sequence[Path]) -> list[Result]:
         InputError: A path is missing, a folder holds no results, a results file is damaged, or two of them have one
             key and other values.
     """
-    found: dict[str, tuple[Path, Result]] = {}
+    by_key: dict[str, tuple[Path, Result]] = {}
     for path in dict.fromkeys(file.resolve() for given in paths for file in _files(given)):
         result = read_result(path)
-        other, known = found.setdefault(result.key, (path, result))
+        other, known = by_key.setdefault(result.key, (path, result))
         if known.metrics_sha256 != result.metrics_sha256:
             raise InputError(
                 f"{other} and {path} are results of the same run, and their values differ",
                 "each run once",
                 "Name the paths of those that count",
             )
-    return [result for _, result in found.values()]
+    return [result for _, result in by_key.values()]
 
 
 def _files(path: Path) -> list[Path]:
@@ -43,14 +43,14 @@ def _files(path: Path) -> list[Path]:
         return [path]
     try:
         files = [file for file in sorted(path.rglob("*.json")) if not _hidden(file.relative_to(path))]
-        found = [file for file in files if file.is_file() and _MARK in file.read_bytes()]
+        matches = [file for file in files if file.is_file() and _MARK in file.read_bytes()]
     except OSError as error:
         raise InputError(f"{error.filename or path} cannot be read: {error.strerror}", "a readable folder") from error
-    if not found:
+    if not matches:
         raise InputError(
             f"{path} holds no results", "results files, as `coliags eval` writes them", "Run `coliags eval RUN` first"
         )
-    return found
+    return matches
 
 
 def _hidden(path: Path) -> bool:

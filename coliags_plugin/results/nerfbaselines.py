@@ -84,16 +84,16 @@ def _name(result: Result) -> str:
 
 def _cost(result: Result) -> dict[str, Any]:
     cost = result.cost
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     if cost.train_seconds is not None:
-        found["total_train_time"] = round(cost.train_seconds, 5)
+        values["total_train_time"] = round(cost.train_seconds, 5)
     if cost.peak_memory_mib is not None:
         memory = math.ceil(cost.peak_memory_mib)
         on_gpu = str(result.provenance.get("training", {}).get("device")).startswith("cuda")
-        found["resources_utilization"] = (
+        values["resources_utilization"] = (
             {"gpu_memory": memory, "gpu_name": cost.device} if on_gpu else {"memory": memory}
         )
-    return found
+    return values
 
 
 def _encoded(values: Sequence[float]) -> str:

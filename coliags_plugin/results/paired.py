@@ -42,14 +42,14 @@ def wilcoxon_p(differences: Differences) -> float:
 def _exact_p(ranks: Float[np.ndarray, "n"], positive: Bool[np.ndarray, "n"]) -> float:
     """Two-sided p of the sum of positive ranks, under all sign changes alike; tied ranks are halves."""
     doubled = np.rint(2.0 * ranks).astype(np.int64)
-    # ways[s]: of choosing the positive ranks so that twice their sum is s. Exact: below 2^53.
-    ways = np.zeros(int(doubled.sum()) + 1)
-    ways[0] = 1.0
+    # counts[s]: ways of choosing the positive ranks so that twice their sum is s. Exact: below 2^53.
+    counts = np.zeros(int(doubled.sum()) + 1)
+    counts[0] = 1.0
     for rank in doubled:
-        ways[rank:] += ways[:-rank].copy()
-    found = int(doubled[positive].sum())
-    tail = min(ways[: found + 1].sum(), ways[found:].sum())
-    return float(min(1.0, 2.0 * tail / ways.sum()))
+        counts[rank:] += counts[:-rank].copy()
+    observed = int(doubled[positive].sum())
+    tail = min(counts[: observed + 1].sum(), counts[observed:].sum())
+    return float(min(1.0, 2.0 * tail / counts.sum()))
 
 
 def t_test_p(differences: Differences) -> float | None:

@@ -91,9 +91,9 @@ class ProfileRecord(_Part):
     @model_validator(mode="after")
     def _one_number_per_bin(self) -> Self:
         for name in ("pixels", "rgb_mse", "depth_mse"):
-            found, bins = len(getattr(self, name)), len(self.edges) - 1
-            if found != bins:
-                raise ValueError(f"{name} has {found} numbers for {bins} bins")
+            count, bins = len(getattr(self, name)), len(self.edges) - 1
+            if count != bins:
+                raise ValueError(f"{name} has {count} numbers for {bins} bins")
         return self
 
 

@@ -53,5 +53,5 @@ def spread(values: BySeed, scenes: Sequence[str]) -> Spread:
 
 def common_scenes(methods: Sequence[BySeed]) -> list[str]:
     """Scenes for which every method has a value, in the order of the first method."""
-    found = [{scene for scene, seeds in values.items() if seeds} for values in methods]
-    return [scene for scene in methods[0] if all(scene in scenes for scenes in found)] if methods else []
+    known = [{scene for scene, seeds in values.items() if seeds} for values in methods]
+    return [scene for scene in methods[0] if all(scene in scenes for scenes in known)] if methods else []

@@ -42,7 +42,7 @@ def facts(result: Result) -> dict[str, str]:
     cost = result.cost
     threads = "" if cost.threads is None else f", {cost.threads} threads"
     reached = {mark: seconds for mark, seconds in cost.seconds_to_psnr.items() if seconds is not None}
-    found = {
+    texts = {
         "key": result.key,
         "seed": str(result.seed),
         "split": f"{result.scene.split or 'unnamed'}, {len(result.scene.train)} training frames",
@@ -55,7 +55,7 @@ def facts(result: Result) -> dict[str, str]:
         "gaussians": _said(cost.gaussians, "{:.0f} in a view"),
         "checkpoint": _said(None if cost.checkpoint_bytes is None else cost.checkpoint_bytes / 2**20, "{:.1f} MiB"),
     }
-    return {name: text for name, text in found.items() if text}
+    return {name: text for name, text in texts.items() if text}
 
 
 def _said(value: float | None, form: str) -> str:
