@@ -40,11 +40,6 @@ class RayScene:
         rays = self._rays(origins, directions)
         return np.asarray(self._scene.test_occlusions(rays, tnear=0.0, tfar=0.999).numpy())
 
-    def distance(self, points: Float[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N"]:
-        """Distance of points to the surface. [N]"""
-        query = self._open3d.core.Tensor(np.ascontiguousarray(points, np.float32))
-        return np.asarray(self._scene.compute_distance(query).numpy())
-
     def nearest(self, points: Float[np.ndarray, "N 3"]) -> tuple[Float[np.ndarray, "N"], Int[np.ndarray, "N"]]:
         """Distance to the nearest point of any triangle, scene units, and that triangle. [N], [N]"""
         points = np.ascontiguousarray(points, np.float32)

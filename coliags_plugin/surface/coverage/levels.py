@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import IntEnum
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
 from coliags_plugin.surface.coverage.settings import CoverageSettings
 from coliags_plugin.surface.coverage.visibility import FaceViews
@@ -30,18 +30,8 @@ class Level(IntEnum):
         return _COLORS[self]
 
 
-_LABELS = {
-    Level.UNSEEN: "not seen",
-    Level.POOR: "seen too dark or too far",
-    Level.GLANCE: "seen only at a glance",
-    Level.SEEN: "seen",
-}
-_COLORS = {
-    Level.UNSEEN: (213, 62, 0),
-    Level.POOR: (95, 75, 139),
-    Level.GLANCE: (240, 200, 66),
-    Level.SEEN: (150, 200, 190),
-}
+_LABELS = ("not seen", "seen too dark or too far", "seen only at a glance", "seen")
+_COLORS = ((213, 62, 0), (95, 75, 139), (240, 200, 66), (150, 200, 190))
 #: Not seen and not reconstructed either: a guess of where the surface is.
 GUESS_LABEL = "not seen, place guessed"
 GUESS_COLOR = (122, 20, 20)
@@ -58,8 +48,3 @@ def classify(views: FaceViews, settings: CoverageSettings) -> UInt8[np.ndarray, 
     level[views.clear_frames > 0] = Level.GLANCE
     level[views.good_frames >= settings.glance_frames] = Level.SEEN
     return level
-
-
-def level_areas(level: UInt8[np.ndarray, "F"], areas: Float[np.ndarray, "F"]) -> dict[str, float]:
-    """Area of each level by its name in lower case, mm^2."""
-    return {each.name.lower(): float(areas[level == each].sum()) for each in Level}
