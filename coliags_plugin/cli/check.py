@@ -11,7 +11,7 @@ from pathlib import Path
 
 import tyro
 
-from coliags_plugin.cli.arguments import AsJson, Assignments, DataFormat, OptionalPath
+from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import print_summary
 
 
@@ -27,12 +27,12 @@ class CheckCommand:
     """Keep the folder with the phantom and the runs, and print its path."""
     traceback: bool = False
     """Print the whole traceback of every exception."""
-    set: Assignments = ()
+    set: arguments.Assignments = ()
     """Change a value of the method config, as for train."""
-    format: DataFormat = None
-    data: OptionalPath = None
+    format: arguments.DataFormat = None
+    data: arguments.OptionalPath = None
     """A scene's folder; default: a small phantom."""
-    json: AsJson = False
+    json: arguments.AsJson = False
 
     def run(self) -> None:
         """Print one line per check, then a summary."""

@@ -9,15 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from coliags_plugin.cli.arguments import (
-    AsJson,
-    Assignments,
-    Device,
-    OptionalInt,
-    OptionalPath,
-    OptionalText,
-    Output,
-)
+from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import coliags, print_summary
 
 if TYPE_CHECKING:
@@ -30,34 +22,34 @@ class ComparisonArguments:
 
     scenes: Annotated[tuple[str, ...], tyro.conf.arg(metavar="SCENE...")]
     """Benchmarks (`coliags list benchmarks`), BENCHMARK/SCENE, paths of benchmark files, or folders of scenes."""
-    output: Output
+    output: arguments.Output
     """Folder of the comparison; one that is there is extended."""
     seeds: int = 1
     """Runs of every method on every scene, with the seeds 0, 1, ..."""
     protocol: str = "paper"
     """Evaluation protocol (`coliags list protocols`)."""
-    steps: OptionalInt = None
+    steps: arguments.OptionalInt = None
     """Training steps of all runs; default: each method's own."""
     splits: Annotated[tuple[str, ...], tyro.conf.arg(metavar="SPLIT...")] = ()
     """Splits, each trained apart, for instance every-8th block; default: the scene's own."""
-    jobs: OptionalInt = None
+    jobs: arguments.OptionalInt = None
     """Runs at a time; default: one per CPU, or per GPU."""
-    threads: OptionalInt = None
+    threads: arguments.OptionalInt = None
     """CPU threads of each run; default: the CPUs divided by the runs at a time."""
     executor: Annotated[str, tyro.conf.arg(metavar="local|ray")] = "local"
     """Where the runs are: processes on this machine, or on a Ray cluster (`pip install "coliags_plugin[sweep]"`)."""
-    ray_address: OptionalText = None
+    ray_address: arguments.OptionalText = None
     """HOST:PORT of the Ray cluster's head; default: RAY_ADDRESS, or the cluster of this machine."""
     retries: int = 2
     """How often a run is resumed whose process was killed or crashed."""
     dry_run: bool = False
     """Only print what would be done: every cell with its state, and the disk that is needed."""
-    set: Assignments = ()
+    set: arguments.Assignments = ()
     """Change a value of every method config, as for train."""
-    data: OptionalPath = None
+    data: arguments.OptionalPath = None
     """Folder of the benchmark's scenes; default scenes/BENCHMARK. Phantoms that are missing are made there."""
-    device: Device = "auto"
-    json: AsJson = False
+    device: arguments.Device = "auto"
+    json: arguments.AsJson = False
 
     def carry_out(self, methods: Sequence[str | Variant]) -> None:
         """Compare and print a summary; exit with status 1 if a cell failed."""

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import tyro
 
-from coliags_plugin.cli.arguments import AsJson, Assignments, Device, MovedData, OptionalOutput, OptionalPath, Overwrite
+from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import print_summary, view_command
 
 
@@ -20,20 +20,20 @@ class CoverageCommand:
 
     path: tyro.conf.Positional[Path]
     """Run folder; or a scene's folder, with --mesh and --output."""
-    output: OptionalOutput = None
+    output: arguments.OptionalOutput = None
     """Folder to create; default RUN/coverage."""
-    mesh: OptionalPath = None
+    mesh: arguments.OptionalPath = None
     """The wall, PLY, OBJ or GLB, in mm in the world of the poses; default: RUN/mesh/mesh.ply, or else the fused depth
     of the run."""
-    truth: OptionalPath = None
+    truth: arguments.OptionalPath = None
     """True surface to measure against: a mesh in the world of the scene, mm, or the folder of a scene with one;
     default: that of the scene, where there is one."""
-    set: Assignments = ()
+    set: arguments.Assignments = ()
     """An option, for instance region_diameter=10 (docs/coverage.md)."""
-    data: MovedData = None
-    device: Device = "auto"
-    overwrite: Overwrite = False
-    json: AsJson = False
+    data: arguments.MovedData = None
+    device: arguments.Device = "auto"
+    overwrite: arguments.Overwrite = False
+    json: arguments.AsJson = False
 
     def run(self) -> None:
         """Measure, write the folder and print a summary."""

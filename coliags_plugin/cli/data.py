@@ -9,7 +9,7 @@ from typing import Literal
 
 import tyro
 
-from coliags_plugin.cli.arguments import AsJson, Assignments, DataFormat, OptionalPath, SceneFolder
+from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import print_summary, train_command
 
 
@@ -19,15 +19,15 @@ class DataCommand:
 
     action: tyro.conf.Positional[Literal["check"]]
     """What to do."""
-    scene: tyro.conf.Positional[SceneFolder]
-    html: OptionalPath = None
+    scene: tyro.conf.Positional[arguments.SceneFolder]
+    html: arguments.OptionalPath = None
     """Also write an HTML page with images and the trajectory."""
-    set: Assignments = ()
+    set: arguments.Assignments = ()
     """An option of the data manager, for instance split=block."""
-    format: DataFormat = None
+    format: arguments.DataFormat = None
     anonymous: bool = False
     """Keep absolute paths out of the page and the JSON (docs/security.md 4)."""
-    json: AsJson = False
+    json: arguments.AsJson = False
 
     def run(self) -> None:
         """Run the checks and print the results."""

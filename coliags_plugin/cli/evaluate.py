@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from coliags_plugin.cli.arguments import AsJson, Device, MovedData, OptionalPath, OptionalText, RunFolder
+from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import coliags, print_summary
 
 
@@ -12,15 +12,15 @@ from coliags_plugin.cli.summaries import coliags, print_summary
 class EvaluateCommand:
     """Evaluate a run on its held-out frames under a protocol."""
 
-    path: RunFolder
-    protocol: OptionalText = None
+    path: arguments.RunFolder
+    protocol: arguments.OptionalText = None
     """Protocol by name (`coliags list protocols`); default: the method config's."""
-    truth: OptionalPath = None
+    truth: arguments.OptionalPath = None
     """A scene of the same frames and poses with true depth, to evaluate against instead of the run's own, for runs
     trained on estimated depth; results go into eval/PROTOCOL-truth."""
-    data: MovedData = None
-    device: Device = "auto"
-    json: AsJson = False
+    data: arguments.MovedData = None
+    device: arguments.Device = "auto"
+    json: arguments.AsJson = False
 
     def run(self) -> None:
         """Evaluate and print a table."""

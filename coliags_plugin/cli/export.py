@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from coliags_plugin.cli.arguments import AsJson, Device, MovedData, OptionalOutput, Overwrite, RunFolder
+from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import print_summary
 
 
@@ -13,9 +13,9 @@ from coliags_plugin.cli.summaries import print_summary
 class ExportCommand:
     """Write the Gaussians of a run to a file that viewers open, and a record of what it is and loses beside it."""
 
-    path: RunFolder
+    path: arguments.RunFolder
     """Run folder of a splatting method."""
-    output: OptionalOutput = None
+    output: arguments.OptionalOutput = None
     """File to write; default RUN/export/SCENE.FORMAT. The record is FILE.json."""
     light: Literal["mean", "flattened"] = "mean"
     """Light that is baked into the colours of methods whose colours depend on the lamp: that of the mean training
@@ -24,10 +24,10 @@ class ExportCommand:
     """Compare the file with the run on the held-out views, for the record."""
     format: Literal["ply", "spz", "splat", "glb"] = "ply"
     """PLY as 3DGS writes it, SPZ, .splat, or glTF with KHR_gaussian_splatting. Lengths stay those of the scene (mm)."""
-    data: MovedData = None
-    device: Device = "auto"
-    overwrite: Overwrite = False
-    json: AsJson = False
+    data: arguments.MovedData = None
+    device: arguments.Device = "auto"
+    overwrite: arguments.Overwrite = False
+    json: arguments.AsJson = False
 
     def run(self) -> None:
         """Export, and print what was written."""

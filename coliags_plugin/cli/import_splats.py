@@ -7,15 +7,7 @@ from pathlib import Path
 
 import tyro
 
-from coliags_plugin.cli.arguments import (
-    AnonymousRun,
-    AsJson,
-    DataFormat,
-    Device,
-    OptionalOutput,
-    Overwrite,
-    SceneFolder,
-)
+from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import coliags, print_summary
 
 
@@ -25,14 +17,14 @@ class ImportCommand:
 
     file: tyro.conf.Positional[Path]
     """PLY (3DGS's attributes; 2DGS's, without scale_2), SPZ or .splat, in the world frame and unit of the scene."""
-    data: SceneFolder
-    output: OptionalOutput = None
+    data: arguments.SceneFolder
+    output: arguments.OptionalOutput = None
     """Run folder; default runs/SCENE/imported/STAMP."""
-    format: DataFormat = None
-    device: Device = "auto"
-    overwrite: Overwrite = False
-    anonymous: AnonymousRun = False
-    json: AsJson = False
+    format: arguments.DataFormat = None
+    device: arguments.Device = "auto"
+    overwrite: arguments.Overwrite = False
+    anonymous: arguments.AnonymousRun = False
+    json: arguments.AsJson = False
 
     def run(self) -> None:
         """Import, and print the run folder."""

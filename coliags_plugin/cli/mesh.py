@@ -5,17 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from coliags_plugin.cli.arguments import (
-    AsJson,
-    Assignments,
-    Device,
-    MovedData,
-    OptionalFloat,
-    OptionalOutput,
-    OptionalPath,
-    Overwrite,
-    RunFolder,
-)
+from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import print_summary, view_command
 
 
@@ -23,25 +13,25 @@ from coliags_plugin.cli.summaries import print_summary, view_command
 class MeshCommand:
     """Make a triangle mesh of a run, and compare it with the true surface where there is one."""
 
-    path: RunFolder
-    output: OptionalOutput = None
+    path: arguments.RunFolder
+    output: arguments.OptionalOutput = None
     """Folder to create; default RUN/mesh."""
-    voxel: OptionalFloat = None
+    voxel: arguments.OptionalFloat = None
     """Edge of a voxel in scene units (mm); default: two training pixels on the surface."""
     color: Literal["plain", "flattened"] = "plain"
     """Colours: as the views show them, each under its lamp; or under one distance and angle to the lamp everywhere, the
     medians of what the training views see, for methods of Gaussians."""
-    truth: OptionalPath = None
+    truth: arguments.OptionalPath = None
     """True surface to compare with: a mesh in the world of the scene, mm, or the folder of a scene with one; default:
     that of the scene, where there is one."""
-    set: Assignments = ()
+    set: arguments.Assignments = ()
     """Another option of meshing (docs/meshes.md 3), for instance depth=median."""
     format: tuple[Literal["ply", "obj", "glb"], ...] = ("ply", "obj", "glb")
     """Formats of the mesh."""
-    data: MovedData = None
-    device: Device = "auto"
-    overwrite: Overwrite = False
-    json: AsJson = False
+    data: arguments.MovedData = None
+    device: arguments.Device = "auto"
+    overwrite: arguments.Overwrite = False
+    json: arguments.AsJson = False
 
     def run(self) -> None:
         """Make the mesh, and print the comparison."""

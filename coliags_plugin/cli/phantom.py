@@ -7,15 +7,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from coliags_plugin.cli.arguments import (
-    AsJson,
-    Assignments,
-    OptionalText,
-    Output,
-    Overwrite,
-    parse_size,
-    parse_vector,
-)
+from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import print_summary, train_command
 
 
@@ -23,7 +15,7 @@ from coliags_plugin.cli.summaries import print_summary, train_command
 class PhantomCommand:
     """Generate a synthetic, physically lit colon with exact ground truth, in the layout of a dataset."""
 
-    output: Output
+    output: arguments.Output
     """Folder to create."""
     seed: int = 0
     """Random seed of the whole phantom."""
@@ -31,24 +23,24 @@ class PhantomCommand:
     """Withdrawal along the lumen, mostly rotation in place, or a withdrawal that approaches spots of the wall."""
     frames: int = 120
     """Frames of the sequence; every 8th is a test frame."""
-    size: OptionalText = None
+    size: arguments.OptionalText = None
     """Image size WxH, pixels; default: the layout's own, 338x270 for most."""
     light: Literal["c3vd", "strong"] = "c3vd"
     """Preset of light and motion: c3vd is the fair default, strong the stress case."""
     gain: Literal["auto", "fixed"] | None = None
     """Exposure; default: the preset's."""
-    light_offset: OptionalText = None
+    light_offset: arguments.OptionalText = None
     """Lamp position X,Y,Z in camera axes, mm; default: the preset's."""
     polyps: int = 4
     """Sessile polyps, 3 to 10 mm wide."""
     rotation_views: int = 12
     """Extra test views rotated by 15 to 30 degrees; none in layouts that cannot store them."""
-    set: Assignments = ()
+    set: arguments.Assignments = ()
     """Any other phantom setting, for instance roughness=0.4 (docs/phantom.md 6 lists them)."""
     layout: Annotated[str, tyro.conf.arg(metavar="NAME")] = "c3vd"
     """Files and folders to write (`coliags list phantom_layouts`)."""
-    overwrite: Overwrite = False
-    json: AsJson = False
+    overwrite: arguments.Overwrite = False
+    json: arguments.AsJson = False
 
     def run(self) -> None:
         """Generate the dataset."""
@@ -67,9 +59,9 @@ class PhantomCommand:
             "overwrite": self.overwrite,
         }
         if self.size is not None:
-            options["width"], options["height"] = parse_size(self.size)
+            options["width"], options["height"] = arguments.parse_size(self.size)
         if self.light_offset is not None:
-            options["light_offset"] = parse_vector("--light-offset", self.light_offset)
+            options["light_offset"] = arguments.parse_vector("--light-offset", self.light_offset)
         options |= parse_assignments(self.set, expected="KEY=VALUE")
         made = make_phantom(self.output, **options)
         print_summary(facts={"settings": options}, written=[made], then=[train_command(made)], as_json=self.json)

@@ -8,17 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from coliags_plugin.cli.arguments import (
-    AsJson,
-    Assignments,
-    Device,
-    OptionalFloat,
-    OptionalInt,
-    OptionalPath,
-    OptionalText,
-    Output,
-    parse_size,
-)
+from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import print_summary, view_command
 
 
@@ -31,34 +21,34 @@ class ReconstructCommand:
 
     video: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="VIDEO")]
     """Video file, folder of images ordered by the numbers in their names, or folder of a scene with poses."""
-    output: Output
+    output: arguments.Output
     """Folder of the results."""
-    camera: OptionalText = None
+    camera: arguments.OptionalText = None
     """A known camera, scaled to the frames (c3vd: whole frames of C3VD; c3vd-undistorted), or a camera model of COLMAP;
     default: found from the frames."""
-    params: Annotated[OptionalText, tyro.conf.arg(metavar="P1,P2,...")] = None
+    params: Annotated[arguments.OptionalText, tyro.conf.arg(metavar="P1,P2,...")] = None
     """Parameters of COLMAP's model, for the frames' size, pixel centres at integers + 0.5; default: estimated."""
-    diameter: OptionalFloat = None
+    diameter: arguments.OptionalFloat = None
     """The colon's typical inner diameter, which gives lengths in mm, roughly; default: their unit stays unknown."""
-    every: OptionalInt = None
+    every: arguments.OptionalInt = None
     """Use the sharpest of every n frames; default: such that at most 200 are left."""
-    mask: OptionalPath = None
+    mask: arguments.OptionalPath = None
     """Image of the frames' size, black where pixels are ignored; default: black surroundings are found."""
-    size: OptionalText = None
+    size: arguments.OptionalText = None
     """Size WxH of the images that depth is estimated from and training sees, pixels; default: what fits 338x270."""
-    method: OptionalText = None
+    method: arguments.OptionalText = None
     """Method to train; default: coliags-estimated-depth, or coliags for a scene with depth."""
-    steps: OptionalInt = None
+    steps: arguments.OptionalInt = None
     """Training steps; default 2000."""
-    set: Assignments = ()
+    set: arguments.Assignments = ()
     """Any setting of a stage, for instance frames.least_motion=0, sfm.max_ratio=0.9 or depth.agreement=0.03
     (docs/reconstruct.md)."""
-    device: Device = "auto"
+    device: arguments.Device = "auto"
     overwrite: bool = False
     """Repeat the stages that were made with other options, and what follows them."""
     anonymous: bool = False
     """Keep absolute paths out of what is written (docs/security.md 4)."""
-    json: AsJson = False
+    json: arguments.AsJson = False
 
     def run(self) -> None:
         """Run the stages that are not done, and print what there is."""
@@ -73,7 +63,7 @@ class ReconstructCommand:
             else parse_assignments([f"params=[{self.params}]"])["params"],
             "diameter": self.diameter,
             "frames.every": self.every,
-            "size": None if self.size is None else parse_size(self.size),
+            "size": None if self.size is None else arguments.parse_size(self.size),
             "method": self.method,
             "steps": self.steps,
         }

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from coliags_plugin.cli.arguments import AsJson, Device, MovedData, OptionalOutput, Overwrite, RunFolder
+from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import print_summary, view_command
 
 
@@ -15,8 +15,8 @@ from coliags_plugin.cli.summaries import print_summary, view_command
 class RenderCommand:
     """Render rgb, depth and error images of a run, and a video along its trajectory."""
 
-    path: RunFolder
-    output: OptionalOutput = None
+    path: arguments.RunFolder
+    output: arguments.OptionalOutput = None
     """Folder to create; default RUN/renders, with --light or --flatten RUN/relit."""
     frames: str = "test"
     """Which frames: train, all, or the name of a test set."""
@@ -39,10 +39,10 @@ class RenderCommand:
     """Also write the light that the method has learned, beside a phantom's: light.html and light.json."""
     channel: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME"), tyro.conf.UseAppendAction] = ()
     """Also write a feature channel of the method's Gaussians, for instance albedo."""
-    data: MovedData = None
-    device: Device = "auto"
-    overwrite: Overwrite = False
-    json: AsJson = False
+    data: arguments.MovedData = None
+    device: arguments.Device = "auto"
+    overwrite: arguments.Overwrite = False
+    json: arguments.AsJson = False
 
     def run(self) -> None:
         """Render, and print the output folder."""

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from coliags_plugin.cli.arguments import AsJson, OptionalOutput, OptionalPath, OptionalText
+from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import print_summary
 
 
@@ -18,30 +18,30 @@ class ReportCommand:
 
     paths: tyro.conf.Positional[tuple[Path, ...]]
     """Evaluated run folders, results files (`eval/PROTOCOL/result.json`), or the folder of a `coliags compare`."""
-    output: OptionalOutput = None
+    output: arguments.OptionalOutput = None
     """File to write; with several formats, its suffix is replaced by that of each; default: report.html, .md, ..."""
-    methods: OptionalText = None
+    methods: arguments.OptionalText = None
     """Names of methods to show, in this order, separated by commas; default: all."""
-    columns: OptionalText = None
+    columns: arguments.OptionalText = None
     """Metrics to show, separated by commas, or `all`; default: psnr,ssim,lpips,depth_mse,depth_mse_inner,
     depth_median_error."""
-    reference: OptionalText = None
+    reference: arguments.OptionalText = None
     """Method that the others are compared with; default: coliags, or the best where it is not there."""
     protocol: str = "paper"
     """Evaluation protocol to read; NAME-truth: evaluations by `coliags eval RUN --truth SCENE`."""
     frames: int = 4
     """Held-out frames to show per scene and test set; the worst ones are added."""
-    title: OptionalText = None
+    title: arguments.OptionalText = None
     """Heading; default: methods and scenes."""
-    note: OptionalText = None
+    note: arguments.OptionalText = None
     """A remark shown at the top."""
-    scene: OptionalPath = None
+    scene: arguments.OptionalPath = None
     """Run folder whose scene the HTML page lets its reader fly through, offline; needs the extra `viewer`."""
     format: Annotated[tuple[Literal["html", "markdown", "latex", "csv", "all"], ...], tyro.conf.UseAppendAction] = ()
     """What to write, repeatable: html (default), markdown, latex (booktabs), csv (every frame), or all."""
     anonymous: bool = False
     """Leave out absolute paths that results hold (docs/security.md 4)."""
-    json: AsJson = False
+    json: arguments.AsJson = False
 
     def run(self) -> None:
         """Write the report and print the paths."""

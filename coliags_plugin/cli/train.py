@@ -6,18 +6,7 @@ from dataclasses import dataclass
 
 import tyro
 
-from coliags_plugin.cli.arguments import (
-    AnonymousRun,
-    AsJson,
-    Assignments,
-    DataFormat,
-    Device,
-    OptionalInt,
-    OptionalOutput,
-    OptionalText,
-    Overwrite,
-    SceneFolder,
-)
+from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import coliags, print_summary
 
 
@@ -27,24 +16,24 @@ class TrainCommand:
 
     method: tyro.conf.Positional[str]
     """Name of a method (`coliags list methods`) or path of a YAML file."""
-    data: SceneFolder
-    output: OptionalOutput = None
+    data: arguments.SceneFolder
+    output: arguments.OptionalOutput = None
     """Run folder; default runs/SCENE/METHOD/STAMP."""
-    steps: OptionalInt = None
+    steps: arguments.OptionalInt = None
     """Training steps; schedules are scaled to them. A resumed run keeps its own unless given."""
-    seed: OptionalInt = None
+    seed: arguments.OptionalInt = None
     """Seed of all random generators; default 0, for a resumed run its own."""
-    renderer: OptionalText = None
+    renderer: arguments.OptionalText = None
     """Renderer by name (`coliags list renderers`); default: the method's."""
     resume: bool = False
     """Continue from the run's latest checkpoint (without --output: the newest run of this method on this scene)."""
-    set: Assignments = ()
+    set: arguments.Assignments = ()
     """Change a value of the method config, for instance field.voxel_size=1.0."""
-    format: DataFormat = None
-    device: Device = "auto"
-    overwrite: Overwrite = False
-    anonymous: AnonymousRun = False
-    json: AsJson = False
+    format: arguments.DataFormat = None
+    device: arguments.Device = "auto"
+    overwrite: arguments.Overwrite = False
+    anonymous: arguments.AnonymousRun = False
+    json: arguments.AsJson = False
 
     def run(self) -> None:
         """Train, and print the run folder."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from coliags_plugin.cli.arguments import AsJson, Device, MovedData, OptionalOutput, RunFolder
+from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import print_summary
 
 
@@ -12,8 +12,8 @@ from coliags_plugin.cli.summaries import print_summary
 class ViewCommand:
     """Show a run in a browser: Gaussians, cameras, meshes, recorded and rendered pictures. Needs the extra `viewer`."""
 
-    path: RunFolder
-    output: OptionalOutput = None
+    path: arguments.RunFolder
+    output: arguments.OptionalOutput = None
     """Write the scene to this file instead, as a self-contained HTML page of at most 5 MB, which opens offline."""
     host: str = "127.0.0.1"
     """Name or address to listen on; 0.0.0.0: all of this machine, for anyone who can reach it. From another machine,
@@ -22,9 +22,9 @@ class ViewCommand:
     """Port to listen on; 0: any free one."""
     open: bool = True
     """Open a browser, where there is a display."""
-    data: MovedData = None
-    device: Device = "auto"
-    json: AsJson = False
+    data: arguments.MovedData = None
+    device: arguments.Device = "auto"
+    json: arguments.AsJson = False
 
     def run(self) -> None:
         """Serve the run until Ctrl-C, or write the page."""

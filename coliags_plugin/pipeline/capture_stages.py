@@ -32,10 +32,10 @@ def make_frames(context: StageContext) -> StageOutcome:
 
 def make_poses(context: StageContext) -> StageOutcome:
     """Estimate poses and points by structure from motion, and write them as a scene."""
+    from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
     from coliags_plugin.reconstruction.structure.image_files import list_images
     from coliags_plugin.reconstruction.structure.model_scale import millimetres, scaled
     from coliags_plugin.reconstruction.structure.sfm import reconstruct
-    from coliags_plugin.reconstruction.structure.sfm_scene import write_sfm_scene
 
     mask = read_lens_mask(context.frames)
     model = reconstruct(list_images(context.frames / IMAGES), context.settings.sfm, mask, context.progress)

@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import Field
 
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.reconstruction.depth.settings import DepthSettings
+from coliags_plugin.reconstruction.depth.settings import DepthEstimationSettings
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 from coliags_plugin.surface.coverage.settings import CoverageSettings
 from coliags_plugin.surface.meshing.settings import MeshSettings
@@ -54,7 +54,7 @@ class ReconstructionSettings(Settings):
         gt=0.0,
         description="The colon's typical inner diameter, mm. None: the unit of length stays unknown.",
     )
-    depth: DepthSettings = DepthSettings()
+    depth: DepthEstimationSettings = DepthEstimationSettings()
     """Estimation of dense depth."""
     size: tuple[Pixels, Pixels] | None = Field(
         default=None,

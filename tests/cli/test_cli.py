@@ -223,37 +223,32 @@ def test_phantom_trains(tmp_path):
 # Bad input
 
 
-def test_missing_data(capsys, tmp_path):
-    assert "gone" in refused(capsys, "train", "coliags", "--data", tmp_path / "gone", "--output", tmp_path / "r")
-    assert not (tmp_path / "r").exists()
-
-
-def test_unknown_method(capsys, scene):
-    assert "Did you mean 'coliags'" in refused(capsys, "train", "colliags", "--data", scene)
-
-
 @pytest.mark.parametrize(
-    ("assignment", "part"),
+    ("command", "part"),
     [
-        ("field.geometry_head.frequences=3", "frequencies"),
-        ("schedule.steps=many", "'many'"),
-        ("losses.l1.weight=heavy", "heavy"),
-        ("nonsense", "key.path=value"),
-        ("renderer.name=cuda-magic", "cuda-magic"),
+        ("train coliags --data GONE --output NEW", "GONE"),
+        ("train colliags --data SCENE", "Did you mean 'coliags'"),
+        ("train coliags --data SCENE --output NEW --set field.geometry_head.frequences=3", "frequencies"),
+        ("train coliags --data SCENE --output NEW --set schedule.steps=many", "'many'"),
+        ("train coliags --data SCENE --output NEW --set losses.l1.weight=heavy", "heavy"),
+        ("train coliags --data SCENE --output NEW --set nonsense", "key.path=value"),
+        ("train coliags --data SCENE --output NEW --set renderer.name=cuda-magic", "cuda-magic"),
+        ("train coliags --data SCENE --renderer magic", "no renderer 'magic'"),
+        ("train coliags --data SCENE --resume", "no run under"),
+        ("train coliags --data . --output GONE --resume", "not a run folder"),
+        ("train scaffold-gs-depth --data SCENE --output RUN --resume", "run of method 'coliags'"),
+        ("eval .", "not a run folder"),
+        ("eval RUN --protocol papper", "Did you mean 'paper'"),
+        ("render .", "not a run folder"),
+        ("render RUN --frames rotation", "one of train, test, all"),
+        ("list renderer", "Did you mean 'renderers'"),
     ],
 )
-def test_bad_settings(capsys, scene, tmp_path, assignment, part):
-    argv = ("train", "coliags", "--data", scene, "--output", tmp_path / "r", "--set", assignment)
-    assert part in refused(capsys, *argv)
-    assert not (tmp_path / "r").exists()
-
-
-def test_unknown_renderer(capsys, scene):
-    assert "no renderer 'magic'" in refused(capsys, "train", "coliags", "--data", scene, "--renderer", "magic")
-
-
-def test_unknown_protocol(capsys, trained):
-    assert "Did you mean 'paper'" in refused(capsys, "eval", trained, "--protocol", "papper")
+def test_what_is_refused(capsys, scene, trained, tmp_path, monkeypatch, command, part):
+    monkeypatch.chdir(tmp_path)
+    words = [{"SCENE": scene, "RUN": trained}.get(word, word) for word in command.split()]
+    assert part in refused(capsys, *words)
+    assert not any(tmp_path.iterdir())
 
 
 def test_output_that_is_a_file(capsys, scene, tmp_path):
@@ -270,30 +265,12 @@ def test_read_only_output(capsys, scene, tmp_path):
     assert "cannot write" in refused(capsys, *argv)
 
 
-def test_checkpoint_of_another_method(capsys, scene, trained):
-    argv = ("train", "scaffold-gs-depth", "--data", scene, "--output", trained, "--resume", *SETS)
-    assert "run of method 'coliags'" in refused(capsys, *argv)
-
-
 def test_checkpoint_moved_under_another_method(capsys, scene, trained, tmp_path):
     other = tmp_path / "other"
     assert run("train", "scaffold-gs-depth", "--data", scene, "--output", other, "--steps", 1, *SETS) == 0
     shutil.rmtree(other / "checkpoints")
     shutil.copytree(trained / "checkpoints", other / "checkpoints")
     assert "is of method 'coliags'" in refused(capsys, "eval", other)
-
-
-def test_folders_that_are_no_runs(capsys, tmp_path):
-    for command in ("eval", "render"):
-        assert "not a run folder" in refused(capsys, command, tmp_path)
-    assert "not a run folder" in refused(
-        capsys, "train", "coliags", "--data", tmp_path, "--output", tmp_path / "gone", "--resume"
-    )
-
-
-def test_nothing_to_resume(capsys, scene, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert "no run under" in refused(capsys, "train", "coliags", "--data", scene, "--resume", *SETS)
 
 
 def test_damaged_provenance(capsys, trained, tmp_path):
@@ -309,10 +286,6 @@ def test_no_test_frames(capsys, scene, tmp_path):
     sets = (*SETS, "--set", "datamanager.split=all-train")
     assert run("train", "coliags", "--data", scene, "--output", tmp_path / "r", "--steps", 1, *sets) == 0
     assert "no test frames" in refused(capsys, "eval", tmp_path / "r")
-
-
-def test_no_frames_of_that_name(capsys, trained):
-    assert "one of train, test, all" in refused(capsys, "render", trained, "--frames", "rotation")
 
 
 def test_report_before_eval(capsys, trained, tmp_path):
@@ -339,10 +312,6 @@ def test_report_before_eval(capsys, trained, tmp_path):
 def test_bad_phantoms(capsys, tmp_path, argv):
     refused(capsys, "phantom", "-o", tmp_path / "p", *argv)
     assert not any(tmp_path.iterdir())
-
-
-def test_unknown_kind(capsys):
-    assert "Did you mean 'renderers'" in refused(capsys, "list", "renderer")
 
 
 def test_argument_errors_exit_with_2(capsys):

@@ -188,7 +188,7 @@ def _prior(folder: Path) -> None:
 
     from coliags_plugin.core.cameras import Camera
     from coliags_plugin.core.scenes import Frame
-    from coliags_plugin.reconstruction.depth.prior_files import FilePrior
+    from coliags_plugin.reconstruction.depth.priors import FilePrior
 
     camera = Camera(50.0, 50.0, 32.0, 25.5, 64, 51, torch.eye(4, dtype=torch.float64))
     frames = [Frame(f"{index:04d}", index, torch.zeros(51, 64, 3, dtype=torch.uint8), camera) for index in range(3)]

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.reconstruction.structure.hypotheses import Hypothesis, choose, is_ambiguous, reversed_in_depth
-from coliags_plugin.reconstruction.structure.observations import brightness_at, brightness_correlation, depths_of
+from coliags_plugin.reconstruction.structure.mapping import brightness_at, brightness_correlation, depths_of
 
 RANGE = (40.0, 150.0)
 #: Of a camera so far away that its images are nearly affine.

@@ -17,12 +17,17 @@ from coliags_plugin.geometry.poses.alignment import align
 from coliags_plugin.geometry.poses.association import associate
 from coliags_plugin.geometry.poses.rigid import inverse, rotation_angles_deg
 from coliags_plugin.geometry.poses.trajectory import Trajectory
+from coliags_plugin.reconstruction.libraries import deterministic_open3d
 from coliags_plugin.reconstruction.odometry.chain import Bridge, chain, fill_gaps, power
-from coliags_plugin.reconstruction.odometry.features import motion_by_features
-from coliags_plugin.reconstruction.odometry.frames import PreparedFrame, PreparedVideo, Video, prepare, typical_depth
-from coliags_plugin.reconstruction.odometry.libraries import deterministic_open3d
+from coliags_plugin.reconstruction.odometry.frames import (
+    PreparedFrame,
+    RgbdVideo,
+    prepare,
+    prepared_frames,
+    typical_depth,
+)
 from coliags_plugin.reconstruction.odometry.pose_graph import optimise, revisit_pairs, skip_pairs
-from coliags_plugin.reconstruction.odometry.registration import Edge, agreement
+from coliags_plugin.reconstruction.odometry.registration import Edge, agreement, motion_by_features
 from coliags_plugin.reconstruction.odometry.settings import TrackingSettings
 from coliags_plugin.reconstruction.odometry.tracking import track
 from tests.geometry.poses.winding import some_transform, winding
@@ -165,7 +170,7 @@ def phantom_video(phantom):
 
 @pytest.fixture(scope="module")
 def phantom_tracked(phantom_video):
-    return track(Video(phantom_video), phantom_video[0].camera.intrinsics, TrackingSettings())
+    return track(RgbdVideo(phantom_video), phantom_video[0].camera.intrinsics, TrackingSettings())
 
 
 def test_a_phantom_of_long_steps(phantom_video, phantom_tracked):
@@ -187,7 +192,7 @@ def test_given_poses_do_not_matter():
         replace(frame, camera=replace(frame.camera, camera_to_world=torch.from_numpy(some_transform(seed))))
         for seed, frame in enumerate(frames)
     ]
-    one, other = (track(Video(video), frames[0].camera.intrinsics, FAST) for video in (frames, scrambled))
+    one, other = (track(RgbdVideo(video), frames[0].camera.intrinsics, FAST) for video in (frames, scrambled))
     np.testing.assert_array_equal(one.camera_to_world, other.camera_to_world)
 
 
@@ -395,13 +400,13 @@ def test_prepared_frames_are_made_once_and_let_go():
             Counting.asked += 1
             return super().__getitem__(index)
 
-    frames = PreparedVideo(Counting(filmed_wall(swaying(4))), 40.0, keep=2)
-    first = frames[0]
-    assert frames[0] is first
+    frame = prepared_frames(Counting(filmed_wall(swaying(4))), 40.0, keep=2)
+    first = frame(0)
+    assert frame(0) is first
     assert Counting.asked == 1
     for index in (1, 2):
-        assert frames[index].depth.shape == (PINHOLE.height, PINHOLE.width)
-    assert frames[0] is not first
+        assert frame(index).depth.shape == (PINHOLE.height, PINHOLE.width)
+    assert frame(0) is not first
     assert Counting.asked == 4
 
 
@@ -430,4 +435,4 @@ def test_what_is_refused():
 def test_frames_without_depth_are_refused():
     frames = [replace(frame, depth=None) for frame in tube_frames(2)]
     with pytest.raises(InputError, match=r"frame 0000 has no depth.*coliags poses sfm"):
-        track(Video(frames), frames[0].camera.intrinsics, FAST)
+        track(RgbdVideo(frames), frames[0].camera.intrinsics, FAST)

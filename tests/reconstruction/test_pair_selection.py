@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from coliags_plugin.reconstruction.structure.features import Features
-from coliags_plugin.reconstruction.structure.pair_selection import alike_pairs
-from coliags_plugin.reconstruction.structure.sfm import Video
+from coliags_plugin.reconstruction.structure.matching import alike_pairs
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
+from coliags_plugin.reconstruction.structure.video import MatchedVideo
 
 
 def video(places, reach, seed=0):
@@ -60,7 +60,9 @@ def test_the_middle_of_a_video_is_matched_too(count):
     pairs = alike_pairs(features, SfmSettings())
     names = tuple(map(str, range(count)))
     matches = {pair: np.zeros((0, 2), np.uint32) for pair in pairs}
-    whole = Video(tuple(map(Path, names)), names, ((8, 8),) * count, tuple(features), (np.zeros(0),) * count, matches)
+    whole = MatchedVideo(
+        tuple(map(Path, names)), names, ((8, 8),) * count, tuple(features), (np.zeros(0),) * count, matches
+    )
     part = whole.middle(24)
     assert len(part.images) == len(part.features) == 24
     steps = {second - first for first, second in part.matches}

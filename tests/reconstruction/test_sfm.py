@@ -18,11 +18,11 @@ from coliags_plugin.geometry.poses.alignment import align
 from coliags_plugin.geometry.poses.association import associate
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.outputs.image_files import write_png
+from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
 from coliags_plugin.reconstruction.structure.features import FeatureSettings
 from coliags_plugin.reconstruction.structure.image_files import file_names, list_images, masks_for
 from coliags_plugin.reconstruction.structure.sfm import reconstruct
 from coliags_plugin.reconstruction.structure.sfm_cameras import distortion
-from coliags_plugin.reconstruction.structure.sfm_scene import write_sfm_scene
 from coliags_plugin.reconstruction.structure.sfm_settings import CameraSettings, SfmSettings
 from tests.textured_tube import INTRINSICS, tube_frames, write_tube
 

@@ -16,8 +16,7 @@ from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z, inverse
 from coliags_plugin.reconstruction.structure.colmap_scene import write_colmap_scene
-from coliags_plugin.reconstruction.structure.triangulation import TriangulationSettings, triangulate
-from coliags_plugin.reconstruction.structure.working_size import in_pixels_of
+from coliags_plugin.reconstruction.structure.triangulation import TriangulationSettings, in_pixels_of, triangulate
 from tests.textured_tube import texture, tube_frames
 
 FRAMES = tube_frames()

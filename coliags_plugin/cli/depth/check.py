@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from coliags_plugin.cli.arguments import AsJson, Assignments, OptionalPath
+from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import print_summary
 
 _Format = Annotated[str | None, tyro.conf.arg(metavar="NAME")]
@@ -24,11 +24,11 @@ class DepthCheckCommand:
     """The same with true depth, dense or at single points."""
     align_scale: bool = False
     """Multiply the estimate by the median of true / estimated depth."""
-    html: OptionalPath = None
+    html: arguments.OptionalPath = None
     """Also write an HTML page with images."""
-    maps: OptionalPath = None
+    maps: arguments.OptionalPath = None
     """Also write maps of the error, PNG, to this folder, which must be new or empty."""
-    set: Assignments = ()
+    set: arguments.Assignments = ()
     """An option of both data managers, for instance max_frames=20."""
     estimate_format: _Format = None
     """Dataset format of the estimate (`coliags list datamanagers`); default: recognised from the files."""
@@ -36,7 +36,7 @@ class DepthCheckCommand:
     """Dataset format of the truth; default: recognised from the files."""
     anonymous: bool = False
     """Keep absolute paths out of the JSON (docs/security.md 4)."""
-    json: AsJson = False
+    json: arguments.AsJson = False
 
     def run(self) -> None:
         """Compare, and print the results."""

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from coliags_plugin.cli.arguments import AsJson, Assignments, DataFormat, OptionalInt, OptionalPath, Output, Overwrite
+from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import print_summary, train_command
 
 #: Prefix of the options of estimation; all others are the data manager's.
@@ -22,21 +22,21 @@ class DepthEstimateCommand:
 
     scene: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCENE")]
     """The scene's folder. Depth that it has is ignored."""
-    output: Output
+    output: arguments.Output
     """Folder to create, in nerfstudio's layout."""
-    prior: OptionalPath = None
+    prior: arguments.OptionalPath = None
     """Folder of depth maps by image name (.png of 16 bits, .npy or .exr), in any unit, to fit instead of brightness."""
     near: _OptionalLength = None
     """Nearest depth, in the scene's unit of length, with --far; default: found from features."""
     far: _OptionalLength = None
     """Farthest depth."""
-    jobs: OptionalInt = None
+    jobs: arguments.OptionalInt = None
     """Number of threads; default: one for each core."""
-    set: Assignments = ()
+    set: arguments.Assignments = ()
     """An option of the data manager, as width=675, or of estimation, as depth.agreement=0.01 (docs/depth.md)."""
-    format: DataFormat = None
-    overwrite: Overwrite = False
-    json: AsJson = False
+    format: arguments.DataFormat = None
+    overwrite: arguments.Overwrite = False
+    json: arguments.AsJson = False
 
     def run(self) -> None:
         """Estimate, or resume; write the scene and print a summary."""
@@ -45,14 +45,14 @@ class DepthEstimateCommand:
         from coliags_plugin.engine.data_formats import open_scene
         from coliags_plugin.engine.progress import progress_callback
         from coliags_plugin.reconstruction.depth.scene import DepthRequest, estimate_scene, training_options
-        from coliags_plugin.reconstruction.depth.settings import DepthSettings
+        from coliags_plugin.reconstruction.depth.settings import DepthEstimationSettings
 
         refuse_output(self.output, self.scene, self.overwrite)
         if (self.near is None) != (self.far is None):
             raise InputError("--near without --far, or the reverse", "both or neither")
         if self.jobs is not None and self.jobs < 1:
             raise InputError(f"--jobs {self.jobs}", "a number of threads of 1 or more")
-        settings, options = settings_among(DepthSettings, self.set, _OWN)
+        settings, options = settings_among(DepthEstimationSettings, self.set, _OWN)
         with progress_callback() as progress:
             # Images are read when they are needed, so that memory does not grow with the video.
             reading = ["initial_points=none", "keep_pixels=false", *options]

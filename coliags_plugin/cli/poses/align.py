@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from coliags_plugin.cli.arguments import AsJson, OptionalPath, OptionalText, Overwrite
+from coliags_plugin.cli import arguments
 from coliags_plugin.cli.poses.arguments import OptionalFormat, read_and_log
 from coliags_plugin.cli.summaries import print_summary
 
@@ -32,16 +32,16 @@ class PosesAlignCommand:
     """How frames are matched; auto: by name, else by time, else by index."""
     tolerance: float = 0.02
     """Largest difference of matched timestamps, s."""
-    unit: OptionalText = None
+    unit: arguments.OptionalText = None
     """Name of the reference's unit of length; default: mm where its format is metric."""
-    plot: OptionalPath = None
+    plot: arguments.OptionalPath = None
     """PNG to write: both trajectories from above and from the side, and the errors over frames."""
     estimate_format: OptionalFormat = None
     """Format of the estimate; default: recognised from its content."""
     reference_format: OptionalFormat = None
     """Format of the reference; default: recognised from its content."""
-    overwrite: Overwrite = False
-    json: AsJson = False
+    overwrite: arguments.Overwrite = False
+    json: arguments.AsJson = False
 
     def run(self) -> None:
         """Align, and print a table of the errors."""

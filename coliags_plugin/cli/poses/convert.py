@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from coliags_plugin.cli.arguments import AsJson, OptionalPath, OptionalText, Output, Overwrite
+from coliags_plugin.cli import arguments
 from coliags_plugin.cli.poses.arguments import OptionalFormat, parse_intrinsics, read_and_log
 from coliags_plugin.cli.summaries import print_summary
 
@@ -19,20 +19,20 @@ class PosesConvertCommand:
 
     input: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="IN")]
     """File with poses, or the folder of a COLMAP model."""
-    output: Output
+    output: arguments.Output
     """File to write; for COLMAP, folder to create."""
     to: Annotated[str, tyro.conf.arg(metavar="FORMAT")]
     """Format to write."""
-    intrinsics: Annotated[OptionalText, tyro.conf.arg(metavar="FX,FY,CX,CY")] = None
+    intrinsics: Annotated[arguments.OptionalText, tyro.conf.arg(metavar="FX,FY,CX,CY")] = None
     """Pinhole intrinsics of all images, px, pixel centres at integers + 0.5; default: the input's."""
-    size: Annotated[OptionalText, tyro.conf.arg(metavar="WxH")] = None
+    size: Annotated[arguments.OptionalText, tyro.conf.arg(metavar="WxH")] = None
     """Image size, px; with --intrinsics."""
-    images: OptionalPath = None
+    images: arguments.OptionalPath = None
     """Folder whose images, in natural order, give the poses their names; default: the input's names."""
     from_format: Annotated[OptionalFormat, tyro.conf.arg(name="from")] = None
     """Format of the input; default: recognised from its content."""
-    overwrite: Overwrite = False
-    json: AsJson = False
+    overwrite: arguments.Overwrite = False
+    json: arguments.AsJson = False
 
     def run(self) -> None:
         """Convert the poses."""

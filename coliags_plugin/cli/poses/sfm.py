@@ -8,16 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from coliags_plugin.cli.arguments import (
-    AsJson,
-    Assignments,
-    OptionalFloat,
-    OptionalInt,
-    OptionalPath,
-    OptionalText,
-    Output,
-    Overwrite,
-)
+from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import depth_commands, print_summary
 
 if TYPE_CHECKING:
@@ -30,27 +21,27 @@ class PosesSfmCommand:
 
     frames: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FRAMES")]
     """Folder of images, ordered by the numbers in their names."""
-    output: Output
+    output: arguments.Output
     """Folder to create, in COLMAP's layout."""
-    camera: OptionalText = None
+    camera: arguments.OptionalText = None
     """A known camera, scaled to the images (c3vd: whole frames of C3VD; c3vd-undistorted), or a camera model of COLMAP,
     for instance PINHOLE or OPENCV_FISHEYE; default: the better of SIMPLE_RADIAL_FISHEYE and SIMPLE_RADIAL."""
-    params: Annotated[OptionalText, tyro.conf.arg(metavar="P1,P2,...")] = None
+    params: Annotated[arguments.OptionalText, tyro.conf.arg(metavar="P1,P2,...")] = None
     """Parameters of COLMAP's model in its order, pixel centres at integers + 0.5, kept fixed; default: estimated."""
-    diameter: OptionalFloat = None
+    diameter: arguments.OptionalFloat = None
     """The colon's typical inner diameter, which fixes the scale roughly; default: the scale stays unknown."""
-    distance: Annotated[OptionalText, tyro.conf.arg(metavar="IMAGE,IMAGE,MM")] = None
+    distance: Annotated[arguments.OptionalText, tyro.conf.arg(metavar="IMAGE,IMAGE,MM")] = None
     """Known distance between the cameras of two images, which fixes the scale."""
-    mask: OptionalPath = None
+    mask: arguments.OptionalPath = None
     """Mask image, black where pixels are ignored, or a folder with one per image."""
     every: int = 1
     """Use every n-th image."""
-    max_frames: OptionalInt = None
+    max_frames: arguments.OptionalInt = None
     """Use at most the first n images."""
-    set: Assignments = ()
+    set: arguments.Assignments = ()
     """An option of matching or mapping, for instance exhaustive_up_to=80 or features.max_features=2000."""
-    overwrite: Overwrite = False
-    json: AsJson = False
+    overwrite: arguments.Overwrite = False
+    json: arguments.AsJson = False
 
     def run(self) -> None:
         """Reconstruct, write the scene and print a summary."""
@@ -58,10 +49,10 @@ class PosesSfmCommand:
         from coliags_plugin.config.assignments import settings_of
         from coliags_plugin.core.errors import InputError
         from coliags_plugin.engine.progress import progress_callback
+        from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
         from coliags_plugin.reconstruction.structure.image_files import list_images, masks_for
         from coliags_plugin.reconstruction.structure.model_scale import millimetres, scaled
         from coliags_plugin.reconstruction.structure.sfm import reconstruct
-        from coliags_plugin.reconstruction.structure.sfm_scene import write_sfm_scene
         from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 
         refuse_output(self.output, self.frames, self.overwrite)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from coliags_plugin.cli.arguments import AsJson, Assignments, DataFormat, Output, Overwrite
+from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import print_summary, train_command
 
 if TYPE_CHECKING:
@@ -25,13 +25,13 @@ class PosesTrackCommand:
 
     scene: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCENE")]
     """A scene, or a folder with colour, depth and intrinsics but without poses."""
-    output: Output
+    output: arguments.Output
     """Folder to create, in the layout of `rgbd`."""
-    set: Assignments = ()
+    set: arguments.Assignments = ()
     """An option of the data manager, as width=675, or of tracking, as tracking.method=hybrid."""
-    format: DataFormat = None
-    overwrite: Overwrite = False
-    json: AsJson = False
+    format: arguments.DataFormat = None
+    overwrite: arguments.Overwrite = False
+    json: arguments.AsJson = False
 
     def run(self) -> None:
         """Track, write the scene and print a summary."""
@@ -39,7 +39,7 @@ class PosesTrackCommand:
         from coliags_plugin.datamanagers.rgbd.writer import write_rgbd_scene
         from coliags_plugin.engine.data_formats import open_video
         from coliags_plugin.engine.progress import progress_callback
-        from coliags_plugin.reconstruction.odometry.frames import Video
+        from coliags_plugin.reconstruction.odometry.frames import RgbdVideo
         from coliags_plugin.reconstruction.odometry.settings import TrackingSettings
         from coliags_plugin.reconstruction.odometry.tracking import track
 
@@ -47,7 +47,7 @@ class PosesTrackCommand:
         settings, options = settings_among(TrackingSettings, self.set, _OWN)
         with progress_callback() as progress:
             scene, posed = open_video(self.scene, self.format, options, progress)
-            tracking = track(Video(scene.train), scene.train[0].camera.intrinsics, settings, progress)
+            tracking = track(RgbdVideo(scene.train), scene.train[0].camera.intrinsics, settings, progress)
             trajectory = write_rgbd_scene(
                 self.output, scene.train, tracking.camera_to_world, overwrite=self.overwrite, progress=progress
             )

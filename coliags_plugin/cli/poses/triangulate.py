@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from coliags_plugin.cli.arguments import AsJson, Assignments, DataFormat, Output, Overwrite
+from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import depth_commands, print_summary
 
 if TYPE_CHECKING:
@@ -27,13 +27,13 @@ class PosesTriangulateCommand:
 
     scene: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCENE")]
     """The scene's folder."""
-    output: Output
+    output: arguments.Output
     """Folder to create, in COLMAP's layout."""
-    set: Assignments = ()
+    set: arguments.Assignments = ()
     """An option of the data manager, as width=675, or of triangulation, as triangulation.min_angle=1."""
-    format: DataFormat = None
-    overwrite: Overwrite = False
-    json: AsJson = False
+    format: arguments.DataFormat = None
+    overwrite: arguments.Overwrite = False
+    json: arguments.AsJson = False
 
     def run(self) -> None:
         """Triangulate the training frames, write all frames and print a summary."""
@@ -43,8 +43,11 @@ class PosesTriangulateCommand:
         from coliags_plugin.engine.data_formats import open_scene
         from coliags_plugin.engine.progress import progress_callback
         from coliags_plugin.reconstruction.structure.colmap_scene import write_colmap_scene
-        from coliags_plugin.reconstruction.structure.triangulation import TriangulationSettings, triangulate
-        from coliags_plugin.reconstruction.structure.working_size import in_pixels_of
+        from coliags_plugin.reconstruction.structure.triangulation import (
+            TriangulationSettings,
+            in_pixels_of,
+            triangulate,
+        )
 
         refuse_output(self.output, self.scene, self.overwrite)
         settings, options = settings_among(TriangulationSettings, self.set, _OWN)

@@ -12,9 +12,9 @@ from jaxtyping import Float
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame
+from coliags_plugin.reconstruction.libraries import quiet_colmap
 from coliags_plugin.reconstruction.structure.features import Features, FeatureSettings, feature_extractor
 from coliags_plugin.reconstruction.structure.matching import epipolar_matches, rays, relative_pose
-from coliags_plugin.reconstruction.structure.quiet import quiet_colmap
 
 log = logging.getLogger(__name__)
 
@@ -71,9 +71,11 @@ def find_range(
         InputError: Too few points are found.
     """
     if any(frame.sparse_depth is not None and len(frame.sparse_depth.depth) for frame in frames):
-        found = [np.zeros(0) if f.sparse_depth is None else f.sparse_depth.depth.cpu().double().numpy() for f in frames]
-        return _range_of(found, "points of the scene")
-    found = [np.zeros(0)] * len(frames)
+        depths_by_frame = [
+            np.zeros(0) if f.sparse_depth is None else f.sparse_depth.depth.cpu().double().numpy() for f in frames
+        ]
+        return _range_of(depths_by_frame, "points of the scene")
+    depths_by_frame = [np.zeros(0)] * len(frames)
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(_FRAMES, len(frames))).round().astype(int))
     with quiet_colmap(0):
         extract = feature_extractor(settings)
@@ -92,12 +94,12 @@ def find_range(
                 triangulated_depths(features_of(index), features_of(other), frames[index], frames[other], max_turn)
                 for other in partners
             ]
-            found[index] = _agreed(np.stack(depths)) if depths else np.zeros(0)
+            depths_by_frame[index] = _agreed(np.stack(depths)) if depths else np.zeros(0)
             for old in [key for key in features if key < index]:
                 del features[old]
             if progress is not None:
                 progress("find the depth range", done, len(chosen))
-    return _range_of(found, "points triangulated between frames")
+    return _range_of(depths_by_frame, "points triangulated between frames")
 
 
 def triangulated_depths(
@@ -115,12 +117,12 @@ def triangulated_depths(
         return depths
     pairs = epipolar_matches(first, second, cameras, _ERROR, 0.8, 0.7)
     turned = rays(first.pixels[pairs[:, 0]], one.camera) @ rotation.T
-    seen = rays(second.pixels[pairs[:, 1]], other.camera)
-    # Depth a of least distance between the lines a * turned + translation and b * seen.
-    aa, bb, ab = (np.einsum("ij,ij->i", *pair) for pair in ((turned, turned), (seen, seen), (turned, seen)))
+    opposite = rays(second.pixels[pairs[:, 1]], other.camera)
+    # Depth a of least distance between the lines a * turned + translation and b * opposite.
+    aa, bb, ab = (np.einsum("ij,ij->i", *pair) for pair in ((turned, turned), (opposite, opposite), (turned, opposite)))
     sine = 1.0 - ab**2 / (aa * bb)
     with np.errstate(divide="ignore", invalid="ignore"):
-        depth = (ab * (seen @ translation) - bb * (turned @ translation)) / (aa * bb - ab**2)
+        depth = (ab * (opposite @ translation) - bb * (turned @ translation)) / (aa * bb - ab**2)
     good = (sine > np.sin(np.radians(_LEAST_ANGLE)) ** 2) & (depth > 0.0)
     depths[pairs[good, 0]] = depth[good]
     return depths
@@ -137,8 +139,8 @@ def _agreed(depths: Float[np.ndarray, "P K"]) -> Float[np.ndarray, "A"]:
     return np.asarray(middle[(near >= np.minimum(2, there)) & (2 * near > there)])
 
 
-def _range_of(found: Sequence[Float[np.ndarray, "K"]], what: str) -> DepthRange:
-    every = np.concatenate(found)
+def _range_of(depths_by_frame: Sequence[Float[np.ndarray, "K"]], what: str) -> DepthRange:
+    every = np.concatenate(depths_by_frame)
     if len(every) < _FEWEST:
         raise InputError(
             f"the depth range is unknown: {len(every)} {what}",
@@ -146,10 +148,12 @@ def _range_of(found: Sequence[Float[np.ndarray, "K"]], what: str) -> DepthRange:
             "Check the poses (coliags data check), use frames farther apart, or give --near and --far",
         )
     near, far = (factor * float(np.percentile(every, part)) for part, factor in (_NEAREST, _FARTHEST))
-    measured = [index for index, depths in enumerate(found) if len(depths) >= _FEWEST_OF_FRAME]
+    measured = [index for index, depths in enumerate(depths_by_frame) if len(depths) >= _FEWEST_OF_FRAME]
     if measured:
-        medians = np.interp(np.arange(len(found)), measured, np.log([np.median(found[index]) for index in measured]))
+        medians = np.interp(
+            np.arange(len(depths_by_frame)), measured, np.log([np.median(depths_by_frame[index]) for index in measured])
+        )
     else:
-        medians = np.full(len(found), np.log(np.median(every)))
+        medians = np.full(len(depths_by_frame), np.log(np.median(every)))
     log.info("depth range %.4g to %.4g, from %d %s", near, far, len(every), what)
     return DepthRange(near, far, tuple(float(value) for value in np.exp(medians)))

@@ -6,30 +6,23 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.reading.parallel import parallel_map
-from coliags_plugin.reconstruction.depth.completion import (
-    complete,
-    data_weight,
-    first_belief,
-    near_rim,
-    smooth_surface,
-)
-from coliags_plugin.reconstruction.depth.confidence import depth_confidence, sweep_weight
+from coliags_plugin.reconstruction.depth.completion import complete, data_weight, first_belief, near_rim, smooth_surface
 from coliags_plugin.reconstruction.depth.depth_range import DepthRange
-from coliags_plugin.reconstruction.depth.fusion import DepthMap, fuse_frame
-from coliags_plugin.reconstruction.depth.neighbours import choose_neighbours
+from coliags_plugin.reconstruction.depth.fusion import WeightedDepth, depth_confidence, fuse_frame, sweep_weight
 from coliags_plugin.reconstruction.depth.priors import DepthPrior
-from coliags_plugin.reconstruction.depth.settings import DepthSettings, SweepSettings
+from coliags_plugin.reconstruction.depth.settings import DepthEstimationSettings, SweepSettings
 from coliags_plugin.reconstruction.depth.sweeping import Swept, ratios, sweep_frame
 from coliags_plugin.reconstruction.depth.views import Guide, guide_of
-from coliags_plugin.reconstruction.depth.work_files import Arrays, Recent, WorkFolder
+from coliags_plugin.reconstruction.depth.work_files import Arrays, WorkFolder
 
 log = logging.getLogger(__name__)
 
@@ -43,7 +36,7 @@ _HELD = 40
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class DepthEstimate:
     """Estimated depth of a frame.
 
     Attributes:
@@ -76,7 +69,7 @@ class Estimation:
         frames: Sequence[Frame],
         prior: DepthPrior,
         depth_range: DepthRange,
-        settings: DepthSettings,
+        settings: DepthEstimationSettings,
         work: WorkFolder,
         jobs: int = 1,
         progress: Progress | None = None,
@@ -97,10 +90,10 @@ class Estimation:
             for number, sweep in enumerate(self.settings.sweeps):
                 self._pass(number, sweep)
 
-    def result(self, index: int) -> Estimate:
+    def result(self, index: int) -> DepthEstimate:
         """The estimate of a frame, after :meth:`run`."""
-        found = self.work.load(self.last, index)
-        return Estimate(found["depth"], found["confidence"])
+        arrays = self.work.load(self.last, index)
+        return DepthEstimate(arrays["depth"], arrays["confidence"])
 
     def _pass(self, number: int, sweep: SweepSettings) -> None:
         neighbours = self._neighbours(f"neighbours-{number}", sweep, self.medians)
@@ -112,11 +105,11 @@ class Estimation:
     def _neighbours(self, name: str, sweep: SweepSettings, medians: Sequence[float]) -> list[list[int]]:
         centers = np.stack([frame.camera.center.cpu().double().numpy() for frame in self.frames])
         axes = np.stack([frame.camera.optical_axis.cpu().double().numpy() for frame in self.frames])
-        found: list[list[int]] = self.work.value(
+        neighbours: list[list[int]] = self.work.value(
             name, lambda: choose_neighbours(centers, axes, medians, sweep.baselines, self.settings)
         )
-        lonely = sum(len(others) < FEWEST_NEIGHBOURS for others in found)
-        if lonely == len(found):
+        lonely = sum(len(others) < FEWEST_NEIGHBOURS for others in neighbours)
+        if lonely == len(neighbours):
             span = float(np.linalg.norm(np.ptp(centers, axis=0)))
             raise InputError(
                 f"no frame has {FEWEST_NEIGHBOURS} others at a distance of {100 * min(sweep.baselines):g} % "
@@ -128,10 +121,10 @@ class Estimation:
             log.warning(
                 "%d of %d frames have fewer than %d neighbours: their depth has confidence 0",
                 lonely,
-                len(found),
+                len(neighbours),
                 FEWEST_NEIGHBOURS,
             )
-        return found
+        return neighbours
 
     def _sweep(
         self, stage: str, sweep: SweepSettings, neighbours: Sequence[Sequence[int]], base: str | None, title: str
@@ -158,19 +151,19 @@ class Estimation:
         swept = self.last
         guides = self._guides(sweep.reduction)
 
-        def depth_map(index: int) -> DepthMap:
-            found = Swept(**self.work.load(swept, index))
-            return DepthMap(guides(index).pose, found.depth, sweep_weight(found))
+        @lru_cache(maxsize=_HELD)
+        def depth_map(index: int) -> WeightedDepth:
+            own = Swept(**self.work.load(swept, index))
+            return WeightedDepth(guides(index).pose, own.depth, sweep_weight(own))
 
-        maps: Recent[DepthMap] = Recent(depth_map, _HELD)
         low, high = np.log(self.range.near), np.log(self.range.far)
 
         def fused(index: int) -> Arrays:
-            own, guide = maps(index), guides(index)
-            found = fuse_frame(own, [maps(other) for other in neighbours[index]], self.settings.agreement)
+            own, guide = depth_map(index), guides(index)
+            result = fuse_frame(own, [depth_map(other) for other in neighbours[index]], self.settings.agreement)
             # Where this frame shows a highlight, others may see the surface.
-            support = found.votes
-            known = np.log(found.depth)
+            support = result.votes
+            known = np.log(result.depth)
             prior = self.prior.log_depth(
                 self.frames[index].to("cpu"), guide.usable, known, data_weight(support), self.medians[index]
             )
@@ -180,15 +173,21 @@ class Estimation:
             whole = sweep.reach is None
             belief = first_belief(known, support, prior, rim) if whole else np.ones_like(support)
             log_depth = np.clip(complete(known, support, belief, prior, guide.intensity), low, high)
-            confidence = depth_confidence(log_depth, support, found.spread, rim)
+            confidence = depth_confidence(log_depth, support, result.spread, rim)
             if len(neighbours[index]) < FEWEST_NEIGHBOURS or own.weight.mean() < LEAST_MATCHED:
                 confidence[:] = 0.0
             return {"depth": np.exp(log_depth), "confidence": confidence}
 
         self._stage(stage, fused, title)
 
-    def _guides(self, reduction: int) -> Recent[Guide]:
-        return Recent(lambda index: guide_of(self.frames[index].to("cpu"), reduction, self.settings.features), _HELD)
+    def _guides(self, reduction: int) -> Callable[[int], Guide]:
+        """Frames prepared for matching, the last ones held."""
+
+        @lru_cache(maxsize=_HELD)
+        def guide(index: int) -> Guide:
+            return guide_of(self.frames[index].to("cpu"), reduction, self.settings.features)
+
+        return guide
 
     def _stage(self, stage: str, function: Callable[[int], Arrays], title: str) -> None:
         def one(index: int) -> None:
@@ -241,3 +240,54 @@ def check_video(frames: Sequence[Frame]) -> None:
             "poses at different positions",
             "A camera that does not move, or only turns, gives no depth; check the poses",
         )
+
+
+def choose_neighbours(
+    centers: Float[np.ndarray, "N 3"],
+    axes: Float[np.ndarray, "N 3"],
+    depths: Sequence[float],
+    baselines: Sequence[float],
+    settings: DepthEstimationSettings,
+) -> list[list[int]]:
+    """Neighbours of every frame of a video: for each baseline the first frame so far away, before and after it.
+
+    Where the video ends on one side, the other gives more frames, farther away. A pause adds no frames, as they are
+    chosen by distance, not by number.
+
+    Args:
+        centers: Camera centres in video order. [N, 3]
+        axes: Unit optical axes. [N, 3]
+        depths: Median depth of every frame. [N]
+        baselines: Distances in units of it.
+        settings: See ``max_baseline`` and ``max_turn``.
+
+    Returns:
+        For every frame the indices of its neighbours, ascending.
+    """
+    baselines = sorted(baselines)
+    farther = [baselines[-1] + (baselines[-1] / len(baselines)) * step for step in range(1, len(baselines) + 1)]
+    least_cosine = np.cos(np.radians(settings.max_turn))
+    neighbours = []
+    for index in range(len(centers)):
+        distance = np.linalg.norm(centers - centers[index], axis=1) / depths[index]
+        is_candidate = (axes @ axes[index] >= least_cosine) & (distance <= settings.max_baseline)
+        before, after = np.arange(index - 1, -1, -1), np.arange(index + 1, len(centers))
+        sides = [_first_beyond(distance, side, is_candidate, baselines) for side in (before, after)]
+        for own, other, side in ((0, 1, before), (1, 0, after)):
+            lacking = len(baselines) - len(sides[other])
+            if lacking > 0:
+                sides[own] = _first_beyond(distance, side, is_candidate, [*baselines, *farther[:lacking]])
+        neighbours.append(sorted({*sides[0], *sides[1]}))
+    return neighbours
+
+
+def _first_beyond(
+    distance: np.ndarray, side: np.ndarray, is_candidate: np.ndarray, baselines: Sequence[float]
+) -> list[int]:
+    """The first frame of one side of the video beyond each baseline, without repetition."""
+    chosen = []
+    for baseline in baselines:
+        beyond = side[(distance[side] >= baseline) & is_candidate[side]]
+        if len(beyond) and int(beyond[0]) not in chosen:
+            chosen.append(int(beyond[0]))
+    return chosen

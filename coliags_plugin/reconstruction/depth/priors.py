@@ -1,13 +1,21 @@
-"""Base class of depth priors."""
+"""Priors of depth: by the law of a lamp at the lens, or of depth maps by others, for instance a monocular network."""
 
 from __future__ import annotations
 
+import hashlib
 from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float, Float32, UInt8
 
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame
+from coliags_plugin.datamanagers.reading.depth_formats import depth_format
+from coliags_plugin.datamanagers.reading.files import first_few
+from coliags_plugin.datamanagers.rotatecolon.exr_depth import read_exr_channel
+from coliags_plugin.reconstruction.depth.views import Pose
 
 
 class DepthPrior(ABC):
@@ -38,3 +46,223 @@ class DepthPrior(ABC):
     @abstractmethod
     def described(self) -> str:
         """What determines the prior, to tell whether work files are of the same one."""
+
+
+#: Reweighted solutions.
+_ROUNDS = 8
+#: Most rows that are used.
+_MOST = 20_000
+
+
+def robust_fit(
+    columns: Float[np.ndarray, "N K"],
+    values: Float[np.ndarray, "N"],
+    weights: Float[np.ndarray, "N"],
+    default: Float[np.ndarray, "K"],
+    default_weight: float,
+) -> Float[np.ndarray, "K"]:
+    """Least squares reweighted by Cauchy's function of the residual, its scale four median deviations.
+
+    Args:
+        columns: Terms; the first is constant. [N, K]
+        values: What they are to add up to. [N]
+        weights: Of the rows. [N]
+        default: Coefficients that the solution is drawn to; the solution without rows. [K]
+        default_weight: How strongly, in rows of unit weight.
+
+    Returns:
+        The coefficients. [K]
+    """
+    if len(values) == 0:
+        return default.copy()
+    every = -(-len(values) // _MOST)
+    rows, wanted, trust = columns[::every], values[::every].astype(np.float64), weights[::every].astype(np.float64)
+    rows = rows.astype(np.float64)
+    scale = np.maximum(rows.std(axis=0), 1e-3)
+    scale[0] = 1.0
+    middle = np.average(rows, axis=0, weights=trust)
+    middle[0] = 0.0
+    standard = (rows - middle) / scale
+    start = default * scale
+    start[0] = default[0] + default[1:] @ middle[1:]
+    pull = np.full(len(start), default_weight)
+    pull[0] = 1e-3 * default_weight  # the level follows the data at once
+    solution, left = start, wanted - standard @ start
+    for _ in range(_ROUNDS):
+        spread = max(4.0 * float(np.median(np.abs(left - np.median(left)))), 1e-4)
+        centred = left - (np.median(left) if solution is start else 0.0)
+        each = trust / (1.0 + (centred / spread) ** 2)
+        normal = standard.T @ (each[:, None] * standard) + np.diag(pull)
+        solution = np.linalg.solve(normal, standard.T @ (each * wanted) + pull * start)
+        left = wanted - standard @ solution
+    coefficients = solution / scale
+    coefficients[0] = solution[0] - coefficients[1:] @ middle[1:]
+    return np.asarray(coefficients)
+
+
+#: Exponent from stored to linear intensity, and the least linear intensity.
+_GAMMA, _DARKEST = 2.2, 2e-4
+#: Standard deviations of smoothing, pixels; the last that reaches usable pixels counts.
+_SIGMAS = (24.0, 6.0, 1.5)
+#: Weight of the physical law, in pixels: what a frame with few known depths falls back to.
+_LAW_WEIGHT = 20.0
+
+
+class LightPrior(DepthPrior):
+    """Log depth as a polynomial of log red, log green and the cosine to the optical axis, fitted to each frame.
+
+    Seven numbers: constant, both logarithms, their squares and product, and the cosine. Where depth is hardly known
+    the fit stays at the law of a lamp at the lens, intensity ~ 1 / depth^2 (docs/depth.md).
+    """
+
+    def log_depth(
+        self,
+        frame: Frame,
+        usable: Bool[np.ndarray, "H W"],
+        known: Float32[np.ndarray, "H W"],
+        weight: Float32[np.ndarray, "H W"],
+        typical: float,
+    ) -> Float32[np.ndarray, "H W"]:
+        """See :class:`DepthPrior`."""
+        import cv2
+
+        size = (known.shape[1], known.shape[0])
+        image = cv2.resize(frame.image.cpu().numpy(), size, interpolation=cv2.INTER_AREA)
+        design = light_terms(image, usable, Pose.resized(frame.camera, size))
+        columns = design.reshape(-1, design.shape[-1])
+        chosen = np.flatnonzero((weight > 0.0) & usable)
+        law = np.zeros(columns.shape[1])
+        law[2] = -0.5
+        lit = columns[usable.ravel()] if usable.any() else columns
+        law[0] = np.log(typical) - law[2] * float(np.median(lit[:, 2]))
+        fitted = robust_fit(columns[chosen], known.ravel()[chosen], weight.ravel()[chosen], law, _LAW_WEIGHT)
+        # Beyond what the fit has seen, a polynomial runs away: hold its terms at the ends.
+        if len(chosen) > 1000:
+            low, high = np.percentile(columns[chosen], [0.05, 99.95], axis=0)
+            slack = 0.15 * (high - low)
+            columns = np.clip(columns, low - slack, high + slack)
+        return np.asarray((columns @ fitted).reshape(known.shape), np.float32)
+
+    def described(self) -> str:
+        """See :class:`DepthPrior`."""
+        return "light"
+
+
+def light_terms(
+    image: UInt8[np.ndarray, "H W 3"], usable: Bool[np.ndarray, "H W"], pose: Pose
+) -> Float[np.ndarray, "H W 7"]:
+    """Terms of the polynomial: 1, log red, log green, their squares and product, cosine to the optical axis.
+
+    Colours are smoothed over a few pixels, without those that are not usable; these take the colours around them.
+    """
+    import cv2
+
+    linear = (image[..., :2].astype(np.float32) / 255.0) ** _GAMMA
+    good = usable.astype(np.float32)
+    smooth = linear
+    for sigma in _SIGMAS:
+        share = cv2.GaussianBlur(good, (0, 0), sigma)[..., None]
+        around = cv2.GaussianBlur(linear * good[..., None], (0, 0), sigma) / np.maximum(share, 1e-3)
+        smooth = np.where(share > 0.05, around, smooth)
+    red, green = np.moveaxis(np.log(np.maximum(smooth, _DARKEST)).astype(np.float64), -1, 0)
+    cosine = 1.0 / np.linalg.norm(pose.rays(), axis=-1)
+    return np.stack([np.ones_like(red), red, green, red * red, red * green, green * green, cosine], axis=-1)
+
+
+_SUFFIXES = (".png", ".npy", ".exr")
+#: How far the aspect ratio of a map may be from the frame's: rounding to whole pixels, but no cropping.
+_ASPECT = 0.02
+#: Fewest known pixels that scale and shift are fitted to.
+_FEWEST = 50
+
+
+class FilePrior(DepthPrior):
+    """Depth maps from files, scale and shift fitted to each frame's known depth, as depth or as inverse depth.
+
+    Args:
+        files: Depth map of each frame, by frame name.
+    """
+
+    def __init__(self, files: Mapping[str, Path]) -> None:
+        self.files = dict(files)
+
+    @classmethod
+    def of(cls, folder: Path, frames: Sequence[Frame]) -> FilePrior:
+        """The prior of a folder with one map of each frame, named as the frame.
+
+        Raises:
+            InputError: The folder is missing, a frame has no map, or a map has another aspect ratio.
+        """
+        if not folder.is_dir():
+            raise InputError(f"--prior {folder}: no such folder", "a folder of depth maps named as the images")
+        files = {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() in _SUFFIXES}
+        missing = [frame.name for frame in frames if frame.name not in files]
+        if missing:
+            raise InputError(
+                f"--prior {folder}: {len(missing)} of {len(frames)} frames have no depth map: {first_few(missing)}",
+                f"NAME{', NAME'.join(_SUFFIXES)} for every frame",
+                "Name the maps as the images",
+            )
+        prior = cls({frame.name: files[frame.name] for frame in frames})
+        for frame in frames:
+            prior._read(frame)
+        return prior
+
+    def described(self) -> str:
+        """See :class:`DepthPrior`: names and a hash of the contents."""
+        digest = hashlib.sha256()
+        for name, path in self.files.items():
+            digest.update(name.encode() + path.read_bytes())
+        return digest.hexdigest()
+
+    def log_depth(
+        self,
+        frame: Frame,
+        usable: Bool[np.ndarray, "H W"],
+        known: Float32[np.ndarray, "H W"],
+        weight: Float32[np.ndarray, "H W"],
+        typical: float,
+    ) -> Float32[np.ndarray, "H W"]:
+        """See :class:`DepthPrior`; unknown pixels of a map take the typical depth."""
+        import cv2
+
+        size = (known.shape[1], known.shape[0])
+        stored = self._read(frame)
+        values = np.asarray(cv2.resize(stored, size, interpolation=cv2.INTER_NEAREST), np.float64)
+        there = np.isfinite(values) & (values > 0.0)
+        chosen = (weight > 0.0) & usable & there
+        nothing = np.full(known.shape, np.log(typical), np.float32)
+        if not there.any():
+            return nothing
+        if chosen.sum() < _FEWEST:
+            scale = np.median(values[there])
+            return np.where(there, np.log(typical * np.where(there, values, scale) / scale), nothing).astype(np.float32)
+        best, least = nothing, np.inf
+        for power in (1.0, -1.0):
+            target = np.exp(power * known[chosen].astype(np.float64))
+            columns = np.stack([np.ones(values.shape), np.where(there, values, 1.0)], axis=-1)
+            fit = columns @ robust_fit(columns[chosen], target, weight[chosen], np.zeros(2), 1e-9)
+            # A line may leave the positive depths: hold it at a tenth of the least that is known.
+            fit = np.clip(fit, 0.1 * target.min(), 10.0 * target.max())
+            log_depth = np.log(fit) / power
+            error = float(np.average(np.abs(log_depth[chosen] - known[chosen]), weights=weight[chosen]))
+            if error < least:
+                best, least = np.where(there, log_depth, nothing).astype(np.float32), error
+        return best
+
+    def _read(self, frame: Frame) -> Float32[np.ndarray, "h w"]:
+        path = self.files[frame.name]
+        if path.suffix.lower() == ".exr":
+            stored = read_exr_channel(path, "V")
+        else:
+            form = depth_format(path, 1.0)
+            stored = form.z_depth(form.read(path))
+        height, width = stored.shape
+        camera = frame.camera
+        if abs(width * camera.height / (height * camera.width) - 1.0) > _ASPECT:
+            raise InputError(
+                f"{path} has {width} x {height} pixels, frame {frame.name} {camera.width} x {camera.height}",
+                "depth maps of the undistorted working image, of its aspect ratio",
+                "Make them from the images of such a scene, or crop them likewise",
+            )
+        return np.asarray(stored, np.float32)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder
@@ -19,11 +20,8 @@ from coliags_plugin.datamanagers.rectification import PAPER_SIZE, fitted
 from coliags_plugin.datamanagers.units import write_unit
 from coliags_plugin.reconstruction.depth.depth_range import DepthRange, find_range, given_range
 from coliags_plugin.reconstruction.depth.estimate import Estimation, check_video
-from coliags_plugin.reconstruction.depth.light_prior import LightPrior
-from coliags_plugin.reconstruction.depth.points import VoxelPoints
-from coliags_plugin.reconstruction.depth.prior_files import FilePrior
-from coliags_plugin.reconstruction.depth.priors import DepthPrior
-from coliags_plugin.reconstruction.depth.settings import DepthSettings
+from coliags_plugin.reconstruction.depth.priors import DepthPrior, FilePrior, LightPrior
+from coliags_plugin.reconstruction.depth.settings import DepthEstimationSettings
 from coliags_plugin.reconstruction.depth.views import Pose
 from coliags_plugin.reconstruction.depth.work_files import WorkFolder, work_folder
 
@@ -48,7 +46,7 @@ class DepthRequest:
         jobs: Number of threads; None: one for each core.
     """
 
-    settings: DepthSettings
+    settings: DepthEstimationSettings
     near_far: tuple[float, float] | None = None
     prior: Path | None = None
     jobs: int | None = None
@@ -134,13 +132,13 @@ def _write(
     voxels = VoxelPoints(_VOXEL * footprint, frames[len(frames) // 2].camera.center.cpu().double().numpy())
     pixels, known = 0, 0
     for done, stored in enumerate(frames, start=1):
-        frame, found = stored.to("cpu"), estimation.result(done - 1)
+        frame, estimate = stored.to("cpu"), estimation.result(done - 1)
         image = frame.image.numpy()
         mask = None if frame.mask is None else frame.mask.numpy()
-        confidence = found.confidence if mask is None else np.where(mask, found.confidence, np.float32(0.0))
-        writer.write_frame(frame.name, frame.camera, image, mask, found.depth, confidence)
+        confidence = estimate.confidence if mask is None else np.where(mask, estimate.confidence, np.float32(0.0))
+        writer.write_frame(frame.name, frame.camera, image, mask, estimate.depth, confidence)
         if frame.name in trained:
-            voxels.add(Pose.of(frame.camera), found.depth, confidence, image)
+            voxels.add(Pose.of(frame.camera), estimate.depth, confidence, image)
         pixels += int(frame.valid.sum())
         known += int((confidence >= _KNOWN).sum())
         if progress is not None:
@@ -162,3 +160,77 @@ def _write(
         f"{100.0 * known / max(pixels, 1):.0f} % of the pixels with a confidence of {_KNOWN:g} or more; "
         f"{len(positions)} points"
     )
+
+
+#: Least confidence of a pixel, and least number of frames that see a point's voxel.
+LEAST_CONFIDENCE, FEWEST_FRAMES = 0.8, 3
+#: Voxels are held as one integer: so many along each axis, the world's origin in the middle.
+_SPAN = 1 << 20
+
+
+class VoxelPoints:
+    """Points merged in cubic voxels of the world, frame by frame; memory grows with the surface, not the frames.
+
+    Args:
+        size: Of the voxels, scene units.
+        origin: A position amid the scene. [3]
+    """
+
+    def __init__(self, size: float, origin: Float[np.ndarray, "3"]) -> None:
+        self.size, self.origin = size, np.asarray(origin, np.float64)
+        self._keys: Int[np.ndarray, "V"] = np.zeros(0, np.int64)
+        #: Sums of weight, weighted offset from the origin and weighted colour, and the number of frames. [V, 8]
+        self._sums: Float[np.ndarray, "V 8"] = np.zeros((0, 8))
+
+    def add(
+        self,
+        pose: Pose,
+        depth: Float32[np.ndarray, "H W"],
+        confidence: Float32[np.ndarray, "H W"],
+        image: UInt8[np.ndarray, "H W 3"],
+    ) -> None:
+        """Add a frame's confident pixels.
+
+        Args:
+            pose: Camera of the frame.
+            depth: z-depth. [H, W]
+            confidence: 0 to 1; below ``LEAST_CONFIDENCE`` a pixel does not count. [H, W]
+            image: RGB. [H, W, 3]
+        """
+        chosen = (confidence >= LEAST_CONFIDENCE) & ~_steep(depth)
+        weight = confidence[chosen].astype(np.float64)[:, None]
+        local = (pose.rays() * depth[..., None])[chosen]
+        offset = local @ pose.camera_to_world[:3, :3].T + pose.camera_to_world[:3, 3] - self.origin
+        cell = np.floor(offset / self.size).astype(np.int64) + _SPAN // 2
+        inside = ((cell >= 0) & (cell < _SPAN)).all(axis=1)
+        keys = (cell[:, 0] * _SPAN + cell[:, 1]) * _SPAN + cell[:, 2]
+        rows = np.concatenate([weight, weight * offset, weight * image[chosen]], axis=1)[inside]
+        own, sums = _summed(keys[inside], rows)
+        once = np.ones((len(own), 1))
+        self._keys, self._sums = _summed(
+            np.concatenate([self._keys, own]), np.concatenate([self._sums, np.hstack([sums, once])])
+        )
+
+    def points(self) -> tuple[Float32[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"]]:
+        """Weighted mean position and colour of every voxel that ``FEWEST_FRAMES`` frames have points in."""
+        sums = self._sums[self._sums[:, 7] >= FEWEST_FRAMES]
+        weight = sums[:, :1]
+        positions = sums[:, 1:4] / weight + self.origin
+        return positions.astype(np.float32), np.rint(sums[:, 4:7] / weight).astype(np.uint8)
+
+
+def _summed(keys: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of equal keys added up; keys ascending."""
+    order = np.argsort(keys, kind="stable")
+    keys, rows = keys[order], rows[order]
+    first = np.flatnonzero(np.concatenate([[True], keys[1:] != keys[:-1]])) if len(keys) else np.zeros(0, np.int64)
+    return keys[first], np.add.reduceat(rows, first, axis=0) if len(keys) else rows
+
+
+def _steep(depth: Float32[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """Pixels at a depth discontinuity: a tenth or more between the neighbours on both sides. [H, W]"""
+    log = np.log(depth)
+    steep = np.zeros(depth.shape, bool)
+    steep[1:-1] |= np.abs(log[2:] - log[:-2]) > 0.1
+    steep[:, 1:-1] |= np.abs(log[:, 2:] - log[:, :-2]) > 0.1
+    return steep

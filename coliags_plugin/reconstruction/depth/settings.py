@@ -37,7 +37,7 @@ class SweepSettings(Settings):
     large_penalty: float = Field(default=1.0, ge=0.0, description="Semi-global penalty P2 of a greater change.")
 
 
-class DepthSettings(Settings):
+class DepthEstimationSettings(Settings):
     """Options of depth estimation."""
 
     max_baseline: float = Field(default=0.6, gt=0.0, description="Largest distance of a neighbour.")

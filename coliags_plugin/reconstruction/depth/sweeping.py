@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32
 
-from coliags_plugin.reconstruction.depth.settings import DepthSettings, SweepSettings
+from coliags_plugin.reconstruction.depth.settings import DepthEstimationSettings, SweepSettings
 from coliags_plugin.reconstruction.depth.views import Guide
 
 #: Log of the factor on depth over which a hypothesis must have had rivals.
@@ -52,7 +52,7 @@ def sweep_frame(
     base: Float32[np.ndarray, "H W"],
     factors: Float32[np.ndarray, "D"],
     sweep: SweepSettings,
-    settings: DepthSettings,
+    settings: DepthEstimationSettings,
 ) -> Swept:
     """Match a frame with its neighbours at multiples of a surface, and take the best.
 

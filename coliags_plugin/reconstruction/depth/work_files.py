@@ -5,12 +5,10 @@ from __future__ import annotations
 import json
 import logging
 import shutil
-import threading
-from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +18,6 @@ from coliags_plugin.core.locks import locked
 log = logging.getLogger(__name__)
 
 Arrays = Mapping[str, np.ndarray]
-_Value = TypeVar("_Value")
 #: What describes the estimation, in the folder of its work files.
 _REQUEST = "request.json"
 
@@ -104,30 +101,3 @@ def work_folder(out: Path, request: Mapping[str, Any]) -> Iterator[WorkFolder]:
             log.info("resuming from the work files in %s", path)
         yield WorkFolder(path)
     shutil.rmtree(path, ignore_errors=True)
-
-
-class Recent(Generic[_Value]):
-    """The most recently used values of a function of an index, for several threads.
-
-    Args:
-        make: The function; may run twice for the same index.
-        most: How many values are held.
-    """
-
-    def __init__(self, make: Callable[[int], _Value], most: int) -> None:
-        self._make, self._most = make, most
-        self._held: OrderedDict[int, _Value] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def __call__(self, index: int) -> _Value:
-        """The value of an index."""
-        with self._lock:
-            if index in self._held:
-                self._held.move_to_end(index)
-                return self._held[index]
-        value = self._make(index)
-        with self._lock:
-            self._held[index] = value
-            while len(self._held) > self._most:
-                self._held.popitem(last=False)
-        return value

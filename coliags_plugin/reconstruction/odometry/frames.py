@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -58,7 +59,7 @@ class PreparedFrame:
     depth: Float32[np.ndarray, "H W"]
 
 
-class Video(Sequence[RgbdFrame]):
+class RgbdVideo(Sequence[RgbdFrame]):
     """Images and depth of frames without their poses, read one at a time.
 
     Args:
@@ -88,30 +89,24 @@ class Video(Sequence[RgbdFrame]):
         return RgbdFrame(frame.name, frame.image.numpy(), depth.numpy(), None if mask is None else mask.numpy())
 
 
-class PreparedVideo:
-    """Lazily prepared frames with a cache of the most recently used.
+def prepared_frames(
+    video: Sequence[RgbdFrame], unit: float, keep: int, factor: int = 1
+) -> Callable[[int], PreparedFrame]:
+    """Function that prepares the frame at an index, and holds the most recently used.
 
     Args:
         video: Frames to prepare.
         unit: Length that becomes 1.
-        keep: Number of cached frames.
-        enlarge: Factor on their size.
+        keep: Number of frames held.
+        factor: On their size.
     """
 
-    def __init__(self, video: Sequence[RgbdFrame], unit: float, keep: int, enlarge: int = 1) -> None:
-        self._video, self._unit, self._keep, self._enlarge = video, unit, keep, enlarge
-        self._kept: dict[int, PreparedFrame] = {}
+    @lru_cache(maxsize=keep)
+    def prepared(index: int) -> PreparedFrame:
+        frame = prepare(video[index], unit)
+        return frame if factor == 1 else enlarged(frame, factor)
 
-    def __getitem__(self, index: int) -> PreparedFrame:
-        """Prepared frame at an index."""
-        found = self._kept.pop(index, None)
-        if found is None:
-            found = prepare(self._video[index], self._unit)
-            found = found if self._enlarge == 1 else enlarged(found, self._enlarge)
-        self._kept[index] = found
-        while len(self._kept) > self._keep:
-            self._kept.pop(next(iter(self._kept)))
-        return found
+    return prepared
 
 
 def prepare(frame: RgbdFrame, unit: float) -> PreparedFrame:

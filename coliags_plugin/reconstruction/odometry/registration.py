@@ -1,4 +1,4 @@
-"""Pairwise RGB-D registration by open3d's multi-scale odometry, and measures of its quality."""
+"""Pairwise RGB-D registration by open3d's multi-scale odometry, measures of its quality, and initial guesses."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class FrameRegistration:
         """
         odometry = self._open3d.t.pipelines.odometry
         try:
-            found = odometry.rgbd_odometry_multi_scale(
+            result = odometry.rgbd_odometry_multi_scale(
                 self._rgbd(source),
                 self._rgbd(target),
                 self._k,
@@ -106,11 +106,11 @@ class FrameRegistration:
             )
         except RuntimeError:  # singular system
             return None
-        motion = _rigid(found.transformation.numpy())
+        motion = _rigid(result.transformation.numpy())
         if motion is None:
             return None
         fitness, depth_rmse, correlation = agreement(source, target, motion, self.intrinsics)
-        return Edge(*frames, motion, fitness, depth_rmse, correlation, float(found.inlier_rmse))
+        return Edge(*frames, motion, fitness, depth_rmse, correlation, float(result.inlier_rmse))
 
     def information(self, edge: Edge, source: PreparedFrame, target: PreparedFrame) -> Float[np.ndarray, "6 6"]:
         """Information matrix of an edge for open3d's pose graph. [6, 6]"""
@@ -204,3 +204,66 @@ def _rigid(matrix: np.ndarray) -> Float[np.ndarray, "4 4"] | None:
     if np.abs(values - 1.0).max() > RIGID_TOLERANCE or np.linalg.det(matrix[:3, :3]) < 0.0:
         return None
     return rigid((left @ right)[None], np.asarray(matrix[:3, 3], np.float64)[None])[0]
+
+
+#: The contrast threshold is low because the images are normalised to uniform contrast.
+_FEATURES, _CONTRAST = 1500, 0.01
+#: Lowe's ratio; loose, as RANSAC rejects outliers afterwards.
+_RATIO = 0.9
+_ROUNDS, _REPROJECTION_PX, _FEWEST = 500, 3.0, 12
+
+
+def motion_by_features(
+    source: PreparedFrame, target: PreparedFrame, intrinsics: Intrinsics
+) -> Float[np.ndarray, "4 4"] | None:
+    """Estimate the motion between two frames by SIFT matches and RANSAC PnP on the source's back-projected features.
+
+    OpenCV's RANSAC uses a fixed seed.
+
+    Args:
+        source: Frame whose depth back-projects the features.
+        target: The other frame.
+        intrinsics: Intrinsics of both.
+
+    Returns:
+        Source camera to target camera, as an initial guess; None with too few matches or inliers. [4, 4]
+    """
+    sift = cv2.SIFT_create(nfeatures=_FEATURES, contrastThreshold=_CONTRAST)  # type: ignore[attr-defined]
+    here, there = _features(sift, source), _features(sift, target)
+    if min(len(here[0]), len(there[0])) < _FEWEST:
+        return None
+    matches = [
+        first
+        for first, second in cv2.BFMatcher().knnMatch(here[1], there[1], k=2)
+        if first.distance < _RATIO * second.distance
+    ]
+    if len(matches) < _FEWEST:
+        return None
+    pixels = here[0][[match.queryIdx for match in matches]]
+    observed = there[0][[match.trainIdx for match in matches]]
+    column, row = np.rint(pixels).astype(int).T
+    z = source.depth[row, column].astype(np.float64)
+    k = intrinsics.opencv_matrix()
+    points = np.stack([(pixels[:, 0] - k[0, 2]) / k[0, 0] * z, (pixels[:, 1] - k[1, 2]) / k[1, 1] * z, z], axis=1)
+    known = z > 0.0
+    if known.sum() < _FEWEST:
+        return None
+    succeeded, rotvec, translation, inliers = cv2.solvePnPRansac(
+        points[known],
+        observed[known],
+        k,
+        None,
+        iterationsCount=_ROUNDS,
+        reprojectionError=_REPROJECTION_PX,
+        flags=cv2.SOLVEPNP_AP3P,
+    )
+    if not succeeded or inliers is None or len(inliers) < _FEWEST:
+        return None
+    return rigid(cv2.Rodrigues(rotvec)[0][None], np.asarray(translation, np.float64).reshape(1, 3))[0]
+
+
+def _features(sift: Any, frame: PreparedFrame) -> tuple[Float[np.ndarray, "K 2"], np.ndarray]:
+    """Pixels (centres at integers, as in OpenCV) and descriptors of features with known depth."""
+    image = np.rint(frame.intensity * 255.0).astype(np.uint8)
+    keypoints, descriptors = sift.detectAndCompute(image, (frame.depth > 0.0).astype(np.uint8))
+    return np.array([point.pt for point in keypoints], np.float64).reshape(-1, 2), descriptors

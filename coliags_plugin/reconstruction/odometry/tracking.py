@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,12 +14,11 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.geometry.poses.rigid import inverse
+from coliags_plugin.reconstruction.libraries import deterministic_open3d
 from coliags_plugin.reconstruction.odometry.chain import Chain, chain, fill_gaps
-from coliags_plugin.reconstruction.odometry.features import motion_by_features
-from coliags_plugin.reconstruction.odometry.frames import PreparedVideo, RgbdFrame, typical_depth
-from coliags_plugin.reconstruction.odometry.libraries import deterministic_open3d
+from coliags_plugin.reconstruction.odometry.frames import PreparedFrame, RgbdFrame, prepared_frames, typical_depth
 from coliags_plugin.reconstruction.odometry.pose_graph import optimise, revisit_pairs, skip_pairs
-from coliags_plugin.reconstruction.odometry.registration import Edge, FrameRegistration, Term
+from coliags_plugin.reconstruction.odometry.registration import Edge, FrameRegistration, Term, motion_by_features
 from coliags_plugin.reconstruction.odometry.settings import TrackingSettings
 
 log = logging.getLogger(__name__)
@@ -100,7 +99,7 @@ def track(
     _check_sizes(video, intrinsics)
     unit = typical_depth(video)
     with deterministic_open3d() as open3d:
-        frames = PreparedVideo(video, unit, max((*settings.skips, 1)) + _SPARE, settings.enlarge)
+        frames = prepared_frames(video, unit, max((*settings.skips, 1)) + _SPARE, settings.enlarge)
         enlarged = intrinsics.resized(intrinsics.width * settings.enlarge, intrinsics.height * settings.enlarge)
         tracker = _Tracker(open3d, frames, enlarged, settings)
         wanted = settings.method
@@ -153,7 +152,9 @@ class Correction:
 class _Tracker:
     """Registration, verification and pose-graph correction of one video."""
 
-    def __init__(self, open3d: Any, frames: PreparedVideo, intrinsics: Intrinsics, settings: TrackingSettings) -> None:
+    def __init__(
+        self, open3d: Any, frames: Callable[[int], PreparedFrame], intrinsics: Intrinsics, settings: TrackingSettings
+    ) -> None:
         self._open3d, self._frames, self._intrinsics, self._settings = open3d, frames, intrinsics, settings
         self.use("hybrid")
 
@@ -167,7 +168,7 @@ class _Tracker:
         If registration from the given guess fails, it is repeated from a feature-based one: direct alignment converges
         only for motions up to about ten pixels.
         """
-        frames = self._frames[source], self._frames[target]
+        frames = self._frames(source), self._frames(target)
         edge = self._registration.register((source, target), *frames, guess)
         if self._is_valid(edge):
             return edge
@@ -190,13 +191,13 @@ class _Tracker:
         The second condition is needed because on a plane or in a smooth tube exact depth leaves no residual for motions
         along the surface.
         """
-        found: dict[Term, list[Edge | None]] = {}
+        edges: dict[Term, list[Edge | None]] = {}
         probes = np.unique(np.linspace(1, count - 1, min(_PROBES, count - 1)).round().astype(int))
         for term in ("point-to-plane", "hybrid"):
             self.use(term)
-            found[term] = [self.verified_edge(int(frame), int(frame) - 1, np.eye(4)) for frame in probes]
-        planes = [edge for edge in found["point-to-plane"] if edge is not None]
-        hybrids = [edge for edge in found["hybrid"] if edge is not None]
+            edges[term] = [self.verified_edge(int(frame), int(frame) - 1, np.eye(4)) for frame in probes]
+        planes = [edge for edge in edges["point-to-plane"] if edge is not None]
+        hybrids = [edge for edge in edges["hybrid"] if edge is not None]
         if not planes or len(planes) < len(hybrids):
             return "hybrid"
         residual = float(np.median([edge.residual for edge in planes]))
@@ -246,7 +247,7 @@ class _Tracker:
         return Correction(poses, kept, dropped, refused)
 
     def _information(self, edge: Edge) -> Float[np.ndarray, "6 6"]:
-        return self._registration.information(edge, self._frames[edge.source], self._frames[edge.target])
+        return self._registration.information(edge, self._frames(edge.source), self._frames(edge.target))
 
 
 def _check_sizes(video: Sequence[RgbdFrame], intrinsics: Intrinsics) -> None:

@@ -1,4 +1,4 @@
-"""Writes features and matches to a COLMAP database."""
+"""Features, matches and posed frames in COLMAP's form."""
 
 from __future__ import annotations
 
@@ -6,6 +6,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from coliags_plugin.core.intrinsics import Intrinsics
+from coliags_plugin.core.scenes import Frame
+from coliags_plugin.geometry.poses.colmap import posed_model
+from coliags_plugin.geometry.poses.rigid import inverse
 from coliags_plugin.reconstruction.structure.features import Features
 from coliags_plugin.reconstruction.structure.matching import Pairs
 
@@ -43,13 +49,13 @@ def write_database(
             rig = pycolmap.Rig(rig_id=number)
             rig.add_ref_sensor(camera.sensor_id)
             database.write_rig(rig, use_rig_id=True)
-        for number, ((name, camera_index), found) in enumerate(zip(images, features, strict=True), start=1):
+        for number, ((name, camera_index), image_features) in enumerate(zip(images, features, strict=True), start=1):
             image = pycolmap.Image(name=name, camera_id=camera_index + 1, image_id=number)
             database.write_image(image, use_image_id=True)
             frame = pycolmap.Frame(frame_id=number, rig_id=camera_index + 1)
             frame.add_data_id(image.data_id)
             database.write_frame(frame, use_frame_id=True)
-            database.write_keypoints(number, found.keypoints)
+            database.write_keypoints(number, image_features.keypoints)
         for (first, second), pairs in matches.items():
             if not len(pairs):
                 continue
@@ -63,3 +69,20 @@ def write_database(
             database.write_two_view_geometry(first + 1, second + 1, geometry)
     finally:
         database.close()
+
+
+def frame_model(frames: Sequence[Frame], names: Sequence[str] | None = None) -> pycolmap.Reconstruction:
+    """A reconstruction of posed frames without points: frame i is COLMAP's image i + 1, equal cameras are shared.
+
+    Args:
+        frames: Their poses and cameras.
+        names: Image names; None: ``0.png``, ``1.png``, ...
+    """
+    import pycolmap
+
+    camera_to_world = np.stack([frame.camera.camera_to_world.cpu().double().numpy() for frame in frames])
+    names = [f"{index}.png" for index in range(len(frames))] if names is None else names
+    cameras: dict[Intrinsics, int] = {}
+    camera_indices = [cameras.setdefault(frame.camera.intrinsics, len(cameras)) for frame in frames]
+    world_to_camera = [pycolmap.Rigid3d(matrix[:3]) for matrix in inverse(camera_to_world)]
+    return posed_model(world_to_camera, names, list(cameras), camera_indices)

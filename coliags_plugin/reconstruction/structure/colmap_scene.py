@@ -1,7 +1,8 @@
-"""Writes a triangulated video as a scene in COLMAP's layout."""
+"""Writes triangulated or reconstructed videos as scenes in COLMAP's layout."""
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,11 +10,13 @@ import numpy as np
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder
+from coliags_plugin.core.images import write_mask
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points, write_image_and_mask, write_model
 from coliags_plugin.datamanagers.units import Unit, write_unit
-from coliags_plugin.reconstruction.structure.colmap_model import frame_model
-from coliags_plugin.reconstruction.structure.image_files import file_names
+from coliags_plugin.reconstruction.structure.colmap_database import frame_model
+from coliags_plugin.reconstruction.structure.image_files import Masks, file_names, mask_of
+from coliags_plugin.reconstruction.structure.sfm import Reconstruction
 from coliags_plugin.reconstruction.structure.triangulation import Triangulation
 
 
@@ -45,8 +48,8 @@ def write_colmap_scene(
             f"a triangulation of {len(triangulation.observations)} frames, and {len(frames)} frames", "the same frames"
         )
     no_points = SeenPoints(np.empty((0, 2)), np.empty(0, np.int64))
-    seen = [SeenPoints(observations.pixels, observations.points) for observations in triangulation.observations]
-    video = [*zip(frames, seen, strict=True), *((frame, no_points) for frame in held_out)]
+    observed = [SeenPoints(observations.pixels, observations.points) for observations in triangulation.observations]
+    video = [*zip(frames, observed, strict=True), *((frame, no_points) for frame in held_out)]
     video.sort(key=lambda pair: pair[0].index)
     posed = [frame for frame, _ in video]
     names = file_names([frame.name for frame in posed], ".png")
@@ -58,4 +61,34 @@ def write_colmap_scene(
             mask = None if frame.mask is None else frame.mask.cpu().numpy()
             write_image_and_mask(scratch, name, frame.image.cpu().numpy(), mask)
         write_model(scratch, model)
+        write_unit(scratch, unit)
+
+
+def write_sfm_scene(
+    folder: Path,
+    reconstruction: Reconstruction,
+    masks: Masks = None,
+    overwrite: bool = False,
+    unit: Unit = "unknown",
+) -> None:
+    """Write a scene in COLMAP's layout: copies of the registered images, masks, the model and its unit.
+
+    Args:
+        folder: The folder to create.
+        reconstruction: What to write.
+        masks: As for :func:`~coliags_plugin.reconstruction.structure.sfm.reconstruct`.
+        overwrite: Replace the folder if it exists.
+        unit: Of the model.
+
+    Raises:
+        InputError: The folder exists or cannot be written.
+    """
+    with atomic_folder(folder, overwrite) as scratch:
+        (scratch / "images").mkdir()
+        for index in reconstruction.registered:
+            shutil.copyfile(reconstruction.images[index], scratch / "images" / reconstruction.names[index])
+            mask = mask_of(reconstruction.images[index], masks)
+            if mask is not None:
+                write_mask(scratch / "masks" / f"{reconstruction.names[index]}.png", mask)
+        write_model(scratch, reconstruction.model)
         write_unit(scratch, unit)

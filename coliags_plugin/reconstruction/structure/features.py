@@ -74,7 +74,7 @@ Extractor = Callable[[UInt8[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"] | None
 def feature_extractor(settings: FeatureSettings) -> Extractor:
     """Create a feature extractor: CLAHE, COLMAP's SIFT, and rejection of masked features; reusable for many images.
 
-    Call it within :func:`~coliags_plugin.reconstruction.structure.quiet.quiet_colmap`.
+    Call it within :func:`~coliags_plugin.reconstruction.libraries.quiet_colmap`.
     """
     import cv2
     import pycolmap
@@ -91,14 +91,14 @@ def feature_extractor(settings: FeatureSettings) -> Extractor:
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         gray = gray if local_contrast is None else local_contrast.apply(gray)
         keypoints, descriptors = sift.extract_from_uint8_array(np.ascontiguousarray(gray))
-        found = pycolmap.keypoints_to_matrix(keypoints).astype(np.float32).reshape(-1, 4)
+        points = pycolmap.keypoints_to_matrix(keypoints).astype(np.float32).reshape(-1, 4)
         vectors = np.asarray(descriptors.data, np.float32).reshape(-1, 128)
         height, width = gray.shape
-        column = np.clip(found[:, 0].astype(np.int64), 0, width - 1)
-        row = np.clip(found[:, 1].astype(np.int64), 0, height - 1)
+        column = np.clip(points[:, 0].astype(np.int64), 0, width - 1)
+        row = np.clip(points[:, 1].astype(np.int64), 0, height - 1)
         kept = usable(image, mask, settings)[row, column]
         lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-        return Features(found[kept], (vectors / np.maximum(lengths, 1e-12))[kept])
+        return Features(points[kept], (vectors / np.maximum(lengths, 1e-12))[kept])
 
     return extract
 

@@ -31,14 +31,14 @@ def list_images(folder: Path) -> list[Path]:
         raise InputError(f"{folder} is a file", "a folder of images", f"{_FFMPEG}, if it is a video")
     if not folder.is_dir():
         raise InputError(f"no folder {folder}", "a folder of images", "Check the path")
-    found = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
-    if len(found) < 2:
+    images = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
+    if len(images) < 2:
         raise InputError(
-            f"{folder} holds {len(found)} images",
+            f"{folder} holds {len(images)} images",
             f"at least two ({', '.join(IMAGE_SUFFIXES)})",
             f"Give the folder of the frames; from a video, {_FFMPEG}",
         )
-    return [found[index] for index in natural_order([path.name for path in found])]
+    return [images[index] for index in natural_order([path.name for path in images])]
 
 
 def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:

@@ -1,9 +1,13 @@
-"""COLMAP's geometric verification, incremental mapping and bundle adjustment, on one thread for determinism."""
+"""COLMAP's incremental mapping and bundle adjustment, on one thread for determinism; observations of its models."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
 
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
@@ -59,7 +63,7 @@ def map_images(
         if progress is not None:
             progress("find poses", min(posed, count), count)
 
-    found = pycolmap.incremental_mapping(
+    models = pycolmap.incremental_mapping(
         str(database),
         str(scratch),
         str(scratch),
@@ -67,7 +71,7 @@ def map_images(
         initial_image_pair_callback=start,
         next_image_callback=next_image,
     )
-    return sorted(found.values(), key=lambda model: -model.num_reg_images())
+    return sorted(models.values(), key=lambda model: -model.num_reg_images())
 
 
 def bundle_adjust(model: pycolmap.Reconstruction, refine_camera: bool) -> None:
@@ -95,3 +99,58 @@ def bundle_adjust(model: pycolmap.Reconstruction, refine_camera: bool) -> None:
             mapper.filter_max_reproj_error, mapper.filter_min_tri_angle
         )
     model.update_point_3d_errors()
+
+
+#: Observations of an image below which it does not count for the correlation.
+_FEWEST = 8
+#: Side of the square whose mean is the brightness at a feature, pixels.
+_BRIGHTNESS_WINDOW = 7
+
+
+def depths_of(model: pycolmap.Reconstruction) -> dict[int, tuple[Int[np.ndarray, "K"], Float[np.ndarray, "K"]]]:
+    """Feature indices and z-depths of the points that each registered image observes, by image ID."""
+    numbers = np.array(sorted(model.points3D), np.int64)
+    positions = np.array([model.points3D[number].xyz for number in numbers.tolist()]).reshape(-1, 3)
+    depths = {}
+    for number in sorted(model.reg_image_ids()):
+        image = model.images[number]
+        features = np.array(image.get_observation_point2D_idxs(), np.int64)
+        point_ids = np.array([image.points2D[index].point3D_id for index in features.tolist()], np.int64)
+        row = image.cam_from_world().matrix()[2]
+        depths[number] = features, positions[np.searchsorted(numbers, point_ids)] @ row[:3] + row[3]
+    return depths
+
+
+def brightness_at(image: UInt8[np.ndarray, "H W 3"], pixels: Float[np.ndarray, "K 2"]) -> Float[np.ndarray, "K"]:
+    """Mean of the red, green and blue values around pixels, 0 to 255. [K]"""
+    import cv2
+
+    mean = cv2.blur(image, (_BRIGHTNESS_WINDOW, _BRIGHTNESS_WINDOW)).mean(axis=2)
+    column = np.clip(pixels[:, 0].astype(np.int64), 0, image.shape[1] - 1)
+    row = np.clip(pixels[:, 1].astype(np.int64), 0, image.shape[0] - 1)
+    return np.asarray(mean[row, column])
+
+
+def brightness_correlation(
+    model: pycolmap.Reconstruction, brightness: Sequence[Float[np.ndarray, "K"]]
+) -> float | None:
+    """Correlation of log brightness with log depth within the images; None where too few points are seen.
+
+    With the lamp at the lens it is negative: what is nearer is brighter. The gain of each image drops out.
+
+    Args:
+        model: Image i has ID i + 1.
+        brightness: At the features of each image, 0 to 255.
+    """
+    light, depth = [], []
+    for number, (features, z) in depths_of(model).items():
+        front = z > 0.0
+        if front.sum() >= _FEWEST:
+            logs = np.log(brightness[number - 1][features[front]] + 1.0), np.log(z[front])
+            light.append(logs[0] - logs[0].mean())
+            depth.append(logs[1] - logs[1].mean())
+    if not light:
+        return None
+    one, other = np.concatenate(light), np.concatenate(depth)
+    size = float(np.sqrt((one**2).sum() * (other**2).sum()))
+    return float(one @ other) / size if size > 0.0 else None

@@ -1,13 +1,17 @@
-"""Feature matching between two images: mutual nearest neighbours, optionally with an epipolar constraint."""
+"""Choice of image pairs, and feature matching between two images by mutual nearest neighbours."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float, Int, UInt32
 from scipy.spatial import cKDTree
 
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.progress import Progress
 from coliags_plugin.reconstruction.structure.features import Features
+from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 
 Pairs = UInt32[np.ndarray, "M 2"]
 
@@ -90,16 +94,18 @@ def epipolar_matches(
     similarity = np.einsum("ij,ij->i", first.descriptors[one], second.descriptors[other])
     best_of_one = _best(one, similarity, len(first))
     best_of_other = _best(other, similarity, len(second))
-    found = best_of_one[best_of_one >= 0]
+    candidates = best_of_one[best_of_one >= 0]
     nearest = np.zeros(len(first), np.int64)
-    nearest[one[found]] = other[found]
+    nearest[one[candidates]] = other[candidates]
     elsewhere = ((second.keypoints[other, :2] - second.keypoints[nearest[one], :2]) ** 2).sum(
         axis=1
     ) >= _DUPLICATE_DISTANCE**2
     next_best = np.full(len(first), -1.0, np.float32)
     np.maximum.at(next_best, one[elsewhere], similarity[elsewhere])
-    mutual = best_of_other[other[found]] == found
-    kept = found[mutual & _passes_ratio_test(similarity[found], next_best[one[found]], max_ratio, max_distance)]
+    mutual = best_of_other[other[candidates]] == candidates
+    kept = candidates[
+        mutual & _passes_ratio_test(similarity[candidates], next_best[one[candidates]], max_ratio, max_distance)
+    ]
     return np.stack([one[kept], other[kept]], axis=1).astype(np.uint32)
 
 
@@ -178,3 +184,54 @@ def _passes_ratio_test(best: np.ndarray, next_best: np.ndarray, max_ratio: float
     """Whether matches with these dot products pass the distance limit and Lowe's ratio test."""
     distance, second_best = (np.sqrt(np.maximum(2.0 - 2.0 * product, 0.0)) for product in (best, next_best))
     return np.asarray((distance < max_distance) & (distance < max_ratio * second_best))
+
+
+#: Features of an image that are compared first, those of the largest scale.
+_LARGEST = 300
+#: Images of the video that are compared with each other for loop closures, at most; and loop closures of each.
+_LOOP_IMAGES, _LOOPS = 40, 2
+
+
+def alike_pairs(
+    features: Sequence[Features], settings: SfmSettings, progress: Progress | None = None
+) -> list[tuple[int, int]]:
+    """Pairs of images to match: all of a short video; else neighbours, and others whose largest features match.
+
+    Each image is paired with the next two; with those 4, 8, 16, ... images ahead, up to the first that is not alike
+    (every second or fourth image has the same pairs, therefore); and images evenly distributed over the video with the
+    two most alike of each other's that are not reached this way, as loop closures.
+
+    Args:
+        features: Of each image, in video order.
+        settings: Of matching.
+        progress: Progress callback.
+    """
+    count = len(features)
+    if count <= settings.exhaustive_up_to:
+        return all_pairs(count)
+    largest = [_largest(one) for one in features]
+
+    def alikeness(first: int, second: int) -> int:
+        return len(mutual_matches(largest[first], largest[second], settings.max_ratio, settings.max_distance))
+
+    pairs = {(first, first + step) for step in (1, 2) for first in range(count - step)}
+    reached = []
+    for first in range(count):
+        step = 4
+        while first + step < count and alikeness(first, first + step) >= settings.min_alike:
+            pairs.add((first, first + step))
+            step *= 2
+        reached.append(first + step)
+        if progress is not None:
+            progress("compare images", first + 1, count)
+    distributed = range(0, count, -(-count // _LOOP_IMAGES))
+    for row, first in enumerate(distributed):
+        distant = [second for second in distributed[row + 1 :] if second > reached[first]]
+        ranked = sorted(((alikeness(first, second), second) for second in distant), reverse=True)[:_LOOPS]
+        pairs.update((first, second) for alike, second in ranked if alike >= settings.min_alike)
+    return sorted(pairs)
+
+
+def _largest(features: Features) -> Features:
+    chosen = np.sort(np.argsort(-features.keypoints[:, 2], kind="stable")[:_LARGEST])
+    return Features(features.keypoints[chosen], features.descriptors[chosen])

@@ -18,19 +18,19 @@ _FEWEST_BESIDE = 30
 
 
 def millimetres(
-    found: Reconstruction, diameter: float | None = None, distance: tuple[str, str, float] | None = None
+    reconstruction: Reconstruction, diameter: float | None = None, distance: tuple[str, str, float] | None = None
 ) -> float | None:
     """Millimetres per unit of a model by what is known of it; None where the scale stays unknown, with a warning.
 
     Args:
-        found: The model.
+        reconstruction: The model.
         diameter: Typical inner diameter of the colon, mm; None: unknown.
         distance: Names of two images, and the distance of their cameras, mm; it takes precedence. None: unknown.
     """
     try:
         if distance is not None:
-            return from_distance(found, *distance)
-        return None if diameter is None else from_diameter(found, diameter)
+            return from_distance(reconstruction, *distance)
+        return None if diameter is None else from_diameter(reconstruction, diameter)
     except InputError as error:
         # The poses took minutes: they are kept all the same.
         log.warning("%s The scale stays unknown", error)
@@ -56,18 +56,18 @@ def distances_beside(path: Float[np.ndarray, "M 3"], points: Float[np.ndarray, "
     return best[(where > 0.0) & (where < len(along))]
 
 
-def from_diameter(found: Reconstruction, diameter: float) -> float:
+def from_diameter(reconstruction: Reconstruction, diameter: float) -> float:
     """Millimetres per unit, for a colon of an inner diameter: twice the median distance of the wall from the path.
 
     Args:
-        found: The model; only points beside its path count.
+        reconstruction: The model; only points beside its path count.
         diameter: Typical inner diameter, mm.
 
     Raises:
         InputError: The path is so short that too few points lie beside it.
     """
-    points = np.array([point.xyz for point in found.model.points3D.values()]).reshape(-1, 3)
-    beside = distances_beside(found.camera_to_world[:, :3, 3], points)
+    points = np.array([point.xyz for point in reconstruction.model.points3D.values()]).reshape(-1, 3)
+    beside = distances_beside(reconstruction.camera_to_world[:, :3, 3], points)
     if len(beside) < _FEWEST_BESIDE:
         raise InputError(
             f"--diameter {diameter:g}, and {len(beside)} of {len(points)} points lie beside the camera's path",
@@ -77,11 +77,11 @@ def from_diameter(found: Reconstruction, diameter: float) -> float:
     return float(diameter / (2.0 * np.median(beside)))
 
 
-def from_distance(found: Reconstruction, first: str, second: str, distance: float) -> float:
+def from_distance(reconstruction: Reconstruction, first: str, second: str, distance: float) -> float:
     """Millimetres per unit, from a known distance between the cameras of two images.
 
     Args:
-        found: The model.
+        reconstruction: The model.
         first: File name of an image, or its stem.
         second: Likewise.
         distance: Between the two optical centres, mm.
@@ -90,24 +90,24 @@ def from_distance(found: Reconstruction, first: str, second: str, distance: floa
         InputError: An image is unknown or has no pose, or the two poses coincide.
     """
     rows = {}
-    for row, index in enumerate(found.registered):
-        rows[found.images[index].stem] = rows[found.images[index].name] = row
+    for row, index in enumerate(reconstruction.registered):
+        rows[reconstruction.images[index].stem] = rows[reconstruction.images[index].name] = row
     for name in (first, second):
         if name not in rows:
             raise InputError(f"--distance: no image '{name}' with a pose", "two of the registered images, by name")
-    centers = found.camera_to_world[[rows[first], rows[second]], :3, 3]
+    centers = reconstruction.camera_to_world[[rows[first], rows[second]], :3, 3]
     units = float(np.linalg.norm(centers[1] - centers[0]))
     if not units > 0.0:
         raise InputError(f"--distance: the cameras of {first} and {second} coincide", "two positions")
     return distance / units
 
 
-def scaled(found: Reconstruction, factor: float) -> Reconstruction:
+def scaled(reconstruction: Reconstruction, factor: float) -> Reconstruction:
     """The model with positions of cameras and points multiplied by a factor."""
     import pycolmap
 
-    model = pycolmap.Reconstruction(found.model)
+    model = pycolmap.Reconstruction(reconstruction.model)
     model.transform(pycolmap.Sim3d(factor, pycolmap.Rotation3d(), np.zeros(3)))
-    camera_to_world = found.camera_to_world.copy()
+    camera_to_world = reconstruction.camera_to_world.copy()
     camera_to_world[:, :3, 3] *= factor
-    return replace(found, model=model, camera_to_world=camera_to_world)
+    return replace(reconstruction, model=model, camera_to_world=camera_to_world)

@@ -15,14 +15,13 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.geometry.poses.rigid import inverse
 from coliags_plugin.geometry.poses.trajectory import Trajectory
-from coliags_plugin.reconstruction.structure.camera_search import both_signs, find_start
-from coliags_plugin.reconstruction.structure.hypotheses import Hypothesis, choose
+from coliags_plugin.reconstruction.libraries import quiet_colmap
+from coliags_plugin.reconstruction.structure.hypotheses import Hypothesis, both_signs, choose, find_start
 from coliags_plugin.reconstruction.structure.image_files import Masks, read_image
-from coliags_plugin.reconstruction.structure.observations import depths_of
-from coliags_plugin.reconstruction.structure.quiet import quiet_colmap
+from coliags_plugin.reconstruction.structure.mapping import depths_of
 from coliags_plugin.reconstruction.structure.sfm_cameras import field_of_view, has_known_camera, is_refined
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
-from coliags_plugin.reconstruction.structure.video import Video, read_video
+from coliags_plugin.reconstruction.structure.video import MatchedVideo, read_video
 
 if TYPE_CHECKING:
     import pycolmap
@@ -89,7 +88,7 @@ def reconstruct(
     """Estimate poses and points by incremental structure from motion, and return the largest model.
 
     An unknown camera's model and focal length are chosen on a part of the video
-    (:func:`~coliags_plugin.reconstruction.structure.camera_search.find_start`).
+    (:func:`~coliags_plugin.reconstruction.structure.hypotheses.find_start`).
 
     Args:
         images: Files in video order. Images of the same size share a camera.
@@ -109,7 +108,7 @@ def reconstruct(
         video = read_video(images, settings, masks, progress)
         models = video.mapped(settings, find_start(video, settings, progress), progress)
         if not models:
-            counts = [len(found) for found in video.features]
+            counts = [len(features) for features in video.features]
             raise InputError(
                 f"no model from {len(images)} images with {np.mean(counts):.0f} features and "
                 f"{np.mean([len(pairs) for pairs in video.matches.values()]):.0f} matches a pair",
@@ -120,7 +119,7 @@ def reconstruct(
         return _result(images, video.names, _adjusted(models[0], video, settings), models)
 
 
-def _adjusted(model: pycolmap.Reconstruction, video: Video, settings: SfmSettings) -> Hypothesis:
+def _adjusted(model: pycolmap.Reconstruction, video: MatchedVideo, settings: SfmSettings) -> Hypothesis:
     """The model after refinement of the intrinsics, if they are; reversed in depth if the lamp says so."""
     refined = is_refined(settings.camera)
     hypotheses = both_signs(model, video, refined)
@@ -137,7 +136,7 @@ def _result(
     world_to_camera = np.tile(np.eye(4), (len(registered), 1, 1))
     for row, index in enumerate(registered):
         world_to_camera[row, :3] = model.images[index + 1].cam_from_world().matrix()
-    found = Reconstruction(
+    reconstruction = Reconstruction(
         images,
         tuple(registered),
         inverse(world_to_camera),
@@ -146,24 +145,24 @@ def _result(
         tuple(other.num_reg_images() for other in models),
         chosen.correlation,
     )
-    if found.left_out:
-        shown = ", ".join(path.name for path in found.left_out[:10])
+    if reconstruction.left_out:
+        shown = ", ".join(path.name for path in reconstruction.left_out[:10])
         log.warning(
             "%d of %d images have no pose: %s%s",
-            len(found.left_out),
+            len(reconstruction.left_out),
             len(images),
             shown,
-            ", ..." if len(found.left_out) > 10 else "",
+            ", ..." if len(reconstruction.left_out) > 10 else "",
         )
         if len(models) > 1:
-            log.warning("the models have %s images; the largest is used", ", ".join(map(str, found.models)))
+            log.warning("the models have %s images; the largest is used", ", ".join(map(str, reconstruction.models)))
     if not chosen.is_lit_from_the_camera:
         log.warning(
             "nearer points are not brighter (correlation of brightness with depth %s): the model may be reversed in "
             "depth, or the lamp is not at the lens. Give the camera's calibration, or other frames",
             "unknown" if chosen.correlation is None else f"{chosen.correlation:.2f}",
         )
-    return found
+    return reconstruction
 
 
 def _color(model: pycolmap.Reconstruction, images: Sequence[Path]) -> None:
@@ -171,8 +170,10 @@ def _color(model: pycolmap.Reconstruction, images: Sequence[Path]) -> None:
     total: dict[int, np.ndarray] = {}
     for number in sorted(model.reg_image_ids()):
         image = read_image(images[number - 1])
-        for seen in model.images[number].get_observation_points2D():
-            row, column = min(int(seen.y()), image.shape[0] - 1), min(int(seen.x()), image.shape[1] - 1)
-            total[seen.point3D_id] = total.get(seen.point3D_id, 0.0) + image[row, column].astype(np.float64)
+        for observation in model.images[number].get_observation_points2D():
+            row, column = min(int(observation.y()), image.shape[0] - 1), min(int(observation.x()), image.shape[1] - 1)
+            total[observation.point3D_id] = total.get(observation.point3D_id, 0.0) + image[row, column].astype(
+                np.float64
+            )
     for point, color in total.items():
         model.points3D[point].color = np.rint(color / model.points3D[point].track.length()).astype(np.uint8)

@@ -41,10 +41,10 @@ class Tracks:
         row = {number: index for index, number in enumerate(numbers)}
         points, frames, pixels = [], [], []
         for frame in range(frame_count):
-            for seen in model.images[frame + 1].get_observation_points2D():
-                points.append(row[seen.point3D_id])
+            for observation in model.images[frame + 1].get_observation_points2D():
+                points.append(row[observation.point3D_id])
                 frames.append(frame)
-                pixels.append(seen.xy)
+                pixels.append(observation.xy)
         positions = np.array([model.points3D[number].xyz for number in numbers], np.float64).reshape(-1, 3)
         return cls(
             positions,
@@ -64,9 +64,9 @@ class Tracks:
 
     def only(self, kept: Bool[np.ndarray, "N"]) -> Tracks:
         """Subset of the points, reindexed."""
-        seen = kept[self.points]
+        is_kept = kept[self.points]
         number = np.cumsum(kept) - 1
-        return Tracks(self.positions[kept], number[self.points[seen]], self.frames[seen], self.pixels[seen])
+        return Tracks(self.positions[kept], number[self.points[is_kept]], self.frames[is_kept], self.pixels[is_kept])
 
     def local(self, cameras: Sequence[Camera]) -> Float[np.ndarray, "K 3"]:
         """Points in the frames of their observing cameras. [K, 3]"""

@@ -5,11 +5,12 @@ from __future__ import annotations
 import logging
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int, UInt8
 from pydantic import Field
 
@@ -17,11 +18,10 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.reconstruction.structure.colmap_database import write_database
-from coliags_plugin.reconstruction.structure.colmap_model import frame_model
+from coliags_plugin.reconstruction.libraries import quiet_colmap
+from coliags_plugin.reconstruction.structure.colmap_database import frame_model, write_database
 from coliags_plugin.reconstruction.structure.features import FeatureSettings, feature_extractor
 from coliags_plugin.reconstruction.structure.matching import Pairs, all_pairs, epipolar_matches, video_pairs
-from coliags_plugin.reconstruction.structure.quiet import quiet_colmap
 from coliags_plugin.reconstruction.structure.tracks import Tracks, uncertainty, widest_angles
 
 if TYPE_CHECKING:
@@ -288,6 +288,39 @@ def _colors(frames: Sequence[Frame], tracks: Tracks) -> UInt8[np.ndarray, "N 3"]
         if here.any():
             column, row = tracks.pixels[here].astype(np.int64).T
             image = frame.image.cpu().numpy()
-            seen = image[np.clip(row, 0, image.shape[0] - 1), np.clip(column, 0, image.shape[1] - 1)]
-            np.add.at(total, tracks.points[here], seen)
+            colors = image[np.clip(row, 0, image.shape[0] - 1), np.clip(column, 0, image.shape[1] - 1)]
+            np.add.at(total, tracks.points[here], colors)
     return np.asarray(np.rint(total / tracks.lengths[:, None]), np.uint8)
+
+
+def in_pixels_of(triangulation: Triangulation, detected: Sequence[Frame], frames: Sequence[Frame]) -> Triangulation:
+    """The same points, with observations, reprojection errors and noise in the pixels of other images.
+
+    Args:
+        triangulation: Triangulated from ``detected``.
+        detected: The frames in which features were detected.
+        frames: The same frames at another size.
+
+    Raises:
+        InputError: The frames are not the same.
+    """
+    names = [[frame.name for frame in video] for video in (detected, frames)]
+    if names[0] != names[1] or len(triangulation.observations) != len(frames):
+        raise InputError(f"{len(detected)} and {len(frames)} frames", "the same frames at two sizes")
+    observations, factors = [], []
+    errors = np.zeros(len(triangulation))
+    for observed, stored, frame in zip(triangulation.observations, detected, frames, strict=True):
+        factor = np.array([frame.camera.width / stored.camera.width, frame.camera.height / stored.camera.height])
+        pixels = observed.pixels * factor
+        projected, _ = frame.camera.to("cpu", torch.float64).project(
+            torch.from_numpy(triangulation.positions[observed.points])
+        )
+        np.add.at(errors, observed.points, np.linalg.norm(projected.numpy() - pixels, axis=1))
+        observations.append(Observations(pixels, observed.depth, observed.points))
+        factors.append(float(np.sqrt(factor.prod())))
+    return replace(
+        triangulation,
+        observations=tuple(observations),
+        errors=errors / triangulation.track_lengths,
+        pixel_noise=triangulation.pixel_noise * float(np.mean(factors)),
+    )

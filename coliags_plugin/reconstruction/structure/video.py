@@ -16,10 +16,8 @@ from coliags_plugin.core.progress import Progress
 from coliags_plugin.reconstruction.structure.colmap_database import write_database
 from coliags_plugin.reconstruction.structure.features import Features, feature_extractor
 from coliags_plugin.reconstruction.structure.image_files import Masks, file_names, mask_of, read_image
-from coliags_plugin.reconstruction.structure.mapping import map_images
-from coliags_plugin.reconstruction.structure.matching import Pairs, mutual_matches
-from coliags_plugin.reconstruction.structure.observations import brightness_at
-from coliags_plugin.reconstruction.structure.pair_selection import alike_pairs
+from coliags_plugin.reconstruction.structure.mapping import brightness_at, map_images
+from coliags_plugin.reconstruction.structure.matching import Pairs, alike_pairs, mutual_matches
 from coliags_plugin.reconstruction.structure.sfm_cameras import Start, starting_cameras, starts
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 
@@ -28,7 +26,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Video:
+class MatchedVideo:
     """Images with features and matches, some or all of a video.
 
     Attributes:
@@ -47,7 +45,7 @@ class Video:
     brightness: tuple[Float[np.ndarray, "K"], ...]
     matches: Mapping[tuple[int, int], Pairs]
 
-    def middle(self, count: int) -> Video:
+    def middle(self, count: int) -> MatchedVideo:
         """At most ``count`` images around the middle: every second or fourth, if there are enough.
 
         These are matched like all (:func:`alike_pairs`).
@@ -55,13 +53,13 @@ class Video:
         step = next((step for step in (4, 2) if len(self.images) >= step * count), 1)
         first = max(0, (len(self.images) - (count - 1) * step - 1) // 2)
         kept = list(range(first, len(self.images), step))[:count]
-        place = {index: row for row, index in enumerate(kept)}
+        row_of = {index: row for row, index in enumerate(kept)}
         matches = {
-            (place[one], place[other]): pairs
+            (row_of[one], row_of[other]): pairs
             for (one, other), pairs in self.matches.items()
-            if one in place and other in place
+            if one in row_of and other in row_of
         }
-        return Video(
+        return MatchedVideo(
             tuple(self.images[index] for index in kept),
             tuple(self.names[index] for index in kept),
             tuple(self.sizes[index] for index in kept),
@@ -83,7 +81,7 @@ class Video:
 
 def read_video(
     images: tuple[Path, ...], settings: SfmSettings, masks: Masks = None, progress: Progress | None = None
-) -> Video:
+) -> MatchedVideo:
     """Find and match the features of a video's images.
 
     Args:
@@ -122,4 +120,4 @@ def read_video(
             progress("match features", done, len(pairs))
     names = file_names([path.stem for path in images], "")
     named = tuple(f"{name}{path.suffix}" for name, path in zip(names, images, strict=True))
-    return Video(images, named, tuple(sizes), tuple(features), tuple(brightness), matches)
+    return MatchedVideo(images, named, tuple(sizes), tuple(features), tuple(brightness), matches)

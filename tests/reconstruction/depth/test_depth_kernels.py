@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coliags_plugin.reconstruction.depth.fusion import DepthMap, fuse_frame
+from coliags_plugin.reconstruction.depth.fusion import WeightedDepth, fuse_frame
 from coliags_plugin.reconstruction.depth.numba_kernels.aggregation import aggregate, pick
 from coliags_plugin.reconstruction.depth.numba_kernels.fusion import vote
 from coliags_plugin.reconstruction.depth.numba_kernels.sweep import sweep
-from coliags_plugin.reconstruction.depth.settings import DepthSettings, SweepSettings
+from coliags_plugin.reconstruction.depth.settings import DepthEstimationSettings, SweepSettings
 from coliags_plugin.reconstruction.depth.sweeping import ratios, sweep_frame
 from coliags_plugin.reconstruction.depth.views import Pose, guide_of
 from coliags_plugin.reconstruction.structure.features import FeatureSettings
@@ -113,7 +113,9 @@ def test_a_plane_seen_by_cameras_at_known_places():
     assert factors[0] == 1.0
     assert factors[-1] == pytest.approx(4.0)
     base = np.full(truth.shape, 20.0, np.float32)
-    found = sweep_frame(guides[2], [guides[k] for k in (0, 1, 3, 4)], base, factors, sweep_settings, DepthSettings())
+    found = sweep_frame(
+        guides[2], [guides[k] for k in (0, 1, 3, 4)], base, factors, sweep_settings, DepthEstimationSettings()
+    )
     inner = (slice(12, -12), slice(16, -16))
     error = np.abs(found.depth / truth - 1.0)[inner]
     assert np.median(error) < 0.01
@@ -126,11 +128,13 @@ def test_a_surface_whose_slant_is_wrong_is_swept_to_the_right_one():
     frames = wall_frames(sideways(5))
     guides = [guide_of(frame, 1, NO_HIGHLIGHTS) for frame in frames]
     truth = wall_depth(frames[2].camera)
-    sweep_settings = DepthSettings().sweeps[-1]
+    sweep_settings = DepthEstimationSettings().sweeps[-1]
     across = np.linspace(-0.06, 0.06, truth.shape[1])
     base = (truth * np.exp(across)[None]).astype(np.float32)
     factors = ratios(sweep_settings, (20.0, 80.0))
-    found = sweep_frame(guides[2], [guides[k] for k in (0, 1, 3, 4)], base, factors, sweep_settings, DepthSettings())
+    found = sweep_frame(
+        guides[2], [guides[k] for k in (0, 1, 3, 4)], base, factors, sweep_settings, DepthEstimationSettings()
+    )
     inner = (slice(12, -12), slice(16, -16))
     error = np.log(found.depth / truth)[inner]
     assert np.median(np.abs(error)) < 0.004
@@ -166,7 +170,7 @@ def test_fusion_repairs_a_wrong_depth():
     maps = []
     for frame in frames:
         depth = wall_depth(frame.camera).astype(np.float32)
-        maps.append(DepthMap(Pose.of(frame.camera), depth, np.ones_like(depth)))
+        maps.append(WeightedDepth(Pose.of(frame.camera), depth, np.ones_like(depth)))
     truth = maps[2].depth.copy()
     maps[2].depth[30:40, 40:50] *= 1.04
     fused = fuse_frame(maps[2], [maps[k] for k in (0, 1, 3, 4)], 0.02)

@@ -11,11 +11,9 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_image
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.reconstruction.depth.completion import complete, near_rim, smooth_surface
-from coliags_plugin.reconstruction.depth.confidence import depth_confidence
-from coliags_plugin.reconstruction.depth.light_prior import LightPrior
-from coliags_plugin.reconstruction.depth.points import VoxelPoints
-from coliags_plugin.reconstruction.depth.prior_files import FilePrior
-from coliags_plugin.reconstruction.depth.robust_fit import robust_fit
+from coliags_plugin.reconstruction.depth.fusion import depth_confidence
+from coliags_plugin.reconstruction.depth.priors import FilePrior, LightPrior, robust_fit
+from coliags_plugin.reconstruction.depth.scene import VoxelPoints
 from coliags_plugin.reconstruction.depth.views import Pose
 from tests.reconstruction.depth.walls import sideways, wall_depth, wall_frames
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from coliags_plugin.reconstruction.depth.neighbours import choose_neighbours
-from coliags_plugin.reconstruction.depth.settings import DepthSettings
+from coliags_plugin.reconstruction.depth.estimate import choose_neighbours
+from coliags_plugin.reconstruction.depth.settings import DepthEstimationSettings
 
-SETTINGS = DepthSettings(max_baseline=0.5)
+SETTINGS = DepthEstimationSettings(max_baseline=0.5)
 
 
 def along(distances):

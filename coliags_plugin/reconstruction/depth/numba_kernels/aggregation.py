@@ -51,15 +51,15 @@ def aggregate(
             y = height - 1 - step if backward else step
             # Along the row: the direction of this pass.
             least = np.float32(0.0)
-            for place in range(width):
-                x = width - 1 - place if backward else place
-                if place == 0:
+            for position in range(width):
+                x = width - 1 - position if backward else position
+                if position == 0:
                     least = _path_step(cost[y, x], start, np.float32(0.0), large, small, line[0], total[y, x])
                 else:
                     aside = x + 1 if backward else x - 1
                     jump = max(small, large / (np.float32(1.0) + contrast * abs(guide[y, x] - guide[y, aside])))
                     least = _path_step(
-                        cost[y, x], line[(place + 1) % 2], least, jump, small, line[place % 2], total[y, x]
+                        cost[y, x], line[(position + 1) % 2], least, jump, small, line[position % 2], total[y, x]
                     )
         # From the row before, straight and along both diagonals.
         for slope in range(-1, 2):

@@ -18,7 +18,7 @@ def reproject(
     origin: np.float32,
     steps: int,
     tolerance: np.float32,
-    found: Array,
+    reprojected: Array,
     trust: Array,
 ) -> None:
     """Where the rays of one camera meet the depth map of another, by fixed-point iteration from a first guess.
@@ -33,7 +33,7 @@ def reproject(
         origin: z-depth of the neighbour's centre in the reference.
         steps: Largest number of iterations.
         tolerance: Relative change of depth at which they have converged.
-        found: Written: z-depth in the reference; NaN where the rays do not meet. float32 [H, W]
+        reprojected: Written: z-depth in the reference; NaN where the rays do not meet. float32 [H, W]
         trust: Written: weight of the neighbour's pixel. float32 [H, W]
     """
     height, width = depth.shape
@@ -42,7 +42,7 @@ def reproject(
         cy = np.float32(y) + np.float32(0.5)
         for x in range(width):
             cx = np.float32(x) + np.float32(0.5)
-            found[y, x] = np.nan
+            reprojected[y, x] = np.nan
             trust[y, x] = 0.0
             z = depth[y, x]
             if not z > 0.0:
@@ -61,17 +61,17 @@ def reproject(
                 d00, d01, d10, d11 = other[j, i], other[j, i + 1], other[j + 1, i], other[j + 1, i + 1]
                 low, high = min(min(d00, d01), min(d10, d11)), max(max(d00, d01), max(d10, d11))
                 if not high < np.float32(1.08) * low:  # an edge, or unknown: the nearest pixel
-                    seen = other[int(v), int(u)]
+                    sampled = other[int(v), int(u)]
                 else:
                     top, bottom = d00 + fx * (d01 - d00), d10 + fx * (d11 - d10)
-                    seen = top + fy * (bottom - top)
-                if not seen > 0.0:
+                    sampled = top + fy * (bottom - top)
+                if not sampled > 0.0:
                     break
-                after = (back[0] * u + back[1] * v + back[2]) * seen + origin
+                after = (back[0] * u + back[1] * v + back[2]) * sampled + origin
                 if not after > 0.0:
                     break
                 if abs(after - z) <= tolerance * z:
-                    found[y, x] = after
+                    reprojected[y, x] = after
                     trust[y, x] = weight[int(v), int(u)]
                     break
                 z = after
@@ -112,11 +112,11 @@ def vote(
                 value = depth[y, x] if k == count else candidates[k, y, x]
                 weight = own[y, x] if k == count else trusts[k, y, x]
                 if value > 0.0 and weight > 0.0:
-                    place = n
-                    while place > 0 and values[place - 1] > value:
-                        values[place], weights[place] = values[place - 1], weights[place - 1]
-                        place -= 1
-                    values[place], weights[place] = value, weight
+                    slot = n
+                    while slot > 0 and values[slot - 1] > value:
+                        values[slot], weights[slot] = values[slot - 1], weights[slot - 1]
+                        slot -= 1
+                    values[slot], weights[slot] = value, weight
                     n += 1
             if n == 0:
                 fused[y, x], votes[y, x], against[y, x], spread[y, x] = depth[y, x], 0.0, 0.0, 1.0

@@ -9,7 +9,7 @@ from coliags_plugin.core.numba_compilation import Array, kernel, part
 
 @part
 def _warp(
-    base: Array, ratio: float, image: Array, usable: Array, turn: Array, shift: Array, out: Array, seen: Array
+    base: Array, ratio: float, image: Array, usable: Array, turn: Array, shift: Array, out: Array, visible: Array
 ) -> None:
     """Sample a neighbour's image at the surface ``base * ratio`` of the reference, bilinearly."""
     height, width = base.shape
@@ -23,7 +23,7 @@ def _warp(
             cx = np.float32(x) + np.float32(0.5)
             z = base[y, x] * ratio
             pz = (turn[2, 0] * cx + az) * z + shift[2]
-            seen[y, x] = 0.0
+            visible[y, x] = 0.0
             out[y, x] = 0.0
             if not pz > np.float32(1e-3) * z:
                 continue
@@ -39,12 +39,12 @@ def _warp(
             top = image[j, i] + fx * (image[j, i + 1] - image[j, i])
             bottom = image[j + 1, i] + fx * (image[j + 1, i + 1] - image[j + 1, i])
             out[y, x] = top + fy * (bottom - top)
-            seen[y, x] = 1.0
+            visible[y, x] = 1.0
 
 
 @part
 def _correlate(
-    reference: Array, warped: Array, seen: Array, radius: int, floor: float, least: float, out: Array
+    reference: Array, warped: Array, visible: Array, radius: int, floor: float, least: float, out: Array
 ) -> None:
     """ZNCC of two images in square windows, of their common pixels; NaN where these are too few.
 
@@ -56,7 +56,7 @@ def _correlate(
         below, above = y + radius, y - radius - 1
         if below < height:
             for x in range(width):
-                s = seen[below, x]
+                s = visible[below, x]
                 a, b = s * reference[below, x], s * warped[below, x]
                 sums[0, x] += s
                 sums[1, x] += a
@@ -66,7 +66,7 @@ def _correlate(
                 sums[5, x] += a * b
         if above >= 0:
             for x in range(width):
-                s = seen[above, x]
+                s = visible[above, x]
                 a, b = s * reference[above, x], s * warped[above, x]
                 sums[0, x] -= s
                 sums[1, x] -= a
@@ -139,36 +139,36 @@ def sweep(
     height, width = base.shape
     count = images.shape[0]
     warped = np.empty((height, width), np.float32)
-    seen = np.empty((height, width), np.float32)
+    visible = np.empty((height, width), np.float32)
     scores = np.empty((count, height, width), np.float32)
     best = np.empty(count, np.float32)
     least = 0.5 * (2 * radius + 1) ** 2
     fewest = min(count, max(2, (count + 3) // 4))
     for d in range(len(ratios)):
         for n in range(count):
-            _warp(base, ratios[d], images[n], masks[n], turns[n], shifts[n], warped, seen)
+            _warp(base, ratios[d], images[n], masks[n], turns[n], shifts[n], warped, visible)
             for y in range(height):
                 for x in range(width):
-                    seen[y, x] *= usable[y, x]
-            _correlate(reference, warped, seen, radius, floor, least, scores[n])
+                    visible[y, x] *= usable[y, x]
+            _correlate(reference, warped, visible, radius, floor, least, scores[n])
         for y in range(height):
             for x in range(width):
-                found = 0
+                valid = 0
                 for n in range(count):
                     value = scores[n, y, x]
                     if not value == value:
                         continue
-                    place = found
-                    while place > 0 and best[place - 1] < value:
-                        best[place] = best[place - 1]
-                        place -= 1
-                    best[place] = value
-                    found += 1
-                taken = int(np.ceil(share * found))
-                if found < fewest:
+                    rank = valid
+                    while rank > 0 and best[rank - 1] < value:
+                        best[rank] = best[rank - 1]
+                        rank -= 1
+                    best[rank] = value
+                    valid += 1
+                taken = int(np.ceil(share * valid))
+                if valid < fewest:
                     cost[y, x, d] = 1.0
                     continue
                 total = np.float32(0.0)
-                for place in range(taken):
-                    total += best[place]
+                for rank in range(taken):
+                    total += best[rank]
                 cost[y, x, d] = max(np.float32(0.0), np.float32(1.0) - total / np.float32(taken))

@@ -1,4 +1,4 @@
-"""Context manager for deterministic open3d."""
+"""COLMAP and open3d, silent and deterministic."""
 
 from __future__ import annotations
 
@@ -29,3 +29,25 @@ def deterministic_open3d() -> Iterator[Any]:
     finally:
         if can_limit:
             library.utility.set_max_threads(threads)
+
+
+#: glog's level FATAL.
+_FATAL = 3
+
+
+@contextmanager
+def quiet_colmap(seed: int) -> Iterator[None]:
+    """Silence COLMAP's log and seed its global random generator.
+
+    Args:
+        seed: Seed of COLMAP's global generator.
+    """
+    import pycolmap
+
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = _FATAL
+    pycolmap.set_random_seed(seed)
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = level
