@@ -38,9 +38,7 @@ def choose_renderer(component: Component, primitive: str, device: torch.device) 
     obstacle = component.target.obstacle(primitive, device)
     if obstacle:
         raise InputError(
-            f"renderer '{component.name}' {obstacle}",
-            "a renderer that can serve the field",
-            _others(primitive, device),
+            f"renderer '{component.name}' {obstacle}", "a renderer that can serve the field", _others(primitive, device)
         )
     return ChosenRenderer(component.name, component.target(component.settings), "named by the config")
 

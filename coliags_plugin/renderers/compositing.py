@@ -16,10 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from coliags_plugin.renderers.sweeping import Chunk, Cuts, crossing_of_half, sweep
-
-#: Finite stand-in for log(0), far below every alpha_min.
-_LOG_ZERO = -1e4
+from coliags_plugin.renderers.sweeping import Chunk, Cuts, crossing_of_half, padded_rows, sweep
 
 
 def log_alpha_polynomials(
@@ -87,7 +84,7 @@ def median_depths(
 ) -> Float[Tensor, "tiles P"]:
     """Depth of the pair that brings the transmittance to one half or less; 0 where none does. [tiles, P]"""
     medians = depths.new_zeros(len(starts) - 1, pixels.shape[1])
-    for chunk in _sweep(_padded(polynomials), starts, pixels, cuts):
+    for chunk in _sweep(padded_rows(polynomials, 0), starts, pixels, cuts):
         crossing, crosses = crossing_of_half(chunk)
         rows = chunk.rows.view(chunk.weights.shape[:2]).gather(1, crossing).clamp_max(len(depths) - 1)
         medians[chunk.tiles] += torch.where(crosses, depths[rows], 0.0)
@@ -95,7 +92,7 @@ def median_depths(
 
 
 def _sweep(padded: Tensor, starts: Tensor, pixels: Tensor, cuts: Cuts) -> Iterator[Chunk[None]]:
-    """Sweep over the pairs of all tiles, the polynomials :func:`_padded`. [M + 1, 6], [tiles + 1], [6, P]"""
+    """Sweep over the pairs of all tiles, the polynomials padded. [M + 1, 6], [tiles + 1], [6, P]"""
 
     def evaluate(rows: Tensor) -> tuple[Tensor, None]:
         return (padded.index_select(0, rows) @ pixels).exp_(), None
@@ -106,7 +103,7 @@ def _sweep(padded: Tensor, starts: Tensor, pixels: Tensor, cuts: Cuts) -> Iterat
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, polynomials: Tensor, features: Tensor, starts: Tensor, pixels: Tensor, cuts: Cuts) -> Tensor:
-        padded, padded_features = _padded(polynomials), torch.nn.functional.pad(features, (0, 0, 0, 1))
+        padded, padded_features = padded_rows(polynomials, 0), torch.nn.functional.pad(features, (0, 0, 0, 1))
         composited = features.new_zeros(len(starts) - 1, features.shape[1], pixels.shape[1])
         for chunk in _sweep(padded, starts, pixels, cuts):
             chunk_features = padded_features.index_select(0, chunk.rows).view(*chunk.weights.shape[:2], -1)
@@ -137,10 +134,3 @@ class _Composite(torch.autograd.Function):
             of_log_alphas.mul_(chunk.weights > 0).mul_(chunk.alphas < ctx.cuts.alpha_max)
             of_polynomials[chunk.rows] = of_log_alphas.flatten(0, 1) @ pixels.T
         return of_polynomials[:-1], of_features[:-1], None, None, None
-
-
-def _padded(polynomials: Tensor) -> Tensor:
-    """Polynomials with one more row, whose alpha is 0 everywhere. [M + 1, 6]"""
-    padded = torch.nn.functional.pad(polynomials, (0, 0, 0, 1))
-    padded[-1, 0] = _LOG_ZERO
-    return padded

@@ -97,10 +97,7 @@ def render_gaussians(
     channels = [name for name in wants if name in gaussians.features]
     try:
         means2d, radii, images, features = autograd.render(
-            [getattr(gaussians, name) for name in _SHAPES],
-            [gaussians.features[name] for name in channels],
-            pose,
-            view,
+            [getattr(gaussians, name) for name in _SHAPES], [gaussians.features[name] for name in channels], pose, view
         )
     except pipeline.UnusableGaussianError:
         raise _unusable(gaussians) from None
@@ -124,10 +121,7 @@ def _view_table(camera: Camera, pose: Tensor, settings: CpuRendererSettings) -> 
     if camera.width < 1 or camera.height < 1:
         raise InputError(f"a camera of {camera.width} x {camera.height} pixels", "at least one pixel each way")
     limits = []
-    for focal, principal, size in (
-        (camera.fx, camera.cx, camera.width),
-        (camera.fy, camera.cy, camera.height),
-    ):
+    for focal, principal, size in ((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height)):
         margin = JACOBIAN_MARGIN * 0.5 * size / focal
         limits += [-principal / focal - margin, (size - principal) / focal + margin]
     table = [

@@ -6,7 +6,6 @@ Differences from the reference are listed in ``docs/rendering.md``, section "The
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from types import ModuleType
 from typing import ClassVar
 
@@ -18,24 +17,16 @@ from coliags_plugin.contracts import Availability
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
-from coliags_plugin.core.render_output import RenderOutput, Splats
+from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.rotations import shortest_axes
 from coliags_plugin.renderers import gsplat_library
 from coliags_plugin.renderers.checks import check_gaussian_outputs, is_surfels
 from coliags_plugin.renderers.projection import facing
-from coliags_plugin.renderers.splatting import SplattingRenderer, SplattingSettings
+from coliags_plugin.renderers.splatting import DrawnView, SplattingRenderer, SplattingSettings, split_channels
 from coliags_plugin.renderers.torch_renderer import TorchRendererSettings, render_gaussians
 
 #: Edge of gsplat's tiles, pixels: the only size it is tested with.
 _TILE_SIZE = 16
-#: Quantity composited or read for each output beyond rgb and alpha.
-_NEEDS = {
-    "depth_accumulated": "depth",
-    "depth_expected": "depth",
-    "depth_median": "median",
-    "inverse_depth_accumulated": "inverse_depth",
-    "normals": "normal",
-}
 
 
 class GsplatRendererSettings(SplattingSettings):
@@ -103,44 +94,16 @@ def render_with_gsplat(
         )
     if is_surfels(gaussians):
         raise InputError("surfels for the gsplat renderer", "3D Gaussians", "Choose renderer 'torch'")
-    needs = {_NEEDS.get(name, name) for name in wants if name not in ("rgb", "alpha")}
+    needs = {"depth_accumulated" if name == "depth_expected" else name for name in wants} - {"rgb", "alpha"}
     camera = camera.to(gaussians.means.device, gaussians.means.dtype)
     # gsplat 1.5 divides by the number of Gaussians, which crashes the process if there are none.
     draw = _draw_nothing if len(gaussians) == 0 else _draw_gaussians
-    drawn = draw(gaussians, camera, needs, settings)
-    maps = {}
-    for name in wants:
-        if name == "depth_expected":
-            covered = drawn.alpha > 0
-            depth = drawn.sums["depth"] / torch.where(covered, drawn.alpha, 1.0)
-            maps[name] = torch.where(covered, depth, 0.0)
-        elif name in _NEEDS:
-            maps[name] = drawn.sums[_NEEDS[name]]
-        elif name in gaussians.features:
-            maps[name] = drawn.sums[name].reshape(camera.height, camera.width, -1)
-    return RenderOutput(drawn.rgb, drawn.alpha, camera, maps, Splats(gaussians, drawn.means2d, drawn.radii))
+    return draw(gaussians, camera, needs, settings).output(gaussians, camera, wants)
 
 
-@dataclass(frozen=True)
-class _Drawn:
-    """Composited images of one view, by quantity.
-
-    Attributes:
-        rgb: Over the background. [H, W, 3]
-        alpha: [H, W]
-        sums: The other quantities needed, by the names in ``_NEEDS``. [H, W] or [H, W, 3]
-        means2d: Retains its gradient; 0 where not drawn. [N, 2]
-        radii: [N]
-    """
-
-    rgb: Float[Tensor, "H W 3"]
-    alpha: Float[Tensor, "H W"]
-    sums: dict[str, Tensor]
-    means2d: Float[Tensor, "N 2"]
-    radii: Float[Tensor, "N"]
-
-
-def _draw_gaussians(gaussians: Gaussians, camera: Camera, needs: set[str], settings: GsplatRendererSettings) -> _Drawn:
+def _draw_gaussians(
+    gaussians: Gaussians, camera: Camera, needs: set[str], settings: GsplatRendererSettings
+) -> DrawnView:
     """Render 3D Gaussians in one projection and one compositing pass for all outputs."""
     library = gsplat_library.load()
     sight, view, intrinsics = _view(gaussians, camera)
@@ -159,15 +122,15 @@ def _draw_gaussians(gaussians: Gaussians, camera: Camera, needs: set[str], setti
     )
     # Of what is not drawn gsplat leaves everything but the radii uninitialised.
     visible = (radii[0] > 0).all(-1)
-    means2d = _retaining(torch.where(visible[:, None], means2d[0], 0.0))
+    means2d = torch.where(visible[:, None], means2d[0], 0.0)
     depths = torch.where(visible, depths[0], 1.0)
-    parts = {"color": gaussians.colors}
-    if "depth" in needs:
-        parts["depth"] = depths[:, None]
-    if "inverse_depth" in needs:
-        parts["inverse_depth"] = depths.reciprocal()[:, None]
-    if "normal" in needs:
-        parts["normal"] = _facing_normals(gaussians, sight, camera)
+    parts = {"rgb": gaussians.colors}
+    if "depth_accumulated" in needs:
+        parts["depth_accumulated"] = depths[:, None]
+    if "inverse_depth_accumulated" in needs:
+        parts["inverse_depth_accumulated"] = depths.reciprocal()[:, None]
+    if "normals" in needs:
+        parts["normals"] = _facing_normals(gaussians, sight, camera)
     parts |= {name: gaussians.features[name] for name in gaussians.features if name in needs}
     features = torch.cat(list(parts.values()), dim=-1)
     image, alpha = library.rasterize_to_pixels(
@@ -180,24 +143,24 @@ def _draw_gaussians(gaussians: Gaussians, camera: Camera, needs: set[str], setti
         *_tiles(library, means2d, radii, depths, size),
         backgrounds=_backgrounds(features, settings),
     )
-    sums = _split(image[0], parts)
-    if "median" in needs:
-        sums["median"] = _median_by_definition(gaussians, camera, settings)
-    return _Drawn(sums["color"], alpha[0, ..., 0], sums, means2d, _largest(radii[0], visible, means2d))
+    maps = split_channels(image[0], parts)
+    if "depth_median" in needs:
+        maps["depth_median"] = _median_by_definition(gaussians, camera, settings)
+    return DrawnView(maps["rgb"], alpha[0, ..., 0], maps, means2d, _largest(radii[0], visible, means2d))
 
 
-def _draw_nothing(gaussians: Gaussians, camera: Camera, needs: set[str], settings: GsplatRendererSettings) -> _Drawn:
+def _draw_nothing(gaussians: Gaussians, camera: Camera, needs: set[str], settings: GsplatRendererSettings) -> DrawnView:
     """Render no Gaussians: the background, connected to the graph so that ``backward`` works."""
-    means2d = _retaining(gaussians.means[:, :2].clone())
+    means2d = gaussians.means[:, :2].clone()
     others = (gaussians.quats_wxyz, gaussians.scales, gaussians.opacities, gaussians.colors, camera.camera_to_world)
     zero = 0.0 * torch.stack([value.sum() for value in (means2d, *others)]).sum()
     alpha = zero.expand(camera.height, camera.width)
-    widths = {"normal": 3, **{name: values.shape[1] for name, values in gaussians.features.items()}}
-    sums = {name: alpha[..., None].expand(-1, -1, widths[name]) if name in widths else alpha for name in needs}
-    if "median" in sums:
-        sums["median"] = alpha.detach()
+    widths = {"normals": 3, **{name: values.shape[1] for name, values in gaussians.features.items()}}
+    maps = {name: alpha[..., None].expand(-1, -1, widths[name]) if name in widths else alpha for name in needs}
+    if "depth_median" in maps:
+        maps["depth_median"] = alpha.detach()
     rgb = alpha[..., None] + alpha.new_tensor(settings.background)
-    return _Drawn(rgb, alpha, sums, means2d, gaussians.opacities.detach())
+    return DrawnView(rgb, alpha, maps, means2d, gaussians.opacities.detach())
 
 
 def _view(
@@ -244,20 +207,5 @@ def _backgrounds(features: Float[Tensor, "N F"], settings: GsplatRendererSetting
     return features.new_tensor([[*settings.background, *[0.0] * (features.shape[-1] - 3)]])
 
 
-def _split(image: Float[Tensor, "H W F"], parts: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Composited channels by quantity; single channels without the last dimension."""
-    channels = torch.split(image, [part.shape[-1] for part in parts.values()], dim=-1)
-    return {
-        name: channel[..., 0] if channel.shape[-1] == 1 else channel
-        for name, channel in zip(parts, channels, strict=True)
-    }
-
-
 def _largest(radii: Tensor, visible: Tensor, like: Tensor) -> Float[Tensor, "N"]:
     return torch.where(visible, radii.amax(-1), 0).to(like.dtype)
-
-
-def _retaining(means2d: Tensor) -> Tensor:
-    if means2d.requires_grad:
-        means2d.retain_grad()
-    return means2d

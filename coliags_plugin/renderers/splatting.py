@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import ClassVar
 
 import pydantic
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import TypeVar
 
@@ -15,7 +17,7 @@ from coliags_plugin.contracts import GaussianField, Renderer
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
-from coliags_plugin.core.render_output import OUTPUTS, SURFEL_OUTPUTS, RenderOutput
+from coliags_plugin.core.render_output import OUTPUTS, SURFEL_OUTPUTS, RenderOutput, Splats
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.renderers.checks import check_primitive
 
@@ -138,3 +140,51 @@ class SplattingRenderer(Renderer[SplattingT, GaussianField]):
     @abstractmethod
     def draw(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> RenderOutput:
         """Render the Gaussians from the camera."""
+
+
+@dataclass(frozen=True)
+class DrawnView:
+    """Composited images of one view.
+
+    Attributes:
+        rgb: Over the background. [H, W, 3]
+        alpha: [H, W]
+        maps: The other outputs, and the accumulated depth if the expected is wanted. [H, W] or [H, W, C]
+        means2d: [N, 2]
+        radii: [N]
+    """
+
+    rgb: Float[Tensor, "H W 3"]
+    alpha: Float[Tensor, "H W"]
+    maps: dict[str, Tensor]
+    means2d: Float[Tensor, "N 2"]
+    radii: Float[Tensor, "N"]
+
+    def output(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> RenderOutput:
+        """What a renderer returns of it; ``means2d`` then retains its gradient."""
+        maps = {}
+        for name in wants:
+            if name == "depth_expected":
+                # 0, and no gradient, where alpha is 0.
+                covered = self.alpha > 0
+                depth = self.maps["depth_accumulated"] / torch.where(covered, self.alpha, 1.0)
+                maps[name] = torch.where(covered, depth, 0.0)
+            elif name not in ("rgb", "alpha"):
+                maps[name] = self.maps[name]
+        if self.means2d.requires_grad:
+            self.means2d.retain_grad()
+        return RenderOutput(self.rgb, self.alpha, camera, maps, Splats(gaussians, self.means2d, self.radii))
+
+
+def split_channels(sums: Float[Tensor, "H W F"], features: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Composited channels by output; the renderer's own single channels without the last dimension.
+
+    Args:
+        sums: All channels. [H, W, F]
+        features: Those of the Gaussians by output, in the same order. [N, C] each
+    """
+    parts = torch.split(sums, [part.shape[1] for part in features.values()], dim=-1)
+    return {
+        name: part[..., 0] if name in OUTPUTS and part.shape[-1] == 1 else part
+        for name, part in zip(features, parts, strict=True)
+    }

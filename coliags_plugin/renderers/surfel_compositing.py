@@ -15,11 +15,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from coliags_plugin.renderers.sweeping import Chunk, Cuts, crossing_of_half, sweep
+from coliags_plugin.renderers.sweeping import Chunk, Cuts, crossing_of_half, padded_rows, sweep
 from coliags_plugin.renderers.tiles import TilePairs
-
-#: Finite stand-in for log(0), far below every alpha_min.
-_LOG_ZERO = -1e4
 
 
 @dataclass(frozen=True)
@@ -70,11 +67,8 @@ def pair_rows(
         log_opacities: [M]
         origins: Midpoints of the tiles, pixels. [M, 2]
     """
-    slopes, at_center, plane_offsets = (
-        intersections[:, 2:8].reshape(-1, 3, 2),
-        intersections[:, 8],
-        intersections[:, 9:],
-    )
+    slopes = intersections[:, 2:8].reshape(-1, 3, 2)
+    at_center, plane_offsets = intersections[:, 8], intersections[:, 9:]
     constants = (slopes * (origins - intersections[:, :2])[:, None]).sum(-1)
     # At its projected centre a surfel has U = V = 0 exactly.
     constants = constants + torch.nn.functional.pad(at_center[:, None], (2, 0))
@@ -122,7 +116,7 @@ class _Hits(NamedTuple):
 
 
 def _sweep(padded: Tensor, starts: Tensor, pixels: Tensor, rules: SurfelRules) -> Iterator[Chunk[_Hits]]:
-    """Sweep over the pairs of all tiles, the rows :func:`_padded`. [M + 1, 13], [tiles + 1], [3, P]"""
+    """Sweep over the pairs of all tiles, the rows padded. [M + 1, 13], [tiles + 1], [3, P]"""
 
     def evaluate(rows: Tensor) -> tuple[Tensor, _Hits]:
         table = padded.index_select(0, rows)
@@ -169,7 +163,7 @@ class _CompositeSurfels(torch.autograd.Function):
     def forward(
         ctx: Any, rows: Tensor, features: Tensor, starts: Tensor, pixels: Tensor, rules: SurfelRules
     ) -> tuple[Tensor, Tensor]:
-        padded, padded_features = _padded(rows), torch.nn.functional.pad(features, (0, 0, 0, 1))
+        padded, padded_features = padded_rows(rows, -1), torch.nn.functional.pad(features, (0, 0, 0, 1))
         tiles = len(starts) - 1
         sums = features.new_zeros(tiles, features.shape[1], pixels.shape[1])
         depths = features.new_zeros(tiles, 4, pixels.shape[1])
@@ -256,10 +250,3 @@ def _of_rows(
     filtered = of_log_alphas * ~hits.on_disc * rules.surfel_filter**-2
     of_center = torch.stack([(filtered * offset).sum(1) for offset in hits.from_center], dim=1)
     return torch.cat([of_planes.flatten(1), of_offset, of_center, of_log_alphas.sum(1, keepdim=True)], dim=1)
-
-
-def _padded(rows: Tensor) -> Tensor:
-    """Rows with one more, whose alpha is 0 everywhere. [M + 1, 13]"""
-    padded = torch.nn.functional.pad(rows, (0, 0, 0, 1))
-    padded[-1, -1] = _LOG_ZERO
-    return padded

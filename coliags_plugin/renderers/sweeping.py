@@ -16,6 +16,8 @@ from torch import Tensor
 
 #: Elements of the largest temporary tensors, by device type: to fit the L2 caches, or to fill the device.
 CHUNK_ELEMENTS = {"cpu": 2**18, "cuda": 2**24}
+#: Finite stand-in for log(0), far below every alpha_min.
+_LOG_ZERO = -1e4
 #: Fewest and most pairs of one tile composited at a time.
 _MIN_RANKS, _MAX_RANKS = 32, 128
 
@@ -110,6 +112,13 @@ def sweep(
             alive = (first < end) & (before.amax(-1) > 0)
             if not bool(alive.all()):
                 tiles, first, end, before = tiles[alive], first[alive], end[alive], before[alive]
+
+
+def padded_rows(rows: Float[Tensor, "M K"], log_alpha: int) -> Float[Tensor, "M+1 K"]:
+    """Rows with one more, whose alpha is 0 everywhere: column ``log_alpha`` is added to its logarithm. [M + 1, K]"""
+    padded = torch.nn.functional.pad(rows, (0, 0, 0, 1))
+    padded[-1, log_alpha] = _LOG_ZERO
+    return padded
 
 
 def crossing_of_half(chunk: Chunk[Evaluated]) -> tuple[Int[Tensor, "G P"], Bool[Tensor, "G P"]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import ClassVar
 
 import pydantic
@@ -14,11 +13,11 @@ from torch import Tensor
 from coliags_plugin.contracts import Availability
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.gaussians import Gaussians
-from coliags_plugin.core.render_output import OUTPUTS, RenderOutput, Splats
+from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.renderers.checks import check_gaussian_outputs, is_surfels
 from coliags_plugin.renderers.compositing import composite, log_alpha_polynomials, median_depths, monomials
 from coliags_plugin.renderers.projection import facing_normals, project_gaussians
-from coliags_plugin.renderers.splatting import CutSettings, SplattingRenderer
+from coliags_plugin.renderers.splatting import CutSettings, DrawnView, SplattingRenderer, split_channels
 from coliags_plugin.renderers.surfel_compositing import SurfelRules, composite_surfels, pair_rows
 from coliags_plugin.renderers.surfel_projection import project_surfels
 from coliags_plugin.renderers.surfel_tiles import bin_surfels, surfel_extents
@@ -77,41 +76,12 @@ def render_gaussians(
     settings = settings or TorchRendererSettings()
     check_gaussian_outputs(wants, gaussians)
     draw = _draw_surfels if is_surfels(gaussians) else _draw_gaussians
-    drawn = draw(gaussians, camera, wants, settings)
-    rgb = drawn.rgb + (1 - drawn.alpha)[..., None] * drawn.rgb.new_tensor(settings.background)
-    maps = {}
-    for name in wants:
-        if name == "depth_expected":
-            maps[name] = _expected(drawn.maps["depth_accumulated"], drawn.alpha)
-        elif name not in ("rgb", "alpha"):
-            maps[name] = drawn.maps[name]
-    if drawn.means2d.requires_grad:
-        drawn.means2d.retain_grad()
-    return RenderOutput(rgb, drawn.alpha, camera, maps, Splats(gaussians, drawn.means2d, drawn.radii))
-
-
-@dataclass(frozen=True)
-class _Drawn:
-    """Composited images of one view.
-
-    Attributes:
-        rgb: Over black. [H, W, 3]
-        alpha: [H, W]
-        maps: The other outputs wanted, and the accumulated depth if the expected is. [H, W] or [H, W, C]
-        means2d: [N, 2]
-        radii: [N]
-    """
-
-    rgb: Float[Tensor, "H W 3"]
-    alpha: Float[Tensor, "H W"]
-    maps: dict[str, Tensor]
-    means2d: Float[Tensor, "N 2"]
-    radii: Float[Tensor, "N"]
+    return draw(gaussians, camera, wants, settings).output(gaussians, camera, wants)
 
 
 def _draw_gaussians(
     gaussians: Gaussians, camera: Camera, wants: Sequence[str], settings: TorchRendererSettings
-) -> _Drawn:
+) -> DrawnView:
     grid = TileGrid(camera.width, camera.height, settings.tile_size)
     cuts = _cuts(settings)
     projected = project_gaussians(gaussians, camera, settings.eps2d)
@@ -134,17 +104,17 @@ def _draw_gaussians(
     polynomials = log_alpha_polynomials(of_pairs[:, 5], of_pairs[:, 2:5], offsets)
     pixels = monomials(grid.offsets(table))
     sums = grid.to_image(composite(polynomials, of_pairs[:, 6:], pairs.starts, pixels, cuts))
-    maps = _split(sums, features)
+    maps = split_channels(sums, features)
     if "depth_median" in wants:
         medians = median_depths(polynomials, projected.depths.detach()[pairs.gaussian], pairs.starts, pixels, cuts)
         maps["depth_median"] = grid.to_image(medians[:, None])[..., 0]
     radii = torch.where(extents.drawn, extents.halves.amax(-1).ceil(), 0.0)
-    return _Drawn(maps.pop("rgb"), maps.pop("alpha"), maps, projected.means2d, radii)
+    return _over_background(maps, projected.means2d, radii, settings)
 
 
 def _draw_surfels(
     gaussians: Gaussians, camera: Camera, wants: Sequence[str], settings: TorchRendererSettings
-) -> _Drawn:
+) -> DrawnView:
     grid = TileGrid(camera.width, camera.height, settings.tile_size)
     low_pass = settings.surfel_filter
     projected = project_surfels(gaussians, camera)
@@ -159,12 +129,20 @@ def _draw_surfels(
     rows = pair_rows(of_pairs[:, :10], of_pairs[:, 10:12], of_pairs[:, 12], origins)
     rules = SurfelRules(_cuts(settings), camera.near_plane, low_pass, bool({*_OF_SURFELS, "depth_expected"} & {*wants}))
     composited = composite_surfels(rows, of_pairs[:, 13:], pairs, grid.offsets(rows), rules)
-    maps = _split(grid.to_image(composited.features), features)
+    maps = split_channels(grid.to_image(composited.features), features)
     if rules.depths:
         maps |= dict(zip(_OF_SURFELS, grid.to_image(composited.depths).unbind(-1), strict=True))
         # m = far / (far - near) (1 - near / z) is linear in 1 / z.
         maps["distortion"] = maps["distortion"] * settings.distortion_slope(camera.near_plane) ** 2
-    return _Drawn(maps.pop("rgb"), maps.pop("alpha"), maps, projected.means2d, extents.radii)
+    return _over_background(maps, projected.means2d, extents.radii, settings)
+
+
+def _over_background(
+    maps: dict[str, Tensor], means2d: Tensor, radii: Tensor, settings: TorchRendererSettings
+) -> DrawnView:
+    alpha = maps["alpha"]
+    rgb = maps["rgb"] + (1 - alpha)[..., None] * alpha.new_tensor(settings.background)
+    return DrawnView(rgb, alpha, maps, means2d, radii)
 
 
 def _cuts(settings: TorchRendererSettings) -> Cuts:
@@ -176,18 +154,3 @@ def _features(gaussians: Gaussians, own: dict[str, Tensor], wants: Sequence[str]
     parts = {"rgb": gaussians.colors, "alpha": torch.ones_like(gaussians.opacities), **own}
     parts |= {name: gaussians.features[name] for name in wants if name in gaussians.features}
     return {name: part[:, None] if part.ndim == 1 else part for name, part in parts.items()}
-
-
-def _split(sums: Float[Tensor, "H W F"], features: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Composited channels by output; the renderer's own single channels without the last dimension."""
-    parts = torch.split(sums, [part.shape[1] for part in features.values()], dim=-1)
-    return {
-        name: part[..., 0] if name in OUTPUTS and part.shape[-1] == 1 else part
-        for name, part in zip(features, parts, strict=True)
-    }
-
-
-def _expected(depth_accumulated: Float[Tensor, "H W"], alpha: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
-    """Expected depth; 0, and no gradient, where alpha is 0. [H, W]"""
-    covered = alpha > 0
-    return torch.where(covered, depth_accumulated / torch.where(covered, alpha, 1.0), 0.0)

@@ -18,8 +18,7 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.render_output import OUTPUTS, SURFEL_OUTPUTS, RenderOutput, concatenate_pixels
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.renderers.checks import check_outputs, check_primitive
-from coliags_plugin.renderers.ray_compositing import CompositedRays, transmittances
-from coliags_plugin.renderers.ray_sampling import even_places, refined_places
+from coliags_plugin.renderers.rays import CompositedRays, even_places, refined_places, transmittances
 
 #: Every output of the splatting renderers that has a meaning without surfaces.
 _COMPOSITED = frozenset(OUTPUTS) - SURFEL_OUTPUTS - {"normals"}

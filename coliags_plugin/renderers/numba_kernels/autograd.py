@@ -41,7 +41,7 @@ def render(
     means2d, links, radii = _Project.apply(*gaussians, pose, pipeline)  # type: ignore[no-untyped-call]
     if means2d.requires_grad:
         means2d.retain_grad()
-    images = _Composite.apply(means2d, links, pipeline)  # type: ignore[no-untyped-call]
+    images = _CompositeImages.apply(means2d, links, pipeline)  # type: ignore[no-untyped-call]
     channels: list[Tensor] = []
     if features:
         drawn = _CompositeFeatures.apply(means2d, links, torch.cat(list(features), dim=1), pipeline)  # type: ignore[no-untyped-call]
@@ -75,7 +75,7 @@ class _Project(torch.autograd.Function):
         return means, quats, scales, opacities[:, 0], colors, pose, None
 
 
-class _Composite(torch.autograd.Function):
+class _CompositeImages(torch.autograd.Function):
     """Projected centres and links -> images."""
 
     @staticmethod
@@ -98,7 +98,7 @@ class _Composite(torch.autograd.Function):
 
 
 class _CompositeFeatures(torch.autograd.Function):
-    """Projected centres, links and features -> the features' images, after :class:`_Composite`."""
+    """Projected centres, links and features -> the features' images, after :class:`_CompositeImages`."""
 
     @staticmethod
     def forward(ctx: FunctionCtx, means2d: Tensor, links: Tensor, features: Tensor, pipeline: Pipeline) -> Tensor:

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from coliags_plugin.core.numba_compilation import Array
 from coliags_plugin.renderers.numba_kernels import layout, sweep_backward, sweep_forward
-from coliags_plugin.renderers.numba_kernels.pipeline import Layer, Pipeline, Run
+from coliags_plugin.renderers.numba_kernels.pipeline import Layer, Pipeline, Runner
 from coliags_plugin.renderers.numba_kernels.projection import project
 from coliags_plugin.renderers.numba_kernels.projection_backward import gather, project_backward
 
@@ -44,12 +44,12 @@ class GaussianPipeline(Pipeline):
     def _composited_vectors(self, layer: Layer) -> int:
         return 1 + len(layer.channels)
 
-    def _run_project(self, run: Run, gaussians: layout.Parameters, means2d: Array, radii: Array) -> None:
+    def _run_project(self, run: Runner, gaussians: layout.Parameters, means2d: Array, radii: Array) -> None:
         run(
             project, self._count, gaussians, self._tail, self._view, self._extras, self._projections, means2d, radii
         )  # fmt: skip
 
-    def _run_sweep(self, run: Run, layer: Layer, composited: Array, images: layout.Images) -> None:
+    def _run_sweep(self, run: Runner, layer: Layer, composited: Array, images: layout.Images) -> None:
         extras, median = layer.own
         run(
             sweep_forward.sweep_forward, self._projections._replace(records=layer.records), self._bins, layer.view,
@@ -57,7 +57,7 @@ class GaussianPipeline(Pipeline):
         )  # fmt: skip
 
     def _run_sweep_backward(
-        self, run: Run, layer: Layer, composited: Array, of_images: layout.Images, entry_sums: Array
+        self, run: Runner, layer: Layer, composited: Array, of_images: layout.Images, entry_sums: Array
     ) -> None:
         run(
             sweep_backward.sweep_backward, self._projections._replace(records=layer.records), self._bins, layer.view,
@@ -65,12 +65,12 @@ class GaussianPipeline(Pipeline):
             entry_sums,
         )  # fmt: skip
 
-    def _run_gather(self, run: Run, layer: Layer, entry_sums: Array, sums: Array, of_means2d: Array) -> None:
+    def _run_gather(self, run: Runner, layer: Layer, entry_sums: Array, sums: Array, of_means2d: Array) -> None:
         run(gather, self._projections._replace(records=layer.records), self._bins, entry_sums, sums, of_means2d)
 
     def _run_project_backward(
         self,
-        run: Run,
+        run: Runner,
         gaussians: layout.Parameters,
         sums: Array,
         given_means2d: Array,

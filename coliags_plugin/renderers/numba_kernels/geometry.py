@@ -72,11 +72,17 @@ class Projected(NamedTuple):
 
 
 @inline
+def camera_axes(view):
+    """The camera's axes in the world: right, down, forward."""
+    three = (0, 0, 0)
+    right, down = broadcast_all(view, layout.VIEW_RIGHT, three), broadcast_all(view, layout.VIEW_DOWN, three)
+    return right, down, broadcast_all(view, layout.VIEW_FORWARD, three)
+
+
+@inline
 def project_axes(mean, quat, view):
     """Everything but scales. ``mean`` and ``quat`` are tuples of lanes, ``view`` the table ``layout`` describes."""
-    right = broadcast_all(view, layout.VIEW_RIGHT, (0, 0, 0))
-    down = broadcast_all(view, layout.VIEW_DOWN, (0, 0, 0))
-    forward = broadcast_all(view, layout.VIEW_FORWARD, (0, 0, 0))
+    right, down, forward = camera_axes(view)
     # Subtracting the centre before rotating keeps float32 accurate far from the world's origin.
     offset = sub(mean, broadcast_all(view, layout.VIEW_CENTER, (0, 0, 0)))
     z = dot(offset, forward, 0.0)
@@ -102,26 +108,11 @@ def project_axes(mean, quat, view):
     per_y = mul(broadcast(view, layout.VIEW_FY), inverse_z)
     image_x = mul(per_x, fma(neg(slope_x), forward, right))
     image_y = mul(per_y, fma(neg(slope_y), forward, down))
+    local_x, local_y = rotated_back(rotation, image_x), rotated_back(rotation, image_y)
     return Projected(
-        in_front,
-        offset,
-        x,
-        y,
-        z,
-        inverse_z,
-        slope_x,
-        slope_y,
-        follows_x,
-        follows_y,
-        rotation,
-        quaternion,
-        inverse_norm,
-        squared_norm,
-        image_x,
-        image_y,
-        rotated_back(rotation, image_x),
-        rotated_back(rotation, image_y),
-    )
+        in_front, offset, x, y, z, inverse_z, slope_x, slope_y, follows_x, follows_y, rotation, quaternion,
+        inverse_norm, squared_norm, image_x, image_y, local_x, local_y,
+    )  # fmt: skip
 
 
 @inline

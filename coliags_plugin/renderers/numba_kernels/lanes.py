@@ -14,7 +14,7 @@ so what is compiled has no loop over them. Tables are flat, contiguous float32 a
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, TypeAlias
 
 from llvmlite import ir
 from numba.core import types
@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 #: Signature of an intrinsic and what builds its instructions; None where it does not take such operands.
 Intrinsic: TypeAlias = "tuple[Signature, Callable[..., ir.Value]] | None"
 
+#: What an intrinsic is called with.
+Values: TypeAlias = Sequence[ir.Value]
+
 #: Numbers in a vector; pixels of a block.
 WIDTH = 16
 
@@ -38,27 +41,34 @@ _LANES = ir.VectorType(_FLOAT, WIDTH)
 _DOUBLES = ir.VectorType(ir.DoubleType(), WIDTH)
 _INTS = ir.VectorType(_INT, WIDTH)
 _MASK = ir.VectorType(ir.IntType(1), WIDTH)
+_FLAGS = ir.IntType(WIDTH)
 
 
-class Lanes(types.Type):
+class _VectorType(types.Type):
+    """A vector, whose form in LLVM is ``form``."""
+
+    form: ClassVar[ir.Type]
+
+    def __init__(self) -> None:
+        super().__init__(name=type(self).__name__)
+
+
+class Lanes(_VectorType):
     """Sixteen float32."""
 
-    def __init__(self) -> None:
-        super().__init__(name="Lanes")
+    form = _LANES
 
 
-class DoubleLanes(types.Type):
+class DoubleLanes(_VectorType):
     """Sixteen float64."""
 
-    def __init__(self) -> None:
-        super().__init__(name="DoubleLanes")
+    form = _DOUBLES
 
 
-class LaneMask(types.Type):
+class LaneMask(_VectorType):
     """Sixteen truth values."""
 
-    def __init__(self) -> None:
-        super().__init__(name="LaneMask")
+    form = _MASK
 
 
 #: Numbers in a kernel.
@@ -70,21 +80,11 @@ lane_mask = LaneMask()
 
 
 @register_model(Lanes)
-class _LanesModel(models.PrimitiveModel):
-    def __init__(self, dmm: DataModelManager, fe_type: types.Type) -> None:
-        super().__init__(dmm, fe_type, _LANES)
-
-
 @register_model(DoubleLanes)
-class _DoubleLanesModel(models.PrimitiveModel):
-    def __init__(self, dmm: DataModelManager, fe_type: types.Type) -> None:
-        super().__init__(dmm, fe_type, _DOUBLES)
-
-
 @register_model(LaneMask)
-class _LaneMaskModel(models.PrimitiveModel):
-    def __init__(self, dmm: DataModelManager, fe_type: types.Type) -> None:
-        super().__init__(dmm, fe_type, _MASK)
+class _VectorModel(models.PrimitiveModel):
+    def __init__(self, dmm: DataModelManager, fe_type: _VectorType) -> None:
+        super().__init__(dmm, fe_type, fe_type.form)
 
 
 # --- building instructions --------------------------------------------------------------------------------------------
@@ -230,9 +230,7 @@ def _lanewise(
             return None
         kind = _result_type(operands)
 
-        def generate(
-            context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
-        ) -> ir.Value:
+        def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
             pairs = list(zip(arguments, signature.args, strict=True))
             if length is None:
                 return emit(builder, *(_as_lanes(builder, *pair, kind) for pair in pairs))
@@ -263,6 +261,19 @@ def _of_masks(name: str, emit: Callable[..., ir.Value]) -> Callable[..., Intrins
         if not (isinstance(a, LaneMask) and isinstance(b, LaneMask)):
             return None
         return lane_mask(a, b), lambda context, builder, signature, arguments: emit(builder, *arguments)
+
+    typed.__name__ = name
+    return intrinsic(typed)
+
+
+def _of_one(
+    name: str, operand: type[types.Type], result: types.Type, emit: Callable[[ir.IRBuilder, ir.Value], ir.Value]
+) -> Callable[..., Intrinsic]:
+    def typed(typingctx: Context, a: types.Type) -> Intrinsic:
+        if not isinstance(a, operand):
+            return None
+        taken = types.int64 if isinstance(a, types.Integer) else a
+        return result(taken), lambda context, builder, signature, arguments: emit(builder, arguments[0])
 
     typed.__name__ = name
     return intrinsic(typed)
@@ -322,9 +333,7 @@ def select(typingctx: Context, mask: types.Type, chosen: types.Type, other: type
         return None
     kind = _result_type((chosen, other))
 
-    def generate(
-        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
-    ) -> ir.Value:
+    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
         pairs = list(zip(arguments[1:], signature.args[1:], strict=True))
         if length is None:
             return builder.select(arguments[0], *(_as_lanes(builder, *pair, kind) for pair in pairs))
@@ -339,32 +348,20 @@ def select(typingctx: Context, mask: types.Type, chosen: types.Type, other: type
     return (kind if length is None else types.UniTuple(kind, length))(mask, chosen, other), generate
 
 
-@intrinsic
-def from_bits(typingctx: Context, flags: types.Type) -> Intrinsic:
-    """The mask that :func:`bits` turns into this integer."""
-    if not isinstance(flags, types.Integer):
-        return None
-
-    def generate(
-        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
-    ) -> ir.Value:
-        return builder.bitcast(builder.trunc(arguments[0], ir.IntType(WIDTH)), _MASK)
-
-    return lane_mask(types.int64), generate
-
-
-@intrinsic
-def bits(typingctx: Context, mask: types.Type) -> Intrinsic:
-    """The mask as an integer, lane 0 in the lowest bit."""
-    if not isinstance(mask, LaneMask):
-        return None
-
-    def generate(
-        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
-    ) -> ir.Value:
-        return builder.zext(builder.bitcast(arguments[0], ir.IntType(WIDTH)), ir.IntType(64))
-
-    return types.int64(mask), generate
+#: The mask that :func:`bits` turns into this integer
+from_bits = _of_one(
+    "from_bits", types.Integer, lane_mask, lambda builder, flags: builder.bitcast(builder.trunc(flags, _FLAGS), _MASK)
+)
+#: The mask as an integer, lane 0 in the lowest bit
+bits = _of_one(
+    "bits", LaneMask, types.int64, lambda builder, mask: builder.zext(builder.bitcast(mask, _FLAGS), ir.IntType(64))
+)
+#: Place of the lowest bit set in an integer that is not 0
+lowest_bit = _of_one(
+    "lowest_bit", types.Integer, types.int64, lambda builder, flags: builder.cttz(flags, ir.Constant(ir.IntType(1), 1))
+)
+#: How many bits are set in an integer
+bit_count = _of_one("bit_count", types.Integer, types.int64, lambda builder, flags: builder.ctpop(flags))
 
 
 # --- 2^x --------------------------------------------------------------------------------------------------------------
@@ -401,18 +398,31 @@ exp2 = _lanewise("exp2", 1, _emit_exp2)
 # --- memory -----------------------------------------------------------------------------------------------------------
 
 
-@intrinsic
-def load(typingctx: Context, table: types.Type, index: types.Type) -> Intrinsic:
-    """Sixteen numbers from ``table[index]`` on."""
-    if not _is_table(table):
-        return None
+def _reading(
+    name: str, result: types.Type, form: ir.Type, emit: Callable[[ir.IRBuilder, ir.Value], ir.Value] | None = None
+) -> Callable[..., Intrinsic]:
+    """An operation that reads ``form`` at ``table[index]``, without asking whether the index counts from the end."""
 
-    def generate(
-        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
-    ) -> ir.Value:
-        return _read(builder, _address(context, builder, signature.args[0], *arguments))
+    def typed(typingctx: Context, table: types.Type, index: types.Type) -> Intrinsic:
+        if not _is_table(table):
+            return None
 
-    return lanes(table, types.intp), generate
+        def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
+            value = _read(builder, _address(context, builder, signature.args[0], *arguments, form))
+            return emit(builder, value) if emit else value
+
+        return result(table, types.intp), generate
+
+    typed.__name__ = name
+    return intrinsic(typed)
+
+
+#: Sixteen numbers from ``table[index]`` on
+load = _reading("load", lanes, _LANES)
+#: ``table[index]``
+number = _reading("number", types.float32, _FLOAT)
+#: ``table[index]`` in all lanes
+broadcast = _reading("broadcast", lanes, _FLOAT, _repeat)
 
 
 @intrinsic
@@ -421,9 +431,7 @@ def store(typingctx: Context, table: types.Type, index: types.Type, value: types
     if not (_is_table(table) and _is_numeric(value)):
         return None
 
-    def generate(
-        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
-    ) -> ir.Value:
+    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
         address = _address(context, builder, signature.args[0], *arguments[:2])
         _write(builder, _as_lanes(builder, arguments[2], signature.args[2]), address)
         return context.get_dummy_value()
@@ -436,9 +444,7 @@ def _prefetching(name: str, writes: int) -> ir.Value:
         if not _is_table(table):
             return None
 
-        def generate(
-            context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
-        ) -> ir.Value:
+        def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
             address = _address(context, builder, signature.args[0], *arguments, ir.IntType(8))
             kind = ir.FunctionType(ir.VoidType(), [address.type, _INT, _INT, _INT])
             function = builder.module.declare_intrinsic("llvm.prefetch", [address.type], kind)
@@ -459,42 +465,12 @@ prefetch_to_write = _prefetching("prefetch_to_write", 1)
 
 
 @intrinsic
-def broadcast(typingctx: Context, table: types.Type, index: types.Type) -> Intrinsic:
-    """``table[index]`` in all lanes."""
-    if not _is_table(table):
-        return None
-
-    def generate(
-        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
-    ) -> ir.Value:
-        return _repeat(builder, _read(builder, _address(context, builder, signature.args[0], *arguments, _FLOAT)))
-
-    return lanes(table, types.intp), generate
-
-
-@intrinsic
-def number(typingctx: Context, table: types.Type, index: types.Type) -> Intrinsic:
-    """``table[index]``, without asking whether the index counts from the end."""
-    if not _is_table(table):
-        return None
-
-    def generate(
-        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
-    ) -> ir.Value:
-        return _read(builder, _address(context, builder, signature.args[0], *arguments, _FLOAT))
-
-    return types.float32(table, types.intp), generate
-
-
-@intrinsic
 def load_all(typingctx: Context, table: types.Type, index: types.Type, like: types.Type) -> Intrinsic:
     """As many vectors, one behind the other from ``table[index]`` on, as the tuple ``like`` is long."""
     if not (_is_table(table) and isinstance(like, types.BaseTuple)):
         return None
 
-    def generate(
-        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
-    ) -> ir.Value:
+    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
         address = _address(context, builder, signature.args[0], *arguments[:2])
         places = [builder.gep(address, [ir.Constant(_INT, place)]) for place in range(len(like))]
         return _pack(builder, [_read(builder, place) for place in places])
@@ -508,9 +484,7 @@ def store_all(typingctx: Context, table: types.Type, index: types.Type, values: 
     if not (_is_table(table) and isinstance(values, types.BaseTuple)):
         return None
 
-    def generate(
-        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
-    ) -> ir.Value:
+    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
         address = _address(context, builder, signature.args[0], *arguments[:2])
         for place in range(len(values)):
             vector = _element(builder, arguments[2], signature.args[2], place)
@@ -526,9 +500,7 @@ def broadcast_all(typingctx: Context, table: types.Type, index: types.Type, like
     if not (_is_table(table) and isinstance(like, types.BaseTuple)):
         return None
 
-    def generate(
-        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
-    ) -> ir.Value:
+    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
         address = _address(context, builder, signature.args[0], *arguments[:2], _FLOAT)
         places = [builder.gep(address, [ir.Constant(_INT, place)]) for place in range(len(like))]
         return _pack(builder, [_repeat(builder, _read(builder, place)) for place in places])
@@ -543,9 +515,7 @@ def load_columns(typingctx: Context, table: types.Type, index: types.Type, like:
         return None
     columns = len(like)
 
-    def generate(
-        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
-    ) -> ir.Value:
+    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
         address = _address(context, builder, signature.args[0], *arguments[:2])
         places = [builder.gep(address, [ir.Constant(_INT, place)]) for place in range(columns)]
         if columns == WIDTH:
@@ -565,9 +535,7 @@ def store_columns(typingctx: Context, table: types.Type, index: types.Type, valu
         return None
     columns = len(values)
 
-    def generate(
-        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
-    ) -> ir.Value:
+    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
         address = _address(context, builder, signature.args[0], *arguments[:2])
         vectors = [_element(builder, arguments[2], signature.args[2], column) for column in range(columns)]
         if columns == WIDTH:
@@ -607,9 +575,7 @@ def repeat(typingctx: Context, value: types.Type, like: types.Type) -> Intrinsic
     if not (_is_scalar(value) and isinstance(like, types.BaseTuple)):
         return None
 
-    def generate(
-        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
-    ) -> ir.Value:
+    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
         return _pack(builder, [_as_lanes(builder, arguments[0], signature.args[0])] * len(like))
 
     return _tuple_of_lanes(len(like))(value, like), generate
@@ -626,9 +592,7 @@ def dot(typingctx: Context, a: types.Type, b: types.Type, start: types.Type) -> 
         return None
     kind = _result_type((a, b, start))
 
-    def generate(
-        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
-    ) -> ir.Value:
+    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
         total = _as_lanes(builder, arguments[2], signature.args[2], kind)
         for index in range(length):
             factors = (_element(builder, arguments[k], signature.args[k], index, kind) for k in range(2))
@@ -644,9 +608,7 @@ def lane_sums(typingctx: Context, vectors: types.Type) -> Intrinsic:
     if not (isinstance(vectors, types.BaseTuple) and len(vectors) <= WIDTH):
         return None
 
-    def generate(
-        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
-    ) -> ir.Value:
+    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
         parts = [_element(builder, arguments[0], signature.args[0], index) for index in range(len(vectors))]
         return _summed(builder, parts)
 
@@ -661,9 +623,7 @@ def store_lane_sums(
     if not (_is_table(table) and isinstance(vectors, types.BaseTuple)):
         return None
 
-    def generate(
-        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
-    ) -> ir.Value:
+    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
         parts = [_element(builder, arguments[3], signature.args[3], place) for place in range(len(vectors))]
         address = _address(context, builder, signature.args[0], *arguments[:2])
         _write(builder, _summed(builder, parts[:WIDTH]), address)
@@ -714,38 +674,6 @@ def lane(typingctx: Context, vector: types.Type, index: types.Type) -> Intrinsic
     """One of the sixteen numbers."""
     if not isinstance(vector, Lanes):
         return None
-
-    def generate(
-        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
-    ) -> ir.Value:
-        return builder.extract_element(*arguments)
-
-    return types.float32(vector, types.intp), generate
-
-
-@intrinsic
-def lowest_bit(typingctx: Context, flags: types.Type) -> Intrinsic:
-    """Place of the lowest bit set in an integer that is not 0."""
-    if not isinstance(flags, types.Integer):
-        return None
-
-    def generate(
-        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
-    ) -> ir.Value:
-        return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
-
-    return types.int64(types.int64), generate
-
-
-@intrinsic
-def bit_count(typingctx: Context, flags: types.Type) -> Intrinsic:
-    """How many bits are set in an integer."""
-    if not isinstance(flags, types.Integer):
-        return None
-
-    def generate(
-        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
-    ) -> ir.Value:
-        return builder.ctpop(arguments[0])
-
-    return types.int64(types.int64), generate
+    return types.float32(vector, types.intp), lambda context, builder, signature, arguments: builder.extract_element(
+        *arguments
+    )

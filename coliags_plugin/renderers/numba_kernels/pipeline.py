@@ -107,27 +107,27 @@ class Pipeline(ABC):
         """Vectors that a forward sweep leaves of each block."""
 
     @abstractmethod
-    def _run_project(self, run: Run, gaussians: layout.Parameters, means2d: Array, radii: Array) -> None:
+    def _run_project(self, run: Runner, gaussians: layout.Parameters, means2d: Array, radii: Array) -> None:
         """Project."""
 
     @abstractmethod
-    def _run_sweep(self, run: Run, layer: Layer, composited: Array, images: layout.Images) -> None:
+    def _run_sweep(self, run: Runner, layer: Layer, composited: Array, images: layout.Images) -> None:
         """Composite."""
 
     @abstractmethod
     def _run_sweep_backward(
-        self, run: Run, layer: Layer, composited: Array, of_images: layout.Images, entry_sums: Array
+        self, run: Runner, layer: Layer, composited: Array, of_images: layout.Images, entry_sums: Array
     ) -> None:
         """Find the sums of entries."""
 
     @abstractmethod
-    def _run_gather(self, run: Run, layer: Layer, entry_sums: Array, sums: Array, of_means2d: Array) -> None:
+    def _run_gather(self, run: Runner, layer: Layer, entry_sums: Array, sums: Array, of_means2d: Array) -> None:
         """Find the sums of Gaussians, and the derivative with respect to the projected centres."""
 
     @abstractmethod
     def _run_project_backward(
         self,
-        run: Run,
+        run: Runner,
         gaussians: layout.Parameters,
         sums: Array,
         given_means2d: Array,
@@ -339,7 +339,7 @@ class Pipeline(ABC):
 
     # --- bins ---------------------------------------------------------------------------------------------------------
 
-    def _bin(self, run: Run) -> None:
+    def _bin(self, run: Runner) -> None:
         """List the Gaussians of each tile."""
         take, grid = self._arena.take, self._grid
         drawn, within_bounds = (int(total) for total in self._projections.parcels.reshape(-1, 2).sum(axis=0))
@@ -368,14 +368,14 @@ class Pipeline(ABC):
         binning.place_entries(grid, pairs, bins)
         run(binning.sort_pairs, grid, pairs, bins)
 
-    def _sorted_keys(self, run: Run, drawn: int) -> Array:
+    def _sorted_keys(self, run: Runner, drawn: int) -> Array:
         """Indices of the Gaussians drawn, nearest first."""
         take = self._arena.take
         keys, moved = take("keys", drawn, np.int64), take("moved", drawn, np.int64)
         if not drawn:
             return keys
         if drawn < _WORTH_SHARING_SORT:
-            run = Run(1)
+            run = Runner(1)
         counts = self._projections.parcels[::2]
         lowest, highest = np.empty_like(counts), np.empty_like(counts)
         depth_bits = self._projections.depths.view(np.int32)
@@ -402,13 +402,13 @@ class Pipeline(ABC):
         """Numbers that a forward sweep leaves."""
         return 16 * layout.BLOCKS * self._grid.tiles * self._composited_vectors(layer)
 
-    def _scratch(self, run: Run, sweep: Any) -> layout.Scratch:
+    def _scratch(self, run: Runner, sweep: Any) -> layout.Scratch:
         """Memory for all threads of a sweep."""
         numbers = self._arena.take("numbers", run.workers * sweep.NUMBERS)
         return layout.Scratch(numbers, self._arena.take("integers", run.workers * sweep.INTEGERS, np.int32))
 
 
-class Run:
+class Runner:
     """Runs kernels on a given number of threads."""
 
     def __init__(self, workers: int) -> None:
@@ -420,10 +420,10 @@ class Run:
 
 
 @contextmanager
-def _workers() -> Iterator[Run]:
+def _workers() -> Iterator[Runner]:
     """Lock the thread pool, as one view uses all cores; with as many threads as torch uses."""
     with _crew.turn:
-        yield Run(torch.get_num_threads())
+        yield Runner(torch.get_num_threads())
 
 
 def _flat_images(images: layout.Images) -> layout.Images:

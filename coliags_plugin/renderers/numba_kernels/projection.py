@@ -8,6 +8,7 @@ from __future__ import annotations
 from coliags_plugin.core.numba_compilation import inline, kernel, part
 from coliags_plugin.renderers.numba_kernels import layout
 from coliags_plugin.renderers.numba_kernels.geometry import (
+    camera_axes,
     cross,
     project_axes,
     shortest_axes,
@@ -22,7 +23,6 @@ from coliags_plugin.renderers.numba_kernels.lanes import (
     bits,
     both,
     broadcast,
-    broadcast_all,
     ceil,
     div,
     dot,
@@ -98,11 +98,8 @@ def _project_groups(first, last, source, gaussians, view, extras, projections, m
     for group in range(first, last):
         row = layout.GROUP * (group - first + source)
         mean, scale = load_columns(gaussians.means, 3 * row, three), load_columns(gaussians.scales, 3 * row, three)
-        quat, color = (
-            load_columns(gaussians.quats, 4 * row, (0, 0, 0, 0)),
-            load_columns(gaussians.colors, 3 * row, three),
-        )
-        opacity = load(gaussians.opacities, row)
+        quat, opacity = load_columns(gaussians.quats, 4 * row, (0, 0, 0, 0)), load(gaussians.opacities, row)
+        color = load_columns(gaussians.colors, 3 * row, three)
         at = project_axes(mean, quat, view)
         usable = usable and bits(are_usable(mean, at.squared_norm, scale, opacity, color)) == 0xFFFF
 
@@ -177,9 +174,7 @@ def _facing_normals(at, scale, view):
     axis = shortest_column(at.rotation, second, third)
     # The line of sight and the axis may be compared in the world as well as in the camera.
     axis = select(greater(dot(axis, at.offset, 0.0), 0.0), neg(axis), axis)
-    right = broadcast_all(view, layout.VIEW_RIGHT, (0, 0, 0))
-    down = broadcast_all(view, layout.VIEW_DOWN, (0, 0, 0))
-    forward = broadcast_all(view, layout.VIEW_FORWARD, (0, 0, 0))
+    right, down, forward = camera_axes(view)
     return dot(axis, right, 0.0), dot(axis, down, 0.0), dot(axis, forward, 0.0)
 
 

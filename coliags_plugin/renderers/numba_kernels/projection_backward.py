@@ -10,11 +10,10 @@ import numpy as np
 
 from coliags_plugin.core.numba_compilation import inline, kernel, part
 from coliags_plugin.renderers.numba_kernels import layout
-from coliags_plugin.renderers.numba_kernels.geometry import project_axes, shortest_axes, shortest_column
+from coliags_plugin.renderers.numba_kernels.geometry import camera_axes, project_axes, shortest_axes, shortest_column
 from coliags_plugin.renderers.numba_kernels.lanes import (
     add,
     broadcast,
-    broadcast_all,
     div,
     dot,
     fma,
@@ -150,9 +149,7 @@ def _project_groups_backward(
 ):
     """Groups ``first`` to ``last``, reading from group ``source`` of the Gaussians on. Returns ``pose``, added to."""
     three = (0, 0, 0)
-    right = broadcast_all(view, layout.VIEW_RIGHT, three)
-    down = broadcast_all(view, layout.VIEW_DOWN, three)
-    forward = broadcast_all(view, layout.VIEW_FORWARD, three)
+    right, down, forward = camera_axes(view)
     fx, fy = broadcast(view, layout.VIEW_FX), broadcast(view, layout.VIEW_FY)
     of_right, of_down, of_forward, of_center = pose[0:3], pose[3:6], pose[6:9], pose[9:12]
     nothing = repeat(0.0, three)
@@ -204,11 +201,8 @@ def _project_groups_backward(
             of_axis = fma(of_normal[0], right, fma(of_normal[1], down, mul(of_normal[2], forward)))
             chosen = (select(third, 0.0, select(second, 0.0, 1.0)), select(third, 0.0, select(second, 1.0, 0.0)))
             chosen = (chosen[0], chosen[1], select(third, 1.0, 0.0))
-            of_a, of_b, of_c = (
-                fma(of_axis[0], chosen, of_a),
-                fma(of_axis[1], chosen, of_b),
-                fma(of_axis[2], chosen, of_c),
-            )
+            of_a, of_b = fma(of_axis[0], chosen, of_a), fma(of_axis[1], chosen, of_b)
+            of_c = fma(of_axis[2], chosen, of_c)
             to_right, to_down = fma(of_normal[0], axis, to_right), fma(of_normal[1], axis, to_down)
             to_forward = fma(of_normal[2], axis, to_forward)
 

@@ -87,23 +87,11 @@ def place_surfels(mean, quat, view):
     first, second, normal = (a[0], b[0], c[0]), (a[1], b[1], c[1]), (a[2], b[2], c[2])
     height = dot(normal, offset, 0.0)
     inverse_height = div(1.0, height)
+    of_first, of_second = mul(cross(second, offset), inverse_height), mul(cross(offset, first), inverse_height)
     return Placed(
-        in_front,
-        offset,
-        x,
-        y,
-        z,
-        div(1.0, z),
-        quaternion,
-        inverse_norm,
-        first,
-        second,
-        normal,
-        height,
-        mul(cross(second, offset), inverse_height),
-        mul(cross(offset, first), inverse_height),
-        mul(normal, inverse_height),
-    )
+        in_front, offset, x, y, z, div(1.0, z), quaternion, inverse_norm, first, second, normal, height,
+        of_first, of_second, mul(normal, inverse_height),
+    )  # fmt: skip
 
 
 @inline

@@ -5,13 +5,8 @@ from __future__ import annotations
 from typing import ClassVar
 
 from coliags_plugin.core.numba_compilation import Array
-from coliags_plugin.renderers.numba_kernels import (
-    layout,
-    surfel_layout,
-    surfel_sweep_backward,
-    surfel_sweep_forward,
-)
-from coliags_plugin.renderers.numba_kernels.pipeline import Layer, Pipeline, Run
+from coliags_plugin.renderers.numba_kernels import layout, surfel_layout, surfel_sweep_backward, surfel_sweep_forward
+from coliags_plugin.renderers.numba_kernels.pipeline import Layer, Pipeline, Runner
 from coliags_plugin.renderers.numba_kernels.surfel_projection import project_surfels
 from coliags_plugin.renderers.numba_kernels.surfel_projection_backward import gather_surfels, project_surfels_backward
 
@@ -48,7 +43,7 @@ class SurfelPipeline(Pipeline):
         of_measures = len(measures.depth) + len(measures.inverse_depth) + 2 * len(measures.distortion)
         return 1 + len(layer.channels) + of_measures
 
-    def _run_project(self, run: Run, gaussians: layout.Parameters, means2d: Array, radii: Array) -> None:
+    def _run_project(self, run: Runner, gaussians: layout.Parameters, means2d: Array, radii: Array) -> None:
         self._outline_rows = self._arena.take("outlines", len(self._projections.records))
         self._remainders = self._arena.take("remainders", len(means2d))
         run(
@@ -56,21 +51,21 @@ class SurfelPipeline(Pipeline):
             self._remainders, means2d, radii,
         )  # fmt: skip
 
-    def _run_sweep(self, run: Run, layer: Layer, composited: Array, images: layout.Images) -> None:
+    def _run_sweep(self, run: Runner, layer: Layer, composited: Array, images: layout.Images) -> None:
         run(
             surfel_sweep_forward.sweep_surfels, layer.records, self._remainders, self._bins, layer.view, self._grid, layer.channels,
             layer.own, self._scratch(run, surfel_sweep_forward), composited, images,
         )  # fmt: skip
 
     def _run_sweep_backward(
-        self, run: Run, layer: Layer, composited: Array, of_images: layout.Images, entry_sums: Array
+        self, run: Runner, layer: Layer, composited: Array, of_images: layout.Images, entry_sums: Array
     ) -> None:
         run(
             surfel_sweep_backward.sweep_surfels_backward, layer.records, self._remainders, self._bins, layer.view, self._grid,
             layer.channels, layer.own, self._scratch(run, surfel_sweep_backward), composited, of_images, entry_sums,
         )  # fmt: skip
 
-    def _run_gather(self, run: Run, layer: Layer, entry_sums: Array, sums: Array, of_means2d: Array) -> None:
+    def _run_gather(self, run: Runner, layer: Layer, entry_sums: Array, sums: Array, of_means2d: Array) -> None:
         run(
             gather_surfels, layer.records, self._projections.drawn, self._bins, self._view, layer.channels, entry_sums,
             sums, of_means2d,
@@ -78,7 +73,7 @@ class SurfelPipeline(Pipeline):
 
     def _run_project_backward(
         self,
-        run: Run,
+        run: Runner,
         gaussians: layout.Parameters,
         sums: Array,
         given_means2d: Array,

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from coliags_plugin.core.numba_compilation import inline, kernel, part
 from coliags_plugin.renderers.numba_kernels import layout, surfel_layout
-from coliags_plugin.renderers.numba_kernels.geometry import squared_distance_to_box
+from coliags_plugin.renderers.numba_kernels.geometry import camera_axes, squared_distance_to_box
 from coliags_plugin.renderers.numba_kernels.lanes import (
     add,
     at_least,
@@ -16,7 +16,6 @@ from coliags_plugin.renderers.numba_kernels.lanes import (
     bits,
     both,
     broadcast,
-    broadcast_all,
     ceil,
     div,
     dot,
@@ -98,9 +97,7 @@ def _project_groups(first, last, source, surfels, view, projections, outlines, r
     """
     drawn, tiles, usable = 0, 0, True
     three = (0, 0, 0)
-    right = broadcast_all(view, layout.VIEW_RIGHT, three)
-    down = broadcast_all(view, layout.VIEW_DOWN, three)
-    forward = broadcast_all(view, layout.VIEW_FORWARD, three)
+    right, down, forward = camera_axes(view)
     fx, fy = broadcast(view, layout.VIEW_FX), broadcast(view, layout.VIEW_FY)
     log2_alpha_min, near = broadcast(view, layout.VIEW_LOG2_ALPHA_MIN), broadcast(view, layout.VIEW_NEAR)
     pixel_scale = broadcast(view, layout.VIEW_PIXEL_SCALE)
@@ -118,10 +115,8 @@ def _project_groups(first, last, source, surfels, view, projections, outlines, r
         at = place_surfels(mean, quat, view)
 
         slope_x, slope_y = mul(at.x, at.inverse_z), mul(at.y, at.inverse_z)
-        wide_x, wide_y = (
-            fma(fx, slope_x, broadcast(view, layout.VIEW_CX)),
-            fma(fy, slope_y, broadcast(view, layout.VIEW_CY)),
-        )
+        wide_x = fma(fx, slope_x, broadcast(view, layout.VIEW_CX))
+        wide_y = fma(fy, slope_y, broadcast(view, layout.VIEW_CY))
         mean_x, mean_y = narrow(wide_x), narrow(wide_y)
         remainder = narrow((sub(wide_x, mean_x), sub(wide_y, mean_y)))
         store_columns(remainders, 2 * layout.GROUP * group, remainder)
@@ -154,12 +149,8 @@ def _project_groups(first, last, source, surfels, view, projections, outlines, r
         u_xx, u_yy = sqrt(div(level, xx)), sqrt(mul(level, div(xx, determinant)))
         u_yx = neg(mul(u_yy, slope_upright))
 
-        left, end, top, bottom = (
-            sub(0.5, center_x),
-            sub(right_edge, center_x),
-            sub(0.5, center_y),
-            sub(bottom_edge, center_y),
-        )
+        left, end = sub(0.5, center_x), sub(right_edge, center_x)
+        top, bottom = sub(0.5, center_y), sub(bottom_edge, center_y)
         in_ellipse = squared_distance_to_box(u_xx, u_yx, u_yy, slope_upright, slope_level, left, end, top, bottom)
         out_x = sub(smaller(larger(mean_x, 0.5), right_edge), mean_x)
         out_y = sub(smaller(larger(mean_y, 0.5), bottom_edge), mean_y)
@@ -170,14 +161,10 @@ def _project_groups(first, last, source, surfels, view, projections, outlines, r
         shown = both(shown, either(less(at.height, 0.0), greater(at.height, 0.0)))
 
         half_x, half_y, radius = sqrt(xx), sqrt(yy), div(sqrt(level), pixel_scale)
-        left, end = (
-            smaller(sub(center_x, half_x), sub(mean_x, radius)),
-            larger(add(center_x, half_x), add(mean_x, radius)),
-        )
-        top, bottom = (
-            smaller(sub(center_y, half_y), sub(mean_y, radius)),
-            larger(add(center_y, half_y), add(mean_y, radius)),
-        )
+        left = smaller(sub(center_x, half_x), sub(mean_x, radius))
+        end = larger(add(center_x, half_x), add(mean_x, radius))
+        top = smaller(sub(center_y, half_y), sub(mean_y, radius))
+        bottom = larger(add(center_y, half_y), add(mean_y, radius))
         half = select(crosses, half_size, mul(0.5, larger(sub(end, left), sub(bottom, top))))
         store(radii, layout.GROUP * group, select(shown, ceil(half), 0.0))
         left, end = select(crosses, 0.0, left), select(crosses, right_edge, end)

@@ -14,10 +14,10 @@ import numpy as np
 
 from coliags_plugin.core.numba_compilation import inline, kernel, part
 from coliags_plugin.renderers.numba_kernels import layout, surfel_layout
+from coliags_plugin.renderers.numba_kernels.geometry import camera_axes
 from coliags_plugin.renderers.numba_kernels.lanes import (
     add,
     broadcast,
-    broadcast_all,
     div,
     dot,
     fma,
@@ -168,9 +168,7 @@ def _project_groups_backward(
 ):
     """Groups ``first`` to ``last``, reading from group ``source`` of the surfels on. Returns ``pose``, added to."""
     three = (0, 0, 0)
-    right = broadcast_all(view, layout.VIEW_RIGHT, three)
-    down = broadcast_all(view, layout.VIEW_DOWN, three)
-    forward = broadcast_all(view, layout.VIEW_FORWARD, three)
+    right, down, forward = camera_axes(view)
     fx, fy = broadcast(view, layout.VIEW_FX), broadcast(view, layout.VIEW_FY)
     filtered = mul(_PLAIN_SQUARE, broadcast(view, layout.VIEW_PIXEL_SCALE))
     of_right, of_down, of_forward, of_center = pose[0:3], pose[3:6], pose[6:9], pose[9:12]

@@ -107,20 +107,9 @@ def sweep_surfels_backward(
             _read_tile(tile, grid, view, channels, of_images, state)
             _prepare_tile(tile, channels, measures, view, composited, state)
             _sweep_tile(
-                tile,
-                records,
-                remainders,
-                bins,
-                view,
-                grid,
-                channels,
-                measures,
-                rows,
-                state,
-                blocks,
-                further,
+                tile, records, remainders, bins, view, grid, channels, measures, rows, state, blocks, further,
                 entry_sums,
-            )
+            )  # fmt: skip
         for entry in range(bins.reached[tile], bins.starts[tile + 1]):
             number = bins.cells[layout.CELL * entry + 2]
             store(entry_sums, layout.ROW * number, 0.0)
@@ -219,19 +208,8 @@ def _sweep_tile(
             prefetch_to_write(entry_sums, layout.ROW * ahead)
             row, mine = FETCHED * (entry - first), blocks[entry - first] & alive
             number = cells[layout.CELL * entry + 2]
-            alive = _sweep_entry(
-                row,
-                mine,
-                alive,
-                rows,
-                channels,
-                measures,
-                view,
-                state,
-                layout.ROW * number,
-                further + number,
-                entry_sums,
-            )
+            target, beyond = layout.ROW * number, further + number
+            alive = _sweep_entry(row, mine, alive, rows, channels, measures, view, state, target, beyond, entry_sums)
         first = end
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
@@ -12,7 +12,7 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
-from coliags_plugin.renderers.numba_kernels.lanes import Intrinsic
+from coliags_plugin.renderers.numba_kernels.lanes import Intrinsic, Values
 
 if TYPE_CHECKING:
     from numba.core.base import BaseContext
@@ -25,9 +25,7 @@ def take(typingctx: Context, counters: types.Type, index: types.Type, amount: ty
     if not (isinstance(counters, types.Array) and counters.dtype == types.int64 and counters.ndim == 1):
         return None
 
-    def generate(
-        context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Sequence[ir.Value]
-    ) -> ir.Value:
+    def generate(context: BaseContext, builder: ir.IRBuilder, signature: Signature, arguments: Values) -> ir.Value:
         table, place, amount = arguments
         data = context.make_array(signature.args[0])(context, builder, table).data
         return builder.atomic_rmw("add", builder.gep(data, [place]), amount, "monotonic")

@@ -8,8 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coliags_plugin.renderers.ray_compositing import CompositedRays, transmittances
-from coliags_plugin.renderers.ray_sampling import WEIGHT_FLOOR, even_places, refined_places
+from coliags_plugin.renderers.rays import WEIGHT_FLOOR, CompositedRays, even_places, refined_places, transmittances
 
 RAYS = torch.zeros(3, 3, dtype=torch.float64)
 

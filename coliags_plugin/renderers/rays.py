@@ -1,4 +1,4 @@
-"""Compositing of samples along rays."""
+"""Places along rays at which a radiance field is evaluated, and compositing of the samples."""
 
 from __future__ import annotations
 
@@ -7,6 +7,63 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+#: Added to every weight, so that no stretch of a ray is left out for good.
+WEIGHT_FLOOR = 1e-5
+
+
+def even_places(
+    near: Float[Tensor, ""] | float,
+    far: Float[Tensor, ""] | float,
+    count: int,
+    rays: Float[Tensor, "P 3"],
+    generator: torch.Generator | None,
+) -> Float[Tensor, "P S"]:
+    """One place in each of ``count`` equal intervals between two ends.
+
+    Args:
+        near: Start of the first interval.
+        far: End of the last interval.
+        count: S.
+        rays: As many, and of the dtype and device. [P, 3]
+        generator: Draws a place within each interval; None takes the midpoints.
+    """
+    return near + (far - near) * _shares(len(rays), count, rays, generator)
+
+
+def refined_places(
+    places: Float[Tensor, "P S"], weights: Float[Tensor, "P S"], count: int, generator: torch.Generator | None
+) -> Float[Tensor, "P S+N"]:
+    """The places and ``count`` more, distributed like the weights; sorted.
+
+    The distribution is NeRF's: constant between the midpoints of neighbouring places, where it is the weight of the
+    place between them plus :data:`WEIGHT_FLOOR`; the first and the last weight are not used.
+
+    Args:
+        places: In order, at least three. [P, S]
+        weights: Compositing weights at the places. [P, S]
+        count: N.
+        generator: Draws a number within each of N equal intervals of [0, 1], which the inverse of the cumulative
+            distribution makes a place; None takes the midpoints.
+    """
+    edges = 0.5 * (places[:, 1:] + places[:, :-1])
+    mass = weights[:, 1:-1] + WEIGHT_FLOOR
+    cumulative = (mass / mass.sum(1, keepdim=True)).cumsum(1)
+    cumulative = torch.cat([torch.zeros_like(cumulative[:, :1]), cumulative[:, :-1]], dim=1)  # at the lower edges
+    shares = _shares(len(places), count, places, generator)
+    interval = torch.searchsorted(cumulative, shares, right=True) - 1
+    start = cumulative.gather(1, interval)
+    within = (shares - start) * mass.sum(1, keepdim=True) / mass.gather(1, interval)
+    below, above = edges.gather(1, interval), edges.gather(1, interval + 1)
+    return torch.cat([places, below + within.clamp(0.0, 1.0) * (above - below)], dim=1).sort(dim=1).values
+
+
+def _shares(rows: int, count: int, like: Tensor, generator: torch.Generator | None) -> Float[Tensor, "P S"]:
+    """One number in each of ``count`` equal intervals of [0, 1], in order."""
+    index = torch.arange(count, dtype=like.dtype, device=like.device)
+    if generator is None:
+        return ((index + 0.5) / count).expand(rows, -1).contiguous()
+    return (index + torch.rand(rows, count, generator=generator, dtype=like.dtype).to(like.device)) / count
 
 
 @dataclass(frozen=True)
