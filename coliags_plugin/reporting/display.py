@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from coliags_plugin.reporting.html_page import html_blocks
 from coliags_plugin.reporting.model import Table
 from coliags_plugin.reporting.terminal import terminal_text
 
@@ -21,4 +20,6 @@ class DisplayTable(Table):
 
     def _repr_html_(self) -> str:
         """The table as HTML; notebooks ask for it."""
+        from coliags_plugin.reporting.html_page import html_blocks
+
         return html_blocks([self])

@@ -288,7 +288,11 @@ ERRORS: dict[str, list[Row]] = {
     "a pose file cut short": [
         ((*MATRICES, *TUM), lambda kind: cut(kind.poses), r"<poses>, line \d+: '.*'.*\d+ finite numbers"),
         (FRAMES_OF_JSON, lambda kind: cut(kind.poses), r"<poses> is not JSON: .* line \d+.*Expected"),
-        ("colmap-text", lambda kind: cut(kind.poses), r"sparse/0 cannot be read.*images\.txt.*complete"),
+        (
+            "colmap-text",
+            lambda kind: cut(kind.poses),
+            r"images\.txt, line \d+: .*Expected X Y POINT3D_ID of each point",
+        ),
         ("colmap", lambda _: cut("sparse/0/images.bin"), r"images\.bin \(\d+ bytes\) is damaged or cut short"),
         (
             PARAMS,
@@ -328,7 +332,7 @@ ERRORS: dict[str, list[Row]] = {
         (
             "colmap-text",
             lambda kind: change_row(kind.poses, 6, 1, lambda quat: quat * np.nan),
-            r"images\.txt, line \d+: '4 nan.*all numbers finite",
+            r"images\.txt, line \d+: '4 nan.*all finite",
         ),
         (
             "colmap",
