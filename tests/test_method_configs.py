@@ -13,8 +13,18 @@ from coliags_plugin.config.method_files import method_files, method_folder
 FOLDER = method_folder()
 METHODS = sorted(name for name, path in method_files().items() if path.is_relative_to(FOLDER))
 
-#: Ablations are checked by ``make test-thorough``: each differs from its method by an option or two.
-THOROUGH = pytest.mark.thorough
+#: Methods of the quick suite; ``make test-thorough`` checks the others, which differ from one of these by few options.
+QUICK = {
+    "coliags",
+    "coliags-plus",
+    "coliags-sparse-depth",
+    "scaffold-gs",
+    "3dgs",
+    "2dgs",
+    "gaussian-pancakes",
+    "pr-endo",
+}
+QUICK |= {"reim-nerf-small"}
 #: Networks so small that a CPU trains them in seconds, by the field's name.
 SMALL_NETWORKS = {
     "reim-nerf": (
@@ -31,7 +41,7 @@ def one_thread(two_threads):
 
 
 @pytest.mark.parametrize(
-    "method", [name if "/" not in name else pytest.param(name, marks=THOROUGH) for name in METHODS]
+    "method", [pytest.param(name, marks=() if name in QUICK else pytest.mark.thorough) for name in METHODS]
 )
 def test_the_contract(method, tmp_path):
     config = load_method(method).config
@@ -50,4 +60,4 @@ def test_the_contract(method, tmp_path):
 
 
 def test_there_are_methods_to_check():
-    assert {"coliags", "scaffold-gs", "3dgs", "ablations/none"} <= set(METHODS)
+    assert QUICK | {"ablations/none"} <= set(METHODS)

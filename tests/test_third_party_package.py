@@ -39,6 +39,7 @@ def coliags(tmp_path):
     return run
 
 
+@pytest.mark.thorough
 def test_the_example_trains_and_is_evaluated(coliags, tmp_path):
     write_wall(tmp_path / "wall")
     listed = coliags("list", "methods").stdout

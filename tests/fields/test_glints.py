@@ -68,6 +68,7 @@ def test_a_tilted_facet_glints_beside_the_normal():
     assert embedded(head, normal, normal)[0, 5].item() < 1e-4
 
 
+@pytest.mark.thorough
 def test_a_glint_beside_the_normal_is_learned():
     """One anchor that glints about a direction 10 degrees off the wall's normal: IMIA finds none of it."""
     generator = torch.Generator().manual_seed(0)

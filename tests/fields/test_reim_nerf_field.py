@@ -264,6 +264,7 @@ def test_every_term_falls(tmp_path):
         assert late < 0.6 * early, name
 
 
+@pytest.mark.thorough
 def test_a_ball_is_learnt_in_colour_and_depth(tmp_path):
     scene = sphere_scene()
     frame = scene.train[0]

@@ -92,6 +92,7 @@ def test_gains_stay_within_their_bounds_and_frames_at_a_bound_are_named():
     assert make().learned["at_bound"] == []
 
 
+@pytest.mark.thorough
 def test_known_gains_are_found(tmp_path):
     """An evenly lit wall whose images were multiplied by 0.74 to 1.1: found to one percent, up to a common factor."""
     generator = torch.Generator().manual_seed(3)

@@ -324,6 +324,7 @@ schedule: {steps: 150}
 """
 
 
+@pytest.mark.thorough
 def test_a_radiance_field_on_batches_of_pixels_fits_a_coloured_ball(tmp_path, monkeypatch):
     monkeypatch.setitem(registry.fields._targets, "test-grid", Grid)
     (tmp_path / "grid.yaml").write_text(METHOD, encoding="utf-8")
