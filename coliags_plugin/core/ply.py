@@ -105,10 +105,7 @@ def read_triangles(path: Path) -> tuple[dict[str, np.ndarray], Int[np.ndarray, "
 
 
 def write_ply(
-    path: Path,
-    vertices: Mapping[str, np.ndarray],
-    triangles: Int[np.ndarray, "F 3"] | None = None,
-    comment: str = "",
+    path: Path, vertices: Mapping[str, np.ndarray], triangles: Int[np.ndarray, "F 3"] | None = None, comment: str = ""
 ) -> None:
     """Write vertices and triangles atomically; the folder is made.
 

@@ -106,8 +106,7 @@ class _Composite(torch.autograd.Function):
         padded, padded_features = padded_rows(polynomials, 0), torch.nn.functional.pad(features, (0, 0, 0, 1))
         composited = features.new_zeros(len(starts) - 1, features.shape[1], pixels.shape[1])
         for chunk in _sweep(padded, starts, pixels, cuts):
-            chunk_features = padded_features.index_select(0, chunk.rows).view(*chunk.weights.shape[:2], -1)
-            composited[chunk.tiles] += chunk_features.mT @ chunk.weights
+            composited[chunk.tiles] += chunk.rows_of(padded_features).mT @ chunk.weights
         ctx.save_for_backward(padded, padded_features, starts, pixels, composited)
         ctx.cuts = cuts
         return composited
@@ -122,15 +121,7 @@ class _Composite(torch.autograd.Function):
         behind = (composited * gradient).sum(1)
         for chunk in _sweep(padded, starts, pixels, ctx.cuts):
             tile_gradient = gradient[chunk.tiles]
-            chunk_features = padded_features.index_select(0, chunk.rows).view(*chunk.weights.shape[:2], -1)
             of_features[chunk.rows] = (chunk.weights @ tile_gradient.mT).flatten(0, 1)
-
-            gained = (chunk_features @ tile_gradient).mul_(chunk.weights)
-            hidden = behind[chunk.tiles][:, None] - gained.cumsum(1)
-            behind[chunk.tiles] = hidden[:, -1]
-            # d loss / d log(alpha) = alpha (T g - hidden / (1 - alpha)): its own contribution less what it occludes.
-            # Behind the stop, and where alpha is clamped, it is 0.
-            of_log_alphas = gained.sub_(hidden.mul_(chunk.ratios))
-            of_log_alphas.mul_(chunk.weights > 0).mul_(chunk.alphas < ctx.cuts.alpha_max)
-            of_polynomials[chunk.rows] = of_log_alphas.flatten(0, 1) @ pixels.T
+            gained = (chunk.rows_of(padded_features) @ tile_gradient).mul_(chunk.weights)
+            of_polynomials[chunk.rows] = chunk.of_log_alphas(gained, behind, ctx.cuts.alpha_max) @ pixels.T
         return of_polynomials[:-1], of_features[:-1], None, None, None

@@ -169,8 +169,7 @@ class _CompositeSurfels(torch.autograd.Function):
         depths = features.new_zeros(tiles, 4, pixels.shape[1])
         spread = _Spread(depths[:, 0])
         for chunk in _sweep(padded, starts, pixels, rules):
-            chunk_features = padded_features.index_select(0, chunk.rows).view(*chunk.weights.shape[:2], -1)
-            sums[chunk.tiles] += chunk_features.mT @ chunk.weights
+            sums[chunk.tiles] += chunk.rows_of(padded_features).mT @ chunk.weights
             if rules.depths:
                 z = chunk.evaluated.depths.view_as(chunk.weights)
                 crossing, crosses = crossing_of_half(chunk)
@@ -203,9 +202,8 @@ class _CompositeSurfels(torch.autograd.Function):
         for chunk in _sweep(padded, starts, pixels, rules):
             weights, hits = chunk.weights, chunk.evaluated
             of_tile = of_sums[chunk.tiles]
-            chunk_features = padded_features.index_select(0, chunk.rows).view(*weights.shape[:2], -1)
             of_features[chunk.rows] = (weights @ of_tile.mT).flatten(0, 1)
-            gained = chunk_features @ of_tile
+            gained = chunk.rows_of(padded_features) @ of_tile
             of_z = None
             if rules.depths:
                 of_accumulated, of_inverse, of_spread, of_median = of_depths[chunk.tiles][:, :, None].unbind(1)
@@ -219,13 +217,9 @@ class _CompositeSurfels(torch.autograd.Function):
                 crossing, crosses = crossing_of_half(chunk)
                 of_z.scatter_add_(1, crossing[:, None], of_median * crosses[:, None])
             gained.mul_(weights)
-            hidden = behind[chunk.tiles][:, None] - gained.cumsum(1)
-            behind[chunk.tiles] = hidden[:, -1]
-            # As in compositing.py. Behind the stop, and where alpha is clamped, it is 0.
-            of_log_alphas = gained.sub_(hidden.mul_(chunk.ratios))
-            of_log_alphas.mul_(weights > 0).mul_(chunk.alphas < rules.cuts.alpha_max)
+            of_log_alphas = chunk.of_log_alphas(gained, behind, rules.cuts.alpha_max)
             of_rows[chunk.rows] = _of_rows(
-                hits, of_log_alphas.flatten(0, 1), None if of_z is None else of_z.flatten(0, 1), pixels, rules
+                hits, of_log_alphas, None if of_z is None else of_z.flatten(0, 1), pixels, rules
             )
         return of_rows[:-1], of_features[:-1], None, None, None
 

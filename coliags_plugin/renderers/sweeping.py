@@ -63,6 +63,28 @@ class Chunk(Generic[Evaluated]):
     weights: Float[Tensor, "G C P"]
     evaluated: Evaluated
 
+    def rows_of(self, padded: Float[Tensor, "M+1 F"]) -> Float[Tensor, "G C F"]:
+        """The rows of a table that belong to the pairs. [M + 1, F] -> [G, C, F]"""
+        return padded.index_select(0, self.rows).view(*self.weights.shape[:2], -1)
+
+    def of_log_alphas(
+        self, gained: Float[Tensor, "G C P"], behind: Float[Tensor, "tiles P"], alpha_max: float
+    ) -> Float[Tensor, "R P"]:
+        """Derivatives of the loss with respect to the logarithms of the alphas: own contribution less what it occludes.
+
+        Behind the stop, and where alpha is clamped, they are 0.
+
+        Args:
+            gained: First-order contribution of each pair; overwritten. [G, C, P]
+            behind: That of all pairs not yet swept; reduced by this chunk's. [tiles, P]
+            alpha_max: Upper bound of alpha.
+        """
+        hidden = behind[self.tiles][:, None] - gained.cumsum(1)
+        behind[self.tiles] = hidden[:, -1]
+        # d loss / d log(alpha) = alpha (T g - hidden / (1 - alpha))
+        result = gained.sub_(hidden.mul_(self.ratios))
+        return result.mul_(self.weights > 0).mul_(self.alphas < alpha_max).flatten(0, 1)
+
 
 def sweep(
     evaluate: Callable[[Int[Tensor, "R"]], tuple[Float[Tensor, "R P"], Evaluated]],

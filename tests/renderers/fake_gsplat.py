@@ -34,12 +34,7 @@ def module(calls=None):
     fake = types.ModuleType("gsplat")
     fake.__spec__ = importlib.machinery.ModuleSpec("gsplat", None)
     fake.__version__ = "1.5.3"
-    for function in (
-        fully_fused_projection,
-        isect_tiles,
-        isect_offset_encode,
-        rasterize_to_pixels,
-    ):
+    for function in (fully_fused_projection, isect_tiles, isect_offset_encode, rasterize_to_pixels):
         setattr(fake, function.__name__, recorded(function))
     return fake
 

@@ -174,15 +174,8 @@ class Pipeline(ABC):
         Raises:
             TooManyPairsError: They cover too many tiles.
         """
-        grid, layer = self._grid, self._main_layer()
-        images = layout.Images(
-            *(
-                _results.take(grid.height, grid.width, *((3,) if name in ("rgb", "normals") else ()))
-                if name in self._wanted
-                else None
-                for name in layout.Images._fields
-            )
-        )
+        layer = self._main_layer()
+        images = self._images(self._wanted, _results.take)
         with _workers() as run:
             self._bin(run)
             self._composited = self._arena.take("composited", self._composited_size(layer))
@@ -312,15 +305,13 @@ class Pipeline(ABC):
 
     def _feature_images(self) -> layout.Images:
         """Images for the channels of a sweep."""
+        return self._images(self.feature_images, lambda *shape: np.zeros(shape, np.float32))
+
+    def _images(self, names: Collection[str], make: Callable[..., Array]) -> layout.Images:
+        """Images of these names made from their shapes, None for the others."""
         size = (self._grid.height, self._grid.width)
-        return layout.Images(
-            *(
-                np.zeros((*size, 3) if name in ("rgb", "normals") else size, np.float32)
-                if name in self.feature_images
-                else None
-                for name in layout.Images._fields
-            )
-        )
+        shapes = {name: (*size, 3) if name in ("rgb", "normals") else size for name in names}
+        return layout.Images(*(make(*shapes[name]) if name in names else None for name in layout.Images._fields))
 
     def _joined(self, images: layout.Images) -> Array:
         """The channels of a sweep from the images that hold them. [H, W, feature_channels]"""

@@ -202,7 +202,7 @@ def _sweep_tile(
     first, last = bins.starts[tile], bins.reached[tile]
     while first < last:
         end = min(first + CHUNK, last)
-        fetch_surfels(first, end, alive, corner_x, corner_y, records, remainders, view, cells, rows, blocks)
+        fetch_surfels(first, end, alive, corner_x, corner_y, (records, remainders, view), cells, rows, blocks)
         for entry in range(first, end):
             ahead = cells[layout.CELL * min(entry + _AHEAD, last - 1) + 2]
             prefetch_to_write(entry_sums, layout.ROW * ahead)

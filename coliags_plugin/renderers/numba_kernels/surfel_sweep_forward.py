@@ -39,12 +39,10 @@ from coliags_plugin.renderers.numba_kernels.surfel_tiles import (
     scaled_pixels,
 )
 from coliags_plugin.renderers.numba_kernels.threads import take
-from coliags_plugin.renderers.numba_kernels.tiles import CHUNK, copy_to_image, inside, list_by_block, tile_corner
+from coliags_plugin.renderers.numba_kernels.tiles import ALPHA, CHUNK, TRANSMITTANCE, copy_to_image, tile_sweep
 
 # A block's vectors: transmittance, alpha, channels, sums of the measures and the median; of the reciprocal depths 1/z
 # the first and the sums of differences to it and of their squares.
-_TRANSMITTANCE = 0
-_ALPHA = 16
 _CHANNELS = 32
 _DEPTH = _CHANNELS + 16 * surfel_layout.MAX_CHANNELS
 _INVERSE_DEPTH = _DEPTH + 16
@@ -54,7 +52,7 @@ _DIFFERENCE = _DEPTH + 64
 _SQUARE = _DEPTH + 80
 _STATE = _DEPTH + 96
 #: These take the place of others when they have done their work.
-_EXPECTED = _TRANSMITTANCE
+_EXPECTED = TRANSMITTANCE
 _DISTORTION = _NEAREST
 
 #: Scratch of one thread: rows of a chunk, states of a tile's blocks.
@@ -81,49 +79,16 @@ def sweep_surfels(counters, records, remainders, bins, view, grid, channels, mea
     """
     thread = take(counters, 1, 1)
     rows = scratch.numbers[thread * NUMBERS : (thread + 1) * NUMBERS]
-    state = rows[CHUNK * FETCHED :]
+    state, source = rows[CHUNK * FETCHED :], (records, remainders, view)
     blocks = scratch.integers[thread * INTEGERS : (thread + 1) * INTEGERS]
     while True:
         place = take(counters, 0, 1)
         if place >= grid.tiles:
             break
         tile = bins.order[place]
-        bins.reached[tile] = _sweep_tile(
-            tile, records, remainders, bins, view, grid, channels, measures, rows, state, blocks
-        )
+        bins.reached[tile] = _sweep_tile(tile, source, bins, view, grid, channels, measures, rows, state, blocks)
         _finish_tile(tile, channels, measures, view, state, composited)
         _write_tile(tile, grid, channels, measures, state, images)
-
-
-@part
-def _sweep_tile(tile, records, remainders, bins, view, grid, channels, measures, rows, state, blocks):
-    """Sweep through one tile's entries; leaves its pixels in ``state``.
-
-    Returns:
-        The entry at which it stopped.
-    """
-    corner_x, corner_y, across, down = tile_corner(tile, grid)
-    listed = blocks[CHUNK:]
-    counts = listed[layout.BLOCKS * CHUNK :]
-    alive = 0
-    for block in range(layout.BLOCKS):
-        at, pixels = _STATE * block, inside(block, across, down)
-        store(state, at + _TRANSMITTANCE, select(pixels, 1.0, 0.0))
-        for vector in range(_ALPHA, _STATE, 16):
-            store(state, at + vector, 0.0)
-        if bits(pixels):
-            alive |= 1 << block
-    first, last = bins.starts[tile], bins.starts[tile + 1]
-    while first < last and alive:
-        end = min(first + CHUNK, last)
-        fetch_surfels(first, end, alive, corner_x, corner_y, records, remainders, view, bins.cells, rows, blocks)
-        list_by_block(end - first, FETCHED, blocks, listed, counts)
-        for block in range(layout.BLOCKS):
-            count = counts[block]
-            if count and not _sweep_block(block, count, listed[CHUNK * block :], rows, channels, measures, view, state):
-                alive &= ~(1 << block)
-        first = end
-    return first
 
 
 @part
@@ -137,7 +102,7 @@ def _sweep_block(block, count, listed, rows, channels, measures, view, state):
     log2_alpha_min, alpha_max = broadcast(view, layout.VIEW_LOG2_ALPHA_MIN), broadcast(view, layout.VIEW_ALPHA_MAX)
     transmittance_min = broadcast(view, layout.VIEW_TRANSMITTANCE_MIN)
     at = _STATE * block
-    transmittance, alpha_sum = load(state, at + _TRANSMITTANCE), load(state, at + _ALPHA)
+    transmittance, alpha_sum = load(state, at + TRANSMITTANCE), load(state, at + ALPHA)
     sums = load_all(state, at + _CHANNELS, channels)
     depths = load_all(state, at + _DEPTH, measures.depth)
     inverse_depths = load_all(state, at + _INVERSE_DEPTH, measures.inverse_depth)
@@ -176,8 +141,8 @@ def _sweep_block(block, count, listed, rows, channels, measures, view, state):
         running = bits(drawn)
         if not running:
             break
-    store(state, at + _TRANSMITTANCE, transmittance)
-    store(state, at + _ALPHA, alpha_sum)
+    store(state, at + TRANSMITTANCE, transmittance)
+    store(state, at + ALPHA, alpha_sum)
     store_all(state, at + _CHANNELS, sums)
     store_all(state, at + _DEPTH, depths)
     store_all(state, at + _INVERSE_DEPTH, inverse_depths)
@@ -188,6 +153,9 @@ def _sweep_block(block, count, listed, rows, channels, measures, view, state):
     return running
 
 
+_sweep_tile = tile_sweep(fetch_surfels, _sweep_block, FETCHED, _STATE)
+
+
 @part
 def _finish_tile(tile, channels, measures, view, state, composited):
     """Store the blocks' sums in ``composited``; then add the background, divide depth by alpha, and find the distortion."""
@@ -195,7 +163,7 @@ def _finish_tile(tile, channels, measures, view, state, composited):
     background = broadcast_all(view, layout.VIEW_BACKGROUND, (0, 0, 0))
     for block in range(layout.BLOCKS):
         at, target = _STATE * block, 16 * width * (layout.BLOCKS * tile + block)
-        alpha = load(state, at + _ALPHA)
+        alpha = load(state, at + ALPHA)
         covered = greater(alpha, 0.0)
         store(composited, target, alpha)
         store_all(composited, target + 16, load_all(state, at + _CHANNELS, channels))
@@ -227,7 +195,7 @@ def _write_tile(tile, grid, channels, measures, state, images):
         if len(channels) > 3:
             _copy_to_image(_CHANNELS + 48 + 16 * channel, state, tile, grid, 3, channel, images.normals)
     for vector, image in (
-        (_ALPHA, images.alpha),
+        (ALPHA, images.alpha),
         (_DEPTH, images.depth),
         (_INVERSE_DEPTH, images.inverse_depth),
         (_EXPECTED, images.expected),

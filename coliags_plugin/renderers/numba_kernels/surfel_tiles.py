@@ -36,17 +36,19 @@ _AHEAD = 32
 
 
 @part
-def fetch_surfels(first, last, alive, corner_x, corner_y, records, remainders, view, cells, rows, blocks):
+def fetch_surfels(first, last, alive, corner_x, corner_y, source, cells, rows, blocks):
     """Fetch entries ``first`` to ``last`` of a tile.
 
     Args:
         first, last: Among ``cells``.
         alive: Blocks with transmittance left, one bit each.
         corner_x, corner_y: First pixel of the tile.
-        records, remainders, view, cells: See ``project_surfels``, ``layout`` and ``surfel_layout``.
+        source: Records, remainders and view: see ``project_surfels``, ``layout`` and ``surfel_layout``.
+        cells: See ``layout``.
         rows: Out. [FETCHED for each entry]
         blocks: Out: those of the alive blocks that the entry touches. [1 for each entry]
     """
+    records, remainders, view = source
     scale, near = number(view, layout.VIEW_PIXEL_SCALE), number(view, layout.VIEW_NEAR)
     middle_x, middle_y = np.float32(corner_x + layout.TILE // 2), np.float32(corner_y + layout.TILE // 2)
     for entry in range(first, last):

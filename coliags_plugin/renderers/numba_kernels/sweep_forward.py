@@ -26,7 +26,6 @@ from coliags_plugin.renderers.numba_kernels.lanes import (
     load_all,
     mul,
     neg,
-    repeat,
     select,
     smaller,
     store,
@@ -35,25 +34,23 @@ from coliags_plugin.renderers.numba_kernels.lanes import (
 )
 from coliags_plugin.renderers.numba_kernels.threads import take
 from coliags_plugin.renderers.numba_kernels.tiles import (
+    ALPHA,
     CHUNK,
     MEDIAN_DEPTH,
     OFFSET_E,
     OFFSET_F,
+    TRANSMITTANCE,
     block_corner,
     copy_to_image,
     fetch_chunk,
-    inside,
-    list_by_block,
-    tile_corner,
+    tile_sweep,
 )
 
 # A block's vectors: transmittance, alpha, channels and, behind them, the median depth.
-_TRANSMITTANCE = 0
-_ALPHA = 16
 _CHANNELS = 32
 _STATE = _CHANNELS + 16 * (layout.MAX_CHANNELS + 1)
 #: Depth over alpha takes the place of the transmittance when that has done its work.
-_EXPECTED = _TRANSMITTANCE
+_EXPECTED = TRANSMITTANCE
 
 #: Scratch of one thread: rows of a chunk, states of a tile's blocks.
 NUMBERS = CHUNK * layout.ROW + layout.BLOCKS * _STATE
@@ -93,38 +90,6 @@ def sweep_forward(counters, projections, bins, view, grid, extras, channels, med
 
 
 @part
-def _sweep_tile(tile, projections, bins, view, grid, channels, median, rows, state, blocks):
-    """Sweep through one tile's entries; leaves its pixels in ``state``.
-
-    Returns:
-        The entry at which it stopped.
-    """
-    corner_x, corner_y, across, down = tile_corner(tile, grid)
-    listed = blocks[CHUNK:]
-    counts = listed[layout.BLOCKS * CHUNK :]
-    alive = 0
-    for block in range(layout.BLOCKS):
-        at, pixels = _STATE * block, inside(block, across, down)
-        store(state, at + _TRANSMITTANCE, select(pixels, 1.0, 0.0))
-        store(state, at + _ALPHA, 0.0)
-        store_all(state, at + _CHANNELS, repeat(0.0, channels))
-        store_all(state, at + _CHANNELS + 16 * len(channels), repeat(0.0, median))
-        if bits(pixels):
-            alive |= 1 << block
-    first, last = bins.starts[tile], bins.starts[tile + 1]
-    while first < last and alive:
-        end = min(first + CHUNK, last)
-        fetch_chunk(first, end, alive, corner_x, corner_y, projections, bins.cells, rows, blocks)
-        list_by_block(end - first, layout.ROW, blocks, listed, counts)
-        for block in range(layout.BLOCKS):
-            count = counts[block]
-            if count and not _sweep_block(block, count, listed[CHUNK * block :], rows, channels, median, view, state):
-                alive &= ~(1 << block)
-        first = end
-    return first
-
-
-@part
 def _sweep_block(block, count, listed, rows, channels, median, view, state):
     """Composite the first ``count`` rows listed into one block.
 
@@ -137,7 +102,7 @@ def _sweep_block(block, count, listed, rows, channels, median, view, state):
     log2_alpha_min, alpha_max = broadcast(view, layout.VIEW_LOG2_ALPHA_MIN), broadcast(view, layout.VIEW_ALPHA_MAX)
     transmittance_min = broadcast(view, layout.VIEW_TRANSMITTANCE_MIN)
     at = _STATE * block
-    transmittance, alpha_sum = load(state, at + _TRANSMITTANCE), load(state, at + _ALPHA)
+    transmittance, alpha_sum = load(state, at + TRANSMITTANCE), load(state, at + ALPHA)
     sums = load_all(state, at + _CHANNELS, channels)
     medians = load_all(state, at + _CHANNELS + 16 * len(channels), median)
     running = 1
@@ -162,11 +127,14 @@ def _sweep_block(block, count, listed, rows, channels, median, view, state):
         running = bits(drawn)
         if not running:
             break
-    store(state, at + _TRANSMITTANCE, transmittance)
-    store(state, at + _ALPHA, alpha_sum)
+    store(state, at + TRANSMITTANCE, transmittance)
+    store(state, at + ALPHA, alpha_sum)
     store_all(state, at + _CHANNELS, sums)
     store_all(state, at + _CHANNELS + 16 * len(channels), medians)
     return running
+
+
+_sweep_tile = tile_sweep(fetch_chunk, _sweep_block, layout.ROW, _STATE)
 
 
 @part
@@ -176,7 +144,7 @@ def _finish_tile(tile, channels, view, has_depth, state, composited):
     background = broadcast_all(view, layout.VIEW_BACKGROUND, (0, 0, 0))
     for block in range(layout.BLOCKS):
         at, target = _STATE * block, size * (layout.BLOCKS * tile + block)
-        alpha = load(state, at + _ALPHA)
+        alpha = load(state, at + ALPHA)
         store(composited, target, alpha)
         store_all(composited, target + 16, load_all(state, at + _CHANNELS, channels))
         if has_depth:
@@ -191,7 +159,7 @@ def _write_tile(tile, grid, extras, state, images):
     """Copy a tile's pixels from its blocks to the images."""
     for channel in range(3):
         _copy_to_image(_CHANNELS + 16 * channel, state, tile, grid, 3, channel, images.rgb)
-    _copy_to_image(_ALPHA, state, tile, grid, 1, 0, images.alpha)
+    _copy_to_image(ALPHA, state, tile, grid, 1, 0, images.alpha)
     at = _CHANNELS + 48
     if extras.depth:
         _copy_to_image(at, state, tile, grid, 1, 0, images.depth)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from coliags_plugin.core.numba_compilation import inline, part
 from coliags_plugin.renderers.numba_kernels import layout
 from coliags_plugin.renderers.numba_kernels.lanes import (
+    bits,
     both,
     lane_columns,
     lane_rows,
@@ -14,6 +17,7 @@ from coliags_plugin.renderers.numba_kernels.lanes import (
     load,
     number,
     prefetch,
+    select,
     store,
 )
 
@@ -21,6 +25,10 @@ from coliags_plugin.renderers.numba_kernels.lanes import (
 CHUNK = 128
 #: Prefetch distance of records, entries.
 _AHEAD = 32
+
+# The first vectors of a block in the forward sweeps.
+TRANSMITTANCE = 0
+ALPHA = 16
 
 # A fetched row is one of ``records`` with other columns where that holds the centre and a slope: with (x, y) counted
 # from the middle of the tile e = U_XX x + OFFSET_E and f = U_YX x + U_YY y + OFFSET_F.
@@ -110,6 +118,44 @@ def list_by_block(count, stride, blocks, listed, counts):
             d += touched >> 3 & 1
         counts[block], counts[block + 1] = a - CHUNK * block, b - CHUNK * (block + 1)
         counts[block + 2], counts[block + 3] = c - CHUNK * (block + 2), d - CHUNK * (block + 3)
+
+
+def tile_sweep(fetch: Callable[..., None], sweep_block: Callable[..., int], row: int, size: int) -> Callable[..., int]:
+    """Compile a forward sweep through one tile's entries; it leaves the pixels in ``state``, and returns where it stopped.
+
+    Args:
+        fetch: As :func:`fetch_chunk`.
+        sweep_block: Composites the rows listed into one block; returns whether any pixel has transmittance left.
+        row: Numbers of a fetched row.
+        size: Numbers of a block's vectors.
+    """
+
+    @part
+    def sweep_tile(tile, source, bins, view, grid, channels, own, rows, state, blocks):
+        corner_x, corner_y, across, down = tile_corner(tile, grid)
+        listed = blocks[CHUNK:]
+        counts = listed[layout.BLOCKS * CHUNK :]
+        alive = 0
+        for block in range(layout.BLOCKS):
+            at, pixels = size * block, inside(block, across, down)
+            store(state, at + TRANSMITTANCE, select(pixels, 1.0, 0.0))
+            for vector in range(ALPHA, size, 16):
+                store(state, at + vector, 0.0)
+            if bits(pixels):
+                alive |= 1 << block
+        first, last = bins.starts[tile], bins.starts[tile + 1]
+        while first < last and alive:
+            end = min(first + CHUNK, last)
+            fetch(first, end, alive, corner_x, corner_y, source, bins.cells, rows, blocks)
+            list_by_block(end - first, row, blocks, listed, counts)
+            for block in range(layout.BLOCKS):
+                count = counts[block]
+                if count and not sweep_block(block, count, listed[CHUNK * block :], rows, channels, own, view, state):
+                    alive &= ~(1 << block)
+            first = end
+        return first
+
+    return sweep_tile
 
 
 @inline
