@@ -23,8 +23,8 @@ QUICK = {
     "2dgs",
     "gaussian-pancakes",
     "pr-endo",
+    "reim-nerf-small",
 }
-QUICK |= {"reim-nerf-small"}
 #: Networks so small that a CPU trains them in seconds, by the field's name.
 SMALL_NETWORKS = {
     "reim-nerf": (
