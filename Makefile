@@ -30,7 +30,7 @@ test: install-dev
 
 # Long sweeps: fuzz, kills, full disks, browsers, notebooks, benchmarks and the contract of every ablation.
 test-thorough: install-dev
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --maxprocesses 4 -m thorough
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --maxprocesses 4 -m "thorough and not slow and not gpu"
 
 test-slow: install-dev
 	$(BIN)/python -m pytest -q -m slow

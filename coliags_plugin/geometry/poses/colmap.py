@@ -45,7 +45,7 @@ def read(path: Path) -> Trajectory:
             "a folder with images.bin and cameras.bin, or images.txt and cameras.txt",
             "Give the folder of the sparse model itself, often sparse/0",
         )
-    images = read_images(path / f"images{suffix}")
+    images = read_images(path / f"images{suffix}", observations=False)
     if not images:
         raise InputError(f"{path / f'images{suffix}'} holds no poses", "at least one registered image")
     refuse_repeated([image.name for image in images], str(path / f"images{suffix}"))

@@ -89,8 +89,12 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
     return {camera.number: camera for camera in cameras}
 
 
-def read_images(path: Path) -> list[ColmapImage]:
+def read_images(path: Path, observations: bool = True) -> list[ColmapImage]:
     """Read ``images.bin`` or ``images.txt``.
+
+    Args:
+        path: The file.
+        observations: Whether to parse the observations of a text file, nearly all of its length; else there are none.
 
     Raises:
         InputError: The file cannot be read or is damaged, or a pose is not finite; the message names line or image.
@@ -102,8 +106,11 @@ def read_images(path: Path) -> list[ColmapImage]:
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         image = _parsed(path, number, line, _text_image, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, all finite")
-        observations = _parsed(path, *next(rows, (number, "")), _text_observations, "X Y POINT3D_ID of each point")
-        images.append(ColmapImage(f"{path}, line {number}", *image, *observations))
+        second, observed = next(rows, (number, ""))
+        parsed = _parsed(
+            path, second, observed if observations else "", _text_observations, "X Y POINT3D_ID of each point"
+        )
+        images.append(ColmapImage(f"{path}, line {number}", *image, *parsed))
     return images
 
 
@@ -219,9 +226,12 @@ def _text_image(line: str) -> tuple[tuple[float, ...], tuple[float, ...], int, s
 
 
 def _text_observations(line: str) -> tuple[Float[np.ndarray, "K 2"], Int[np.ndarray, "K"]]:
-    words = np.array(line.split()).reshape(-1, 3)
-    points = words[:, 2].astype(np.int64)
-    return words[points != -1, :2].astype(np.float64), points[points != -1]
+    words = line.split()
+    if len(words) % 3:
+        raise ValueError("an observation is of three")
+    points = np.array([int(word) for word in words[2::3]], np.int64)
+    pixels = np.array([[float(word) for word in words[axis::3]] for axis in range(2)]).T
+    return pixels[points != -1], points[points != -1]
 
 
 def _text_point(line: str) -> ColmapPoint:
