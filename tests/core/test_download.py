@@ -23,8 +23,6 @@ from tests.file_server import file_server
 DATA = random.Random(0).randbytes(300_000)
 DIGEST = hashlib.sha256(DATA).hexdigest()
 PATH = "/models/net.pth"
-#: Of a file, bytes; of what is there already, and of the whole, MiB.
-SIZES = [(10, 0, 1), (1 << 20, 0, 1), ((5 << 20) + 1, 0, 6), (3 << 20, 2, 3)]
 
 
 @pytest.fixture

@@ -43,6 +43,8 @@ def start(folder, overrides=(), method="scaffold-gs", scene=None):
         ),
         ("scaffold-gs", ["strategy=adaptive-density"], "strategy 'adaptive-density' changes gaussians"),
         ("scaffold-gs", ["sampler=pixels"], "sampler 'pixels' with renderer 'cpu', which draws whole images"),
+        ("scaffold-gs", ["optimizers.mirrors={lr: 0.1}"], "optimizers names mirrors, which the model does not have"),
+        ("scaffold-gs", ["optimizers.features=null"], "optimizers lacks the parameter groups features"),
         ("scaffold-gs", ["modules.exposure=gain"], "optimizers lacks the parameter groups exposure.gain"),
         (
             "scaffold-gs",
@@ -107,8 +109,11 @@ def test_a_term_that_would_never_count_is_refused():
 
 
 def test_depth_that_no_frame_has(tmp_path):
-    with pytest.raises(InputError, match="loss term 'depth' needs depth, and no training frame"):
+    with pytest.raises(
+        InputError, match=r"loss term 'depth' needs depth, and no training frame.*--set losses\.depth=null"
+    ):
         start(tmp_path / "run", method="scaffold-gs-depth", scene=wall_scene(depth=False))
+    assert not (tmp_path / "run").exists()
 
 
 def test_the_methods_made_for_such_data_are_named(tmp_path, caplog):
@@ -222,9 +227,11 @@ def test_metres_on_purpose_train_and_see_an_image(tmp_path, method, option):
 @pytest.mark.parametrize("method", ["scaffold-gs", "3dgs", "2dgs"])
 def test_a_run_that_sees_nothing_stops_after_a_few_steps(tmp_path, method):
     trainer = start(tmp_path / "run", method=method)
-    trainer.model.near_plane = 50.0  # beyond the wall
     trainer.start()
-    with pytest.raises(NothingDrawnError, match=r"in the last 10 views, until step 10: .* near_plane 0.* may lie"):
+    for _ in range(2):
+        trainer.take_step()
+    trainer.model.near_plane = 50.0  # beyond the wall
+    with pytest.raises(NothingDrawnError, match=r"in the last 10 views, until step 12: .* near_plane 0.* may lie"):
         trainer.train()
 
 

@@ -126,10 +126,6 @@ def test_without_proc_the_peak_is_that_of_getrusage(monkeypatch):
     assert costs.peak_memory_mib(CPU) is None
 
 
-def test_the_processor_has_a_name():
-    assert device_name(CPU).strip()
-
-
 # In a run
 
 
@@ -256,24 +252,11 @@ def rows_of(psnr, every=1):
     ]
 
 
-def test_a_mark_is_reached_when_the_mean_over_one_pass_is():
-    """40 dB from step 5 on: over 4 steps the mean of 20 and 40 reaches 25, 30 and 40 after 1, 2 and 4 such rows."""
-    found = seconds_to_psnr(rows_of([20.0] * 4 + [40.0] * 6), frames=4)
-    assert found["25"] == 2.0 * 5 and found["30"] == 2.0 * 6 and found["32"] == 2.0 * 7 and found["40"] == 2.0 * 8
-
-
-def test_a_single_good_view_reaches_nothing():
-    found = seconds_to_psnr(rows_of([60.0] + [20.0] * 20), frames=4)
-    assert found["30"] == 8.0 and found["32"] is None, "the first whole pass has a mean of 30"
-    assert seconds_to_psnr(rows_of([60.0] * 3), frames=4) == dict.fromkeys(map(str, PSNR_MARKS))
-    assert seconds_to_psnr([], frames=4) == {}
-
-
 @settings(max_examples=50, deadline=None)
-@given(psnr=st.lists(st.floats(10, 50), min_size=1, max_size=60), frames=st.integers(1, 25), every=st.integers(1, 12))
+@given(psnr=st.lists(st.floats(10, 50), max_size=60), frames=st.integers(1, 25), every=st.integers(1, 12))
 def test_marks_agree_with_means_taken_one_by_one(psnr, frames, every):
     rows = rows_of(psnr, every)
-    expected = dict.fromkeys(map(str, PSNR_MARKS))
+    expected = dict.fromkeys(map(str, PSNR_MARKS)) if rows else {}
     for row in rows:
         window = [other["psnr"] for other in rows if row["step"] - frames < other["step"] <= row["step"]]
         for mark in PSNR_MARKS:

@@ -8,11 +8,12 @@ import pytest
 import torch
 from torch import nn
 
-from coliags_plugin.contracts import GaussianField, ViewModule
+from coliags_plugin.contracts import ViewModule
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import View
 from coliags_plugin.engine.model import Model
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings
+from tests.export.viewer.made import Scripted
 from tests.renderers.test_torch_renderer import pinhole, random_gaussians
 
 
@@ -48,32 +49,8 @@ class Shift(ViewModule):
         return replace(output, rgb=output.rgb * self.factor)
 
 
-class Held(GaussianField):
-    """Gaussians that are the same from everywhere."""
-
-    primitive = "gaussians3d"
-
-    def __init__(self, gaussians):
-        super().__init__()
-        self.held = gaussians
-
-    @classmethod
-    def from_scene(cls, scene, settings, generator):
-        raise NotImplementedError
-
-    @classmethod
-    def from_state(cls, state, settings):
-        raise NotImplementedError
-
-    def gaussians(self, camera):
-        return self.held
-
-    def parameter_groups(self):
-        return {}
-
-
 def make_model(**modules):
-    field = Held(random_gaussians(40, 0))
+    field = Scripted(random_gaussians(40, 0))
     return Model(field, TorchRenderer(TorchRendererSettings()), modules)
 
 

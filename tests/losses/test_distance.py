@@ -10,11 +10,11 @@ import torch
 
 from coliags_plugin.config import registry
 from coliags_plugin.contracts import Schedule, TrainingStep
-from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.render_output import RenderOutput, concatenate_pixels
 from coliags_plugin.core.scenes import concatenate_targets
 from tests.losses import terms
 from tests.scenes import camera_at, wall_scene
+from tests.scenes import plain_frame as make_frame
 
 make = partial(terms.make, "distance-l1")
 
@@ -25,7 +25,7 @@ def output(depth, lengths, kind="depth_accumulated"):
     )
 
 
-def test_it_is_the_distance_between_points_on_the_ray(make_frame):
+def test_it_is_the_distance_between_points_on_the_ray():
     camera = camera_at(1.0, 2.0, 3.0, 6, 5, yaw=0.4)
     generator = torch.Generator().manual_seed(0)
     true, drawn = 20 + 5 * torch.rand(2, 5, 6, generator=generator, dtype=torch.float64)
@@ -39,25 +39,12 @@ def test_it_is_the_distance_between_points_on_the_ray(make_frame):
     assert coarse.loss.wants == {"depth_accumulated_coarse", "ray_lengths"} and coarse.loss.needs == {"depth"}
 
 
-def test_in_the_fields_unit_it_is_divided_by_it(make_frame):
+def test_in_the_fields_unit_it_is_divided_by_it():
     frame = make_frame(torch.zeros(1, 2, 3, dtype=torch.uint8), torch.tensor([[10.0, 20.0]]))
     loss = make(unit="field").loss
     model = SimpleNamespace(field=SimpleNamespace(length_unit=torch.tensor(50.0)))
     seen = output(torch.tensor([[12.0, 20.0]]), torch.tensor([[1.5, 1.0]]))
     assert loss(TrainingStep(seen, frame.target, model, 1, Schedule(1, 1))).item() == pytest.approx(1.5 / 50)
-
-
-def test_unknown_and_ignored_pixels_have_no_gradient_and_nothing_costs_nothing(make_frame):
-    depth = torch.full((2, 2), 12.0, requires_grad=True)
-    truth = torch.tensor([[10.0, torch.nan], [torch.inf, 11.0]])
-    mask = torch.tensor([[True, True], [True, False]])
-    image, lengths = torch.zeros(2, 2, 3, dtype=torch.uint8), torch.full((2, 2), 1.25)
-    term = make()(output(depth, lengths), make_frame(image, truth, mask))
-    term.backward()
-    assert term.item() == 2.5 and depth.grad.tolist() == [[1.25, 0.0], [0.0, 0.0]]
-    assert make()(output(depth, lengths), make_frame(image, truth, torch.zeros_like(mask))).item() == 0.0
-    with pytest.raises(InputError, match=r"'0007' has no depth"):
-        make()(output(depth, lengths), make_frame(image))
 
 
 def test_a_share_of_each_image_counts_and_is_always_the_same():
@@ -87,7 +74,7 @@ def test_a_share_of_each_image_counts_and_is_always_the_same():
     assert not torch.equal(gradient[:, 0] != 0, expected)
 
 
-def test_the_mean_square_of_either_image(make_frame):
+def test_the_mean_square_of_either_image():
     image = torch.zeros(1, 2, 3, dtype=torch.uint8)
     image[0, 0] = torch.tensor([255, 51, 0])
     rgb, coarse = torch.zeros(1, 2, 3), torch.full((1, 2, 3), 0.5)

@@ -11,12 +11,11 @@ from hypothesis import strategies as st
 from torch.nn.functional import huber_loss
 
 from coliags_plugin.contracts import Schedule, TrainingStep
-from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.masked import masked_mean, weighted_mean
 from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import concatenate_targets
-from tests.losses.terms import make
-from tests.scenes import plain_frame
+from tests.losses.terms import make, make_output
+from tests.scenes import plain_frame as make_frame
 
 HEIGHT, WIDTH = 7, 9
 WEIGHTED = ("depth-l1", "depth-huber", "distance-l1")
@@ -28,7 +27,7 @@ def generator():
 
 
 @pytest.fixture
-def case(make_output, make_frame, generator):
+def case(generator):
     """A rendered depth, and a frame with estimated depth, a mask and unknown pixels."""
     depth, rendered = 20 + 10 * torch.rand(2, HEIGHT, WIDTH, generator=generator, dtype=torch.float64)
     depth[0, :3] = torch.nan
@@ -118,14 +117,12 @@ def test_it_is_hubers_loss_of_the_relative_error(case):
 @settings(max_examples=30, deadline=None)
 @given(scale=st.floats(1e-3, 1e3), shift=st.floats(-0.6, 0.6), floor=st.floats(0, 1))
 def test_it_does_not_depend_on_the_unit(scale, shift, floor):
-    from tests.losses.conftest import _output
-
     image, depth = torch.zeros(2, 3, 3, dtype=torch.uint8), torch.linspace(5, 80, 6, dtype=torch.float64).view(2, 3)
     confidence = torch.linspace(0, 1, 6).view(2, 3)
 
     def term(unit):
-        output = _output(torch.zeros(2, 3, 3), depth_accumulated=unit * depth * (1 + shift))
-        frame = replace(plain_frame(image, unit * depth), depth_confidence=confidence)
+        output = make_output(torch.zeros(2, 3, 3), depth_accumulated=unit * depth * (1 + shift))
+        frame = replace(make_frame(image, unit * depth), depth_confidence=confidence)
         return make("estimated-depth", floor=floor)(output, frame).item()
 
     weight = confidence.clamp_min(floor).mean().item()
@@ -146,7 +143,7 @@ def test_a_prior_guides_with_a_tenth_of_the_weight(case):
     assert make("estimated-depth", floor=0.0)(output, replace(frame, depth_confidence=nothing)).item() == 0.0
 
 
-def test_ignored_and_unknown_pixels_may_be_nan(make_output, make_frame):
+def test_ignored_and_unknown_pixels_may_be_nan():
     depth = torch.tensor([[10.0, torch.nan, 0.0, torch.inf, 20.0]])
     rendered = torch.tensor([[12.0, 5.0, 5.0, 5.0, torch.nan]], requires_grad=True)
     mask = torch.tensor([[True, True, True, True, False]])
@@ -157,7 +154,7 @@ def test_ignored_and_unknown_pixels_may_be_nan(make_output, make_frame):
     assert rendered.grad[0].tolist() == pytest.approx([0.1, 0, 0, 0, 0])
 
 
-def test_inverse_depth_counts_where_something_was_drawn(make_output, make_frame):
+def test_inverse_depth_counts_where_something_was_drawn():
     inverse = torch.tensor([[0.05, 0.0]], requires_grad=True)
     output = make_output(torch.zeros(1, 2, 3), inverse_depth_accumulated=inverse)
     loss = make("estimated-depth", depth="inverse_depth_accumulated")
@@ -180,16 +177,10 @@ def test_pixel_batches_of_several_frames(case):
     assert batch == pytest.approx(make("estimated-depth")(output, frame).item(), rel=1e-12)
 
 
-def test_a_frame_without_depth_is_refused(case):
-    output, frame, _ = case
-    with pytest.raises(InputError, match=r"'0007' has no depth"):
-        make("estimated-depth")(output, replace(frame, depth=None, depth_confidence=None))
-
-
 # Opacity
 
 
-def test_opacity_is_the_mean_transparency_of_valid_pixels(make_output, make_frame):
+def test_opacity_is_the_mean_transparency_of_valid_pixels():
     alpha = torch.tensor([[1.0, 0.75], [0.25, torch.nan]], requires_grad=True)
     mask = torch.tensor([[True, True], [True, False]])
     frame = make_frame(torch.zeros(2, 2, 3, dtype=torch.uint8), mask=mask)

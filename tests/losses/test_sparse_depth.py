@@ -15,7 +15,9 @@ from coliags_plugin.core.scenes import SparseDepth
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer
 from tests.losses import terms
+from tests.losses.terms import make_output
 from tests.scenes import SMALL, wall_scene
+from tests.scenes import plain_frame as make_frame
 
 HEIGHT, WIDTH = 7, 9
 
@@ -34,7 +36,7 @@ def rendered(generator):
 
 
 @pytest.fixture
-def case(make_output, make_frame):
+def case():
     """The loss of a rendered depth at points."""
 
     def term(rendered, pixels, depth, alpha=None, mask=None, kind="depth_expected", **options):
@@ -117,7 +119,7 @@ def test_a_point_counts_only_where_all_its_pixels_show_something(case, rendered,
     assert values.grad.nonzero().tolist() == [[4, 6]]
 
 
-def test_nothing_to_compare_is_zero_and_keeps_the_graph(case, rendered, make_output, make_frame):
+def test_nothing_to_compare_is_zero_and_keeps_the_graph(case, rendered):
     frame = make_frame(torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8))
     output = make_output(torch.zeros(HEIGHT, WIDTH, 3), depth_expected=rendered)
     empty = SparseDepth(torch.zeros(0, 2), torch.zeros(0))
@@ -150,12 +152,6 @@ def test_images_of_one_row_or_column(case, size):
     rendered = torch.arange(1.0, 1.0 + size[0] * size[1]).reshape(size)
     assert case(rendered, [[0.5, 0.5]], [0.0]).item() == 1.0
     assert case(rendered, [[size[1] - 0.5, size[0] - 0.5]], [0.0]).item() == rendered[-1, -1].item()
-
-
-def test_what_it_asks_for():
-    assert make().loss.wants == {"depth_expected"}
-    assert make(depth="depth_accumulated").loss.wants == {"depth_accumulated"}
-    assert make().loss.needs == {"sparse_depth"}
 
 
 # Training with it

@@ -14,8 +14,9 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.losses.surfel_regularization import depth_normals
 from coliags_plugin.renderers.torch_renderer import render_gaussians
-from tests.losses.terms import make
+from tests.losses.terms import make, make_output
 from tests.renderers.test_torch_renderer import rigid
+from tests.scenes import plain_frame as make_frame
 
 
 def off_centre(width=23, height=17, pose=None):
@@ -96,13 +97,13 @@ def plane(tilt, count=15, spacing=0.4, dtype=torch.float64):
     return Gaussians(*leaves, torch.arange(n), torch.arange(n))
 
 
-def frame(make_frame, mask=None):
+def frame(mask=None):
     return make_frame(torch.zeros(17, 23, 3, dtype=torch.uint8), mask=mask)
 
 
 @pytest.mark.parametrize("depth", ["depth_expected", "depth_median"])
 @pytest.mark.parametrize("tilt", [0.0, 40.0])
-def test_a_plane_of_surfels_is_consistent(make_frame, depth, tilt):
+def test_a_plane_of_surfels_is_consistent(depth, tilt):
     term = make("normal-consistency", depth=depth)
     assert term.loss.wants == {"normals", depth} and term.loss.whole_image
     output = render_gaussians(plane(tilt), off_centre(), ("normals", depth))
@@ -111,11 +112,11 @@ def test_a_plane_of_surfels_is_consistent(make_frame, depth, tilt):
     inside[1:-1, 1:-1] = True
     # <N, n> = alpha there, times the detached alpha; the border enters as 1.
     expected = torch.where(inside, 1 - alpha**2, 1.0).mean()
-    assert term(output, frame(make_frame)).item() == pytest.approx(expected.item(), abs=1e-9)
+    assert term(output, frame()).item() == pytest.approx(expected.item(), abs=1e-9)
     assert expected < 0.3
 
 
-def test_inconsistent_surfels_are_turned_into_their_surface(make_frame):
+def test_inconsistent_surfels_are_turned_into_their_surface():
     surfels, term = plane(0.0, count=9, spacing=0.6), make("normal-consistency")
     half = math.radians(25) / 2
     with torch.no_grad():  # blinds that stand at 25 degrees to the wall they cover
@@ -123,63 +124,63 @@ def test_inconsistent_surfels_are_turned_into_their_surface(make_frame):
     least, values = 1 - 15 * 21 / (17 * 23), []  # the border's share
     optimizer = torch.optim.Adam([surfels.quats_wxyz], lr=0.03)
     for _ in range(20):
-        values.append(term(render_gaussians(surfels, off_centre(), tuple(term.loss.wants)), frame(make_frame)))
+        values.append(term(render_gaussians(surfels, off_centre(), tuple(term.loss.wants)), frame()))
         optimizer.zero_grad()
         values[-1].backward()
         optimizer.step()
     assert values[-1] - least < 0.3 * (values[0] - least)
 
 
-def test_alpha_of_the_weight_has_no_gradient(make_frame, make_output):
+def test_alpha_of_the_weight_has_no_gradient():
     normals = torch.zeros(17, 23, 3)
     normals[..., 2] = -1.0
     alpha = torch.full((17, 23), 0.5, requires_grad=True)
     output = make_output(torch.zeros(17, 23, 3), alpha=alpha, normals=normals.requires_grad_(),
                          depth_expected=torch.full((17, 23), 5.0, requires_grad=True))  # fmt: skip
     output = dataclasses.replace(output, camera=off_centre())
-    value = make("normal-consistency")(output, frame(make_frame))
+    value = make("normal-consistency")(output, frame())
     assert value.item() == pytest.approx(1 - 0.5 * 15 * 21 / (17 * 23), rel=1e-6)
     value.backward()
     assert alpha.grad is None and normals.grad.any()
 
 
-def test_ignored_pixels_count_for_nothing(make_frame):
+def test_ignored_pixels_count_for_nothing():
     mask = torch.ones(17, 23, dtype=torch.bool)
     mask[4:9, 6:12] = False
     for name in ("normal-consistency", "distortion"):
         term = make(name)
         output = render_gaussians(plane(30.0), off_centre(), tuple(term.loss.wants))
-        value = term(output, frame(make_frame, mask))
+        value = term(output, frame(mask))
         maps = {
             key: torch.where(mask[..., None] if v.ndim == 3 else mask, v.detach(), torch.nan).requires_grad_()
             for key, v in output.maps.items()
         }
         spoiled = dataclasses.replace(output, maps=maps)
-        other = term(spoiled, frame(make_frame, mask))
+        other = term(spoiled, frame(mask))
         torch.testing.assert_close(other, value)
         other.backward()
         for key, v in maps.items():
             assert v.grad.isfinite().all() and not v.grad[~mask].any(), (name, key)
 
 
-def test_distortion_is_the_mean_of_its_output(make_frame, make_output):
+def test_distortion_is_the_mean_of_its_output():
     distortion = torch.rand(17, 23, generator=torch.Generator().manual_seed(0))
     output = make_output(torch.zeros(17, 23, 3), distortion=distortion)
-    assert make("distortion")(output, frame(make_frame)).item() == pytest.approx(distortion.mean().item(), rel=1e-6)
+    assert make("distortion")(output, frame()).item() == pytest.approx(distortion.mean().item(), rel=1e-6)
 
 
-def test_distortion_draws_the_surfels_of_a_ray_together(make_frame):
+def test_distortion_draws_the_surfels_of_a_ray_together():
     means = torch.tensor([[0, 0, 4.0], [0, 0, 5.0]], dtype=torch.float64)
     quats = torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64).expand(2, 4)
     gaussians = Gaussians(
         means.requires_grad_(), quats, torch.full((2, 2), 30.0).double(), torch.full((2,), 0.5).double(),
         torch.ones(2, 3).double(), torch.arange(2), torch.arange(2),
     )  # fmt: skip
-    make("distortion")(render_gaussians(gaussians, off_centre(), ("distortion",)), frame(make_frame)).backward()
+    make("distortion")(render_gaussians(gaussians, off_centre(), ("distortion",)), frame()).backward()
     assert means.grad[0, 2] < 0 < means.grad[1, 2]
 
 
-def test_single_pixels_are_refused(make_frame, make_output):
+def test_single_pixels_are_refused():
     output = make_output(torch.zeros(4, 1, 3), normals=torch.zeros(4, 1, 3), depth_expected=torch.zeros(4, 1))
     with pytest.raises(InputError, match="whole images"):
         make("normal-consistency").loss(

@@ -1,4 +1,4 @@
-"""Hand-made comparisons, renders and frames for metrics and protocols."""
+"""Weights and images of LPIPS."""
 
 from __future__ import annotations
 
@@ -6,61 +6,8 @@ import cv2
 import pytest
 import torch
 
-from coliags_plugin.config import registry
-from coliags_plugin.contracts import Comparison
-from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.metrics import lpips_weights
-from tests.scenes import plain_frame
-
-
-def _make(name, **options):
-    metric = registry.metrics.get(name)
-    return metric(metric.Settings(**options))
-
-
-def _images(rgb, true_rgb, valid=None):
-    valid = torch.ones(rgb.shape[:2], dtype=torch.bool) if valid is None else valid
-    return Comparison(rgb, true_rgb, valid)
-
-
-def _depths(depth, true_depth, valid=None):
-    grey = torch.zeros(*depth.shape, 3)
-    everywhere = torch.ones(depth.shape, dtype=torch.bool)
-    return Comparison(grey, grey, everywhere, depth, true_depth, torch.isfinite(true_depth) if valid is None else valid)
-
-
-def _output(rgb, **maps):
-    return RenderOutput(rgb, torch.ones(rgb.shape[:2]), None, maps)
-
-
-@pytest.fixture
-def make():
-    """A metric by name and options."""
-    return _make
-
-
-@pytest.fixture
-def images():
-    """A Comparison of two images."""
-    return _images
-
-
-@pytest.fixture
-def depths():
-    """A Comparison of two depth maps."""
-    return _depths
-
-
-@pytest.fixture
-def make_output():
-    """A RenderOutput of these colours and maps."""
-    return _output
-
-
-@pytest.fixture
-def make_frame():
-    """A Frame of this image, depth and mask."""
-    return plain_frame
+from tests.metrics.made import images
 
 
 @pytest.fixture
@@ -77,7 +24,7 @@ def pair():
     """A Comparison of a random image and a noisy copy."""
     generator = torch.Generator().manual_seed(3)
     truth = torch.rand(48, 40, 3, generator=generator)
-    return _images((truth + 0.1 * torch.randn(48, 40, 3, generator=generator)).clamp(0, 1), truth)
+    return images((truth + 0.1 * torch.randn(48, 40, 3, generator=generator)).clamp(0, 1), truth)
 
 
 def _read(path):

@@ -5,6 +5,7 @@ import torch
 from coliags_plugin.core.errors import InputError, UnavailableError
 from coliags_plugin.metrics import lpips_weights
 from coliags_plugin.metrics.lpips_network import TAPS, LPIPSNetwork, features
+from tests.metrics.made import images, make
 from tests.metrics.weight_files import TORCHVISION, lay_out, random_backbone, random_heads
 
 NETS = ["vgg", "alex", "squeeze"]
@@ -13,34 +14,34 @@ NETS = ["vgg", "alex", "squeeze"]
 
 
 @pytest.fixture
-def squeeze(shared_data, make, nowhere):
+def squeeze(shared_data, nowhere):
     def options(**more):
         return make("lpips", net="squeeze", weights=str(shared_data / "lpips"), **more)
 
     return options
 
 
-def test_the_example_images_score_as_the_lpips_package_scores_them(squeeze, images, examples):
+def test_the_example_images_score_as_the_lpips_package_scores_them(squeeze, examples):
     """0.7110476 and 0.1479016: lpips 0.1.4 (net="squeeze") on the same weights and images, run once."""
     metric = squeeze(input_range="minus-one-one")
     assert metric(images(examples["p0"], examples["ref"])) == pytest.approx(0.7110476, abs=2e-6)
     assert metric(images(examples["p1"], examples["ref"])) == pytest.approx(0.1479016, abs=2e-6)
 
 
-def test_unmapped_images_give_other_values_in_the_same_order(squeeze, images, examples):
+def test_unmapped_images_give_other_values_in_the_same_order(squeeze, examples):
     blurred, warped = (squeeze()(images(examples[name], examples["ref"])) for name in ("p0", "p1"))
     assert 0 < warped < blurred
     mapped = squeeze(input_range="minus-one-one")(images(examples["p0"], examples["ref"]))
     assert abs(blurred - mapped) > 0.001
 
 
-def test_equal_images_are_at_zero_and_distance_has_no_direction(squeeze, images, examples):
+def test_equal_images_are_at_zero_and_distance_has_no_direction(squeeze, examples):
     assert squeeze()(images(examples["ref"], examples["ref"])) == 0.0
     there = squeeze()(images(examples["p0"], examples["ref"]))
     assert squeeze()(images(examples["ref"], examples["p0"])) == there
 
 
-def test_ignored_pixels_do_not_change_lpips(squeeze, images, examples):
+def test_ignored_pixels_do_not_change_lpips(squeeze, examples):
     mask = torch.ones(64, 64, dtype=torch.bool)
     mask[:, 40:] = False
     hidden, truth = examples["p1"].clone(), examples["ref"].clone()
@@ -50,7 +51,7 @@ def test_ignored_pixels_do_not_change_lpips(squeeze, images, examples):
     assert masked != squeeze()(images(examples["p1"], examples["ref"]))
 
 
-def test_the_mask_chooses_where_the_distance_is_averaged(squeeze, images, examples):
+def test_the_mask_chooses_where_the_distance_is_averaged(squeeze, examples):
     """Only the left half differs, so leaving out the right half raises the mean."""
     rendered = examples["ref"].clone()
     rendered[:, :32] = examples["p0"][:, :32]
@@ -128,7 +129,7 @@ def test_building_a_network_draws_no_random_numbers():
 
 
 @pytest.mark.parametrize("net", NETS)
-def test_torch_hub_s_folder_is_found(net, nowhere, make, pair):
+def test_torch_hub_s_folder_is_found(net, nowhere, pair):
     checkpoints = nowhere / "torch" / "hub" / "checkpoints"
     checkpoints.mkdir(parents=True)
     lay_out(checkpoints, net, "{}.pth")
@@ -164,7 +165,7 @@ def test_an_installed_lpips_package_lends_its_heads_without_being_imported(nowhe
     assert heads == package / "weights" / "v0.1" / "alex.pth"
 
 
-def test_missing_weights_say_what_and_how_to_get_it(nowhere, make, pair):
+def test_missing_weights_say_what_and_how_to_get_it(nowhere, pair):
     with pytest.raises(UnavailableError) as caught:
         make("lpips", net="vgg")(pair)
     text = str(caught.value)
@@ -178,7 +179,7 @@ def test_missing_weights_say_what_and_how_to_get_it(nowhere, make, pair):
 
 
 @pytest.mark.parametrize("damage", ["truncated", "other net", "not tensors", "wrong heads", "negative heads"])
-def test_weights_that_do_not_fit_name_the_file(damage, nowhere, make, pair):
+def test_weights_that_do_not_fit_name_the_file(damage, nowhere, pair):
     folder = nowhere / damage.replace(" ", "-")
     lay_out(folder, "squeeze")
     backbone, heads = folder / lpips_weights.BACKBONE_FILES["squeeze"][0], folder / "v0.1" / "squeeze.pth"
@@ -198,17 +199,17 @@ def test_weights_that_do_not_fit_name_the_file(damage, nowhere, make, pair):
     assert str(culprit) in str(caught.value)
 
 
-def test_a_missing_weights_folder_is_an_input_error(make, tmp_path):
+def test_a_missing_weights_folder_is_an_input_error(tmp_path):
     with pytest.raises(InputError, match="is not a folder"):
         make("lpips", weights=str(tmp_path / "nothing"))
 
 
-def test_lpips_of_too_small_images_is_unavailable(make, images, nowhere):
+def test_lpips_of_too_small_images_is_unavailable(nowhere):
     with pytest.raises(UnavailableError, match="40x31"):
         make("lpips")(images(torch.zeros(31, 40, 3), torch.ones(31, 40, 3)))
 
 
-def test_the_network_is_read_once(nowhere, make, pair):
+def test_the_network_is_read_once(nowhere, pair):
     lay_out(nowhere / "kept", "alex")
     metric = make("lpips", net="alex", weights=str(nowhere / "kept"))
     with torch.inference_mode():

@@ -16,6 +16,7 @@ from coliags_plugin.metrics.lpips_install import SOURCES, Published, install
 from coliags_plugin.metrics.lpips_network import LPIPSNetwork
 from coliags_plugin.metrics.lpips_weights import BACKBONE_FILES, DEFAULT_NETS, find_weights, load_network, weights_in
 from tests.file_server import file_server
+from tests.metrics.made import images, make
 from tests.metrics.weight_files import lay_out, random_backbone, random_heads
 
 NETS = ("alex", "squeeze")
@@ -80,7 +81,7 @@ def direct(net, pair):
 # Downloading
 
 
-def test_what_is_downloaded_is_found_and_gives_the_same_values(server, cache, make, pair):
+def test_what_is_downloaded_is_found_and_gives_the_same_values(server, cache, pair):
     written = install(NETS, None, None, quiet)
     assert sorted(path.relative_to(cache).as_posix() for path in written) == files(cache) == EVERYTHING
     for net in NETS:
@@ -117,18 +118,6 @@ def test_a_folder_of_one_s_own_gets_everything(server, cache, tmp_path):
     assert find_weights("alex", folder)[0].parent == folder
 
 
-def test_a_broken_transfer_goes_on_and_ends_with_the_same_values(server, cache, make, pair):
-    server.cuts = [len(server.files["/v0.1/squeeze.pth"]), 1_000_000]
-    with pytest.raises(InputError, match="the connection broke after"):
-        install(["squeeze"], None, None, quiet)
-    (part,) = cache.rglob("*.part")
-    kept = part.stat().st_size
-    assert 900_000 < kept <= 1_000_000
-    install(["squeeze"], None, None, quiet)
-    assert server.requests[-1][2] == f"bytes={kept}-"
-    assert make("lpips", net="squeeze")(pair) == pytest.approx(direct("squeeze", pair), rel=1e-6)
-
-
 def test_without_a_connection_all_that_is_missing_is_named(server, cache):
     server.statuses = {"/v0.1/squeeze.pth": 503}
     with pytest.raises(InputError) as caught:
@@ -139,17 +128,10 @@ def test_without_a_connection_all_that_is_missing_is_named(server, cache):
     assert files(cache) == ["v0.1/alex.pth"]
 
 
-def test_something_else_in_a_file_s_place_is_never_installed(server, cache):
-    server.files["/v0.1/alex.pth"] = b"<html>Please log in to the hospital's network</html>"
-    with pytest.raises(InputError, match="SHA-256"):
-        install(["alex"], None, None, quiet)
-    assert files(cache) == []
-
-
 # Copying
 
 
-def test_files_of_a_folder_are_copied(server, cache, made, make, pair):
+def test_files_of_a_folder_are_copied(server, cache, made, pair):
     assert len(install(NETS, None, made, quiet)) == 4
     assert files(cache) == EVERYTHING
     assert server.requests == []
@@ -213,17 +195,6 @@ def test_no_folder_to_copy_from(server, tmp_path):
         install(NETS, None, tmp_path / "nothing", quiet)
 
 
-def test_a_copy_that_fails_leaves_nothing(server, cache, made, monkeypatch):
-    def full(source, target):
-        target.write(b"half")
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("coliags_plugin.core.files.shutil.copyfileobj", full)
-    with pytest.raises(InputError, match="No space left"):
-        install(["alex"], None, made, quiet)
-    assert files(cache) == []
-
-
 # What is there already
 
 
@@ -278,7 +249,7 @@ def test_the_published_heads_have_the_checksums_of_the_table(shared_data):
         assert sha256(shared_data / "lpips" / heads.path) == heads.sha256
 
 
-def test_the_real_squeezenet_is_installed_and_scores_as_before(shared_data, nowhere, cache, make, images, examples):
+def test_the_real_squeezenet_is_installed_and_scores_as_before(shared_data, nowhere, cache, examples):
     """0.7110476: lpips 0.1.4 (net="squeeze") on the same weights and images, run once."""
     written = install(["squeeze"], None, shared_data / "lpips", quiet)
     assert sorted(written) == sorted(cache / name for name in files(cache)) == sorted(find_weights("squeeze"))

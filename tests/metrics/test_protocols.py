@@ -8,6 +8,8 @@ import torch
 from coliags_plugin.config import registry
 from coliags_plugin.core.errors import UnavailableError
 from coliags_plugin.core.render_output import OUTPUTS
+from tests.metrics.made import make_output
+from tests.scenes import plain_frame as make_frame
 
 HEIGHT, WIDTH = 12, 15
 NAMES = ["paper", "authors-code"]
@@ -24,7 +26,7 @@ def score(name, metric, comparison):
 
 
 @pytest.fixture
-def scene(make_output, make_frame):
+def scene():
     """A render and a frame: true depth 20 mm all over, drawn 1 mm too far; one pixel unknown, one masked."""
     generator = torch.Generator().manual_seed(0)
     image = torch.randint(0, 256, (HEIGHT, WIDTH, 3), generator=generator, dtype=torch.uint8)
@@ -94,7 +96,7 @@ def test_paper_compares_floats_where_truth_is_known(scene):
     assert score("paper", "depth_abs_rel", comparison) == pytest.approx(0.05)
 
 
-def test_paper_clamps_the_render(make_output, scene):
+def test_paper_clamps_the_render(scene):
     _, frame = scene
     rgb = torch.full((HEIGHT, WIDTH, 3), 1.5)
     rgb[0] = -0.5
@@ -140,7 +142,7 @@ def test_authors_code_rounds_images_to_eight_bits(scene):
     assert torch.equal(comparison.true_rgb, frame.rgb)
 
 
-def test_authors_code_scores_pixels_nothing_was_drawn_on_at_zero(make_output, scene):
+def test_authors_code_scores_pixels_nothing_was_drawn_on_at_zero(scene):
     """Of 12 rows the upper 3 are empty, one of their pixels without truth: 1/0 is infinite and its cast 0."""
     _, frame = scene
     inverse = torch.full((HEIGHT, WIDTH), 1 / 20.0)
@@ -155,7 +157,7 @@ def test_authors_code_scores_pixels_nothing_was_drawn_on_at_zero(make_output, sc
     assert score("authors-code", "depth_mse", comparison) == pytest.approx(expected, rel=1e-5)
 
 
-def test_authors_code_wraps_a_surface_beyond_150_mm_to_the_camera(make_output, scene):
+def test_authors_code_wraps_a_surface_beyond_150_mm_to_the_camera(scene):
     _, frame = scene
     far = torch.full((HEIGHT, WIDTH), 1 / 160.0)
     output = make_output(torch.zeros(HEIGHT, WIDTH, 3), inverse_depth_accumulated=far)

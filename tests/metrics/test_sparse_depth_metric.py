@@ -13,24 +13,26 @@ from coliags_plugin.contracts import Comparison
 from coliags_plugin.core.errors import UnavailableError
 from coliags_plugin.core.scenes import SparseDepth
 from coliags_plugin.engine.scoring import Scorer
+from tests.metrics.made import make, make_output
+from tests.scenes import plain_frame as make_frame
 
 HEIGHT, WIDTH = 6, 8
 
 
 @pytest.fixture
-def frame(make_frame):
+def frame():
     return make_frame(torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8))
 
 
 @pytest.fixture
-def output(make_output):
+def output():
     plane = 20 + torch.arange(WIDTH, dtype=torch.float32).expand(HEIGHT, WIDTH)  # z = 19.5 + column
     rgb = torch.full((HEIGHT, WIDTH, 3), 0.5)
     return make_output(rgb, depth_accumulated=plane, inverse_depth_accumulated=1 / plane)
 
 
 @pytest.mark.parametrize("quantile", [0.0, 0.5, 0.9, 1.0])
-def test_it_is_a_quantile_of_the_relative_errors(make, quantile):
+def test_it_is_a_quantile_of_the_relative_errors(quantile):
     generator = torch.Generator().manual_seed(0)
     rendered, known = 10 + 20 * torch.rand(2, 101, generator=generator)
     grey, valid = torch.zeros(1, 1, 3), torch.ones(1, 1, dtype=torch.bool)
@@ -66,7 +68,7 @@ def test_without_points_or_without_anything_drawn_it_is_unavailable(frame, outpu
 
 
 @pytest.mark.parametrize("name", ["paper", "authors-code"])
-def test_estimated_depth_is_no_truth(name, frame, output, make):
+def test_estimated_depth_is_no_truth(name, frame, output):
     depth = torch.full((HEIGHT, WIDTH), 21.0)
     estimated = replace(frame, depth=depth, depth_confidence=torch.ones(HEIGHT, WIDTH))
     comparison = registry.protocols.get(name)().compare(output, estimated)

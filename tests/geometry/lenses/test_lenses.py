@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.geometry.lenses.models import LENSES, NOWHERE, octagon_mask, undistortion_map
 
 NAMES = sorted(LENSES)
@@ -140,12 +139,6 @@ def test_scaled_pinhole_is_the_table_moved_by_half_a_pixel(width, height, scaled
     np.testing.assert_allclose([k.cx - 0.5 * x, k.cy - 0.5 * y], scaled[2:], atol=6e-5)
 
 
-def test_half_pixel_correct_centres_on_record():
-    for size, center in (((338, 270), (166.944, 136.558)), ((675, 540), (333.893, 273.617))):
-        k = BROWN.resized(*size).pinhole
-        assert (k.cx - 0.5, k.cy - 0.5) == pytest.approx(center, abs=6e-4)
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_scaling_keeps_what_a_place_in_the_image_sees(name):
     lens = LENSES[name]
@@ -210,18 +203,6 @@ def test_undistortion_map_marks_what_the_lens_does_not_reach():
     assert columns[0, 0] == NOWHERE
     assert np.isfinite(columns).all()
     assert np.isfinite(rows).all()
-
-
-def test_undistorting_with_no_lens_is_the_identity():
-    plain = replace(BROWN, k1=0.0, k2=0.0).resized(90, 72)
-    columns, rows = undistortion_map(plain, plain.pinhole)
-    np.testing.assert_allclose(columns, np.arange(90)[None].repeat(72, 0), atol=1e-4)
-    np.testing.assert_allclose(rows, np.arange(72)[:, None].repeat(90, 1), atol=1e-4)
-
-
-def test_pinhole_scaling_is_its_own_inverse():
-    k = Intrinsics(100.0, 90.0, 40.5, 31.5, 80, 60)
-    assert astuple(k.resized(40, 15).resized(80, 60)) == pytest.approx(astuple(k))
 
 
 def test_octagon_is_symmetric_and_scales():

@@ -100,23 +100,13 @@ def test_tum_of_comments_alone_holds_no_poses(tmp_path):
 # C3VD
 
 
-@pytest.mark.parametrize("order", ["column-major", "row-major"])
-def test_c3vd_in_both_orders(tmp_path, order):
-    trajectory = winding(5)
-    stored = trajectory.camera_to_world
-    stored = stored.transpose(0, 2, 1) if order == "column-major" else stored
-    (tmp_path / "pose.txt").write_text(as_text(stored.reshape(-1, 16), ","))
-    read = c3vd.read(tmp_path / "pose.txt")
-    np.testing.assert_array_equal(read.camera_to_world, trajectory.camera_to_world)
-    assert order in read.stored_as
-
-
 def test_c3vd_is_written_column_by_column(tmp_path):
     trajectory = winding(4)
     c3vd.write(tmp_path / "pose.txt", trajectory)
     numbers = np.loadtxt(tmp_path / "pose.txt", delimiter=",")
     np.testing.assert_array_equal(numbers[:, 12:15], trajectory.centers)
     np.testing.assert_array_equal(numbers[:, :3], trajectory.camera_to_world[:, :3, 0])
+    assert "column-major" in c3vd.read(tmp_path / "pose.txt").stored_as
 
 
 # nerfstudio
