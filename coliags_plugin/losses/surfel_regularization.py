@@ -47,7 +47,7 @@ class NormalConsistencyLoss(Loss[NormalConsistencySettings]):
             raise InputError("normals of single pixels", "whole images", "Set --set sampler=frames")
         depth = output[self.settings.depth]
         known = depth > 0 if mask is None else (depth > 0) & mask
-        of_depth = depth_normals(depth, output.camera, known) * output.alpha.detach()[..., None]
+        of_depth = depth_normals(depth, output.camera, known) * zero_outside(output.alpha.detach(), mask)[..., None]
         return masked_mean(1.0 - (zero_outside(output["normals"], mask) * of_depth).sum(-1), mask)
 
 
