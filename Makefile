@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PYTHONS ?= 3.10 3.11 3.12 3.13
 DEMO ?= demo
-DEMO_STEPS ?= 500
+DEMO_STEPS ?= 300
 DEMO_FLAGS := --data $(DEMO)/phantom --steps $(DEMO_STEPS) --overwrite
 
 .PHONY: demo test test-thorough test-slow lint docs notebooks matrix install install-dev system clean
@@ -12,9 +12,9 @@ DEMO_FLAGS := --data $(DEMO)/phantom --steps $(DEMO_STEPS) --overwrite
 demo: install
 	@echo "1/5  a synthetic colon with exact depth, poses and light ..."
 	@$(BIN)/coliags phantom --output $(DEMO)/phantom --seed 0 --overwrite
-	@echo "2/5  ColIAGS, $(DEMO_STEPS) steps: about a minute on two cores ..."
+	@echo "2/5  ColIAGS, $(DEMO_STEPS) steps: under a minute on two cores ..."
 	@$(BIN)/coliags train coliags --output $(DEMO)/coliags $(DEMO_FLAGS)
-	@echo "3/5  Scaffold-GS with the same depth supervision, as many steps: about a minute ..."
+	@echo "3/5  Scaffold-GS with the same depth supervision, as many steps: under a minute ..."
 	@$(BIN)/coliags train scaffold-gs-depth --output $(DEMO)/scaffold-gs-depth $(DEMO_FLAGS)
 	@echo "4/5  held-out views of both: seconds ..."
 	@$(BIN)/coliags eval $(DEMO)/coliags
