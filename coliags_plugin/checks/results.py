@@ -32,7 +32,7 @@ class CheckResult:
 
 
 class CheckFailedError(Exception):
-    """The method breaks what the check is about; the message says how."""
+    """A check found a fault; the message says which."""
 
 
 class CheckSkippedError(Exception):

@@ -24,7 +24,7 @@ from coliags_plugin.core.progress import Progress
 
 @dataclass(frozen=True)
 class FrameErrors:
-    """DepthErrors of one frame; None where the truth has no depth of that kind.
+    """Errors of one frame's estimate; None where the truth has no depth of that kind.
 
     Attributes:
         name: Of the estimate's frame.

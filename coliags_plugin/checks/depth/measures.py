@@ -22,7 +22,7 @@ _BINS = 10
 
 @dataclass(frozen=True)
 class DepthErrors:
-    """DepthErrors of the pixels that have both an estimate and a truth; None where there are none.
+    """Errors over the pixels that have both an estimate and a truth; None where there are none.
 
     Attributes:
         pixels: Their number.
@@ -46,7 +46,7 @@ class DepthErrors:
 
 @dataclass(frozen=True)
 class Band:
-    """DepthErrors of the pixels whose true depth is in [low, high), units of the truth."""
+    """Errors over the pixels whose true depth is in [low, high), units of the truth."""
 
     low: float
     high: float
