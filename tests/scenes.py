@@ -70,8 +70,4 @@ def write_wall(folder: Path, frames: int = 9, width: int = 32, height: int = 24,
 
 
 #: Overrides that make a shipped method small enough for a test.
-SMALL = (
-    "datamanager.points_count=2000",
-    "field.voxel_size=2.0",
-    "schedule.log_every=1",
-)
+SMALL = ("datamanager.points_count=2000", "field.voxel_size=2.0", "schedule.log_every=1")

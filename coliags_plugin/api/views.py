@@ -17,12 +17,7 @@ from coliags_plugin.core.render_output import DEPTH_KINDS
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.engine import rendering
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.outputs.colormaps import (
-    DEPTH_ERROR_LIMIT_MM,
-    colorize_depth,
-    colorize_depth_error,
-    depth_limits,
-)
+from coliags_plugin.outputs.colormaps import DEPTH_ERROR_LIMIT_MM, colorize_depth, colorize_depth_error, depth_limits
 from coliags_plugin.outputs.image_files import as_array, eight_bit, encode_png
 
 #: Smallest width of an image in a notebook, px on the screen.

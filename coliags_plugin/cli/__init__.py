@@ -72,11 +72,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     os.environ.setdefault("GOMP_SPINCOUNT", "10000")
     try:
         command = tyro.cli(
-            Command,
-            prog="coliags",
-            description=DESCRIPTION,
-            args=argv,
-            config=(tyro.conf.FlagCreatePairsOff,),
+            Command, prog="coliags", description=DESCRIPTION, args=argv, config=(tyro.conf.FlagCreatePairsOff,)
         )
     except SystemExit as refused:
         if refused.code == _USAGE_ERROR and (hint := renamed_argument(sys.argv[1:] if argv is None else argv)):

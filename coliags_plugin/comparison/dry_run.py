@@ -138,7 +138,5 @@ def forecast(
     ordered = sorted((each.size for each in forecasts), reverse=True)
     disk = next(path for path in (folder.path, *folder.path.parents) if path.exists())
     return DryRun(
-        forecasts,
-        phantoms * _PHANTOM_BYTES + sum(ordered) + sum(ordered[:slots]),
-        float(shutil.disk_usage(disk).free),
+        forecasts, phantoms * _PHANTOM_BYTES + sum(ordered) + sum(ordered[:slots]), float(shutil.disk_usage(disk).free)
     )

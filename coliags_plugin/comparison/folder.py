@@ -142,9 +142,7 @@ class ComparisonFolder:
                 result=self.result(cell).relative_to(self.path).as_posix(),
             )
             scenes[cell.scene.name] = PlannedScene(
-                phantom=cell.scene.phantom_record,
-                fingerprint=cell.known_keys.fingerprint,
-                package_version=__version__,
+                phantom=cell.scene.phantom_record, fingerprint=cell.known_keys.fingerprint, package_version=__version__
             )
         plan = ComparisonPlan(
             steps=request.steps, overrides=tuple(request.overrides), scenes=scenes, cells=tuple(entries.values())
@@ -179,10 +177,7 @@ class ComparisonFolder:
     def fail(self, cell: ComparisonCell, reason: str, attempts: int) -> FailureRecord:
         """Record why a cell failed; a full disk loses the record, not the reason."""
         failure = FailureRecord(
-            **cell.named,
-            reason=reason,
-            attempts=attempts,
-            log=str(self.log(cell).relative_to(self.path)),
+            **cell.named, reason=reason, attempts=attempts, log=str(self.log(cell).relative_to(self.path))
         )
         try:
             write_json(self.failure(cell), failure.model_dump(mode="json"))

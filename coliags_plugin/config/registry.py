@@ -97,9 +97,7 @@ class Registry:
         self._discover()
         if name not in self._targets:
             raise InputError(
-                f"no {self.noun} '{name}'",
-                f"one of {', '.join(self.names())}",
-                did_you_mean(name, self._targets),
+                f"no {self.noun} '{name}'", f"one of {', '.join(self.names())}", did_you_mean(name, self._targets)
             )
         target = self._targets[name]
         if isinstance(target, str):
@@ -237,10 +235,7 @@ modules = Registry(
 )
 samplers = Registry(
     "samplers",
-    {
-        "frames": "coliags_plugin.engine.samplers:FrameSampler",
-        "pixels": "coliags_plugin.engine.samplers:PixelSampler",
-    },
+    {"frames": "coliags_plugin.engine.samplers:FrameSampler", "pixels": "coliags_plugin.engine.samplers:PixelSampler"},
     noun="sampler",
 )
 strategies = Registry(

@@ -17,14 +17,7 @@ from coliags_plugin.contracts.heads import AppearanceHead, GeometryHead, Head
 from coliags_plugin.contracts.losses import Loss, LossSettings
 from coliags_plugin.contracts.rendering import Availability, GainModule, Renderer, ResponseModule, ViewModule
 from coliags_plugin.contracts.schedule import Schedule, log_linear
-from coliags_plugin.contracts.training import (
-    Draw,
-    ParameterRows,
-    Sampler,
-    Strategy,
-    TrainedModel,
-    TrainingStep,
-)
+from coliags_plugin.contracts.training import Draw, ParameterRows, Sampler, Strategy, TrainedModel, TrainingStep
 
 __all__ = [
     "AppearanceHead",

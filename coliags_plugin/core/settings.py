@@ -55,11 +55,7 @@ class Settings(BaseModel):
                         type=PydanticCustomError(
                             "unknown_key",
                             "unknown key '{key}'; known keys: {known}. {hint}",
-                            {
-                                "key": str(key),
-                                "known": known,
-                                "hint": did_you_mean(str(key), cls.model_fields),
-                            },
+                            {"key": str(key), "known": known, "hint": did_you_mean(str(key), cls.model_fields)},
                         ),
                         loc=(key,),
                         input=data[key],

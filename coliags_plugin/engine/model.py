@@ -31,11 +31,7 @@ class Model(nn.Module):
     field: Field
 
     def __init__(
-        self,
-        field: Field,
-        renderer: Renderer,
-        view_modules: Mapping[str, ViewModule],
-        near_plane: float = NEAR_PLANE,
+        self, field: Field, renderer: Renderer, view_modules: Mapping[str, ViewModule], near_plane: float = NEAR_PLANE
     ) -> None:
         super().__init__()
         self.field = field

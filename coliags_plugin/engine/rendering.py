@@ -185,12 +185,7 @@ def depth_picture(output: RenderOutput, depth: str, limits: tuple[float, float])
 
 
 def _film(
-    trained: TrainedRun,
-    path: list[Frame],
-    depth: str,
-    limits: tuple[float, float],
-    progress: ProgressReport,
-    done: int,
+    trained: TrainedRun, path: list[Frame], depth: str, limits: tuple[float, float], progress: ProgressReport, done: int
 ) -> Iterator[np.ndarray]:
     for count, frame in enumerate(path, start=1):
         output = render_view(trained, frame, ("rgb", "alpha", depth))

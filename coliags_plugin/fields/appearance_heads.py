@@ -47,10 +47,7 @@ class PlainAppearanceHead(AppearanceHead):
         self.color_mlp = mlp(features + embedded, settings.hidden, 3 * children, generator)
 
     def embed_direction(
-        self,
-        features: Float[Tensor, "V F"],
-        directions: Float[Tensor, "V 3"],
-        normals: Float[Tensor, "V 3"] | None,
+        self, features: Float[Tensor, "V F"], directions: Float[Tensor, "V 3"], normals: Float[Tensor, "V 3"] | None
     ) -> Float[Tensor, "V D"]:
         """Encoding of the viewing direction that the MLP gets; arguments as of :meth:`forward`."""
         return directions

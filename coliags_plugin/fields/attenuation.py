@@ -96,11 +96,7 @@ class AttenuatedAppearanceHead(AppearanceHead):
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Those of the head, the exponents, and the offset of the lamp, which needs a rate in scene units."""
-        return {
-            **self.head.parameter_groups(),
-            "attenuation": [self.exponents],
-            "lamp_offset": [self.lamp_offset],
-        }
+        return {**self.head.parameter_groups(), "attenuation": [self.exponents], "lamp_offset": [self.lamp_offset]}
 
     def forward(
         self,
@@ -130,10 +126,7 @@ class AttenuatedAppearanceHead(AppearanceHead):
         return self.exponents.shape[1] - 1
 
     def law(
-        self,
-        distances: Float[Tensor, "N"],
-        cosines: Float[Tensor, "N"],
-        incidences: Float[Tensor, "N"] | None = None,
+        self, distances: Float[Tensor, "N"], cosines: Float[Tensor, "N"], incidences: Float[Tensor, "N"] | None = None
     ) -> Float[Tensor, "N C"]:
         """The law's factor. [N, C]
 

@@ -46,10 +46,7 @@ class GlintAppearanceHead(IMIAAppearanceHead):
         return {"color_mlp": [*self.color_mlp.parameters(), *self.tilt_layer.parameters()]}
 
     def embed_direction(
-        self,
-        features: Float[Tensor, "V F"],
-        directions: Float[Tensor, "V 3"],
-        normals: Float[Tensor, "V 3"] | None,
+        self, features: Float[Tensor, "V F"], directions: Float[Tensor, "V 3"], normals: Float[Tensor, "V 3"] | None
     ) -> Float[Tensor, "V D"]:
         """v, and the facets' components and lobes."""
         assert normals is not None, "the field keeps normals, as uses_normals says"

@@ -187,12 +187,7 @@ class LitGaussians(ExplicitField[LitGaussiansSettings], LitField[LitGaussiansSet
             colors=light.clamp_min(MIN_LIGHT).pow(1.0 / GAMMA),
             source_index=visible,
             visible_sources=visible,
-            features={
-                "albedo": albedos,
-                "roughness": roughness[:, None],
-                "f0": f0[:, None],
-                "diffuse_factor": factors,
-            },
+            features={"albedo": albedos, "roughness": roughness[:, None], "f0": f0[:, None], "diffuse_factor": factors},
         )
 
     def _reflected(

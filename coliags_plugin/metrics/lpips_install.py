@@ -71,14 +71,8 @@ _SQUEEZE_FEATURES = {"squeeze.backbone.pth": "435cedb387e95bc8291893f61a3a64f034
 
 #: Net -> backbone and linear heads.
 SOURCES: dict[str, tuple[Published, Published]] = {
-    "vgg": (
-        _backbone("vgg"),
-        _heads("vgg", "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868"),
-    ),
-    "alex": (
-        _backbone("alex"),
-        _heads("alex", "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0"),
-    ),
+    "vgg": (_backbone("vgg"), _heads("vgg", "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868")),
+    "alex": (_backbone("alex"), _heads("alex", "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0")),
     "squeeze": (
         _backbone("squeeze", **_SQUEEZE_FEATURES),
         _heads("squeeze", "4a5350f23600cb79923ce65bb07cbf57dca461329894153e05a1346bd531cf76"),

@@ -77,8 +77,7 @@ def _encode(frames: Iterable[np.ndarray | Tensor], scratch: Path, fps: float) ->
                 writer = _writer(scratch, fps, shape[1] + shape[1] % 2, shape[0] + shape[0] % 2)
             elif image.shape != shape:
                 raise InputError(
-                    f"frame {count} is {image.shape[1]} x {image.shape[0]} px",
-                    f"{shape[1]} x {shape[0]} px as frame 0",
+                    f"frame {count} is {image.shape[1]} x {image.shape[0]} px", f"{shape[1]} x {shape[0]} px as frame 0"
                 )
             even = np.pad(image, ((0, shape[0] % 2), (0, shape[1] % 2), (0, 0)), mode="edge")
             writer.write(np.ascontiguousarray(even[:, :, ::-1]))

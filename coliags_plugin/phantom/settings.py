@@ -146,10 +146,7 @@ class PhantomSettings(Settings):
         None, ge=0.0, le=10.0, description="Lamp axis against optical axis, degrees; measured 0.64 on one endoscope."
     )
     interreflection: float = Field(
-        1.0,
-        ge=0.0,
-        le=1.0,
-        description="Scale of indirect light; 1 is the solved radiosity, 0 none.",
+        1.0, ge=0.0, le=1.0, description="Scale of indirect light; 1 is the solved radiosity, 0 none."
     )
     specular: float = Field(1.0, ge=0.0, le=1.0, description="Scale of the mucus film's Fresnel reflection.")
     roughness: float = Field(

@@ -25,8 +25,7 @@ def make_frames(context: StageContext) -> StageOutcome:
     source = frame_source(context.source)
     summary = write_frames(source, context.frames, context.settings.frames, context.mask, context.progress)
     return StageOutcome(
-        summary,
-        {"frames/images": "frames of use, PNG", "frames/frames.json": "which frames were dropped, and why"},
+        summary, {"frames/images": "frames of use, PNG", "frames/frames.json": "which frames were dropped, and why"}
     )
 
 
@@ -77,8 +76,7 @@ def check_data(context: StageContext) -> StageOutcome:
     for finding in check.findings:
         log.warning("suspect: %s (%s). %s", finding.what, finding.evidence, finding.do)
     return StageOutcome(
-        verdict(check),
-        {"check.html": "consistency of images, poses and calibration", "check.json": "the same as JSON"},
+        verdict(check), {"check.html": "consistency of images, poses and calibration", "check.json": "the same as JSON"}
     )
 
 

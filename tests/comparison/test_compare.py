@@ -334,10 +334,7 @@ def test_invalid_input_leaves_no_files(wall, tmp_path):
 
 
 def test_a_second_comparison_in_the_same_folder_is_refused(wall, folder):
-    with (
-        ComparisonFolder(folder).held(),
-        pytest.raises(InputError, match=r"comparison is in use by process \d+"),
-    ):
+    with ComparisonFolder(folder).held(), pytest.raises(InputError, match=r"comparison is in use by process \d+"):
         again(wall, folder)
 
 

@@ -19,16 +19,7 @@ from coliags_plugin.config.assignments import parse_assignments
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.run_folder import RunFolder
 from tests.commands import refused
-from tests.comparison.small import (
-    OFTEN,
-    TINY,
-    check_logs,
-    hashes,
-    start_compare,
-    trainings,
-    undisturbed_hashes,
-    until,
-)
+from tests.comparison.small import OFTEN, TINY, check_logs, hashes, start_compare, trainings, undisturbed_hashes, until
 from tests.scenes import write_wall
 
 STEPS = 300

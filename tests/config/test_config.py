@@ -39,11 +39,7 @@ def test_scaffold_and_coliags_differ_in_heads_only():
     assert ours.pop("description") != rival.pop("description")
     assert ours["field"].pop("geometry_head") == {"name": "imve", "hidden": 32, "frequencies": 10}
     appearance = {"hidden": 32, "bias_init": "scene_distances"}
-    assert ours["field"].pop("appearance_head") == {
-        "name": "imia",
-        "frequencies": 5,
-        **appearance,
-    }
+    assert ours["field"].pop("appearance_head") == {"name": "imia", "frequencies": 5, **appearance}
     assert rival["field"].pop("geometry_head") == {"name": "plain", "hidden": 32}
     assert rival["field"].pop("appearance_head") == {"name": "plain", "distance": False, **appearance}
     assert ours == rival

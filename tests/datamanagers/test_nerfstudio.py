@@ -32,14 +32,7 @@ SIZE = vars(PINHOLE)
 BROWN = {"k1": -0.15, "k2": 0.03, "k3": 0.004, "p1": 0.003, "p2": -0.004}
 FISHEYE = {"k1": -0.05, "k2": 0.01, "k3": 0.003, "k4": -0.001}
 #: The file's keys, pixel centres at integers + 0.5.
-CAMERA = {
-    "fl_x": PINHOLE.fx,
-    "fl_y": PINHOLE.fy,
-    "cx": PINHOLE.cx,
-    "cy": PINHOLE.cy,
-    "w": WIDTH,
-    "h": HEIGHT,
-}
+CAMERA = {"fl_x": PINHOLE.fx, "fl_y": PINHOLE.fy, "cx": PINHOLE.cx, "cy": PINHOLE.cy, "w": WIDTH, "h": HEIGHT}
 COUNT = 9
 
 

@@ -51,22 +51,14 @@ def start(folder, overrides=(), method="scaffold-gs", scene=None):
             ["modules.exposure={name: gain, reference: '0099'}", 'optimizers."exposure.gain"={lr: 0.1}'],
             "gain names frame '0099'",
         ),
-        (
-            "scaffold-gs",
-            ["modules.poses={name: pose-correction, fixed: ['7']}"],
-            "pose-correction names frame '7'",
-        ),
+        ("scaffold-gs", ["modules.poses={name: pose-correction, fixed: ['7']}"], "pose-correction names frame '7'"),
         ("scaffold-gs", ["renderer=volume"], "renderer 'volume' draws radiance, the field is made of gaussians3d"),
         (
             "scaffold-gs",
             ["losses.l1.from_step=20000", "losses.d-ssim=null", "losses.scale-volume=null"],
             "no loss term",
         ),
-        (
-            "scaffold-gs",
-            [f"losses.{name}.until_step=15000" for name in LOSSES],
-            "no loss term counts at step 11 of 20",
-        ),
+        ("scaffold-gs", [f"losses.{name}.until_step=15000" for name in LOSSES], "no loss term counts at step 11 of 20"),
     ],
 )
 def test_refused_by_name_before_anything_is_written(tmp_path, method, overrides, message):

@@ -244,11 +244,7 @@ def test_same_seed_same_field():
 
 @pytest.mark.parametrize(
     ("head", "column"),
-    [
-        ({"name": "imia"}, 32 + 3),
-        ({"name": "imia-glints"}, 32 + 11),
-        ({"name": "plain", "distance": True}, 32 + 3),
-    ],
+    [({"name": "imia"}, 32 + 3), ({"name": "imia-glints"}, 32 + 11), ({"name": "plain", "distance": True}, 32 + 3)],
 )
 def test_hidden_units_start_over_the_distances_that_occur(head, column):
     """Each unit's pre-activation at its own quantile of the distances is what the default start has at distance 0."""

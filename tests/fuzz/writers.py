@@ -99,20 +99,20 @@ WRITERS: dict[str, Writer] = {
         lambda i, o: (
             *("poses", "align", i / "poses.txt", i / "poses.json", "--match", "index"),
             *("--plot", o / "errors.png"),
-        ),
+        )
     ),
     "poses triangulate": Writer(lambda i, o: ("poses", "triangulate", i / "tube", "--output", o / "tube")),
     "poses track": Writer(
         lambda i, o: (
             *("poses", "track", i / "unposed", "--output", o / "tracked"),
             *_settings("tracking.method=hybrid", "tracking.pose_graph=false"),
-        ),
+        )
     ),
     "poses sfm": Writer(
         lambda i, o: (
             *("poses", "sfm", i / "unposed/rgb", "--output", o / "found"),
             *("--camera", "PINHOLE", "--params", (i / "params.txt").read_text()),
-        ),
+        )
     ),
     "depth estimate": Writer(
         lambda i, o: ("depth", "estimate", i / "tube", "--output", o / "depth", "--jobs", 1), goes_on=True

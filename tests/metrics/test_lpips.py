@@ -81,8 +81,7 @@ def test_layers_are_numbered_and_shaped_as_torchvision_s(net):
 
 
 @pytest.mark.parametrize(
-    ("net", "sizes"),
-    [("vgg", [96, 48, 24, 12, 6]), ("alex", [23, 11, 5, 5, 5]), ("squeeze", [47, 23, 11, 5, 5, 5, 5])],
+    ("net", "sizes"), [("vgg", [96, 48, 24, 12, 6]), ("alex", [23, 11, 5, 5, 5]), ("squeeze", [47, 23, 11, 5, 5, 5, 5])]
 )
 def test_every_tap_is_a_relu_of_the_right_width_and_size(net, sizes):
     x, taps = torch.rand(1, 3, 96, 96, generator=torch.Generator().manual_seed(0)), []

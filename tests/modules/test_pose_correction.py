@@ -82,10 +82,7 @@ def test_held_out_frames_follow_the_frames_around_them():
     scene, module = make(frames=17, fixed=("0001",))
     turns, shifts = (
         torch.outer(torch.tensor(module.frames.times) - 1.0, torch.tensor(way))
-        for way in (
-            (0.001, -0.002, 0.003),
-            (0.02, 0.05, -0.03),
-        )
+        for way in ((0.001, -0.002, 0.003), (0.02, 0.05, -0.03))
     )
     with torch.no_grad():
         module.rotation.copy_(turns)
@@ -102,10 +99,7 @@ def test_held_out_frames_follow_the_frames_around_them():
     # beyond the last training frame: its own correction
     ends = [
         module.adjust_camera(last.camera, View(name, time, trained))
-        for name, time, trained in (
-            ("0016", 16.0, False),
-            ("0015", 15.0, True),
-        )
+        for name, time, trained in (("0016", 16.0, False), ("0015", 15.0, True))
     ]
     torch.testing.assert_close(ends[0].camera_to_world, ends[1].camera_to_world)
     assert module.adjust_camera(last.camera, None) is last.camera

@@ -84,9 +84,7 @@ def depth_findings(depth: DepthFacts | None, metric: bool) -> Iterator[Finding]:
         )
     elif depth.median > 1000.0 and metric:
         yield Finding(
-            "depth is too far for an endoscope",
-            f"median {depth.median:.4g} mm",
-            "Check the unit of the depth files",
+            "depth is too far for an endoscope", f"median {depth.median:.4g} mm", "Check the unit of the depth files"
         )
 
 

@@ -54,10 +54,7 @@ class PosesTrackCommand:
         _warn_of_losses(tracking)
         lines = [*_described(tracking), *([_errors(tracking, scene)] if posed else [])]
         print_summary(
-            "\n".join(lines),
-            written=[trajectory, self.output],
-            then=[train_command(self.output)],
-            as_json=self.json,
+            "\n".join(lines), written=[trajectory, self.output], then=[train_command(self.output)], as_json=self.json
         )
 
 

@@ -54,10 +54,7 @@ _OTHERS = (
         Column("fps", "Rendering", "views/s", "higher"), lambda cost: cost.render_fps, "{:.3g}".format, "rendering"
     ),
     _CostColumn(
-        Column("memory", "Peak memory", "MiB", "lower"),
-        lambda cost: cost.peak_memory_mib,
-        "{:,.0f}".format,
-        "training",
+        Column("memory", "Peak memory", "MiB", "lower"), lambda cost: cost.peak_memory_mib, "{:,.0f}".format, "training"
     ),
     _CostColumn(
         Column("gaussians", "Gaussians"),

@@ -7,13 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.datamanagers.reading.files import (
-    TIFF_SUFFIXES,
-    numbered,
-    numbered_images,
-    paired,
-    require_folder,
-)
+from coliags_plugin.datamanagers.reading.files import TIFF_SUFFIXES, numbered, numbered_images, paired, require_folder
 from coliags_plugin.geometry.poses.c3vd import recognise as has_matrices
 
 LAYOUT = (

@@ -46,10 +46,7 @@ SH0 = 0.28209479177387814
 class C3VDEndoGSLAMSettings(SceneSettings):
     """Options of the ``c3vd-endogslam`` data manager."""
 
-    poses: PoseSource = Field(
-        "slam",
-        description="'slam': EndoGSLAM's estimated poses; 'ground-truth': the dataset's.",
-    )
+    poses: PoseSource = Field("slam", description="'slam': EndoGSLAM's estimated poses; 'ground-truth': the dataset's.")
     params_file: str | None = Field(
         None,
         description="EndoGSLAM's params.npz, relative to the scene folder or absolute. None: params.npz in the scene "

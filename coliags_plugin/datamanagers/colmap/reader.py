@@ -60,9 +60,7 @@ class ColmapSettings(SceneSettings):
         description="Largest reprojection error of an observation that gives sparse depth, pixels of the stored image.",
     )
     min_track_length: int = Field(
-        3,
-        ge=2,
-        description="Least track length of points that give sparse depth; all points are initial points.",
+        3, ge=2, description="Least track length of points that give sparse depth; all points are initial points."
     )
     depth_unit: float = Field(
         1.0, gt=0.0, description="Millimetres per stored unit of the files in depths/ (after scale)."

@@ -15,12 +15,7 @@ from coliags_plugin.datamanagers.reading.images import read_mask
 from coliags_plugin.datamanagers.recorded import RecordedDataManager
 from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
 from coliags_plugin.datamanagers.rectification import Rectification
-from coliags_plugin.datamanagers.reim_nerf.files import (
-    RayDistance,
-    ReimNerfSequence,
-    ray_cosines,
-    read_sequence,
-)
+from coliags_plugin.datamanagers.reim_nerf.files import RayDistance, ReimNerfSequence, ray_cosines, read_sequence
 from coliags_plugin.datamanagers.scene_settings import SceneSettings
 from coliags_plugin.datamanagers.seen_masks import find_seen_masks
 from coliags_plugin.datamanagers.splits import Split

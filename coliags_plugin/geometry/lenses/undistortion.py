@@ -37,10 +37,7 @@ class Undistortion:
     """
 
     def __init__(
-        self,
-        lens: Lens,
-        pinhole: Intrinsics,
-        source_mask: Bool[np.ndarray, "H_source W_source"] | None = None,
+        self, lens: Lens, pinhole: Intrinsics, source_mask: Bool[np.ndarray, "H_source W_source"] | None = None
     ) -> None:
         self.lens = lens
         self.source_mask = source_mask

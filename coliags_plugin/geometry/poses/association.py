@@ -149,12 +149,7 @@ def _by_training_frame(first: Trajectory, second: Trajectory, tolerance: float) 
     return np.column_stack([np.arange(len(first)), indices]), ""
 
 
-_ASSOCIATIONS = {
-    "name": _by_name,
-    "time": _by_time,
-    "index": _by_index,
-    "endogslam-train": _by_training_frame,
-}
+_ASSOCIATIONS = {"name": _by_name, "time": _by_time, "index": _by_index, "endogslam-train": _by_training_frame}
 
 
 def _stem(name: str) -> str:

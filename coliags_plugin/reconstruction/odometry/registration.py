@@ -74,11 +74,7 @@ class FrameRegistration:
         self._k = open3d.core.Tensor(intrinsics.opencv_matrix())
 
     def register(
-        self,
-        frames: tuple[int, int],
-        source: PreparedFrame,
-        target: PreparedFrame,
-        guess: Float[np.ndarray, "4 4"],
+        self, frames: tuple[int, int], source: PreparedFrame, target: PreparedFrame, guess: Float[np.ndarray, "4 4"]
     ) -> Edge | None:
         """Estimate the motion from a source to a target frame.
 

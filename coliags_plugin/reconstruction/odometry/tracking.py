@@ -77,10 +77,7 @@ class Tracking:
 
 
 def track(
-    video: Sequence[RgbdFrame],
-    intrinsics: Intrinsics,
-    settings: TrackingSettings,
-    progress: Progress | None = None,
+    video: Sequence[RgbdFrame], intrinsics: Intrinsics, settings: TrackingSettings, progress: Progress | None = None
 ) -> Tracking:
     """Estimate the poses of a video.
 

@@ -65,11 +65,7 @@ def write_colmap_scene(
 
 
 def write_sfm_scene(
-    folder: Path,
-    reconstruction: Reconstruction,
-    masks: Masks = None,
-    overwrite: bool = False,
-    unit: Unit = "unknown",
+    folder: Path, reconstruction: Reconstruction, masks: Masks = None, overwrite: bool = False, unit: Unit = "unknown"
 ) -> None:
     """Write a scene in COLMAP's layout: copies of the registered images, masks, the model and its unit.
 

@@ -80,10 +80,7 @@ class Reconstruction:
 
 
 def reconstruct(
-    images: Sequence[Path],
-    settings: SfmSettings | None = None,
-    masks: Masks = None,
-    progress: Progress | None = None,
+    images: Sequence[Path], settings: SfmSettings | None = None, masks: Masks = None, progress: Progress | None = None
 ) -> Reconstruction:
     """Estimate poses and points by incremental structure from motion, and return the largest model.
 

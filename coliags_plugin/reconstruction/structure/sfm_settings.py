@@ -70,8 +70,6 @@ class SfmSettings(Settings):
     )
     min_model_size: int = Field(default=3, ge=2, description="Least number of registered images of a model.")
     search_images: int = Field(
-        default=24,
-        ge=3,
-        description="An unknown camera is chosen on this many images from the middle of the video.",
+        default=24, ge=3, description="An unknown camera is chosen on this many images from the middle of the video."
     )
     seed: int = Field(default=0, ge=0, description="Seed of COLMAP's random samples.")

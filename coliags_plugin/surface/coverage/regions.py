@@ -59,10 +59,7 @@ def connected(chosen: Bool[np.ndarray, "F"], pairs: Int[np.ndarray, "E 2"]) -> I
 
 
 def large_regions(
-    chosen: Bool[np.ndarray, "F"],
-    pairs: Int[np.ndarray, "E 2"],
-    areas: Float[np.ndarray, "F"],
-    smallest: float,
+    chosen: Bool[np.ndarray, "F"], pairs: Int[np.ndarray, "E 2"], areas: Float[np.ndarray, "F"], smallest: float
 ) -> list[Int[np.ndarray, "K"]]:
     """Connected regions above an area, the largest first, each as the indices of its triangles.
 

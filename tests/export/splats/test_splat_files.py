@@ -41,9 +41,7 @@ def written(tmp_path, cloud: SplatCloud, name: str):
 def test_ply_round_trip(tmp_path_factory, count, degree, exponent, opacity, seed):
     cloud = random_cloud(count, degree, seed=seed)
     cloud = replace(
-        cloud,
-        scales=cloud.scales * np.float32(np.exp(exponent)),
-        opacities=np.full_like(cloud.opacities, opacity),
+        cloud, scales=cloud.scales * np.float32(np.exp(exponent)), opacities=np.full_like(cloud.opacities, opacity)
     )
     again = read_splats(written(tmp_path_factory.mktemp("ply"), cloud, "ply"))
     assert again.degree == degree

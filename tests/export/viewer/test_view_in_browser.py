@@ -14,10 +14,7 @@ from tests.browser import SOFTWARE_WEBGL, Browser, find_chromium
 pytest.importorskip("viser")
 
 CHROMIUM = find_chromium()
-pytestmark = [
-    pytest.mark.thorough,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine"),
-]
+pytestmark = [pytest.mark.thorough, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")]
 
 WIDTH, HEIGHT = 900, 420
 #: Where neither the panel nor a notice is, px.

@@ -148,10 +148,7 @@ def test_nerfstudios_change_of_the_world_is_undone(tmp_path_factory, seed, scale
         matrix[:3, 3] *= scale
     path = tmp_path_factory.mktemp("nerf") / "t.json"
     transforms(path, stored, applied_transform=applied[:3].tolist(), applied_scale=scale)
-    changed, plain = (
-        nerfstudio.read(path),
-        nerfstudio.read(transforms(path.with_name("plain.json"), matrices)),
-    )
+    changed, plain = (nerfstudio.read(path), nerfstudio.read(transforms(path.with_name("plain.json"), matrices)))
     np.testing.assert_allclose(changed.camera_to_world, plain.camera_to_world, atol=1e-9)
     assert any("applied_transform" in remark for remark in changed.remarks)
     assert not plain.remarks[:-1]
