@@ -20,18 +20,13 @@ _STEP = 0.25
 
 @dataclass(frozen=True)
 class CentreLine:
-    """A space curve with a rotation-minimising frame.
+    """A space curve with a rotation-minimising frame."""
 
-    Attributes:
-        points: World, mm, every 0.25 mm of arc. [M, 3]
-        frames: Columns: across, across and tangent; right-handed. [M, 3, 3]
-    """
-
-    points: Float[np.ndarray, "M 3"]
-    frames: Float[np.ndarray, "M 3 3"]
+    points: Float[np.ndarray, "M 3"]  # world, mm, every 0.25 mm of arc
+    frames: Float[np.ndarray, "M 3 3"]  # columns: across, across and tangent; right-handed
 
     def at(self, arc: Float[np.ndarray, "N"]) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3 3"]]:
-        """Points and frames at arc lengths, mm. [N, 3], [N, 3, 3]"""
+        """Points and frames at arc lengths, mm."""
         position = np.clip(np.asarray(arc, dtype=np.float64) / _STEP, 0.0, len(self.points) - 1.001)
         low = position.astype(int)
         weight = position - low

@@ -28,28 +28,18 @@ _RELIEF = ((4.0, 0.2), (1.5, 0.05), (0.6, 0.015))
 
 @dataclass(frozen=True)
 class Fold:
-    """A haustral fold: a thin crescent across part of the circumference.
+    """A haustral fold: a thin crescent across part of the circumference; mm and radians."""
 
-    Attributes:
-        arc: Arc length of its position, mm.
-        clock: Middle of the crescent, radians.
-        half_width: Half the angle it spans, radians.
-        height: Height above the wall at its middle, mm.
-        thickness: Full width at half height, mm.
-        slant: Distance of its ends ahead of its middle, mm.
-        sway: Amplitude and phase of its waviness, mm and radians.
-    """
-
-    arc: float
-    clock: float
-    half_width: float
-    height: float
-    thickness: float
-    slant: float
-    sway: tuple[float, float]
+    arc: float  # arc length of its position
+    clock: float  # middle of the crescent
+    half_width: float  # half the angle it spans
+    height: float  # above the wall at its middle
+    thickness: float  # full width at half height
+    slant: float  # distance of its ends ahead of its middle
+    sway: tuple[float, float]  # amplitude and phase of its waviness
 
     def rise(self, arc: Float[np.ndarray, "S 1"], clock: Float[np.ndarray, "1 C"]) -> Float[np.ndarray, "S C"]:
-        """Height above the wall, mm. [S, C]"""
+        """Height above the wall, mm."""
         turn = _wrapped(clock - self.clock)
         across = np.clip(1.0 - (turn / self.half_width) ** 2, 0.0, None)
         ridge = self.arc + self.slant * (turn / self.half_width) ** 2 + self.sway[0] * np.sin(3.0 * turn + self.sway[1])
@@ -69,7 +59,7 @@ class Polyp:
     height: float
 
     def nearness(self, arc: Float[np.ndarray, "S 1"], clock: Float[np.ndarray, "1 C"]) -> Float[np.ndarray, "S C"]:
-        """1 at the middle, 0 at the rim and outside. [S, C]"""
+        """1 at the middle, 0 at the rim and outside."""
         along = arc - self.arc
         across = _wrapped(clock - self.clock) * RADIUS
         return np.asarray(np.clip(1.0 - (along**2 + across**2) / (0.5 * self.width) ** 2, 0.0, None))
@@ -89,12 +79,12 @@ class Anatomy:
     def taenia_distance(
         self, arc: Float[np.ndarray, "S 1"], clock: Float[np.ndarray, "1 C"]
     ) -> Float[np.ndarray, "3 S C"]:
-        """Clock angle to each of the three taeniae, radians. [3, S, C]"""
+        """Clock angle to each of the three taeniae, radians."""
         rotated = clock - self.taenia_clock - self.taenia_twist * arc
         return _wrapped(rotated[None] - _TAENIAE[:, None, None])
 
     def radius(self, arc: Float[np.ndarray, "S"], clock: Float[np.ndarray, "C"]) -> Float[np.ndarray, "S C"]:
-        """Distance of the wall from the centre line, mm. [S, C]"""
+        """Distance of the wall from the centre line, mm."""
         arc, clock = arc[:, None], clock[None, :]
         # Narrower beyond the bend (and so never wider than the bend's radius of curvature).
         calibre = RADIUS * (1.0 + 0.05 * np.sin(2.0 * np.pi * arc / 90.0 + self.swell_phase))
@@ -162,47 +152,32 @@ class ColonSurface:
     """The wall as a mesh on a grid: rows along the colon, columns around it (periodic).
 
     Rows are evenly spaced along the wall's surface, not along the centre line, so that texture and mesh are not
-    stretched on the flanks of folds.
-
-    Attributes:
-        vertices: World, mm, row-major. [R*C, 3]
-        normals: Unit, into the lumen. [R*C, 3]
-        tangents: Unit, along the colon. [R*C, 3]
-        triangles: Vertex indices; counter-clockwise seen from the lumen. [F, 3]
-        areas: Wall area of each vertex, mm^2. [R*C]
-        arc: Arc length of each row, mm. [R]
-        columns: C.
-        row_length: Mean distance of rows along the wall, mm.
+    stretched on the flanks of folds. Vertices are row-major.
     """
 
-    vertices: Float[np.ndarray, "V 3"]
-    normals: Float[np.ndarray, "V 3"]
-    tangents: Float[np.ndarray, "V 3"]
-    triangles: Int[np.ndarray, "F 3"]
-    areas: Float[np.ndarray, "V"]
-    arc: Float[np.ndarray, "R"]
+    vertices: Float[np.ndarray, "V 3"]  # world, mm
+    normals: Float[np.ndarray, "V 3"]  # unit, into the lumen
+    tangents: Float[np.ndarray, "V 3"]  # unit, along the colon
+    triangles: Int[np.ndarray, "F 3"]  # vertex indices; counter-clockwise seen from the lumen
+    areas: Float[np.ndarray, "V"]  # wall area of each vertex, mm^2
+    arc: Float[np.ndarray, "R"]  # arc length of each row, mm
     columns: int
-    row_length: float
+    row_length: float  # mean distance of rows along the wall, mm
 
     @property
     def rows(self) -> int:
-        """R."""
+        """Number of rows."""
         return len(self.arc)
 
     @property
     def clock(self) -> Float[np.ndarray, "C"]:
-        """Clock angle of each column, radians. [C]"""
+        """Clock angle of each column, radians."""
         return np.arange(self.columns) * (2.0 * np.pi / self.columns)
 
     def grid_coordinates(
         self, triangle: Int[np.ndarray, "N"], barycentric: Float[np.ndarray, "N 2"]
     ) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
-        """Fractional row and column of points inside triangles.
-
-        Args:
-            triangle: Triangle indices. [N]
-            barycentric: Weights of the second and third corner. [N, 2]
-        """
+        """Fractional row and column of points inside triangles, by the weights of the second and third corner."""
         cell, odd = np.divmod(triangle, 2)
         row, column = np.divmod(cell, self.columns)
         sign = 1.0 - 2.0 * odd.astype(np.float32)

@@ -44,27 +44,16 @@ _POINTS = 20_000
 
 @dataclass(frozen=True)
 class PreparedPhantom:
-    """A prepared phantom: scene, camera poses and exposure, from which :func:`generate` renders the frames.
+    """A prepared phantom: scene, camera poses and exposure, from which :func:`generate` renders the frames."""
 
-    Attributes:
-        settings: Resolved settings.
-        layout: Output layout.
-        world: Wall, material, lamp.
-        sensor: Sensor of every image.
-        poses: Poses of the sequence. [T, 4, 4]
-        rotation_views: Test views with rotated cameras.
-        indirect: Indirect light for the sequence and then the rotation views.
-        gains: Red, green, blue gain of every frame of the sequence. [T, 3]
-    """
-
-    settings: PhantomSettings
+    settings: PhantomSettings  # resolved
     layout: Layout
     world: World
     sensor: Sensor
-    poses: Float[np.ndarray, "T 4 4"]
-    rotation_views: list[RotationView]
-    indirect: list[IndirectLight | None]
-    gains: Float[np.ndarray, "T 3"]
+    poses: Float[np.ndarray, "T 4 4"]  # of the sequence
+    rotation_views: list[RotationView]  # test views with rotated cameras
+    indirect: list[IndirectLight | None]  # for the sequence and then the rotation views
+    gains: Float[np.ndarray, "T 3"]  # red, green, blue gain of every frame of the sequence
 
     @property
     def training_poses(self) -> list[Float[np.ndarray, "4 4"]]:
@@ -73,7 +62,7 @@ class PreparedPhantom:
 
     @property
     def vertex_albedo(self) -> Float[np.ndarray, "V 3"]:
-        """Albedo at the mesh's vertices, linear RGB. [V, 3]"""
+        """Albedo at the mesh's vertices, linear RGB."""
         return vertex_albedo(self.world.surface, self.world.mucosa)
 
     def render_frame(self, number: int) -> tuple[Exposure, UInt8[np.ndarray, "P 3"]]:
@@ -95,7 +84,7 @@ class PreparedPhantom:
     def seen(
         self, points: Float[np.ndarray, "N 3"], camera_to_world: Float[np.ndarray, "4 4"]
     ) -> Bool[np.ndarray, "N"]:
-        """Which points of the wall seen from this pose are also seen by a training frame. [N]"""
+        """Which points of the wall seen from this pose are also seen by a training frame."""
         order = nearest_poses_first(camera_to_world, self.training_poses)
         return seen_from(points, order, self.sensor.lens, self.sensor.mask, self.world.tracer)
 
@@ -114,11 +103,7 @@ def resolve(settings: PhantomSettings, layout: Layout) -> PhantomSettings:
 
 
 def prepare(settings: PhantomSettings, progress: Progress | None = None) -> PreparedPhantom:
-    """Generate the colon and the camera path, and solve for indirect light and exposure.
-
-    Raises:
-        InputError: The seed's colon leaves no clearance for the path, or open3d is missing.
-    """
+    """Generate the colon and the camera path, and solve for indirect light and exposure."""
     report = progress or (lambda stage, done, total: None)
     layout: Layout = phantom_layouts.get(settings.layout)()
     settings = resolve(settings, layout)
@@ -237,7 +222,7 @@ def _rendered_frames(phantom: PreparedPhantom, total: int) -> Iterator[tuple[Exp
 def _seen_mask(
     phantom: PreparedPhantom, exposure: Exposure, camera_to_world: Float[np.ndarray, "4 4"]
 ) -> UInt8[np.ndarray, "P"]:
-    """Seen mask: 255 where a training frame sees the pixel's surface point, else 0. [P]"""
+    """Seen mask: 255 where a training frame sees the pixel's surface point, else 0."""
     hit = np.flatnonzero(exposure.z_depth > 0.0)
     points = _wall(phantom, exposure, camera_to_world, hit)
     mask = np.zeros(len(exposure.z_depth), np.uint8)
@@ -251,7 +236,7 @@ def _wall(
     camera_to_world: Float[np.ndarray, "4 4"],
     pixels: Int[np.ndarray, "N"],
 ) -> Float[np.ndarray, "N 3"]:
-    """Wall points of the lit pixels, world frame. [N, 3]"""
+    """Wall points of the lit pixels, world frame."""
     local = phantom.sensor.centers[pixels] * exposure.z_depth[pixels, None]
     return np.asarray(local.astype(np.float64) @ camera_to_world[:3, :3].T + camera_to_world[:3, 3])
 
@@ -323,7 +308,7 @@ def _write_truth(
 
 
 def vertex_albedo(surface: ColonSurface, mucosa: Mucosa) -> Float[np.ndarray, "V 3"]:
-    """Albedo at the mesh's vertices, averaged over a mesh cell. [V, 3]"""
+    """Albedo at the mesh's vertices, averaged over a mesh cell."""
     row, column = np.meshgrid(
         np.arange(surface.rows, dtype=np.float32), np.arange(surface.columns, dtype=np.float32), indexing="ij"
     )

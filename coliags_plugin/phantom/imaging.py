@@ -20,19 +20,12 @@ _CHUNK = 1 << 15
 
 @dataclass(frozen=True)
 class Sensor:
-    """The lit pixels and their ray directions.
-
-    Attributes:
-        lens: Lens.
-        mask: Lit pixels. [H, W]
-        centers: Ray direction through each lit pixel's centre. [P, 3]
-        samples: Directions of its K colour samples. [P, K, 3]
-    """
+    """The lit pixels and their ray directions."""
 
     lens: Lens
-    mask: Bool[np.ndarray, "H W"]
-    centers: Float[np.ndarray, "P 3"]
-    samples: Float[np.ndarray, "P K 3"]
+    mask: Bool[np.ndarray, "H W"]  # lit pixels
+    centers: Float[np.ndarray, "P 3"]  # ray direction through each lit pixel's centre
+    samples: Float[np.ndarray, "P K 3"]  # directions of its K colour samples
 
     @classmethod
     def behind(cls, lens: Lens, mask: Bool[np.ndarray, "H W"], supersampling: int) -> Sensor:
@@ -61,7 +54,7 @@ class Sensor:
         return Sensor(self.lens, mask, chosen, chosen[:, None, :])
 
     def image(self, values: np.ndarray) -> np.ndarray:
-        """Scatter values of the lit pixels to an image that is 0 elsewhere. [P, ...] -> [H, W, ...]"""
+        """Scatter values of the lit pixels to an image that is 0 elsewhere."""
         image = np.zeros((*self.mask.shape, *values.shape[1:]), values.dtype)
         image[self.mask] = values
         return image
@@ -80,19 +73,12 @@ class World:
 
 @dataclass(frozen=True)
 class Exposure:
-    """Rendered values of the sensor's P lit pixels.
+    """Rendered values of the sensor's P lit pixels."""
 
-    Attributes:
-        radiance: Linear, before exposure. [P, 3]
-        z_depth: mm at the pixel's centre; 0 where the ray hits nothing. [P]
-        normals: Unit, camera axes, towards the camera; 0 where the ray hits nothing. [P, 3]
-        triangles: Indices of all triangles hit.
-    """
-
-    radiance: Float[np.ndarray, "P 3"]
-    z_depth: Float[np.ndarray, "P"]
-    normals: Float[np.ndarray, "P 3"]
-    triangles: Int[np.ndarray, "T"]
+    radiance: Float[np.ndarray, "P 3"]  # linear, before exposure
+    z_depth: Float[np.ndarray, "P"]  # mm at the pixel's centre; 0 where the ray hits nothing
+    normals: Float[np.ndarray, "P 3"]  # unit, camera axes, towards the camera; 0 where the ray hits nothing
+    triangles: Int[np.ndarray, "T"]  # indices of all triangles hit
 
 
 def expose(
@@ -124,7 +110,7 @@ def expose(
 def meter(
     world: World, sensor: Sensor, camera_to_world: Float[np.ndarray, "4 4"], indirect: IndirectLight | None
 ) -> Float[np.ndarray, "P 3"]:
-    """Radiance of the pixels' centres only, for exposure metering. [P, 3]"""
+    """Radiance of the pixels' centres only, for exposure metering."""
     hits = world.tracer.cast(camera_to_world, sensor.centers)
     light = np.zeros((len(sensor.centers), 3), np.float32)
     spacing = float(np.sqrt(_pixel_solid_angle(sensor)))
@@ -140,17 +126,10 @@ def shade(
     spacing: float,
     indirect: IndirectLight | None,
 ) -> Float[np.ndarray, "N 3"]:
-    """Radiance reflected from ray hits towards the camera.
+    """Radiance reflected from ray hits, all valid, towards the camera.
 
-    ``cos^k theta (albedo (E n.l + E_indirect) + gloss E)`` with ``E = beam (20 / d)^2``.
-
-    Args:
-        world: Wall, lamp and lens.
-        camera_to_world: Pose. [4, 4]
-        directions: Ray directions, camera axes, z = 1. [N, 3]
-        hits: Their hits; all valid. [N]
-        spacing: Distance between neighbouring samples at z-depth 1.
-        indirect: Indirect light, or None.
+    ``cos^k theta (albedo (E n.l + E_indirect) + gloss E)`` with ``E = beam (20 / d)^2``. Directions are in camera axes
+    with z = 1; ``spacing`` is the distance between neighbouring samples at z-depth 1.
     """
     length = np.sqrt(np.einsum("nc,nc->n", directions, directions))
     cos_theta = 1.0 / length

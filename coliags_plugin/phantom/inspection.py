@@ -45,22 +45,15 @@ _FAR_ANGLES = np.arange(0.0, 36.0, 2.0)
 
 @dataclass(frozen=True)
 class _Withdrawal:
-    """The motion without its approaches: along the centre line, drifting sideways between them.
-
-    Attributes:
-        centre_line: Centre line of the colon.
-        length: mm of arc.
-        most: Largest offset along each of the two across directions, mm.
-        drift: Curve of each offset, of amplitude 1.
-    """
+    """The motion without its approaches: along the centre line, drifting sideways between them."""
 
     centre_line: CentreLine
-    length: float
-    most: float
-    drift: tuple[Curve, Curve]
+    length: float  # mm of arc
+    most: float  # largest offset along each of the two across directions, mm
+    drift: tuple[Curve, Curve]  # curve of each offset, of amplitude 1
 
     def at(self, time: Float[np.ndarray, "T"]) -> tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T 3 3"]]:
-        """Positions, world, mm, and frames of the centre line there. [T, 3], [T, 3, 3]"""
+        """Positions, world, mm, and frames of the centre line there."""
         arc = resting(SHALLOW_END + self.length * np.linspace(1.0, 0.0, 2 * APPROACHES + 1)[:, None], time)[:, 0]
         points, frames = self.centre_line.at(arc)
         sideways = self.most * np.stack([curve(time) for curve in self.drift], axis=1)
@@ -70,28 +63,14 @@ class _Withdrawal:
 
 @dataclass(frozen=True)
 class _Spot:
-    """A near stop.
+    """A near stop, in the centre line's frame."""
 
-    Attributes:
-        shift: Camera's offset from the withdrawal, in the centre line's frame, mm. [3]
-        turn: Rotation vector from the centre line's direction to the spot's, in that frame, radians. [3]
-    """
-
-    shift: Float[np.ndarray, "3"]
-    turn: Float[np.ndarray, "3"]
+    shift: Float[np.ndarray, "3"]  # camera's offset from the withdrawal, mm
+    turn: Float[np.ndarray, "3"]  # rotation vector from the centre line's direction to the spot's, radians
 
 
 def inspecting_path(centre_line: CentreLine, settings: PhantomSettings, tracer: Tracer) -> Float[np.ndarray, "T 4 4"]:
-    """Camera-to-world pose of every frame, OpenCV axes, mm. [T, 4, 4]
-
-    Args:
-        centre_line: Centre line of the colon.
-        settings: Seed, frames, length of the withdrawal, and the preset's sideways motion and roll.
-        tracer: Ray tracer of the wall.
-
-    Raises:
-        InputError: The colon has no spot that can be approached.
-    """
+    """Camera-to-world pose of every frame, OpenCV axes, mm."""
     generator = stream(settings.seed, Purpose.TRAJECTORY)
     drift = draw_sway(generator), draw_sway(generator)
     roll = draw_sway(generator)
@@ -116,7 +95,7 @@ def inspecting_path(centre_line: CentreLine, settings: PhantomSettings, tracer: 
 
 
 def resting(values: Float[np.ndarray, "S K"], time: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T K"]:
-    """A twice continuously differentiable curve through values at even times from 0 to 1, which rests at each. [T, K]
+    """A twice continuously differentiable curve through values at even times from 0 to 1, which rests at each.
 
     Between two of them it follows Perlin's quintic, whose first and second derivatives are 0 at its ends.
     """
@@ -128,7 +107,7 @@ def resting(values: Float[np.ndarray, "S K"], time: Float[np.ndarray, "T"]) -> F
 
 
 def nearness(time: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T"]:
-    """0 at far stops, 1 at near stops. [T]"""
+    """0 at far stops, 1 at near stops."""
     return resting((np.arange(2 * APPROACHES + 1) % 2.0)[:, None], time)[:, 0]
 
 
@@ -183,7 +162,7 @@ def _approach(withdrawal: _Withdrawal, number: int, turn: Float[np.ndarray, "3"]
 def _far_turn(
     withdrawal: _Withdrawal, time: float, neighbours: Float[np.ndarray, "N 3"], tracer: Tracer
 ) -> Float[np.ndarray, "3"]:
-    """Rotation vector of a far stop: the one nearest to its neighbours' of those whose wall is about 60 mm away. [3]"""
+    """Rotation vector of a far stop: the one nearest to its neighbours' of those whose wall is about 60 mm away."""
     (point,), (frame,) = withdrawal.at(np.array([time]))
     clocks = np.arange(24) * (np.pi / 12.0)
     turns = np.array([_turn(angle, clock) for angle in np.radians(_FAR_ANGLES) for clock in clocks])
@@ -201,14 +180,7 @@ def _far_turn(
 def _distances(
     point: Float[np.ndarray, "3"], frame: Float[np.ndarray, "3 3"], directions: Float[np.ndarray, "N 3"], tracer: Tracer
 ) -> Float[np.ndarray, "N"]:
-    """Distances of the wall from a point, mm; infinite where there is none. [N]
-
-    Args:
-        point: World, mm. [3]
-        frame: Axes of the directions. [3, 3]
-        directions: Less than 90 degrees from the third axis. [N, 3]
-        tracer: Ray tracer of the wall.
-    """
+    """Distances, mm, of the wall from a point, infinite where there is none; directions are in axes ``frame``."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = frame, point
     directions = directions / directions[:, 2:]
@@ -217,10 +189,10 @@ def _distances(
 
 
 def _turn(angle: float, clock: float) -> Float[np.ndarray, "3"]:
-    """Rotation vector that turns the third axis by an angle towards a clock angle around it, radians. [3]"""
+    """Rotation vector that turns the third axis by an angle towards a clock angle around it, radians."""
     return angle * np.array([-np.sin(clock), np.cos(clock), 0.0])
 
 
 def _matrices(turns: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3 3"]:
-    """Rotations of rotation vectors. [..., 3, 3]"""
+    """Rotations of rotation vectors."""
     return np.asarray(Rotation.from_rotvec(turns).as_matrix())

@@ -27,19 +27,14 @@ _BOUNCES = 24
 
 @dataclass(frozen=True)
 class IndirectLight:
-    """Indirect irradiance on a coarse grid over the colon, for one position of the lamp.
-
-    Attributes:
-        irradiance: In the unit of :mod:`light`. [R, C, 3]
-        rows_per_row, columns_per_column: Patches per row and column of the mesh.
-    """
+    """Indirect irradiance on a coarse grid over the colon, for one place of the lamp, in the unit of :mod:`light`."""
 
     irradiance: Float[np.ndarray, "R C 3"]
-    rows_per_row: float
-    columns_per_column: float
+    rows_per_row: float  # patches per row of the mesh
+    columns_per_column: float  # likewise
 
     def at(self, row: Float[np.ndarray, "N"], column: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N 3"]:
-        """Bilinear interpolation between patch centres; columns are periodic. [N, 3]"""
+        """Bilinear interpolation between patch centres; columns are periodic."""
         rows, columns = self.irradiance.shape[:2]
         y = np.clip(row * self.rows_per_row - 0.5, 0.0, rows - 1.001)
         x = column * self.columns_per_column - 0.5
@@ -55,21 +50,13 @@ class IndirectLight:
 
 @dataclass(frozen=True)
 class Patches:
-    """Patches of the wall.
+    """Patches of the wall."""
 
-    Attributes:
-        points: Sample points, world, mm. [P, K, 3]
-        normals: Unit, into the lumen. [P, K, 3]
-        areas: mm^2. [P]
-        albedo: Linear RGB. [P, 3]
-        shape: Rows and columns; P is their product.
-    """
-
-    points: Float[np.ndarray, "P K 3"]
-    normals: Float[np.ndarray, "P K 3"]
-    areas: Float[np.ndarray, "P"]
-    albedo: Float[np.ndarray, "P 3"]
-    shape: tuple[int, int]
+    points: Float[np.ndarray, "P K 3"]  # sample points, world, mm
+    normals: Float[np.ndarray, "P K 3"]  # unit, into the lumen
+    areas: Float[np.ndarray, "P"]  # mm^2
+    albedo: Float[np.ndarray, "P 3"]  # linear RGB
+    shape: tuple[int, int]  # rows and columns; P is their product
 
 
 def make_patches(
@@ -106,7 +93,7 @@ def make_patches(
 
 
 def form_factors(patches: Patches, tracer: Tracer) -> Float[np.ndarray, "P P"]:
-    """Form factors from patch j to patch i. [P, P]
+    """Form factors from patch j to patch i.
 
     The form factor of a small disc of area A is ``cos cos A / (pi r^2 + A)``, averaged over pairs of samples.
     """
@@ -134,13 +121,7 @@ def form_factors(patches: Patches, tracer: Tracer) -> Float[np.ndarray, "P P"]:
 def solve(
     patches: Patches, factors: Float[np.ndarray, "P P"], direct: Float[np.ndarray, "P T"]
 ) -> Float[np.ndarray, "T P 3"]:
-    """Solve for the indirect irradiance of T lamps at once.
-
-    Args:
-        patches: The wall.
-        factors: From :func:`form_factors`. [P, P]
-        direct: Direct irradiance from each (white) lamp. [P, T]
-    """
+    """Solve for the indirect irradiance of T lamps at once, from the direct irradiance of each (white) lamp."""
     answer = np.empty((direct.shape[1], direct.shape[0], 3), np.float32)
     for channel in range(3):
         albedo = patches.albedo[:, channel, None]
@@ -160,17 +141,7 @@ def indirect_lights(
     share: float,
     generator: np.random.Generator,
 ) -> list[IndirectLight]:
-    """Indirect light for every camera pose.
-
-    Args:
-        surface: The wall.
-        vertex_albedo: Its albedo, linear RGB. [V, 3]
-        tracer: Ray tracer for visibility.
-        lamp: Lamp, fixed to the cameras.
-        cameras_to_world: Poses, each [4, 4].
-        share: Factor on the result.
-        generator: Random generator of the patches' sample points.
-    """
+    """Indirect light for every camera pose, times a factor ``share``."""
     patches = make_patches(surface, vertex_albedo, generator)
     factors = form_factors(patches, tracer)
     flat_points, flat_normals = patches.points.reshape(-1, 3), patches.normals.reshape(-1, 3)

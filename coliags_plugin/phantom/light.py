@@ -25,17 +25,10 @@ UNIT_DISTANCE = 20.0
 
 @dataclass(frozen=True)
 class CameraLight:
-    """A spotlight fixed to the camera, and the mucosa's specular reflection.
+    """A spotlight fixed to the camera, and the mucosa's specular reflection; see :class:`PhantomSettings`."""
 
-    Attributes:
-        offset: Position in camera axes, mm.
-        axis: Unit direction of the beam in camera axes.
-        spread_law, spread: Angular fall-off; see :class:`PhantomSettings`.
-        specular, roughness, f0: The mucus film; see :class:`PhantomSettings`.
-    """
-
-    offset: tuple[float, float, float]
-    axis: tuple[float, float, float]
+    offset: tuple[float, float, float]  # camera axes, mm
+    axis: tuple[float, float, float]  # unit direction of the beam, camera axes
     spread_law: SpreadLaw
     spread: float
     specular: float
@@ -63,24 +56,15 @@ class CameraLight:
         return bool(np.hypot(self.offset[0], self.offset[1]) > 0.0)
 
     def beam(self, cosine: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
-        """Intensity at an angle psi from the beam's axis, 1 on it. [N]
-
-        Args:
-            cosine: cos psi. [N]
-        """
+        """Intensity at an angle psi from the beam's axis by its cosine, 1 on the axis."""
         return beam(cosine, self.spread_law, self.spread)
 
     def irradiance(
         self, points: Float[np.ndarray, "N 3"], camera_to_world: Float[np.ndarray, "4 4"]
     ) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N 3"]]:
-        """Irradiance of surfaces perpendicular to the light, and the directions to the lamp.
+        """Irradiance of surfaces perpendicular to the light, and unit directions to the lamp; world, mm.
 
-        Args:
-            points: World, mm. [N, 3]
-            camera_to_world: Camera pose. [4, 4]
-
-        Returns:
-            ``beam(cos psi) (20 / d)^2`` and unit directions from the points to the lamp, world. [N], [N, 3]
+        The irradiance is ``beam(cos psi) (20 / d)^2``.
         """
         rotation, center = camera_to_world[:3, :3], camera_to_world[:3, 3]
         lamp = (center + rotation @ np.asarray(self.offset)).astype(points.dtype)
@@ -97,16 +81,11 @@ class CameraLight:
         to_eye: Float[np.ndarray, "N 3"],
         slope_variance: Float[np.ndarray, "N"],
     ) -> Float[np.ndarray, "N"]:
-        """Pi times the GGX reflection of the film times n.l: radiance per unit of :meth:`irradiance`. [N]
+        """Pi times the GGX reflection of the film times n.l: radiance per unit of :meth:`irradiance`.
 
-        Smith's height-correlated masking and Schlick's Fresnel term.
-
-        Args:
-            normals: Unit, with the micro-relief. [N, 3]
-            to_lamp: Unit. [N, 3]
-            to_eye: Unit. [N, 3]
-            slope_variance: Slope variance of relief smaller than the sample, summed over two directions; it widens the
-                lobe like roughness (a GGX lobe of width alpha has slope variance alpha^2). [N]
+        Smith's height-correlated masking and Schlick's Fresnel term, of unit vectors. The slope variance of relief
+        smaller than the sample, summed over two directions, widens the lobe like roughness (a GGX lobe of width alpha
+        has slope variance alpha^2).
         """
         half = to_lamp + to_eye
         half /= np.maximum(np.sqrt(np.einsum("nc,nc->n", half, half)), 1e-6)[:, None]

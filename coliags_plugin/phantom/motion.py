@@ -18,7 +18,7 @@ Curve = Callable[[Float[np.ndarray, "T"]], Float[np.ndarray, "T"]]
 
 
 def times(settings: PhantomSettings) -> Float[np.ndarray, "T"]:
-    """Time of every frame along the path, from 0 to 1: even steps, and none during pauses. [T]"""
+    """Time of every frame along the path, from 0 to 1: even steps, and none during pauses."""
     pauses = settings.pauses
     moving = settings.frames - pauses * settings.pause_frames
     frames = np.ones(moving, dtype=np.int64)

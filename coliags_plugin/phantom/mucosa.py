@@ -31,53 +31,33 @@ _LEVELS = 6
 
 @dataclass(frozen=True)
 class MucosaSample:
-    """The wall's material at N points.
+    """The wall's material at N points."""
 
-    Attributes:
-        albedo: Linear RGB. [N, 3]
-        wetness: Coverage by the mucus film, 0 to 1. [N]
-        slopes: Micro-relief along the colon and around it, rise per run. [N, 2]
-        slope_variance: Slope variance filtered out within the footprint, summed over both directions. [N]
-    """
-
-    albedo: Float[np.ndarray, "N 3"]
-    wetness: Float[np.ndarray, "N"]
-    slopes: Float[np.ndarray, "N 2"]
-    slope_variance: Float[np.ndarray, "N"]
+    albedo: Float[np.ndarray, "N 3"]  # linear RGB
+    wetness: Float[np.ndarray, "N"]  # coverage by the mucus film, 0 to 1
+    slopes: Float[np.ndarray, "N 2"]  # micro-relief along the colon and around it, rise per run
+    slope_variance: Float[np.ndarray, "N"]  # filtered out within the footprint, both directions summed
 
 
 @dataclass(frozen=True)
 class Mucosa:
-    """Mipmapped texture; columns are periodic.
+    """Mipmapped texture; columns are periodic."""
 
-    Attributes:
-        color: Albedo RGB and wetness, float32, per level. [Hl, Wl + 2, 4]
-        relief: Slopes along and around and their summed squares, float32, per level. [Hl, Wl + 2, 3]
-        texel: Size of a texel of level 0, mm.
-        rows_per_row, columns_per_column: Texels of level 0 per row and column of the mesh.
-    """
-
-    color: tuple[Float[np.ndarray, "H W 4"], ...]
-    relief: tuple[Float[np.ndarray, "H W 3"], ...]
-    texel: float
-    rows_per_row: float
-    columns_per_column: float
+    color: tuple[Float[np.ndarray, "H W 4"], ...]  # albedo RGB and wetness, float32, per level
+    relief: tuple[Float[np.ndarray, "H W 3"], ...]  # slopes along, around and their summed squares, per level
+    texel: float  # size of a texel of level 0, mm
+    rows_per_row: float  # texels of level 0 per row of the mesh
+    columns_per_column: float  # likewise
 
     @property
     def albedo(self) -> Float[np.ndarray, "H W 3"]:
-        """The full-size albedo texture, linear RGB. [H, W, 3]"""
+        """The full-size albedo texture, linear RGB."""
         return self.color[0][:, 1:-1, :3]
 
     def sample(
         self, row: Float[np.ndarray, "N"], column: Float[np.ndarray, "N"], footprint: Float[np.ndarray, "N"]
     ) -> MucosaSample:
-        """Sample the material at grid coordinates, filtered to the footprint of a camera sample.
-
-        Args:
-            row: Fractional row of the mesh's grid. [N]
-            column: Fractional column of the mesh's grid. [N]
-            footprint: Size of the sample on the wall, mm. [N]
-        """
+        """Sample the material at fractional rows and columns of the mesh, filtered to a sample's footprint, mm."""
         level = np.clip(np.log2(np.maximum(footprint / self.texel, 1.0)), 0.0, _LEVELS - 1.001).astype(np.float32)
         lower = level.astype(np.int32)
         fraction = level - lower
@@ -158,7 +138,7 @@ def paint_mucosa(anatomy: Anatomy, surface: ColonSurface, settings: PhantomSetti
 
 
 def _texel_positions(surface: ColonSurface, shape: tuple[int, int]) -> Float[np.ndarray, "H W 3"]:
-    """Texel centres in the world frame, mm. [H, W, 3]"""
+    """Texel centres in the world frame, mm."""
     grid = surface.vertices.reshape(surface.rows, surface.columns, 3)
     grid = np.concatenate([grid, grid[:, :1]], axis=1)
     row = (np.arange(shape[0], dtype=np.float32) + 0.5) * ((surface.rows - 1) / shape[0])
@@ -170,7 +150,7 @@ def _texel_positions(surface: ColonSurface, shape: tuple[int, int]) -> Float[np.
 def _draw_vessels(
     shape: tuple[int, int], sizes: tuple[float, float], generator: np.random.Generator
 ) -> Float[np.ndarray, "H W"]:
-    """Vessel density at each texel, 0 to about 1. [H, W]
+    """Vessel density at each texel, 0 to about 1.
 
     Vessels are random walks that taper and branch. Half are deep, blurred and attenuated by the tissue above.
     """
@@ -248,7 +228,7 @@ def _pyramid(texture: Float[np.ndarray, "H W K"]) -> tuple[Float[np.ndarray, "H 
 def _look_up(
     texture: Float[np.ndarray, "H W K"], x: Float[np.ndarray, "N"], y: Float[np.ndarray, "N"]
 ) -> Float[np.ndarray, "N K"]:
-    """Bilinear values, centres at integers, rows clamped. [N, K]"""
+    """Bilinear values, centres at integers, rows clamped."""
     # cv2.remap takes maps of at most 32767 per side.
     width = min(len(x), 4096)
     padded = -len(x) % width

@@ -31,14 +31,10 @@ def exposure_for(radiance: Float[np.ndarray, "N 3"], target: float, gamma: float
 
 
 def exposures(ideal: Sequence[float], settings: PhantomSettings) -> Float[np.ndarray, "T"]:
-    """Exposure gain of every frame.
+    """Exposure gain of every frame, from the gain that would bring it to the target grey.
 
     Automatic exposure follows the logarithm of the ideal gain with a first-order lag, limited to ``gain_span`` around
     the sequence's median; fixed exposure is the median.
-
-    Args:
-        ideal: For each frame, the gain that would bring it to the target grey. [T]
-        settings: Gain and its lag and span.
     """
     wanted = np.log(np.asarray(ideal, np.float64))
     reference = float(np.median(wanted))
@@ -56,7 +52,7 @@ def exposures(ideal: Sequence[float], settings: PhantomSettings) -> Float[np.nda
 
 
 def white_balances(settings: PhantomSettings) -> Float[np.ndarray, "T 3"]:
-    """Smooth gains of red and blue against green, of log standard deviation ``white_balance_drift``. [T, 3]"""
+    """Smooth gains of red and blue against green, of log standard deviation ``white_balance_drift``."""
     generator = stream(settings.seed, Purpose.WHITE_BALANCE)
     drift = generator.standard_normal((settings.frames + 8 * int(_DRIFT_LENGTH), 2))
     drift = scipy.ndimage.gaussian_filter1d(drift, _DRIFT_LENGTH, axis=0)[4 * int(_DRIFT_LENGTH) :][: settings.frames]
@@ -73,16 +69,10 @@ def develop(
     settings: PhantomSettings,
     generator: np.random.Generator,
 ) -> UInt8[np.ndarray, "N 3"]:
-    """Apply gain, tone curve and noise, and quantise to 8 bits.
+    """Apply gain (exposure times white balance), tone curve and noise to linear radiance, and quantise to 8 bits.
 
     Noise is added to the encoded value; half its variance at mid grey is read noise, the other half is shot noise,
     whose variance grows with the value.
-
-    Args:
-        radiance: Linear, from :mod:`imaging`. [N, 3]
-        gain: Exposure times white balance. [3]
-        settings: Gamma and noise.
-        generator: Random generator of this frame.
     """
     value = encode(radiance * gain.astype(np.float32), settings.gamma)
     deviation = settings.noise / 255.0 * np.sqrt(0.5 + value)

@@ -237,11 +237,7 @@ class PhantomSettings(Settings):
 
 
 def phantom_settings(options: Mapping[str, Any]) -> PhantomSettings:
-    """Validate plain options.
-
-    Raises:
-        InputError: An option is unknown, of the wrong type or out of range; the first such one is named.
-    """
+    """Validate plain options; an error names the first that is unknown, of the wrong type or out of range."""
     try:
         return PhantomSettings(**options)
     except ValidationError as error:

@@ -51,11 +51,9 @@ class SolidNoise:
         self._generator = generator
 
     def layer(self, points: Float[np.ndarray, "... 3"], scale: float) -> Float[np.ndarray, "..."]:
-        """Noise of zero mean and unit standard deviation at points; every call samples an independent layer.
+        """Noise of zero mean and unit deviation at points, mm; every call samples an independent layer.
 
-        Args:
-            points: mm. [..., 3]
-            scale: Size of its blobs, about 2.5 standard deviations of its kernel, mm.
+        ``scale`` is the size of its blobs, about 2.5 standard deviations of its kernel, mm.
         """
         turn, _ = np.linalg.qr(self._generator.standard_normal((3, 3)))
         shift = self._generator.uniform(0.0, self._SIZE, 3)

@@ -15,22 +15,15 @@ from coliags_plugin.phantom.colon import ColonSurface
 
 @dataclass(frozen=True)
 class Hits:
-    """First hits of N rays on the wall.
-
-    Attributes:
-        found: Whether the ray hits the wall. [N]
-        z_depth: mm along the optical axis; infinite without a hit. [N]
-        triangle: Triangle index. [N]
-        barycentric: Weights of the triangle's second and third corner. [N, 2]
-    """
+    """First hits of N rays on the wall."""
 
     found: Bool[np.ndarray, "N"]
-    z_depth: Float[np.ndarray, "N"]
-    triangle: Int[np.ndarray, "N"]
-    barycentric: Float[np.ndarray, "N 2"]
+    z_depth: Float[np.ndarray, "N"]  # mm; infinite without a hit
+    triangle: Int[np.ndarray, "N"]  # index
+    barycentric: Float[np.ndarray, "N 2"]  # weights of the second and third corner
 
     def kept(self) -> Hits:
-        """Subset of the rays that hit the wall."""
+        """Those of the rays that hit the wall."""
         keep = self.found
         return Hits(keep[keep], self.z_depth[keep], self.triangle[keep], self.barycentric[keep])
 
@@ -41,11 +34,7 @@ def rotated(vectors: Float[np.ndarray, "N 3"], rotation: Float[np.ndarray, "3 3"
 
 
 class Tracer:
-    """Ray-casting scene of the mesh.
-
-    Raises:
-        InputError: open3d cannot be imported.
-    """
+    """Ray-casting scene of the mesh."""
 
     def __init__(self, surface: ColonSurface) -> None:
         self._open3d = import_open3d("traces a phantom's rays")
@@ -57,12 +46,7 @@ class Tracer:
         )
 
     def cast(self, camera_to_world: Float[np.ndarray, "4 4"], directions: Float[np.ndarray, "N 3"]) -> Hits:
-        """First hits of rays from a camera.
-
-        Args:
-            camera_to_world: Pose. [4, 4]
-            directions: Camera axes, z = 1, so that the hit's parameter is the z-depth. [N, 3]
-        """
+        """First hits of rays from a camera; directions in its axes, z = 1, so that a hit's parameter is its z-depth."""
         rays = np.empty((len(directions), 6), np.float32)
         rays[:, :3] = camera_to_world[:3, 3]
         rays[:, 3:] = rotated(directions, camera_to_world[:3, :3])
@@ -73,7 +57,7 @@ class Tracer:
         return Hits(found, z_depth, triangle, answer["primitive_uvs"].numpy())
 
     def interpolate(self, values: Float[np.ndarray, "V K"], hits: Hits) -> Float[np.ndarray, "N K"]:
-        """Interpolate vertex values at hits. [N, K]"""
+        """Interpolate vertex values at hits."""
         corners = self._surface.triangles[hits.triangle]
         second, third = hits.barycentric[:, :1], hits.barycentric[:, 1:]
         return np.asarray(
@@ -85,7 +69,7 @@ class Tracer:
     def visible(
         self, points: Float[np.ndarray, "N 3"], viewpoints: Float[np.ndarray, "3"] | Float[np.ndarray, "N 3"]
     ) -> Bool[np.ndarray, "N"]:
-        """Whether points on the wall are visible from viewpoints off it. [N]
+        """Whether points on the wall are visible from viewpoints off it.
 
         The last thousandth of the ray is ignored, as the point is on the wall itself.
         """
@@ -96,7 +80,7 @@ class Tracer:
         return ~np.asarray(blocked.numpy(), dtype=bool)
 
     def clearance(self, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N"]:
-        """Distance to the nearest wall, mm. [N]"""
+        """Distance to the nearest wall, mm."""
         query = self._open3d.core.Tensor(np.ascontiguousarray(points, np.float32))
         return np.asarray(self._scene.compute_distance(query).numpy())
 
@@ -108,16 +92,9 @@ def seen_from(
     mask: Bool[np.ndarray, "H W"],
     tracer: Tracer,
 ) -> Bool[np.ndarray, "N"]:
-    """Whether at least one camera sees each point of the wall.
+    """Whether at least one camera sees each point of the wall: it projects to a lit pixel and is not occluded.
 
-    A camera sees a point that projects to a lit pixel and is not occluded.
-
-    Args:
-        points: Points on the wall, world, mm. [N, 3]
-        cameras_to_world: Poses, ideally the likeliest to see the points first, as seen points are not tested again.
-        lens: Lens of all cameras.
-        mask: Lit pixels. [H, W]
-        tracer: Ray tracer of the wall.
+    Seen points are not tested again: give the poses that are likeliest to see the points first.
     """
     seen = np.zeros(len(points), bool)
     open_points = np.arange(len(points))

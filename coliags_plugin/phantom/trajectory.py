@@ -31,30 +31,15 @@ Clearance = Callable[[Float[np.ndarray, "N 3"]], Float[np.ndarray, "N"]]
 
 @dataclass(frozen=True)
 class RotationView:
-    """A rotated test view at the position of a frame.
+    """A rotated test view at the position of a frame."""
 
-    Attributes:
-        frame: Index of the frame whose position and exposure it shares.
-        turn: Angle between its viewing direction and the frame's, degrees.
-        camera_to_world: OpenCV axes, mm. [4, 4]
-    """
-
-    frame: int
-    turn: float
-    camera_to_world: Float[np.ndarray, "4 4"]
+    frame: int  # index of the frame whose position and exposure it shares
+    turn: float  # angle between its viewing direction and the frame's, degrees
+    camera_to_world: Float[np.ndarray, "4 4"]  # OpenCV axes, mm
 
 
 def camera_path(centre_line: CentreLine, settings: PhantomSettings, tracer: Tracer) -> Float[np.ndarray, "T 4 4"]:
-    """Camera-to-world pose of every frame, OpenCV axes, mm.
-
-    Args:
-        centre_line: Centre line of the colon.
-        settings: Frames, trajectory, preset.
-        tracer: Ray tracer of the wall.
-
-    Raises:
-        InputError: The colon leaves no path that keeps 6 mm from the wall.
-    """
+    """Camera-to-world pose of every frame, OpenCV axes, mm, at least 6 mm from the wall."""
     poses = (
         inspecting_path(centre_line, settings, tracer)
         if settings.trajectory == "inspection"

@@ -14,9 +14,6 @@ def deterministic_open3d() -> Iterator[Any]:
     """open3d, silent and on one thread: with several the order of summation varies, and poses differ by 1e-6.
 
     open3d before 0.20 cannot limit its threads.
-
-    Raises:
-        InputError: open3d cannot be imported.
     """
     library = import_open3d("registers frames and optimises the pose graph")
     can_limit = hasattr(library.utility, "set_max_threads")
@@ -37,11 +34,7 @@ _FATAL = 3
 
 @contextmanager
 def quiet_colmap(seed: int) -> Iterator[None]:
-    """Silence COLMAP's log and seed its global random generator.
-
-    Args:
-        seed: Seed of COLMAP's global generator.
-    """
+    """Silence COLMAP's log and seed its global random generator."""
     import pycolmap
 
     level = pycolmap.logging.minloglevel

@@ -25,36 +25,22 @@ _C3VD_PINHOLE = Intrinsics(200.8769, 200.4713, 167.3190 + 0.5, 136.9333 + 0.5, 3
 
 @dataclass(frozen=True)
 class PhantomFrame:
-    """One frame of a phantom.
-
-    Attributes:
-        part: Part that the frame belongs to.
-        index: Index within its part, from 0.
-        color: RGB. [H, W, 3]
-        z_depth: mm; 0 where there is no wall. [H, W]
-        normals: Unit, camera axes, towards the camera; 0 where there is no wall. [H, W, 3]
-    """
+    """One frame of a phantom."""
 
     part: Part
-    index: int
-    color: UInt8[np.ndarray, "H W 3"]
-    z_depth: Float[np.ndarray, "H W"]
-    normals: Float[np.ndarray, "H W 3"]
+    index: int  # within its part, from 0
+    color: UInt8[np.ndarray, "H W 3"]  # RGB
+    z_depth: Float[np.ndarray, "H W"]  # mm; 0 where there is no wall
+    normals: Float[np.ndarray, "H W 3"]  # unit, camera axes, towards the camera; 0 where there is no wall
 
 
 @dataclass(frozen=True)
 class WallPoints:
-    """Points of the wall that training frames see, as a stand-in for structure-from-motion points.
+    """Points of the wall that training frames see, as a stand-in for structure-from-motion points."""
 
-    Attributes:
-        positions: World, mm. [N, 3]
-        colors: RGB from a training frame. [N, 3]
-        seen_in: Mask of the points that a frame of the sequence sees, by frame index. [N]
-    """
-
-    positions: Float[np.ndarray, "N 3"]
-    colors: UInt8[np.ndarray, "N 3"]
-    seen_in: Callable[[int], Bool[np.ndarray, "N"]]
+    positions: Float[np.ndarray, "N 3"]  # world, mm
+    colors: UInt8[np.ndarray, "N 3"]  # RGB from a training frame
+    seen_in: Callable[[int], Bool[np.ndarray, "N"]]  # those that a frame of the sequence sees, by its index
 
 
 class Layout(ABC):
@@ -123,11 +109,7 @@ class Layout(ABC):
 
 
 def pinhole_of(lens: Lens) -> Intrinsics:
-    """Intrinsics of frames that are a pinhole's.
-
-    Raises:
-        TypeError: They are taken through another lens.
-    """
+    """Intrinsics of frames that are a pinhole's."""
     if not isinstance(lens, PinholeLens):
         raise TypeError(f"{type(lens).__name__} is no pinhole, and the layout holds a pinhole camera")
     return lens.pinhole

@@ -87,8 +87,7 @@ class PREndoLayout(EndoGSLAMLayout):
 def _write_params(path: Path, trajectory: Trajectory, points: WallPoints) -> Float[np.ndarray, "N 3"]:
     """Write ``params.npz`` like EndoGSLAM, with given poses and an isotropic Gaussian at every point.
 
-    Returns:
-        The map's points in EndoGSLAM's world, that of the first camera, mm. [N, 3]
+    The map's points are returned in EndoGSLAM's world, that of the first camera, mm.
     """
     endogslam.write(path, trajectory)
     arrays = read_arrays(path, "what was just written", optional=None)

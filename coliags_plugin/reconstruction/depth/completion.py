@@ -34,13 +34,8 @@ def complete(
 
     The residual is known depth minus prior, spread by an edge-aware global smoother (Min et al. 2014) normalised by
     the spread weight. Depth that several frames agree on is kept; what has less support is mixed with the smooth one.
-
-    Args:
-        log_known: Log of z-depth; anything where there is no support. [H, W]
-        support: Number of frames that agree with it, weighted; 0 where it is not known. [H, W]
-        belief: How much of the support counts, 0 to 1. [H, W]
-        log_prior: Log of z-depth by the prior. [H, W]
-        intensity: Log intensity, whose edges stop the smoothing. [H, W]
+    ``support`` is the weighted number of frames that agree, 0 where depth is unknown; ``belief``, 0 to 1, how much of
+    it counts; edges of the log ``intensity`` stop the smoothing.
     """
     data = data_weight(support) * belief
     smooth = _smoother(intensity, _STRENGTH, _EDGE)
@@ -57,16 +52,10 @@ def first_belief(
     log_prior: Float32[np.ndarray, "H W"],
     rim: Bool[np.ndarray, "H W"],
 ) -> Float32[np.ndarray, "H W"]:
-    """How much of a sweep without a surface to start from is believed, 0 to 1. [H, W]
+    """How much of a sweep without a surface to start from is believed, 0 to 1.
 
-    Large windows make a near surface too wide at its edges: there, its rim has little weight, and the edges of the
-    image decide. Depth with little support that is far off the prior is not believed.
-
-    Args:
-        log_known: See :func:`complete`. [H, W]
-        support: Likewise. [H, W]
-        log_prior: Likewise. [H, W]
-        rim: Where a near surface may be too wide: :func:`near_rim`. [H, W]
+    Large windows make a near surface too wide at its edges: there, its rim (:func:`near_rim`) has little weight, and
+    the edges of the image decide. Depth with little support that is far off the prior is not believed.
     """
     absurd = (support < _FEW) & (np.abs(log_known - log_prior) > _ABSURD)
     return np.where(absurd, 0.0, np.where(rim, _BELIEF, 1.0)).astype(np.float32)
@@ -75,30 +64,21 @@ def first_belief(
 def smooth_surface(
     depth: Float32[np.ndarray, "h w"], intensity: Float32[np.ndarray, "H W"]
 ) -> Float32[np.ndarray, "H W"]:
-    """z-depth at the size of an image and smoothed up to its edges, as a surface to sweep.
+    """z-depth at the size of a log image and smoothed up to its edges, as a surface to sweep.
 
-    Windows of correlation lie on the surface: where its slant is wrong, so is what they find. [H, W]
-
-    Args:
-        depth: z-depth at any size.
-        intensity: Log intensity, whose edges stop the smoothing.
+    Windows of correlation lie on the surface: where its slant is wrong, so is what they find.
     """
     log_depth = np.log(resized_map(depth, (intensity.shape[1], intensity.shape[0])))
     return np.asarray(np.exp(_smoother(intensity, _SURFACE_STRENGTH, _SURFACE_EDGE)(log_depth)), np.float32)
 
 
 def data_weight(support: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
-    """Weight of known depth beside other known depth, where priors are fitted and residuals spread: 0 to 1. [H, W]"""
+    """Weight of known depth beside other known depth, where priors are fitted and residuals spread: 0 to 1."""
     return np.where(support > 0.0, np.minimum(0.3 + support, 1.0), 0.0).astype(np.float32)
 
 
 def near_rim(log_depth: Float32[np.ndarray, "H W"], reach: int) -> Bool[np.ndarray, "H W"]:
-    """Pixels on the near side of a depth edge, within some pixels of it. [H, W]
-
-    Args:
-        log_depth: Log of z-depth. [H, W]
-        reach: Pixels.
-    """
+    """Pixels on the near side of a depth edge, within ``reach`` pixels of it."""
     import cv2
 
     values = cv2.medianBlur(log_depth, 5)

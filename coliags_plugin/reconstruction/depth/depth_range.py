@@ -32,13 +32,7 @@ _NEAREST, _FARTHEST = (1.0, 0.6), (99.0, 2.0)
 
 @dataclass(frozen=True)
 class DepthRange:
-    """Nearest and farthest depth of a video, and each frame's median.
-
-    Attributes:
-        near: Scene units.
-        far: Scene units.
-        medians: Of every frame, scene units. [N]
-    """
+    """Nearest and farthest depth of a video, and each frame's median, scene units."""
 
     near: float
     far: float
@@ -46,11 +40,7 @@ class DepthRange:
 
 
 def given_range(near: float, far: float, count: int) -> DepthRange:
-    """The range that a user states; frames' medians are its geometric mean.
-
-    Raises:
-        InputError: It is not one.
-    """
+    """The range that a user states; frames' medians are its geometric mean."""
     if not 0.0 < near < far:
         raise InputError(f"--near {near:g} --far {far:g}", "0 < near < far")
     return DepthRange(near, far, (float(np.sqrt(near * far)),) * count)
@@ -61,14 +51,7 @@ def find_range(
 ) -> DepthRange:
     """Depth range from points triangulated between pairs of frames, or from sparse depth where the scene has some.
 
-    Args:
-        frames: In video order.
-        settings: Of the features.
-        max_turn: Largest angle between the optical axes of a pair, degrees.
-        progress: Progress callback.
-
-    Raises:
-        InputError: Too few points are found.
+    ``max_turn``: largest angle between the optical axes of a pair, degrees.
     """
     if any(frame.sparse_depth is not None and len(frame.sparse_depth.depth) for frame in frames):
         depths_by_frame = [
@@ -107,7 +90,7 @@ def triangulated_depths(
 ) -> Float[np.ndarray, "K"]:
     """z-depths, in the first frame, of its features that match along epipolar lines and are seen at a sufficient angle.
 
-    NaN for all others. [K]
+    NaN for all others.
     """
     depths = np.full(len(first), np.nan)
     cameras = (one.camera, other.camera)
@@ -129,7 +112,7 @@ def triangulated_depths(
 
 
 def _agreed(depths: Float[np.ndarray, "P K"]) -> Float[np.ndarray, "A"]:
-    """Median depths of the features about which two partners agree, and most do. [A]"""
+    """Median depths of the features about which two partners agree, and most do."""
     depths = depths[:, (~np.isnan(depths)).sum(axis=0) >= min(2, len(depths))]
     if not depths.size:
         return np.zeros(0)

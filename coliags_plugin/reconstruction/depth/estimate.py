@@ -37,32 +37,14 @@ _HELD = 40
 
 @dataclass(frozen=True, eq=False)
 class DepthEstimate:
-    """Estimated depth of a frame.
+    """Estimated depth of a frame."""
 
-    Attributes:
-        depth: z-depth at every pixel, scene units. [H, W]
-        confidence: Estimated probability that it is off by less than 5 %; 0 where a prior alone speaks. [H, W]
-    """
-
-    depth: Float32[np.ndarray, "H W"]
-    confidence: Float32[np.ndarray, "H W"]
+    depth: Float32[np.ndarray, "H W"]  # z-depth at every pixel, scene units
+    confidence: Float32[np.ndarray, "H W"]  # probability that it is off by less than 5 %; 0: by prior alone
 
 
 class Estimation:
-    """Estimation of the depth of a video, resumable at every frame of every pass.
-
-    Args:
-        frames: All frames in video order; pinhole cameras.
-        prior: Gives depth where matching gives none.
-        depth_range: Of the video.
-        settings: Options.
-        work: Where the results of the passes are kept.
-        jobs: Number of threads.
-        progress: Progress callback.
-
-    Raises:
-        InputError: There are too few frames, or the camera does not move.
-    """
+    """Estimation of the depth of a video of pinhole cameras, resumable at every frame of every pass."""
 
     def __init__(
         self,
@@ -81,11 +63,7 @@ class Estimation:
         self.medians: Sequence[float] = depth_range.medians
 
     def run(self) -> None:
-        """Run all passes that are not done.
-
-        Raises:
-            InputError: No frame has enough neighbours.
-        """
+        """Run all passes that are not done."""
         with _one_thread_of_opencv():
             for number, sweep in enumerate(self.settings.sweeps):
                 self._pass(number, sweep)
@@ -217,11 +195,7 @@ def _one_thread_of_opencv() -> Iterator[None]:
 
 
 def check_video(frames: Sequence[Frame]) -> None:
-    """Check that a video can give depth at all.
-
-    Raises:
-        InputError: It has too few frames, images of several sizes, or all cameras are at one position.
-    """
+    """Check that a video can give depth at all."""
     if len(frames) < FEWEST_FRAMES:
         raise InputError(
             f"{len(frames)} frames", f"at least {FEWEST_FRAMES}, from different positions", "Give more of the video"
@@ -252,17 +226,7 @@ def choose_neighbours(
     """Neighbours of every frame of a video: for each baseline the first frame so far away, before and after it.
 
     Where the video ends on one side, the other gives more frames, farther away. A pause adds no frames, as they are
-    chosen by distance, not by number.
-
-    Args:
-        centers: Camera centres in video order. [N, 3]
-        axes: Unit optical axes. [N, 3]
-        depths: Median depth of every frame. [N]
-        baselines: Distances in units of it.
-        settings: See ``max_baseline`` and ``max_turn``.
-
-    Returns:
-        For every frame the indices of its neighbours, ascending.
+    chosen by distance (in units of the frame's median depth), not by number.
     """
     baselines = sorted(baselines)
     farther = [baselines[-1] + (baselines[-1] / len(baselines)) * step for step in range(1, len(baselines) + 1)]

@@ -17,46 +17,28 @@ _ITERATIONS, _CONVERGED = 12, 1e-3
 
 @dataclass(frozen=True, eq=False)
 class WeightedDepth:
-    """Depth of a frame with weights.
+    """Depth of a frame with weights."""
 
-    Attributes:
-        pose: Camera of its size.
-        depth: z-depth; NaN where unknown. [H, W]
-        weight: 0 where it does not count. [H, W]
-    """
-
-    pose: Pose
-    depth: Float32[np.ndarray, "H W"]
-    weight: Float32[np.ndarray, "H W"]
+    pose: Pose  # camera of its size
+    depth: Float32[np.ndarray, "H W"]  # z-depth; NaN where unknown
+    weight: Float32[np.ndarray, "H W"]  # 0 where it does not count
 
 
 @dataclass(frozen=True, eq=False)
 class Fused:
-    """Depth that a frame and its neighbours agree on.
+    """Depth that a frame and its neighbours agree on."""
 
-    Attributes:
-        depth: z-depth; the frame's own where no other counts. [H, W]
-        votes: Weight of the frames that agree with it. [H, W]
-        against: Weight of those that do not. [H, W]
-        spread: Mean relative deviation within the group. [H, W]
-    """
-
-    depth: Float32[np.ndarray, "H W"]
-    votes: Float32[np.ndarray, "H W"]
-    against: Float32[np.ndarray, "H W"]
-    spread: Float32[np.ndarray, "H W"]
+    depth: Float32[np.ndarray, "H W"]  # z-depth; the frame's own where no other counts
+    votes: Float32[np.ndarray, "H W"]  # weight of the frames that agree with it
+    against: Float32[np.ndarray, "H W"]  # weight of those that do not
+    spread: Float32[np.ndarray, "H W"]  # mean relative deviation within the group
 
 
 def fuse_frame(own: WeightedDepth, neighbours: Sequence[WeightedDepth], agreement: float) -> Fused:
     """Weighted median of the depths that a frame and its neighbours give to each pixel, within the densest group.
 
     A neighbour's depth of a pixel is where the pixel's ray meets the neighbour's surface, found by fixed-point
-    iteration from the frame's own depth.
-
-    Args:
-        own: The frame.
-        neighbours: Others that may see the same surface.
-        agreement: Relative difference up to which two depths agree.
+    iteration from the frame's own depth. Depths agree up to a relative difference of ``agreement``.
     """
     from coliags_plugin.reconstruction.depth.numba_kernels.fusion import reproject, vote
 
@@ -91,7 +73,7 @@ _STEP_REACH = 6
 
 
 def sweep_weight(swept: Swept) -> Float32[np.ndarray, "H W"]:
-    """Weight of a frame's own depth in fusion, 0 to 1. [H, W]"""
+    """Weight of a frame's own depth in fusion, 0 to 1."""
     quality = np.clip((swept.match - 0.2) / 0.6, 0.0, 1.0) * np.clip(swept.margin / 1.0, 0.0, 1.0)
     return np.asarray(np.where(swept.match > 0.0, 0.05 + 0.95 * quality, 0.0), np.float32)
 
@@ -104,14 +86,8 @@ def depth_confidence(
 ) -> Float32[np.ndarray, "H W"]:
     """Estimated probability that depth is off by less than 5 %: a logistic regression (docs/depth.md).
 
-    Args:
-        log_depth: Log of the completed z-depth. [H, W]
-        support: Number of frames that agree with it, weighted; 0 where a prior alone speaks. [H, W]
-        spread: Mean relative deviation of their depths. [H, W]
-        rim: Near side of a depth edge. [H, W]
-
-    Returns:
-        0 to 1; 0 where there is no support. [H, W]
+    ``support`` is the weighted number of frames that agree with the completed depth, 0 (as is the confidence) where a
+    prior alone speaks; ``spread`` the mean relative deviation of their depths; ``rim`` the near side of a depth edge.
     """
     import cv2
 

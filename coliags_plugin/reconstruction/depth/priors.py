@@ -30,7 +30,7 @@ class DepthPrior(ABC):
         weight: Float32[np.ndarray, "H W"],
         typical: float,
     ) -> Float32[np.ndarray, "H W"]:
-        """The prior of a frame, fitted to its known depth.
+        """Log of z-depth at every pixel of a frame, fitted to its known depth.
 
         Args:
             frame: The frame, of the size of the maps or larger.
@@ -38,9 +38,6 @@ class DepthPrior(ABC):
             known: Log of z-depth; anything where the weight is 0. [H, W]
             weight: Of the known depth, 0 to 1. [H, W]
             typical: z-depth of a typical pixel, for a frame without known depth.
-
-        Returns:
-            Log of z-depth at every pixel. [H, W]
         """
 
     @abstractmethod
@@ -61,17 +58,10 @@ def robust_fit(
     default: Float[np.ndarray, "K"],
     default_weight: float,
 ) -> Float[np.ndarray, "K"]:
-    """Least squares reweighted by Cauchy's function of the residual, its scale four median deviations.
+    """Coefficients by least squares reweighted by Cauchy's function of the residual, its scale four median deviations.
 
-    Args:
-        columns: Terms; the first is constant. [N, K]
-        values: What they are to add up to. [N]
-        weights: Of the rows. [N]
-        default: Coefficients that the solution is drawn to; the solution without rows. [K]
-        default_weight: How strongly, in rows of unit weight.
-
-    Returns:
-        The coefficients. [K]
+    The first column is constant. ``default``, the solution without rows, draws it with the weight of ``default_weight``
+    rows of unit weight.
     """
     if len(values) == 0:
         return default.copy()
@@ -177,22 +167,14 @@ _FEWEST = 50
 
 
 class FilePrior(DepthPrior):
-    """Depth maps from files, scale and shift fitted to each frame's known depth, as depth or as inverse depth.
-
-    Args:
-        files: Depth map of each frame, by frame name.
-    """
+    """Depth maps from files, scale and shift fitted to each frame's known depth, as depth or as inverse depth."""
 
     def __init__(self, files: Mapping[str, Path]) -> None:
         self.files = dict(files)
 
     @classmethod
     def of(cls, folder: Path, frames: Sequence[Frame]) -> FilePrior:
-        """The prior of a folder with one map of each frame, named as the frame.
-
-        Raises:
-            InputError: The folder is missing, a frame has no map, or a map has another aspect ratio.
-        """
+        """The prior of a folder with one map of each frame, named as the frame, of its aspect ratio."""
         if not folder.is_dir():
             raise InputError(f"--prior {folder}: no such folder", "a folder of depth maps named as the images")
         files = {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() in _SUFFIXES}

@@ -37,25 +37,18 @@ _VOXEL = 2.0
 
 @dataclass(frozen=True)
 class DepthRequest:
-    """What is asked for.
-
-    Attributes:
-        settings: Options of estimation.
-        near_far: Depth range, scene units; None: found.
-        prior: Folder of depth maps; None: brightness.
-        jobs: Number of threads; None: one for each core.
-    """
+    """What is asked for."""
 
     settings: DepthEstimationSettings
-    near_far: tuple[float, float] | None = None
-    prior: Path | None = None
-    jobs: int | None = None
+    near_far: tuple[float, float] | None = None  # depth range, scene units; None: found
+    prior: Path | None = None  # folder of depth maps; None: brightness
+    jobs: int | None = None  # number of threads; None: one for each core
 
 
 def estimate_scene(
     scene: Scene, out: Path, request: DepthRequest, overwrite: bool = False, progress: Progress | None = None
 ) -> str:
-    """Estimate the depth of a scene's video and write it as a scene in nerfstudio's layout.
+    """Estimate the depth of a scene's video, write it as a scene in nerfstudio's layout, and return a summary line.
 
     Training and test frames take part; test sets of their own do not. Work files stay beside ``out`` until all is
     written, and the same request resumes from them.
@@ -66,9 +59,6 @@ def estimate_scene(
         request: What is asked for.
         overwrite: Replace an existing folder.
         progress: Progress callback.
-
-    Returns:
-        A summary of one line.
 
     Raises:
         InputError: The frames give no depth, the prior does not fit them, or a folder cannot be written.
@@ -99,11 +89,7 @@ def estimate_scene(
 
 
 def training_options(scene: Scene) -> list[str]:
-    """Options of training with which the written scene has the split and the size of its source.
-
-    Args:
-        scene: The source, as it was opened for :func:`estimate_scene`.
-    """
+    """Options of training with which the scene written for a source has its split and its size."""
     split, camera = scene.provenance["split"], scene.train[0].camera
     options = [] if split["name"] == "every-8th" else [f"datamanager.split={split['name']}"]
     if split["name"] == "block":
@@ -171,9 +157,7 @@ _SPAN = 1 << 20
 class VoxelPoints:
     """Points merged in cubic voxels of the world, frame by frame; memory grows with the surface, not the frames.
 
-    Args:
-        size: Of the voxels, scene units.
-        origin: A position amid the scene. [3]
+    ``size``: of the voxels, scene units; ``origin``: a position amid the scene.
     """
 
     def __init__(self, size: float, origin: Float[np.ndarray, "3"]) -> None:
@@ -189,14 +173,7 @@ class VoxelPoints:
         confidence: Float32[np.ndarray, "H W"],
         image: UInt8[np.ndarray, "H W 3"],
     ) -> None:
-        """Add a frame's confident pixels.
-
-        Args:
-            pose: Camera of the frame.
-            depth: z-depth. [H, W]
-            confidence: 0 to 1; below ``LEAST_CONFIDENCE`` a pixel does not count. [H, W]
-            image: RGB. [H, W, 3]
-        """
+        """Add a frame's pixels of z-depth with a confidence of at least ``LEAST_CONFIDENCE``."""
         chosen = (confidence >= LEAST_CONFIDENCE) & ~_steep(depth)
         weight = confidence[chosen].astype(np.float64)[:, None]
         local = (pose.rays() * depth[..., None])[chosen]
@@ -228,7 +205,7 @@ def _summed(keys: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def _steep(depth: Float32[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """Pixels at a depth discontinuity: a tenth or more between the neighbours on both sides. [H, W]"""
+    """Pixels at a depth discontinuity: a tenth or more between the neighbours on both sides."""
     log = np.log(depth)
     steep = np.zeros(depth.shape, bool)
     steep[1:-1] |= np.abs(log[2:] - log[:-2]) > 0.1

@@ -18,25 +18,17 @@ _RIVALS = math.log(2.0)
 
 @dataclass(frozen=True, eq=False)
 class Swept:
-    """Depth of one frame from its own sweep.
+    """Depth of one frame from its own sweep."""
 
-    Attributes:
-        depth: z-depth. [H, W]
-        match: Correlation with the better neighbours, -1 to 1; 0 where too few neighbours see it. [H, W]
-        margin: By how much other depths match worse, after aggregation. [H, W]
-    """
-
-    depth: Float32[np.ndarray, "H W"]
-    match: Float32[np.ndarray, "H W"]
-    margin: Float32[np.ndarray, "H W"]
+    depth: Float32[np.ndarray, "H W"]  # z-depth
+    match: Float32[np.ndarray, "H W"]  # correlation with the better neighbours, -1 to 1; 0: too few
+    margin: Float32[np.ndarray, "H W"]  # by how much other depths match worse, after aggregation
 
 
 def ratios(sweep: SweepSettings, depth_range: tuple[float, float]) -> Float32[np.ndarray, "D"]:
-    """Hypotheses as factors on the swept surface, equally spaced in their logarithm. [D]
+    """Hypotheses as factors on the swept surface, equally spaced in their logarithm.
 
-    Args:
-        sweep: Its step and, unless the whole range is swept, its reach.
-        depth_range: Nearest and farthest depth; the surface of a whole sweep is at the nearest.
+    The surface of a sweep of the whole range (``reach`` None) is at the nearest depth.
     """
     step = math.log1p(sweep.step)
     if sweep.reach is None:
@@ -54,18 +46,10 @@ def sweep_frame(
     sweep: SweepSettings,
     settings: DepthEstimationSettings,
 ) -> Swept:
-    """Match a frame with its neighbours at multiples of a surface, and take the best.
+    """Match a frame with its neighbours at multiples (ascending) of a surface of z-depth, and take the best.
 
     Correlation of log intensity in square windows, sampled on the surface itself, so that windows follow its slant;
-    semi-global aggregation; a parabola between hypotheses.
-
-    Args:
-        guide: The frame.
-        neighbours: At least one, all of one size.
-        base: The surface, z-depth. [H, W]
-        factors: Multiples of it, ascending. [D]
-        sweep: Options of this sweep.
-        settings: Options of all.
+    semi-global aggregation; a parabola between hypotheses. The neighbours, at least one, are all of one size.
     """
     from coliags_plugin.reconstruction.depth.numba_kernels.aggregation import aggregate, pick
     from coliags_plugin.reconstruction.depth.numba_kernels.sweep import sweep as match

@@ -18,12 +18,7 @@ _OFFSET = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Intrinsics and pose of a view in float64.
-
-    Attributes:
-        intrinsics: Of the view.
-        camera_to_world: Rigid. [4, 4]
-    """
+    """Intrinsics and rigid pose of a view in float64."""
 
     intrinsics: Intrinsics
     camera_to_world: Float[np.ndarray, "4 4"]
@@ -40,12 +35,12 @@ class Pose:
 
     @property
     def matrix(self) -> Float[np.ndarray, "3 3"]:
-        """K for pixel centres at integers + 0.5. [3, 3]"""
+        """K for pixel centres at integers + 0.5."""
         k = self.intrinsics
         return np.array([[k.fx, 0.0, k.cx], [0.0, k.fy, k.cy], [0.0, 0.0, 1.0]])
 
     def rays(self) -> Float[np.ndarray, "H W 3"]:
-        """Directions through the pixel centres in the camera's axes, z = 1. [H, W, 3]"""
+        """Directions through the pixel centres in the camera's axes, z = 1."""
         k = self.intrinsics
         x = (np.arange(k.width) + 0.5 - k.cx) / k.fx
         y = (np.arange(k.height) + 0.5 - k.cy) / k.fy
@@ -70,17 +65,11 @@ class Pose:
 
 @dataclass(frozen=True, eq=False)
 class Guide:
-    """An image prepared for matching.
+    """An image prepared for matching."""
 
-    Attributes:
-        pose: Camera of its size.
-        intensity: Log of green; comparable up to a constant. [H, W]
-        usable: Neither masked nor near a highlight. [H, W]
-    """
-
-    pose: Pose
-    intensity: Float32[np.ndarray, "H W"]
-    usable: Bool[np.ndarray, "H W"]
+    pose: Pose  # camera of its size
+    intensity: Float32[np.ndarray, "H W"]  # log of green; comparable up to a constant
+    usable: Bool[np.ndarray, "H W"]  # neither masked nor near a highlight
 
 
 def reduced_size(width: int, height: int, reduction: int) -> tuple[int, int]:
@@ -89,13 +78,7 @@ def reduced_size(width: int, height: int, reduction: int) -> tuple[int, int]:
 
 
 def guide_of(frame: Frame, reduction: int, features: FeatureSettings) -> Guide:
-    """Prepare a frame for matching.
-
-    Args:
-        frame: The frame.
-        reduction: Factor by which it is reduced.
-        features: Says what a highlight is.
-    """
+    """Prepare a frame, reduced by a factor, for matching; ``features`` says what a highlight is."""
     import cv2
 
     image = frame.image.cpu().numpy()

@@ -23,11 +23,7 @@ _REQUEST = "request.json"
 
 
 class WorkFolder:
-    """The folder of an estimation's work files: one folder for each pass, one file in it for each frame.
-
-    Args:
-        path: The folder.
-    """
+    """The folder of an estimation's work files: one folder for each pass, one file in it for each frame."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -37,11 +33,7 @@ class WorkFolder:
         return self._file(stage, index).is_file()
 
     def save(self, stage: str, index: int, arrays: Arrays) -> None:
-        """Keep the results of a frame of a pass; atomic.
-
-        Raises:
-            InputError: The folder cannot be written.
-        """
+        """Keep the results of a frame of a pass; atomic."""
         write_arrays(self._file(stage, index), arrays)
 
     def load(self, stage: str, index: int) -> dict[str, np.ndarray]:
@@ -74,14 +66,7 @@ class WorkFolder:
 def work_folder(out: Path, request: Mapping[str, Any]) -> Iterator[WorkFolder]:
     """The work files for an output folder, beside it; removed when the block ends without an error.
 
-    Those of an estimation with another request are removed first.
-
-    Args:
-        out: The output folder.
-        request: Everything that determines the results, as JSON values.
-
-    Raises:
-        InputError: Another process works there, or the folder cannot be written.
+    ``request`` is everything that determines the results, as JSON values; work files of another one are removed first.
     """
     path = out.parent / f".{out.name}.work"
     make_folder(path)

@@ -20,12 +20,7 @@ Register = Callable[[int, int, Float[np.ndarray, "4 4"]], Edge | None]
 
 @dataclass(frozen=True, eq=False)
 class Bridge:
-    """Constant-velocity guess in place of an edge, where tracking was lost.
-
-    Attributes:
-        source, target: Frames without an edge between them.
-        source_to_target: Motion at constant velocity. [4, 4]
-    """
+    """Constant-velocity guess in place of an edge between two frames, where tracking was lost."""
 
     source: int
     target: int
@@ -34,21 +29,13 @@ class Bridge:
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """Trajectory from frame-to-frame odometry.
+    """Trajectory from frame-to-frame odometry."""
 
-    Attributes:
-        posed: Frames that have a pose by an edge or a bridge, in order; the others are lost.
-        camera_to_world: Their poses; world: the first of them. [P, 4, 4]
-        edges: Edges between consecutive posed frames.
-        bridges: Guesses where there is no edge.
-        failed: Consecutive frames (i, i + 1) that could not be registered.
-    """
-
-    posed: tuple[int, ...]
-    camera_to_world: Float[np.ndarray, "P 4 4"]
-    edges: tuple[Edge, ...]
-    bridges: tuple[Bridge, ...]
-    failed: tuple[tuple[int, int], ...]
+    posed: tuple[int, ...]  # frames that have a pose by an edge or a bridge, in order; the others are lost
+    camera_to_world: Float[np.ndarray, "P 4 4"]  # their poses; world: the first of them
+    edges: tuple[Edge, ...]  # between consecutive posed frames
+    bridges: tuple[Bridge, ...]  # guesses where there is no edge
+    failed: tuple[tuple[int, int], ...]  # consecutive frames (i, i + 1) that could not be registered
 
 
 def chain(count: int, register: Register, max_gap: int, progress: Progress | None = None) -> Chain:
@@ -57,12 +44,6 @@ def chain(count: int, register: Register, max_gap: int, progress: Progress | Non
     A frame for which this fails is registered to its predecessor instead, in case the camera has jumped; then a new
     segment starts at the pose that constant velocity predicts. Frames that match neither are skipped. After
     ``max_gap`` skipped frames the next one gets its constant-velocity pose, and tracking restarts there.
-
-    Args:
-        count: Number of frames.
-        register: Registers a source to a target frame.
-        max_gap: Largest number of consecutive frames to skip.
-        progress: Progress callback.
     """
     poses = {0: np.eye(4)}
     anchor, velocity = 0, np.eye(4)
@@ -97,13 +78,7 @@ def chain(count: int, register: Register, max_gap: int, progress: Progress | Non
 def fill_gaps(
     posed: tuple[int, ...], camera_to_world: Float[np.ndarray, "P 4 4"], count: int
 ) -> Float[np.ndarray, "N 4 4"]:
-    """Poses of all frames, lost ones interpolated or extrapolated at constant velocity. [N, 4, 4]
-
-    Args:
-        posed: Frames with a pose, in order; the first is 0.
-        camera_to_world: Their poses. [P, 4, 4]
-        count: Number of frames.
-    """
+    """Poses of all frames, lost ones interpolated or extrapolated at constant velocity; the first posed frame is 0."""
     result = np.tile(np.eye(4), (count, 1, 1))
     result[list(posed)] = camera_to_world
     velocity = np.eye(4)
@@ -118,7 +93,7 @@ def fill_gaps(
 
 
 def power(motion: Float[np.ndarray, "4 4"], exponent: float) -> Float[np.ndarray, "4 4"]:
-    """Real power of a rigid transform, along its screw axis: the exponential of its scaled logarithm. [4, 4]"""
+    """Real power of a rigid transform, along its screw axis: the exponential of its scaled logarithm."""
     if exponent == 1.0:
         return motion
     rotvec = Rotation.from_matrix(motion[:3, :3]).as_rotvec()

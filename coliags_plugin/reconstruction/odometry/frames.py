@@ -31,43 +31,24 @@ _SPAN = 8.0
 
 @dataclass(frozen=True, eq=False)
 class RgbdFrame:
-    """An RGB image with depth, without a pose.
-
-    Attributes:
-        name: Name of the frame.
-        image: RGB. [H, W, 3]
-        depth: z-depth, any unit of length; not finite or not positive where unknown. [H, W]
-        mask: False where a pixel is ignored; None: all are used. [H, W]
-    """
+    """An RGB image with depth, without a pose."""
 
     name: str
     image: UInt8[np.ndarray, "H W 3"]
-    depth: Float32[np.ndarray, "H W"]
-    mask: Bool[np.ndarray, "H W"] | None = None
+    depth: Float32[np.ndarray, "H W"]  # z-depth in any unit; not finite or not positive: unknown
+    mask: Bool[np.ndarray, "H W"] | None = None  # False where a pixel is ignored; None: all are used
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedFrame:
-    """A frame ready for registration.
+    """A frame ready for registration."""
 
-    Attributes:
-        intensity: Locally normalised brightness, 0 to 1, 0.5 at the local mean. [H, W]
-        depth: z-depth in units of the video's median depth; 0 where unknown, masked or a highlight. [H, W]
-    """
-
-    intensity: Float32[np.ndarray, "H W"]
-    depth: Float32[np.ndarray, "H W"]
+    intensity: Float32[np.ndarray, "H W"]  # locally normalised brightness, 0 to 1, 0.5 at the local mean
+    depth: Float32[np.ndarray, "H W"]  # in median depths of the video; 0: unknown, masked or a highlight
 
 
 class RgbdVideo(Sequence[RgbdFrame]):
-    """Images and depth of frames without their poses, read one at a time.
-
-    Args:
-        frames: In video order.
-
-    Raises:
-        InputError: A frame without depth is read.
-    """
+    """Images and depth of frames without their poses, read one at a time; every frame must have depth."""
 
     def __init__(self, frames: Sequence[Frame]) -> None:
         self._frames = frames
@@ -92,13 +73,9 @@ class RgbdVideo(Sequence[RgbdFrame]):
 def prepared_frames(
     video: Sequence[RgbdFrame], unit: float, keep: int, factor: int = 1
 ) -> Callable[[int], PreparedFrame]:
-    """Function that prepares the frame at an index, and holds the most recently used.
+    """Function that prepares the frame at an index, and holds the ``keep`` most recently used.
 
-    Args:
-        video: Frames to prepare.
-        unit: Length that becomes 1.
-        keep: Number of frames held.
-        factor: On their size.
+    ``unit`` is the length that becomes 1, ``factor`` that on the frames' size.
     """
 
     @lru_cache(maxsize=keep)
@@ -110,15 +87,11 @@ def prepared_frames(
 
 
 def prepare(frame: RgbdFrame, unit: float) -> PreparedFrame:
-    """Normalise brightness locally, and set depth to 0 where masked, unknown or a highlight.
+    """Normalise brightness locally, and set depth, in ``unit``, to 0 where masked, unknown or a highlight.
 
     The light source moves with the camera, so that the brightness of a surface point varies between frames by more
     than the texture's contrast; its ratio to neighbouring pixels does not. So the local mean of the logarithm of
     brightness is subtracted, and the result divided by the local standard deviation.
-
-    Args:
-        frame: RGB-D frame.
-        unit: Length that becomes 1.
     """
     image, width = frame.image, frame.image.shape[1]
     valid = np.ones(image.shape[:2], bool) if frame.mask is None else frame.mask
@@ -148,11 +121,7 @@ def enlarged(frame: PreparedFrame, factor: int) -> PreparedFrame:
 
 
 def typical_depth(video: Sequence[RgbdFrame]) -> float:
-    """Median known depth over frames sampled evenly from the video: the unit of the thresholds.
-
-    Raises:
-        InputError: None of them has known depth.
-    """
+    """Median known depth over frames sampled evenly from the video: the unit of the thresholds."""
     indices = np.unique(np.linspace(0, len(video) - 1, min(_SAMPLED, len(video))).round().astype(int))
     depths = [video[int(index)].depth[::4, ::4].ravel() for index in indices]
     known = np.concatenate(depths)

@@ -31,19 +31,9 @@ def optimise(
     bridges: Sequence[Bridge],
     prune: float,
 ) -> tuple[Float[np.ndarray, "P 4 4"], tuple[Edge, ...]]:
-    """Optimise a pose graph.
+    """Optimise a pose graph; the poses in the world of the first, and the uncertain edges that were dropped.
 
-    Args:
-        open3d: The library.
-        posed: The posed frames, in order.
-        camera_to_world: Their initial poses; world: the first of them. [P, 4, 4]
-        certain: Odometry edges with their information matrices.
-        uncertain: Further edges, some of which may be outliers.
-        bridges: Constant-velocity guesses.
-        prune: Weight below which an uncertain edge is dropped.
-
-    Returns:
-        The optimised poses in the same world, and the uncertain edges that were dropped. [P, 4, 4]
+    Edges come with their information matrices; an uncertain one of a weight below ``prune`` is dropped as an outlier.
     """
     registration = open3d.pipelines.registration
     node = {frame: index for index, frame in enumerate(posed)}
@@ -100,13 +90,8 @@ def revisit_pairs(
 ) -> list[tuple[int, int]]:
     """Loop-closure candidates (source, target): frames far apart in time with similar poses.
 
-    Args:
-        posed: Posed frames, in order.
-        camera_to_world: Their poses. [P, 4, 4]
-        apart: Least number of frames in between.
-        distance: Largest distance of their centres.
-        angle_deg: Largest angle between their optical axes, degrees.
-        every: Stride of source frames; each is paired with its nearest candidate.
+    Every ``every``-th frame is paired with its nearest candidate among those more than ``apart`` frames earlier, whose
+    centre is within ``distance`` and whose optical axis within ``angle_deg`` degrees.
     """
     frames, centers, axes = np.asarray(posed), camera_to_world[:, :3, 3], camera_to_world[:, :3, 2]
     pairs = []

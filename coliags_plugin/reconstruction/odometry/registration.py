@@ -28,24 +28,15 @@ _METHODS = {"hybrid": "Hybrid", "point-to-plane": "PointToPlane", "intensity": "
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """Relative motion between two frames.
-
-    Attributes:
-        source, target: Indices of the frames.
-        source_to_target: Source camera to target camera, in units of the video's median depth. [4, 4]
-        fitness: Share of the source's pixels of known depth that are inliers on the target's surface.
-        depth_rmse: RMSE of the inliers' z-depth, in units of the video's median depth.
-        correlation: Correlation of the normalised intensities of source and target at the inliers.
-        residual: open3d's final mean squared residual.
-    """
+    """Relative motion between two frames; lengths in units of the video's median depth."""
 
     source: int
     target: int
     source_to_target: Float[np.ndarray, "4 4"]
-    fitness: float
-    depth_rmse: float
-    correlation: float
-    residual: float
+    fitness: float  # share of the source's pixels of known depth that are inliers on the target's surface
+    depth_rmse: float  # of the inliers' z-depth
+    correlation: float  # of the normalised intensities of source and target at the inliers
+    residual: float  # open3d's final mean squared residual
 
 
 class FrameRegistration:
@@ -53,11 +44,6 @@ class FrameRegistration:
 
     Hybrid and intensity are Park et al., "Colored point cloud registration revisited" (ICCV 2017) and Steinbruecker et
     al., "Real-time visual odometry from dense RGB-D images" (ICCV workshops 2011), as open3d has them.
-
-    Args:
-        open3d: The library, from :func:`deterministic_open3d`.
-        intrinsics: Intrinsics of all frames.
-        term: Residual to minimise.
     """
 
     def __init__(self, open3d: Any, intrinsics: Intrinsics, term: Term) -> None:
@@ -76,17 +62,7 @@ class FrameRegistration:
     def register(
         self, frames: tuple[int, int], source: PreparedFrame, target: PreparedFrame, guess: Float[np.ndarray, "4 4"]
     ) -> Edge | None:
-        """Estimate the motion from a source to a target frame.
-
-        Args:
-            frames: Their indices.
-            source: Source frame.
-            target: Target frame.
-            guess: Initial source-to-target transform. [4, 4]
-
-        Returns:
-            The edge, not yet verified; None if open3d fails or returns a transform that is not rigid.
-        """
+        """The motion from a source to a target frame, not yet verified; None if open3d finds none that is rigid."""
         odometry = self._open3d.t.pipelines.odometry
         try:
             result = odometry.rgbd_odometry_multi_scale(
@@ -109,7 +85,7 @@ class FrameRegistration:
         return Edge(*frames, motion, fitness, depth_rmse, correlation, float(result.inlier_rmse))
 
     def information(self, edge: Edge, source: PreparedFrame, target: PreparedFrame) -> Float[np.ndarray, "6 6"]:
-        """Information matrix of an edge for open3d's pose graph. [6, 6]"""
+        """Information matrix of an edge for open3d's pose graph."""
         odometry = self._open3d.t.pipelines.odometry
         matrix = odometry.compute_odometry_information_matrix(
             self._rgbd(source).depth,
@@ -133,20 +109,10 @@ class FrameRegistration:
 def agreement(
     source: PreparedFrame, target: PreparedFrame, source_to_target: Float[np.ndarray, "4 4"], intrinsics: Intrinsics
 ) -> tuple[float, float, float]:
-    """Fitness, depth RMSE and intensity correlation of two frames under a given motion.
+    """Fitness, depth RMSE and intensity correlation (0 where one is constant) of two frames under a given motion.
 
     Overlap and depth alone do not detect sliding along a smooth tube; intensity does, so it is compared even if the
-    motion was estimated from depth alone.
-
-    Args:
-        source: Source frame.
-        target: Target frame.
-        source_to_target: Source camera to target camera. [4, 4]
-        intrinsics: Intrinsics of both.
-
-    Returns:
-        Share of the source's pixels of known depth that are inliers on the target's surface, the RMSE of their
-        z-depth, and the correlation of their intensities (0 where one is constant).
+    motion was estimated from depth alone. See :class:`Edge`.
     """
     step = 2 if min(source.depth.shape) > 2 * _COARSEST else 1
     row, column = np.nonzero(source.depth[::step, ::step])
@@ -212,17 +178,9 @@ _ROUNDS, _REPROJECTION_PX, _FEWEST = 500, 3.0, 12
 def motion_by_features(
     source: PreparedFrame, target: PreparedFrame, intrinsics: Intrinsics
 ) -> Float[np.ndarray, "4 4"] | None:
-    """Estimate the motion between two frames by SIFT matches and RANSAC PnP on the source's back-projected features.
+    """Initial guess of the motion by SIFT matches and RANSAC PnP on the source's back-projected features.
 
-    OpenCV's RANSAC uses a fixed seed.
-
-    Args:
-        source: Frame whose depth back-projects the features.
-        target: The other frame.
-        intrinsics: Intrinsics of both.
-
-    Returns:
-        Source camera to target camera, as an initial guess; None with too few matches or inliers. [4, 4]
+    None with too few matches or inliers. OpenCV's RANSAC uses a fixed seed.
     """
     sift = cv2.SIFT_create(nfeatures=_FEATURES, contrastThreshold=_CONTRAST)  # type: ignore[attr-defined]
     here, there = _features(sift, source), _features(sift, target)

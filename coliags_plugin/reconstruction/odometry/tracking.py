@@ -36,29 +36,17 @@ _SPARE = 4
 
 @dataclass(frozen=True, eq=False)
 class Tracking:
-    """Result of tracking.
+    """Result of tracking."""
 
-    Attributes:
-        camera_to_world: OpenCV axes; world: the first camera; unit of the depth. [N, 4, 4]
-        tracked: False where a pose is only a guess at constant velocity. [N]
-        term: Residual used for registration.
-        edges: Odometry edges, lengths in units of the depth.
-        further: Edges over several frames and loop closures, without the dropped ones.
-        dropped: Edges that the optimisation rejected as outliers.
-        refused: Number of further pairs that could not be registered.
-        failed: Consecutive frames (i, i + 1) that could not be registered.
-        jumps: Pairs of frames that no edge spans: the relative pose of the segments before and after is a guess.
-    """
-
-    camera_to_world: Float[np.ndarray, "N 4 4"]
-    tracked: Bool[np.ndarray, "N"]
-    term: Term
-    edges: tuple[Edge, ...]
-    further: tuple[Edge, ...]
-    dropped: tuple[Edge, ...]
-    refused: int
-    failed: tuple[tuple[int, int], ...]
-    jumps: tuple[tuple[int, int], ...]
+    camera_to_world: Float[np.ndarray, "N 4 4"]  # OpenCV axes; world: the first camera; unit of the depth
+    tracked: Bool[np.ndarray, "N"]  # False where a pose is only a guess at constant velocity
+    term: Term  # residual used for registration
+    edges: tuple[Edge, ...]  # odometry edges, lengths in units of the depth
+    further: tuple[Edge, ...]  # edges over several frames and loop closures, without the dropped ones
+    dropped: tuple[Edge, ...]  # edges that the optimisation rejected as outliers
+    refused: int  # number of further pairs that could not be registered
+    failed: tuple[tuple[int, int], ...]  # consecutive frames (i, i + 1) that could not be registered
+    jumps: tuple[tuple[int, int], ...]  # frames that no edge spans: the relative pose of the segments is a guess
 
     @property
     def fitness(self) -> float:
@@ -79,11 +67,11 @@ class Tracking:
 def track(
     video: Sequence[RgbdFrame], intrinsics: Intrinsics, settings: TrackingSettings, progress: Progress | None = None
 ) -> Tracking:
-    """Estimate the poses of a video.
+    """Estimate the poses of a video, read lazily, whose frames share a pinhole.
 
     Args:
-        video: Frames, in order; read lazily.
-        intrinsics: The pinhole of all of them.
+        video: Frames, in order.
+        intrinsics: Of all of them.
         settings: Options.
         progress: Progress callback.
 
@@ -133,12 +121,7 @@ def track(
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """Result of pose-graph optimisation; lengths in units of the video's median depth.
-
-    Attributes:
-        camera_to_world: Poses of the posed frames. [P, 4, 4]
-        further, dropped, refused: See :class:`Tracking`.
-    """
+    """Result of pose-graph optimisation, see :class:`Tracking`; lengths in units of the video's median depth."""
 
     camera_to_world: Float[np.ndarray, "P 4 4"]
     further: tuple[Edge, ...] = ()
@@ -261,7 +244,7 @@ def _check_sizes(video: Sequence[RgbdFrame], intrinsics: Intrinsics) -> None:
 
 
 def _tracked(path: Chain, count: int) -> Bool[np.ndarray, "N"]:
-    """Mask of the frames with an edge. [N]"""
+    """Mask of the frames with an edge."""
     tracked = np.zeros(count, bool)
     for edge in path.edges:
         tracked[[edge.source, edge.target]] = True

@@ -29,14 +29,7 @@ def write_database(
 ) -> None:
     """Create a database; image i gets COLMAP's image and frame ID i + 1, camera k its camera and rig ID k + 1.
 
-    Args:
-        path: The file to create.
-        cameras: Their IDs are set.
-        images: Name and camera index of each image.
-        features: Features of each image.
-        matches: Matches by pair of image indices.
-        verified: Whether to store the matches as inliers of a verified two-view geometry; otherwise COLMAP has to
-            verify them.
+    Matches that are ``verified`` are stored as inliers of a two-view geometry; the others COLMAP has to verify.
     """
     import numpy as np
     import pycolmap
@@ -72,12 +65,7 @@ def write_database(
 
 
 def frame_model(frames: Sequence[Frame], names: Sequence[str] | None = None) -> pycolmap.Reconstruction:
-    """A reconstruction of posed frames without points: frame i is COLMAP's image i + 1, equal cameras are shared.
-
-    Args:
-        frames: Their poses and cameras.
-        names: Image names; None: ``0.png``, ``1.png``, ...
-    """
+    """A reconstruction of posed frames without points: frame i is COLMAP's image i + 1, equal cameras are shared."""
     import pycolmap
 
     camera_to_world = np.stack([frame.camera.camera_to_world.cpu().double().numpy() for frame in frames])

@@ -47,19 +47,14 @@ class FeatureSettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Keypoints and descriptors of one image.
+    """Keypoints and descriptors of one image."""
 
-    Attributes:
-        keypoints: Column, row, scale (pixels) and orientation (radians); pixel centres at integers + 0.5. [N, 4]
-        descriptors: L2-normalised. [N, 128]
-    """
-
-    keypoints: Float32[np.ndarray, "N 4"]
-    descriptors: Float32[np.ndarray, "N 128"]
+    keypoints: Float32[np.ndarray, "N 4"]  # column, row (centres at integers + 0.5), scale; angle, radians
+    descriptors: Float32[np.ndarray, "N 128"]  # L2-normalised
 
     @property
     def pixels(self) -> Float[np.ndarray, "N 2"]:
-        """Column and row, pixel centres at integers + 0.5. float64. [N, 2]"""
+        """Column and row, pixel centres at integers + 0.5; float64."""
         return self.keypoints[:, :2].astype(np.float64)
 
     def __len__(self) -> int:
@@ -72,7 +67,7 @@ Extractor = Callable[[UInt8[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"] | None
 
 
 def feature_extractor(settings: FeatureSettings) -> Extractor:
-    """Create a feature extractor: CLAHE, COLMAP's SIFT, and rejection of masked features; reusable for many images.
+    """Create a reusable feature extractor: CLAHE, COLMAP's SIFT, and rejection of masked features.
 
     Call it within :func:`~coliags_plugin.reconstruction.libraries.quiet_colmap`.
     """
@@ -106,7 +101,7 @@ def feature_extractor(settings: FeatureSettings) -> Extractor:
 def usable(
     image: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"] | None, settings: FeatureSettings
 ) -> Bool[np.ndarray, "H W"]:
-    """Pixels where features are accepted: neither masked nor near a highlight. [H, W]"""
+    """Pixels where features are accepted: neither masked nor near a highlight."""
     excluded = highlights(image, settings)
     if mask is not None:
         excluded |= ~mask
@@ -114,7 +109,7 @@ def usable(
 
 
 def highlights(image: UInt8[np.ndarray, "H W 3"], settings: FeatureSettings) -> Bool[np.ndarray, "H W"]:
-    """Specular highlights: pixels that are saturated or much brighter than their surroundings. [H, W]"""
+    """Specular highlights: pixels that are saturated or much brighter than their surroundings."""
     import cv2
 
     brightest = image.max(axis=2)

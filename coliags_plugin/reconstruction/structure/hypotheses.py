@@ -40,17 +40,11 @@ _MIRROR = np.diag([1.0, 1.0, -1.0])
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A model and what tells it from others.
-
-    Attributes:
-        model: COLMAP's reconstruction, after bundle adjustment.
-        correlation: Of log brightness with log depth; None: unknown.
-        is_reversed: Whether it was made by reversing another one's depth.
-    """
+    """A model after bundle adjustment, and what tells it from others."""
 
     model: pycolmap.Reconstruction
-    correlation: float | None
-    is_reversed: bool = False
+    correlation: float | None  # of log brightness with log depth; None: unknown
+    is_reversed: bool = False  # made by reversing another one's depth
 
     @classmethod
     def of(
@@ -115,15 +109,7 @@ class Hypothesis:
 
 
 def choose(hypotheses: Sequence[Hypothesis], plausible: tuple[float, float]) -> Hypothesis:
-    """The :func:`best` model of plausible field of view; all are logged.
-
-    Args:
-        hypotheses: The most likely first.
-        plausible: Least and largest nominal field of view, degrees.
-
-    Raises:
-        InputError: No model has a plausible field of view.
-    """
+    """The :func:`best` model of plausible nominal field of view, degrees; all, the most likely first, are logged."""
     for hypothesis in hypotheses:
         log.info("%s", hypothesis.described())
     left = [one for one in hypotheses if one.is_plausible(plausible)]
@@ -141,11 +127,8 @@ def choose(hypotheses: Sequence[Hypothesis], plausible: tuple[float, float]) -> 
 def best(hypotheses: Sequence[Hypothesis]) -> Hypothesis:
     """The best of models, at least one: explaining the images as well as any; lit from the camera; exact; undistorted.
 
-    Where errors hardly differ, the first of each camera model is left, as focal length and distortion compensate each
-    other; and of these, that with the least distortion is taken, as a lens is near the law that it was made for.
-
-    Args:
-        hypotheses: The most likely first.
+    Where errors hardly differ, the first (most likely) of each camera model is left, as focal length and distortion
+    compensate each other; of these, that with the least distortion is taken, as a lens is near the law it was made for.
     """
     left = _explaining(hypotheses)
     left = [one for one in left if one.is_lit_from_the_camera] or left
@@ -175,14 +158,10 @@ def _explaining(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
 
 
 def reversed_in_depth(model: pycolmap.Reconstruction, refine_camera: bool) -> pycolmap.Reconstruction:
-    """The model with near and far exchanged, bundle-adjusted.
+    """A copy of the model with near and far exchanged, bundle-adjusted.
 
     In the frame of the middle registered camera, every point is moved along its ray to the median depth squared divided
     by its depth, and the rotations of the others to it are mirrored; the images change least this way.
-
-    Args:
-        model: Stays as it is.
-        refine_camera: Whether focal length and distortion are adjusted too.
     """
     import pycolmap
 
@@ -213,14 +192,8 @@ def reversed_in_depth(model: pycolmap.Reconstruction, refine_camera: bool) -> py
 def find_start(video: MatchedVideo, settings: SfmSettings, progress: Progress | None = None) -> Start:
     """Camera model and focal length to map a video from, chosen on its middle if there are several candidates.
 
-    The part is mapped from each of :func:`~coliags_plugin.reconstruction.structure.sfm_cameras.starts`; the models, and
-    their reversals in depth, are bundle-adjusted and compared
-    (:func:`~coliags_plugin.reconstruction.structure.hypotheses.choose`). Where no model is plausible, the first start.
-
-    Args:
-        video: Features and matches.
-        settings: Of the camera and of mapping.
-        progress: Progress callback.
+    The part is mapped from each of :func:`starts`; the models, and their reversals in depth, are bundle-adjusted and
+    compared (:func:`choose`). Where no model is plausible, the first start.
     """
     tried = starts(settings.camera)
     if len(tried) == 1:
@@ -248,13 +221,7 @@ def find_start(video: MatchedVideo, settings: SfmSettings, progress: Progress | 
 
 
 def both_signs(model: pycolmap.Reconstruction, video: MatchedVideo, refined: bool) -> list[Hypothesis]:
-    """The bundle-adjusted model, and its reversal in depth unless it is lit from the camera.
-
-    Args:
-        model: Adjusted in place.
-        video: Its images.
-        refined: Whether focal length and distortion are adjusted too.
-    """
+    """The model, bundle-adjusted in place if refined, and its reversal in depth unless it is lit from the camera."""
     if refined:
         bundle_adjust(model, refine_camera=True)
     hypothesis = Hypothesis.of(model, video.brightness)

@@ -22,11 +22,7 @@ _FFMPEG = "make images with ffmpeg -i VIDEO -vf fps=10 FOLDER/%05d.png"
 
 
 def list_images(folder: Path) -> list[Path]:
-    """Image files of a folder in natural order, 2 before 10.
-
-    Raises:
-        InputError: The folder does not exist or holds fewer than two images.
-    """
+    """Image files of a folder in natural order, 2 before 10; at least two."""
     if folder.is_file():
         raise InputError(f"{folder} is a file", "a folder of images", f"{_FFMPEG}, if it is a video")
     if not folder.is_dir():
@@ -42,11 +38,7 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
-    """Read an image as 8-bit RGB, converting other formats.
-
-    Raises:
-        InputError: It cannot be read.
-    """
+    """Read an image as 8-bit RGB, converting other formats."""
     import cv2
 
     # Ignore the EXIF orientation, as COLMAP's cameras do.
@@ -55,24 +47,12 @@ def read_image(path: Path) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def read_mask(path: Path) -> Bool[np.ndarray, "H W"]:
-    """Read a mask: True where the image is not black.
-
-    Raises:
-        InputError: It cannot be read.
-    """
+    """Read a mask: True where the image is not black."""
     return np.asarray(read_image(path).max(axis=2) > 0)
 
 
 def masks_for(path: Path, images: Sequence[Path]) -> Masks:
-    """Read one mask for all images from a file, or a mask per image from a folder.
-
-    Args:
-        path: A mask image, black where pixels are ignored; or a folder of ``NAME.png`` or ``NAME.jpg.png``.
-        images: The images to find masks for.
-
-    Raises:
-        InputError: A mask is missing or cannot be read.
-    """
+    """Read one mask for all images from a file, or from a folder a mask ``NAME.png`` or ``NAME.jpg.png`` per image."""
     if path.is_file():
         return read_mask(path)
     masks = {}

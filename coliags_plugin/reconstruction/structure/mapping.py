@@ -22,14 +22,7 @@ def map_images(
     """Models of verified matches by incremental mapping with fixed intrinsics, the largest first.
 
     Intrinsics that are to be refined stay fixed until all images are registered (:func:`bundle_adjust`): with few
-    images, motion along the optical axis makes them diverge.
-
-    Args:
-        database: Features and matches.
-        scratch: A new folder for COLMAP's files.
-        settings: Of mapping.
-        count: Number of images, for the progress.
-        progress: Progress callback.
+    images, motion along the optical axis makes them diverge. ``count``, the number of images, is for the progress.
     """
     import pycolmap
 
@@ -75,12 +68,7 @@ def map_images(
 
 
 def bundle_adjust(model: pycolmap.Reconstruction, refine_camera: bool) -> None:
-    """Global bundle adjustment of poses and points, followed by point filtering; done twice.
-
-    Args:
-        model: Adjusted in place.
-        refine_camera: Whether focal length and distortion are adjusted too.
-    """
+    """Global bundle adjustment of poses, points and, if refined, intrinsics, then point filtering; twice, in place."""
     import pycolmap
 
     options = pycolmap.BundleAdjustmentOptions()
@@ -122,7 +110,7 @@ def depths_of(model: pycolmap.Reconstruction) -> dict[int, tuple[Int[np.ndarray,
 
 
 def brightness_at(image: UInt8[np.ndarray, "H W 3"], pixels: Float[np.ndarray, "K 2"]) -> Float[np.ndarray, "K"]:
-    """Mean of the red, green and blue values around pixels, 0 to 255. [K]"""
+    """Mean of the red, green and blue values around pixels, 0 to 255."""
     import cv2
 
     mean = cv2.blur(image, (_BRIGHTNESS_WINDOW, _BRIGHTNESS_WINDOW)).mean(axis=2)
@@ -137,10 +125,7 @@ def brightness_correlation(
     """Correlation of log brightness with log depth within the images; None where too few points are seen.
 
     With the lamp at the lens it is negative: what is nearer is brighter. The gain of each image drops out.
-
-    Args:
-        model: Image i has ID i + 1.
-        brightness: At the features of each image, 0 to 255.
+    ``brightness`` is that of each image's features, 0 to 255; image i has ID i + 1.
     """
     light, depth = [], []
     for number, (features, z) in depths_of(model).items():

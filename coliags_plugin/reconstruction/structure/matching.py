@@ -33,17 +33,7 @@ def all_pairs(count: int) -> list[tuple[int, int]]:
 
 
 def mutual_matches(first: Features, second: Features, max_ratio: float, max_distance: float) -> Pairs:
-    """Match features by mutual nearest descriptors, Lowe's ratio test and a distance limit.
-
-    Args:
-        first: Features of one image.
-        second: Features of the other.
-        max_ratio: Largest ratio of the best to the second-best descriptor distance.
-        max_distance: Largest distance of unit-length descriptors, 0 to 2.
-
-    Returns:
-        Index pairs into ``first`` and ``second``. [M, 2]
-    """
+    """Match features by mutual nearest descriptors, Lowe's ratio test and a limit of their distance, 0 to 2."""
     if min(len(first), len(second)) < 2:
         return np.empty((0, 2), np.uint32)
     similarity = first.descriptors @ second.descriptors.T
@@ -73,20 +63,10 @@ def epipolar_matches(
     max_ratio: float,
     max_distance: float,
 ) -> Pairs:
-    """Match features of images with known poses among the candidates that satisfy the epipolar constraint.
+    """Match features of images with known poses among candidates that satisfy the epipolar constraint.
 
-    Fewer candidates make more matches pass the ratio test than in :func:`mutual_matches`.
-
-    Args:
-        first: Features of one image.
-        second: Features of the other.
-        cameras: Cameras of the two images.
-        max_error: Largest Sampson distance from the epipolar geometry, pixels.
-        max_ratio: Largest ratio of the best to the second-best descriptor distance among the candidates.
-        max_distance: Largest distance of unit-length descriptors, 0 to 2.
-
-    Returns:
-        Index pairs into ``first`` and ``second``. [M, 2]
+    ``max_error`` is the largest Sampson distance, pixels. Fewer candidates make more matches pass the ratio test than
+    in :func:`mutual_matches`.
     """
     one, other = _epipolar_candidates(first, second, cameras, max_error)
     if not len(one):
@@ -200,11 +180,6 @@ def alike_pairs(
     Each image is paired with the next two; with those 4, 8, 16, ... images ahead, up to the first that is not alike
     (every second or fourth image has the same pairs, therefore); and images evenly distributed over the video with the
     two most alike of each other's that are not reached this way, as loop closures.
-
-    Args:
-        features: Of each image, in video order.
-        settings: Of matching.
-        progress: Progress callback.
     """
     count = len(features)
     if count <= settings.exhaustive_up_to:

@@ -20,12 +20,10 @@ _FEWEST_BESIDE = 30
 def millimetres(
     reconstruction: Reconstruction, diameter: float | None = None, distance: tuple[str, str, float] | None = None
 ) -> float | None:
-    """Millimetres per unit of a model by what is known of it; None where the scale stays unknown, with a warning.
+    """Millimetres per unit of a model; None where the scale stays unknown, with a warning.
 
-    Args:
-        reconstruction: The model.
-        diameter: Typical inner diameter of the colon, mm; None: unknown.
-        distance: Names of two images, and the distance of their cameras, mm; it takes precedence. None: unknown.
+    Known are the colon's typical inner diameter, mm, or the names of two images and their cameras' distance, mm, which
+    takes precedence.
     """
     try:
         if distance is not None:
@@ -38,12 +36,7 @@ def millimetres(
 
 
 def distances_beside(path: Float[np.ndarray, "M 3"], points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "K"]:
-    """Distances of points from a polyline, for those nearest to its inside instead of one of its ends. [K]
-
-    Args:
-        path: Vertices, at least two.
-        points: Points; those ahead of and behind the path are left out.
-    """
+    """Distances of points from a polyline, without the points ahead of and behind it."""
     start, along = path[:-1], np.diff(path, axis=0)
     squares = np.maximum((along**2).sum(axis=1), 1e-30)
     best = np.full(len(points), np.inf)
@@ -57,15 +50,7 @@ def distances_beside(path: Float[np.ndarray, "M 3"], points: Float[np.ndarray, "
 
 
 def from_diameter(reconstruction: Reconstruction, diameter: float) -> float:
-    """Millimetres per unit, for a colon of an inner diameter: twice the median distance of the wall from the path.
-
-    Args:
-        reconstruction: The model; only points beside its path count.
-        diameter: Typical inner diameter, mm.
-
-    Raises:
-        InputError: The path is so short that too few points lie beside it.
-    """
+    """Millimetres per unit, for a colon whose inner diameter, mm, is twice the wall's median distance from the path."""
     points = np.array([point.xyz for point in reconstruction.model.points3D.values()]).reshape(-1, 3)
     beside = distances_beside(reconstruction.camera_to_world[:, :3, 3], points)
     if len(beside) < _FEWEST_BESIDE:
@@ -78,17 +63,7 @@ def from_diameter(reconstruction: Reconstruction, diameter: float) -> float:
 
 
 def from_distance(reconstruction: Reconstruction, first: str, second: str, distance: float) -> float:
-    """Millimetres per unit, from a known distance between the cameras of two images.
-
-    Args:
-        reconstruction: The model.
-        first: File name of an image, or its stem.
-        second: Likewise.
-        distance: Between the two optical centres, mm.
-
-    Raises:
-        InputError: An image is unknown or has no pose, or the two poses coincide.
-    """
+    """Millimetres per unit, from a known distance, mm, between the cameras of two images, by file name or stem."""
     rows = {}
     for row, index in enumerate(reconstruction.registered):
         rows[reconstruction.images[index].stem] = rows[reconstruction.images[index].name] = row

@@ -31,25 +31,15 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """Result of structure from motion. Scale and world frame are arbitrary: images alone determine neither.
+    """Result of structure from motion. Scale and world frame are arbitrary: images alone determine neither."""
 
-    Attributes:
-        images: All input images, in order.
-        registered: Indices of the registered images, ascending. [M]
-        camera_to_world: Their poses, OpenCV axes. [M, 4, 4]
-        names: Names of all images in the model.
-        model: COLMAP's reconstruction.
-        models: Number of registered images of every model found, the largest first.
-        correlation: Of log brightness with log depth (:func:`brightness_correlation`); None: unknown.
-    """
-
-    images: tuple[Path, ...]
-    registered: tuple[int, ...]
-    camera_to_world: Float[np.ndarray, "M 4 4"]
-    names: tuple[str, ...]
+    images: tuple[Path, ...]  # all input images, in order
+    registered: tuple[int, ...]  # indices of the registered images, ascending
+    camera_to_world: Float[np.ndarray, "M 4 4"]  # their poses, OpenCV axes
+    names: tuple[str, ...]  # of all images in the model
     model: pycolmap.Reconstruction
-    models: tuple[int, ...]
-    correlation: float | None = None
+    models: tuple[int, ...]  # number of registered images of every model found, the largest first
+    correlation: float | None = None  # of log brightness with log depth; None: unknown
 
     @property
     def left_out(self) -> tuple[Path, ...]:
@@ -84,8 +74,7 @@ def reconstruct(
 ) -> Reconstruction:
     """Estimate poses and points by incremental structure from motion, and return the largest model.
 
-    An unknown camera's model and focal length are chosen on a part of the video
-    (:func:`~coliags_plugin.reconstruction.structure.hypotheses.find_start`).
+    An unknown camera's model and focal length are chosen on a part of the video (:func:`find_start`).
 
     Args:
         images: Files in video order. Images of the same size share a camera.

@@ -27,15 +27,10 @@ _ASPECT_TOLERANCE = 0.02
 
 @dataclass(frozen=True)
 class Start:
-    """Camera that mapping starts with.
+    """Camera that mapping starts with."""
 
-    Attributes:
-        model: Of COLMAP, or of :data:`CALIBRATED`.
-        focal_factor: Focal length relative to the image's larger side, where no parameters are known.
-    """
-
-    model: str
-    focal_factor: float
+    model: str  # of COLMAP, or of CALIBRATED
+    focal_factor: float  # focal length relative to the image's larger side, where no parameters are known
 
 
 def starts(settings: CameraSettings) -> list[Start]:
@@ -62,16 +57,7 @@ def is_refined(settings: CameraSettings) -> bool:
 
 
 def calibrated_camera(name: str, width: int, height: int) -> tuple[str, tuple[float, ...]]:
-    """COLMAP's model and parameters of a known camera, scaled to an image size.
-
-    Args:
-        name: Of :data:`CALIBRATED`.
-        width: Of the images, which show the whole frame, pixels.
-        height: Likewise.
-
-    Raises:
-        InputError: The images have another aspect ratio than the whole frame.
-    """
+    """COLMAP's model and parameters of a known camera, scaled to the size of images that show its whole frame."""
     whole = LENSES[CALIBRATED[name]]
     if abs((width / height) / (whole.width / whole.height) - 1.0) > _ASPECT_TOLERANCE:
         raise InputError(
@@ -91,17 +77,7 @@ def calibrated_camera(name: str, width: int, height: int) -> tuple[str, tuple[fl
 def starting_cameras(
     settings: CameraSettings, images: Sequence[Path], sizes: Sequence[tuple[int, int]], start: Start
 ) -> list[pycolmap.Camera]:
-    """One camera per image size, in order of first appearance.
-
-    Args:
-        settings: With the parameters, where they are known.
-        images: Files, for errors.
-        sizes: Width and height of each.
-        start: Model and focal length.
-
-    Raises:
-        InputError: The model is unknown, the parameters do not fit it, or sizes differ where parameters are given.
-    """
+    """One camera per image size, in order of first appearance; ``images`` are the files, for errors."""
     import pycolmap
 
     known = {name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"}
@@ -136,10 +112,7 @@ def starting_cameras(
 
 
 def field_of_view(camera: pycolmap.Camera) -> float:
-    """Nominal field of view of the larger side, degrees.
-
-    Without distortion, that is 2 atan(side / 2f), and side / f of a fisheye.
-    """
+    """Nominal (undistorted) field of view of the larger side, degrees: 2 atan(side / 2f), or side / f of a fisheye."""
     return float(np.degrees(2.0 * _border(camera)[1]))
 
 

@@ -20,19 +20,12 @@ LEAST_NOISE = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Tracks of N points with K observations in all.
+    """Tracks of N points with K observations in all."""
 
-    Attributes:
-        positions: World. [N, 3]
-        points: Point index of each observation. [K]
-        frames: Frame index of each observation. [K]
-        pixels: Observed pixels, centres at integers + 0.5. [K, 2]
-    """
-
-    positions: Float[np.ndarray, "N 3"]
-    points: Int[np.ndarray, "K"]
-    frames: Int[np.ndarray, "K"]
-    pixels: Float[np.ndarray, "K 2"]
+    positions: Float[np.ndarray, "N 3"]  # world
+    points: Int[np.ndarray, "K"]  # point index of each observation
+    frames: Int[np.ndarray, "K"]  # frame index of each observation
+    pixels: Float[np.ndarray, "K 2"]  # observed pixels, centres at integers + 0.5
 
     @classmethod
     def of(cls, model: pycolmap.Reconstruction, frame_count: int) -> Tracks:
@@ -59,7 +52,7 @@ class Tracks:
 
     @property
     def lengths(self) -> Int[np.ndarray, "N"]:
-        """Number of frames that observe each point. [N]"""
+        """Number of frames that observe each point."""
         return np.bincount(self.points, minlength=len(self))
 
     def only(self, kept: Bool[np.ndarray, "N"]) -> Tracks:
@@ -69,18 +62,18 @@ class Tracks:
         return Tracks(self.positions[kept], number[self.points[is_kept]], self.frames[is_kept], self.pixels[is_kept])
 
     def local(self, cameras: Sequence[Camera]) -> Float[np.ndarray, "K 3"]:
-        """Points in the frames of their observing cameras. [K, 3]"""
+        """Points in the frames of their observing cameras."""
         poses = _poses(cameras)[self.frames]
         return np.einsum("kji,kj->ki", poses[:, :3, :3], self.positions[self.points] - poses[:, :3, 3])
 
     def residuals(self, cameras: Sequence[Camera]) -> tuple[Float[np.ndarray, "K 2"], Float[np.ndarray, "K"]]:
-        """Reprojection residuals (projection minus observation, pixels) and z-depths. [K, 2], [K]"""
+        """Reprojection residuals (projection minus observation, pixels) and z-depths."""
         local, k = self.local(cameras), _intrinsics(cameras)[self.frames]
         return local[:, :2] / local[:, 2:] * k[:, :2] + k[:, 2:] - self.pixels, local[:, 2]
 
 
 def widest_angles(tracks: Tracks, cameras: Sequence[Camera]) -> Float[np.ndarray, "N"]:
-    """Upper bound of the widest angle between a point's rays, degrees: twice the largest angle to their mean. [N]"""
+    """Upper bound of the widest angle between a point's rays, degrees: twice the largest angle to their mean."""
     poses = _poses(cameras)[tracks.frames]
     rays = tracks.positions[tracks.points] - poses[:, :3, 3]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -94,12 +87,10 @@ def widest_angles(tracks: Tracks, cameras: Sequence[Camera]) -> Float[np.ndarray
 
 
 def uncertainty(tracks: Tracks, cameras: Sequence[Camera]) -> tuple[float, Float[np.ndarray, "N"]]:
-    """Observation noise and the depth uncertainty it propagates to, for exact poses.
+    """Observation noise, and the depth uncertainty it propagates to for exact poses.
 
-    Returns:
-        The standard deviation of an observation along each axis, estimated from the residuals, pixels, at least
-        ``LEAST_NOISE``; and the resulting standard deviation of each point's z-depth relative to it, mean over the
-        observing cameras. [N]
+    The noise is the standard deviation of an observation along each axis, estimated from the residuals, pixels, at
+    least ``LEAST_NOISE``; the uncertainty each point's standard deviation of z-depth relative to it, mean over cameras.
     """
     if not len(tracks):
         return LEAST_NOISE, np.empty(0)

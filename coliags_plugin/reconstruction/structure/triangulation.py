@@ -88,44 +88,26 @@ class TriangulationSettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Observations of triangulated points in one frame.
+    """Observations of triangulated points in one frame."""
 
-    Attributes:
-        pixels: Observed column and row, pixel centres at integers + 0.5. [K, 2]
-        depth: z-depth of the points in this frame, scene units. [K]
-        points: Point indices. [K]
-    """
-
-    pixels: Float[np.ndarray, "K 2"]
-    depth: Float[np.ndarray, "K"]
-    points: Int[np.ndarray, "K"]
+    pixels: Float[np.ndarray, "K 2"]  # observed column and row, pixel centres at integers + 0.5
+    depth: Float[np.ndarray, "K"]  # z-depth of the points in this frame, scene units
+    points: Int[np.ndarray, "K"]  # point indices
 
 
 @dataclass(frozen=True, eq=False)
 class Triangulation:
-    """Triangulated surface points and their observations.
+    """Triangulated surface points and their observations."""
 
-    Attributes:
-        positions: World, scene units. [N, 3]
-        colors: RGB, mean over the observations. [N, 3]
-        errors: Mean reprojection error, pixels. [N]
-        depth_uncertainty: Standard deviation of z-depth relative to it, mean over the observing frames. [N]
-        track_lengths: Number of frames that observe the point. [N]
-        observations: Observations of each frame.
-        pixel_noise: Standard deviation of an observation along each axis, estimated from the residuals, pixels.
-        matches: Number of feature matches over all pairs of frames.
-        found: Number of points before filtering.
-    """
-
-    positions: Float[np.ndarray, "N 3"]
-    colors: UInt8[np.ndarray, "N 3"]
-    errors: Float[np.ndarray, "N"]
-    depth_uncertainty: Float[np.ndarray, "N"]
-    track_lengths: Int[np.ndarray, "N"]
-    observations: tuple[Observations, ...]
-    pixel_noise: float
-    matches: int
-    found: int
+    positions: Float[np.ndarray, "N 3"]  # world, scene units
+    colors: UInt8[np.ndarray, "N 3"]  # RGB, mean over the observations
+    errors: Float[np.ndarray, "N"]  # mean reprojection error, pixels
+    depth_uncertainty: Float[np.ndarray, "N"]  # standard deviation of z-depth relative to it, mean over the frames
+    track_lengths: Int[np.ndarray, "N"]  # number of frames that observe the point
+    observations: tuple[Observations, ...]  # of each frame
+    pixel_noise: float  # standard deviation of an observation along each axis, from the residuals, pixels
+    matches: int  # number of feature matches over all pairs of frames
+    found: int  # number of points before filtering
 
     def __len__(self) -> int:
         """Number of points."""
@@ -294,16 +276,7 @@ def _colors(frames: Sequence[Frame], tracks: Tracks) -> UInt8[np.ndarray, "N 3"]
 
 
 def in_pixels_of(triangulation: Triangulation, detected: Sequence[Frame], frames: Sequence[Frame]) -> Triangulation:
-    """The same points, with observations, reprojection errors and noise in the pixels of other images.
-
-    Args:
-        triangulation: Triangulated from ``detected``.
-        detected: The frames in which features were detected.
-        frames: The same frames at another size.
-
-    Raises:
-        InputError: The frames are not the same.
-    """
+    """The same points, with pixels, errors and noise those of ``frames``, the detected ones at another size."""
     names = [[frame.name for frame in video] for video in (detected, frames)]
     if names[0] != names[1] or len(triangulation.observations) != len(frames):
         raise InputError(f"{len(detected)} and {len(frames)} frames", "the same frames at two sizes")

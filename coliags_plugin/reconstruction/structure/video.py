@@ -27,23 +27,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class MatchedVideo:
-    """Images with features and matches, some or all of a video.
-
-    Attributes:
-        images: Files.
-        names: Names in the model.
-        sizes: Width and height of each.
-        features: Of each.
-        brightness: At the features of each.
-        matches: By pair of indices.
-    """
+    """Images with features and matches, some or all of a video."""
 
     images: tuple[Path, ...]
-    names: tuple[str, ...]
-    sizes: tuple[tuple[int, int], ...]
+    names: tuple[str, ...]  # in the model
+    sizes: tuple[tuple[int, int], ...]  # width and height
     features: tuple[Features, ...]
-    brightness: tuple[Float[np.ndarray, "K"], ...]
-    matches: Mapping[tuple[int, int], Pairs]
+    brightness: tuple[Float[np.ndarray, "K"], ...]  # at the features
+    matches: Mapping[tuple[int, int], Pairs]  # by pair of indices
 
     def middle(self, count: int) -> MatchedVideo:
         """At most ``count`` images around the middle: every second or fourth, if there are enough.
@@ -82,18 +73,7 @@ class MatchedVideo:
 def read_video(
     images: tuple[Path, ...], settings: SfmSettings, masks: Masks = None, progress: Progress | None = None
 ) -> MatchedVideo:
-    """Find and match the features of a video's images.
-
-    Args:
-        images: Files in video order.
-        settings: Of features, matching and the camera.
-        masks: False where a pixel is ignored; one for all images, or one per image.
-        progress: Progress callback.
-
-    Raises:
-        InputError: An image cannot be read, a mask has another size, sizes differ where parameters are given, or the
-            camera model is unknown.
-    """
+    """Find and match the features of a video's images."""
     extract = feature_extractor(settings.features)
     features, sizes, brightness = [], [], []
     for done, path in enumerate(images, start=1):

@@ -31,14 +31,9 @@ def aggregate(
 ) -> None:
     """Sum of the path costs over eight directions.
 
-    Args:
-        cost: float32 [H, W, D]
-        guide: Image whose edges make jumps cheaper. float32 [H, W]
-        small: Penalty of a change by one hypothesis (P1).
-        large: Penalty of any greater change (P2), divided by ``1 + contrast * |difference of the guide|`` and not less
-            than ``small``.
-        contrast: See ``large``.
-        total: Written. float32 [H, W, D]
+    ``guide``: image whose edges make jumps cheaper. Penalty of a change by one hypothesis: ``small`` (P1); of any
+    greater one: ``large`` (P2) divided by ``1 + contrast * |difference of the guide|``, and not less than ``small``.
+    Costs are float32 [H, W, D].
     """
     height, width, count = cost.shape
     total[:] = 0.0
@@ -92,15 +87,11 @@ def aggregate(
 def pick(total: Array, cost: Array, rivals: int, index: Array, match: Array, margin: Array) -> None:
     """The hypothesis of the least aggregated cost, to a part of a step by a parabola.
 
-    Args:
-        total: Aggregated costs. float32 [H, W, D]
-        cost: Before aggregation. float32 [H, W, D]
-        rivals: How many hypotheses before the best one must have been compared, where there are as many: at the rim of
-            an image, what is near leaves the neighbours' views, and what is left wins for want of rivals.
-        index: Written: position among the hypotheses, fractional. float32 [H, W]
-        match: Written: correlation at it, -1 to 1; 0 without its rivals. float32 [H, W]
-        margin: Written: by how much the aggregated cost of any hypothesis more than two steps away is greater, of those
-            with a cost other than exactly 1, which says that nothing was compared. float32 [H, W]
+    ``rivals``: how many hypotheses before the best one must have been compared, where there are as many: at the rim of
+    an image, what is near leaves the neighbours' views, and what is left wins for want of rivals. Written, float32
+    [H, W]: ``index``, the fractional position; ``match``, the correlation at it before aggregation, -1 to 1, 0 without
+    its rivals; ``margin``, by how much the aggregated cost of any hypothesis more than two steps away is greater, of
+    those with a cost other than exactly 1, which says that nothing was compared.
     """
     height, width, count = total.shape
     for y in range(height):
