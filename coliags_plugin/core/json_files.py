@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn, TypeAlias
 
@@ -73,3 +74,27 @@ def _refuse(text: str) -> NoReturn:
 
 
 _FINITE: dict[str, Any] = {"parse_float": _finite, "parse_constant": _refuse}
+
+
+def read_number(
+    values: Mapping[str, Any],
+    key: str,
+    where: object,
+    expected: str = "a finite number",
+    above: float = -math.inf,
+    below: float = math.inf,
+) -> float:
+    """The finite number of a JSON object under a key, strictly between two others; ``where`` is named in errors."""
+    value = values.get(key)
+    if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+        if above < value < below:
+            return float(value)
+    raise InputError(f"{where}: {key} is {value!r}", expected)
+
+
+def image_size(values: Mapping[str, Any], where: object) -> tuple[int, int]:
+    """Width and height of images, whole pixels above 0, of the keys ``w`` and ``h``."""
+    width, height = (read_number(values, key, where, "whole pixels, above 0", above=0.0) for key in ("w", "h"))
+    if width != int(width) or height != int(height):
+        raise InputError(f"{where}: w = {width}, h = {height}", "whole pixels")
+    return int(width), int(height)

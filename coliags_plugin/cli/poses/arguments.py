@@ -12,7 +12,7 @@ from coliags_plugin.core.errors import InputError
 
 if TYPE_CHECKING:
     from coliags_plugin.core.intrinsics import Intrinsics
-    from coliags_plugin.geometry.poses.format import Format
+    from coliags_plugin.geometry.poses.formats import Format
     from coliags_plugin.geometry.poses.trajectory import Trajectory
 
 OptionalFormat = Annotated[str | None, tyro.conf.arg(metavar="FORMAT")]

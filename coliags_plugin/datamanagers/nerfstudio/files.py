@@ -12,11 +12,10 @@ from typing import Any, cast
 import numpy as np
 
 from coliags_plugin.core.errors import InputError, did_you_mean
-from coliags_plugin.core.json_files import read_json
+from coliags_plugin.core.json_files import read_json, read_number
 from coliags_plugin.datamanagers.nerfstudio.cameras import PixelCenters, camera_of
 from coliags_plugin.datamanagers.reading.files import first_few, named_file
 from coliags_plugin.datamanagers.reading.images import size_of
-from coliags_plugin.datamanagers.reading.json_numbers import read_number
 from coliags_plugin.geometry.lenses.models import Lens
 
 FILE = "transforms.json"

@@ -7,8 +7,7 @@ from pathlib import Path
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.intrinsics import Intrinsics
-from coliags_plugin.core.json_files import read_json
-from coliags_plugin.datamanagers.reading.json_numbers import image_size, read_number
+from coliags_plugin.core.json_files import image_size, read_json, read_number
 
 
 def read_intrinsics(path: Path) -> Intrinsics:

@@ -13,11 +13,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Shaped
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.json_files import read_json
+from coliags_plugin.core.json_files import image_size, read_json, read_number
 from coliags_plugin.datamanagers.reading.depth_formats import DepthFormat
 from coliags_plugin.datamanagers.reading.files import inventory, named_file, require_folder
 from coliags_plugin.datamanagers.reading.images import read_gray
-from coliags_plugin.datamanagers.reading.json_numbers import image_size, read_number
 from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z, check_rigid
 from coliags_plugin.geometry.poses.trajectory import natural_order, refuse_repeated

@@ -13,13 +13,12 @@ from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import Intrinsics
-from coliags_plugin.core.json_files import read_json
+from coliags_plugin.core.json_files import read_json, read_number
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.core.text_files import read_text, text_lines
 from coliags_plugin.datamanagers.reading.camera_json import read_intrinsics
 from coliags_plugin.datamanagers.reading.files import DEPTH_SUFFIXES, IMAGE_SUFFIXES, inventory, require_folder
 from coliags_plugin.datamanagers.reading.images import size_of
-from coliags_plugin.datamanagers.reading.json_numbers import read_number
 from coliags_plugin.geometry.poses import tum
 from coliags_plugin.geometry.poses.colmap import read_pinholes
 from coliags_plugin.geometry.poses.text import shortened

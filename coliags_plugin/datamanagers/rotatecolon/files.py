@@ -12,9 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.json_files import read_json
+from coliags_plugin.core.json_files import read_json, read_number
 from coliags_plugin.datamanagers.reading.files import numbered
-from coliags_plugin.datamanagers.reading.json_numbers import read_number
 from coliags_plugin.geometry.poses.nerfstudio import read as read_transforms
 
 log = logging.getLogger(__name__)

@@ -35,11 +35,7 @@ _NEGLIGIBLE = 1e-100
 
 
 class Lens(ABC):
-    """A camera without its pose: between pixels of one image and viewing directions.
-
-    Attributes:
-        width, height: Size of the image, pixels.
-    """
+    """A camera without its pose: between pixels of one image and viewing directions. Sizes in pixels."""
 
     width: int
     height: int
@@ -54,26 +50,17 @@ class Lens(ABC):
 
     @abstractmethod
     def unproject(self, pixels: ArrayLike) -> Float[np.ndarray, "N 3"]:
-        """Viewing directions of pixels.
+        """Viewing directions of pixels, (column, row).
 
-        Args:
-            pixels: (column, row), centres at integers + 0.5. [N, 2]
-
-        Returns:
-            Directions with z = 1, so that a point at z-depth ``z`` is ``z * direction``; NaN where the model does not
-            reach (a direction at or beyond 90 degrees, or past its turning point). [N, 3]
+        They have z = 1, so that a point at z-depth ``z`` is ``z * direction``; NaN where the model does not reach: at
+        90 degrees or beyond, or past its turning point.
         """
 
     @abstractmethod
     def project(self, points: ArrayLike) -> Float[np.ndarray, "N 2"]:
-        """Pixels of points.
+        """Pixels, (column, row), of points in camera axes, inside the image or not.
 
-        Args:
-            points: In camera axes, any unit. [N, 3]
-
-        Returns:
-            (column, row), centres at integers + 0.5, inside the image or not; NaN where the model does not reach and
-            for points not in front of the camera. [N, 2]
+        NaN where the model does not reach and for points not in front of the camera.
         """
 
     @property
@@ -100,11 +87,7 @@ class CalibratedLens(Lens):
     origin: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        """Check that the numbers are those of a lens.
-
-        Raises:
-            InputError: One is not finite or absurdly large.
-        """
+        """Refuse numbers that are not finite or absurdly large."""
         for each in fields(self):
             value, limit = getattr(self, each.name), _LIMITS.get(each.name, bounds.DISTORTION)
             for number in value if isinstance(value, tuple) else (value,):
@@ -162,18 +145,13 @@ class OmnidirectionalLens(CalibratedLens):
     """Scaramuzza's polynomial model, with which C3VD's ground truth was rendered (docs/layouts/c3vd.md 2).
 
     A pixel (u, v) lies at ``A q + (cx, cy)``, and its ray is ``(q_x, q_y, a0 + a2 rho^2 + a3 rho^3 + a4 rho^4)`` with
-    ``rho = |q|``.
+    ``rho = |q|``; all but the affine part A are pixels.
 
     The source says ``c, d, e`` and leaves the order open. ``A = [[c, e], [d, 1]]``, as C3VD's renderer fills it, column
     by column: depth and normals were rendered so, and poses registered to them. C3VD's example loader has
     ``[[c, d], [e, 1]]``, which is this lens with ``d`` and ``e`` exchanged. As d is nearly -e, the two differ by a turn
     of the image of 0.33 degrees about its centre: up to 3.9 pixels at the left and right edges. Tracks through real
     frames, triangulated with C3VD's poses, agree better with the renderer's (docs/layouts/c3vd.md 2).
-
-    Attributes:
-        cx, cy: Centre, pixels.
-        a0, a2, a3, a4: Polynomial in rho, pixels.
-        c, d, e: The affine part.
     """
 
     cx: float
@@ -197,9 +175,6 @@ class OmnidirectionalLens(CalibratedLens):
     def _height(self, rho: Array) -> Array:
         return self.a0 + rho**2 * (self.a2 + rho * (self.a3 + rho * self.a4))
 
-    def _slope(self, rho: Array) -> Array:
-        return rho * (2.0 * self.a2 + rho * (3.0 * self.a3 + rho * 4.0 * self.a4))
-
     @property
     def _rim(self) -> float:
         """The radius seen at 90 degrees."""
@@ -216,39 +191,59 @@ class OmnidirectionalLens(CalibratedLens):
         tangent = np.linalg.norm(tangents, axis=1)
         # rho = tangent * height(rho), divided by sqrt(1 + tangent^2) so that grazing rays stay well scaled.
         cosine = 1.0 / np.hypot(1.0, tangent)
-        rho = _solve_increasing(
-            lambda rho: cosine * (rho - tangent * self._height(rho)),
-            lambda rho: cosine * (1.0 - tangent * self._slope(rho)),
-            np.where(np.isnan(tangent), np.nan, self._rim),
-        )
-        return _along(tangents, tangent, rho, self.a0) @ self._affine.T + (self.cx, self.cy)
+
+        def slope(rho: Array) -> Array:
+            rise = rho * (2.0 * self.a2 + rho * (3.0 * self.a3 + rho * 4.0 * self.a4))
+            return cosine * (1.0 - tangent * rise)
+
+        upper = np.where(np.isnan(tangent), np.nan, self._rim)
+        rho = _solve_increasing(lambda rho: cosine * (rho - tangent * self._height(rho)), slope, upper)
+        return along(tangents, tangent, rho, self.a0) @ self._affine.T + (self.cx, self.cy)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _FocalLens(CalibratedLens):
-    """A radial distortion in front of a pinhole camera: fx, fy, cx, cy in pixels."""
+    """A radial distortion ``r (1 + k1 r^2 + k2 r^4 + ...)`` in front of a pinhole camera: fx, fy, cx, cy in pixels."""
 
     fx: float
     fy: float
     cx: float
     cy: float
+    k1: float
+    k2: float
 
     @property
     def _calibrated_pinhole(self) -> tuple[float, float, float, float]:
         return self.fx, self.fy, self.cx, self.cy
 
-    @abstractmethod
+    @property
+    def _terms(self) -> tuple[float, ...]:
+        """k1, k2, ..."""
+        return self.k1, self.k2
+
     def _bent(self, radius: Array) -> Array:
         """The radius after distortion; increasing up to :attr:`_turning_point`."""
+        square = radius**2
+        *others, last = self._terms
+        factor = np.full_like(square, last)
+        for term in reversed(others):
+            factor = term + square * factor
+        return radius * (1.0 + square * factor)
 
-    @abstractmethod
     def _bent_slope(self, radius: Array) -> Array:
         """Derivative of :meth:`_bent`."""
+        square = radius**2
+        *others, last = self._terms
+        slope = square * (2.0 * len(self._terms) + 1.0) * last
+        for degree, term in reversed(list(enumerate(others, start=1))):
+            slope = square * ((2.0 * degree + 1.0) * term + slope)
+        return 1.0 + slope
 
     @property
-    @abstractmethod
     def _turning_point(self) -> float:
         """Up to where :meth:`_bent` increases; infinite where it always does."""
+        slope = [(2.0 * degree + 1.0) * term for degree, term in enumerate((1.0, *self._terms))]
+        return float(np.sqrt(_first_root(slope)))
 
     @abstractmethod
     def _radius_of_tangent(self, tangent: Array) -> Array:
@@ -269,33 +264,18 @@ class _FocalLens(CalibratedLens):
                 upper[short] *= 2.0
         upper = np.where(target <= self._bent(upper), upper, np.nan)
         radius = _solve_increasing(lambda radius: self._bent(radius) - target, self._bent_slope, upper)
-        return _along(bent, target, self._tangent_of_radius(radius), 1.0)
+        return along(bent, target, self._tangent_of_radius(radius), 1.0)
 
     def _calibrated_pixels(self, tangents: Array) -> Array:
         tangent = np.linalg.norm(tangents, axis=1)
         radius = self._radius_of_tangent(tangent)
         bent = np.where(radius < self._turning_point, self._bent(radius), np.nan)
-        return _along(tangents, tangent, bent, 1.0) * (self.fx, self.fy) + (self.cx, self.cy)
+        return along(tangents, tangent, bent, 1.0) * (self.fx, self.fy) + (self.cx, self.cy)
 
 
 @dataclass(frozen=True, kw_only=True)
 class BrownLens(_FocalLens):
-    """OpenCV's pinhole with radial distortion: ``r (1 + k1 r^2 + k2 r^4)`` of the tangent r."""
-
-    k1: float
-    k2: float
-
-    def _bent(self, radius: Array) -> Array:
-        square = radius**2
-        return radius * (1.0 + square * (self.k1 + square * self.k2))
-
-    def _bent_slope(self, radius: Array) -> Array:
-        square = radius**2
-        return 1.0 + square * (3.0 * self.k1 + square * 5.0 * self.k2)
-
-    @property
-    def _turning_point(self) -> float:
-        return float(np.sqrt(_first_root([1.0, 3.0 * self.k1, 5.0 * self.k2])))
+    """OpenCV's pinhole with radial distortion: r is the tangent."""
 
     def _radius_of_tangent(self, tangent: Array) -> Array:
         return tangent
@@ -306,27 +286,18 @@ class BrownLens(_FocalLens):
 
 @dataclass(frozen=True, kw_only=True)
 class FisheyeLens(_FocalLens):
-    """OpenCV's fisheye (Kannala-Brandt): ``t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)`` of the angle t, radians."""
+    """OpenCV's fisheye (Kannala-Brandt), with four terms: r is the angle, radians."""
 
-    k1: float
-    k2: float
     k3: float
     k4: float
 
-    def _bent(self, radius: Array) -> Array:
-        square = radius**2
-        return radius * (1.0 + square * (self.k1 + square * (self.k2 + square * (self.k3 + square * self.k4))))
-
-    def _bent_slope(self, radius: Array) -> Array:
-        square = radius**2
-        return 1.0 + square * (
-            3.0 * self.k1 + square * (5.0 * self.k2 + square * (7.0 * self.k3 + square * 9.0 * self.k4))
-        )
+    @property
+    def _terms(self) -> tuple[float, ...]:
+        return self.k1, self.k2, self.k3, self.k4
 
     @property
     def _turning_point(self) -> float:
-        slope = [1.0, 3.0 * self.k1, 5.0 * self.k2, 7.0 * self.k3, 9.0 * self.k4]
-        return min(float(np.sqrt(_first_root(slope))), np.pi / 2.0)
+        return min(super()._turning_point, np.pi / 2.0)
 
     def _radius_of_tangent(self, tangent: Array) -> Array:
         return np.arctan(tangent)
@@ -384,15 +355,10 @@ def octagon_mask(width: int, height: int) -> Bool[np.ndarray, "H W"]:
 
 
 def undistortion_map(lens: Lens, pinhole: Intrinsics) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
-    """Where ``cv2.remap`` finds each pixel of a pinhole image in the distorted image.
+    """Where ``cv2.remap`` finds each pixel of a pinhole image in the distorted image: its columns and rows.
 
-    Args:
-        lens: The lens of the distorted image.
-        pinhole: The camera of the pinhole image.
-
-    Returns:
-        Columns and rows in the distorted image, as ``cv2.remap`` counts them: pixel centres at INTEGERS.
-        :data:`NOWHERE` where the lens does not reach; they may lie outside the distorted image. Two of [H, W]
+    Unlike elsewhere, pixel centres are at INTEGERS, as OpenCV counts. Places may lie outside the distorted image, and
+    are :data:`NOWHERE` where the lens does not reach.
     """
     k = pinhole
     x, y = np.meshgrid((np.arange(k.width) + 0.5 - k.cx) / k.fx, (np.arange(k.height) + 0.5 - k.cy) / k.fy)
@@ -401,7 +367,7 @@ def undistortion_map(lens: Lens, pinhole: Intrinsics) -> tuple[Float32[np.ndarra
     return pixels[:, 0].reshape(k.height, k.width), pixels[:, 1].reshape(k.height, k.width)
 
 
-def _along(direction: Array, length: Array, new_length: Array, ratio_at_zero: float) -> Array:
+def along(direction: Array, length: Array, new_length: Array, ratio_at_zero: float) -> Array:
     """Vectors of new lengths along ``direction``, whose lengths are ``length``; smooth through zero. [N, 2]"""
     near = length < 1e-12
     ratio = np.where(near, ratio_at_zero, new_length / np.where(near, 1.0, length))
@@ -419,10 +385,7 @@ def _first_root(coefficients: list[float]) -> float:
 def _solve_increasing(
     function: Callable[[Array], Array], slope: Callable[[Array], Array], upper: Array, iterations: int = 60
 ) -> Array:
-    """Roots in [0, upper] of increasing functions, one per element, by Newton's method kept inside a bracket.
-
-    Elements whose ``upper`` is NaN are NaN.
-    """
+    """Roots in [0, upper] of increasing functions, one each, by Newton's method kept inside a bracket; NaN stays."""
     low, high = np.zeros_like(upper), upper.copy()
     root = 0.5 * upper
     for _ in range(iterations):

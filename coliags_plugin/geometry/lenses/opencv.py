@@ -18,13 +18,8 @@ class OpenCVLens(MappedLens):
 
         x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
 
-    and y' likewise with p1 and p2 exchanged (OpenCV, "Camera Calibration and 3D Reconstruction").
-
-    Attributes:
-        fx, fy, cx, cy: Pixels, centres at integers + 0.5.
-        k1, k2, k3: Numerator of the radial part.
-        k4, k5, k6: Its denominator.
-        p1, p2: Tangential part.
+    and y' likewise with p1 and p2 exchanged (OpenCV, "Camera Calibration and 3D Reconstruction"). fx, fy, cx and cy are
+    pixels, centres at integers + 0.5.
     """
 
     fx: float

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
-from coliags_plugin.geometry.lenses.models import Array, CalibratedLens
+from coliags_plugin.geometry.lenses.models import Array, CalibratedLens, along
 
 #: Largest angle from the optical axis in the table, radians. A pinhole image never shows larger ones.
 _WIDEST = np.deg2rad(89.9)
@@ -37,10 +37,7 @@ class MappedLens(CalibratedLens):
 
     @abstractmethod
     def _bent(self, tangents: Array) -> Array:
-        """Pixels of the calibrated image, centres at integers + 0.5, of (x / z, y / z). [N, 2]
-
-        May return anything where the model makes no sense.
-        """
+        """Pixels of the calibrated image of (x / z, y / z), anything where the model makes no sense. [N, 2]"""
 
     def _calibrated_pixels(self, tangents: Array) -> Array:
         angles = _angles(tangents)
@@ -130,18 +127,13 @@ def _vector(clock: Array, angle: Array) -> Array:
 def _angles(tangents: Array) -> Array:
     """Angle vectors of (x / z, y / z). [N, 2]"""
     length = np.linalg.norm(tangents, axis=1)
-    return _rescaled(tangents, length, np.arctan(length))
+    return along(tangents, length, np.arctan(length), 1.0)
 
 
 def _directions(angles: Array) -> Array:
     """Inverse of :func:`_angles`. [N, 2]"""
     length = np.linalg.norm(angles, axis=1)
-    return _rescaled(angles, length, np.tan(length))
-
-
-def _rescaled(vectors: Array, length: Array, wanted: Array) -> Array:
-    near = length < 1e-12
-    return np.asarray(vectors * np.where(near, 1.0, wanted / np.where(near, 1.0, length))[:, None])
+    return along(angles, length, np.tan(length), 1.0)
 
 
 def _solved(matrices: Array, values: Array) -> Array:

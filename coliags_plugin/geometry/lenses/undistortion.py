@@ -21,17 +21,15 @@ class Undistortion:
 
     Where one pixel of the result covers several source pixels, its colour is the mean of ``supersampling`` x
     ``supersampling`` bilinear samples spread over it, which avoids aliasing. Values that must not be mixed (depth,
-    masks) are taken from the nearest source pixel, in their own type. z-depth needs no conversion:
-    both cameras share their optical axis.
+    masks) are taken from the nearest source pixel, in their own type. z-depth needs no conversion: both cameras share
+    their optical axis.
 
     Args:
         lens: The lens of the source images.
         pinhole: The camera of the result.
-        source_mask: Source pixels with image content. None means all. [H_source, W_source]
+        source_mask: Source pixels with image content; None: all.
 
     Attributes:
-        lens: The lens of the source images.
-        source_mask: As given.
         supersampling: Bilinear samples per result pixel, along each side.
         valid: Result pixels made only of source pixels with image content. [height, width]
     """

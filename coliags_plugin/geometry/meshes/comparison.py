@@ -24,13 +24,7 @@ _FEW = 200
 
 @dataclass(frozen=True)
 class Score:
-    """Shares of points within a distance.
-
-    Attributes:
-        threshold_mm: The distance.
-        precision: Share of the reconstructed surface that lies so near the true one.
-        recall: Share of the seen true surface that lies so near the reconstructed one.
-    """
+    """Shares of the reconstructed and of the seen true surface that lie within a distance of the other."""
 
     threshold_mm: float
     precision: float
@@ -102,20 +96,9 @@ class SurfaceComparison:
 def sample_surface(
     mesh: TriangleMesh, count: int, part: Bool[np.ndarray, "F"] | None = None
 ) -> tuple[Float[np.ndarray, "N 3"], Int[np.ndarray, "N"]]:
-    """Points uniform by area: one in each of N equal shares of it, in the order of the triangles.
+    """Points uniform by area, one in each of ``count`` equal shares, float32, and the triangles they lie in.
 
-    The same mesh has the same points.
-
-    Args:
-        mesh: Any mesh.
-        count: Number of points, N.
-        part: True for triangles to sample; None: all. [F]
-
-    Returns:
-        Points, float32 [N, 3], and the triangles they lie in [N].
-
-    Raises:
-        InputError: There is no area.
+    They are in the order of the triangles, and the same for the same mesh; of ``part`` only, where it is given.
     """
     areas = mesh.areas if part is None else np.where(part, mesh.areas, 0.0)
     reached = np.cumsum(areas)
@@ -131,15 +114,10 @@ def sample_surface(
 
 
 def compare_meshes(mesh: TriangleMesh, truth: TrueSurface, samples: int = SAMPLES) -> SurfaceComparison:
-    """Compare a reconstructed mesh with the true surface.
+    """Compare a reconstructed mesh with the true surface, in its world and mm, by points on both.
 
     Distances are between points, uniform by area, and the nearest point of any triangle of the other mesh. Invented
     surface costs accuracy and precision, wherever it is; what no camera saw costs no completeness or recall.
-
-    Args:
-        mesh: In the frame of the truth, mm.
-        truth: The true surface.
-        samples: Points on each surface.
 
     Raises:
         InputError: A surface has no area, or the two lie apart or are of different size, as of another frame or unit.

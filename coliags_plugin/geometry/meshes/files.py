@@ -25,24 +25,14 @@ _TRIANGLES = 4
 
 
 def read_mesh(path: Path) -> TriangleMesh:
-    """Read a mesh from a PLY, OBJ or GLB file, told apart by their suffix; polygons are split into triangles.
-
-    Lengths stay those of the file.
-
-    Raises:
-        InputError: No such file, another suffix, a damaged file, or one without triangles.
-    """
+    """Read a mesh from a PLY, OBJ or GLB file, told apart by their suffix; lengths stay, polygons become triangles."""
     return read_flagged_mesh(path)[0]
 
 
 def read_flagged_mesh(path: Path) -> tuple[TriangleMesh, Int[np.ndarray, "F"] | None]:
-    """A mesh as :func:`read_mesh` reads it, with the texture index of each triangle where it is an OBJ file with such.
+    """A mesh as :func:`read_mesh` reads it, and the texture index of each triangle where it is an OBJ file with such.
 
-    Returns:
-        The mesh; and the texture index (``vt``, counted from 1) of the first corner of each triangle. [F]
-
-    Raises:
-        InputError: See there.
+    The index (``vt``, counted from 1) is that of the triangle's first corner.
     """
     if not path.is_file():
         raise InputError(f"no file {path}", "a mesh as PLY, OBJ or GLB file", "Check the path")
@@ -64,9 +54,6 @@ def write_mesh(path: Path, mesh: TriangleMesh) -> None:
     Vertex colours are written as they are: in PLY as uchar, in OBJ as three numbers in [0, 1] behind the position (an
     extension that MeshLab, Blender and open3d read), in GLB as linear light, as glTF demands. GLB has the same axes and
     lengths as the mesh; glTF's own are y up, metres.
-
-    Raises:
-        InputError: Another suffix, or the folder cannot be written.
     """
     suffix = _suffix(path)
     if suffix == "ply":
@@ -105,7 +92,10 @@ def _read_glb(path: Path) -> TriangleMesh:
 
 
 def encode_mesh(mesh: TriangleMesh) -> bytes:
-    """Bytes of a GLB file: one primitive with 32-bit indices, float positions and 8-bit colours."""
+    """Bytes of a GLB file: one primitive with 32-bit indices, float positions and 8-bit colours.
+
+    By hand: open3d 0.20 writes 16-bit indices at an offset that its own reader then refuses.
+    """
     arrays = [
         GlbArray(mesh.triangles.astype(np.uint32).reshape(-1, 1), indices=True),
         GlbArray(mesh.vertices.astype(np.float32), bounds=True),

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from coliags_plugin.core.open3d_library import import_open3d
 
+#: Where rays begin: each of its own, or all of one.
+Origins: TypeAlias = Float[np.ndarray, "N 3"] | Float[np.ndarray, "3"]
+
 
 class RayScene:
-    """A mesh indexed for rays and distances.
-
-    Args:
-        mesh: ``open3d.t.geometry.TriangleMesh``.
-    """
+    """An ``open3d.t.geometry.TriangleMesh`` indexed for rays and distances."""
 
     def __init__(self, mesh: Any) -> None:
         self._open3d = import_open3d("casts rays at meshes")
@@ -25,7 +26,7 @@ class RayScene:
         self._scene.add_triangles(mesh)
 
     def cast(
-        self, origins: Float[np.ndarray, "N 3"] | Float[np.ndarray, "3"], directions: Float[np.ndarray, "N 3"]
+        self, origins: Origins, directions: Float[np.ndarray, "N 3"]
     ) -> tuple[Int[np.ndarray, "N"], Float32[np.ndarray, "N"]]:
         """Triangle that each ray hits first, -1 without a hit, and how many lengths of the ray it is away. [N], [N]"""
         answer = self._scene.cast_rays(self._rays(origins, directions))
@@ -33,9 +34,7 @@ class RayScene:
         triangle = answer["primitive_ids"].numpy().astype(np.int64)  # unsigned; its largest value without a hit
         return np.where(np.isfinite(parameter), triangle, -1), parameter
 
-    def blocked(
-        self, origins: Float[np.ndarray, "N 3"] | Float[np.ndarray, "3"], directions: Float[np.ndarray, "N 3"]
-    ) -> Bool[np.ndarray, "N"]:
+    def blocked(self, origins: Origins, directions: Float[np.ndarray, "N 3"]) -> Bool[np.ndarray, "N"]:
         """Whether something lies on each ray before its end, the last thousandth of it left out. [N]"""
         rays = self._rays(origins, directions)
         return np.asarray(self._scene.test_occlusions(rays, tnear=0.0, tfar=0.999).numpy())
@@ -47,9 +46,7 @@ class RayScene:
         distances = np.linalg.norm(closest["points"].numpy().astype(np.float64) - points, axis=1)
         return distances, closest["primitive_ids"].numpy().astype(np.int64)
 
-    def _rays(
-        self, origins: Float[np.ndarray, "N 3"] | Float[np.ndarray, "3"], directions: Float[np.ndarray, "N 3"]
-    ) -> Any:
+    def _rays(self, origins: Origins, directions: Float[np.ndarray, "N 3"]) -> Any:
         rays = np.empty((len(directions), 6), np.float32)
         rays[:, :3], rays[:, 3:] = origins, directions
         return self._open3d.core.Tensor(rays)
@@ -96,29 +93,29 @@ class TriangleMesh:
 
     @cached_property
     def rays(self) -> RayScene:
-        """Casts rays at the mesh and measures distances to it; made once.
-
-        Raises:
-            InputError: open3d cannot be imported.
-        """
+        """Casts rays at the mesh and measures distances to it; made once."""
         return RayScene(self.to_open3d())
 
     def part(self, kept: Bool[np.ndarray, "F"]) -> TriangleMesh:
-        """The mesh of some triangles, without the vertices that no longer belong to any.
-
-        Args:
-            kept: True for triangles to keep. [F]
-        """
+        """The mesh of some triangles, without the vertices that no longer belong to any."""
         used, corners = np.unique(self.triangles[kept], return_inverse=True)
         colors = None if self.colors is None else self.colors[used]
         return TriangleMesh(self.vertices[used], corners.reshape(-1, 3), colors)
 
-    def to_open3d(self) -> Any:
-        """The mesh as an ``open3d.t.geometry.TriangleMesh``, for ray casting and measures.
+    def without_small_parts(self, share: float) -> TriangleMesh:
+        """The mesh without parts, connected by vertices, whose area is below a share of that of the largest part."""
+        if not len(self):
+            return self
+        first, second, third = self.triangles.T
+        rows, columns = np.concatenate([first, second]), np.concatenate([second, third])
+        count = len(self.vertices)
+        graph = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(count, count))
+        parts = connected_components(graph, directed=False)[1][first]
+        areas = np.bincount(parts, self.areas)
+        return self.part(areas[parts] >= share * areas.max())
 
-        Raises:
-            InputError: open3d cannot be imported.
-        """
+    def to_open3d(self) -> Any:
+        """The mesh as an ``open3d.t.geometry.TriangleMesh``, for ray casting and measures."""
         open3d = import_open3d("casts rays at meshes")
         made = open3d.t.geometry.TriangleMesh(
             open3d.core.Tensor(np.ascontiguousarray(self.vertices, np.float32)),

@@ -1,4 +1,8 @@
-"""Wavefront OBJ text of triangle meshes, with the texture indices that C3VD uses as flags."""
+"""Wavefront OBJ text of triangle meshes, with the texture indices that C3VD uses as flags.
+
+Read by hand: open3d 0.20 gives texture coordinates in place of their indices, which are lost where two coordinates are
+equal, splits vertices there, and of a damaged file returns an empty mesh without an error.
+"""
 
 from __future__ import annotations
 
@@ -21,12 +25,8 @@ _LONGEST_TRIANGLE = 200
 def decode_obj(path: Path) -> tuple[TriangleMesh, Int[np.ndarray, "F"] | None]:
     """Read the triangles of an OBJ file; polygons are split into fans.
 
-    Args:
-        path: The file.
-
-    Returns:
-        The mesh, with vertex colours where every ``v`` has six numbers, in [0, 1]; and for each triangle the texture
-        index (``vt``, counted from 1) of its first corner, None where corners have none. [F]
+    The mesh has vertex colours where every ``v`` has six numbers, the last three in [0, 1]. Beside it, for each
+    triangle, the texture index (``vt``, counted from 1) of its first corner; None where corners have none.
 
     Raises:
         InputError: It cannot be read, or a line of a vertex or a face is damaged.

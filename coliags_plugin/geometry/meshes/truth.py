@@ -37,24 +37,16 @@ class TrueSurface:
 
 
 def find_true_surface(scene: Path) -> Path | None:
-    """File of the true surface in the folder of a scene, if there is one: ``truth/mesh.ply`` or ``coverage_mesh.obj``.
-
-    Args:
-        scene: The folder.
-    """
+    """File of the true surface in a scene's folder, if there is one: ``truth/mesh.ply`` or ``coverage_mesh.obj``."""
     return next((scene / name for name in _PLACES if (scene / name).is_file()), None)
 
 
 def read_true_surface(path: Path, any_frame: bool = False) -> TrueSurface:
-    """Read a true surface and what was seen of it.
+    """Read a true surface, of a mesh or of the folder of a scene with one, and what was seen of it.
 
     Seen are, of a phantom, the triangles of ``face_seen`` in ``mesh_seen.npz`` beside it: those that are the first hit
-    of a pixel of a training frame; or those of ``face_seen_by_any_frame``. Of C3VD's ``coverage_mesh.obj``, those of
-    texture index 1: observed in any frame.
-
-    Args:
-        path: A mesh, or the folder of a scene with one.
-        any_frame: Of a phantom, what any frame of the video saw, held out or not.
+    of a pixel of a training frame; or, with ``any_frame``, those of ``face_seen_by_any_frame``, held out or not. Of
+    C3VD's ``coverage_mesh.obj``, those of texture index 1: observed in any frame.
 
     Raises:
         InputError: There is no mesh, or a file is damaged or does not belong to it.
@@ -70,7 +62,10 @@ def read_true_surface(path: Path, any_frame: bool = False) -> TrueSurface:
         of, key = ("any", "face_seen_by_any_frame") if any_frame else ("a training", "face_seen")
         return TrueSurface(path, mesh, _phantom_flags(flags, key, mesh), f"first hit of a pixel of {of} frame")
     if textures is not None and set(np.unique(textures)) <= {_OBSERVED, _UNOBSERVED}:
-        return _checked(TrueSurface(path, mesh, textures == _OBSERVED, "observed in any frame, by its vt 1"))
+        seen = textures == _OBSERVED
+        if not seen.any():
+            raise InputError(f"{path} marks no triangle as seen", "vt 1 at the triangles that were observed")
+        return TrueSurface(path, mesh, seen, "observed in any frame, by its vt 1")
     return TrueSurface(path, mesh, np.ones(len(mesh), bool), "")
 
 
@@ -81,9 +76,3 @@ def _phantom_flags(path: Path, key: str, mesh: TriangleMesh) -> Bool[np.ndarray,
             f"{path} has {seen.dtype} flags of shape {list(seen.shape)}", f"one bool for each of {len(mesh)} triangles"
         )
     return seen
-
-
-def _checked(surface: TrueSurface) -> TrueSurface:
-    if not surface.seen.any():
-        raise InputError(f"{surface.path} marks no triangle as seen", "vt 1 at the triangles that were observed")
-    return surface

@@ -15,9 +15,8 @@ from jaxtyping import Float
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.poses.association import FrameMatches
 from coliags_plugin.geometry.poses.rigid import inverse, rigid, rotation_angles_deg
-from coliags_plugin.geometry.poses.similarity import Similarity, umeyama
+from coliags_plugin.geometry.poses.similarity import Similarity, WorldRotation, umeyama, world_rotation
 from coliags_plugin.geometry.poses.trajectory import Trajectory
-from coliags_plugin.geometry.poses.world_rotation import WorldRotation, world_rotation
 
 
 @dataclass(frozen=True)
@@ -48,13 +47,12 @@ class Alignment:
             nearly straight.
         with_scale: Whether the scale was estimated.
         estimate: The estimate after alignment, camera-to-world: positions by ``transform``, orientations by
-            ``world_rotation``. [M, 4, 4]
-        reference: The reference, camera-to-world. [M, 4, 4]
-        delta: Frames between the two poses of a relative error.
-        position_errors: Distance of the centres, in units of the reference. [M]
-        rotation_errors_deg: Angle between the cameras. [M]
-        relative_translation_errors: RPE over ``delta`` matched frames, units of the reference. [M - delta]
-        relative_rotation_errors_deg: RPE over ``delta`` matched frames, degrees. [M - delta]
+            ``world_rotation``.
+        reference: The reference, camera-to-world.
+        delta: Matched frames between the two poses of a relative error.
+        position_errors: Distance of the centres, units of the reference as all lengths here.
+        rotation_errors_deg: Angle between the cameras.
+        relative_translation_errors, relative_rotation_errors_deg: RPE, P = M - delta.
     """
 
     matches: FrameMatches
@@ -101,11 +99,7 @@ class Alignment:
         return ErrorStatistics.of(self.relative_rotation_errors_deg)
 
     def to_json(self, unit: str) -> dict[str, Any]:
-        """All results as JSON values.
-
-        Args:
-            unit: Name of the reference's unit of length.
-        """
+        """All results as JSON values; ``unit`` names the reference's unit of length."""
         return {
             "unit": unit,
             "matched": len(self.matches),
@@ -146,9 +140,6 @@ def align(
         matches: From :func:`associate`, estimate first.
         with_scale: Sim(3) instead of SE(3), for an estimate of arbitrary scale.
         delta: Matched frames between the two poses of a relative error.
-
-    Raises:
-        InputError: ``delta`` is not between 1 and the number of matches less one; or as :func:`umeyama`.
     """
     if not 1 <= delta < len(matches):
         raise InputError(

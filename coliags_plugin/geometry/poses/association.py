@@ -41,10 +41,10 @@ class FrameMatches:
 
 
 def associate(first: Trajectory, second: Trajectory, match: Match = "auto", tolerance: float = 0.02) -> FrameMatches:
-    """Match the frames of two trajectories.
+    """Match the frames of two trajectories, the estimate usually first.
 
     Args:
-        first: One trajectory, usually the estimate.
+        first: One trajectory.
         second: The other.
         match: ``name``: equal image names, or equal file stems. ``time``: timestamps within ``tolerance``, nearest
             pairs first, each frame once. ``index``: by index, for equal counts. ``endogslam-train``: the k-th pose of
@@ -81,12 +81,7 @@ def associate(first: Trajectory, second: Trajectory, match: Match = "auto", tole
 def nearest_in_time(
     wanted: Float[np.ndarray, "N"], known: Float[np.ndarray, "M"], tolerance: float
 ) -> Int[np.ndarray, "N"]:
-    """Match timestamps one to one, closest pairs first, as TUM's tools do.
-
-    Args:
-        wanted: Timestamps, in any order. [N]
-        known: Timestamps to match them with, in any order. [M]
-        tolerance: Largest difference.
+    """Match timestamps, in any order, one to one, closest pairs first, as TUM's tools do.
 
     Returns:
         Indices into ``known``, -1 without a match within the tolerance. [N]

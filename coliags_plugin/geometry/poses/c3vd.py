@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_write
-from coliags_plugin.geometry.poses.format import Format
+from coliags_plugin.geometry.poses.formats import Format
 from coliags_plugin.geometry.poses.rigid import RIGID_TOLERANCE, check_rigid
 from coliags_plugin.geometry.poses.text import count_first_numbers, read_numbers
 from coliags_plugin.geometry.poses.trajectory import Trajectory
@@ -37,10 +37,6 @@ def read_poses(path: Path) -> C3vdPoses:
 
     The web page calls the files row-major, but they are column-major (docs/layouts/c3vd.md 4). So the order is
     detected: read row-major, a rigid transform has its translation in the last column and (0, 0, 0, 1) in the last row.
-
-    Raises:
-        InputError: A line does not hold sixteen finite numbers, or is not a rigid transform in either order, or is
-            left-handed; or the order cannot be determined.
     """
     lines = read_numbers(
         path,
@@ -86,21 +82,13 @@ def read_poses(path: Path) -> C3vdPoses:
 
 
 def read(path: Path) -> Trajectory:
-    """Read a C3VD pose file, row-major or column-major.
-
-    Raises:
-        InputError: As :func:`read_poses`.
-    """
+    """Read a C3VD pose file, row-major or column-major."""
     poses = read_poses(path)
     return Trajectory(poses.camera_to_world, stored_as=f"camera-to-world matrices, {poses.convention}")
 
 
 def write(path: Path, trajectory: Trajectory) -> None:
-    """Write column-major matrices of the current release, sixteen unrounded numbers per line.
-
-    Raises:
-        InputError: The folder cannot be written.
-    """
+    """Write column-major matrices of the current release, sixteen unrounded numbers per line."""
     atomic_write(path, matrix_lines(trajectory.camera_to_world))
 
 

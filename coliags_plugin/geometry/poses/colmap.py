@@ -14,7 +14,7 @@ from coliags_plugin.core.files import atomic_folder, make_folder
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scratch import final_place
 from coliags_plugin.geometry.poses.colmap_files import model_suffix, read_cameras, read_images
-from coliags_plugin.geometry.poses.format import Format
+from coliags_plugin.geometry.poses.formats import Format
 from coliags_plugin.geometry.poses.rigid import inverse, rigid, rotations_from_wxyz, wxyz_from_rotations
 from coliags_plugin.geometry.poses.text import prefixed_errors
 from coliags_plugin.geometry.poses.trajectory import Trajectory, natural_order, refuse_repeated
@@ -31,12 +31,7 @@ _MODEL_FILES = {f"{part}{suffix}" for part in _PARTS for suffix in (".bin", ".tx
 def read(path: Path) -> Trajectory:
     """Read the poses of a sparse model, ordered by image name, 2 before 10.
 
-    Args:
-        path: A folder with ``images`` and ``cameras``, both ``.bin`` or both ``.txt``; binary is preferred.
-
-    Raises:
-        InputError: The files are missing, damaged or empty; or a quaternion is zero or further than 1e-3 from unit
-            length (the message names the line or image); or an image is repeated.
+    The folder has ``images`` and ``cameras``, both ``.bin`` or both ``.txt``; binary is preferred.
     """
     suffix = model_suffix(path, _NEEDED)
     if suffix is None:
@@ -64,21 +59,12 @@ def read(path: Path) -> Trajectory:
 
 
 def write(path: Path, trajectory: Trajectory) -> None:
-    """Write a binary model of one PINHOLE camera and no points.
-
-    Raises:
-        InputError: The trajectory has no intrinsics, a name is repeated, the folder holds something other than a
-            COLMAP model, or it cannot be written.
-    """
+    """Write a binary model of one PINHOLE camera and no points."""
     _write(path, trajectory, text=False)
 
 
 def write_text(path: Path, trajectory: Trajectory) -> None:
-    """Write a text model of one PINHOLE camera and no points; as :func:`write`.
-
-    Raises:
-        InputError: As :func:`write`; or a name has blanks, which COLMAP's reader would truncate.
-    """
+    """Write a text model as :func:`write`; without blanks in names, which COLMAP's reader would truncate."""
     for name in trajectory.names_or_numbers():
         if name.split() != [name]:
             raise InputError(f"the image name '{name}'", "no blanks in a text model", "Write a binary one: colmap")
@@ -108,13 +94,9 @@ def posed_model(
     cameras: Sequence[Intrinsics],
     camera_indices: Sequence[int],
 ) -> pycolmap.Reconstruction:
-    """A model of posed images without points: image i becomes COLMAP's image i + 1, camera k its camera k + 1.
+    """A model of posed images without points, of pinholes: image i becomes COLMAP's i + 1, camera k its k + 1.
 
-    Args:
-        world_to_camera: World-to-camera transforms of the images, OpenCV axes.
-        names: Image names.
-        cameras: Undistorted pinholes.
-        camera_indices: Camera index of each image.
+    ``camera_indices`` has the camera of each image.
     """
     import pycolmap
 
@@ -131,28 +113,18 @@ def posed_model(
 
 
 def _write(path: Path, trajectory: Trajectory, text: bool) -> None:
-    if trajectory.intrinsics is None:
-        raise InputError(
-            f"no intrinsics for {path}",
-            "a COLMAP model to hold the camera's intrinsics and image size",
-            "Pass --intrinsics fx,fy,cx,cy --size WIDTHxHEIGHT",
-        )
-    refuse_repeated(trajectory.names_or_numbers(), str(path))
+    intrinsics, names = trajectory.needed_intrinsics(path, "a COLMAP model"), trajectory.names_or_numbers()
+    refuse_repeated(names, str(path))
     others = sorted(file.name for file in path.iterdir() if file.name not in _MODEL_FILES) if path.is_dir() else []
     if others:
         raise InputError(f"{path} holds {others[0]}, which is not part of a COLMAP model", "an empty or new folder")
-    names = trajectory.names_or_numbers()
-    model = posed_model(colmap_poses(trajectory.camera_to_world), names, [trajectory.intrinsics], [0] * len(names))
+    model = posed_model(colmap_poses(trajectory.camera_to_world), names, [intrinsics], [0] * len(names))
     with atomic_folder(path, overwrite=True) as scratch:
         write_reconstruction(scratch, model, text)
 
 
 def write_reconstruction(folder: Path, model: pycolmap.Reconstruction, text: bool = False) -> None:
-    """Write a COLMAP model into a folder, which is made, and read it back: COLMAP itself ignores a full disk.
-
-    Raises:
-        InputError: The folder cannot be written.
-    """
+    """Write a COLMAP model into a folder, which is made, and read it back: COLMAP itself ignores a full disk."""
     import pycolmap
 
     make_folder(folder)
@@ -178,14 +150,7 @@ def _incomplete(folder: Path) -> InputError:
 
 
 def read_pinholes(path: Path) -> dict[int, Intrinsics | str]:
-    """Read the cameras of a model by ID: the pinhole, or a description of another camera model.
-
-    Args:
-        path: ``cameras.bin`` or ``cameras.txt``.
-
-    Raises:
-        InputError: As :func:`~coliags_plugin.geometry.poses.colmap_files.read_cameras`, or a pinhole is invalid.
-    """
+    """Read ``cameras.bin`` or ``cameras.txt`` by ID: the pinhole, or a description of another camera model."""
     pinholes: dict[int, Intrinsics | str] = {}
     for number, camera in read_cameras(path).items():
         if camera.model not in ("PINHOLE", "SIMPLE_PINHOLE"):

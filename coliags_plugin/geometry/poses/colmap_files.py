@@ -77,11 +77,7 @@ def model_suffix(folder: Path, parts: tuple[str, ...]) -> str | None:
 
 
 def read_cameras(path: Path) -> dict[int, ColmapCamera]:
-    """Read ``cameras.bin`` or ``cameras.txt``, by ID.
-
-    Raises:
-        InputError: The file cannot be read or is damaged, or names a camera model that COLMAP does not know.
-    """
+    """Read ``cameras.bin`` or ``cameras.txt``, by ID."""
     if path.suffix == ".bin":
         cameras = _binary_records(path, _binary_camera)
     else:
@@ -92,12 +88,7 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
 def read_images(path: Path, observations: bool = True) -> list[ColmapImage]:
     """Read ``images.bin`` or ``images.txt``.
 
-    Args:
-        path: The file.
-        observations: Whether to parse the observations of a text file, nearly all of its length; else there are none.
-
-    Raises:
-        InputError: The file cannot be read or is damaged, or a pose is not finite; the message names line or image.
+    Without ``observations`` those of a text file, nearly all of its length, are not parsed, and there are none.
     """
     if path.suffix == ".bin":
         return _binary_records(path, _binary_image)
@@ -115,11 +106,7 @@ def read_images(path: Path, observations: bool = True) -> list[ColmapImage]:
 
 
 def read_points(path: Path) -> list[ColmapPoint]:
-    """Read ``points3D.bin`` or ``points3D.txt``, in the order of their IDs.
-
-    Raises:
-        InputError: The file cannot be read or is damaged, or an ID is repeated.
-    """
+    """Read ``points3D.bin`` or ``points3D.txt``, in the order of their IDs."""
     if path.suffix == ".bin":
         points = _binary_records(path, _binary_point)
     else:

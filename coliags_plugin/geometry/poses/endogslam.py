@@ -16,7 +16,7 @@ from coliags_plugin.core.arrays import read_arrays
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_arrays
 from coliags_plugin.core.intrinsics import Intrinsics
-from coliags_plugin.geometry.poses.format import Format
+from coliags_plugin.geometry.poses.formats import Format
 from coliags_plugin.geometry.poses.rigid import check_rigid, inverse, rigid, rotations_from_wxyz, wxyz_from_rotations
 from coliags_plugin.geometry.poses.text import head, prefixed_errors
 from coliags_plugin.geometry.poses.trajectory import Trajectory
@@ -44,17 +44,16 @@ _HELD_OUT_EVERY = 8
 
 @dataclass(frozen=True, eq=False)
 class EndoGslamParams:
-    """Contents of a ``params.npz``, in this package's conventions.
+    """Contents of a ``params.npz``, in this package's conventions: the world is the first camera, lengths are mm.
 
     Attributes:
-        camera_to_world: Estimated poses, rigid, OpenCV axes; world: the first camera; mm. [F, 4, 4]
-        true_camera_to_world: The data set's poses of the same frames in the same world. [F, 4, 4]
+        camera_to_world: Estimated poses, rigid, OpenCV axes.
+        true_camera_to_world: The data set's poses of the same frames in the same world.
         intrinsics: Of all images.
-        means: Centres of the Gaussians, world, mm; N may be 0. float64. [N, 3]
-        rgb_colors: Colours, nominally in [0, 1]; may lie a little outside. float64. [N, 3]
-        log_scales: Logarithms of the standard deviations in mm; one column if Gaussians are isotropic. None if missing
-            in the file. [N, 1] or [N, 3]
-        keyframes: Indices of keyframes; None if missing in the file. [K]
+        means: Centres of the Gaussians; N may be 0. float64.
+        rgb_colors: Colours, nominally in [0, 1]; may lie a little outside. float64.
+        log_scales: Logarithms of the standard deviations, one column if Gaussians are isotropic; None if missing.
+        keyframes: Indices of keyframes; None if missing.
     """
 
     camera_to_world: Float[np.ndarray, "F 4 4"]
@@ -67,12 +66,11 @@ class EndoGslamParams:
 
 
 def read_params(path: Path) -> EndoGslamParams:
-    """Read all contents of a ``params.npz``.
+    """Read all contents of a ``params.npz``; ``log_scales`` and ``keyframe_time_indices`` may be missing.
 
     Raises:
         InputError: It is not an NPZ file, or keys are missing or have invalid shapes or values (all of them are named);
-            a pose is not rigid; or the intrinsics are not a pinhole's. ``log_scales`` and
-            ``keyframe_time_indices`` may be missing.
+            a pose is not rigid; or the intrinsics are not a pinhole's.
     """
     arrays = _arrays(path, tuple(key for key in SHAPES if key not in _SPARE), optional=_SPARE)
     keyframes = arrays.get("keyframe_time_indices")
@@ -88,11 +86,7 @@ def read_params(path: Path) -> EndoGslamParams:
 
 
 def read(path: Path) -> Trajectory:
-    """Read the estimated poses and the intrinsics.
-
-    Raises:
-        InputError: As :func:`read_params`, about the keys needed here.
-    """
+    """Read the estimated poses and the intrinsics."""
     arrays = _arrays(path, _POSES, optional=_PINHOLE)
     camera_to_world = _estimate(path, arrays)
     untouched = np.all(arrays["cam_trans"][0] == 0.0, axis=0) & np.all(arrays["cam_unnorm_rots"][0, 1:] == 0.0, axis=0)
@@ -102,11 +96,7 @@ def read(path: Path) -> Trajectory:
 
 
 def read_truth(path: Path) -> Trajectory:
-    """Read the dataset's true poses stored by EndoGSLAM.
-
-    Raises:
-        InputError: As :func:`read_params`, about the keys needed here.
-    """
+    """Read the dataset's true poses stored by EndoGSLAM."""
     arrays = _arrays(path, ("gt_w2c_all_frames",), optional=_PINHOLE)
     return _trajectory(path, arrays, _truth(path, arrays), "world-to-camera matrices", [])
 
@@ -116,17 +106,8 @@ def write(path: Path, trajectory: Trajectory) -> None:
 
     The world becomes the first camera, as the format requires. The trajectory is written as both estimated and true
     poses, since readers differ in which of them they use. Poses are float32, as EndoGSLAM's.
-
-    Raises:
-        InputError: The trajectory has no intrinsics, or the folder cannot be written.
     """
-    if trajectory.intrinsics is None:
-        raise InputError(
-            f"no intrinsics for {path}",
-            "a params.npz to hold the camera's intrinsics and image size",
-            "Pass --intrinsics fx,fy,cx,cy --size WIDTHxHEIGHT",
-        )
-    intrinsics = trajectory.intrinsics
+    intrinsics = trajectory.needed_intrinsics(path, "a params.npz")
     # World to first camera, then first camera to each camera.
     world_to_camera = inverse(trajectory.camera_to_world) @ trajectory.camera_to_world[0]
     world_to_camera[0] = np.eye(4)
@@ -156,16 +137,9 @@ def recognise(path: Path) -> bool:
 
 
 def image_indices(poses: int, images: int) -> Int[np.ndarray, "F"] | None:
-    """Image indices of EndoGSLAM's poses in a sequence.
+    """Image index of each of EndoGSLAM's poses: all, or all but 7, 15, 23, ...; None if the counts match neither. [F]
 
     EndoGSLAM's default config tracks only training frames, so that a file may hold 7/8 of the sequence's poses.
-
-    Args:
-        poses: Number of poses in the file.
-        images: Number of images of the sequence.
-
-    Returns:
-        Image index of each pose: all images, or all but 7, 15, 23, ...; None if the counts match neither. [F]
     """
     every = np.arange(images)
     if poses == images:
@@ -208,13 +182,11 @@ def _truth(path: Path, arrays: dict[str, np.ndarray]) -> np.ndarray:
 
 def _arrays(path: Path, required: Sequence[str], optional: Sequence[str] = ()) -> dict[str, np.ndarray]:
     """Load the named arrays as float64 and check their shapes and values; optional ones if present."""
-    faults: list[str] = []
     arrays = read_arrays(path, "a params.npz written by EndoGSLAM", optional=(*required, *optional))
-    faults += [f"no {key}" for key in required if key not in arrays]
+    faults = [f"no {key}" for key in required if key not in arrays]
     sizes: dict[str, int] = {}
     for key, array in list(arrays.items()):
-        fault = _fault(key, array, sizes)
-        if fault:
+        if fault := _fault(key, array, sizes):
             faults.append(fault)
         else:
             arrays[key] = array.astype(np.float64)

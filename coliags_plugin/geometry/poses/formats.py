@@ -1,32 +1,48 @@
-"""Detects pose file formats and writes trajectories."""
+"""Pose file formats, registered in :data:`coliags_plugin.config.registry.pose_formats`: detection and writing."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 from coliags_plugin.config.registry import pose_formats
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.geometry.poses.format import Format
 from coliags_plugin.geometry.poses.text import count_first_numbers
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 
 
-def format_named(name: str) -> Format:
-    """The format with a given name.
+@dataclass(frozen=True)
+class Format:
+    """A pose file format.
 
-    Raises:
-        InputError: The name is unknown.
+    Attributes:
+        name: Name on the command line.
+        read: Reads a file or folder.
+        write: Writes a file or folder, replacing an existing one; None if the format is read-only.
+        recognise: Whether a path has this format, by content; None if another format recognises it.
+        unit: Its unit of length, or ``"units"`` if the format defines none.
+        keeps: Further stored data: ``names``, ``timestamps``, ``intrinsics``.
+        folder: Whether the format is a folder of files.
     """
+
+    name: str
+    read: Callable[[Path], Trajectory]
+    write: Callable[[Path, Trajectory], None] | None
+    recognise: Callable[[Path], bool] | None
+    unit: str = "units"
+    keeps: frozenset[str] = frozenset()
+    folder: bool = False
+
+
+def format_named(name: str) -> Format:
+    """The format with a given name."""
     known: Format = pose_formats.get(name)
     return known
 
 
 def format_of(path: Path, name: str | None = None) -> Format:
-    """The format of a file or folder.
-
-    Args:
-        path: An existing file or folder.
-        name: The format's name; None: detect it from the content.
+    """The format of an existing file or folder, by its name or, where that is None, by the content.
 
     Raises:
         InputError: The path or format does not exist; a file is given for a folder format, or the other way round; or
@@ -55,13 +71,7 @@ def format_of(path: Path, name: str | None = None) -> Format:
 
 
 def write_trajectory(path: Path, trajectory: Trajectory, name: str, overwrite: bool = False) -> None:
-    """Write a trajectory atomically.
-
-    Args:
-        path: The file or folder; its parent folder is created.
-        trajectory: The trajectory.
-        name: Name of the format.
-        overwrite: Replace an existing file, or a COLMAP model in a folder.
+    """Write a trajectory atomically; the parent folder is made.
 
     Raises:
         InputError: The format is unknown or read-only; the path exists and ``overwrite`` is off; or as the format's

@@ -14,8 +14,8 @@ import numpy as np
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.intrinsics import Intrinsics
-from coliags_plugin.core.json_files import read_json
-from coliags_plugin.geometry.poses.format import Format
+from coliags_plugin.core.json_files import read_json, read_number
+from coliags_plugin.geometry.poses.formats import Format
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z, check_rigid
 from coliags_plugin.geometry.poses.text import head, prefixed_errors
 from coliags_plugin.geometry.poses.trajectory import Trajectory, natural_order, refuse_repeated
@@ -30,13 +30,10 @@ def read(path: Path) -> Trajectory:
 
     nerfstudio's conversion transforms the world and stores that in ``applied_transform`` (and ``applied_scale``); it is
     undone, so that poses are in their original world.
-
-    Raises:
-        InputError: The file is not such a JSON, or holds no frames; a frame has no file_path or no finite, rigid 4x4 or
-            3x4 matrix (the message names it); an image is repeated; or the applied transform is not rigid with a
-            positive scale.
     """
-    content = _json(path)
+    content = read_json(path, "a transforms.json")
+    if not isinstance(content, dict):
+        raise InputError(f"{path} holds a JSON {type(content).__name__}", "a JSON object with 'frames'")
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
         raise InputError(f"{path} has no frames", "'frames': [{'file_path': ..., 'transform_matrix': ...}, ...]")
@@ -68,11 +65,7 @@ def read(path: Path) -> Trajectory:
 
 
 def write(path: Path, trajectory: Trajectory) -> None:
-    """Write a ``transforms.json``, with intrinsics if known.
-
-    Raises:
-        InputError: A name is repeated, or the folder cannot be written.
-    """
+    """Write a ``transforms.json``, with intrinsics if known."""
     names = trajectory.names_or_numbers()
     refuse_repeated(names, str(path))
     content: dict[str, Any] = {}
@@ -89,13 +82,6 @@ def write(path: Path, trajectory: Trajectory) -> None:
 def recognise(path: Path) -> bool:
     """Whether a file begins like a JSON object."""
     return head(path).removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{")
-
-
-def _json(path: Path) -> dict[str, Any]:
-    content = read_json(path, "a transforms.json")
-    if not isinstance(content, dict):
-        raise InputError(f"{path} holds a JSON {type(content).__name__}", "a JSON object with 'frames'")
-    return content
 
 
 def _matrix(value: Any, place: str) -> np.ndarray:
@@ -119,9 +105,7 @@ def _undo_applied_transform(path: Path, content: dict[str, Any], camera_to_world
     """Poses before nerfstudio's applied_transform and applied_scale."""
     applied = _matrix(content.get("applied_transform", np.eye(4)), f"{path}: applied_transform")
     check_rigid(applied[None], lambda _: f"{path}: applied_transform")
-    scale = content.get("applied_scale", 1.0)
-    if isinstance(scale, bool) or not isinstance(scale, int | float) or not (math.isfinite(scale) and scale > 0.0):
-        raise InputError(f"{path}: applied_scale is {scale!r}", "a positive number")
+    scale = read_number({"applied_scale": 1.0} | content, "applied_scale", path, "a positive number", above=0.0)
     before = camera_to_world.copy()
     before[:, :3, 3] /= scale
     return np.asarray(np.linalg.inv(applied) @ before)
@@ -140,27 +124,18 @@ def _intrinsics(path: Path, content: dict[str, Any], frames: list[dict[str, Any]
             return None, f"no intrinsics: the camera ({model or 'OPENCV'}) is distorted"
         if values["fl_x"] is None and values["camera_angle_x"] is not None and values["w"] and values["h"]:
             # Blender's form: square pixels, the principal point in the middle.
-            half_width, half_height = (0.5 * _number(path, values, key) for key in ("w", "h"))
-            focal_length = half_width / math.tan(0.5 * _number(path, values, "camera_angle_x"))
+            half_width, half_height = (0.5 * read_number(values, key, path) for key in ("w", "h"))
+            focal_length = half_width / math.tan(0.5 * read_number(values, "camera_angle_x", path))
             values |= {"fl_x": focal_length, "fl_y": focal_length, "cx": half_width, "cy": half_height}
         missing = [key for key in _PINHOLE if values[key] is None]
         if missing:
             return None, f"no intrinsics: the file has no {', '.join(missing)}"
-        fx, fy, cx, cy, width, height = (_number(path, values, key) for key in _PINHOLE)
+        fx, fy, cx, cy, width, height = (read_number(values, key, path) for key in _PINHOLE)
         with prefixed_errors(str(path)):
             found.add(Intrinsics(fx, fy, cx, cy, round(width), round(height)))
     if len(found) > 1:
         return None, f"no intrinsics: the images have {len(found)} different cameras"
     return found.pop(), ""
-
-
-def _number(path: Path, values: dict[str, Any], key: str) -> float:
-    value = values[key]
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"{path}: {key} is {value!r}", "a number")
-    if not math.isfinite(value):
-        raise InputError(f"{path}: {key} is {value}", "a finite number")
-    return float(value)
 
 
 FORMAT = Format("nerfstudio", read, write, recognise, keeps=frozenset({"names", "intrinsics"}))

@@ -1,14 +1,17 @@
 """Least-squares transforms between the positions, and rotations between the orientations, of matched cameras.
 
 S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", IEEE TPAMI 13(4), 1991.
+R. Hartley et al., "Rotation averaging", International Journal of Computer Vision 103, 2013: the chordal mean.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
 
@@ -17,6 +20,11 @@ from coliags_plugin.core.errors import InputError
 OFF_LINE_SHARE = 1e-3
 #: Extents below this share of the coordinates are rounding errors.
 _ROUNDING = 1e-9
+#: Spread of a path (:attr:`Similarity.spread`) below which it is nearly straight: the rotation about it is taken from
+#: orientations, as errors of positions are a large part of what little they deviate from a line.
+NEARLY_STRAIGHT = 0.1
+
+By = Literal["positions", "orientations about the path", "orientations"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,14 +59,6 @@ def umeyama(source: Float[np.ndarray, "N 3"], target: Float[np.ndarray, "N 3"], 
     The rotation is unique only if d2 + s d3 > 0, with d1 >= d2 >= d3 the singular values of the covariance and s the
     sign of its determinant (Umeyama 1991, section III). Otherwise, as for points on a line, the smallest rotation that
     fits is returned, and :attr:`Similarity.undetermined` gives the reason.
-
-    Args:
-        source: Points to transform. [N, 3]
-        target: Corresponding target points. [N, 3]
-        with_scale: Also estimate a scale.
-
-    Raises:
-        InputError: A scale is requested, and the points of one side coincide or the two are uncorrelated.
     """
     source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
     centered, wanted = source - source_mean, target - target_mean
@@ -115,3 +115,50 @@ def _half_turn(axis: np.ndarray) -> np.ndarray:
 
 def _still(points: np.ndarray, centered: np.ndarray) -> bool:
     return bool(np.abs(centered).max() <= _ROUNDING * np.abs(points).max())
+
+
+@dataclass(frozen=True, eq=False)
+class WorldRotation:
+    """Rotation from the estimate's world to the reference's, with which rotation errors are computed.
+
+    Attributes:
+        rotation: Rotation matrix, det 1.
+        by: What determined it. ``positions``: those alone. ``orientations about the path``: positions determined the
+            direction of the path, the cameras' orientations the rotation about it. ``orientations``: those alone.
+        reason: Why positions alone did not, or an empty string.
+    """
+
+    rotation: Float[np.ndarray, "3 3"]
+    by: By
+    reason: str = ""
+
+
+def world_rotation(
+    estimated: Float[np.ndarray, "N 3 3"], true: Float[np.ndarray, "N 3 3"], transform: Similarity
+) -> WorldRotation:
+    """The rotation between two worlds, of the camera-to-world rotations of the same cameras in both.
+
+    The rotation of ``transform``, from positions, if the path is not nearly straight; else that rotation, turned about
+    the path by the angle that minimises the chordal distances of the orientations; and without any path the chordal
+    mean of the relative orientations.
+    """
+    total = np.einsum("nij,nkj->ik", true, estimated)
+    if not transform.axis.any():
+        return WorldRotation(_nearest_rotation(total), "orientations", transform.undetermined)
+    if transform.spread >= NEARLY_STRAIGHT:
+        return WorldRotation(transform.rotation, "positions")
+    # tr(R(angle)^T M) = constant + cos(angle) (tr M - a^T M a) + sin(angle) a . w, with w the antisymmetric part of M.
+    rest, axis = total @ transform.rotation.T, transform.axis
+    antisymmetric = np.array([rest[2, 1] - rest[1, 2], rest[0, 2] - rest[2, 0], rest[1, 0] - rest[0, 1]])
+    angle = np.arctan2(axis @ antisymmetric, np.trace(rest) - axis @ rest @ axis)
+    about = Rotation.from_rotvec(angle * axis).as_matrix()
+    reason = transform.undetermined or (
+        f"the path is nearly straight: its extent across is {100.0 * transform.spread:.2g} % of that along it"
+    )
+    return WorldRotation(about @ transform.rotation, "orientations about the path", reason)
+
+
+def _nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation with the largest tr(R^T M)."""
+    left, _, right = np.linalg.svd(matrix)
+    return np.asarray(left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right)

@@ -26,12 +26,9 @@ def read_numbers(
     Args:
         path: A text file.
         count: Numbers per row.
-        expected: Expectation in the error message for an invalid line.
+        expected: Expectation in the error message for an invalid line, which names it.
         do: Advice in that message.
         comments: Skip lines that begin with ``#``.
-
-    Raises:
-        InputError: The file cannot be read or holds no rows, or a line is invalid; the message names the line.
     """
     rows: list[tuple[int, list[float]]] = []
     for number, line in text_lines(path, EXPECTED):

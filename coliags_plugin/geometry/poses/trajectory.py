@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -20,9 +21,9 @@ class Trajectory:
 
     Attributes:
         camera_to_world: Rigid, OpenCV axes (x right, y down, z forward); lengths and world as in the file, unless a
-            remark says otherwise. float64. [N, 4, 4]
+            remark says otherwise. float64.
         names: Image name of each pose in the file, or None.
-        timestamps: Capture time of each image, s, or None. float64. [N]
+        timestamps: Capture time of each image, s, or None. float64.
         intrinsics: The pinhole that took all images, or None where it is unknown or there are several.
         stored_as: Convention of the file, for messages.
         remarks: Changes and omissions when the file was read.
@@ -36,12 +37,7 @@ class Trajectory:
     remarks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check poses, names and timestamps.
-
-        Raises:
-            InputError: There is no pose; one is not rigid, right-handed and finite; or there is not one name or finite
-                timestamp per pose.
-        """
+        """Refuse no poses, those not rigid, right-handed and finite, and other than one name or finite time each."""
         matrices = np.asarray(self.camera_to_world, dtype=np.float64)
         if matrices.ndim != 3 or matrices.shape[1:] != (4, 4) or not len(matrices):
             raise InputError(f"poses of the shape {list(matrices.shape)}", "[N, 4, 4], at least one")
@@ -78,11 +74,7 @@ class Trajectory:
         return np.asarray(np.linalg.norm(np.diff(self.centers, axis=0), axis=1))
 
     def summary(self, unit: str = "units") -> str:
-        """One-line summary: number of poses, path length and viewing direction, which reveal a wrong convention.
-
-        Args:
-            unit: Name of the unit of length.
-        """
+        """One-line summary: number of poses, path length and viewing direction, which reveal a wrong convention."""
         steps = self.steps
         mean_step = float(steps.mean()) if len(steps) else 0.0
         x, y, z = self.rotations[:, :, 2].mean(axis=0)
@@ -90,6 +82,16 @@ class Trajectory:
             f"{len(self)} poses, path {steps.sum():.4g} {unit}, mean step {mean_step:.3g} {unit}, "
             f"mean looking direction ({x:.2f}, {y:.2f}, {z:.2f})"
         )
+
+    def needed_intrinsics(self, path: Path, holder: str) -> Intrinsics:
+        """The intrinsics, for a file that must hold them; refuses a trajectory without."""
+        if self.intrinsics is None:
+            raise InputError(
+                f"no intrinsics for {path}",
+                f"{holder} to hold the camera's intrinsics and image size",
+                "Pass --intrinsics fx,fy,cx,cy --size WIDTHxHEIGHT",
+            )
+        return self.intrinsics
 
     def names_or_numbers(self) -> tuple[str, ...]:
         """The names, or ``0000.png``, ``0001.png``, ... without names."""
@@ -102,11 +104,7 @@ def natural_order(names: Sequence[str]) -> list[int]:
 
 
 def refuse_repeated(names: Sequence[str], place: str) -> None:
-    """Refuse a name that is repeated.
-
-    Raises:
-        InputError: A name is repeated; the message gives it and its two indices.
-    """
+    """Refuse a name that is repeated; the message gives it and its two indices."""
     first: dict[str, int] = {}
     for index, name in enumerate(names):
         if first.setdefault(name, index) != index:

@@ -7,19 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from coliags_plugin.core.files import atomic_write
-from coliags_plugin.geometry.poses.format import Format
+from coliags_plugin.geometry.poses.formats import Format
 from coliags_plugin.geometry.poses.rigid import rigid, rotations_from_wxyz, wxyz_from_rotations
 from coliags_plugin.geometry.poses.text import count_first_numbers, read_numbers
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 
 
 def read(path: Path) -> Trajectory:
-    """Read lines of ``timestamp tx ty tz qx qy qz qw``: camera-to-world, seconds, quaternion with w last.
-
-    Raises:
-        InputError: A line does not hold eight finite numbers, or its quaternion is zero or further than 1e-3 from unit
-            length.
-    """
+    """Read lines of ``timestamp tx ty tz qx qy qz qw``: camera-to-world, seconds, unit quaternion with w last."""
     lines = read_numbers(
         path,
         8,
@@ -38,11 +33,7 @@ def read(path: Path) -> Trajectory:
 
 
 def write(path: Path, trajectory: Trajectory) -> None:
-    """Write a TUM file; without timestamps, frame indices are written instead.
-
-    Raises:
-        InputError: The folder cannot be written.
-    """
+    """Write a TUM file; without timestamps, frame indices are written instead."""
     timestamps = trajectory.timestamps if trajectory.timestamps is not None else np.arange(len(trajectory))
     xyzw = wxyz_from_rotations(trajectory.rotations)[:, [1, 2, 3, 0]]
     rows = np.column_stack([timestamps, trajectory.centers, xyzw])

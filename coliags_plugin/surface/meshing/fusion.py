@@ -17,7 +17,6 @@ from coliags_plugin.engine.held_light import held_light, render_held
 from coliags_plugin.engine.progress import ProgressReport
 from coliags_plugin.engine.rendering import render_view
 from coliags_plugin.engine.trained import TrainedRun
-from coliags_plugin.geometry.meshes.cleaning import without_small_parts
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.outputs.image_files import eight_bit
 from coliags_plugin.surface.meshing.settings import MeshSettings, max_depth_of, voxel_size_of
@@ -63,7 +62,7 @@ def fuse_run(trained: TrainedRun, settings: MeshSettings | None = None) -> Trian
             f"opaque surface that {settings.min_views} views agree on",
             "Look at `coliags render RUN`; perhaps train longer, or lower min_views or min_alpha",
         )
-    return without_small_parts(mesh, settings.min_part)
+    return mesh.without_small_parts(settings.min_part)
 
 
 def _rendered(output: RenderOutput, camera: Camera) -> Float[Tensor, "H W 3"]:

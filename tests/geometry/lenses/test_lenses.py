@@ -10,10 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.geometry.lenses.models import LENSES, NOWHERE, octagon_mask, undistortion_map
+from coliags_plugin.geometry.lenses.pinhole import PinholeLens
 
 NAMES = sorted(LENSES)
+PINHOLE = PinholeLens(fx=61.0, fy=55.0, cx=33.5, cy=21.5, width=64, height=48)
 FISHEYE = LENSES["fisheye"]
 BROWN = LENSES["legacy-pinhole"]
 OMNI = LENSES["omnidirectional"]
@@ -150,14 +152,6 @@ def test_scaling_keeps_what_a_place_in_the_image_sees(name):
     np.testing.assert_allclose(back.unproject(same_place), lens.unproject(same_place), rtol=0, atol=1e-12)
 
 
-def test_scaling_a_pinhole_agrees_with_resizing_a_camera():
-    import torch
-
-    camera = Camera.of(BROWN.pinhole, torch.eye(4)).resized(338, 270)
-    assert camera.intrinsics == BROWN.pinhole.resized(338, 270)
-    assert astuple(BROWN.resized(338, 270).pinhole) == pytest.approx(astuple(camera.intrinsics))
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_cropping_moves_pixels(name):
     lens = LENSES[name].resized(675, 540)
@@ -274,3 +268,26 @@ def test_lenses_on_real_geometry(sparse_depth, lens, pixel_error, mm_error):
     assert np.quantile(off, 0.95) < pixel_error[1]
     assert np.median(wrong) < mm_error[0]
     assert np.quantile(wrong, 0.95) < mm_error[1]
+
+
+def test_pixels_and_directions_of_a_pinhole_are_inverse():
+    pixels = np.array([[33.5, 21.5], [0.5, 0.5], [63.75, -7.0]])
+    directions = PINHOLE.unproject(pixels)
+    np.testing.assert_array_equal(directions[0], [0.0, 0.0, 1.0])
+    np.testing.assert_allclose(PINHOLE.project(7.0 * directions), pixels, atol=1e-12)
+    assert np.isnan(PINHOLE.project([[1.0, 2.0, -3.0], [1.0, 2.0, 0.0]])).all()
+
+
+def test_scaled_and_cropped_images_of_a_pinhole_show_the_same():
+    directions = PINHOLE.unproject([[10.5, 12.5]])
+    # Pixel 10 covers 10 to 11: at twice the size, 20 to 22.
+    np.testing.assert_allclose(PINHOLE.resized(128, 96).project(directions), [[21.0, 25.0]])
+    np.testing.assert_allclose(PINHOLE.cropped(4, 5, 20, 20).project(directions), [[6.5, 7.5]])
+    assert (PINHOLE.cropped(4, 5, 20, 22).width, PINHOLE.cropped(4, 5, 20, 22).height) == (20, 22)
+    assert isinstance(PINHOLE.resized(32, 24), PinholeLens)
+
+
+def test_a_pinhole_is_what_it_is_made_of():
+    intrinsics = Intrinsics(61.0, 55.0, 33.5, 21.5, 64, 48)
+    assert PinholeLens.of(intrinsics) == PINHOLE
+    assert PINHOLE.pinhole == intrinsics

@@ -39,3 +39,19 @@ def test_open3d_gets_the_same_mesh(two_triangles):
     made = two_triangles.to_open3d()
     assert made.get_surface_area() == pytest.approx(7.0)
     assert made.vertex.positions.numpy() == pytest.approx(two_triangles.vertices)
+
+
+def squares(*edges: float) -> TriangleMesh:
+    """A square of two triangles for each length of an edge, side by side, not connected."""
+    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
+    vertices = [corners * edge + np.float32([100 * place, 0, 0]) for place, edge in enumerate(edges)]
+    triangles = [np.array([[0, 1, 2], [0, 2, 3]]) + 4 * place for place in range(len(edges))]
+    return TriangleMesh(np.concatenate(vertices), np.concatenate(triangles))
+
+
+def test_small_parts_are_removed_by_area():
+    mesh = squares(1, 10, 2)
+    assert np.allclose(mesh.without_small_parts(0.02).areas, [50, 50, 2, 2])
+    assert len(mesh.without_small_parts(0.05)) == 2
+    assert len(mesh.without_small_parts(0.0)) == 6
+    assert len(mesh.part(np.zeros(6, bool)).without_small_parts(0.5)) == 0

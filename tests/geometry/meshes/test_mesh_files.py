@@ -80,6 +80,8 @@ def test_damaged_files_are_refused(name, content, message, tmp_path):
     (tmp_path / name).write_text(content)
     with pytest.raises(InputError, match=message):
         read_mesh(tmp_path / name)
+    with pytest.raises(InputError, match="no file"):
+        read_mesh(tmp_path / "gone.ply")
 
 
 HEADER = """ply
@@ -120,8 +122,3 @@ def test_ply_of_any_form_with_other_lists_and_polygons(tmp_path, form, corners):
         if order or cut > 2:
             with pytest.raises(InputError):
                 read_mesh(tmp_path / "m.ply")
-
-
-def test_a_missing_file_is_refused(tmp_path):
-    with pytest.raises(InputError, match="no file"):
-        read_mesh(tmp_path / "gone.ply")

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
@@ -16,9 +15,8 @@ from coliags_plugin.geometry.poses import c3vd, nerfstudio
 from coliags_plugin.geometry.poses.alignment import ErrorStatistics, align
 from coliags_plugin.geometry.poses.association import FrameMatches, associate
 from coliags_plugin.geometry.poses.rigid import rigid
-from coliags_plugin.geometry.poses.similarity import Similarity, umeyama
+from coliags_plugin.geometry.poses.similarity import Similarity, umeyama, world_rotation
 from coliags_plugin.geometry.poses.trajectory import Trajectory
-from coliags_plugin.geometry.poses.world_rotation import world_rotation
 from tests.geometry.poses.winding import some_transform, trajectories, winding
 
 SEEDS = st.integers(0, 10_000)
@@ -43,9 +41,6 @@ def shaken(trajectory, seed, size=0.5):
 
 def aligned(estimate, reference, **options):
     return align(estimate, reference, associate(estimate, reference), **options)
-
-
-# Umeyama
 
 
 @given(trajectory=trajectories(), seed=SEEDS, scale=SCALES, with_scale=st.booleans())
@@ -87,26 +82,6 @@ def test_transform_is_open3ds(with_scale):
     np.testing.assert_allclose(found.translation, matrix[:3, 3], atol=1e-10)
 
 
-@pytest.mark.parametrize("with_scale", [False, True])
-def test_nothing_nearby_is_closer(with_scale):
-    rng = np.random.default_rng(6)
-    source, target = rng.normal(size=(2, 8, 3))
-    found = umeyama(source, target, with_scale)
-
-    def misfit(change):
-        rotation = Rotation.from_rotvec(change[:3]).as_matrix() @ found.rotation
-        scale = found.scale * np.exp(change[6]) if with_scale else 1.0
-        return ((scale * source @ rotation.T + found.translation + change[3:6] - target) ** 2).sum()
-
-    best = minimize(misfit, np.zeros(7), method="BFGS")
-    assert misfit(np.zeros(7)) == pytest.approx(best.fun, rel=1e-9)
-
-
-def test_a_mirror_image_is_not_met_by_a_reflection():
-    source = winding(10).centers
-    assert np.linalg.det(umeyama(source, source * (1, 1, -1)).rotation) == pytest.approx(1.0)
-
-
 def line(count=10, direction=(1.0, 2.0, -0.5), off_line=0.0):
     poses = winding(count, 4).camera_to_world.copy()
     rng = np.random.default_rng(1)
@@ -140,11 +115,9 @@ def test_errors_of_positions_do_not_turn_a_nearly_straight_path():
     assert np.rad2deg(Rotation.from_matrix(turned).magnitude()) > 10.0
     assert result.rotation_deg.rmse < 0.5
     # The ATE is the usual one, by positions alone.
-    expected = umeyama(moved(Trajectory(poses), some_transform(4)).centers, reference.centers)
     centers = moved(Trajectory(poses), some_transform(4)).centers
-    np.testing.assert_allclose(
-        result.position_errors, np.linalg.norm(expected.points(centers) - reference.centers, axis=1)
-    )
+    off = umeyama(centers, reference.centers).points(centers) - reference.centers
+    np.testing.assert_allclose(result.position_errors, np.linalg.norm(off, axis=1))
 
 
 @given(seed=SEEDS)
@@ -219,14 +192,6 @@ def test_how_far_off_a_line_is_enough(off_line, undetermined, by):
     assert result.transform.spread == pytest.approx(np.hypot(values[1], values[2]) / values[0], abs=1e-9)
 
 
-def test_a_line_run_backwards_is_turned_round():
-    poses = line().camera_to_world.copy()
-    poses[:, :3, 3] *= -1.0
-    result = aligned(Trajectory(poses), line())
-    assert result.ate.max < 1e-10
-    assert result.transform.undetermined
-
-
 @pytest.mark.parametrize("away", [0.0, 100.0])
 def test_a_camera_that_stays_in_place(away):
     poses = winding(6, 2).camera_to_world.copy()
@@ -244,9 +209,6 @@ def test_a_mirror_image_that_several_rotations_fit_is_told():
     corners = np.array([[2, 0, 0], [-2, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
     result = umeyama(corners, corners * (1, 1, -1) + 0.0)
     assert "mirror image" in result.undetermined or np.abs(result.points(corners) - corners * (1, 1, -1)).max() < 1e-9
-
-
-# Errors
 
 
 @given(trajectory=trajectories(), seed=SEEDS, scale=SCALES)
@@ -272,13 +234,6 @@ def test_errors_do_not_depend_on_the_worlds(seed, delta):
         np.testing.assert_allclose(getattr(after, name), getattr(before, name), atol=1e-8)
     for name in ("rotation_errors_deg", "relative_rotation_errors_deg"):
         np.testing.assert_allclose(getattr(after, name), getattr(before, name), atol=1e-5)
-
-
-def test_sim3_never_has_a_larger_ate_than_se3():
-    reference = winding(20)
-    estimate = moved(shaken(reference, 1), np.eye(4), 1.3)
-    rigidly, scaled = (aligned(estimate, reference, with_scale=flag) for flag in (False, True))
-    assert scaled.ate.rmse < rigidly.ate.rmse
 
 
 @pytest.mark.parametrize("delta", [1, 3])
@@ -335,9 +290,6 @@ def test_figures_are_json():
     assert told["ate_share_of_path"] == pytest.approx(told["ate"]["rmse"] / winding().steps.sum())
 
 
-# Association
-
-
 def named(names, **options):
     return winding(len(names), names=tuple(names), **options)
 
@@ -346,12 +298,9 @@ def pairs(matches):
     return list(zip(matches.first.tolist(), matches.second.tolist(), strict=True))
 
 
-def test_by_name_first():
+def test_by_name_first_or_its_last_part_where_folders_and_suffixes_differ():
     matches = associate(named(["c", "a", "x", "b"]), named(["a", "b", "c", "d", "e"]))
     assert (matches.by, pairs(matches)) == ("name", [(0, 2), (1, 0), (3, 1)])
-
-
-def test_by_the_last_part_of_the_name_where_folders_and_suffixes_differ():
     matches = associate(named(["images/a.png", "images/b.png", "images/c.png"]), named(["c.jpg", "b.jpg", "a.jpg"]))
     assert (matches.by, pairs(matches)) == ("name", [(0, 2), (1, 1), (2, 0)])
 
@@ -425,9 +374,6 @@ def test_matched_frames_alone_are_aligned():
     estimate = Trajectory(moved(reference, some_transform(1)).camera_to_world[[7, 2, 5, 0]])
     matches = FrameMatches(np.arange(4), np.array([7, 2, 5, 0]), "index")
     assert align(estimate, reference, matches).ate.max < 1e-9
-
-
-# Real data
 
 
 def test_two_files_of_one_real_trajectory(shared_data):

@@ -42,10 +42,7 @@ def test_what_is_written_is_read(tmp_path_factory, name, trajectory):
     write_trajectory(path, trajectory, name)
     read = format_named(name).read(path)
     same_poses(read, trajectory, name)
-    if "intrinsics" in format_named(name).keeps:
-        assert read.intrinsics == PINHOLE
-    else:
-        assert read.intrinsics is None
+    assert read.intrinsics == (PINHOLE if "intrinsics" in format_named(name).keeps else None)
 
 
 @given(trajectory=trajectories(intrinsics=PINHOLE), way=st.lists(st.sampled_from(WRITABLE), min_size=2, max_size=5))
@@ -132,15 +129,15 @@ def test_a_repeated_name_is_not_written(tmp_path, name):
 def test_what_is_no_pose_file_is_told(tmp_path):
     with pytest.raises(InputError, match="no file or folder"):
         format_of(tmp_path / "none")
-    (tmp_path / "kitti.txt").write_text(as_text(np.ones((2, 12))))
-    with pytest.raises(InputError, match="its first line holds 12 numbers"):
-        format_of(tmp_path / "kitti.txt")
-    (tmp_path / "letter.txt").write_text("Dear all,\n")
-    with pytest.raises(InputError, match="its first line holds no row of numbers"):
-        format_of(tmp_path / "letter.txt")
-    (tmp_path / "empty").write_text("")
-    with pytest.raises(InputError, match="no row of numbers"):
-        format_of(tmp_path / "empty")
+    kitti = as_text(np.ones((2, 12)))
+    for name, text, held in (
+        ("kitti.txt", kitti, "12 numbers"),
+        ("letter.txt", "Dear", "no row of"),
+        ("empty", "", "no row of"),
+    ):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(InputError, match=f"its first line holds {held}"):
+            format_of(tmp_path / name)
     with pytest.raises(InputError, match=r"holds empty, kitti\.txt, letter\.txt\. Expected the folder of a COLMAP"):
         format_of(tmp_path)
 
@@ -176,8 +173,10 @@ def test_trajectories_are_checked(tmp_path):
         Trajectory(poses[:0])
     with pytest.raises(InputError, match=r"\[3, 3, 4\]"):
         Trajectory(poses[:, :3])
+    broken = poses.copy()
+    broken[1, :3] *= -1.0
     with pytest.raises(InputError, match="pose 1: a left-handed transform"):
-        Trajectory(poses * np.where(np.arange(3) == 1, -1.0, 1.0)[:, None, None] @ np.diag([1, 1, 1, 1.0]) * _border(1))
+        Trajectory(broken)
     broken = poses.copy()
     broken[2, 0, 3] = np.nan
     with pytest.raises(InputError, match="pose 2: a transform that is not finite"):
@@ -188,13 +187,6 @@ def test_trajectories_are_checked(tmp_path):
         Trajectory(poses, timestamps=np.array([0.0, 1.0, np.inf]))
     with pytest.raises(InputError, match="focal lengths and size positive"):
         Intrinsics(0.0, 1.0, 1.0, 1.0, 4, 4)
-
-
-def _border(index: int) -> np.ndarray:
-    """Undoes the sign in the last row of one pose. [3, 4, 4]"""
-    signs = np.ones((3, 4, 4))
-    signs[index, 3] = -1.0
-    return signs
 
 
 def test_summary_counts_and_measures():
