@@ -60,11 +60,6 @@ class PreparedPhantom:
         """Poses of the frames that are not held out."""
         return [pose for index, pose in enumerate(self.poses) if not self.layout.is_test(index)]
 
-    @property
-    def vertex_albedo(self) -> Float[np.ndarray, "V 3"]:
-        """Albedo at the mesh's vertices, linear RGB."""
-        return vertex_albedo(self.world.surface, self.world.mucosa)
-
     def render_frame(self, number: int) -> tuple[Exposure, UInt8[np.ndarray, "P 3"]]:
         """Render image ``number``: the sequence's frames come first, then the rotation views.
 
@@ -81,12 +76,9 @@ class PreparedPhantom:
         noise = stream(self.settings.seed, Purpose.SENSOR, number)
         return exposure, develop(exposure.radiance, gain, self.settings, noise)
 
-    def seen(
-        self, points: Float[np.ndarray, "N 3"], camera_to_world: Float[np.ndarray, "4 4"]
-    ) -> Bool[np.ndarray, "N"]:
-        """Which points of the wall seen from this pose are also seen by a training frame."""
-        order = nearest_poses_first(camera_to_world, self.training_poses)
-        return seen_from(points, order, self.sensor.lens, self.sensor.mask, self.world.tracer)
+    def seen(self, points: Float[np.ndarray, "N 3"], cameras: list[Float[np.ndarray, "4 4"]]) -> Bool[np.ndarray, "N"]:
+        """Which points of the wall are seen from at least one of these poses."""
+        return seen_from(points, cameras, self.sensor.lens, self.sensor.mask, self.world.tracer)
 
 
 def image_size(settings: PhantomSettings, layout: Layout) -> tuple[int, int]:
@@ -140,21 +132,11 @@ def prepare(settings: PhantomSettings, progress: Progress | None = None) -> Prep
 def generate(
     settings: PhantomSettings, output: Path, overwrite: bool = False, progress: Progress | None = None
 ) -> None:
-    """Generate a phantom and write it.
+    """Generate a phantom and write it, atomically.
 
     The folder holds the sequence in ``settings.layout``; rotation-only test views and their seen masks, if the layout
     supports them; ``truth/``, with the mesh, the albedo, the light, every frame's gain, the poses in float64, and the
     seen masks of the sequence's test frames; and ``phantom.json``. The same settings give the same bytes.
-
-    Args:
-        settings: Settings.
-        output: The folder to create, atomically.
-        overwrite: Replace the folder if it exists.
-        progress: Progress callback ``(stage, done, total)``.
-
-    Raises:
-        InputError: The folder exists or cannot be written, the seed's colon leaves no clearance for the path, or open3d
-            is missing.
     """
     report = progress or (lambda stage, done, total: None)
     try:
@@ -226,7 +208,8 @@ def _seen_mask(
     hit = np.flatnonzero(exposure.z_depth > 0.0)
     points = _wall(phantom, exposure, camera_to_world, hit)
     mask = np.zeros(len(exposure.z_depth), np.uint8)
-    mask[hit] = np.where(phantom.seen(points, camera_to_world), 255, 0)
+    order = nearest_poses_first(camera_to_world, phantom.training_poses)
+    mask[hit] = np.where(phantom.seen(points, order), 255, 0)
     return mask
 
 
@@ -256,12 +239,8 @@ def _wall_points(
     phantom: PreparedPhantom, drawn: Sequence[tuple[Float[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"]]]
 ) -> WallPoints:
     positions = np.concatenate([positions for positions, _ in drawn])
-
-    def seen_in(index: int) -> Bool[np.ndarray, "N"]:
-        sensor = phantom.sensor
-        return seen_from(positions, [phantom.poses[index]], sensor.lens, sensor.mask, phantom.world.tracer)
-
-    return WallPoints(positions, np.concatenate([colors for _, colors in drawn]), seen_in)
+    colors = np.concatenate([colors for _, colors in drawn])
+    return WallPoints(positions, colors, lambda index: phantom.seen(positions, [phantom.poses[index]]))
 
 
 def _write_truth(
@@ -269,27 +248,19 @@ def _write_truth(
 ) -> None:
     surface, settings = phantom.world.surface, phantom.settings
     folder.mkdir(parents=True, exist_ok=True)
-    albedo = phantom.vertex_albedo
+    albedo = vertex_albedo(surface, phantom.world.mucosa)
     _write_mesh(folder / "mesh.ply", surface, albedo)
     vertices = surface.vertices.astype(np.float64)
-    seen = seen_from(vertices, phantom.training_poses, phantom.sensor.lens, phantom.sensor.mask, phantom.world.tracer)
-    write_arrays(
-        folder / "mesh_seen.npz", {"vertex_seen": seen, "face_seen": trained_on, "face_seen_by_any_frame": observed}
-    )
-    write_arrays(
-        folder / "albedo.npz",
-        {
-            "texture": phantom.world.mucosa.albedo.astype(np.float16),
-            "vertex_albedo": albedo,
-            "row_arc_mm": surface.arc,
-            "columns": np.array(surface.columns),
-        },
-    )
+    seen = phantom.seen(vertices, phantom.training_poses)
+    faces = {"face_seen": trained_on, "face_seen_by_any_frame": observed}
+    write_arrays(folder / "mesh_seen.npz", {"vertex_seen": seen, **faces})
+    texture = {"texture": phantom.world.mucosa.albedo.astype(np.float16), "vertex_albedo": albedo}
+    grid = {"row_arc_mm": surface.arc, "columns": np.array(surface.columns)}
+    write_arrays(folder / "albedo.npz", texture | grid)
     np.save(folder / "camera_to_world.npy", phantom.poses)
-    (folder / "gain.csv").write_text(_gain_csv(range(len(phantom.poses)), phantom.gains))
+    _write_gains(folder / "gain.csv", phantom.gains)
     if phantom.rotation_views:
-        used = phantom.gains[[view.frame for view in phantom.rotation_views]]
-        (folder / "rotation_gain.csv").write_text(_gain_csv(range(len(used)), used))
+        _write_gains(folder / "rotation_gain.csv", phantom.gains[[view.frame for view in phantom.rotation_views]])
     light = {
         "law": "pixel = noise + shoulder(gain * cos(theta)^vignetting * (albedo * (E n.l + E_indirect) + gloss E))"
         "^(1/gamma), E = beam(psi) (unit_distance_mm / d)^2, psi and d at the lamp",
@@ -337,11 +308,9 @@ def _write_coverage_mesh(path: Path, surface: ColonSurface, observed: Bool[np.nd
         np.savetxt(file, corners, "f %d/%d %d/%d %d/%d")
 
 
-def _gain_csv(frames: range, gains: Float[np.ndarray, "T 3"]) -> str:
-    lines = [
-        f"{frame},{red:.9g},{green:.9g},{blue:.9g}" for frame, (red, green, blue) in zip(frames, gains, strict=True)
-    ]
-    return "\n".join(["frame,gain_r,gain_g,gain_b", *lines]) + "\n"
+def _write_gains(path: Path, gains: Float[np.ndarray, "T 3"]) -> None:
+    rows = np.column_stack([np.arange(len(gains)), gains])
+    np.savetxt(path, rows, "%d,%.9g,%.9g,%.9g", header="frame,gain_r,gain_g,gain_b", comments="")
 
 
 def _json(value: object) -> str:

@@ -68,17 +68,9 @@ def make_patches(
     row_of = (np.arange(surface.rows) * rows) // surface.rows
     column_of = (np.arange(surface.columns) * columns) // surface.columns
     patch_of = (row_of[:, None] * columns + column_of[None, :]).ravel()
-    areas = np.bincount(patch_of, weights=surface.areas, minlength=rows * columns)
-    albedo = (
-        np.stack(
-            [
-                np.bincount(patch_of, weights=channel * surface.areas, minlength=rows * columns)
-                for channel in vertex_albedo.T
-            ],
-            axis=1,
-        )
-        / np.maximum(areas, 1e-9)[:, None]
-    )
+    areas = np.bincount(patch_of, surface.areas, rows * columns)
+    reflecting = [np.bincount(patch_of, channel * surface.areas, rows * columns) for channel in vertex_albedo.T]
+    albedo = np.stack(reflecting, axis=1) / np.maximum(areas, 1e-9)[:, None]
     order = np.argsort(patch_of, kind="stable")
     first = np.searchsorted(patch_of[order], np.arange(rows * columns))
     count = np.bincount(patch_of, minlength=rows * columns)

@@ -34,16 +34,7 @@ GainMode = Literal["auto", "fixed"]
 
 @dataclass(frozen=True)
 class Preset:
-    """Defaults of settings left at None, and motion parameters.
-
-    Attributes:
-        light_offset, spread_law, spread, vignetting, tilt, gain, white_balance_drift: See :class:`PhantomSettings`.
-        turn: Largest yaw, pitch and roll of the wobble, degrees.
-        scan: Largest rotation away from the lumen of the ``rotation`` trajectory, degrees.
-        wobble: Smallest and largest lateral excursion from the centre line, mm.
-        approaches: How often the camera comes close to the wall.
-        closest: Camera-to-wall distance of an approach, mm.
-    """
+    """Defaults of settings left at None (see :class:`PhantomSettings`), and motion parameters."""
 
     light_offset: tuple[float, float, float]
     spread_law: SpreadLaw
@@ -52,11 +43,11 @@ class Preset:
     tilt: float
     gain: GainMode
     white_balance_drift: float
-    turn: tuple[float, float, float]
-    scan: float
-    wobble: tuple[float, float]
-    approaches: int
-    closest: float
+    turn: tuple[float, float, float]  # largest yaw, pitch and roll of the wobble, degrees
+    scan: float  # largest rotation away from the lumen of the rotation trajectory, degrees
+    wobble: tuple[float, float]  # smallest and largest lateral excursion from the centre line, mm
+    approaches: int  # how often the camera comes close to the wall
+    closest: float  # camera-to-wall distance of an approach, mm
 
 
 #: ``c3vd`` is the fair default. Its fall-off towards the rim adds up to the cos^1.25 that a free fit of real C3VD

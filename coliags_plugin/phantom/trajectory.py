@@ -40,11 +40,10 @@ class RotationView:
 
 def camera_path(centre_line: CentreLine, settings: PhantomSettings, tracer: Tracer) -> Float[np.ndarray, "T 4 4"]:
     """Camera-to-world pose of every frame, OpenCV axes, mm, at least 6 mm from the wall."""
-    poses = (
-        inspecting_path(centre_line, settings, tracer)
-        if settings.trajectory == "inspection"
-        else _withdrawing_path(centre_line, settings, tracer.clearance)
-    )
+    if settings.trajectory == "inspection":
+        poses = inspecting_path(centre_line, settings, tracer)
+    else:
+        poses = _withdrawing_path(centre_line, settings, tracer.clearance)
     nearest = float(tracer.clearance(poses[:, :3, 3]).min())
     if nearest < NEAREST:
         raise InputError(
@@ -107,12 +106,21 @@ def _withdrawing_path(
     clock = generator.uniform(0.0, 2.0 * np.pi) + 2.2 * waver[:, 0] + 4.0 * time
     amount = 0.5 * (low + high) + 0.5 * (high - low) * waver[:, 1]
     sideways = amount[:, None] * np.stack([np.cos(clock), np.sin(clock)], axis=1)
-    sideways = _limit_excursion(sideways, points, frames, clearance, NEAREST + 0.5)
+
+    def centers(sideways: Float[np.ndarray, "T 2"]) -> Float[np.ndarray, "T 3"]:
+        return np.asarray(points + np.einsum("nck,nk->nc", frames[:, :, :2], sideways))
+
+    def distances(sideways: Float[np.ndarray, "T 2"]) -> Float[np.ndarray, "T"]:
+        return clearance(centers(sideways))
+
+    for _ in range(30):
+        if distances(sideways).min() >= NEAREST + 0.5:
+            break
+        sideways = 0.85 * sideways
     for approach in range(0 if on_the_spot else preset.approaches):
-        sideways = _add_approach(sideways, points, frames, clearance, preset.closest, approach, time, generator)
-    centers = points + np.einsum("nck,nk->nc", frames[:, :, :2], sideways)
+        sideways = _with_approach(sideways, distances, preset.closest, approach, time, generator)
     ahead, _ = centre_line.at(arc + _LOOK_AHEAD)
-    poses = _looking(centers, ahead, frames)
+    poses = _looking(centers(sideways), ahead, frames)
     if not on_the_spot:
         yaw, pitch, roll = (np.radians(limit) * waver[:, 2 + axis] for axis, limit in enumerate(preset.turn))
     else:
@@ -140,26 +148,9 @@ def _looking(
     return poses
 
 
-def _limit_excursion(
+def _with_approach(
     sideways: Float[np.ndarray, "T 2"],
-    points: Float[np.ndarray, "T 3"],
-    frames: Float[np.ndarray, "T 3 3"],
-    clearance: Clearance,
-    least: float,
-) -> Float[np.ndarray, "T 2"]:
-    """Lateral offsets, scaled down until they keep the least distance from the wall."""
-    for _ in range(30):
-        if clearance(points + np.einsum("nck,nk->nc", frames[:, :, :2], sideways)).min() >= least:
-            break
-        sideways = 0.85 * sideways
-    return sideways
-
-
-def _add_approach(
-    sideways: Float[np.ndarray, "T 2"],
-    points: Float[np.ndarray, "T 3"],
-    frames: Float[np.ndarray, "T 3 3"],
-    clearance: Clearance,
+    distances: Callable[[Float[np.ndarray, "T 2"]], Float[np.ndarray, "T"]],
     closest: float,
     number: int,
     time: Float[np.ndarray, "T"],
@@ -176,14 +167,10 @@ def _add_approach(
         # The wobble is faded out during the approach.
         return np.asarray(sideways * (1.0 - swing[:, None]) + amount * swing[:, None] * direction)
 
-    def distance(amount: float) -> float:
-        places = points[near] + np.einsum("nck,nk->nc", frames[near][:, :, :2], swung(amount)[near])
-        return float(clearance(places).min())
-
     low, high = 0.0, 14.0
     for _ in range(18):
         amount = 0.5 * (low + high)
-        if distance(amount) > closest:
+        if float(distances(swung(amount))[near].min()) > closest:
             low = amount
         else:
             high = amount

@@ -126,7 +126,7 @@ def test_features_are_detected_at_the_stored_size(tube, tmp_path, capsys, caplog
         ),
         (("--set", "splitt=block"), "unknown key 'splitt'"),
         (("--set", "triangulation.min_angle"), "key.path=value"),
-        (("--set", "max_frames=1", "--set", "split=all-train"), "1 frames. Expected at least two"),
+        (("--set", "max_frames=1", "--set", "split=all-train"), "1 frames. Expected at least 2"),
         (("--output", "tube/out"), "a folder apart from the input"),
         (("--output", "."), "a folder apart from the input"),
         (("--format", "rgbd"), "coliags: "),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.engine.data_formats import open_video
 from coliags_plugin.geometry.poses.alignment import align
 from coliags_plugin.geometry.poses.association import associate
@@ -21,6 +23,7 @@ from coliags_plugin.reconstruction.libraries import deterministic_open3d
 from coliags_plugin.reconstruction.odometry.chain import Bridge, chain, fill_gaps, power
 from coliags_plugin.reconstruction.odometry.frames import (
     PreparedFrame,
+    RgbdFrame,
     RgbdVideo,
     prepare,
     prepared_frames,
@@ -31,8 +34,46 @@ from coliags_plugin.reconstruction.odometry.registration import Edge, agreement,
 from coliags_plugin.reconstruction.odometry.settings import TrackingSettings
 from coliags_plugin.reconstruction.odometry.tracking import track
 from tests.geometry.poses.winding import some_transform, winding
-from tests.reconstruction.filmed import PINHOLE, filmed_wall, swaying
-from tests.textured_tube import tube_frames
+from tests.textured_tube import texture, tube_frames
+
+#: Off-centre, and pixels that are not square.
+PINHOLE = Intrinsics(101.0, 98.0, 83.0, 61.5, 160, 128)
+#: The wall is where NORMAL . x = OFFSET (mm), with a dent in it unless it is flat.
+NORMAL, OFFSET = np.array([0.2, -0.1, 1.0]), 40.0
+
+Lamp = Callable[[int, np.ndarray], np.ndarray]
+
+
+def swaying(count: int, step: float = 0.5) -> np.ndarray:
+    """A camera that moves sideways and forward, and turns by half a degree a frame. [N, 4, 4]"""
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    along = np.arange(count)
+    poses[:, :3, 3] = step * np.stack([along, 2.0 * np.sin(along / 3.0), 0.6 * along], axis=1)
+    turns = 0.5 * np.stack([np.sin(along / 2.0), along, 0.5 * along], axis=1)
+    poses[:, :3, :3] = Rotation.from_euler("xyz", turns, degrees=True).as_matrix()
+    return poses
+
+
+def filmed_wall(poses: np.ndarray, lamp: Lamp | None = None) -> list[RgbdFrame]:
+    """The wall as cameras see it.
+
+    Args:
+        poses: Camera-to-world. [N, 4, 4]
+        lamp: Factor on the image's brightness from the frame's number and the distance of each pixel.
+    """
+    x = (np.arange(PINHOLE.width) + 0.5 - PINHOLE.cx) / PINHOLE.fx
+    y = (np.arange(PINHOLE.height) + 0.5 - PINHOLE.cy) / PINHOLE.fy
+    rays = np.stack([*np.meshgrid(x, y), np.ones((PINHOLE.height, PINHOLE.width))], axis=-1)
+    frames = []
+    for index, pose in enumerate(poses):
+        world = rays @ pose[:3, :3].T
+        depth = (OFFSET - NORMAL @ pose[:3, 3]) / (world @ NORMAL)
+        color = texture(pose[:3, 3] + depth[..., None] * world)
+        if lamp is not None:
+            color = np.clip(color * lamp(index, depth * np.linalg.norm(rays, axis=-1))[..., None], 0, 255)
+        frames.append(RgbdFrame(f"{index:04d}", np.rint(color).astype(np.uint8), depth.astype(np.float32)))
+    return frames
+
 
 FAST = TrackingSettings(method="hybrid", pose_graph=False)
 

@@ -1,4 +1,4 @@
-"""Surface points under known poses."""
+"""Surface points under known poses, and closed forms of their tracks."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.engine.data_formats import open_scene
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z, inverse
 from coliags_plugin.reconstruction.structure.colmap_scene import write_colmap_scene
+from coliags_plugin.reconstruction.structure.tracks import LEAST_NOISE, Tracks, uncertainty, widest_angles
 from coliags_plugin.reconstruction.structure.triangulation import TriangulationSettings, in_pixels_of, triangulate
 from tests.textured_tube import texture, tube_frames
 
@@ -194,7 +195,7 @@ def test_other_frames_or_a_folder_that_is_there_are_refused(found, tmp_path):
 
 
 def test_one_frame_is_refused():
-    with pytest.raises(InputError, match=r"1 frames\. Expected at least two"):
+    with pytest.raises(InputError, match=r"1 frames\. Expected at least 2"):
         triangulate(FRAMES[:1])
 
 
@@ -242,3 +243,65 @@ def test_points_of_a_phantom_lie_on_its_wall(phantom):
     errors = depth_errors(found, frames)
     assert np.median(np.abs(errors)) < 0.025
     assert abs(np.median(errors)) < 0.005
+
+
+F, DEPTH, BASELINE = 120.0, 30.0, 4.0
+
+
+def camera(x):
+    c2w = torch.eye(4, dtype=torch.float64)
+    c2w[0, 3] = x
+    return Camera(F, F, 50.0, 40.0, 100, 80, c2w)
+
+
+CAMERAS = [camera(-BASELINE / 2), camera(BASELINE / 2)]
+
+
+def tracks(points, shift=0.0):
+    """Seen by both cameras, the second ``shift`` pixels to the side of where it should."""
+    points = np.asarray(points, np.float64)
+    pixels = [cam.project(torch.from_numpy(points))[0].numpy() for cam in CAMERAS]
+    pixels[1] = pixels[1] + [shift, 0.0]
+    numbers = np.arange(len(points))
+    return Tracks(points, np.tile(numbers, 2), np.repeat([0, 1], len(points)), np.concatenate(pixels))
+
+
+def test_what_points_leave_over():
+    residuals, depth = tracks([[1.0, 2, DEPTH], [0, 0, 50]], shift=0.5).residuals(CAMERAS)
+    np.testing.assert_allclose(residuals, [[0, 0], [0, 0], [-0.5, 0], [-0.5, 0]], atol=1e-12)
+    np.testing.assert_allclose(depth, [DEPTH, 50, DEPTH, 50])
+
+
+def test_the_angle_between_two_rays():
+    expected = np.degrees(2 * np.arctan(BASELINE / 2 / DEPTH))
+    assert widest_angles(tracks([[0.0, 0, DEPTH]]), CAMERAS) == pytest.approx(expected)
+
+
+def test_depth_is_as_uncertain_as_the_parallax_is_small():
+    """Between two cameras: sigma_z / z = sqrt(2) sigma z / (f b)."""
+    noise, shares = uncertainty(tracks([[0.0, 0, DEPTH], [0, 0, 2 * DEPTH]]), CAMERAS)
+    assert noise == LEAST_NOISE
+    np.testing.assert_allclose(shares, np.sqrt(2) * noise * DEPTH / (F * BASELINE) * np.array([1, 2]), rtol=1e-6)
+
+
+def test_residuals_tell_the_noise():
+    """8 residuals, 2 of them 0.5 px, for 6 numbers that were fitted."""
+    noise, shares = uncertainty(tracks([[0.0, 0, DEPTH], [3, 1, DEPTH]], shift=0.5), CAMERAS)
+    assert noise == pytest.approx(np.sqrt(2 * 0.25 / 2))
+    assert shares[0] == pytest.approx(np.sqrt(2) * noise * DEPTH / (F * BASELINE))
+
+
+def test_parallel_rays_have_no_depth():
+    far = tracks([[0.0, 0, 1e7]])
+    assert uncertainty(far, CAMERAS)[1][0] > 100.0
+
+
+def test_some_of_the_points():
+    some = tracks([[0.0, 0, 10], [0, 1, 20], [0, 2, 30]]).only(np.array([True, False, True]))
+    assert len(some) == 2
+    np.testing.assert_array_equal(some.points, [0, 1, 0, 1])
+    np.testing.assert_array_equal(some.frames, [0, 0, 1, 1])
+    np.testing.assert_array_equal(some.lengths, [2, 2])
+    np.testing.assert_allclose(some.residuals(CAMERAS)[1], [10, 30, 10, 30])
+    assert len(some.only(np.array([False, False]))) == 0
+    assert uncertainty(some.only(np.array([False, False])), CAMERAS)[1].shape == (0,)

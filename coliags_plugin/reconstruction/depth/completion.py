@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Float32
 
-from coliags_plugin.reconstruction.depth.views import resized_map
+from coliags_plugin.reconstruction.depth.views import Map, Mask, resized_map
 
 #: Fast global smoother: strength, and the difference of the 8-bit guide at which smoothing ceases.
 _STRENGTH, _EDGE = 10.0, 12.0
@@ -23,13 +23,7 @@ _JUMP, _BELIEF = 0.06, 0.1
 _FEW, _ABSURD = 1.5, 0.35
 
 
-def complete(
-    log_known: Float32[np.ndarray, "H W"],
-    support: Float32[np.ndarray, "H W"],
-    belief: Float32[np.ndarray, "H W"],
-    log_prior: Float32[np.ndarray, "H W"],
-    intensity: Float32[np.ndarray, "H W"],
-) -> Float32[np.ndarray, "H W"]:
+def complete(log_known: Map, support: Map, belief: Map, log_prior: Map, intensity: Map) -> Map:
     """Log depth that keeps to what is known and elsewhere is the prior plus a smooth residual.
 
     The residual is known depth minus prior, spread by an edge-aware global smoother (Min et al. 2014) normalised by
@@ -46,12 +40,7 @@ def complete(
     return np.asarray(np.where(kept > 0.0, kept * log_known + (1.0 - kept) * filled, filled), np.float32)
 
 
-def first_belief(
-    log_known: Float32[np.ndarray, "H W"],
-    support: Float32[np.ndarray, "H W"],
-    log_prior: Float32[np.ndarray, "H W"],
-    rim: Bool[np.ndarray, "H W"],
-) -> Float32[np.ndarray, "H W"]:
+def first_belief(log_known: Map, support: Map, log_prior: Map, rim: Mask) -> Map:
     """How much of a sweep without a surface to start from is believed, 0 to 1.
 
     Large windows make a near surface too wide at its edges: there, its rim (:func:`near_rim`) has little weight, and
@@ -61,9 +50,7 @@ def first_belief(
     return np.where(absurd, 0.0, np.where(rim, _BELIEF, 1.0)).astype(np.float32)
 
 
-def smooth_surface(
-    depth: Float32[np.ndarray, "h w"], intensity: Float32[np.ndarray, "H W"]
-) -> Float32[np.ndarray, "H W"]:
+def smooth_surface(depth: Float32[np.ndarray, "h w"], intensity: Map) -> Map:
     """z-depth at the size of a log image and smoothed up to its edges, as a surface to sweep.
 
     Windows of correlation lie on the surface: where its slant is wrong, so is what they find.
@@ -72,12 +59,12 @@ def smooth_surface(
     return np.asarray(np.exp(_smoother(intensity, _SURFACE_STRENGTH, _SURFACE_EDGE)(log_depth)), np.float32)
 
 
-def data_weight(support: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
+def data_weight(support: Map) -> Map:
     """Weight of known depth beside other known depth, where priors are fitted and residuals spread: 0 to 1."""
     return np.where(support > 0.0, np.minimum(0.3 + support, 1.0), 0.0).astype(np.float32)
 
 
-def near_rim(log_depth: Float32[np.ndarray, "H W"], reach: int) -> Bool[np.ndarray, "H W"]:
+def near_rim(log_depth: Map, reach: int) -> Mask:
     """Pixels on the near side of a depth edge, within ``reach`` pixels of it."""
     import cv2
 
@@ -88,9 +75,7 @@ def near_rim(log_depth: Float32[np.ndarray, "H W"], reach: int) -> Bool[np.ndarr
     return np.asarray((cv2.dilate(edge, wide) > 0) & (values < middle))
 
 
-def _smoother(
-    intensity: Float32[np.ndarray, "H W"], strength: float, edge: float
-) -> Callable[[Float32[np.ndarray, "H W"]], Float32[np.ndarray, "H W"]]:
+def _smoother(intensity: Map, strength: float, edge: float) -> Callable[[Map], Map]:
     """An edge-aware global smoother (Min et al. 2014) guided by log intensity."""
     import cv2
 

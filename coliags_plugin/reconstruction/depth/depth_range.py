@@ -13,7 +13,12 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.reconstruction.libraries import quiet_colmap
-from coliags_plugin.reconstruction.structure.features import Features, FeatureSettings, feature_extractor
+from coliags_plugin.reconstruction.structure.features import (
+    Features,
+    FeatureSettings,
+    feature_extractor,
+    image_and_mask,
+)
 from coliags_plugin.reconstruction.structure.matching import epipolar_matches, rays, relative_pose
 
 log = logging.getLogger(__name__)
@@ -66,8 +71,7 @@ def find_range(
 
         def features_of(index: int) -> Features:
             if index not in features:
-                frame = frames[index].to("cpu")
-                features[index] = extract(frame.image.numpy(), None if frame.mask is None else frame.mask.numpy())
+                features[index] = extract(*image_and_mask(frames[index]))
             return features[index]
 
         for done, index in enumerate(chosen, start=1):

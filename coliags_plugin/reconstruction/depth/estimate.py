@@ -5,11 +5,10 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress
@@ -21,8 +20,9 @@ from coliags_plugin.reconstruction.depth.fusion import WeightedDepth, depth_conf
 from coliags_plugin.reconstruction.depth.priors import DepthPrior
 from coliags_plugin.reconstruction.depth.settings import DepthEstimationSettings, SweepSettings
 from coliags_plugin.reconstruction.depth.sweeping import Swept, ratios, sweep_frame
-from coliags_plugin.reconstruction.depth.views import Guide, guide_of
+from coliags_plugin.reconstruction.depth.views import Guide, Map, guide_of
 from coliags_plugin.reconstruction.depth.work_files import Arrays, WorkFolder
+from coliags_plugin.reconstruction.structure.matching import camera_centers, check_motion
 
 log = logging.getLogger(__name__)
 
@@ -33,14 +33,6 @@ FEWEST_FRAMES = FEWEST_NEIGHBOURS + 1
 LEAST_MATCHED = 0.1
 #: Frames and depth maps held in memory.
 _HELD = 40
-
-
-@dataclass(frozen=True, eq=False)
-class DepthEstimate:
-    """Estimated depth of a frame."""
-
-    depth: Float32[np.ndarray, "H W"]  # z-depth at every pixel, scene units
-    confidence: Float32[np.ndarray, "H W"]  # probability that it is off by less than 5 %; 0: by prior alone
 
 
 class Estimation:
@@ -68,80 +60,70 @@ class Estimation:
             for number, sweep in enumerate(self.settings.sweeps):
                 self._pass(number, sweep)
 
-    def result(self, index: int) -> DepthEstimate:
-        """The estimate of a frame, after :meth:`run`."""
+    def result(self, index: int) -> tuple[Map, Map]:
+        """A frame's z-depth, scene units, and the probability that it is off by less than 5 %, 0 by a prior alone."""
         arrays = self.work.load(self.last, index)
-        return DepthEstimate(arrays["depth"], arrays["confidence"])
+        return arrays["depth"], arrays["confidence"]
 
     def _pass(self, number: int, sweep: SweepSettings) -> None:
-        neighbours = self._neighbours(f"neighbours-{number}", sweep, self.medians)
-        base = self.last or None
-        self._sweep(f"swept-{number}", sweep, neighbours, base, f"sweep {number + 1}")
-        self._fuse(f"fused-{number}", sweep, neighbours, f"fuse {number + 1}")
-        self.medians = self.work.value(f"medians-{number}", lambda: self._medians(self.last))
+        neighbours = self._neighbours(number, sweep)
+        self._sweep(number, sweep, neighbours)
+        self._fuse(number, sweep, neighbours)
+        self.medians = self.work.value(f"medians-{number}", self._medians)
 
-    def _neighbours(self, name: str, sweep: SweepSettings, medians: Sequence[float]) -> list[list[int]]:
-        centers = np.stack([frame.camera.center.cpu().double().numpy() for frame in self.frames])
+    def _neighbours(self, number: int, sweep: SweepSettings) -> list[list[int]]:
+        centers = camera_centers(self.frames)
         axes = np.stack([frame.camera.optical_axis.cpu().double().numpy() for frame in self.frames])
         neighbours: list[list[int]] = self.work.value(
-            name, lambda: choose_neighbours(centers, axes, medians, sweep.baselines, self.settings)
+            f"neighbours-{number}",
+            lambda: choose_neighbours(centers, axes, self.medians, sweep.baselines, self.settings),
         )
         lonely = sum(len(others) < FEWEST_NEIGHBOURS for others in neighbours)
         if lonely == len(neighbours):
             span = float(np.linalg.norm(np.ptp(centers, axis=0)))
             raise InputError(
                 f"no frame has {FEWEST_NEIGHBOURS} others at a distance of {100 * min(sweep.baselines):g} % "
-                f"of the depth or more: the path spans {span:.3g}, the median depth is {np.median(medians):.3g}",
+                f"of the depth or more: the path spans {span:.3g}, the median depth is {np.median(self.medians):.3g}",
                 "a camera that moves: rotation alone gives no depth",
                 "Use a longer stretch, check the poses, or lower the baselines of depth.sweeps",
             )
         if lonely:
-            log.warning(
-                "%d of %d frames have fewer than %d neighbours: their depth has confidence 0",
-                lonely,
-                len(neighbours),
-                FEWEST_NEIGHBOURS,
-            )
+            fewer = f"fewer than {FEWEST_NEIGHBOURS} neighbours: their depth has confidence 0"
+            log.warning("%d of %d frames have %s", lonely, len(neighbours), fewer)
         return neighbours
 
-    def _sweep(
-        self, stage: str, sweep: SweepSettings, neighbours: Sequence[Sequence[int]], base: str | None, title: str
-    ) -> None:
-        guides = self._guides(sweep.reduction)
+    def _sweep(self, number: int, sweep: SweepSettings, neighbours: Sequence[Sequence[int]]) -> None:
+        base, guides = self.last, self._guides(sweep.reduction)
         factors = ratios(sweep, (self.range.near, self.range.far))
 
         def swept(index: int) -> Arrays:
             guide = guides(index)
-            height, width = guide.intensity.shape
-            if base is None or sweep.reach is None:
-                surface = np.full((height, width), self.range.near, np.float32)
+            if sweep.reach is None:
+                surface = np.full_like(guide.intensity, self.range.near)
             else:
                 surface = smooth_surface(self.work.load(base, index)["depth"], guide.intensity)
             others = [guides(other) for other in neighbours[index]]
             if len(others) < FEWEST_NEIGHBOURS:
-                nothing = np.zeros((height, width), np.float32)
+                nothing = np.zeros_like(surface)
                 return vars(Swept(surface, nothing, nothing))
             return vars(sweep_frame(guide, others, surface, factors, sweep, self.settings))
 
-        self._stage(stage, swept, title)
+        self._stage(f"swept-{number}", swept, f"sweep {number + 1}")
 
-    def _fuse(self, stage: str, sweep: SweepSettings, neighbours: Sequence[Sequence[int]], title: str) -> None:
-        swept = self.last
-        guides = self._guides(sweep.reduction)
+    def _fuse(self, number: int, sweep: SweepSettings, neighbours: Sequence[Sequence[int]]) -> None:
+        swept, guides = self.last, self._guides(sweep.reduction)
+        low, high = np.log(self.range.near), np.log(self.range.far)
 
         @lru_cache(maxsize=_HELD)
         def depth_map(index: int) -> WeightedDepth:
             own = Swept(**self.work.load(swept, index))
             return WeightedDepth(guides(index).pose, own.depth, sweep_weight(own))
 
-        low, high = np.log(self.range.near), np.log(self.range.far)
-
         def fused(index: int) -> Arrays:
             own, guide = depth_map(index), guides(index)
             result = fuse_frame(own, [depth_map(other) for other in neighbours[index]], self.settings.agreement)
             # Where this frame shows a highlight, others may see the surface.
-            support = result.votes
-            known = np.log(result.depth)
+            support, known = result.votes, np.log(result.depth)
             prior = self.prior.log_depth(
                 self.frames[index].to("cpu"), guide.usable, known, data_weight(support), self.medians[index]
             )
@@ -156,7 +138,7 @@ class Estimation:
                 confidence[:] = 0.0
             return {"depth": np.exp(log_depth), "confidence": confidence}
 
-        self._stage(stage, fused, title)
+        self._stage(f"fused-{number}", fused, f"fuse {number + 1}")
 
     def _guides(self, reduction: int) -> Callable[[int], Guide]:
         """Frames prepared for matching, the last ones held."""
@@ -177,8 +159,8 @@ class Estimation:
             self.work.finish(stage, self.last or None)
         self.last = stage
 
-    def _medians(self, stage: str) -> list[float]:
-        return [float(np.median(self.work.load(stage, index)["depth"])) for index in range(len(self.frames))]
+    def _medians(self) -> list[float]:
+        return [float(np.median(self.result(index)[0])) for index in range(len(self.frames))]
 
 
 @contextmanager
@@ -196,23 +178,13 @@ def _one_thread_of_opencv() -> Iterator[None]:
 
 def check_video(frames: Sequence[Frame]) -> None:
     """Check that a video can give depth at all."""
-    if len(frames) < FEWEST_FRAMES:
-        raise InputError(
-            f"{len(frames)} frames", f"at least {FEWEST_FRAMES}, from different positions", "Give more of the video"
-        )
+    check_motion(frames, FEWEST_FRAMES)
     sizes = sorted({(frame.camera.width, frame.camera.height) for frame in frames})
     if len(sizes) > 1:
         raise InputError(
             f"images of {' and '.join(f'{width} x {height}' for width, height in sizes[:3])} pixels",
             "images of one size",
             "Set width and height of the data manager, or estimate each camera's frames apart",
-        )
-    centers = np.stack([frame.camera.center.cpu().double().numpy() for frame in frames])
-    if not np.ptp(centers, axis=0).max() > 0.0:
-        raise InputError(
-            f"all {len(frames)} cameras are at the same position",
-            "poses at different positions",
-            "A camera that does not move, or only turns, gives no depth; check the poses",
         )
 
 

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32
 
 from coliags_plugin.reconstruction.depth.sweeping import Swept
-from coliags_plugin.reconstruction.depth.views import Pose
+from coliags_plugin.reconstruction.depth.views import Map, Mask, Pose
 
 #: Iterations until a ray has met a neighbour's surface, and the relative change at which it has.
 _ITERATIONS, _CONVERGED = 12, 1e-3
@@ -20,18 +19,18 @@ class WeightedDepth:
     """Depth of a frame with weights."""
 
     pose: Pose  # camera of its size
-    depth: Float32[np.ndarray, "H W"]  # z-depth; NaN where unknown
-    weight: Float32[np.ndarray, "H W"]  # 0 where it does not count
+    depth: Map  # z-depth; NaN where unknown
+    weight: Map  # 0 where it does not count
 
 
 @dataclass(frozen=True, eq=False)
 class Fused:
     """Depth that a frame and its neighbours agree on."""
 
-    depth: Float32[np.ndarray, "H W"]  # z-depth; the frame's own where no other counts
-    votes: Float32[np.ndarray, "H W"]  # weight of the frames that agree with it
-    against: Float32[np.ndarray, "H W"]  # weight of those that do not
-    spread: Float32[np.ndarray, "H W"]  # mean relative deviation within the group
+    depth: Map  # z-depth; the frame's own where no other counts
+    votes: Map  # weight of the frames that agree with it
+    against: Map  # weight of those that do not
+    spread: Map  # mean relative deviation within the group
 
 
 def fuse_frame(own: WeightedDepth, neighbours: Sequence[WeightedDepth], agreement: float) -> Fused:
@@ -72,18 +71,13 @@ _COEFFICIENTS = (1.125, 0.797, -0.187, -1.396, -2.229)
 _STEP_REACH = 6
 
 
-def sweep_weight(swept: Swept) -> Float32[np.ndarray, "H W"]:
+def sweep_weight(swept: Swept) -> Map:
     """Weight of a frame's own depth in fusion, 0 to 1."""
     quality = np.clip((swept.match - 0.2) / 0.6, 0.0, 1.0) * np.clip(swept.margin / 1.0, 0.0, 1.0)
     return np.asarray(np.where(swept.match > 0.0, 0.05 + 0.95 * quality, 0.0), np.float32)
 
 
-def depth_confidence(
-    log_depth: Float32[np.ndarray, "H W"],
-    support: Float32[np.ndarray, "H W"],
-    spread: Float32[np.ndarray, "H W"],
-    rim: Bool[np.ndarray, "H W"],
-) -> Float32[np.ndarray, "H W"]:
+def depth_confidence(log_depth: Map, support: Map, spread: Map, rim: Mask) -> Map:
     """Estimated probability that depth is off by less than 5 %: a logistic regression (docs/depth.md).
 
     ``support`` is the weighted number of frames that agree with the completed depth, 0 (as is the confidence) where a

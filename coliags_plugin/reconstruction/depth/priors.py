@@ -8,28 +8,21 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Float, Float32, UInt8
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.reading.depth_formats import depth_format
 from coliags_plugin.datamanagers.reading.files import first_few
 from coliags_plugin.datamanagers.rotatecolon.exr_depth import read_exr_channel
-from coliags_plugin.reconstruction.depth.views import Pose
+from coliags_plugin.reconstruction.depth.views import Map, Mask, Pose
 
 
 class DepthPrior(ABC):
     """Gives every pixel of a frame a depth, fitted to where depth is known."""
 
     @abstractmethod
-    def log_depth(
-        self,
-        frame: Frame,
-        usable: Bool[np.ndarray, "H W"],
-        known: Float32[np.ndarray, "H W"],
-        weight: Float32[np.ndarray, "H W"],
-        typical: float,
-    ) -> Float32[np.ndarray, "H W"]:
+    def log_depth(self, frame: Frame, usable: Mask, known: Map, weight: Map, typical: float) -> Map:
         """Log of z-depth at every pixel of a frame, fitted to its known depth.
 
         Args:
@@ -105,14 +98,7 @@ class LightPrior(DepthPrior):
     the fit stays at the law of a lamp at the lens, intensity ~ 1 / depth^2 (docs/depth.md).
     """
 
-    def log_depth(
-        self,
-        frame: Frame,
-        usable: Bool[np.ndarray, "H W"],
-        known: Float32[np.ndarray, "H W"],
-        weight: Float32[np.ndarray, "H W"],
-        typical: float,
-    ) -> Float32[np.ndarray, "H W"]:
+    def log_depth(self, frame: Frame, usable: Mask, known: Map, weight: Map, typical: float) -> Map:
         """See :class:`DepthPrior`."""
         import cv2
 
@@ -138,9 +124,7 @@ class LightPrior(DepthPrior):
         return "light"
 
 
-def light_terms(
-    image: UInt8[np.ndarray, "H W 3"], usable: Bool[np.ndarray, "H W"], pose: Pose
-) -> Float[np.ndarray, "H W 7"]:
+def light_terms(image: UInt8[np.ndarray, "H W 3"], usable: Mask, pose: Pose) -> Float[np.ndarray, "H W 7"]:
     """Terms of the polynomial: 1, log red, log green, their squares and product, cosine to the optical axis.
 
     Colours are smoothed over a few pixels, without those that are not usable; these take the colours around them.
@@ -197,14 +181,7 @@ class FilePrior(DepthPrior):
             digest.update(name.encode() + path.read_bytes())
         return digest.hexdigest()
 
-    def log_depth(
-        self,
-        frame: Frame,
-        usable: Bool[np.ndarray, "H W"],
-        known: Float32[np.ndarray, "H W"],
-        weight: Float32[np.ndarray, "H W"],
-        typical: float,
-    ) -> Float32[np.ndarray, "H W"]:
+    def log_depth(self, frame: Frame, usable: Mask, known: Map, weight: Map, typical: float) -> Map:
         """See :class:`DepthPrior`; unknown pixels of a map take the typical depth."""
         import cv2
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, UInt8
+from jaxtyping import Float, Float32, Int, UInt8
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder
@@ -22,8 +22,9 @@ from coliags_plugin.reconstruction.depth.depth_range import DepthRange, find_ran
 from coliags_plugin.reconstruction.depth.estimate import Estimation, check_video
 from coliags_plugin.reconstruction.depth.priors import DepthPrior, FilePrior, LightPrior
 from coliags_plugin.reconstruction.depth.settings import DepthEstimationSettings
-from coliags_plugin.reconstruction.depth.views import Pose
+from coliags_plugin.reconstruction.depth.views import Map, Mask, Pose
 from coliags_plugin.reconstruction.depth.work_files import WorkFolder, work_folder
+from coliags_plugin.reconstruction.structure.features import image_and_mask
 
 log = logging.getLogger(__name__)
 
@@ -118,13 +119,13 @@ def _write(
     voxels = VoxelPoints(_VOXEL * footprint, frames[len(frames) // 2].camera.center.cpu().double().numpy())
     pixels, known = 0, 0
     for done, stored in enumerate(frames, start=1):
-        frame, estimate = stored.to("cpu"), estimation.result(done - 1)
-        image = frame.image.numpy()
-        mask = None if frame.mask is None else frame.mask.numpy()
-        confidence = estimate.confidence if mask is None else np.where(mask, estimate.confidence, np.float32(0.0))
-        writer.write_frame(frame.name, frame.camera, image, mask, estimate.depth, confidence)
+        frame, (depth, confidence) = stored.to("cpu"), estimation.result(done - 1)
+        image, mask = image_and_mask(frame)
+        if mask is not None:
+            confidence = np.where(mask, confidence, np.float32(0.0))
+        writer.write_frame(frame.name, frame.camera, image, mask, depth, confidence)
         if frame.name in trained:
-            voxels.add(Pose.of(frame.camera), estimate.depth, confidence, image)
+            voxels.add(Pose.of(frame.camera), depth, confidence, image)
         pixels += int(frame.valid.sum())
         known += int((confidence >= _KNOWN).sum())
         if progress is not None:
@@ -166,13 +167,7 @@ class VoxelPoints:
         #: Sums of weight, weighted offset from the origin and weighted colour, and the number of frames. [V, 8]
         self._sums: Float[np.ndarray, "V 8"] = np.zeros((0, 8))
 
-    def add(
-        self,
-        pose: Pose,
-        depth: Float32[np.ndarray, "H W"],
-        confidence: Float32[np.ndarray, "H W"],
-        image: UInt8[np.ndarray, "H W 3"],
-    ) -> None:
+    def add(self, pose: Pose, depth: Map, confidence: Map, image: UInt8[np.ndarray, "H W 3"]) -> None:
         """Add a frame's pixels of z-depth with a confidence of at least ``LEAST_CONFIDENCE``."""
         chosen = (confidence >= LEAST_CONFIDENCE) & ~_steep(depth)
         weight = confidence[chosen].astype(np.float64)[:, None]
@@ -204,7 +199,7 @@ def _summed(keys: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return keys[first], np.add.reduceat(rows, first, axis=0) if len(keys) else rows
 
 
-def _steep(depth: Float32[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+def _steep(depth: Map) -> Mask:
     """Pixels at a depth discontinuity: a tenth or more between the neighbours on both sides."""
     log = np.log(depth)
     steep = np.zeros(depth.shape, bool)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from coliags_plugin.reconstruction.depth.settings import DepthEstimationSettings, SweepSettings
-from coliags_plugin.reconstruction.depth.views import Guide
+from coliags_plugin.reconstruction.depth.views import Guide, Map
 
 #: Log of the factor on depth over which a hypothesis must have had rivals.
 _RIVALS = math.log(2.0)
@@ -20,9 +20,9 @@ _RIVALS = math.log(2.0)
 class Swept:
     """Depth of one frame from its own sweep."""
 
-    depth: Float32[np.ndarray, "H W"]  # z-depth
-    match: Float32[np.ndarray, "H W"]  # correlation with the better neighbours, -1 to 1; 0: too few
-    margin: Float32[np.ndarray, "H W"]  # by how much other depths match worse, after aggregation
+    depth: Map  # z-depth
+    match: Map  # correlation with the better neighbours, -1 to 1; 0: too few
+    margin: Map  # by how much other depths match worse, after aggregation
 
 
 def ratios(sweep: SweepSettings, depth_range: tuple[float, float]) -> Float32[np.ndarray, "D"]:
@@ -41,7 +41,7 @@ def ratios(sweep: SweepSettings, depth_range: tuple[float, float]) -> Float32[np
 def sweep_frame(
     guide: Guide,
     neighbours: Sequence[Guide],
-    base: Float32[np.ndarray, "H W"],
+    base: Map,
     factors: Float32[np.ndarray, "D"],
     sweep: SweepSettings,
     settings: DepthEstimationSettings,

@@ -10,7 +10,11 @@ from jaxtyping import Bool, Float, Float32
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import Frame
-from coliags_plugin.reconstruction.structure.features import FeatureSettings, usable
+from coliags_plugin.reconstruction.structure.features import FeatureSettings, image_and_mask, usable
+
+#: A value, and whether one counts, for every pixel of a frame.
+Map = Float32[np.ndarray, "H W"]
+Mask = Bool[np.ndarray, "H W"]
 
 #: Added to intensity before the logarithm, which would amplify the noise of dark pixels.
 _OFFSET = 0.02
@@ -68,8 +72,8 @@ class Guide:
     """An image prepared for matching."""
 
     pose: Pose  # camera of its size
-    intensity: Float32[np.ndarray, "H W"]  # log of green; comparable up to a constant
-    usable: Bool[np.ndarray, "H W"]  # neither masked nor near a highlight
+    intensity: Map  # log of green; comparable up to a constant
+    usable: Mask  # neither masked nor near a highlight
 
 
 def reduced_size(width: int, height: int, reduction: int) -> tuple[int, int]:
@@ -81,8 +85,7 @@ def guide_of(frame: Frame, reduction: int, features: FeatureSettings) -> Guide:
     """Prepare a frame, reduced by a factor, for matching; ``features`` says what a highlight is."""
     import cv2
 
-    image = frame.image.cpu().numpy()
-    mask = None if frame.mask is None else frame.mask.cpu().numpy()
+    image, mask = image_and_mask(frame)
     good = usable(image, mask, features)
     size = reduced_size(image.shape[1], image.shape[0], reduction)
     green = image[..., 1].astype(np.float32) / 255.0
@@ -94,7 +97,7 @@ def guide_of(frame: Frame, reduction: int, features: FeatureSettings) -> Guide:
     return Guide(Pose.of(frame.camera, reduction), np.ascontiguousarray(intensity - np.float32(middle)), good)
 
 
-def resized_map(values: Float32[np.ndarray, "H W"], size: tuple[int, int]) -> Float32[np.ndarray, "h w"]:
+def resized_map(values: Map, size: tuple[int, int]) -> Float32[np.ndarray, "h w"]:
     """A map without unknown values at another width and height, bilinearly."""
     import cv2
 

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.morphology import dilated
 from coliags_plugin.core.scenes import Frame
+from coliags_plugin.reconstruction.structure.features import image_and_mask
 
 #: Number of frames that the median depth is computed from.
 _SAMPLED = 16
@@ -60,14 +61,14 @@ class RgbdVideo(Sequence[RgbdFrame]):
     def __getitem__(self, index: int) -> RgbdFrame:  # type: ignore[override]  # no slices
         """Frame at an index."""
         frame = self._frames[index]
-        depth, mask = frame.depth, frame.mask
-        if depth is None:
+        if frame.depth is None:
             raise InputError(
                 f"frame {frame.name} has no depth",
                 "depth for every frame: RGB-D odometry registers surfaces and takes the unit of length from it",
                 "Without depth use coliags poses sfm, which estimates poses from images alone",
             )
-        return RgbdFrame(frame.name, frame.image.numpy(), depth.numpy(), None if mask is None else mask.numpy())
+        image, mask = image_and_mask(frame)
+        return RgbdFrame(frame.name, image, frame.depth.numpy(), mask)
 
 
 def prepared_frames(

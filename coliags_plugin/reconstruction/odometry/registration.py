@@ -134,28 +134,16 @@ def agreement(
         return 0.0, 0.0, 0.0
     one = source.intensity[row, column][meets]
     other = _sampled(target.intensity, u, v)[meets]
-    spreads = float(one.std()), float(other.std())
-    flat = min(spreads) < 1e-4
-    correlation = (
-        0.0 if flat else float(((one - one.mean()) * (other - other.mean())).mean() / (spreads[0] * spreads[1]))
-    )
+    spreads, correlation = (float(one.std()), float(other.std())), 0.0
+    if min(spreads) >= 1e-4:
+        correlation = float(((one - one.mean()) * (other - other.mean())).mean() / (spreads[0] * spreads[1]))
     return float(meets.mean()), float(np.sqrt(np.mean((z - there)[meets] ** 2))), correlation
 
 
 def _sampled(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Bilinear samples, 0 outside the image; in chunks, as cv2.remap takes at most 32767 rows."""
-    pieces = [
-        cv2.remap(
-            image,
-            u[at : at + 32_000],
-            v[at : at + 32_000],
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_CONSTANT,
-            borderValue=0,
-        )
-        for at in range(0, len(u), 32_000)
-    ]
-    return np.concatenate(pieces)[:, 0]
+    parts = [slice(at, at + 32_000) for at in range(0, len(u), 32_000)]
+    return np.concatenate([cv2.remap(image, u[part], v[part], cv2.INTER_LINEAR) for part in parts])[:, 0]
 
 
 def _rigid(matrix: np.ndarray) -> Float[np.ndarray, "4 4"] | None:

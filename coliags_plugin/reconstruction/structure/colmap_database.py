@@ -31,7 +31,6 @@ def write_database(
 
     Matches that are ``verified`` are stored as inliers of a two-view geometry; the others COLMAP has to verify.
     """
-    import numpy as np
     import pycolmap
 
     database = pycolmap.Database.open(str(path))

@@ -15,6 +15,7 @@ from coliags_plugin.core.scenes import Frame
 from coliags_plugin.datamanagers.colmap.writer import SeenPoints, add_points, write_image_and_mask, write_model
 from coliags_plugin.datamanagers.units import Unit, write_unit
 from coliags_plugin.reconstruction.structure.colmap_database import frame_model
+from coliags_plugin.reconstruction.structure.features import image_and_mask
 from coliags_plugin.reconstruction.structure.image_files import Masks, file_names, mask_of
 from coliags_plugin.reconstruction.structure.sfm import Reconstruction
 from coliags_plugin.reconstruction.structure.triangulation import Triangulation
@@ -30,18 +31,8 @@ def write_colmap_scene(
 ) -> None:
     """Write images, masks and a sparse model: ``images/NAME.png``, ``masks/NAME.png``, ``sparse/0/*.bin``.
 
-    Poses, intrinsics and the unit of length are those of the frames; ``unit.txt`` states the unit.
-
-    Args:
-        folder: The folder to create.
-        frames: The triangulated frames. No mask is written for frames without one.
-        triangulation: Points of these frames.
-        held_out: Further frames of the same video, without observations; sorted among the others by ``index``.
-        overwrite: Replace the folder if it exists.
-        unit: Of the frames' poses.
-
-    Raises:
-        InputError: The triangulation has another number of frames, or the folder exists or cannot be written.
+    Poses, intrinsics and the unit of length (``unit.txt``) are those of the frames, which have masks or none. Those
+    ``held_out``, of the same video but without observations, are sorted among the others by ``index``.
     """
     if len(triangulation.observations) != len(frames):
         raise InputError(
@@ -58,8 +49,7 @@ def write_colmap_scene(
     add_points(model, [points_seen for _, points_seen in video], *points)
     with atomic_folder(folder, overwrite) as scratch:
         for frame, name in zip(posed, names, strict=True):
-            mask = None if frame.mask is None else frame.mask.cpu().numpy()
-            write_image_and_mask(scratch, name, frame.image.cpu().numpy(), mask)
+            write_image_and_mask(scratch, name, *image_and_mask(frame))
         write_model(scratch, model)
         write_unit(scratch, unit)
 
@@ -67,18 +57,7 @@ def write_colmap_scene(
 def write_sfm_scene(
     folder: Path, reconstruction: Reconstruction, masks: Masks = None, overwrite: bool = False, unit: Unit = "unknown"
 ) -> None:
-    """Write a scene in COLMAP's layout: copies of the registered images, masks, the model and its unit.
-
-    Args:
-        folder: The folder to create.
-        reconstruction: What to write.
-        masks: As for :func:`~coliags_plugin.reconstruction.structure.sfm.reconstruct`.
-        overwrite: Replace the folder if it exists.
-        unit: Of the model.
-
-    Raises:
-        InputError: The folder exists or cannot be written.
-    """
+    """Write a scene in COLMAP's layout: copies of the registered images, masks, the model and its unit."""
     with atomic_folder(folder, overwrite) as scratch:
         (scratch / "images").mkdir()
         for index in reconstruction.registered:

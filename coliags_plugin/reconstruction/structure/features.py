@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from pydantic import Field
 
 from coliags_plugin.core.morphology import dilated
+from coliags_plugin.core.scenes import Frame
 from coliags_plugin.core.settings import Settings
 
 
@@ -60,6 +61,11 @@ class Features:
     def __len__(self) -> int:
         """Number of features."""
         return len(self.keypoints)
+
+
+def image_and_mask(frame: Frame) -> tuple[UInt8[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"] | None]:
+    """A frame's RGB image and its mask, if any."""
+    return frame.image.cpu().numpy(), None if frame.mask is None else frame.mask.cpu().numpy()
 
 
 #: Extracts the features of an RGB image where its mask, if any, is True.

@@ -236,17 +236,11 @@ def _compare(chosen: Hypothesis, hypotheses: Sequence[Hypothesis], plausible: tu
         rivals = [one for one in hypotheses if one.camera_model == name and one.is_plausible(plausible)]
         if name == chosen.camera_model or not rivals:
             continue
+        compared = ("error", "observations", "focal_length")
         rival = best(rivals)
         log.info(
             "%s is taken; %s at best has %+.1f %% reprojection error, %+.1f %% observations, %+.1f %% focal length",
             chosen.camera_model,
             name,
-            *(
-                100.0 * (other / own - 1.0)
-                for other, own in (
-                    (rival.error, chosen.error),
-                    (rival.observations, chosen.observations),
-                    (rival.focal_length, chosen.focal_length),
-                )
-            ),
+            *(100.0 * (getattr(rival, value) / getattr(chosen, value) - 1.0) for value in compared),
         )

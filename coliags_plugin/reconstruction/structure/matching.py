@@ -9,7 +9,9 @@ from jaxtyping import Float, Int, UInt32
 from scipy.spatial import cKDTree
 
 from coliags_plugin.core.cameras import Camera
+from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.scenes import Frame
 from coliags_plugin.reconstruction.structure.features import Features
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 
@@ -25,6 +27,25 @@ def video_pairs(count: int, overlap: int) -> list[tuple[int, int]]:
     """Pairs of COLMAP's sequential matching: frames 1, 2, ..., ``overlap`` and 2, 4, ..., 2^(overlap - 1) apart."""
     steps = {*range(1, overlap + 1), *(2**power for power in range(overlap))}
     return sorted((first, first + step) for step in steps for first in range(count - step))
+
+
+def camera_centers(frames: Sequence[Frame]) -> Float[np.ndarray, "N 3"]:
+    """World positions of the frames' cameras."""
+    return np.stack([frame.camera.center.cpu().double().numpy() for frame in frames])
+
+
+def check_motion(frames: Sequence[Frame], least: int) -> None:
+    """Refuse fewer frames than ``least``, and cameras that are all at one position."""
+    if len(frames) < least:
+        raise InputError(
+            f"{len(frames)} frames", f"at least {least}, from different camera positions", "Give more of the video"
+        )
+    if not np.ptp(camera_centers(frames), axis=0).max() > 0.0:
+        raise InputError(
+            f"all {len(frames)} cameras are at the same position",
+            "poses at different positions",
+            "A camera that does not move, or only turns, gives no depth; check the poses",
+        )
 
 
 def all_pairs(count: int) -> list[tuple[int, int]]:
@@ -44,9 +65,8 @@ def mutual_matches(first: Features, second: Features, max_ratio: float, max_dist
     one = np.sort(np.flatnonzero(mutual)[one[one >= 0]])
     other, similarity, best = nearest[one], similarity[one], best[one]
     # Duplicates of the best match, from neighbouring octaves, are excluded from the second-best.
-    duplicates = (
-        cKDTree(second.keypoints[:, :2]).query_pairs(_DUPLICATE_DISTANCE, output_type="ndarray").astype(np.int64)
-    )
+    tree = cKDTree(second.keypoints[:, :2])
+    duplicates = tree.query_pairs(_DUPLICATE_DISTANCE, output_type="ndarray").astype(np.int64)
     similarity[np.arange(len(one)), other] = -1.0
     for of, duplicate in ((0, 1), (1, 0)):
         row, which = _joined(other, duplicates[:, of])
@@ -77,15 +97,13 @@ def epipolar_matches(
     candidates = best_of_one[best_of_one >= 0]
     nearest = np.zeros(len(first), np.int64)
     nearest[one[candidates]] = other[candidates]
-    elsewhere = ((second.keypoints[other, :2] - second.keypoints[nearest[one], :2]) ** 2).sum(
-        axis=1
-    ) >= _DUPLICATE_DISTANCE**2
+    apart = second.keypoints[other, :2] - second.keypoints[nearest[one], :2]
+    elsewhere = (apart**2).sum(axis=1) >= _DUPLICATE_DISTANCE**2
     next_best = np.full(len(first), -1.0, np.float32)
     np.maximum.at(next_best, one[elsewhere], similarity[elsewhere])
     mutual = best_of_other[other[candidates]] == candidates
-    kept = candidates[
-        mutual & _passes_ratio_test(similarity[candidates], next_best[one[candidates]], max_ratio, max_distance)
-    ]
+    mutual &= _passes_ratio_test(similarity[candidates], next_best[one[candidates]], max_ratio, max_distance)
+    kept = candidates[mutual]
     return np.stack([one[kept], other[kept]], axis=1).astype(np.uint32)
 
 

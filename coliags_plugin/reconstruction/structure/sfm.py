@@ -102,7 +102,7 @@ def reconstruct(
                 "Take frames farther apart (the camera has to move) or closer together (they have to overlap), give "
                 "the camera parameters if known, mask what does not move with the scene, or raise max_ratio",
             )
-        return _result(images, video.names, _adjusted(models[0], video, settings), models)
+        return _result(video, _adjusted(models[0], video, settings), models)
 
 
 def _adjusted(model: pycolmap.Reconstruction, video: MatchedVideo, settings: SfmSettings) -> Hypothesis:
@@ -113,10 +113,8 @@ def _adjusted(model: pycolmap.Reconstruction, video: MatchedVideo, settings: Sfm
     return choose(hypotheses, (0.0, 180.0) if known else settings.camera.field_of_view)
 
 
-def _result(
-    images: tuple[Path, ...], names: Sequence[str], chosen: Hypothesis, models: Sequence[pycolmap.Reconstruction]
-) -> Reconstruction:
-    model = chosen.model
+def _result(video: MatchedVideo, chosen: Hypothesis, models: Sequence[pycolmap.Reconstruction]) -> Reconstruction:
+    images, model = video.images, chosen.model
     registered = sorted(number - 1 for number in model.reg_image_ids())
     _color(model, images)
     world_to_camera = np.tile(np.eye(4), (len(registered), 1, 1))
@@ -126,20 +124,15 @@ def _result(
         images,
         tuple(registered),
         inverse(world_to_camera),
-        tuple(names),
+        video.names,
         model,
         tuple(other.num_reg_images() for other in models),
         chosen.correlation,
     )
     if reconstruction.left_out:
-        shown = ", ".join(path.name for path in reconstruction.left_out[:10])
-        log.warning(
-            "%d of %d images have no pose: %s%s",
-            len(reconstruction.left_out),
-            len(images),
-            shown,
-            ", ..." if len(reconstruction.left_out) > 10 else "",
-        )
+        left_out = [path.name for path in reconstruction.left_out]
+        shown = ", ".join([*left_out[:10], *(["..."] if len(left_out) > 10 else [])])
+        log.warning("%d of %d images have no pose: %s", len(left_out), len(images), shown)
         if len(models) > 1:
             log.warning("the models have %s images; the largest is used", ", ".join(map(str, reconstruction.models)))
     if not chosen.is_lit_from_the_camera:
@@ -158,8 +151,7 @@ def _color(model: pycolmap.Reconstruction, images: Sequence[Path]) -> None:
         image = read_image(images[number - 1])
         for observation in model.images[number].get_observation_points2D():
             row, column = min(int(observation.y()), image.shape[0] - 1), min(int(observation.x()), image.shape[1] - 1)
-            total[observation.point3D_id] = total.get(observation.point3D_id, 0.0) + image[row, column].astype(
-                np.float64
-            )
+            color = image[row, column].astype(np.float64)
+            total[observation.point3D_id] = total.get(observation.point3D_id, 0.0) + color
     for point, color in total.items():
         model.points3D[point].color = np.rint(color / model.points3D[point].track.length()).astype(np.uint8)

@@ -20,8 +20,14 @@ from coliags_plugin.core.scenes import Frame
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.reconstruction.libraries import quiet_colmap
 from coliags_plugin.reconstruction.structure.colmap_database import frame_model, write_database
-from coliags_plugin.reconstruction.structure.features import FeatureSettings, feature_extractor
-from coliags_plugin.reconstruction.structure.matching import Pairs, all_pairs, epipolar_matches, video_pairs
+from coliags_plugin.reconstruction.structure.features import FeatureSettings, feature_extractor, image_and_mask
+from coliags_plugin.reconstruction.structure.matching import (
+    Pairs,
+    all_pairs,
+    check_motion,
+    epipolar_matches,
+    video_pairs,
+)
 from coliags_plugin.reconstruction.structure.tracks import Tracks, uncertainty, widest_angles
 
 if TYPE_CHECKING:
@@ -140,28 +146,16 @@ def triangulate(
             wrong poses.
     """
     settings = settings or TriangulationSettings()
-    if len(frames) < 2:
-        raise InputError(
-            f"{len(frames)} frames", "at least two, from different camera positions", "Give more of the video"
-        )
-    centers = np.stack([frame.camera.center.cpu().double().numpy() for frame in frames])
-    if not np.ptp(centers, axis=0).max() > 0.0:
-        raise InputError(
-            f"all {len(frames)} cameras are at the same position",
-            "poses at different positions",
-            "A purely rotating camera gives no depth; check the poses",
-        )
+    check_motion(frames, 2)
     with quiet_colmap(settings.seed):
         features = []
         extract = feature_extractor(settings.features)
         for done, frame in enumerate(frames, start=1):
-            mask = frame.mask
-            features.append(extract(frame.image.cpu().numpy(), None if mask is None else mask.cpu().numpy()))
+            features.append(extract(*image_and_mask(frame)))
             if progress is not None:
                 progress("find features", done, len(frames))
-        pairs = all_pairs(len(frames))
-        if len(frames) > settings.exhaustive_up_to:
-            pairs = video_pairs(len(frames), settings.overlap)
+        exhaustive = len(frames) <= settings.exhaustive_up_to
+        pairs = all_pairs(len(frames)) if exhaustive else video_pairs(len(frames), settings.overlap)
         matches: dict[tuple[int, int], Pairs] = {}
         for done, (first, second) in enumerate(pairs, start=1):
             matches[first, second] = epipolar_matches(

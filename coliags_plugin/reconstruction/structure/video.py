@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -45,18 +46,14 @@ class MatchedVideo:
         first = max(0, (len(self.images) - (count - 1) * step - 1) // 2)
         kept = list(range(first, len(self.images), step))[:count]
         row_of = {index: row for row, index in enumerate(kept)}
+        pick = itemgetter(*kept)  # of two or more, so that it gives tuples
         matches = {
             (row_of[one], row_of[other]): pairs
             for (one, other), pairs in self.matches.items()
             if one in row_of and other in row_of
         }
         return MatchedVideo(
-            tuple(self.images[index] for index in kept),
-            tuple(self.names[index] for index in kept),
-            tuple(self.sizes[index] for index in kept),
-            tuple(self.features[index] for index in kept),
-            tuple(self.brightness[index] for index in kept),
-            matches,
+            pick(self.images), pick(self.names), pick(self.sizes), pick(self.features), pick(self.brightness), matches
         )
 
     def mapped(self, settings: SfmSettings, start: Start, progress: Progress | None) -> list[pycolmap.Reconstruction]:

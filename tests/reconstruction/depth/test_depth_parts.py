@@ -1,6 +1,8 @@
-"""Priors, completion, confidence and points against closed forms."""
+"""Parts of depth estimation against closed forms: range, neighbours, priors, completion, confidence and points."""
 
 from __future__ import annotations
+
+import dataclasses
 
 import numpy as np
 import pytest
@@ -9,13 +11,107 @@ import torch
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_image
-from coliags_plugin.core.scenes import Frame
+from coliags_plugin.core.scenes import Frame, SparseDepth
 from coliags_plugin.reconstruction.depth.completion import complete, near_rim, smooth_surface
+from coliags_plugin.reconstruction.depth.depth_range import find_range, given_range
+from coliags_plugin.reconstruction.depth.estimate import choose_neighbours
 from coliags_plugin.reconstruction.depth.fusion import depth_confidence
 from coliags_plugin.reconstruction.depth.priors import FilePrior, LightPrior, robust_fit
 from coliags_plugin.reconstruction.depth.scene import VoxelPoints
+from coliags_plugin.reconstruction.depth.settings import DepthEstimationSettings
 from coliags_plugin.reconstruction.depth.views import Pose
+from coliags_plugin.reconstruction.structure.features import FeatureSettings
 from tests.reconstruction.depth.walls import sideways, wall_depth, wall_frames
+
+FEATURES = FeatureSettings(highlight_level=256)
+
+
+def test_features_give_the_range_in_any_unit():
+    frames = wall_frames(sideways(8))
+    found = find_range(frames, FEATURES, 40.0)
+    depths = [wall_depth(frame.camera) for frame in frames]
+    assert 0.4 * min(map(np.min, depths)) < found.near < min(map(np.min, depths))
+    assert max(map(np.max, depths)) < found.far < 3.0 * max(map(np.max, depths))
+    np.testing.assert_allclose(found.medians, [np.median(depth) for depth in depths], rtol=0.08)
+    scaled = []
+    for frame in frames:
+        pose = frame.camera.camera_to_world.clone()
+        pose[:3, 3] *= 1e-3
+        scaled.append(dataclasses.replace(frame, camera=dataclasses.replace(frame.camera, camera_to_world=pose)))
+    smaller = find_range(scaled, FEATURES, 40.0)
+    assert smaller.near == pytest.approx(1e-3 * found.near, rel=1e-6)
+    assert smaller.far == pytest.approx(1e-3 * found.far, rel=1e-6)
+
+
+def test_sparse_depth_of_the_scene_counts():
+    pixels = torch.full((50, 2), 20.5)
+    depths = torch.linspace(30.0, 50.0, 50)
+    frames = [
+        dataclasses.replace(frame, sparse_depth=SparseDepth(pixels, depths)) for frame in wall_frames(sideways(4, 0.0))
+    ]
+    found = find_range(frames, FEATURES, 40.0)
+    assert found.near == pytest.approx(0.6 * np.percentile(np.tile(depths, 4), 1.0), rel=1e-5)
+    assert found.far == pytest.approx(2.0 * np.percentile(np.tile(depths, 4), 99.0), rel=1e-5)
+    np.testing.assert_allclose(found.medians, 40.0, rtol=1e-5)
+
+
+def test_a_given_range():
+    assert given_range(10.0, 40.0, 2).medians == (20.0, 20.0)
+    with pytest.raises(InputError, match="0 < near < far"):
+        given_range(0.0, 40.0, 2)
+
+
+def test_frames_without_features_are_refused():
+    flat = torch.full((80, 96, 3), 90, dtype=torch.uint8)
+    frames = [dataclasses.replace(frame, image=flat) for frame in wall_frames(sideways(4))]
+    with pytest.raises(InputError, match="the depth range is unknown: 0 points"):
+        find_range(frames, FEATURES, 40.0)
+
+
+SETTINGS = DepthEstimationSettings(max_baseline=0.5)
+
+
+def along(distances):
+    centers = np.zeros((len(distances), 3))
+    centers[:, 0] = distances
+    return centers
+
+
+def chosen(distances, depth=10.0, settings=SETTINGS, axes=None):
+    ahead = np.tile([0.0, 0.0, 1.0], (len(distances), 1))
+    directions = ahead if axes is None else axes
+    return choose_neighbours(along(distances), directions, [depth] * len(distances), (0.1, 0.2), settings)
+
+
+def test_the_first_frame_beyond_each_baseline_on_either_side():
+    # A baseline of 0.1 at depth 10 is 1.
+    assert chosen([0.5 * k for k in range(12)])[6] == [2, 4, 8, 10]
+
+
+def test_a_pause_changes_no_distance():
+    moving = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
+    paused = moving[:3] + [3.0] * 50 + moving[4:]
+    for index in (3, 30, 52):
+        assert [paused[other] for other in chosen(paused)[index]] == [1.0, 2.0, 4.0, 5.0]
+
+
+def test_at_an_end_the_other_side_gives_more():
+    first = chosen([1.0 * k for k in range(8)])[0]
+    assert first == [1, 2, 4]  # 0.1 and 0.2, then 0.3, which is frame 4 by rounding, and 0.4
+    assert len(chosen([0.5 * k for k in range(20)])[0]) == 4
+
+
+def test_no_motion_gives_none():
+    assert chosen([0.0] * 5) == [[]] * 5
+    assert chosen([0.0, 0.2, 0.4]) == [[]] * 3
+
+
+def test_neither_too_far_nor_turned_away():
+    assert chosen([0.0, 9.0, 18.0]) == [[]] * 3
+    axes = np.tile([0.0, 0.0, 1.0], (5, 1))
+    axes[3] = [1.0, 0.0, 0.0]
+    assert 3 not in chosen([1.0 * k for k in range(5)], axes=axes)[1]
+
 
 ALL = np.ones((80, 96), bool)
 FLOAT = np.ones((80, 96), np.float32)
