@@ -47,14 +47,7 @@ class AblationSettings(Settings):
 
 
 def load_ablation(name: str) -> list[Variant]:
-    """The variants of an ablation.
-
-    Args:
-        name: Of a shipped one, or the path of a YAML file; methods are named in it by name, or by paths relative to it.
-
-    Raises:
-        InputError: There is none, or it is not valid; names file, line and key.
-    """
+    """The variants of a shipped ablation, or of a YAML file, whose methods are names, or paths relative to it."""
     path = find_file(name, shipped(ABLATIONS), "ablation")
     settings = read_settings(path, AblationSettings, "ablation")
     return [

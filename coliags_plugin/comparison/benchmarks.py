@@ -95,14 +95,7 @@ class Benchmark:
 
 
 def load_benchmark(name: str) -> Benchmark:
-    """Read a benchmark.
-
-    Args:
-        name: Of a shipped one, or the path of a YAML file.
-
-    Raises:
-        InputError: There is none, or it is not valid; names file, line and key.
-    """
+    """Read a shipped benchmark by its name, or a YAML file."""
     path = find_file(name, shipped(), "benchmark")
     return Benchmark(path.stem, read_settings(path, BenchmarkSettings, "benchmark"))
 

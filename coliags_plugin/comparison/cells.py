@@ -40,35 +40,20 @@ class CellKeys:
 
 @dataclass(frozen=True)
 class ComparisonCell:
-    """One run of the comparison and its evaluation.
-
-    Attributes:
-        variant: Method.
-        scene: Scene.
-        scene_label: Name of the scene; with that of the split where it is not the scene's own.
-        seed: Of all random generators.
-        protocol: Name of the evaluation protocol.
-        overrides: All changes of the method config: of the scene, the split, the variant and the comparison.
-        config: The resolved method config.
-        keys: None while the scene, a phantom, is not there.
-    """
+    """One run of the comparison and its evaluation."""
 
     variant: Variant
     scene: SceneSource
-    scene_label: str
+    scene_label: str  # name of the scene; with that of the split where it is not the scene's own
     seed: int
     protocol: str
-    overrides: tuple[str, ...]
+    overrides: tuple[str, ...]  # of the scene, the split, the variant and the comparison
     config: MethodConfig
-    keys: CellKeys | None
+    keys: CellKeys | None  # None while the scene, a phantom, is not there
 
     @property
     def named(self) -> dict[str, Any]:
-        """Scene, method, seed, protocol and key of its result, as records hold them.
-
-        Raises:
-            ValueError: The scene is not there yet.
-        """
+        """Scene, method, seed, protocol and key of its result, as records hold them."""
         return {
             "scene": self.scene_label,
             "method": self.variant.name,
@@ -94,11 +79,7 @@ class ComparisonCell:
 
     @property
     def known_keys(self) -> CellKeys:
-        """Its keys.
-
-        Raises:
-            ValueError: The scene is not there yet.
-        """
+        """Its keys."""
         if self.keys is None:
             raise ValueError(f"{self.title}: the scene is not there, so that it has no key")
         return self.keys

@@ -52,14 +52,7 @@ class FinishedComparison:
     failures: Sequence[FailureRecord]
 
     def table(self, columns: Sequence[str] = COLUMNS) -> DisplayTable:
-        """Mean of every method over its finished cells, of their main test sets, with the reasons of failures.
-
-        Args:
-            columns: Names of metrics.
-
-        Raises:
-            InputError: No result has one of the metrics.
-        """
+        """Mean of metrics over every method's finished cells, of their main test sets, with the reasons of failures."""
         units = {name: metric.unit for result in self.results for name, metric in result.metrics.items()}
         for name in columns:
             if self.results and name not in units:
@@ -102,38 +95,22 @@ def _mean(results: Sequence[Result], metric: str) -> float | None:
 
 @dataclass(frozen=True)
 class ExecutionOptions:
-    """How a comparison is carried out.
+    """How a comparison is carried out."""
 
-    Attributes:
-        jobs: Runs at a time; None: one per CPU, or per GPU.
-        threads: CPU threads of each; None: the CPUs divided by the runs at a time.
-        device: ``auto``, ``cpu`` or ``cuda``.
-        executor: ``local`` or ``ray``.
-        ray_address: ``HOST:PORT`` of the cluster's head; None: ``RAY_ADDRESS``, or the cluster of this machine.
-        retries: How often a cell whose process died is tried again.
-        save_seconds: Largest time between two checkpoints of a run.
-    """
-
-    jobs: int | None = None
-    threads: int | None = None
+    jobs: int | None = None  # runs at a time; None: one per CPU, or per GPU
+    threads: int | None = None  # CPU threads of each; None: the CPUs divided by the runs at a time
     device: str = "auto"
     executor: str = "local"
-    ray_address: str | None = None
-    retries: int = 2
-    save_seconds: float = 60.0
+    ray_address: str | None = None  # HOST:PORT of the head; None: RAY_ADDRESS, or the cluster of this machine
+    retries: int = 2  # how often a cell whose process died is tried again
+    save_seconds: float = 60.0  # largest time between two checkpoints of a run
 
 
 def carry_out(request: Request, folder: ComparisonFolder, options: ExecutionOptions) -> FinishedComparison:
-    """Train and evaluate methods on scenes, as far as that is not done in a folder.
-
-    Args:
-        request: What is asked for.
-        folder: New, or with a comparison that this one extends.
-        options: How.
+    """Train and evaluate methods on scenes, as far as that is not done in a folder, which is new or extended.
 
     Raises:
-        InputError: Methods, scenes or options are not valid or not there, the folder cannot be used, or the disk is
-            too small; nothing was run.
+        InputError: Something is not valid or not there, or the disk is too small; nothing was run.
         InterruptedRunError: Ctrl-C; all runs are saved.
     """
     executor = make_executor(options)
@@ -159,11 +136,7 @@ def carry_out(request: Request, folder: ComparisonFolder, options: ExecutionOpti
 
 
 def dry_run(request: Request, folder: ComparisonFolder, options: ExecutionOptions) -> DryRun:
-    """What :func:`carry_out` would do; writes nothing.
-
-    Raises:
-        InputError: See :func:`carry_out`.
-    """
+    """What :func:`carry_out` would do; writes nothing."""
     slots, cells = make_executor(options).slots, _plan_cells(request, folder)
     return forecast(cells, folder, folder.finished(), RunSizes(folder), slots)
 
@@ -185,11 +158,7 @@ def make_request(
     steps: int | None = None,
     overrides: Sequence[str] = (),
 ) -> Request:
-    """What is asked for, checked as far as names and numbers go; arguments as in :func:`coliags_plugin.compare`.
-
-    Raises:
-        InputError: A name is unknown or there twice, or a number is not valid.
-    """
+    """What is asked for, checked as far as names and numbers go; arguments as in :func:`coliags_plugin.compare`."""
     variants = [each if isinstance(each, Variant) else Variant(method_name(each), each) for each in methods]
     if not variants:
         raise InputError("no method", "at least one")
@@ -207,11 +176,7 @@ def make_request(
 
 
 def make_executor(options: ExecutionOptions) -> Executor:
-    """The executor of a comparison.
-
-    Raises:
-        InputError: An option is not valid, or the executor cannot be used.
-    """
+    """The executor of a comparison."""
     _check_number("jobs", options.jobs)
     _check_number("threads", options.threads)
     _check_number("retries", options.retries, least=0)

@@ -24,9 +24,6 @@ class RunSizes:
     """Sizes of run folders by method: the median of the finished ones, if there are any.
 
     While it is worked on, a run has more checkpoints and may take twice that.
-
-    Args:
-        folder: Of the comparison.
     """
 
     def __init__(self, folder: ComparisonFolder) -> None:
@@ -45,34 +42,21 @@ class RunSizes:
 
 @dataclass(frozen=True)
 class CellForecast:
-    """What would be done for one cell.
-
-    Attributes:
-        cell: The cell.
-        state: ``done``, ``resume``, ``new``, ``same`` as an earlier cell, or ``scene to make`` where that comes first.
-        step: Where training starts.
-        size: Disk that it takes, bytes.
-    """
+    """What would be done for one cell."""
 
     cell: ComparisonCell
-    state: str
-    step: int = 0
-    size: float = 0.0
+    state: str  # done, resume, new, same (as an earlier cell), or scene to make
+    step: int = 0  # where training starts
+    size: float = 0.0  # disk that it takes, bytes
 
 
 @dataclass(frozen=True)
 class DryRun:
-    """The cells of a comparison, and their disk.
-
-    Attributes:
-        cells: All of them.
-        size: Disk that is needed, bytes.
-        free: Of the disk, bytes.
-    """
+    """The cells of a comparison, and their disk."""
 
     cells: Sequence[CellForecast]
-    size: float
-    free: float
+    size: float  # disk that is needed, bytes
+    free: float  # of the disk, bytes
 
     def __str__(self) -> str:
         """Counts and disk, in one line."""
@@ -95,11 +79,7 @@ class DryRun:
         return DisplayTable(str(self), columns, rows)
 
     def check_disk(self) -> None:
-        """Refuse what cannot fit.
-
-        Raises:
-            InputError: The disk is too small.
-        """
+        """Refuse what cannot fit."""
         if self.size > self.free:
             raise InputError(
                 f"the runs need about {file_size(self.size)}, and the disk has {file_size(self.free)} left",
@@ -111,15 +91,7 @@ class DryRun:
 def forecast(
     cells: Sequence[ComparisonCell], folder: ComparisonFolder, finished: FinishedCells, sizes: RunSizes, slots: int
 ) -> DryRun:
-    """Look at the state of every cell; writes nothing.
-
-    Args:
-        cells: What is asked for.
-        folder: Of the comparison.
-        finished: The folder's results.
-        sizes: Of runs.
-        slots: Runs at a time.
-    """
+    """Look at the state of every cell; writes nothing."""
     forecasts: list[CellForecast] = []
     keys: set[str | None] = set()
     for cell in cells:

@@ -19,23 +19,14 @@ _PAUSE = 0.1
 
 
 class Executor(ABC):
-    """Runs tasks, each in a worker process of its own.
+    """Runs tasks, each in a worker process of its own."""
 
-    Attributes:
-        slots: How many run at once.
-        threads: CPU threads of each.
-    """
-
-    slots: int
-    threads: int
+    slots: int  # how many run at once
+    threads: int  # CPU threads of each
 
     @abstractmethod
     def check(self, folder: Path, scenes: Sequence[Path]) -> None:
-        """Find out whether tasks will see and can write a folder, and will see scenes.
-
-        Raises:
-            InputError: They cannot.
-        """
+        """Find out whether tasks will see and can write a folder, and will see scenes."""
 
     @abstractmethod
     def start(self, task: Task) -> None:
@@ -55,13 +46,7 @@ class Executor(ABC):
 
 
 class LocalExecutor(Executor):
-    """Processes on this machine.
-
-    Args:
-        slots: How many at once.
-        threads: CPU threads of each.
-        gpus: Identifiers of GPUs, as in ``CUDA_VISIBLE_DEVICES``, over which they are spread; empty: none.
-    """
+    """Processes on this machine, spread over the GPUs with these identifiers, as in ``CUDA_VISIBLE_DEVICES``."""
 
     def __init__(self, slots: int, threads: int, gpus: Sequence[str] = ()) -> None:
         self.slots, self.threads = slots, threads
@@ -106,12 +91,7 @@ class LocalExecutor(Executor):
 
 
 class LocalWorker:
-    """A worker process on this machine, which ends when this object's process does.
-
-    Args:
-        task: What it works on.
-        gpu: The GPU that it sees; None: all.
-    """
+    """A worker process on this machine, which ends when this object's process does; it sees one GPU, or all."""
 
     def __init__(self, task: Task, gpu: str | None = None) -> None:
         self.task = task

@@ -61,21 +61,13 @@ class ComparisonFolder:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Keep other comparisons out of the folder, which is created where it is missing.
-
-        Raises:
-            InputError: Another one is running, or the folder cannot be written or is of something else.
-        """
+        """Keep other comparisons out of the folder, which is created where it is missing."""
         self.check()
         with locked(self.path / ".lock", self.path):
             yield
 
     def check(self) -> None:
-        """Refuse a folder that holds something else than comparisons.
-
-        Raises:
-            InputError: See above.
-        """
+        """Refuse a folder that holds something else than comparisons."""
         if self.path.exists() and not self.path.is_dir():
             raise InputError(f"{self.path} is a file", "a folder", "Choose another --output")
         if self.path.is_dir() and not (self.path / PLAN_FILE).is_file():
@@ -89,19 +81,11 @@ class ComparisonFolder:
                 )
 
     def plan(self) -> ComparisonPlan:
-        """What was asked for so far; empty where nothing was.
-
-        Raises:
-            InputError: The file is damaged or from a newer version.
-        """
+        """What was asked for so far; empty where nothing was."""
         return read_plan(self.path) or ComparisonPlan()
 
     def check_extends(self, request: Request) -> None:
-        """Refuse to mix runs of different length or with different changes.
-
-        Raises:
-            InputError: The folder's comparison had another length of runs or other changes.
-        """
+        """Refuse to mix runs of different length or with different changes."""
         before = read_plan(self.path)
         if before is None:
             return
@@ -118,11 +102,7 @@ class ComparisonFolder:
             raise InputError(f"{self.path} compares runs with {earlier}, not {now}", "the same, or another --output")
 
     def record(self, request: Request, cells: Sequence[ComparisonCell]) -> None:
-        """Add to the plan what is asked for now; a cell whose key has changed replaces the former one.
-
-        Raises:
-            InputError: The folder cannot be written.
-        """
+        """Add to the plan what is asked for now; a cell whose key has changed replaces the former one."""
         before = self.plan()
         entries = {entry.identity: entry for entry in before.cells}
         changed = [
@@ -187,12 +167,7 @@ class ComparisonFolder:
 
 
 class FinishedCells:
-    """The results of a folder, for cells to be looked up by their keys.
-
-    Args:
-        folder: Whose results.
-        results: By path.
-    """
+    """The results of a folder, by path, for cells to be looked up by their keys."""
 
     def __init__(self, folder: ComparisonFolder, results: Mapping[Path, Result]) -> None:
         self._folder = folder
@@ -211,12 +186,7 @@ class FinishedCells:
     def add(self, cell: ComparisonCell, result: Result) -> None:
         """Count a cell as done, and write its results file where that is not there.
 
-        Args:
-            cell: The cell.
-            result: Of the cell, or of one whose method is the same under another name.
-
-        Raises:
-            InputError: The folder cannot be written.
+        The result may be that of a cell whose method is the same under another name.
         """
         path, name = self._folder.result(cell), cell.variant.name
         if result.method != name:

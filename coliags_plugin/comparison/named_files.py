@@ -27,11 +27,7 @@ def is_path(name: str) -> bool:
 
 
 def find_file(name: str, files: dict[str, Path], noun: str) -> Path:
-    """The file of a name, or the path itself.
-
-    Raises:
-        InputError: There is none of the name.
-    """
+    """The file of a name, or the path itself."""
     if is_path(name):
         return Path(name)
     if name not in files:
@@ -40,11 +36,7 @@ def find_file(name: str, files: dict[str, Path], noun: str) -> Path:
 
 
 def read_settings(path: Path, content: type[_Settings], noun: str) -> _Settings:
-    """Read and validate a file.
-
-    Raises:
-        InputError: It is missing or not valid; names file, line and key.
-    """
+    """Read and validate a file."""
     tree = read_tree(path)
     try:
         return content.model_validate(tree.plain())

@@ -22,25 +22,15 @@ RecordedFingerprint = Callable[[SceneSource], str | None]
 
 @dataclass(frozen=True)
 class Request:
-    """What is to be compared.
-
-    Attributes:
-        variants: Methods.
-        scenes: Scenes.
-        seeds: One run for each.
-        protocol: Name of the evaluation protocol.
-        splits: Names of splits, one run for each; empty: each scene's own.
-        steps: Length of all runs; None: each method's own.
-        overrides: ``key.path=value`` changes of all methods.
-    """
+    """What is to be compared."""
 
     variants: Sequence[Variant]
     scenes: Sequence[SceneSource]
-    seeds: Sequence[int] = (0,)
+    seeds: Sequence[int] = (0,)  # one run for each
     protocol: str = "paper"
-    splits: Sequence[str] = ()
-    steps: int | None = None
-    overrides: Sequence[str] = ()
+    splits: Sequence[str] = ()  # names of splits, one run for each; empty: each scene's own
+    steps: int | None = None  # length of all runs; None: each method's own
+    overrides: Sequence[str] = ()  # ``key.path=value`` changes of all methods
 
     @property
     def changes(self) -> tuple[str, ...]:
@@ -49,15 +39,7 @@ class Request:
 
 
 def make_cells(request: Request, recorded: RecordedFingerprint | None = None) -> list[ComparisonCell]:
-    """All cells, those of one seed together, and within it those of one scene.
-
-    Args:
-        request: What is asked for.
-        recorded: Fingerprints of scenes that are not there.
-
-    Raises:
-        InputError: A method, split, protocol or change is not valid, or the folder of a scene is damaged.
-    """
+    """All cells, those of one seed together, and within it those of one scene."""
     protocol = registry.protocols.get(request.protocol)
     fingerprints = _Fingerprints(recorded or (lambda scene: None))
     cells: list[ComparisonCell] = []

@@ -23,39 +23,23 @@ class _PlanPart(BaseModel):
 
 
 class PlannedScene(_PlanPart):
-    """A scene of a plan.
+    """A scene of a plan."""
 
-    Attributes:
-        phantom: Settings it is made with; None for a dataset.
-        fingerprint: Of its files.
-        package_version: That computed the fingerprint.
-    """
-
-    phantom: dict[str, Any] | None
+    phantom: dict[str, Any] | None  # settings it is made with; None for a dataset
     fingerprint: str
-    package_version: str
+    package_version: str  # that computed the fingerprint
 
 
 class PlannedCell(_PlanPart):
-    """A cell of a plan.
+    """A cell of a plan."""
 
-    Attributes:
-        scene: Name of the scene; with that of the split where it is not the scene's own.
-        method: Name of the method.
-        seed: Of the run.
-        protocol: Name of the evaluation protocol.
-        key: Of the result.
-        run: Run folder, relative to the comparison's.
-        result: Results file, relative to the comparison's folder; there once the cell is done.
-    """
-
-    scene: str
+    scene: str  # name of the scene; with that of the split where it is not the scene's own
     method: str
     seed: int
     protocol: str
     key: str
-    run: str
-    result: str
+    run: str  # run folder, relative to the comparison's
+    result: str  # results file, relative to the comparison's folder; there once the cell is done
 
     @property
     def identity(self) -> tuple[str, str, int, str]:
@@ -64,34 +48,18 @@ class PlannedCell(_PlanPart):
 
 
 class ComparisonPlan(_PlanPart):
-    """Content of ``plan.json``: all that was ever asked for in this folder.
-
-    Attributes:
-        format: Marks the file.
-        version: Of this schema.
-        steps: Length of all runs; None: each method's own.
-        overrides: Changes of all methods.
-        scenes: By name.
-        cells: In the order in which they were asked for.
-    """
+    """Content of ``plan.json``: all that was ever asked for in this folder."""
 
     format: Literal["coliags-comparison"] = "coliags-comparison"
-    version: int = VERSION
-    steps: int | None = None
-    overrides: tuple[str, ...] = ()
+    version: int = VERSION  # of this schema
+    steps: int | None = None  # length of all runs; None: each method's own
+    overrides: tuple[str, ...] = ()  # changes of all methods
     scenes: dict[str, PlannedScene] = {}
-    cells: tuple[PlannedCell, ...] = ()
+    cells: tuple[PlannedCell, ...] = ()  # in the order in which they were asked for
 
 
 class FailureRecord(_PlanPart):
-    """Why a cell failed.
-
-    Attributes:
-        scene, method, seed, protocol, key: As in the plan.
-        reason: One line.
-        attempts: Processes that tried.
-        log: Their messages, relative to the comparison's folder.
-    """
+    """Why a cell failed."""
 
     scene: str
     method: str
@@ -99,16 +67,12 @@ class FailureRecord(_PlanPart):
     protocol: str
     key: str
     reason: str
-    attempts: int
-    log: str
+    attempts: int  # processes that tried
+    log: str  # their messages, relative to the comparison's folder
 
 
 def read_plan(folder: Path) -> ComparisonPlan | None:
-    """The plan of a folder; None where there is none.
-
-    Raises:
-        InputError: The file is damaged or from a newer version.
-    """
+    """The plan of a folder; None where there is none."""
     file = folder / PLAN_FILE
     if not file.is_file():
         return None

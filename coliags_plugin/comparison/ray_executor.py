@@ -48,9 +48,6 @@ class RayExecutor(Executor):
         slots: How many at once; None: as many as the cluster has CPUs or GPUs for.
         threads: CPU threads of each, which it takes from the node's CPUs.
         device: ``auto``, ``cpu`` or ``cuda``; each task takes a GPU for itself unless it is ``cpu`` or there is none.
-
-    Raises:
-        InputError: Ray is not installed, or there is no such cluster.
     """
 
     def __init__(self, address: str | None, slots: int | None, threads: int, device: str) -> None:
@@ -71,11 +68,7 @@ class RayExecutor(Executor):
         return max(1, room if self._slots is None else min(room, self._slots))
 
     def check(self, folder: Path, scenes: Sequence[Path]) -> None:
-        """Have every node read and write in the folder, and see the scenes.
-
-        Raises:
-            InputError: One cannot, lacks this package, or has another version of it.
-        """
+        """Have every node read and write in the folder, and see the scenes."""
         token = uuid.uuid4().hex
         file = folder / f".storage-{token}"
         atomic_write(file, token)

@@ -35,21 +35,13 @@ _PLAIN_LINE_EVERY_S = 60.0
 
 @dataclass(frozen=True)
 class RunnerConfig:
-    """Where and how cells are run.
-
-    Attributes:
-        folder: Of the comparison.
-        executor: Starts the workers.
-        device: ``auto``, ``cpu`` or ``cuda``.
-        retries: How often a cell whose process died is tried again.
-        save_seconds: Largest time between two checkpoints.
-    """
+    """Where and how cells are run."""
 
     folder: ComparisonFolder
     executor: Executor
     device: str = "auto"
-    retries: int = 2
-    save_seconds: float = 60.0
+    retries: int = 2  # how often a cell whose process died is tried again
+    save_seconds: float = 60.0  # largest time between two checkpoints
 
     def task(self, cell: ComparisonCell) -> Task:
         """What a worker is told of a cell."""
@@ -78,16 +70,7 @@ class RunnerConfig:
 def run_cells(
     config: RunnerConfig, cells: Sequence[ComparisonCell], finished: FinishedCells, sizes: RunSizes
 ) -> list[FailureRecord]:
-    """Complete all cells; one that fails does not keep the others.
-
-    Args:
-        config: Where and how.
-        cells: All cells asked for, whose scenes are there.
-        finished: The folder's results, to which those of the cells are added.
-        sizes: Of runs.
-
-    Returns:
-        Why cells failed.
+    """Complete all cells, whose scenes are there, and add their results to the finished ones; returns the failures.
 
     Raises:
         InterruptedRunError: Ctrl-C, or the system's request to end; all runs are saved.

@@ -29,21 +29,13 @@ SCENES = Path("scenes")
 
 @dataclass(frozen=True)
 class SceneSource:
-    """A scene on disk, or a phantom to make there.
+    """A scene on disk, or a phantom to make there."""
 
-    Attributes:
-        name: Unique within a comparison.
-        path: Its folder, absolute.
-        overrides: ``key.path=value`` changes of a method config with which it is read.
-        data_format: Name of a data manager; None: recognised from the files.
-        phantom: Settings to make it with; None for a dataset.
-    """
-
-    name: str
-    path: Path
-    overrides: tuple[str, ...] = ()
-    data_format: str | None = None
-    phantom: PhantomSettings | None = None
+    name: str  # unique within a comparison
+    path: Path  # its folder, absolute
+    overrides: tuple[str, ...] = ()  # ``key.path=value`` changes of a method config with which it is read
+    data_format: str | None = None  # name of a data manager; None: recognised from the files
+    phantom: PhantomSettings | None = None  # settings to make it with; None for a dataset
 
     @property
     def is_there(self) -> bool:
@@ -63,14 +55,8 @@ class SceneSource:
 def find_scenes(names: Sequence[str], data: Path | None = None) -> list[SceneSource]:
     """The scenes that names stand for.
 
-    Args:
-        names: Each a benchmark, ``BENCHMARK/SCENE`` for one scene of it, the path of a benchmark's YAML file, or the
-            folder of a scene.
-        data: Folder of the benchmark's scenes; None: ``scenes/BENCHMARK``.
-
-    Raises:
-        InputError: A name is unknown, scenes are missing that cannot be made, a folder holds another phantom, or two
-            scenes have one name.
+    Each is a benchmark, ``BENCHMARK/SCENE``, the path of a benchmark's YAML file, or the folder of a scene. Those of a
+    benchmark are in the folder ``data``, or else in ``scenes/BENCHMARK``.
     """
     sources: list[SceneSource] = []
     benchmarks: set[str] = set()
@@ -92,11 +78,7 @@ def find_scenes(names: Sequence[str], data: Path | None = None) -> list[SceneSou
 
 
 def make_phantoms(sources: Sequence[SceneSource], progress: Progress | None = None) -> None:
-    """Make every phantom that is missing.
-
-    Raises:
-        InputError: One cannot be made or written.
-    """
+    """Make every phantom that is missing."""
     for source in sources:
         if source.phantom is None or source.is_there:
             continue

@@ -19,47 +19,26 @@ STOPPED = 130
 
 @dataclass(frozen=True)
 class Task:
-    """One cell, as a worker process is told of it.
-
-    Attributes:
-        title: For messages.
-        name: Of the method, in tables.
-        method: Name or path of the method config.
-        overrides: ``key.path=value`` changes of it.
-        scene: Name of the scene, in tables.
-        data: The scene's folder.
-        data_format: Name of a data manager, or None.
-        seed: Of all random generators.
-        device: ``auto``, ``cpu`` or ``cuda``.
-        protocol: Name of the evaluation protocol.
-        run: Run folder.
-        result: Where the results file goes.
-        result_key: Key that the result must have.
-        log: File of the worker's messages.
-        threads: CPU threads for a run that begins; one that goes on keeps its number.
-        variables: Environment variables of this package, for machines that may not have them.
-        save_seconds: Largest time between two checkpoints.
-        lock_seconds: How long to wait for another process that has the run.
-    """
+    """One cell, as a worker process is told of it."""
 
     title: str
-    name: str
-    method: str
-    overrides: tuple[str, ...]
-    scene: str
+    name: str  # of the method, in tables
+    method: str  # name or path of the method config
+    overrides: tuple[str, ...]  # ``key.path=value`` changes of it
+    scene: str  # name of the scene, in tables
     data: str
     data_format: str | None
     seed: int
     device: str
     protocol: str
     run: str
-    result: str
-    result_key: str
-    log: str
-    threads: int
-    variables: Mapping[str, str] = field(default_factory=dict)
-    save_seconds: float = 60.0
-    lock_seconds: float = 120.0
+    result: str  # where the results file goes
+    result_key: str  # key that the result must have
+    log: str  # file of the worker's messages
+    threads: int  # CPU threads for a run that begins; one that goes on keeps its number
+    variables: Mapping[str, str] = field(default_factory=dict)  # this package's, for machines without them
+    save_seconds: float = 60.0  # largest time between two checkpoints
+    lock_seconds: float = 120.0  # how long to wait for another process that has the run
 
     def to_json(self) -> str:
         """As the argument of a worker."""
@@ -89,15 +68,10 @@ class Task:
 
 @dataclass(frozen=True)
 class TaskOutcome:
-    """How a worker ended.
-
-    Attributes:
-        ending: How.
-        reason: Why it failed, died or stopped; empty where it is done.
-    """
+    """How a worker ended."""
 
     ending: Ending
-    reason: str = ""
+    reason: str = ""  # why it failed, died or stopped; empty where it is done
 
 
 def outcome_line(outcome: TaskOutcome) -> str:
@@ -106,12 +80,7 @@ def outcome_line(outcome: TaskOutcome) -> str:
 
 
 def read_outcome(returncode: int, printed: str) -> TaskOutcome:
-    """The outcome of a worker that has ended.
-
-    Args:
-        returncode: Exit status; negative: the signal that ended it.
-        printed: Its standard output.
-    """
+    """The outcome of a worker that has ended; a negative status is the signal that ended it."""
     try:
         values: dict[str, Any] = json.loads(printed.strip().splitlines()[-1])
         return TaskOutcome(**values)

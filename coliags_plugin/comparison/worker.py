@@ -73,13 +73,7 @@ def work(task: Task) -> TaskOutcome:
 
 
 def complete(task: Task) -> None:
-    """Train, evaluate and write the results file, as far as that has not been done.
-
-    Raises:
-        InputError: The method does not fit the scene, scene or method have changed, or something cannot be written.
-        NotFiniteError: A loss or a parameter became NaN or infinite.
-        InterruptedRunError: The worker was asked to stop during training.
-    """
+    """Train, evaluate and write the results file, as far as that has not been done."""
     from coliags_plugin.engine import evaluator
     from coliags_plugin.engine.devices import choose_device
     from coliags_plugin.engine.trained import load_trained

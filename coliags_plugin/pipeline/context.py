@@ -18,27 +18,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StageContext:
-    """What every stage is given.
+    """What every stage is given."""
 
-    Attributes:
-        out: The reconstruction's folder.
-        source: The video, folder of images or scene.
-        settings: Of all stages.
-        mask: Image that is black where pixels are ignored; None: found from the frames.
-        data_format: Of a source that is a scene; None: it is none.
-        device: Where to compute.
-        progress: Progress callback.
-        anonymous: Keep absolute paths out of what is written.
-    """
-
-    out: Path
-    source: Path
+    out: Path  # the reconstruction's folder
+    source: Path  # the video, folder of images or scene
     settings: ReconstructionSettings
-    mask: Path | None
-    data_format: str | None
+    mask: Path | None  # image that is black where pixels are ignored; None: found from the frames
+    data_format: str | None  # of a source that is a scene; None: it is none
     device: torch.device
     progress: Progress | None = None
-    anonymous: bool = False
+    anonymous: bool = False  # keep absolute paths out of what is written
 
     @property
     def frames(self) -> Path:

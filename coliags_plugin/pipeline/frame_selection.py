@@ -31,25 +31,12 @@ THINNED, BLURRED, EMPTY, RESTING = "thinned out", "blurred", "black or without a
 
 
 def interval(count: int, settings: FrameSettings) -> int:
-    """Of so many frames one is used.
-
-    Args:
-        count: Frames of the video.
-        settings: Which to use.
-    """
+    """Of so many frames one is used, in a video of ``count``."""
     return settings.every or max(1, math.ceil(count / settings.at_most))
 
 
 def sharp_frames(sharpness: Sequence[float], settings: FrameSettings) -> tuple[list[int], dict[int, str]]:
-    """Frames to use, by their sharpness alone.
-
-    Args:
-        sharpness: Of every frame of the video.
-        settings: Which to use.
-
-    Returns:
-        Indices, ascending; and why each of the others is dropped.
-    """
+    """Frames to use by the sharpness of every frame: ascending indices, and why each of the others is dropped."""
     values, step = np.asarray(sharpness), interval(len(sharpness), settings)
     best = [first + int(np.argmax(values[first : first + step])) for first in range(0, len(values), step)]
     dropped = dict.fromkeys(set(range(len(values))) - set(best), THINNED)
@@ -68,11 +55,8 @@ def sharp_frames(sharpness: Sequence[float], settings: FrameSettings) -> tuple[l
 def lens_mask(brightest: UInt8[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"] | None:
     """Mask of a lens's image within black surroundings; None where the image has none.
 
-    Args:
-        brightest: The largest value of each pixel in any channel of any frame. [H, W]
-
-    Returns:
-        False where a pixel is dark in every frame and connected to the image's edge. [H, W]
+    False where a pixel is dark in every frame and connected to the image's edge. ``brightest`` is the largest value of
+    each pixel in any channel of any frame.
     """
     import cv2
 
@@ -100,9 +84,6 @@ def sharpness(gray: UInt8[np.ndarray, "h w"]) -> float:
     """Root mean square of the Laplacian of the smoothed image, relative to its mean brightness; 0 for a black image.
 
     Highlights do not count: they are sharp in a blurred frame too. Comparable between frames of one video only.
-
-    Args:
-        gray: By :func:`reduced`. [h, w]
     """
     import cv2
 
@@ -117,12 +98,7 @@ def sharpness(gray: UInt8[np.ndarray, "h w"]) -> float:
 
 
 def motion(before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"]) -> float:
-    """Median displacement of corners between two frames, as a share of the larger side; infinity if too few are found.
-
-    Args:
-        before: By :func:`reduced`. [h, w]
-        after: Likewise.
-    """
+    """Median displacement of corners between two frames, as a share of the larger side; infinity for too few."""
     import cv2
 
     corners = cv2.goodFeaturesToTrack(_equalised(before), _CORNERS, 0.01, 8)

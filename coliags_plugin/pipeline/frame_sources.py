@@ -36,20 +36,12 @@ class FrameSource(Protocol):
         """Number of frames by what the file says, at least 1; for progress alone."""
 
     def __iter__(self) -> Iterator[tuple[str, UInt8[np.ndarray, "H W 3"]]]:
-        """Names, which sort in frame order, and RGB images, all of one size.
-
-        Raises:
-            InputError: A frame cannot be read, or has another size than the first.
-        """
+        """Names, which sort in frame order, and RGB images, all of one size."""
 
 
 @dataclass(frozen=True)
 class ImageFolder:
-    """Images of a folder, in the natural order of their names.
-
-    Attributes:
-        path: The folder.
-    """
+    """Images of a folder, in the natural order of their names."""
 
     path: Path
 
@@ -76,11 +68,7 @@ class ImageFolder:
 
 @dataclass(frozen=True)
 class VideoFile:
-    """Frames of a video file, decoded by OpenCV.
-
-    Attributes:
-        path: The file.
-    """
+    """Frames of a video file, decoded by OpenCV."""
 
     path: Path
 
@@ -124,11 +112,7 @@ _AS_IMAGES = "Make images with ffmpeg -i VIDEO FOLDER/%06d.png and give the fold
 
 
 def frame_source(path: Path) -> FrameSource:
-    """The frames of a file or folder.
-
-    Raises:
-        InputError: There is nothing, an image instead of a video, or a video that OpenCV cannot open.
-    """
+    """The frames of a file or folder."""
     if path.is_dir():
         list_images(path)
         return ImageFolder(path)

@@ -51,22 +51,8 @@ def write_frames(
 ) -> str:
     """Choose frames and write them: ``images/NAME.png``, ``frames.json``, and ``mask.png`` where there is a mask.
 
-    The video is read twice: for the sharpness of all frames, and to write those chosen.
-
-    Args:
-        source: The video.
-        folder: To create; replaced if it is there.
-        settings: Which frames.
-        mask: Image of the frames' size, black where pixels are ignored; None: black surroundings of the lens's image
-            are found.
-        progress: Progress callback.
-
-    Returns:
-        A summary of one line.
-
-    Raises:
-        InputError: The video cannot be read, the mask does not fit, fewer than four frames are left, or the folder
-            cannot be written.
+    The video is read twice: for the sharpness of all frames, and to write those chosen. Without a mask, black
+    surroundings of the lens's image are found. Replaces the folder; returns a summary of one line.
     """
     given = None if mask is None else read_mask(mask)
     survey = _survey(source, progress)

@@ -14,15 +14,7 @@ PAGE_FILE = "index.html"
 
 
 def write_index(record: Record, title: str) -> None:
-    """Write ``index.html``: what each stage gave, and links to the files.
-
-    Args:
-        record: Of the reconstruction.
-        title: Heading, plain text.
-
-    Raises:
-        InputError: The file cannot be written.
-    """
+    """Write ``index.html``: what each stage gave, and links to the files."""
     stages = record.stages.items()
     links = [Bullet(what, path, quote(path)) for _, stage in stages for path, what in stage.files.items()]
     columns = [Column("stage"), Column("result", words=True), Column("time")]

@@ -36,20 +36,7 @@ def reconstruct(
     progress: Progress | None = None,
     anonymous: bool = False,
 ) -> Record:
-    """Reconstruct a video, or go on with what was begun.
-
-    Args:
-        source: Video file, folder of images, or folder of a scene with poses, whose frames and poses are used.
-        out: Folder of the results.
-        settings: Of all stages.
-        device: Where to compute.
-        mask: Image of the frames' size, black where pixels are ignored; None: black surroundings are found.
-        overwrite: Repeat stages that were made with other settings, and what follows them.
-        progress: Progress callback.
-        anonymous: Keep absolute paths out of what is written.
-
-    Returns:
-        The record of what was made.
+    """Reconstruct a video, or go on with what was begun; arguments as in :func:`coliags_plugin.reconstruct`.
 
     Raises:
         InputError: The source cannot be read; a stage cannot be done; ``out`` is something else, or was made with

@@ -27,41 +27,24 @@ LOCK_FILE = ".lock"
 
 @dataclass(frozen=True)
 class StageRecord:
-    """A stage that was begun.
+    """A stage that was begun."""
 
-    Attributes:
-        options: What it depends on, as JSON.
-        state: ``begun``, ``failed`` for its input, or ``done``.
-        summary: What came out, in one line.
-        seconds: Of the attempt that ended, wall-clock.
-        files: What it made, relative to the folder, and what each is.
-    """
-
-    options: Mapping[str, Any]
+    options: Mapping[str, Any]  # what it depends on, as JSON
     state: Literal["begun", "failed", "done"] = "begun"
-    summary: str = ""
-    seconds: float = 0.0
-    files: Mapping[str, str] = field(default_factory=dict)
+    summary: str = ""  # what came out, in one line
+    seconds: float = 0.0  # of the attempt that ended, wall-clock
+    files: Mapping[str, str] = field(default_factory=dict)  # what it made, relative to the folder, and what each is
 
 
 class Record:
-    """The record in a folder, written after every change.
-
-    Args:
-        folder: The reconstruction.
-        stages: By their names.
-    """
+    """The record in a folder, written after every change: its stages by their names."""
 
     def __init__(self, folder: Path, stages: Mapping[str, StageRecord] | None = None) -> None:
         self.folder, self.stages = folder, dict(stages or {})
 
     @classmethod
     def of(cls, folder: Path) -> Record:
-        """The record of a folder; empty for one that is new or empty.
-
-        Raises:
-            InputError: The folder holds something else, or the record is damaged.
-        """
+        """The record of a folder; empty for one that is new or empty."""
         file = folder / RECORD_FILE
         if file.is_file():
             try:
@@ -85,12 +68,7 @@ class Record:
         self.write()
 
     def forget(self, names: Sequence[str], outputs: Sequence[str]) -> None:
-        """Forget stages and remove what they made.
-
-        Args:
-            names: Of the stages.
-            outputs: Files and folders of theirs, relative to the folder.
-        """
+        """Forget stages and remove what they made, files and folders relative to the folder."""
         self.stages = {name: stage for name, stage in self.stages.items() if name not in names}
         self.write()
         for output in outputs:
@@ -101,11 +79,7 @@ class Record:
                 path.unlink(missing_ok=True)
 
     def write(self) -> None:
-        """Write the file atomically.
-
-        Raises:
-            InputError: The folder cannot be written.
-        """
+        """Write the file atomically."""
         stages = {name: asdict(stage) for name, stage in self.stages.items()}
         write_json(self.folder / RECORD_FILE, {"format": _FORMAT, "version": __version__, "stages": stages})
 
@@ -117,32 +91,23 @@ def _is_ours(path: Path) -> bool:
 
 @dataclass(frozen=True)
 class StageOutcome:
-    """What a stage has made.
-
-    Attributes:
-        summary: One line.
-        files: Paths relative to the reconstruction's folder, and what each is.
-    """
+    """What a stage has made."""
 
     summary: str
-    files: Mapping[str, str] = field(default_factory=dict)
+    files: Mapping[str, str] = field(default_factory=dict)  # paths relative to the folder, and what each is
 
 
 @dataclass(frozen=True)
 class Stage:
     """A step of a reconstruction. It reads what earlier stages wrote, and can be repeated after a kill.
 
-    Attributes:
-        name: As the record and messages call it.
-        options: All that it depends on apart from the stages before it, as JSON.
-        run: Does it, replacing what an attempt that was killed has left, or going on with that.
-        outputs: Files and folders that it writes, relative to the reconstruction's folder.
+    ``run`` replaces what an attempt that was killed has left, or goes on with that.
     """
 
-    name: str
-    options: Mapping[str, Any]
+    name: str  # as the record and messages call it
+    options: Mapping[str, Any]  # all that it depends on apart from the stages before it, as JSON
     run: Callable[[], StageOutcome]
-    outputs: Sequence[str] = ()
+    outputs: Sequence[str] = ()  # files and folders that it writes, relative to the reconstruction's folder
 
 
 def run_stages(stages: Sequence[Stage], record: Record, overwrite: bool = False) -> None:
@@ -150,14 +115,6 @@ def run_stages(stages: Sequence[Stage], record: Record, overwrite: bool = False)
 
     A stage that was begun with other options is an error, or with ``overwrite`` removed and repeated, along with those
     after it. The options of one that failed may change.
-
-    Args:
-        stages: In order.
-        record: Of what is done; kept up to date.
-        overwrite: Remove what other options made.
-
-    Raises:
-        InputError: See above; or a stage cannot be done: the message says which, and what stands.
     """
     _check_options(stages, record, overwrite)
     for number, stage in enumerate(stages, start=1):

@@ -23,11 +23,7 @@ def method_for(context: StageContext) -> str:
 
 
 def train(context: StageContext) -> StageOutcome:
-    """Train, or go on from the newest checkpoint.
-
-    Raises:
-        InterruptedRunError: Ctrl-C, after the state was saved.
-    """
+    """Train, or go on from the newest checkpoint."""
     from coliags_plugin.engine.run_folder import RunFolder
     from coliags_plugin.engine.training import TrainingRequest, open_training
     from coliags_plugin.reconstruction.depth.scene import training_options
@@ -83,11 +79,7 @@ def mesh(context: StageContext) -> StageOutcome:
 
 
 def coverage(context: StageContext) -> StageOutcome:
-    """Coverage stage: measure the share of the wall seen in the video; skipped where it cannot be measured.
-
-    Raises:
-        NotWritableError: It could be measured, but not written.
-    """
+    """Measure the share of the wall seen in the video; left out where it cannot be measured."""
     from coliags_plugin.geometry.meshes.files import read_mesh
     from coliags_plugin.surface.coverage.page import summary
     from coliags_plugin.surface.coverage.writing import measure_scene

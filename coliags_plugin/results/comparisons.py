@@ -25,44 +25,26 @@ LEVELS = (0.05, 0.01, 0.001)
 
 @dataclass(frozen=True)
 class PairedTests:
-    """Tests and effect sizes of a lead; positive effects speak for the reference.
+    """Tests and effect sizes of a lead; positive effects speak for the reference."""
 
-    Attributes:
-        wilcoxon: Two-sided p of the Wilcoxon signed-rank test.
-        wilcoxon_holm: The same, adjusted for the number of rivals.
-        t_test: Two-sided p of the paired t-test; None where all leads are equal.
-        t_test_holm: The same, adjusted for the number of rivals that have one.
-        interval: 95 % percentile bootstrap interval of the mean lead.
-        cohen_dz: None where all leads are equal.
-        rank_biserial: Matched-pairs rank-biserial correlation.
-    """
-
-    wilcoxon: float
-    wilcoxon_holm: float
-    t_test: float | None
-    t_test_holm: float | None
-    interval: tuple[float, float]
-    cohen_dz: float | None
-    rank_biserial: float
+    wilcoxon: float  # two-sided p of the Wilcoxon signed-rank test
+    wilcoxon_holm: float  # the same, adjusted for the number of rivals
+    t_test: float | None  # two-sided p of the paired t-test; None where all leads are equal
+    t_test_holm: float | None  # the same, adjusted for the number of rivals that have one
+    interval: tuple[float, float]  # 95 % percentile bootstrap interval of the mean lead
+    cohen_dz: float | None  # None where all leads are equal
+    rank_biserial: float  # matched-pairs rank-biserial correlation
 
 
 @dataclass(frozen=True)
 class RivalComparison:
-    """By how much a reference leads over a rival.
-
-    Attributes:
-        rival: The method.
-        scenes: Scenes that both have.
-        lead: Mean over the scenes, positive where the reference is better; None without a common scene.
-        better_on: Number of scenes on which the reference is better.
-        tests: None with fewer than six common scenes.
-    """
+    """By how much a reference leads over a rival."""
 
     rival: str
-    scenes: tuple[str, ...]
-    lead: float | None
-    better_on: int
-    tests: PairedTests | None
+    scenes: tuple[str, ...]  # scenes that both have
+    lead: float | None  # mean over the scenes, positive where the reference is better; None without a common scene
+    better_on: int  # number of scenes on which the reference is better
+    tests: PairedTests | None  # None with fewer than six common scenes
 
     @property
     def stars(self) -> str:
@@ -76,14 +58,7 @@ class RivalComparison:
 def compare_with_rivals(
     values: Mapping[str, BySeed], reference: str, higher_is_better: bool, seed: int = 0
 ) -> list[RivalComparison]:
-    """Compare a reference with every other method, each pair on the scenes that both have.
-
-    Args:
-        values: By method, scene and seed; seeds are averaged per scene.
-        reference: One of the methods.
-        higher_is_better: Whether larger values are better.
-        seed: Of the bootstrap.
-    """
+    """Compare a reference with every other method, each pair on their common scenes, seeds averaged first."""
     leads = {
         rival: _leads(values[reference], by_seed, 1.0 if higher_is_better else -1.0)
         for rival, by_seed in values.items()

@@ -15,14 +15,8 @@ _MARK = f'"{FORMAT}"'.encode()
 def find_results(paths: Sequence[Path]) -> list[Result]:
     """Read the results at some paths, each once: of files with one key and the same values the first counts.
 
-    Args:
-        paths: Results files, and folders that are searched for them: run folders, folders of runs, or folders of
-            results files of any name. Hidden files and folders, such as an interrupted evaluation leaves, are not
-            looked into, nor are JSON files of other content.
-
-    Raises:
-        InputError: A path is missing, a folder holds no results, a results file is damaged, or two of them have one
-            key and other values.
+    Paths are results files, and folders that are searched for them. Hidden files and folders, such as an interrupted
+    evaluation leaves, are not looked into, nor are JSON files of other content.
     """
     by_key: dict[str, tuple[Path, Result]] = {}
     for path in dict.fromkeys(file.resolve() for given in paths for file in _files(given)):

@@ -22,13 +22,7 @@ class ArraysHash:
         self._sha = hashlib.sha256()
 
     def add(self, frame: str, part: str, values: np.ndarray) -> None:
-        """Add an array.
-
-        Args:
-            frame: Name of the frame it belongs to.
-            part: What it is, for instance ``rgb``.
-            values: Of floats or of bool, any shape.
-        """
+        """Add an array of floats or of bool, for instance the part ``rgb`` of a frame."""
         if values.dtype != np.bool_:
             values = np.where(np.isnan(values), np.float32(np.nan), values).astype("<f4")
         header = json.dumps([frame, part, values.dtype.str, list(values.shape)])

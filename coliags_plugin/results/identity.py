@@ -36,14 +36,7 @@ def training_config(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def training_key(config: Mapping[str, Any], fingerprint: str, seed: int, package_version: str) -> str:
-    """Key of a trained model, 16 hexadecimal digits; how often is logged and saved does not count.
-
-    Args:
-        config: The resolved method config as plain data.
-        fingerprint: Of the scene's files.
-        seed: Of the run.
-        package_version: Of this package.
-    """
+    """Key of a trained model, 16 hexadecimal digits; how often is logged and saved does not count."""
     return _digest([training_config(config), fingerprint, seed, package_version])
 
 
@@ -58,15 +51,8 @@ def result_key(
 ) -> str:
     """Key of a result, 16 hexadecimal digits.
 
-    Args:
-        config: See :func:`training_key`.
-        fingerprint: See :func:`training_key`.
-        seed: See :func:`training_key`.
-        package_version: See :func:`training_key`.
-        protocol: Name of the evaluation protocol.
-        protocol_version: Its version.
-        deviations: How the run differs from one that goes through as configured: taken to another step, with another
-            schedule on the way, or trained by another version. None where it does not.
+    Deviations are how the run differs from one that goes through as configured: taken to another step, with another
+    schedule on the way, or trained by another version.
     """
     parts: list[Any] = [training_key(config, fingerprint, seed, package_version), protocol, protocol_version]
     if deviations:

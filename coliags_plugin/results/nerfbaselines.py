@@ -53,18 +53,10 @@ def nerfbaselines_result(result: Result) -> dict[str, Any]:
 
 
 def write_nerfbaselines(output: Path, results: Sequence[Result]) -> list[Path]:
-    """Write one file per result in their form.
+    """Write one file per result in their form, and return the files.
 
-    Args:
-        output: A folder, where each is named by its method, scene, seed, protocol and key; or a file ending in
-            ``.json`` for a single result.
-        results: What to write.
-
-    Returns:
-        The files.
-
-    Raises:
-        InputError: A file is named for several results, or cannot be written.
+    In a folder, each is named by its method, scene, seed, protocol and key; a path ending in ``.json`` is the file of a
+    single result.
     """
     if output.suffix == ".json" and not output.is_dir():
         if len(results) != 1:

@@ -26,9 +26,6 @@ def wilcoxon_p(differences: Differences) -> float:
 
     Zeros are dropped. Exact for up to 50 differences, of which scipy takes those without ties; the normal approximation
     beyond. Never below :func:`smallest_p`. Without a difference that is not zero it is 1.
-
-    Args:
-        differences: One per scene. [n]
     """
     kept = differences[differences != 0.0]
     if not kept.size:
@@ -53,22 +50,14 @@ def _exact_p(ranks: Float[np.ndarray, "n"], positive: Bool[np.ndarray, "n"]) -> 
 
 
 def t_test_p(differences: Differences) -> float | None:
-    """Two-sided p of the paired t-test; None where all differences are equal, so that it is undefined.
-
-    Args:
-        differences: One per scene, at least two. [n]
-    """
+    """Two-sided p of the paired t-test of two differences or more; undefined, None, where all are equal."""
     if _constant(differences):
         return None
     return float(stats.ttest_1samp(differences, 0.0).pvalue)
 
 
 def cohen_dz(differences: Differences) -> float | None:
-    """Cohen's d of paired samples: mean over standard deviation (n - 1); None where all differences are equal.
-
-    Args:
-        differences: One per scene, at least two. [n]
-    """
+    """Cohen's d of paired samples: mean over standard deviation (n - 1); None where all differences are equal."""
     if _constant(differences):
         return None
     return float(np.mean(differences) / np.std(differences, ddof=1))
@@ -79,9 +68,6 @@ def rank_biserial(differences: Differences) -> float:
 
     1 where all differences are positive, -1 where all are negative, 0 where none is other than zero. Source: Kerby,
     The simple difference formula, 2014.
-
-    Args:
-        differences: One per scene. [n]
     """
     kept = differences[differences != 0.0]
     if not kept.size:
@@ -91,13 +77,7 @@ def rank_biserial(differences: Differences) -> float:
 
 
 def bootstrap_interval(differences: Differences, seed: int = 0, confidence: float = 0.95) -> tuple[float, float]:
-    """Percentile bootstrap interval of the mean difference; scenes are resampled, never frames.
-
-    Args:
-        differences: One per scene. [n]
-        seed: Of the resampling.
-        confidence: Share of the resampled means inside.
-    """
+    """Percentile bootstrap interval of the mean difference; scenes are resampled, never frames."""
     count = len(differences)
     chosen = np.random.default_rng(seed).integers(0, count, (RESAMPLES, count))
     tail = 50.0 * (1.0 - confidence)

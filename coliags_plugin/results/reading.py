@@ -27,21 +27,16 @@ class NewerResultError(InputError):
 
 
 def write_result(path: Path, result: Result) -> None:
-    """Write a results file atomically.
-
-    Raises:
-        InputError: The folder cannot be written.
-    """
+    """Write a results file atomically."""
     write_json(path, result.model_dump(mode="json"))
 
 
 def read_result(path: Path) -> Result:
-    """Read a results file.
+    """Read a results file, and check its values against their hash.
 
     Raises:
         NewerResultError: It is of a newer version of the schema.
-        InputError: There is none, it is cut off or otherwise not JSON, no results file, lacks a field or has one of a
-            wrong type, or its values are not those that were written.
+        InputError: There is none, it is damaged, or its values are not those that were written.
     """
     try:
         text = json_text(path)

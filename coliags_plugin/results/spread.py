@@ -16,15 +16,12 @@ class Spread:
     """Mean and spread of a method's metric.
 
     Attributes:
-        mean: Mean over scenes of the means over seeds.
-        over_scenes: Standard deviation (n - 1) of these means; None for a single scene.
-        over_seeds: Root mean square, over the scenes with two seeds or more, of the standard deviation (n - 1) over
-            the seeds of a scene; None where there is no such scene.
-        scenes: Number of scenes.
+        over_seeds: Root mean square, over the scenes with two seeds or more, of the standard deviation (n - 1) over the
+            seeds of a scene; None where there is no such scene.
     """
 
-    mean: float
-    over_scenes: float | None
+    mean: float  # mean over scenes of the means over seeds
+    over_scenes: float | None  # standard deviation (n - 1) of these means; None for a single scene
     over_seeds: float | None
     scenes: int
 
@@ -35,12 +32,7 @@ def scene_means(values: BySeed) -> dict[str, float]:
 
 
 def spread(values: BySeed, scenes: Sequence[str]) -> Spread:
-    """Mean and spread over some scenes.
-
-    Args:
-        values: By scene and seed.
-        scenes: At least one; each has a value.
-    """
+    """Mean and spread over one or more scenes that all have a value."""
     means = [float(np.mean([*values[scene].values()])) for scene in scenes]
     variances = [np.var([*values[scene].values()], ddof=1) for scene in scenes if len(values[scene]) > 1]
     return Spread(

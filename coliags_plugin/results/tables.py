@@ -37,22 +37,7 @@ def per_frame_table(result: Result) -> str:
 
 
 class FrameValue(NamedTuple):
-    """One value of one frame.
-
-    Attributes:
-        key: Of the result.
-        method: Name of the method.
-        scene: Name of the scene.
-        split: Name of the split.
-        seed: Of the run.
-        protocol: Name of the evaluation protocol.
-        protocol_version: Its version.
-        set: Name of the test set.
-        frame: Name of the frame.
-        metric: Name of the metric.
-        value: The raw value; None where the frame has none.
-        unit: Of the value.
-    """
+    """One value of one frame; None where the frame has none."""
 
     key: str
     method: str
@@ -79,20 +64,12 @@ def rows(result: Result) -> Iterator[FrameValue]:
 
 
 def write_csv(path: Path, results: Sequence[Result]) -> None:
-    """Write the rows of results as CSV, values with all their digits, missing ones empty.
-
-    Raises:
-        InputError: The file cannot be written.
-    """
+    """Write the rows of results as CSV, values with all their digits, missing ones empty."""
     atomic_write(path, csv_text(FrameValue._fields, (row for result in results for row in rows(result))))
 
 
 def write_parquet(path: Path, results: Sequence[Result]) -> None:
-    """Write the rows of results as Parquet, missing values null.
-
-    Raises:
-        InputError: pyarrow is not installed, or the file cannot be written.
-    """
+    """Write the rows of results as Parquet, missing values null."""
     try:
         import pyarrow
         from pyarrow import parquet

@@ -98,11 +98,7 @@ class _Log:
 
 
 def training_blocks(study: Study) -> list[Block]:
-    """Curves of every scene against steps and seconds; says so where there is no log.
-
-    Raises:
-        InputError: A log is damaged.
-    """
+    """Curves of every scene against steps and seconds; says so where there is no log."""
     by_scene = {scene: logs for scene in study.scenes if (logs := _logs(study, scene))}
     if not by_scene:
         return [Paragraph("No training log: only results files are here, or runs without metrics.jsonl.")]
@@ -189,11 +185,7 @@ def _frame_chart(part: Part, scene: str) -> Chart:
 
 
 def light_section(study: Study) -> Section:
-    """Light that methods have learned, beside the true one of phantoms; without blocks where none has learned any.
-
-    Raises:
-        InputError: A record of light is damaged.
-    """
+    """Light that methods have learned, beside the true one of phantoms; without blocks where none has learned any."""
     runs = [(run, blocks) for runs in study.by_method.values() for run in runs if (blocks := _light_blocks(run))]
     explanation = Paragraph(
         "What a learned law makes of the light over distance and angle, relative to the optical axis at the median "

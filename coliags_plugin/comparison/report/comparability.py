@@ -12,12 +12,7 @@ from coliags_plugin.results.record import Result
 
 
 def refuse_incomparable(runs: Sequence[StudyRun]) -> None:
-    """Refuse results that do not belong into one table.
-
-    Raises:
-        InputError: Two results have different protocols or versions of one; two of one scene and split have different
-            sizes, training frames, test frames or true images; or a method shares no scene with the others.
-    """
+    """Refuse results that do not belong into one table."""
     first: dict[tuple[str, str], StudyRun] = {}
     for run in runs:
         _refuse_protocols(runs[0], run)

@@ -32,11 +32,7 @@ def is_comparison(folder: Path) -> bool:
 
 
 def read_comparison(folder: Path, protocol: str) -> tuple[list[ResultSource], list[MissingResult]]:
-    """Results and failures of one protocol: those of the plan, in its order; all that are there without a plan.
-
-    Raises:
-        InputError: A file is damaged, or there are results of other protocols only.
-    """
+    """Results and failures of one protocol: those of the plan, in its order; all that are there without a plan."""
     plan = read_plan(folder)
     if plan is not None:
         return _read_planned(folder, plan.cells, protocol)

@@ -27,13 +27,7 @@ def per_frame_csv(study: Study) -> str:
 
 
 def frame_section(study: Study, chosen: Sequence[str], reference: str) -> Section:
-    """The worst frames first, charts along the video, and all values as CSV.
-
-    Args:
-        study: The results.
-        chosen: Columns that the reader chose.
-        reference: Method by whose values the frames are sorted.
-    """
+    """The reference's worst frames first, charts along the video, and all values as CSV."""
     download = {
         "name": "per_frame.csv",
         "data": b64encode(per_frame_csv(study).encode()).decode("ascii"),

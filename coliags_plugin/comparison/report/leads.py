@@ -28,11 +28,7 @@ _SMALLEST_PRINTED = 1e-4
 
 
 def choose_reference(study: Study, chosen: str | None) -> str:
-    """The method that the others are compared with: the one chosen, else ``coliags``, else the best.
-
-    Raises:
-        InputError: The chosen one is not among the methods.
-    """
+    """The method that the others are compared with: the one chosen, else ``coliags``, else the best."""
     if chosen is None:
         return PREFERRED if PREFERRED in study.methods else _best_method(study.parts[0])
     if chosen not in study.methods:
@@ -130,12 +126,9 @@ def _signed(value: float, decimals: int) -> TableCell:
 
 
 def statistics_text(compared: Sequence[RivalComparison], reference: str, chosen: bool) -> list[str]:
-    """Sentences on the unit, the number of scenes and the smallest possible p; or why no test is run.
+    """Sentences on the unit, the number of scenes and the smallest possible p of one metric; or why no test is run.
 
-    Args:
-        compared: The reference with each rival, by one metric.
-        reference: Its name.
-        chosen: Whether it was chosen beforehand, not for being the best.
+    A reference that was not chosen beforehand, but for being the best, is warned of.
     """
     most = max((len(row.scenes) for row in compared), default=0)
     if not most:

@@ -46,11 +46,7 @@ def metric_title(metric: str) -> str:
 
 
 def check_columns(study: Study, chosen: Sequence[str]) -> None:
-    """Refuse the name of a metric that no result has.
-
-    Raises:
-        InputError: See above.
-    """
+    """Refuse the name of a metric that no result has."""
     for name in chosen:
         if name not in study.metrics and name != ALL_COLUMNS:
             known = [*study.metrics, ALL_COLUMNS]
@@ -60,11 +56,8 @@ def check_columns(study: Study, chosen: Sequence[str]) -> None:
 def metric_columns(part: Part, chosen: Sequence[str] = ()) -> list[Column]:
     """Columns of a part: every metric that it has, or that no part has; those not chosen are there, but not shown.
 
-    Unless chosen, metrics that have no value in the part, nor a published one, are not shown either.
-
-    Args:
-        part: Test set and split.
-        chosen: Metrics to show, in this order, before the others; empty: :data:`DEFAULT_COLUMNS`.
+    Chosen ones come first, in their order. Unless chosen, metrics that have no value in the part, nor a published one,
+    are not shown either.
     """
     metrics = part.study.metrics
     own = [name for name in metrics if not _belongs_elsewhere(part, name)]

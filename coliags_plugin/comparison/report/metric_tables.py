@@ -20,13 +20,7 @@ METHOD = Column("method", "Method", words=True)
 def method_rows(
     study: Study, columns: Sequence[Column], cells: Sequence[Sequence[TableCell]]
 ) -> list[dict[str, TableCell]]:
-    """Rows of a table with one method each.
-
-    Args:
-        study: The results.
-        columns: Behind that of the methods.
-        cells: One per column and method.
-    """
+    """Rows of a table with one method each, of one cell per column and method."""
     keys = [column.key for column in columns]
     return [
         {METHOD.key: TableCell(method, style=style), **dict(zip(keys, own, strict=True))}
@@ -47,11 +41,7 @@ def summary_table(
 ) -> Table:
     """Mean of every metric over the scenes that all methods have, with its standard deviation over them.
 
-    Args:
-        part: Test set and split.
-        columns: Metrics.
-        comparisons: By metric, for the stars; metrics without one have none.
-        published: Numbers to show below ours.
+    Stars are of the comparisons, by metric; published numbers stand below ours.
     """
     cells = [_summary_cells(part, column, comparisons.get(column.key, ())) for column in columns]
     rows = method_rows(part.study, columns, cells)

@@ -34,29 +34,17 @@ _LISTED = 12
 
 @dataclass(frozen=True)
 class Choices:
-    """What the reader of a report chooses.
+    """What the reader of a report chooses."""
 
-    Attributes:
-        columns: Metrics to show, in this order; empty: the default ones.
-        reference: Method that the others are compared with; None: ``coliags``, or the best where it is not there.
-        title: Heading; None: made from methods and scenes.
-        note: Remark under the heading.
-        frames: Held-out views to show per scene and test set, beside the worst ones.
-    """
-
-    columns: Sequence[str] = ()
-    reference: str | None = None
-    title: str | None = None
-    note: str | None = None
-    frames: int = 4
+    columns: Sequence[str] = ()  # metrics to show, in this order; empty: the default ones
+    reference: str | None = None  # what others are compared with; None: coliags, or else the best
+    title: str | None = None  # heading; None: made from methods and scenes
+    note: str | None = None  # remark under the heading
+    frames: int = 4  # held-out views to show per scene and test set, beside the worst ones
 
 
 def text_page(study: Study, choices: Choices) -> Page:
-    """The page without what only a screen shows.
-
-    Raises:
-        InputError: A chosen column or the reference does not exist.
-    """
+    """The page without what only a screen shows."""
     check_columns(study, choices.columns)
     reference = choose_reference(study, choices.reference)
     return Page(
@@ -74,17 +62,7 @@ def text_page(study: Study, choices: Choices) -> Page:
 
 
 def screen_page(text: Page, study: Study, choices: Choices, scene: Section | None = None) -> Page:
-    """The whole page, for HTML.
-
-    Args:
-        text: The page without views, charts and provenance.
-        study: The results.
-        choices: What its reader chose.
-        scene: Section with a scene to fly through.
-
-    Raises:
-        InputError: A choice is not possible, or an image, a training log or a record of light is missing or damaged.
-    """
+    """The whole page, for HTML: the text page with views, charts and provenance, and a scene to fly through."""
     reference = choose_reference(study, choices.reference)
     metrics, missing, costs, scenes = text.sections
     sections = [

@@ -14,15 +14,10 @@ _METHODS = ("REIM-NeRF", "2DGS", "Gaussian Pancakes", "3DGS", "Scaffold-GS", "PR
 
 @dataclass(frozen=True)
 class PublishedBenchmark:
-    """Means over a benchmark's scenes as printed in the paper of ColIAGS.
-
-    Attributes:
-        title: Name of the benchmark.
-        methods: Printed numbers by method and metric.
-    """
+    """Means over a benchmark's scenes as printed in the paper of ColIAGS."""
 
     title: str
-    methods: Mapping[str, Mapping[str, str]]
+    methods: Mapping[str, Mapping[str, str]]  # printed numbers by method and metric
 
     @property
     def note(self) -> str:

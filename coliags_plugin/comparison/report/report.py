@@ -45,10 +45,6 @@ def write_report(
 
     Returns:
         The files.
-
-    Raises:
-        InputError: A result is missing, damaged or not comparable with the others, a choice is not possible, or an
-            output cannot be written.
     """
     choices = choices or Choices()
     files = {

@@ -15,16 +15,9 @@ from coliags_plugin.results.record import TRUTH_SUFFIX
 
 
 def read_study(paths: Sequence[Path], protocol: str = "paper", methods: Sequence[str] = ()) -> Study:
-    """Read results and check that they are comparable.
+    """Read run folders, results files and folders of a comparison, and check that the results are comparable.
 
-    Args:
-        paths: Run folders, results files, and folders of a comparison, in any mixture.
-        protocol: Name of the evaluation to read from folders.
-        methods: Names of methods to keep, in this order; empty: all.
-
-    Raises:
-        InputError: Nothing is there, a path is neither, a file is damaged or given twice, a method is not there, or the
-            results are not comparable.
+    Of folders, the evaluation by a protocol is read. Methods, where named, are kept alone, in that order.
     """
     if not paths:
         raise InputError("no results", "run folders, results files or the folder of a comparison", "Name at least one")

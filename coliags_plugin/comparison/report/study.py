@@ -16,19 +16,12 @@ _SET_TITLES = {"test": "held out along the path", "rotation": "beyond the path"}
 
 @dataclass(frozen=True)
 class StudyRun:
-    """One evaluated run.
+    """One evaluated run."""
 
-    Attributes:
-        method: Name in the report, see :func:`coliags_plugin.comparison.report.labels.disambiguate_labels`.
-        result: Its results file.
-        stamp: Name of its run folder or results file.
-        run: The run folder with the images of this evaluation; None where only the results file is there.
-    """
-
-    method: str
+    method: str  # name in the report, see labels.disambiguate_labels
     result: Result
-    stamp: str
-    run: Path | None = None
+    stamp: str  # name of its run folder or results file
+    run: Path | None = None  # folder with the images of this evaluation; None: only the results file is there
 
     @property
     def scene(self) -> str:
@@ -129,15 +122,10 @@ class Part:
 
 @dataclass(frozen=True)
 class Study:
-    """Comparable results; see :func:`coliags_plugin.comparison.report.comparability.refuse_incomparable`.
+    """Comparable results; see :func:`coliags_plugin.comparison.report.comparability.refuse_incomparable`."""
 
-    Attributes:
-        runs: At least one.
-        missing: Cells without a result.
-    """
-
-    runs: tuple[StudyRun, ...]
-    missing: tuple[MissingResult, ...] = ()
+    runs: tuple[StudyRun, ...]  # at least one
+    missing: tuple[MissingResult, ...] = ()  # cells without a result
 
     def anonymous(self) -> Study:
         """The same without absolute paths."""

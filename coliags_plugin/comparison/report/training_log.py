@@ -20,12 +20,6 @@ def read_training_log(run: Path) -> dict[str, Float[np.ndarray, "L"]]:
     """The logged steps of a run by column: step, loss, psnr, and seconds since training began.
 
     NaN where a line lacks the column; without the columns that no line has; empty where there is no log.
-
-    Args:
-        run: Run folder.
-
-    Raises:
-        InputError: The log cannot be read, or a line is not a JSON object.
     """
     path = run / "metrics.jsonl"
     if not path.is_file():

@@ -27,28 +27,20 @@ Map = Float[np.ndarray, "H W"]
 
 @dataclass(frozen=True)
 class ViewPixels:
-    """A frame and its renderings.
+    """A frame and its renderings: one render, error and expected depth per run.
 
-    Attributes:
-        frame: The frame.
-        runs: One run of every method.
-        truth: Camera image.
-        true_depth: mm, NaN where unknown; None where the frame has none.
-        renders: One per run.
-        errors: Absolute errors, one per run: of depth, mm, NaN where the truth is unknown, and None where there is
-            none to compare; of colours, levels of 255, where no run has depth to compare.
-        of_depth: Whether errors are those of depth.
-        expected: Expected depth, one per run, NaN where pixels are nearly transparent; None where there is none.
+    Errors are absolute: of depth, mm, NaN where the truth is unknown, and None where there is none to compare; of
+    colours, levels of 255, where no run has depth to compare.
     """
 
     frame: ChosenFrame
-    runs: Sequence[StudyRun]
+    runs: Sequence[StudyRun]  # one run of every method
     truth: Rgb
-    true_depth: Map | None
+    true_depth: Map | None  # mm, NaN where unknown; None where the frame has none
     renders: Sequence[Rgb]
     errors: Sequence[Map | None]
     of_depth: bool
-    expected: Sequence[Map | None]
+    expected: Sequence[Map | None]  # NaN where nearly transparent; None where there is none
 
 
 def reduction(width: int) -> int:
@@ -57,15 +49,7 @@ def reduction(width: int) -> int:
 
 
 def read_pixels(frame: ChosenFrame, runs: Sequence[StudyRun]) -> ViewPixels:
-    """Read a frame of some runs of one scene.
-
-    Args:
-        frame: The frame.
-        runs: At least one, each with a run folder.
-
-    Raises:
-        InputError: An image is missing, damaged, or not of the true image's size.
-    """
+    """Read a frame of one or more runs of one scene, each with a run folder."""
     truth = _read(read_rgb, runs[0], "truth", frame, ".png")
     shape, factor = truth.shape[:2], reduction(truth.shape[1])
 

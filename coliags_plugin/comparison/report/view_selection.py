@@ -14,34 +14,17 @@ _WORST_OF = ("psnr", "depth_mse")
 
 @dataclass(frozen=True)
 class ChosenFrame:
-    """A frame to show.
-
-    Attributes:
-        part: Its test set and split.
-        scene: Its scene.
-        position: Its index among the frames of the set.
-        name: Its name.
-        why: Why it is shown, where not for being one of those spread along the video.
-    """
+    """A frame to show."""
 
     part: Part
     scene: str
-    position: int
+    position: int  # its index among the frames of the set
     name: str
-    why: str = ""
+    why: str = ""  # why it is shown, where not for being one of those spread along the video
 
 
 def choose_frames(study: Study, reference: str, count: int) -> list[ChosenFrame]:
-    """Frames of every scene and set: spread evenly, first and last included, and the reference's worst.
-
-    Args:
-        study: The results.
-        reference: Method whose worst frames by PSNR and by depth error are added.
-        count: Evenly spread frames per scene and set; all of a smaller set.
-
-    Raises:
-        InputError: ``count`` is not positive.
-    """
+    """Frames of every scene and set: ``count`` spread evenly, first and last included, and the reference's worst."""
     if count < 1:
         raise InputError(f"{count} frames to show", "at least one")
     return [

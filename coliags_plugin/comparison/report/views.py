@@ -36,18 +36,11 @@ _Tile = tuple[EncodedImage | None, str]
 
 @dataclass(frozen=True)
 class _Scales:
-    """Colour scales that all views share.
+    """Colour scales that all views share."""
 
-    Attributes:
-        depth_error: Upper end, mm; None where no depth is compared.
-        rgb_error: Upper end, levels of 255; None where depth is compared everywhere.
-        depth: Range of the true depth, or else of the expected depth, scene units; None without depth.
-        unit: Of depths.
-    """
-
-    depth_error: float | None
-    rgb_error: float | None
-    depth: tuple[float, float] | None
+    depth_error: float | None  # upper end, mm; None where no depth is compared
+    rgb_error: float | None  # upper end, levels of 255; None where depth is compared everywhere
+    depth: tuple[float, float] | None  # range of the true, or else the expected depth, scene units
     unit: str
 
     @property
@@ -65,16 +58,7 @@ class _Scales:
 
 
 def view_section(study: Study, reference: str, count: int) -> Section:
-    """Section of held-out views; says so where there are no images.
-
-    Args:
-        study: The results; those without run folders are left out.
-        reference: Method by whose metrics views are sorted, and whose worst frames are shown.
-        count: Evenly spread frames per scene and set.
-
-    Raises:
-        InputError: ``count`` is not positive, or an image is missing, damaged or of another size.
-    """
+    """Section of held-out views, which can be sorted by the reference's metrics; says so where there are no images."""
     title = "Held-out views"
     chosen = [(frame, _runs_with_images(study, frame)) for frame in choose_frames(study, reference, count)]
     views = [read_pixels(frame, runs) for frame, runs in chosen if runs]
