@@ -14,21 +14,13 @@ _WORDS: dict[Status, str] = {"passed": "ok  ", "failed": "FAIL", "skipped": "-  
 
 @dataclass(frozen=True)
 class CheckResult:
-    """Outcome of one check.
+    """Outcome of one check."""
 
-    Attributes:
-        name: Of the check.
-        status: How it ended.
-        detail: One line: what was measured, what is wrong, or why it was skipped.
-        seconds: How long it took.
-        traceback: Of an exception that ended it; empty without.
-    """
-
-    name: str
-    status: Status
-    detail: str
-    seconds: float = 0.0
-    traceback: str = ""
+    name: str  # of the check
+    status: Status  # how it ended
+    detail: str  # one line: what was measured, what is wrong, or why it was skipped
+    seconds: float = 0.0  # how long it took
+    traceback: str = ""  # of an exception that ended it; empty without
 
 
 class CheckFailedError(Exception):

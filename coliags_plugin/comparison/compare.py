@@ -24,8 +24,8 @@ from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.datamanagers.splits import Split
 from coliags_plugin.engine.devices import choose_device
 from coliags_plugin.engine.progress import progress_callback
-from coliags_plugin.reporting.display import DisplayTable
 from coliags_plugin.reporting.model import Column
+from coliags_plugin.reporting.terminal import DisplayTable
 from coliags_plugin.results.record import Result
 
 log = logging.getLogger(__name__)

@@ -12,9 +12,9 @@ from coliags_plugin.comparison.cells import ComparisonCell, file_name
 from coliags_plugin.comparison.folder import ComparisonFolder, FinishedCells
 from coliags_plugin.comparison.plan_file import RUNS
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.reporting.display import DisplayTable
 from coliags_plugin.reporting.model import Column
 from coliags_plugin.reporting.numbers import file_size
+from coliags_plugin.reporting.terminal import DisplayTable
 
 #: Assumed size of a run folder while no run of its method is finished, and of a phantom, bytes.
 _RUN_BYTES, _PHANTOM_BYTES = 70e6, 70e6

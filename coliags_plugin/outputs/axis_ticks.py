@@ -10,14 +10,7 @@ _SLACK = 1e-9
 
 
 def round_up(value: float) -> float:
-    """The smallest 1, 2 or 5 times a power of ten that is not below ``value``.
-
-    Args:
-        value: Positive and finite.
-
-    Raises:
-        ValueError: ``value`` is not positive and finite.
-    """
+    """The smallest 1, 2 or 5 times a power of ten that is not below ``value``, which is positive and finite."""
     if not (math.isfinite(value) and value > 0.0):
         raise ValueError(f"round_up({value}): expected a positive, finite number")
     exponent = math.floor(math.log10(value))
@@ -29,11 +22,7 @@ def round_up(value: float) -> float:
 
 
 def linear_ticks(low: float, high: float, count: int = 5) -> list[float]:
-    """At most ``count + 1`` multiples of one 1-2-5 step inside [low, high].
-
-    Raises:
-        ValueError: The interval is empty or not finite.
-    """
+    """At most ``count + 1`` multiples of one 1-2-5 step inside [low, high]."""
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
         raise ValueError(f"linear_ticks({low}, {high}): expected low < high, both finite")
     step = round_up((high - low) / count)
@@ -43,11 +32,7 @@ def linear_ticks(low: float, high: float, count: int = 5) -> list[float]:
 
 
 def log_ticks(low: float, high: float) -> list[float]:
-    """The 1-2-5 numbers inside [low, high], thinned to powers of ten over three decades and more.
-
-    Raises:
-        ValueError: The interval is empty or reaches zero.
-    """
+    """The 1-2-5 numbers inside [low, high], thinned to powers of ten over three decades and more."""
     if not (0.0 < low < high and math.isfinite(high)):
         raise ValueError(f"log_ticks({low}, {high}): expected 0 < low < high")
     exponents = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)

@@ -26,23 +26,15 @@ _LABEL_ROOM = 7.5
 
 @dataclass(frozen=True)
 class Series:
-    """One line of a chart.
+    """One line of a chart."""
 
-    Attributes:
-        name: Label.
-        style: Colour index, the same for one method in every chart of a page.
-        x: Increasing.
-        y: Same length; values that are not finite (or not positive on a logarithmic axis) interrupt the line.
-        low: Lower edge of a band around the line, or empty.
-        high: Upper edge of the band.
-    """
-
-    name: str
-    style: int
-    x: Sequence[float]
+    name: str  # label
+    style: int  # colour index, the same for one method in every chart of a page
+    x: Sequence[float]  # increasing
+    #: same length; values that are not finite (or not positive on a logarithmic axis) interrupt the line
     y: Sequence[float]
-    low: Sequence[float] = ()
-    high: Sequence[float] = ()
+    low: Sequence[float] = ()  # lower edge of a band around the line, or empty
+    high: Sequence[float] = ()  # upper edge of the band
 
 
 def style_classes(style: int) -> str:
@@ -61,13 +53,8 @@ def line_chart(
 ) -> str:
     """SVG line chart with labelled axes, or an empty string where no series has a point to draw.
 
-    Args:
-        series: Lines over one x axis.
-        x_label: Quantity and unit of the x axis.
-        y_label: Quantity and unit of the y axis.
-        log_y: Whether the y axis is logarithmic.
-        x_names: For a categorical x axis: the names of x = 0, 1, ...
-        markers: Whether to draw a dot with a tooltip at every point.
+    ``x_names`` are the names of x = 0, 1, ... of a categorical axis; ``markers`` draws a dot with a tooltip at every
+    point.
     """
     points = [
         (x, y)
@@ -100,15 +87,7 @@ def line_chart(
 
 
 def color_bar_svg(limits: tuple[float, float], unit: str, color_map: ColorMap, label: str, name: str) -> str:
-    """SVG colour bar with ticks and unit.
-
-    Args:
-        limits: Values of the first and the last colour.
-        unit: For instance ``"mm"``.
-        color_map: The colour map to show.
-        label: The quantity.
-        name: Identifier of its gradient, unique on the page.
-    """
+    """SVG colour bar of ``label`` with ticks and unit; ``name``, unique on the page, identifies its gradient."""
     low, high = limits
     left, width, top, height = 14, 312, 20, 12
     table = color_table(color_map)

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.outputs.axis_ticks import linear_ticks, tick_label
-from coliags_plugin.outputs.image_files import as_array
+from coliags_plugin.outputs.image_files import as_array, checked_rgb
 from coliags_plugin.outputs.raster_text import INK, draw_text, text_width
 
 if TYPE_CHECKING:
@@ -47,15 +47,9 @@ def color_table(color_map: ColorMap) -> UInt8[np.ndarray, "256 3"]:
 def colorize_depth(
     depth_mm: Float[np.ndarray, "H W"] | Tensor, limits: tuple[float, float], hatched: bool = False
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Colour-mapped depth: near is dark, far is bright, unknown is grey.
+    """Colour-mapped depth of any kind, mm: near is dark, far is bright, what is not finite is grey, or hatched.
 
-    Args:
-        depth_mm: Depth of any kind, mm; NaN and infinities are unknown. [H, W]
-        limits: Depths of the first and the last colour, mm; values beyond them are clipped.
-        hatched: Hatch what is unknown, as of pixels that are nearly transparent.
-
-    Raises:
-        InputError: ``depth_mm`` is not [H, W], or the limits are not an interval.
+    The limits are the depths of the first and the last colour, mm; values beyond them are clipped.
     """
     depth = _map(depth_mm, "depth_mm")
     low, high = _interval(limits)
@@ -66,12 +60,9 @@ def colorize_depth(
 
 
 def common_limits(depths: Iterable[Float[np.ndarray, "H W"]]) -> tuple[float, float]:
-    """Limits of rendered depths, some of which may be far off: from 0 to the largest of their 99th percentiles.
+    """From 0 to the largest 99th percentile of depths in any unit, rounded up to two significant digits.
 
-    Rounded up to two significant digits.
-
-    Args:
-        depths: Depth maps in any unit; what is not finite is unknown. [H, W] each
+    For rendered depths, some of which may be far off; what is not finite is unknown.
     """
     known = [depth[np.isfinite(depth)] for depth in depths]
     largest = max((float(np.percentile(values, 99.0)) for values in known if values.size), default=0.0)
@@ -82,12 +73,7 @@ def common_limits(depths: Iterable[Float[np.ndarray, "H W"]]) -> tuple[float, fl
 
 
 def depth_limits(depths: Iterable[Float[np.ndarray, "H W"] | Tensor], unit: str = "mm") -> tuple[float, float]:
-    """From 0 to the largest known depth, rounded up to 10 mm; in another unit than mm, :func:`common_limits`.
-
-    Args:
-        depths: Depth maps; what is not finite is unknown. [H, W] each
-        unit: Of the depths, see ``Scene.length_unit``.
-    """
+    """From 0 to the largest known depth, rounded up to 10 mm; in another unit than mm, :func:`common_limits`."""
     if unit != "mm":
         return common_limits(map(as_array, depths))
     known = [array[np.isfinite(array)] for array in map(as_array, depths)]
@@ -103,16 +89,8 @@ def colorize_depth_error(
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Colour-mapped absolute depth error on a fixed scale; pixels without ground truth are hatched in grey.
 
-    A pixel whose ground truth is known and whose rendering is not finite takes the last colour.
-
-    Args:
-        rendered_mm: Rendered depth, mm. [H, W]
-        true_mm: True depth of the same kind, mm; NaN is unknown. [H, W]
-        valid: Pixels that count; None means wherever the truth is known. [H, W]
-        limit_mm: The error of the last colour, mm; larger errors take it too.
-
-    Raises:
-        InputError: The shapes differ, or the limit is not positive.
+    Depths are of one kind, mm; NaN of the truth is unknown. ``valid`` masks the pixels that count. Errors from
+    ``limit_mm`` on take the last colour, and so does a pixel whose truth is known and whose rendering is not finite.
     """
     error, known = depth_error(rendered_mm, true_mm, valid)
     return colorize_error(error, known, limit_mm)
@@ -123,14 +101,9 @@ def depth_error(
     true_mm: Float[np.ndarray, "H W"] | Tensor,
     valid: Bool[np.ndarray, "H W"] | Tensor | None = None,
 ) -> tuple[Float[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
-    """Absolute depth error, as drawn by :func:`colorize_depth_error`.
+    """Absolute depth error, mm, and where the truth is known.
 
-    Returns:
-        |rendered - true| in mm, infinite where the truth is known and the rendering is not finite, 0 where the truth is
-        unknown [H, W]; and where the truth is known [H, W].
-
-    Raises:
-        InputError: The shapes differ.
+    The error is infinite where only the rendering is not finite, and 0 where the truth is unknown.
     """
     rendered, true = _map(rendered_mm, "rendered_mm"), _map(true_mm, "true_mm")
     known = np.isfinite(true)
@@ -153,14 +126,8 @@ def colorize_rgb_error(
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Colour-mapped absolute RGB error (channel mean) on a fixed scale; ignored pixels are hatched in grey.
 
-    Args:
-        rendered: uint8, or floating point in [0, 1]. [H, W, 3]
-        true: The same kind. [H, W, 3]
-        valid: Pixels that count; None means all. [H, W]
-        limit: The error of the last colour, as a fraction of full scale; larger errors take it too.
-
-    Raises:
-        InputError: The shapes differ, or the limit is not positive.
+    Colours are uint8, or floating point in [0, 1]. Errors from ``limit`` on, a fraction of full scale, take the last
+    colour.
     """
     error = rgb_error(rendered, true)
     known = np.ones(error.shape, dtype=bool) if valid is None else as_array(valid).astype(bool)
@@ -171,16 +138,7 @@ def colorize_rgb_error(
 def colorize_error(
     error: Float[np.ndarray, "H W"], known: Bool[np.ndarray, "H W"], limit: float
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Colour-mapped error on a fixed scale; pixels without ground truth are hatched in grey.
-
-    Args:
-        error: Not negative; of any value where not known. [H, W]
-        known: Where there is ground truth. [H, W]
-        limit: The error of the last colour; larger errors take it too.
-
-    Raises:
-        InputError: The limit is not positive.
-    """
+    """Colour-mapped error of 0 to ``limit`` and more; pixels without ground truth are hatched in grey."""
     if not (math.isfinite(limit) and limit > 0.0):
         raise InputError(f"an error scale that ends at {limit}", "a positive number")
     image = _colored(np.where(known, error, 0.0) / limit, "error")
@@ -189,11 +147,7 @@ def colorize_error(
 
 
 def rgb_error(rendered: np.ndarray | Tensor, true: np.ndarray | Tensor) -> Float[np.ndarray, "H W"]:
-    """Mean over the channels of |rendered - true|, as a fraction of full scale. [H, W]
-
-    Raises:
-        InputError: The shapes differ.
-    """
+    """Mean over the channels of |rendered - true|, as a fraction of full scale. [H, W]"""
     first, second = _unit_rgb(rendered, "rendered"), _unit_rgb(true, "true")
     _same_shape(first, second, "rendered")
     error: np.ndarray = np.abs(first - second).mean(axis=2)
@@ -203,17 +157,7 @@ def rgb_error(rendered: np.ndarray | Tensor, true: np.ndarray | Tensor) -> Float
 def color_bar(
     limits: tuple[float, float], unit: str, color_map: ColorMap = "error", width: int = 480
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Horizontal colour bar with ticks and unit, on white.
-
-    Args:
-        limits: Values of the first and the last colour.
-        unit: For instance ``"mm"``; ASCII, as OpenCV's font has no other characters.
-        color_map: The colour map to show.
-        width: px.
-
-    Raises:
-        InputError: The limits are not an interval, or the width is below 120.
-    """
+    """Horizontal colour bar with ticks and unit (ASCII, as OpenCV's font has no other characters), on white."""
     low, high = _interval(limits)
     if width < 120:
         raise InputError(f"a colour bar {width} px wide", "at least 120 px")
@@ -233,22 +177,12 @@ def color_bar(
 def side_by_side(
     images: Sequence[UInt8[np.ndarray, "H W 3"] | Tensor], labels: Sequence[str], gap: int = 8
 ) -> UInt8[np.ndarray, "Hs Ws 3"]:
-    """Images of equal height in a row on white, each under its label.
-
-    Args:
-        images: uint8 RGB. [H, W, 3] each
-        labels: One per image; ASCII; shortened where wider than its image.
-        gap: White pixels between the images.
-
-    Raises:
-        InputError: No image, another number of labels, or heights that differ.
-    """
+    """Images of one height in a row on white, ``gap`` px apart, each under its ASCII label, shortened to its width."""
     arrays = [as_array(image) for image in images]
     if not arrays or len(arrays) != len(labels):
         raise InputError(f"{len(arrays)} images with {len(labels)} labels", "one label for each image")
     for label, array in zip(labels, arrays, strict=True):
-        if array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] != 3:
-            raise InputError(f"image '{label}' is {array.dtype} {list(array.shape)}", "uint8 RGB [H, W, 3]")
+        checked_rgb(array, f"image '{label}'")
         if array.shape[0] != arrays[0].shape[0]:
             raise InputError(
                 f"image '{label}' is {array.shape[0]} px high, '{labels[0]}' {arrays[0].shape[0]} px",

@@ -36,67 +36,29 @@ def eight_bit(rgb: Tensor) -> Tensor:
 
 
 def encode_png(rgb: UInt8[np.ndarray, "H W 3"] | Tensor) -> bytes:
-    """Encode an 8-bit RGB image as PNG.
-
-    Args:
-        rgb: uint8. [H, W, 3]
-
-    Raises:
-        InputError: Not an 8-bit RGB image.
-    """
-    return encode_image(_checked(rgb))
+    """An 8-bit RGB image as PNG."""
+    return encode_image(checked_rgb(rgb))
 
 
 def encode_jpeg(rgb: UInt8[np.ndarray, "H W 3"] | Tensor, quality: int = 95) -> bytes:
-    """Encode an 8-bit RGB image as JPEG without chroma subsampling, which visibly degrades red mucosa.
-
-    Args:
-        rgb: uint8. [H, W, 3]
-        quality: 1 to 100.
-
-    Raises:
-        InputError: Not an 8-bit RGB image.
-    """
+    """An 8-bit RGB image as JPEG without chroma subsampling, which visibly degrades red mucosa; quality 1 to 100."""
     sampling = int(cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
     options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, sampling]
-    return encode_image(_checked(rgb), ".jpg", options)
+    return encode_image(checked_rgb(rgb), ".jpg", options)
 
 
 def encode_webp(rgb: UInt8[np.ndarray, "H W 3"] | Tensor) -> bytes:
-    """Encode an 8-bit RGB image as WebP without loss: a third of a PNG's size for colour-mapped images.
-
-    Args:
-        rgb: uint8. [H, W, 3]
-
-    Raises:
-        InputError: Not an 8-bit RGB image.
-    """
-    return encode_image(_checked(rgb), ".webp", [cv2.IMWRITE_WEBP_QUALITY, _WEBP_LOSSLESS])
+    """An 8-bit RGB image as WebP without loss: a third of a PNG's size for colour-mapped images."""
+    return encode_image(checked_rgb(rgb), ".webp", [cv2.IMWRITE_WEBP_QUALITY, _WEBP_LOSSLESS])
 
 
 def write_png(path: Path, rgb: UInt8[np.ndarray, "H W 3"] | Tensor) -> None:
-    """Write an 8-bit RGB PNG atomically.
-
-    Args:
-        path: Output file; its folder is created.
-        rgb: uint8. [H, W, 3]
-
-    Raises:
-        InputError: Not an 8-bit RGB image, or the folder cannot be written.
-    """
+    """Write an 8-bit RGB PNG atomically; its folder is created."""
     atomic_write(path, encode_png(rgb))
 
 
 def write_depth_tiff(path: Path, depth_mm: Float32[np.ndarray, "H W"] | Tensor) -> None:
-    """Write a depth map of any kind as a one-channel float32 TIFF, atomically. NaN is preserved.
-
-    Args:
-        path: Output file; its folder is created.
-        depth_mm: mm; float64 is rounded to float32. [H, W]
-
-    Raises:
-        InputError: Not a real [H, W] map, or the folder cannot be written.
-    """
+    """Write a depth map of any kind, mm, as a one-channel float32 TIFF, atomically. NaN is preserved."""
     depth = as_array(depth_mm)
     if depth.ndim != 2 or depth.size == 0 or not np.issubdtype(depth.dtype, np.floating):
         raise InputError(f"cannot write {_kind(depth)} to {path}", "a depth map: floating point, [H, W]")
@@ -106,21 +68,18 @@ def write_depth_tiff(path: Path, depth_mm: Float32[np.ndarray, "H W"] | Tensor) 
 
 
 def read_depth_tiff(path: Path) -> Float32[np.ndarray, "H W"]:
-    """Read a one-channel float32 TIFF in mm. [H, W]
-
-    Raises:
-        InputError: Missing, unreadable, or not one channel of float32.
-    """
+    """Read a one-channel float32 TIFF in mm. [H, W]"""
     depth = decode_image(path)
     if depth.dtype != np.float32 or depth.ndim != 2:
         raise InputError(f"{path} holds {_kind(depth)}", "one channel of float32, mm")
     return depth
 
 
-def _checked(rgb: np.ndarray | Tensor) -> np.ndarray:
+def checked_rgb(rgb: np.ndarray | Tensor, name: str = "an image") -> UInt8[np.ndarray, "H W 3"]:
+    """Pixels that are checked to be an 8-bit RGB image."""
     pixels = as_array(rgb)
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.size == 0:
-        raise InputError(f"an image is {_kind(pixels)}", "8-bit RGB, uint8 [H, W, 3]")
+        raise InputError(f"{name} is {_kind(pixels)}", "8-bit RGB, uint8 [H, W, 3]")
     return pixels
 
 

@@ -43,14 +43,10 @@ class _Panel:
 
 
 def plot_trajectory(alignment: Alignment, unit: str) -> UInt8[np.ndarray, "900 1200 3"]:
-    """Plot an aligned estimate over its reference.
+    """Plot an aligned estimate over its reference; the name of the unit of length must be ASCII.
 
     The views look along the axes of the reference's world, both at one scale: from above x over z, from the side y over
     z with y downwards. A circle marks the first frame.
-
-    Args:
-        alignment: The aligned trajectories and their errors.
-        unit: Name of the unit of length; ASCII.
     """
     image = np.full((_HEIGHT, _WIDTH, 3), 255, np.uint8)
     paths = (alignment.reference[:, :3, 3], alignment.estimate[:, :3, 3])

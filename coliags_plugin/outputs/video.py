@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_path
-from coliags_plugin.outputs.image_files import as_array
+from coliags_plugin.outputs.image_files import checked_rgb
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -26,19 +26,10 @@ CODECS = ("vp09", "mp4v")
 
 
 def write_video(frames: Iterable[UInt8[np.ndarray, "H W 3"] | Tensor], path: Path, fps: float) -> None:
-    """Write an MP4 video atomically.
+    """Write an MP4 video atomically; frames are consumed one at a time, so that a generator may render them.
 
-    An odd width or height is padded by repeating the last column or row: the codecs halve the chroma planes, and
-    OpenCV would crop a line instead.
-
-    Args:
-        frames: uint8 RGB, all of one size; consumed one at a time, so a generator may render them. [H, W, 3] each
-        path: Output file, ends in ``.mp4``; its folder is created.
-        fps: Frames per second.
-
-    Raises:
-        InputError: No frames, frames that differ in size or are not 8-bit RGB, another suffix, no codec, or a folder
-            that cannot be written.
+    An odd width or height is padded by repeating the last column or row: the codecs halve the chroma planes, and OpenCV
+    would crop a line instead.
     """
     if path.suffix.lower() != ".mp4":
         raise InputError(f"video file {path}", "a name that ends in .mp4")
@@ -69,9 +60,7 @@ def _encode(frames: Iterable[np.ndarray | Tensor], scratch: Path, fps: float) ->
     count = 0
     try:
         for frame in frames:
-            image = as_array(frame)
-            if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
-                raise InputError(f"frame {count} is {image.dtype} {list(image.shape)}", "uint8 RGB [H, W, 3]")
+            image = checked_rgb(frame, f"frame {count}")
             if writer is None:
                 shape = image.shape
                 writer = _writer(scratch, fps, shape[1] + shape[1] % 2, shape[0] + shape[0] % 2)

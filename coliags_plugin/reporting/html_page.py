@@ -6,6 +6,7 @@ The same page gives the same bytes: the file contains neither the time nor the m
 from __future__ import annotations
 
 import hashlib
+import math
 import re
 import shutil
 from base64 import b64encode
@@ -38,28 +39,13 @@ _PLACEHOLDER = re.compile(r"picture:([0-9a-f]{20})")
 
 
 def write_html(page: Page, output: Path, limit: int | None = None) -> None:
-    """Write a page, and the pictures for which it has no room into a folder beside it.
-
-    Args:
-        page: What to write.
-        output: The file; an existing one is replaced.
-        limit: Largest page, bytes, unless the text alone is larger; None: :data:`PAGE_LIMIT`.
-
-    Raises:
-        InputError: ``output`` is a folder, or a file cannot be written.
-    """
+    """Write a page; pictures that do not fit into ``limit`` bytes go into a folder beside it."""
     refuse_folder(output)
     atomic_write(output, html_text(page, output, PAGE_LIMIT if limit is None else limit))
 
 
 def html_text(page: Page, output: Path | None = None, limit: int = PAGE_LIMIT) -> str:
-    """A page as HTML.
-
-    Args:
-        page: What to write.
-        output: File that it is for, beside which pictures without room are written; None: all are in the text.
-        limit: Largest page, bytes, unless the text alone is larger.
-    """
+    """A page as HTML, all pictures within it, or those beyond ``limit`` bytes in files beside ``output``."""
     pictures: dict[str, EncodedImage] = {}
     style, script = (Markup((_ASSETS / name).read_text(encoding="utf-8")) for name in ("page.css", "page.js"))
     text = _filled(pictures, "page.html", page=page, style=style, script=script, version=__version__)
@@ -122,25 +108,21 @@ def _with_pictures(text: str, pictures: dict[str, EncodedImage], output: Path | 
 
 @cache
 def _environment() -> Environment:
+    loader = FileSystemLoader(_ASSETS)
     environment = Environment(
-        loader=FileSystemLoader(_ASSETS),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.globals |= {
-        "dash": DASH,
-        "drawn": _drawn,
-        "enumerated": enumerate,
-        "sentence": sentence,
-        "style_classes": style_classes,
-        "unit_text": unit_text,
-    }
+    functions = (columns_of, drawn, enumerate, sentence, style_classes, unit_text)
+    environment.globals |= {"dash": DASH, **{function.__name__: function for function in functions}}
     return environment
 
 
-def _drawn(figures: Sequence[Figure]) -> list[tuple[Figure, Markup]]:
+def columns_of(count: int) -> int:
+    """Pictures in a row, at most four, such that rows are filled evenly: 3 for six pictures."""
+    return math.ceil(count / math.ceil(count / 4)) if count else 1
+
+
+def drawn(figures: Sequence[Figure]) -> list[tuple[Figure, Markup]]:
     """Figures with their SVG, without charts that have no point to draw."""
     return [(figure, Markup(_svg(figure))) for figure in figures if not isinstance(figure, Chart) or figure.has_points]
 

@@ -27,21 +27,13 @@ _LETTERS = "abcdefghijklmnopqrstuvwxyz"
 
 @dataclass(frozen=True)
 class Fact:
-    """A named value.
-
-    Attributes:
-        name: What it is.
-        value: Text or number; facts whose value is empty or None are not shown.
-        unit: Of a number.
-        note: What it means.
-        wide: Whether it takes a line of its own.
-    """
+    """A named value."""
 
     name: str
-    value: Value
+    value: Value  # text or number; facts whose value is empty or None are not shown
     unit: str = ""
     note: str = ""
-    wide: bool = False
+    wide: bool = False  # whether it takes a line of its own
 
     @property
     def text(self) -> str:
@@ -52,23 +44,14 @@ class Fact:
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table.
+    """A column of a table."""
 
-    Attributes:
-        key: Key of its values in the rows.
-        title: Heading; empty: the key.
-        unit: As recorded; empty for a plain number.
-        direction: Whether higher or lower is better; None where neither is.
-        shown: Whether it is part of the table unless the reader chooses otherwise.
-        words: Whether it holds words, which are aligned to the left.
-    """
-
-    key: str
-    title: str = ""
-    unit: str = ""
-    direction: Direction | None = None
-    shown: bool = True
-    words: bool = False
+    key: str  # key of its values in the rows
+    title: str = ""  # heading; empty: the key
+    unit: str = ""  # as recorded; empty for a plain number
+    direction: Direction | None = None  # whether higher or lower is better; None where neither is
+    shown: bool = True  # whether it is part of the table unless the reader chooses otherwise
+    words: bool = False  # whether it holds words, which are aligned to the left
 
     @property
     def name(self) -> str:
@@ -88,27 +71,16 @@ class Column:
 
 @dataclass(frozen=True)
 class TableCell:
-    """A cell of a table.
+    """A cell of a table."""
 
-    Attributes:
-        text: The value as printed; empty where there is none.
-        value: The number, for sorting; None where there is none.
-        spread: Number behind a plus-minus sign.
-        rank: 1 for the best; None where nothing is ranked.
-        stars: Marks of significance.
-        note: Footnote: why there is no value, or what it leaves out.
-        style: Colour index of the method that it names; None where it names none.
-        published: Whether it labels a row of numbers from a publication.
-    """
-
-    text: str = ""
-    value: float | None = None
-    spread: str = ""
-    rank: int | None = None
-    stars: str = ""
-    note: str = ""
-    style: int | None = None
-    published: bool = False
+    text: str = ""  # the value as printed; empty where there is none
+    value: float | None = None  # the number, for sorting; None where there is none
+    spread: str = ""  # number behind a plus-minus sign
+    rank: int | None = None  # 1 for the best; None where nothing is ranked
+    stars: str = ""  # marks of significance
+    note: str = ""  # footnote: why there is no value, or what it leaves out
+    style: int | None = None  # colour index of the method that it names; None where it names none
+    published: bool = False  # whether it labels a row of numbers from a publication
 
 
 @dataclass(frozen=True)
@@ -122,23 +94,14 @@ class Footnote:
 
 @dataclass(frozen=True)
 class Table:
-    """A table: columns, and rows of values or cells by the keys of the columns.
-
-    Attributes:
-        title: Above it.
-        columns: The first one labels the rows.
-        rows: Values by key; a missing one is shown as a dash.
-        notes: Sentences below it.
-        count: What it is about, behind the title: for instance ``8 scenes``.
-        name: Identifier, unique on a page: part of labels and file names.
-    """
+    """A table: columns, and rows of values or cells by the keys of the columns."""
 
     title: str
-    columns: Sequence[Column]
-    rows: Sequence[Mapping[str, Value | TableCell]]
-    notes: Sequence[str] = ()
-    count: str = ""
-    name: str = ""
+    columns: Sequence[Column]  # the first one labels the rows
+    rows: Sequence[Mapping[str, Value | TableCell]]  # values by key; a missing one is shown as a dash
+    notes: Sequence[str] = ()  # sentences below it
+    count: str = ""  # what it is about, behind the title: for instance ``8 scenes``
+    name: str = ""  # identifier, unique on a page: part of labels and file names
 
     kind: ClassVar[str] = "table"
 
@@ -203,19 +166,12 @@ class FactList:
 
 @dataclass(frozen=True)
 class EncodedImage:
-    """An image file.
-
-    Attributes:
-        data: Bytes.
-        mime: Its kind, for instance ``image/png``.
-        width: px.
-        height: px.
-    """
+    """An image file with its size, px."""
 
     data: bytes
-    mime: str
-    width: int
-    height: int
+    mime: str  # its kind, for instance ``image/png``
+    width: int  # px
+    height: int  # px
 
     @classmethod
     def png(cls, rgb: UInt8[np.ndarray, "H W 3"]) -> EncodedImage:
@@ -227,46 +183,28 @@ class EncodedImage:
 
 @dataclass(frozen=True)
 class Image:
-    """A picture.
+    """A picture."""
 
-    Attributes:
-        image: The file.
-        caption: Above it.
-        wide: Whether it takes the page's width, on white.
-    """
-
-    image: EncodedImage
+    image: EncodedImage  # the file
     caption: str
-    wide: bool = False
+    wide: bool = False  # whether it takes the page's width, on white
 
     kind: ClassVar[str] = "image"
 
 
 @dataclass(frozen=True)
 class Chart:
-    """A line chart (:func:`coliags_plugin.outputs.charts.line_chart`).
+    """A line chart (:func:`coliags_plugin.outputs.charts.line_chart`)."""
 
-    Attributes:
-        series: Lines over one x axis.
-        x_label: Quantity and unit of the x axis.
-        y_label: Quantity and unit of the y axis.
-        title: Above it.
-        log_y: Whether the y axis is logarithmic.
-        x_names: For a categorical x axis: the names of x = 0, 1, ...
-        markers: Whether to draw a dot at every point.
-        legend: Whether the names of the series stand below it.
-        group: Name of the charts that a switch of the page shows together; empty: always shown.
-    """
-
-    series: Sequence[Series]
-    x_label: str
-    y_label: str
+    series: Sequence[Series]  # lines over one x axis
+    x_label: str  # quantity and unit of the x axis
+    y_label: str  # quantity and unit of the y axis
     title: str = ""
-    log_y: bool = False
-    x_names: Sequence[str] | None = None
-    markers: bool = False
-    legend: bool = False
-    group: str = ""
+    log_y: bool = False  # whether the y axis is logarithmic
+    x_names: Sequence[str] | None = None  # for a categorical x axis: the names of x = 0, 1, ...
+    markers: bool = False  # whether to draw a dot at every point
+    legend: bool = False  # whether the names of the series stand below it
+    group: str = ""  # name of the charts that a switch of the page shows together; empty: always shown
 
     kind: ClassVar[str] = "chart"
 
@@ -287,21 +225,13 @@ class Chart:
 
 @dataclass(frozen=True)
 class ColorBar:
-    """The scale of a colour map.
+    """The scale of a colour map."""
 
-    Attributes:
-        limits: Values of the first and the last colour.
-        unit: Of the values.
-        color_map: The colour map.
-        label: The quantity.
-        name: Identifier, unique on a page.
-    """
-
-    limits: tuple[float, float]
-    unit: str
-    color_map: ColorMap
-    label: str
-    name: str
+    limits: tuple[float, float]  # values of the first and the last colour
+    unit: str  # of the values
+    color_map: ColorMap  # the colour map
+    label: str  # the quantity
+    name: str  # identifier, unique on a page
 
     kind: ClassVar[str] = "bar"
 
@@ -311,32 +241,21 @@ Figure = Image | Chart | ColorBar
 
 @dataclass(frozen=True)
 class Figures:
-    """Figures of one kind beside each other; charts without a line are left out.
+    """Figures of one kind beside each other; charts without a line are left out."""
 
-    Attributes:
-        figures: Of one kind.
-        title: Above them.
-        legend: Names of the styles 0, 1, ... of charts, above them.
-    """
-
-    figures: Sequence[Figure]
-    title: str = ""
-    legend: Sequence[str] = ()
+    figures: Sequence[Figure]  # of one kind
+    title: str = ""  # above them
+    legend: Sequence[str] = ()  # names of the styles 0, 1, ... of charts, above them.
 
     kind: ClassVar[str] = "figures"
 
 
 @dataclass(frozen=True)
 class Template:
-    """What only the HTML page shows: a template of this package, filled with values.
+    """What only the HTML page shows: a template of this package, filled with values."""
 
-    Attributes:
-        file: Name of the file in ``reporting/assets``.
-        values: By the names that the template uses.
-    """
-
-    file: str
-    values: Mapping[str, Any] = field(default_factory=dict)
+    file: str  # name of the file in ``reporting/assets``
+    values: Mapping[str, Any] = field(default_factory=dict)  # by the names that the template uses
 
     kind: ClassVar[str] = "template"
 
@@ -354,19 +273,12 @@ class Folded:
 
 @dataclass(frozen=True)
 class Section:
-    """Blocks under a heading.
-
-    Attributes:
-        title: Heading.
-        blocks: Sections among them have smaller headings.
-        screen_only: Whether only the HTML page has it.
-        name: Identifier, unique on a page; empty: none.
-    """
+    """Blocks under a heading."""
 
     title: str
-    blocks: Sequence[Block]
-    screen_only: bool = False
-    name: str = ""
+    blocks: Sequence[Block]  # sections among them have smaller headings
+    screen_only: bool = False  # whether only the HTML page has it
+    name: str = ""  # identifier, unique on a page; empty: none
 
     kind: ClassVar[str] = "section"
 
@@ -376,23 +288,14 @@ Block = Paragraph | Bullets | FactList | Table | Figures | Template | Folded | S
 
 @dataclass(frozen=True)
 class Page:
-    """What a command says.
-
-    Attributes:
-        title: Heading.
-        sections: In order; those without blocks are left out.
-        facts: Below the heading.
-        note: Remark below the heading.
-        cautions: What limits what is said.
-        heading: Longer heading of the HTML page; empty: the title.
-    """
+    """What a command says."""
 
     title: str
-    sections: Sequence[Section]
-    facts: Sequence[Fact] = ()
-    note: str = ""
-    cautions: Sequence[str] = ()
-    heading: str = ""
+    sections: Sequence[Section]  # in order; those without blocks are left out
+    facts: Sequence[Fact] = ()  # below the heading
+    note: str = ""  # remark below the heading
+    cautions: Sequence[str] = ()  # what limits what is said
+    heading: str = ""  # longer heading of the HTML page; empty: the title
 
     @property
     def text_sections(self) -> list[Section]:
@@ -401,13 +304,7 @@ class Page:
 
 
 def simple_table(head: Sequence[str], rows: Iterable[Sequence[Value | TableCell]], title: str = "") -> Table:
-    """A table of a heading, and rows of as many values.
-
-    Args:
-        head: Headings; the first column labels the rows.
-        rows: Text, numbers or cells; None is shown as a dash.
-        title: Above it.
-    """
+    """A table of headings, the first of which is that of the rows' labels, and rows of as many values."""
     columns = [Column(name, words=not index) for index, name in enumerate(head)]
     return Table(title, columns, [dict(zip(head, row, strict=True)) for row in rows])
 
@@ -415,14 +312,7 @@ def simple_table(head: Sequence[str], rows: Iterable[Sequence[Value | TableCell]
 def ranked_cells(
     values: Sequence[float | None], unit: str, direction: Direction | None, spreads: Sequence[float | None] = ()
 ) -> list[TableCell]:
-    """Cells of one column: equal decimals, and ranks by the printed digits.
-
-    Args:
-        values: One per row; None where there is none.
-        unit: Decides the decimals.
-        direction: None: not ranked.
-        spreads: One per row, or empty.
-    """
+    """Cells of one column: decimals by the unit, the same for values and spreads; ranks by the printed digits."""
     decimals = column_decimals(unit, values)
     texts = ["" if value is None else number_text(value, decimals) for value in values]
     shown = ["" if spread is None else number_text(spread, decimals) for spread in spreads or [None] * len(texts)]

@@ -78,11 +78,8 @@ def unit_text(unit: str) -> str:
 def ranks_of(keys: Sequence[float | None], direction: Direction | None) -> list[int | None]:
     """Rank of each value from 1 on; equal values share a rank and the next one is skipped.
 
-    None where a value is unavailable, and everywhere with fewer than two values or without a direction.
-
-    Args:
-        keys: Numbers as printed, so that what looks alike shares a rank.
-        direction: Whether higher or lower is better.
+    None where a value is unavailable, and everywhere with fewer than two values or without a direction. Give numbers as
+    printed, so that what looks alike shares a rank.
     """
     sign = -1.0 if direction == "higher" else 1.0
     signed = [None if key is None else sign * key for key in keys]

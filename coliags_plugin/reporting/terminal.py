@@ -2,15 +2,32 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from rich.cells import cell_len
 
 from coliags_plugin.reporting.model import Block, Bullets, Fact, FactList, Folded, Page, Paragraph, Section, Table
 from coliags_plugin.reporting.numbers import unit_text
 
 _MISSING = "-"
-#: No terminal is wider: lines are never broken here.
-_WIDTH = 10_000
+
+
+@dataclass(frozen=True, repr=False)
+class DisplayTable(Table):
+    """A table that ``print`` shows as text and a notebook as HTML; ``pandas.DataFrame(table.rows)`` is a data frame."""
+
+    def __str__(self) -> str:
+        """The table as text."""
+        return terminal_text([self])
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        """The table as HTML; notebooks ask for it."""
+        from coliags_plugin.reporting.html_page import html_blocks
+
+        return html_blocks([self])
 
 
 def page_text(page: Page) -> str:
@@ -69,18 +86,11 @@ def _unit(unit: str) -> str:
 
 def _aligned(rows: Sequence[Sequence[str]], alignment: str) -> str:
     """Rows of cells as lines; ``l`` or ``r`` for each column."""
-    from rich.console import Console
-    from rich.table import Table as Grid
-    from rich.text import Text
-
-    if not rows:
-        return ""
-    grid = Grid.grid(padding=(0, 2))
-    for side in alignment:
-        grid.add_column(justify="right" if side == "r" else "left", no_wrap=True)
-    for row in rows:
-        grid.add_row(*map(Text, row))
-    console = Console(file=io.StringIO(), width=_WIDTH, color_system=None, force_terminal=False, legacy_windows=False)
-    with console.capture() as capture:
-        console.print(grid)
-    return "\n".join(line.rstrip() for line in capture.get().splitlines())
+    widths = [max(map(cell_len, column)) for column in zip(*rows, strict=True)]
+    pads = [[" " * (width - cell_len(text)) for text, width in zip(row, widths, strict=True)] for row in rows]
+    return "\n".join(
+        "  ".join(
+            pad + text if side == "r" else text + pad for text, pad, side in zip(row, own, alignment, strict=True)
+        ).rstrip()
+        for row, own in zip(rows, pads, strict=True)
+    )

@@ -11,7 +11,6 @@ import pytest
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.outputs.charts import Series
-from coliags_plugin.reporting.display import DisplayTable
 from coliags_plugin.reporting.html_page import html_blocks, html_text, write_html
 from coliags_plugin.reporting.json_values import page_values
 from coliags_plugin.reporting.latex import latex_text
@@ -37,7 +36,7 @@ from coliags_plugin.reporting.model import (
     simple_table,
 )
 from coliags_plugin.reporting.numbers import DASH
-from coliags_plugin.reporting.terminal import page_text, terminal_text
+from coliags_plugin.reporting.terminal import DisplayTable, page_text, terminal_text
 
 PLAIN = DisplayTable(
     "A <title>",

@@ -38,30 +38,20 @@ _LONGEST_STEP = 3.0
 
 @dataclass(frozen=True)
 class SceneCheck:
-    """Result of the consistency checks.
+    """Result of the consistency checks."""
 
-    Attributes:
-        scene: The scene checked.
-        pairs: Source and target frames of the reprojection or matching.
-        depth, path, images, lamp: Statistics; None where there is nothing to measure.
-        agreement: Reprojection errors of frames with depth, by pose hypothesis.
-        scale: The factor on depth with the smallest reprojection error, and the errors with it.
-        matches: Epipolar errors of matched features, by pose hypothesis; empty where there is depth.
-        findings: Suspected problems.
-        undecided: What the data are not enough to check.
-    """
-
-    scene: Scene
-    pairs: list[tuple[Frame, Frame]]
-    depth: DepthFacts | None
+    scene: Scene  # the scene checked
+    pairs: list[tuple[Frame, Frame]]  # source and target frames of the reprojection or matching
+    depth: DepthFacts | None  # statistics; None where there is nothing to measure
     path: PathFacts | None
     images: ImageFacts
     lamp: LampFacts | None
-    agreement: dict[str, Agreement]
-    scale: BestScale | None
+    agreement: dict[str, Agreement]  # reprojection errors of frames with depth, by pose hypothesis
+    scale: BestScale | None  # the factor on depth with the smallest reprojection error, and the errors with it
+    #: epipolar errors of matched features, by pose hypothesis; empty where there is depth
     matches: dict[str, EpipolarAgreement]
-    findings: list[Finding]
-    undecided: list[Finding]
+    findings: list[Finding]  # suspected problems
+    undecided: list[Finding]  # what the data are not enough to check
 
     def anonymous(self) -> SceneCheck:
         """The same without absolute paths."""

@@ -62,17 +62,11 @@ class ImageFacts:
 
 @dataclass(frozen=True)
 class LampFacts:
-    """Rank correlation (Spearman's) of brightness and distance from the camera within frames.
+    """Rank correlation (Spearman's) of brightness and distance from the camera within frames."""
 
-    Attributes:
-        correlation: Median of the frames; -1 where every farther pixel is darker, as under a lamp at the camera.
-        rising_share: Share of the frames in which it is positive.
-        frames: Number of frames.
-    """
-
-    correlation: float
-    rising_share: float
-    frames: int
+    correlation: float  # median of the frames; -1 where every farther pixel is darker, as under a lamp at the camera
+    rising_share: float  # share of the frames in which it is positive
+    frames: int  # number of frames
 
 
 def sampled_frames(frames: Sequence[Frame], count: int = _FRAMES) -> list[Frame]:

@@ -33,17 +33,11 @@ NEAR = 0.2
 
 @dataclass(frozen=True)
 class Finding:
-    """One suspected problem.
+    """One suspected problem."""
 
-    Attributes:
-        what: Short description.
-        evidence: The numbers behind it.
-        do: What the user can do about it.
-    """
-
-    what: str
-    evidence: str
-    do: str
+    what: str  # short description
+    evidence: str  # the numbers behind it
+    do: str  # what the user can do about it
 
 
 def depth_findings(depth: DepthFacts | None, metric: bool) -> Iterator[Finding]:

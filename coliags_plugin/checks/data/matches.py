@@ -37,22 +37,15 @@ class FeatureMatches:
 
 @dataclass(frozen=True)
 class EpipolarAgreement:
-    """Agreement of matches with one pose hypothesis.
+    """Agreement of matches with one pose hypothesis."""
 
-    Attributes:
-        error: Median distance from the epipolar line, px.
-        in_front: Share of the good matches with enough parallax whose point lies in front of both cameras; None where
-            there are too few.
-        parallax: Median displacement of the matches by the translation between the cameras, px.
-        count: Number of matches.
-        width: Width of the images, px, the mean of all pairs.
-    """
-
-    error: float
+    error: float  # median distance from the epipolar line, px
+    #: share of the good matches with enough parallax whose point lies in front of both cameras; None where there are
+    #: too few
     in_front: float | None
-    parallax: float
-    count: int
-    width: float
+    parallax: float  # median displacement of the matches by the translation between the cameras, px
+    count: int  # number of matches
+    width: float  # width of the images, px, the mean of all pairs
 
     @property
     def agrees(self) -> bool:

@@ -26,19 +26,12 @@ _MIN_SHARE = 0.2
 
 @dataclass(frozen=True)
 class ReprojectedPixels:
-    """Pixels of a source frame reprojected into a target frame.
+    """Pixels of a source frame reprojected into a target frame."""
 
-    Attributes:
-        share: Share of the pixels that project into the target image, in front of its camera.
-        depth_errors: |z - z_target| / z_target, of those that hit known depth. [K]
-        depth_errors_mm: |z - z_target|, scene units. [K]
-        color_errors: Mean absolute difference of the channels, grey levels, brightness matched. [K]
-    """
-
-    share: float
-    depth_errors: Float[Tensor, "K"]
-    depth_errors_mm: Float[Tensor, "K"]
-    color_errors: Float[Tensor, "K"]
+    share: float  # share of the pixels that project into the target image, in front of its camera
+    depth_errors: Float[Tensor, "K"]  # |z - z_target| / z_target, of those that hit known depth. [K]
+    depth_errors_mm: Float[Tensor, "K"]  # |z - z_target|, scene units. [K]
+    color_errors: Float[Tensor, "K"]  # mean absolute difference of the channels, grey levels, brightness matched. [K]
 
 
 class Pair:
@@ -92,19 +85,12 @@ class Pair:
 
 @dataclass(frozen=True)
 class Agreement:
-    """Agreement of frames under one pose hypothesis: medians over the pixels of all pairs.
+    """Agreement of frames under one pose hypothesis: medians over the pixels of all pairs."""
 
-    Attributes:
-        depth_error: Relative error of z-depth; None where no pixel hits known depth.
-        depth_error_mm: The same in scene units.
-        color_error: Grey levels.
-        share: Share of pixels that project into the target image.
-    """
-
-    depth_error: float | None
-    depth_error_mm: float | None
-    color_error: float | None
-    share: float
+    depth_error: float | None  # relative error of z-depth; None where no pixel hits known depth
+    depth_error_mm: float | None  # the same in scene units
+    color_error: float | None  # grey levels
+    share: float  # share of pixels that project into the target image
 
 
 def agreement(pairs: Sequence[Pair], change: str = GIVEN, scale: float = 1.0, every: int = 1) -> Agreement:
@@ -120,17 +106,11 @@ def agreement(pairs: Sequence[Pair], change: str = GIVEN, scale: float = 1.0, ev
 
 @dataclass(frozen=True)
 class BestScale:
-    """The factor on depth with the smallest reprojection error.
+    """The factor on depth with the smallest reprojection error."""
 
-    Attributes:
-        factor: On depth.
-        depth_error: Relative error of z-depth with it.
-        beside: The smaller of the errors with half and with twice the factor; infinite where nothing overlaps.
-    """
-
-    factor: float
-    depth_error: float
-    beside: float
+    factor: float  # on depth
+    depth_error: float  # relative error of z-depth with it
+    beside: float  # the smaller of the errors with half and with twice the factor; infinite where nothing overlaps
 
 
 def best_scale(pairs: Sequence[Pair]) -> BestScale | None:

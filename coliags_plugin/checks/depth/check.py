@@ -24,39 +24,26 @@ from coliags_plugin.core.progress import Progress
 
 @dataclass(frozen=True)
 class FrameErrors:
-    """Errors of one frame's estimate; None where the truth has no depth of that kind.
+    """Errors of one frame's estimate; None where the truth has no depth of that kind."""
 
-    Attributes:
-        name: Of the estimate's frame.
-        dense, sparse: Against dense depth and against single points.
-    """
-
-    name: str
-    dense: DepthErrors | None
+    name: str  # of the estimate's frame
+    dense: DepthErrors | None  # against dense depth and against single points
     sparse: DepthErrors | None
 
 
 @dataclass(frozen=True)
 class DepthCheck:
-    """Result of the comparison.
+    """Result of the comparison."""
 
-    Attributes:
-        estimate, truth: What was compared.
-        pairs: The frames in both.
-        unit: Of lengths: ``"mm"``, or ``"units of the truth"``.
-        scale: Factor that the estimate was multiplied by; None: not aligned.
-        dense, sparse: Statistics over all pixels and points of all frames; None where the truth has no such depth.
-        frames: DepthErrors of every frame.
-    """
-
-    estimate: DepthSource
+    estimate: DepthSource  # what was compared
     truth: DepthSource
-    pairs: FramePairs
-    unit: str
-    scale: float | None
+    pairs: FramePairs  # the frames in both
+    unit: str  # of lengths: ``"mm"``, or ``"units of the truth"``
+    scale: float | None  # factor that the estimate was multiplied by; None: not aligned
+    #: statistics over all pixels and points of all frames; None where the truth has no such depth
     dense: DepthStatistics | None
     sparse: DepthStatistics | None
-    frames: list[FrameErrors]
+    frames: list[FrameErrors]  # depthErrors of every frame
 
     def as_json(self) -> dict[str, Any]:
         """The same as JSON values; unavailable ones are null."""

@@ -22,25 +22,15 @@ _BINS = 10
 
 @dataclass(frozen=True)
 class DepthErrors:
-    """Errors over the pixels that have both an estimate and a truth; None where there are none.
+    """Errors over the pixels that have both an estimate and a truth; None where there are none."""
 
-    Attributes:
-        pixels: Their number.
-        coverage: Share of the truth's pixels that have an estimate.
-        median: Median of |dz| / z.
-        p90: 90th percentile of |dz| / z.
-        within: Share with |dz| / z below 5 %.
-        bias: Median of dz / z; positive where the estimate is too far.
-        median_length, p90_length: Median and 90th percentile of |dz|, units of the truth.
-    """
-
-    pixels: int
-    coverage: float
-    median: float | None = None
-    p90: float | None = None
-    within: float | None = None
-    bias: float | None = None
-    median_length: float | None = None
+    pixels: int  # their number
+    coverage: float  # share of the truth's pixels that have an estimate
+    median: float | None = None  # median of |dz| / z
+    p90: float | None = None  # 90th percentile of |dz| / z
+    within: float | None = None  # share with |dz| / z below 5 %
+    bias: float | None = None  # median of dz / z; positive where the estimate is too far
+    median_length: float | None = None  # median and 90th percentile of |dz|, units of the truth
     p90_length: float | None = None
 
 
@@ -55,39 +45,26 @@ class Band:
 
 @dataclass(frozen=True)
 class ConfidenceBin:
-    """Pixels whose confidence is in [low, high), the last bin with its upper end; [0, 0] where it is 0.
+    """Pixels whose confidence is in [low, high), the last bin with its upper end; [0, 0] where it is 0."""
 
-    Attributes:
-        low, high: Ends of the bin.
-        pixels: Their number.
-        stated: Mean confidence.
-        observed: Share of them with |dz| / z below 5 %.
-    """
-
-    low: float
+    low: float  # ends of the bin
     high: float
-    pixels: int
-    stated: float
-    observed: float
+    pixels: int  # their number
+    stated: float  # mean confidence
+    observed: float  # share of them with |dz| / z below 5 %
 
 
 @dataclass(frozen=True)
 class DepthStatistics:
-    """Statistics of a set of samples.
+    """Statistics of a set of samples."""
 
-    Attributes:
-        errors: Over all of them.
-        sure: The same with only the estimates of a confidence of 0.5 or more; None where there is no confidence.
-        bands: By distance, the nearest first; those without a pixel of known truth are left out.
-        bins: By confidence; empty where there is none.
-        calibration_error: Expected calibration error: mean of |stated - observed| over the bins of confidence above 0,
-            weighted by their pixels; None without such pixels.
-    """
-
-    errors: DepthErrors
+    errors: DepthErrors  # over all of them
+    #: the same with only the estimates of a confidence of 0.5 or more; None where there is no confidence
     sure: DepthErrors | None
-    bands: list[Band]
-    bins: list[ConfidenceBin]
+    bands: list[Band]  # by distance, the nearest first; those without a pixel of known truth are left out
+    bins: list[ConfidenceBin]  # by confidence; empty where there is none
+    #: expected calibration error: mean of |stated - observed| over the bins of confidence above 0, weighted by their
+    #: pixels; None without such pixels
     calibration_error: float | None
 
 

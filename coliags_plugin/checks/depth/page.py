@@ -201,11 +201,7 @@ def error_map(
 
 
 def write_error_maps(check: DepthCheck, folder: Path) -> None:
-    """Write the error maps as ``NAME.png``, each above its colour bar; ``folder`` must be new or empty.
-
-    Raises:
-        InputError: The folder holds files, or cannot be written.
-    """
+    """Write the error maps as ``NAME.png``, each above its colour bar; ``folder`` must be new or empty."""
     limit = error_limit(check)
     bar = color_bar((0.0, limit), f"|dz|, {_unit(check)}", width=_BAR_WIDTH)
     with atomic_folder(folder) as scratch:

@@ -18,40 +18,24 @@ _SAME_ASPECT = 0.02
 
 @dataclass(frozen=True)
 class FramePairs:
-    """Frames in both sources.
+    """Frames in both sources."""
 
-    Attributes:
-        by: ``"name"`` or ``"index"``.
-        indices: Of each frame in the estimate and in the truth.
-        left_out: Number of frames of the estimate, and of the truth, without a partner.
-    """
-
-    by: str
-    indices: list[tuple[int, int]]
-    left_out: tuple[int, int]
+    by: str  # ``"name"`` or ``"index"``
+    indices: list[tuple[int, int]]  # of each frame in the estimate and in the truth
+    left_out: tuple[int, int]  # number of frames of the estimate, and of the truth, without a partner
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Estimated and true depth at the places of known truth, N of them.
+    """Estimated and true depth at the places of known truth, N of them."""
 
-    Attributes:
-        estimated: Scene units of the estimate; NaN where there is no estimate. [N]
-        true: Positive. [N]
-        confidence: 0 where unknown; None where the estimate has none. [N]
-    """
-
-    estimated: Float[np.ndarray, "N"]
-    true: Float[np.ndarray, "N"]
-    confidence: Float[np.ndarray, "N"] | None
+    estimated: Float[np.ndarray, "N"]  # scene units of the estimate; NaN where there is no estimate. [N]
+    true: Float[np.ndarray, "N"]  # positive. [N]
+    confidence: Float[np.ndarray, "N"] | None  # 0 where unknown; None where the estimate has none. [N]
 
 
 def match_frames(estimate: DepthSource, truth: DepthSource) -> FramePairs:
-    """Match frames by name; if no name is common, by index, provided that the counts agree.
-
-    Raises:
-        InputError: No name is common, and the counts differ.
-    """
+    """Match frames by name; if no name is common, by index, provided that the counts agree."""
     names = {name: index for index, name in enumerate(truth.names)}
     indices = [(index, names[name]) for index, name in enumerate(estimate.names) if name in names]
     if indices:
@@ -102,11 +86,7 @@ def sparse_samples(estimate: FrameDepth, truth: FrameDepth) -> Samples | None:
 
 
 def check_same_view(name: str, estimate: FrameDepth, truth: FrameDepth) -> None:
-    """Check that two maps of one frame show the same view, if at different sizes.
-
-    Raises:
-        InputError: Their aspect ratios or cameras differ.
-    """
+    """Check that two maps of one frame show the same view, if at different sizes."""
     (width, height), (true_width, true_height) = estimate.size, truth.size
     if abs(width * true_height / (height * true_width) - 1.0) > _SAME_ASPECT:
         raise InputError(

@@ -24,40 +24,26 @@ _TIFF = (".tiff", ".tif")
 
 @dataclass(frozen=True)
 class FrameDepth:
-    """Depth of one frame.
+    """Depth of one frame."""
 
-    Attributes:
-        depth: z-depth, scene units; NaN where unknown or masked. None where there are only single points. [H, W]
-        confidence: Estimated probability of an error below 5 %; 0 where unknown. None where there is none. [H, W]
-        sparse: Depth at single points.
-        size: Width and height of the image, px.
-        intrinsics: Of the image; None for a folder of depth maps.
-        image: RGB; None for a folder of depth maps. [H, W, 3]
-    """
-
+    #: z-depth, scene units; NaN where unknown or masked. None where there are only single points. [H, W]
     depth: Float[np.ndarray, "H W"] | None
+    #: estimated probability of an error below 5 %; 0 where unknown. None where there is none. [H, W]
     confidence: Float[np.ndarray, "H W"] | None
-    sparse: SparseDepth | None
-    size: tuple[int, int]
-    intrinsics: Intrinsics | None = None
-    image: UInt8[np.ndarray, "H W 3"] | None = None
+    sparse: SparseDepth | None  # depth at single points
+    size: tuple[int, int]  # width and height of the image, px
+    intrinsics: Intrinsics | None = None  # of the image; None for a folder of depth maps
+    image: UInt8[np.ndarray, "H W 3"] | None = None  # RGB; None for a folder of depth maps. [H, W, 3]
 
 
 @dataclass(frozen=True)
 class DepthSource:
-    """Depth maps by the names of their frames.
+    """Depth maps by the names of their frames."""
 
-    Attributes:
-        path: The scene or folder.
-        metric: Whether lengths are in mm; False where the unit is unknown.
-        names: Of the frames, in order.
-        read: Reads the depth map of a frame by its index.
-    """
-
-    path: Path
-    metric: bool
-    names: Sequence[str]
-    read: Callable[[int], FrameDepth]
+    path: Path  # the scene or folder
+    metric: bool  # whether lengths are in mm; False where the unit is unknown
+    names: Sequence[str]  # of the frames, in order
+    read: Callable[[int], FrameDepth]  # reads the depth map of a frame by its index
 
 
 def open_depth(

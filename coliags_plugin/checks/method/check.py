@@ -24,18 +24,13 @@ MIN_STEPS = 10
 
 @dataclass(frozen=True)
 class MethodCheck:
-    """One entry of the list.
+    """One entry of the list."""
 
-    Attributes:
-        name: Short and unique.
-        run: Does it and returns what it found; its docstring says what it is about. Raises CheckFailedError or
-            CheckSkippedError, or whatever a component raises.
-        needs: Checks that must have passed.
-    """
-
-    name: str
+    name: str  # short and unique
+    #: does it and returns what it found; its docstring says what it is about. Raises CheckFailedError or
+    #: CheckSkippedError, or whatever a component raises.
     run: Callable[[CheckContext], str]
-    needs: tuple[str, ...] = ()
+    needs: tuple[str, ...] = ()  # checks that must have passed
 
 
 CHECKS = (

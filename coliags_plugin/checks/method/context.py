@@ -26,33 +26,19 @@ SEED = 0
 
 @dataclass
 class CheckContext:
-    """What the checks of one method share. A check may use what the checks that it needs have filled in.
+    """What the checks of one method share. A check may use what the checks that it needs have filled in."""
 
-    Attributes:
-        method: Name or path of the method config.
-        overrides: The user's ``key.path=value`` assignments.
-        data: The scene's folder.
-        data_format: A data manager's name; None: the method's, or recognised.
-        steps: Length of the runs.
-        folder: Where runs go.
-        loaded: The method, resolved for the scene (by ``resolves``).
-        scene: The scene (by ``builds``).
-        trainer: The run of the whole length, at its end (by ``trains``).
-        rows: Its log, one row per step (by ``trains``).
-        trained: The same run, read back from its folder (by ``loads``).
-    """
-
-    method: str
-    overrides: tuple[str, ...]
-    data: Path
-    data_format: str | None
-    steps: int
-    folder: Path
-    loaded: LoadedMethod = field(init=False)
-    scene: Scene = field(init=False)
-    trainer: Trainer = field(init=False)
-    rows: list[dict[str, Any]] = field(init=False)
-    trained: TrainedRun = field(init=False)
+    method: str  # name or path of the method config
+    overrides: tuple[str, ...]  # the user's ``key.path=value`` assignments
+    data: Path  # the scene's folder
+    data_format: str | None  # a data manager's name; None: the method's, or recognised
+    steps: int  # length of the runs
+    folder: Path  # where runs go
+    loaded: LoadedMethod = field(init=False)  # the method, resolved for the scene (by ``resolves``)
+    scene: Scene = field(init=False)  # the scene (by ``builds``)
+    trainer: Trainer = field(init=False)  # the run of the whole length, at its end (by ``trains``)
+    rows: list[dict[str, Any]] = field(init=False)  # its log, one row per step (by ``trains``)
+    trained: TrainedRun = field(init=False)  # the same run, read back from its folder (by ``loads``)
 
     @property
     def config(self) -> MethodConfig | None:
@@ -65,11 +51,7 @@ class CheckContext:
         return self.steps // 2
 
     def load(self, extra: Sequence[str] = ()) -> LoadedMethod:
-        """The method with its length set, logging every step, and with a checkpoint in the middle.
-
-        Raises:
-            InputError: It is not valid.
-        """
+        """The method with its length set, logging every step, and with a checkpoint in the middle."""
         lengths = (f"steps={self.steps}", "log_every=1", f"checkpoint_every={self.half}")
         changes = [*self.overrides, *(f"schedule.{length}" for length in lengths), *extra]
         return load_method_for(self.data, self.method, changes, self.data_format)
@@ -81,9 +63,6 @@ class CheckContext:
             run: Name of its run folder, which is not made yet.
             scene: Another scene.
             method: Another method.
-
-        Raises:
-            InputError: The components do not fit one another or the scene.
         """
         scene = scene or self.scene
         return Trainer(method or self.loaded, scene, str(self.data.resolve()), RunFolder(self.folder / run), SEED, CPU)

@@ -64,19 +64,12 @@ def _hastened(settings: Settings, steps: int) -> list[str]:
 
 @dataclass
 class _Census:
-    """Numbers of rows at one time.
+    """Numbers of rows at one time."""
 
-    Attributes:
-        count: Elements of the field.
-        parameters: Rows of the groups of one parameter.
-        buffers: Rows of the field's own buffers; those of its parts may be of another kind.
-        counters: Rows of the strategy's counters.
-    """
-
-    count: int
-    parameters: dict[str, int]
-    buffers: dict[str, int]
-    counters: dict[str, int]
+    count: int  # elements of the field
+    parameters: dict[str, int]  # rows of the groups of one parameter
+    buffers: dict[str, int]  # rows of the field's own buffers; those of its parts may be of another kind
+    counters: dict[str, int]  # rows of the strategy's counters
 
     def __init__(self, trainer: Trainer) -> None:
         model = trainer.model

@@ -46,9 +46,6 @@ def write_phantom(method: str, overrides: Sequence[str], folder: Path) -> Path:
         method: Name or path of a method config.
         overrides: ``key.path=value`` assignments.
         folder: To make it in.
-
-    Raises:
-        InputError: No such method.
     """
     named = method_tree(method, overrides).find(["datamanager", "name"]).value
     layout = named if named in registry.phantom_layouts else _layout_for_losses(method, overrides)
