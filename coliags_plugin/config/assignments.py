@@ -19,13 +19,7 @@ EXAMPLE = "key.path=value, for instance field.geometry_head.frequencies=8"
 def parse_assignments(texts: Iterable[str], option: str = "--set", expected: str = EXAMPLE) -> dict[str, object]:
     """Values by key path, read as YAML; of a key that is there twice the last one counts, in its place.
 
-    Args:
-        texts: ``key.path=value`` each.
-        option: Name of the option, for messages.
-        expected: What would have been valid, for messages.
-
-    Raises:
-        InputError: A text has no ``=``.
+    ``option`` and ``expected`` are for messages.
     """
     values: dict[str, object] = {}
     for text in texts:
@@ -40,11 +34,7 @@ def parse_assignments(texts: Iterable[str], option: str = "--set", expected: str
 def assignments(settings: Mapping[str, object] | None) -> tuple[str, ...]:
     """``key.path=value`` texts, in the settings' order; what :func:`parse_assignments` reads as the same settings.
 
-    Args:
-        settings: Plain values by key path; a key with a dot in it is put in double quotes. None: no settings.
-
-    Raises:
-        InputError: This is no mapping from text, or a value is not plain data.
+    A key with a dot in it is put in double quotes.
     """
     if settings is None:
         return ()
@@ -74,16 +64,7 @@ S = TypeVar("S", bound=Settings)
 
 
 def settings_of(kind: type[S], assignments: Sequence[str], prefix: str = "") -> S:
-    """Settings from their defaults and ``--set`` assignments.
-
-    Args:
-        kind: The class.
-        assignments: ``key.path=value``.
-        prefix: Prefix of the keys in messages.
-
-    Raises:
-        InputError: An assignment is malformed, or a key or value is invalid; the message names it.
-    """
+    """Settings from their defaults and ``key.path=value`` assignments; messages put the prefix before keys."""
     tree = override_all(Node({}, "options"), assignments)
     try:
         # Merged with the defaults, as a nested part's defaults may differ from its class's.

@@ -19,12 +19,7 @@ def candidates(kind: str) -> list[str]:
 
 
 def resolved(component: Component, choose: Callable[[], str]) -> Component:
-    """A component, or the one that ``auto`` stands for, with the options that were set.
-
-    Args:
-        component: Of a config.
-        choose: Name of the one that ``auto`` stands for; called where it is needed.
-    """
+    """A component, or the one that ``auto`` stands for, as ``choose`` says, with the options that were set."""
     return with_options(component, choose()) if is_auto(component.kind, component.name) else component
 
 

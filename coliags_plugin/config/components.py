@@ -62,15 +62,9 @@ def make_component(kind: str, node: object) -> Component:
 
 
 def named_component(kind: str, node: Mapping[str, object], asking: str) -> Component:
-    """Validate a node outside method configs into a component.
+    """Validate a node outside method configs, ``{"name": ..., options...}``, into a component.
 
-    Args:
-        kind: The registry's kind.
-        node: ``{"name": ..., options...}``.
-        asking: Origin of the node, for the message.
-
-    Raises:
-        InputError: The name is unknown, or an option is.
+    ``asking`` is its origin, for the message.
     """
     try:
         return make_component(kind, node)

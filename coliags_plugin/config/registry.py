@@ -23,12 +23,7 @@ PLUGIN_PATH_VARIABLE = "COLIAGS_PLUGIN_PATH"
 
 
 class Resolver:
-    """What the name ``auto`` stands for; its options are those common to the components it may be resolved to.
-
-    Args:
-        options: ``"module:Class"`` of the options.
-        description: What is chosen, for lists of components.
-    """
+    """What the name ``auto`` stands for; its options, ``"module:Class"``, are common to what it may be resolved to."""
 
     def __init__(self, options: str, description: str) -> None:
         self._options = options
@@ -41,12 +36,9 @@ class Resolver:
 
 
 class Registry:
-    """The components of one kind.
+    """The components of one kind, a plural noun such as ``"renderers"``; the singular ``noun`` is for errors.
 
-    Args:
-        kind: Plural noun, for instance ``"renderers"``.
-        builtins: Name to ``"module:Class"`` or resolver.
-        noun: Singular of the kind, for errors.
+    Built-ins are resolvers, or ``"module:Class"``.
     """
 
     def __init__(self, kind: str, builtins: Mapping[str, object], noun: str) -> None:
@@ -59,15 +51,9 @@ class Registry:
             self.register(name, target, source="built in")
 
     def register(self, name: str, target: object, source: str = "registered") -> None:
-        """Add one component.
+        """Add one component: a class, an object, or ``"module:Class"`` to import when first asked for.
 
-        Args:
-            name: The name method configs use.
-            target: The class or object, or ``"module:Class"`` to import it when first asked for.
-            source: Where it comes from, for listings and errors.
-
-        Raises:
-            InputError: The name is taken.
+        The source is for listings and errors. InputError where the name is taken.
         """
         if name in self._targets:
             raise InputError(
@@ -89,11 +75,7 @@ class Registry:
         return self._sources[name]
 
     def get(self, name: str) -> Any:
-        """The component of a name, imported on first use.
-
-        Raises:
-            InputError: No such name; says which are known and which was probably meant.
-        """
+        """The component of a name, imported on first use."""
         self._discover()
         if name not in self._targets:
             raise InputError(

@@ -102,11 +102,7 @@ _Dumper.add_implicit_resolver(*_NUMBERS)
 
 
 def read_tree(path: Path) -> Node:
-    """Read a YAML file whose top level is a mapping.
-
-    Raises:
-        InputError: The file is missing, is not YAML, repeats a key, or is no mapping.
-    """
+    """Read a YAML file whose top level is a mapping, without repeated keys."""
     try:
         text = whole_text(path)
     except OSError as error:
@@ -119,7 +115,7 @@ def read_tree(path: Path) -> Node:
 
 
 def parse_tree(text: str, source: str) -> Node:
-    """Parse YAML text whose top level is a mapping; ``source`` names it in origins. Raises InputError as read_tree."""
+    """Parse YAML text whose top level is a mapping; ``source`` names it in origins."""
     try:
         loader = _Loader(text)
         try:
@@ -150,11 +146,7 @@ def parse_value(text: str) -> object:
 
 
 def _check_extent(root: yaml.Node, source: str) -> None:
-    """Refuse aliases that refer to themselves, or that expand a short text to more values than any config has.
-
-    Raises:
-        InputError: See above.
-    """
+    """Refuse aliases that refer to themselves, or that expand a short text to more values than any config has."""
     extents: dict[int, float] = {}
 
     def extent(node: yaml.Node) -> float:
@@ -218,11 +210,7 @@ _KEY = re.compile(r'"[^"]+"|[^".]+')
 
 
 def parse_assignment(assignment: str) -> Node:
-    """The tree of one ``key.path=value``; a key with a dot is put in double quotes.
-
-    Raises:
-        InputError: It has no ``=``, an empty key, or bytes that are not UTF-8.
-    """
+    """The tree of one ``key.path=value``; a key with a dot is put in double quotes."""
     if not _is_text(assignment):
         raise InputError(f"--set {assignment!a}", "text in UTF-8")
     path, equals, text = assignment.partition("=")
@@ -244,11 +232,7 @@ def _nodes(value: object, origin: str) -> Node:
 
 
 def override_all(tree: Node, assignments: Iterable[str]) -> Node:
-    """Apply ``key.path=value`` assignments, the last one last.
-
-    Raises:
-        InputError: See :func:`parse_assignment`.
-    """
+    """Apply ``key.path=value`` assignments, the last one last."""
     for assignment in assignments:
         tree = merge(tree, parse_assignment(assignment))
     return tree
@@ -284,13 +268,7 @@ _TELLING = frozenset({"no_name", "unknown_key", "unknown_component", "no_setting
 
 
 def errors_with_origins(error: ValidationError, tree: Node, what: str = "config") -> list[str]:
-    """One line per problem: where the value was written, its key, and what is wrong with it.
-
-    Args:
-        error: What validation raised.
-        tree: What was validated.
-        what: Name of the whole, for problems without a key.
-    """
+    """One line per problem: where the value was written, its key (``what`` without one), and what is wrong with it."""
     lines = []
     for item in error.errors():
         path = [key for key in item["loc"] if isinstance(key, str)]

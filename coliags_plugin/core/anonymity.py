@@ -14,11 +14,9 @@ _WHOLE = re.compile(r"(?:~|[A-Za-z]:)?[/\\][^\n]*")
 
 
 def without_places(value: Any) -> Any:
-    """Plain data without absolute paths: of each, the last part stays.
+    """Plain data without absolute paths, of each of which the last part stays.
 
-    Args:
-        value: Mappings, sequences, texts and other values; a text that begins like an absolute path is taken for one,
-            blanks included, and paths are also found within texts.
+    A text that begins like an absolute path is taken for one, blanks included; paths are also found within texts.
     """
     if isinstance(value, str):
         if _WHOLE.fullmatch(value):

@@ -39,17 +39,9 @@ _DAMAGED = (
 def read_arrays(
     path: Path, expected: str, needed: Collection[str] = (), optional: Collection[str] | None = ()
 ) -> dict[str, np.ndarray]:
-    """Read arrays of an NPZ file by name.
+    """Read arrays of an NPZ file by name: those needed, and of the optional ones (None: all) what is there.
 
-    Args:
-        path: The file.
-        expected: What it should be, for messages.
-        needed: Names that must be there.
-        optional: Names that are read where they are there; None: all.
-
-    Raises:
-        InputError: The file cannot be read, is damaged, lacks an array, holds other than plain arrays, or expands to
-            far more than its size.
+    Refused are damaged files, other than plain arrays, and what expands to far more than its size.
     """
     try:
         packed = path.stat().st_size
@@ -72,11 +64,7 @@ def read_arrays(
 
 
 def read_array(path: Path, expected: str) -> np.ndarray:
-    """Read the array of an NPY file.
-
-    Raises:
-        InputError: The file cannot be read, is damaged, or is shorter than it says.
-    """
+    """Read the array of an NPY file."""
     try:
         # Mapped first: numpy would reserve what the header says, whatever follows.
         with _HEADERS:

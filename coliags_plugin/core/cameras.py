@@ -62,10 +62,7 @@ class Camera(Intrinsics):
         return torch.tensor(matrix, dtype=self.camera_to_world.dtype, device=self.camera_to_world.device)
 
     def rays(self) -> Float[Tensor, "H W 3"]:
-        """World directions through the pixel centres, scaled to z-depth 1.
-
-        A point at z-depth ``z`` is ``center + z * rays()``. [H, W, 3]
-        """
+        """World directions through the pixel centres, scaled to z-depth 1: the point at depth z is center + z * ray."""
         like = self.camera_to_world
         x = (torch.arange(self.width, dtype=like.dtype, device=like.device) + 0.5 - self.cx) / self.fx
         y = (torch.arange(self.height, dtype=like.dtype, device=like.device) + 0.5 - self.cy) / self.fy
@@ -76,45 +73,28 @@ class Camera(Intrinsics):
         return directions @ self.camera_to_world[:3, :3].T
 
     def rays_at(self, pixels: Int[Tensor, "P 2"]) -> Float[Tensor, "P 3"]:
-        """World directions through some pixel centres, scaled to z-depth 1.
-
-        Args:
-            pixels: Columns and rows. [P, 2]
-        """
+        """World directions through some pixel centres, given as columns and rows, scaled to z-depth 1."""
         like = self.camera_to_world
         column, row = (pixels.to(like.device, like.dtype) + 0.5).unbind(1)
         local = [(column - self.cx) / self.fx, (row - self.cy) / self.fy, torch.ones_like(row)]
         return torch.stack(local, dim=-1) @ like[:3, :3].T
 
     def project(self, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N 2"], Float[Tensor, "N"]]:
-        """Project world points.
+        """Pixel positions (column, row) and z-depths of world points.
 
-        Args:
-            points: World positions. [N, 3]
-
-        Returns:
-            Pixel positions (column, row) and z-depths. Points at or behind the camera plane project nowhere useful:
-            look at the depth first. [N, 2], [N]
+        Points at or behind the camera plane project nowhere useful: look at the depth first.
         """
         local = (points - self.center) @ self.camera_to_world[:3, :3]
         x, y, z = local.unbind(-1)
         return torch.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], dim=-1), z
 
     def sees(self, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Bool[Tensor, "N"]]:
-        """z-depths of world points, and which of them are in front of the camera and inside its image; [N], [N].
-
-        Occlusion is not tested.
-        """
+        """z-depths of world points, and which are in front of the camera and inside its image, occluded or not."""
         pixels, depth = self.project(points)
         return depth, self.is_inside(pixels, depth)
 
     def is_inside(self, pixels: Float[Tensor, "N 2"], depth: Float[Tensor, "N"]) -> Bool[Tensor, "N"]:
-        """Which projected points are in front of the camera and inside its image. [N]
-
-        Args:
-            pixels: Column and row. [N, 2]
-            depth: z-depths. [N]
-        """
+        """Which points, projected to columns and rows at z-depths, are in front of the camera and inside its image."""
         inside = ((pixels >= 0) & (pixels < pixels.new_tensor([self.width, self.height]))).all(dim=-1)
         return inside & (depth > 0)
 

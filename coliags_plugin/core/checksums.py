@@ -30,11 +30,7 @@ def file_sha256(file: Path) -> str:
 
 
 def write_checksums(folder: Path) -> None:
-    """List the checksums of all files of a folder in a file of it, :data:`CHECKSUMS`.
-
-    Raises:
-        InputError: The folder cannot be read or written.
-    """
+    """List the checksums of all files of a folder in a file of it, :data:`CHECKSUMS`."""
     names = sorted(path.name for path in folder.iterdir() if path.is_file() and path.name != CHECKSUMS)
     atomic_write(folder / CHECKSUMS, "".join(f"{file_sha256(folder / name)}  {name}\n" for name in names))
 

@@ -29,21 +29,17 @@ _MIB = 1 << 20
 
 
 def download(url: str, target: Path, sha256: str, progress: Progress, otherwise: str = "") -> None:
-    """Fetch a file by HTTP, through the proxy of ``HTTPS_PROXY`` where that is set.
+    """Fetch a file by HTTP, through the proxy of ``HTTPS_PROXY`` where that is set; nothing where ``target`` exists.
 
     What arrives is written to ``target`` with ``.part`` appended, which is kept when the transfer fails or is
     interrupted, continued by the next call, and renamed once its checksum is right.
 
     Args:
         url: Where the file is.
-        target: The file to write. Where it exists, nothing is done.
+        target: The file to write.
         sha256: Its SHA-256 in hexadecimal, or the first digits of it.
         progress: Called with what has arrived and all there is, MiB.
         otherwise: What the user can do where the server cannot be reached.
-
-    Raises:
-        InputError: No connection, a status of the server other than success, a transfer that ended early, another
-            checksum, a folder or disk that cannot be written, or another process that fetches the same file.
     """
     make_folder(target.parent)
     part, lock = (target.with_name(f"{target.name}.{suffix}") for suffix in ("part", "lock"))

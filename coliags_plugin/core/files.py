@@ -36,15 +36,7 @@ _FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 @contextmanager
 def atomic_folder(target: Path, overwrite: bool = False) -> Iterator[Path]:
-    """Scratch folder that becomes ``target`` when the block ends without an error; first, killed ones are removed.
-
-    Args:
-        target: The folder to create, with its parents.
-        overwrite: Replace an existing folder.
-
-    Raises:
-        InputError: ``target`` exists and ``overwrite`` is off, or it cannot be written.
-    """
+    """Scratch folder that becomes ``target`` when the block ends without an error; first, killed ones are removed."""
     durable = not is_in_scratch(target)
     make_folder(target.parent)
     with ExitStack() as scratches:

@@ -20,16 +20,9 @@ _CHUNK = 12
 
 
 def decode_image(path: Path, flags: int | None = None) -> Shaped[np.ndarray, "H W *C"]:
-    """Pixels of an image file, in OpenCV's order of channels.
+    """Pixels of an image file in OpenCV's order of channels, decoded with its ``flags`` or unchanged.
 
     What would fill the memory is refused before anything is decoded.
-
-    Args:
-        path: The file.
-        flags: OpenCV's; by default ``IMREAD_UNCHANGED``.
-
-    Raises:
-        InputError: It cannot be read, is damaged or cut short, or has more pixels than a frame of a video.
     """
     import cv2
 
@@ -54,11 +47,7 @@ def decode_image(path: Path, flags: int | None = None) -> Shaped[np.ndarray, "H 
 
 
 def read_rgb(path: Path) -> UInt8[np.ndarray, "H W 3"]:
-    """Read an 8-bit colour image, without its alpha channel. [H, W, 3]
-
-    Raises:
-        InputError: It cannot be read, is damaged, or is of another depth or number of channels.
-    """
+    """Read an 8-bit colour image, without its alpha channel."""
     image = decode_image(path)
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] not in (3, 4):
         raise InputError(f"{path} is {kind_of(image)}", "an 8-bit RGB image", "Convert it")
@@ -107,16 +96,7 @@ def _is_whole_png(data: bytes) -> bool:
 
 
 def encode_image(pixels: np.ndarray, suffix: str = ".png", options: Sequence[int] = ()) -> bytes:
-    """Encode an image as the bytes of a file.
-
-    Args:
-        pixels: RGB or one channel, of a type that the format holds. [H, W, 3] or [H, W]
-        suffix: Of the format, with its dot.
-        options: OpenCV's keys and values, one after the other.
-
-    Raises:
-        InputError: The format cannot hold these pixels.
-    """
+    """Encode RGB or one channel as the bytes of a file of a format, with OpenCV's options: keys and values in turn."""
     import cv2
 
     kind = f"{pixels.dtype} {list(pixels.shape)}"
@@ -131,22 +111,10 @@ def encode_image(pixels: np.ndarray, suffix: str = ".png", options: Sequence[int
 
 
 def write_image(path: Path, pixels: np.ndarray) -> None:
-    """Write an image atomically in the format of its suffix; its folder is made.
-
-    Args:
-        path: Where to.
-        pixels: RGB or one channel. [H, W, 3] or [H, W]
-
-    Raises:
-        InputError: The format cannot hold these pixels, or the folder cannot be written.
-    """
+    """Write RGB or one channel atomically in the format of the file's suffix; its folder is made."""
     atomic_write(path, encode_image(pixels, path.suffix))
 
 
 def write_mask(path: Path, mask: np.ndarray) -> None:
-    """Write a mask as one channel of 8 bits: 255 where it is True, 0 elsewhere. [H, W]
-
-    Raises:
-        InputError: The folder cannot be written.
-    """
+    """Write a mask as one channel of 8 bits: 255 where it is True, 0 elsewhere."""
     write_image(path, mask.astype(np.uint8) * 255)

@@ -12,15 +12,8 @@ def interpolated(
 ) -> tuple[Float[Tensor, "K"], Bool[Tensor, "K"]]:
     """Bilinear samples of a map at points, and whether all interpolated pixels are usable.
 
-    Unusable pixels may be NaN; they affect no value and no gradient. Points outside the map are not usable.
-
-    Args:
-        values: A map. [H, W]
-        usable: Pixels that may be interpolated. [H, W]
-        pixels: Columns and rows of the points, pixel centres at integers + 0.5. [K, 2]
-
-    Returns:
-        Samples [K], of which those of unusable points mean nothing; and which are usable [K].
+    Points are columns and rows, pixel centres at integers + 0.5; those outside the map are not usable. Unusable
+    pixels may be NaN, and affect no value and no gradient; samples of unusable points mean nothing.
     """
     height, width = values.shape
     size = pixels.new_tensor([width, height])

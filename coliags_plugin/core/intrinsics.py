@@ -37,11 +37,7 @@ class Intrinsics:
     height: int
 
     def __post_init__(self) -> None:
-        """Check that the values are valid.
-
-        Raises:
-            InputError: A number is not finite or absurdly large, or a focal length or size not positive.
-        """
+        """Refuse numbers that are not finite or absurdly large, and focal lengths or sizes that are not positive."""
         numbers = (self.fx, self.fy, self.cx, self.cy)
         good = all(abs(number) <= bounds.PIXELS for number in numbers)  # NaN is not
         good = good and min(self.fx, self.fy) > 0.0 and self._slope <= bounds.SLOPE
@@ -65,5 +61,5 @@ class Intrinsics:
         return replace(self, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y, width=width, height=height)
 
     def opencv_matrix(self) -> Float[np.ndarray, "3 3"]:
-        """K for pixel centres at integers, as in OpenCV, open3d and EndoGSLAM's files. float64. [3, 3]"""
+        """K for pixel centres at integers, as in OpenCV, open3d and EndoGSLAM's files."""
         return np.array([[self.fx, 0.0, self.cx - 0.5], [0.0, self.fy, self.cy - 0.5], [0.0, 0.0, 1.0]])

@@ -17,17 +17,7 @@ JsonObject: TypeAlias = dict[str, Any]
 
 
 def read_json(path: Path, expected: str, do: str = "", finite: bool = False) -> Any:
-    """The value of a JSON file in UTF-8, with or without a byte order mark.
-
-    Args:
-        path: The file.
-        expected: What it should be, for messages.
-        do: What the user can do about it.
-        finite: See :func:`parse_json`.
-
-    Raises:
-        InputError: The file is refused by :func:`json_text` or :func:`parse_json`.
-    """
+    """The value of a JSON file in UTF-8, with or without a byte order mark; ``finite`` as in :func:`parse_json`."""
     try:
         text = json_text(path)
     except (OSError, ValueError) as error:
@@ -49,11 +39,7 @@ def json_text(path: Path) -> str:
 
 
 def parse_json(text: str | bytes, finite: bool = False) -> Any:
-    """The value of a JSON text.
-
-    Args:
-        text: The text.
-        finite: Refuse infinity and NaN, which the standard does not have, so that they cannot be written again.
+    """The value of a JSON text; ``finite`` refuses infinity and NaN, which cannot be written again.
 
     Raises:
         ValueError: It is not JSON, is nested too deeply, or has a number of thousands of digits; or see ``finite``.

@@ -28,10 +28,12 @@ class LockedError(InputError):
 
 @contextmanager
 def locked(file: Path, what: str | Path, wait: float = 0.0) -> Iterator[None]:
-    """Hold the lock of a file, which ends with the process, however that ends. The file stays.
+    """Hold the lock of a file, which ends with the process, however that ends.
+
+    The file is created, names the process that has the lock, and stays.
 
     Args:
-        file: Created where it is missing; holds the name of the process that has the lock.
+        file: Of the lock.
         what: What the lock protects, for messages.
         wait: Seconds to wait for another process; infinity: without end.
 

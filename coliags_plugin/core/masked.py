@@ -8,13 +8,9 @@ from torch import Tensor
 
 
 def zero_outside(values: Float[Tensor, "H W *C"], mask: Bool[Tensor, "H W"] | None) -> Float[Tensor, "H W *C"]:
-    """The values where the mask is True, 0 elsewhere.
+    """The values where the mask is True, or everywhere without one; 0 elsewhere.
 
     Selected with ``torch.where``, not multiplied: NaN or infinity outside still yields 0 and a gradient of exactly 0.
-
-    Args:
-        values: An image or a map. [H, W] or [H, W, C]
-        mask: False where a pixel is ignored; None keeps every pixel. [H, W]
     """
     if mask is None:
         return values
@@ -25,11 +21,7 @@ def zero_outside(values: Float[Tensor, "H W *C"], mask: Bool[Tensor, "H W"] | No
 def masked_mean(values: Float[Tensor, "H W *C"], mask: Bool[Tensor, "H W"] | None) -> Float[Tensor, ""]:
     """Mean over the pixels (and channels) where the mask is True; 0, still part of the graph, where there are none.
 
-    A full mask gives the unmasked mean to the bit.
-
-    Args:
-        values: An image or a map. [H, W] or [H, W, C]
-        mask: False where a pixel is ignored; None counts every pixel. [H, W]
+    A full mask, or none, gives the unmasked mean to the bit.
     """
     # Sums run in memory order, and ``torch.where`` may lay its result out differently from its input.
     values = values.contiguous()
@@ -44,12 +36,7 @@ def weighted_mean(
 ) -> Float[Tensor, ""]:
     """Weighted mean over the pixels where the mask is True: sum w v / sum w; 0, still part of the graph, if sum w = 0.
 
-    Without weights it is :func:`masked_mean` to the bit.
-
-    Args:
-        values: A map. [H, W]
-        mask: False where a pixel is ignored. [H, W]
-        weights: Not negative; None: all equal. [H, W]
+    Weights are not negative; without them it is :func:`masked_mean` to the bit.
     """
     if weights is None:
         return masked_mean(values, mask)

@@ -11,11 +11,7 @@ from coliags_plugin.core.errors import InputError
 def import_open3d(purpose: str) -> Any:
     """open3d, which takes a second to import; in a notebook without its server of 3D views, which prints and listens.
 
-    Args:
-        purpose: What it does, for the message.
-
-    Raises:
-        InputError: It cannot be imported.
+    The purpose, what it does, is for the message where it cannot be imported.
     """
     os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")
     try:

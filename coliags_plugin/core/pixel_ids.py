@@ -11,22 +11,12 @@ _GOLDEN, _MIX = 0x9E3779B97F4A7C15 - 2**64, (0xBF58476D1CE4E5B9 - 2**64, 0x94D04
 
 
 def pixel_ids(frame: int, pixels: Int[Tensor, "*P"]) -> Int[Tensor, "*P"]:
-    """Numbers that no other pixel of the video has.
-
-    Args:
-        frame: Index of the frame.
-        pixels: Row times width plus column, below 2^32.
-    """
+    """Numbers that no other pixel of the video has, of pixels by row times width plus column, below 2^32."""
     return pixels.to(torch.int64) + (frame << 32)
 
 
 def fixed_uniform(ids: Int[Tensor, "*P"], seed: int) -> Float[Tensor, "*P"]:
-    """A number in [0, 1) for each identifier, the same at every call: splitmix64 of identifier and seed.
-
-    Args:
-        ids: Of :func:`pixel_ids`.
-        seed: Of the numbers.
-    """
+    """A number in [0, 1) for each identifier, the same at every call: splitmix64 of identifier and seed."""
     return (_mixed(ids ^ _mixed(torch.tensor(seed))) >> 11 & (1 << 53) - 1).double() * 2.0**-53
 
 

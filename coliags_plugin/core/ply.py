@@ -67,32 +67,14 @@ class _PlyFile:
 
 
 def read_vertices(path: Path, needed: tuple[str, ...] = ("x", "y", "z")) -> dict[str, np.ndarray]:
-    """Read the vertex properties of a PLY file, by name.
-
-    Args:
-        path: The file, whose vertices come first.
-        needed: Required properties.
-
-    Returns:
-        One array per property, of the stored data type. Each [N]
-
-    Raises:
-        InputError: The file is damaged or not a PLY file, or its vertices lack a property.
-    """
+    """The vertex properties of a PLY file by name, in their stored types; the file begins with its vertices."""
     return _vertices(_opened(path), needed)[0]
 
 
 def read_triangles(path: Path) -> tuple[dict[str, np.ndarray], Int[np.ndarray, "F 3"]]:
-    """Read the vertex properties and the triangles of a PLY file; polygons are split into fans.
+    """Vertex properties as of :func:`read_vertices`, and triangles; polygons are split into fans.
 
-    Args:
-        path: The file: vertices, then faces.
-
-    Returns:
-        Vertex properties as :func:`read_vertices` returns them, each [V], and indices of vertices [F, 3].
-
-    Raises:
-        InputError: The file is damaged, or holds no faces behind its vertices.
+    The file has vertices, then faces.
     """
     file = _opened(path)
     columns, rest = _vertices(file, ("x", "y", "z"))
@@ -112,11 +94,8 @@ def write_ply(
     Args:
         path: Where to.
         vertices: Properties by name, in their order: uint8 is kept, everything else becomes float32. Each [V]
-        triangles: Indices of vertices, counted from 0. [F, 3]
+        triangles: Indices of vertices, counted from 0.
         comment: A line for the header.
-
-    Raises:
-        InputError: The folder cannot be written.
     """
     kinds = {name: "u1" if values.dtype == np.uint8 else "<f4" for name, values in vertices.items()}
     rows = np.empty(len(next(iter(vertices.values()))), list(kinds.items()))

@@ -19,15 +19,12 @@ _SHARE, _FEWEST = 500, 20
 def point_normals(
     points: Float[Tensor, "P 3"], neighbours: int, at: Float[Tensor, "N 3"] | None = None
 ) -> Float[Tensor, "N 3"]:
-    """Unit normals, of either sign: the direction in which the points nearest to a position vary least. [N, 3]
+    """Unit normals, of either sign: the direction in which the points nearest to a position vary least.
 
     Args:
-        points: Scene units. [P, 3]
+        points: Scene units.
         neighbours: Points that count at each position.
-        at: Positions, scene units; None: those of the points, each of which does not count at its own. [N, 3]
-
-    Raises:
-        InputError: There are not enough points.
+        at: Positions, scene units; None: those of the points, each of which does not count at its own.
     """
     least = neighbours + (at is None)
     if len(points) < least:
@@ -49,13 +46,9 @@ def point_normals(
 
 
 def wall_normals(points: Float[Tensor, "P 3"], at: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-    """Unit normals, of either sign, of the smooth wall that noisy points lie on. [N, 3]
+    """Unit normals, of either sign, of the smooth wall that noisy points lie on, at positions.
 
     Each is that of the nearest five hundredth of the points, and of 20 at least: in a colon's section, of some
     millimetres.
-
-    Args:
-        points: Scene units. [P, 3]
-        at: Positions, scene units. [N, 3]
     """
     return point_normals(points, min(len(points), max(_FEWEST, len(points) // _SHARE)), at)

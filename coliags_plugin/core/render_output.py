@@ -81,11 +81,7 @@ class RenderOutput:
 
     @property
     def drawn(self) -> Splats:
-        """The splats.
-
-        Raises:
-            InputError: The renderer draws none.
-        """
+        """The splats; InputError where the renderer draws none."""
         if self.splats is None:
             raise InputError("a rendered view without splats", "one of a splatting renderer", "Choose another renderer")
         return self.splats
@@ -102,11 +98,7 @@ class RenderOutput:
 
 
 def concatenate_pixels(parts: Sequence[RenderOutput]) -> RenderOutput:
-    """Pixel batches of several cameras as one.
-
-    Args:
-        parts: Outputs of P_i rows and one column each, with the same maps.
-    """
+    """Pixel batches of several cameras, of P_i rows and one column each and with the same maps, as one."""
     if len(parts) == 1:
         return parts[0]
     maps = {name: torch.cat([part.maps[name] for part in parts]) for name in parts[0].maps}

@@ -19,13 +19,9 @@ def rotation_matrices(quats_wxyz: Float[Tensor, "N 4"]) -> Float[Tensor, "N 3 3"
 
 
 def shortest_axes(quats_wxyz: Float[Tensor, "N 4"], scales: Float[Tensor, "N S"]) -> Float[Tensor, "N 3"]:
-    """Local axis of the smallest scale of each Gaussian, in the frame its rotation leads to.
+    """Local axis of the smallest scale (or logarithm of one) of each Gaussian, in the frame its rotation leads to.
 
     The third axis where there are two scales. Differentiable in the quaternions; the choice of the axis is not.
-
-    Args:
-        quats_wxyz: Rotations, of any length. [N, 4]
-        scales: Three or two, or their logarithms. [N, S]
     """
     if scales.shape[1] == 2:
         return third_axes(quats_wxyz)
@@ -33,11 +29,9 @@ def shortest_axes(quats_wxyz: Float[Tensor, "N 4"], scales: Float[Tensor, "N S"]
 
 
 def shortest_columns(rotations: Float[Tensor, "N 3 3"], scales: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-    """Column of each rotation matrix that belongs to the smallest of three scales; the choice is not differentiable.
+    """Column of each rotation matrix that belongs to the smallest of three scales, or of their logarithms.
 
-    Args:
-        rotations: [N, 3, 3]
-        scales: Or their logarithms. [N, 3]
+    The choice is not differentiable.
     """
     return rotations.gather(2, scales.argmin(1)[:, None, None].expand(-1, 3, 1)).squeeze(2)
 

@@ -148,11 +148,7 @@ class Frame(_MaskedImage):
         )
 
     def target_at(self, pixels: Int[Tensor, "P 2"]) -> Target:
-        """Some pixels as a target.
-
-        Args:
-            pixels: Columns and rows. [P, 2]
-        """
+        """Some pixels, by columns and rows, as a target."""
         column, row = pixels.to(self.image.device).unbind(1)
 
         def taken(values: Tensor | None) -> Tensor | None:
@@ -283,10 +279,7 @@ class Scene:
         return float((found if len(found) else others).median()) if len(others) else math.nan
 
     def depths_in_view(self) -> Float[Tensor, "K"]:
-        """z-depths of the points inside the images of up to 16 training frames, scene units; occlusion is not tested.
-
-        [K]
-        """
+        """z-depths of the points inside the images of up to 16 training frames, scene units, occluded or not."""
         return torch.cat([depth[inside] for _, depth, inside in self._projected_points()])
 
     def _projected_points(self) -> Iterator[tuple[Camera, Tensor, Tensor]]:
@@ -298,12 +291,9 @@ class Scene:
 
 
 def concatenate_targets(parts: Sequence[Target]) -> Target:
-    """Pixel batches of several frames as one.
+    """Pixel batches of several frames, of P_i rows and one column each, as one.
 
     A missing mask is all True; beside others, missing depth is all NaN and missing confidence all 1.
-
-    Args:
-        parts: Of P_i rows and one column each.
     """
     if len(parts) == 1:
         return parts[0]

@@ -78,16 +78,7 @@ def _is_huge(value: object) -> bool:
 
 
 def validated(kind: type[Model], values: Mapping[str, object], what: str) -> Model:
-    """Settings of plain values by name.
-
-    Args:
-        kind: Their class.
-        values: Those that are not to have their defaults.
-        what: What to call one of them in the message, for instance ``mesh option``.
-
-    Raises:
-        InputError: A name is unknown, or a value is invalid.
-    """
+    """Settings of plain values by name; ``what`` is what messages call one of them, for instance ``mesh option``."""
     try:
         return kind.model_validate(dict(values))
     except ValidationError as error:
@@ -102,15 +93,10 @@ def first_error(error: ValidationError) -> tuple[str, str, object]:
 
 
 def refuse_zero_ends(settings: Settings, start: str, end: str) -> None:
-    """Refuse a logarithmic schedule with an end that is not above 0 (docs/methods.md 2.3).
+    """Refuse a logarithmic schedule with an end that is not above 0 (docs/methods.md 2.3), at the key to blame.
 
-    Args:
-        settings: Whose schedule; without a value at ``end`` there is none.
-        start: Name of the value at the first step.
-        end: Name of the value at the last step.
-
-    Raises:
-        ValidationError: At the key to blame, with what was seen and what to do.
+    ``start`` and ``end`` name the values at the first and the last step; without a value at ``end`` there is no
+    schedule.
     """
     first, last = getattr(settings, start), getattr(settings, end)
     if last is None or (first > 0 and last > 0):

@@ -27,36 +27,21 @@ C2 = 0.03**2
 def ssim(
     rendered: Float[Tensor, "H W C"], truth: Float[Tensor, "H W C"], mask: Bool[Tensor, "H W"] | None = None
 ) -> Float[Tensor, ""]:
-    """Mean of :func:`ssim_map` over the valid pixels and all channels; 0 where no pixel is valid.
-
-    Args:
-        rendered: In [0, 1]. [H, W, C]
-        truth: In [0, 1]. [H, W, C]
-        mask: False where a pixel is ignored; None means every pixel counts. [H, W]
-    """
+    """Mean of :func:`ssim_map` over the valid pixels and all channels; 0 where no pixel is valid."""
     return masked_mean(ssim_map(rendered, truth, mask), mask)
 
 
 def ssim_map(
     rendered: Float[Tensor, "H W C"], truth: Float[Tensor, "H W C"], mask: Bool[Tensor, "H W"] | None = None
 ) -> Float[Tensor, "H W C"]:
-    """Structural similarity of the windows around every pixel, differentiable twice.
+    """Structural similarity of the windows around every pixel of images in [0, 1], differentiable twice.
 
-    With a mask, a window's means, variances and covariance are taken over its valid pixels alone, their weights scaled
-    up to the total that the window has without a mask. So an ignored pixel influences neither the value nor the
-    gradient of any other; a window without ignored pixels is what it is without a mask, to the bit; and two equal
+    With a mask, a window's means, variances and covariance are taken over its valid pixels alone, their weights
+    scaled up to the total that the window has without a mask. So an ignored pixel influences neither the value nor
+    the gradient of any other; a window without ignored pixels is what it is without a mask, to the bit; and two equal
     images score 1 whatever the mask. (Setting ignored pixels to one common value in both images would do the first,
     but would also put a strong common edge into all windows around them and so raise the score there.) The values at
-    the ignored pixels themselves are meaningless: average with
-    :func:`coliags_plugin.core.masked.masked_mean`.
-
-    Args:
-        rendered: In [0, 1]. [H, W, C]
-        truth: In [0, 1]. [H, W, C]
-        mask: False where a pixel is ignored; None means every pixel counts. [H, W]
-
-    Raises:
-        ValueError: The images differ in size.
+    the ignored pixels themselves are meaningless: average with :func:`coliags_plugin.core.masked.masked_mean`.
     """
     if rendered.shape != truth.shape or rendered.dim() != 3:
         raise ValueError(f"SSIM of images of shapes {tuple(rendered.shape)} and {tuple(truth.shape)}: both [H, W, C]")

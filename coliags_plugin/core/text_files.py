@@ -10,11 +10,7 @@ from coliags_plugin.core.errors import InputError
 
 
 def whole_text(path: Path, most: int = bounds.TEXT_BYTES) -> str:
-    """The content of a file in UTF-8, with or without a byte order mark.
-
-    Args:
-        path: The file.
-        most: Bytes that it may have.
+    """The content of a file in UTF-8, with or without a byte order mark, of at most so many bytes.
 
     Raises:
         OSError: The file cannot be read.

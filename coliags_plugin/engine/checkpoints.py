@@ -85,10 +85,7 @@ def save_checkpoint(
     sampler: Sampler,
     cost: TrainingCost | None = None,
 ) -> Path:
-    """Write ``step-<step>`` into ``folder``, for bitwise identical continuation of training.
-
-    Returns:
-        The checkpoint's folder.
+    """Write ``step-<step>`` into ``folder``, for bitwise identical continuation of training; its folder.
 
     Raises:
         NotFiniteError: A number in it is NaN or infinite; nothing was written.
@@ -160,19 +157,7 @@ def keep_newest(folder: Path, count: int) -> None:
 
 
 def take_newest(folder: Path, method: str, device: torch.device) -> Checkpoint | None:
-    """Read the newest whole checkpoint, to go on from; damaged ones are renamed to ``damaged-*``, with a warning.
-
-    Args:
-        folder: The run's checkpoints.
-        method: Name of its method.
-        device: Where to.
-
-    Returns:
-        None where there is no whole checkpoint.
-
-    Raises:
-        InputError: The newest whole one is of another format or method.
-    """
+    """The newest whole checkpoint, to go on from; None without one. Damaged ones are renamed to ``damaged-*``."""
     while (newest := newest_checkpoint(folder)) is not None:
         try:
             return read_checkpoint(newest, method, device)
@@ -196,7 +181,7 @@ def latest_checkpoint(folder: Path) -> Path:
 
 
 def read_checkpoint(path: Path, method: str, device: torch.device) -> Checkpoint:
-    """Read one checkpoint.
+    """Read one checkpoint; generator states stay on the CPU.
 
     Raises:
         DamagedCheckpointError: A file of it is not what was written.
@@ -225,17 +210,7 @@ def read_checkpoint(path: Path, method: str, device: torch.device) -> Checkpoint
 
 
 def restore_model(checkpoint: Checkpoint, config: MethodConfig, scene: Scene, renderer: Renderer) -> Model:
-    """The model of a checkpoint.
-
-    Args:
-        checkpoint: As read.
-        config: Of the run.
-        scene: Of the run, for view modules with parameters per frame.
-        renderer: The renderer of the model.
-
-    Raises:
-        InputError: The checkpoint's field or modules do not fit the config and the scene.
-    """
+    """The model of a checkpoint; the scene is that of the run, for view modules with parameters per frame."""
     try:
         field = config.field.target.from_state(checkpoint.part("field"), config.field.settings)
     except (KeyError, RuntimeError) as error:

@@ -20,13 +20,7 @@ _DATA = {"sparse_depth": "depth at single points"}
 def check_components(
     config: MethodConfig, chosen: ChosenRenderer, scene: Scene, losses: Mapping[str, Loss], schedule: Schedule
 ) -> None:
-    """Refuse components that cannot work together.
-
-    Raises:
-        InputError: The strategy is for another field; the sampler's batches are not for the renderer or a loss; a loss
-            needs data that no training frame has; no initial point is where cameras look; or no loss counts at some
-            step.
-    """
+    """Refuse components that cannot work together."""
     _check_strategy(config)
     _check_sampler(config, chosen, losses)
     _check_splats(config, losses)

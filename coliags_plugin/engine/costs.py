@@ -42,13 +42,9 @@ class TrainingCost(BaseModel):
 
 
 class CostMeter:
-    """Measures the cost of a training loop on top of what earlier parts of the run cost.
+    """Measures the cost of a training loop on top of what earlier parts of the run cost (None where it begins).
 
     Reading a clock and the memory takes microseconds.
-
-    Args:
-        device: Where the loop computes.
-        earlier: Cost of the run before; None where it begins.
     """
 
     def __init__(self, device: torch.device, earlier: TrainingCost | None = None) -> None:
@@ -132,11 +128,7 @@ class RenderMeter:
         self._drawn: list[int] = []
 
     def render(self, view: Callable[[], RenderOutput]) -> RenderOutput:
-        """Render a view, and measure it.
-
-        Args:
-            view: Renders it, and does nothing else.
-        """
+        """Call ``view``, which renders a view and does nothing else, and measure it."""
         self._wait()
         began = time.perf_counter()
         output = view()
@@ -164,14 +156,8 @@ class RenderMeter:
 def seconds_to_psnr(rows: Sequence[Mapping[str, Any]], frames: int) -> dict[str, float | None]:
     """Training seconds at which the smoothed PSNR first reached each of :data:`PSNR_MARKS`; None where it never did.
 
-    Empty without rows.
-
-    Smoothed is the mean over the logged rows of the last ``frames`` steps, one pass over the frames where a step draws
-    one, from the end of the first pass on.
-
-    Args:
-        rows: Of the training log, ascending, with ``step``, ``psnr`` and ``seconds``.
-        frames: Number of training frames.
+    Smoothed is the mean over the logged rows of the last ``frames`` steps (the number of training frames), one pass
+    where a step draws one frame, from the end of the first pass on. Rows ascend by step; empty without rows.
     """
     if not rows:
         return {}

@@ -35,16 +35,9 @@ def load_method_for(
 ) -> LoadedMethod:
     """A method config whose data manager is the one that reads ``path``.
 
-    Options that the method gives to ``auto`` are those of the folder's format; options for another format are dropped.
-
-    Args:
-        path: The scene's folder.
-        method: Name or path of a method config.
-        overrides: ``key.path=value`` assignments; options of the folder's own format are welcome among them.
-        data_format: A data manager's name, instead of what the method says or the files show.
-
-    Raises:
-        InputError: No such method or format, or the config is not valid, or see :func:`find_format`.
+    Options that the method gives to ``auto`` are those of the folder's format, those of the overrides too; options
+    for another format are dropped. ``data_format`` names a data manager instead of what the method says or the files
+    show.
     """
     named = method_tree(method, overrides).find(["datamanager", "name"]).value
     if is_auto("datamanagers", named):
@@ -65,11 +58,7 @@ def load_scene(config: MethodConfig, path: Path) -> Scene:
 
 
 def data_manager(component: Component, path: Path) -> DataManager:
-    """The data manager of a config; of ``auto``, the one that recognises the folder.
-
-    Raises:
-        InputError: See :func:`find_format`.
-    """
+    """The data manager of a config; of ``auto``, the one that recognises the folder."""
     chosen = resolved(component, lambda: find_format(path))
     manager: DataManager = chosen.target(chosen.settings)
     return manager
@@ -90,9 +79,6 @@ def open_scene(
         options: ``key=value`` options of that data manager.
         progress: Called with ``(what, done, total)`` while images are read.
         stored_size: Read images at their stored size, each when it is used, and make no initial points.
-
-    Raises:
-        InputError: See :func:`find_format`; an option is unknown; or the scene cannot be read.
     """
     name = find_format(path) if data_format is None else data_format
     given = override_all(Node({}, "options"), options).plain()
@@ -108,19 +94,13 @@ def open_scene(
 def open_video(
     path: Path, data_format: str | None = None, options: Sequence[str] = (), progress: Progress | None = None
 ) -> tuple[Scene, bool]:
-    """Read all frames of a video as training frames, to estimate their poses.
+    """Read all frames of a video as training frames, to estimate their poses; arguments as of :func:`open_scene`.
 
-    Args:
-        path: Its folder: a scene, or one of a format that can do without poses (``rgbd``).
-        data_format: See :func:`open_scene`.
-        options: See :func:`open_scene`; the split and initial points are not to be chosen.
-        progress: Called with ``(what, done, total)`` while images are read.
+    The folder is a scene, or one of a format that can do without poses (``rgbd``); split and initial points are not
+    to be chosen.
 
     Returns:
         The scene, and whether it has poses; where not, all its cameras are at the origin.
-
-    Raises:
-        InputError: See :func:`open_scene`.
     """
     options = (*options, "split=all-train", "initial_points=none")
     name = data_format or unposed_format(path)

@@ -15,14 +15,7 @@ _SCALE = "scale.png"
 def write_depth_pictures(evaluation: Path, unit: str) -> None:
     """Colour the depth maps of ``expected_depth/SET/`` as ``depth_pictures/SET/``, beside their scale.
 
-    Nearly transparent pixels are hatched.
-
-    Args:
-        evaluation: Folder of an evaluation.
-        unit: Of the depth.
-
-    Raises:
-        InputError: A file cannot be read or written.
+    Nearly transparent pixels are hatched. The unit is that of the depth.
     """
     files = sorted((evaluation / EXPECTED_DEPTH).glob("*/*.tiff"))
     if not files:

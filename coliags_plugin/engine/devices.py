@@ -11,11 +11,7 @@ from coliags_plugin.core.errors import InputError
 
 
 def choose_device(wanted: str) -> torch.device:
-    """The torch device; ``auto`` prefers CUDA.
-
-    Raises:
-        InputError: The device is not there.
-    """
+    """The torch device; ``auto`` prefers CUDA."""
     if wanted == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if wanted == "cuda" and not torch.cuda.is_available():

@@ -32,14 +32,7 @@ class EvaluatedSet:
         self._pixels = self._transparent = 0
 
     def add(self, frame: Frame, comparison: Comparison, scorer: Scorer, alpha: Float[Tensor, "H W"]) -> None:
-        """Score a frame and take it up.
-
-        Args:
-            frame: The frame.
-            comparison: It and what was rendered, prepared by the protocol.
-            scorer: Whose metrics are computed.
-            alpha: As rendered. [H, W]
-        """
+        """Score a frame under its protocol and take it up, with its rendered alpha."""
         self._pixels += int(frame.valid.sum())
         self._transparent += int(((alpha < OPAQUE_ALPHA) & frame.valid).sum())
         self._add_scores(frame.name, scorer.score(comparison))
@@ -79,11 +72,7 @@ class EvaluatedSet:
         return {name for row in self._rows.values() for name in row}
 
     def record(self, metrics: Iterable[str]) -> SetRecord:
-        """The set's record.
-
-        Args:
-            metrics: Names of the protocol's metrics, which are listed even where no frame has one.
-        """
+        """The set's record; the protocol's ``metrics`` are listed even where no frame has one."""
         rows = self._rows.values()
         lacking = set(self._optional) - set(self.optional_metrics)
         names = [*metrics, *self.optional_metrics, *self.seen_metrics]

@@ -35,25 +35,18 @@ logger = logging.getLogger(__name__)
 
 
 def evaluate(trained: TrainedRun, protocol_name: str, other: Scene | None = None) -> Path:
-    """Render every held-out view, compute the protocol's metrics, and write them with the images.
+    """Render every held-out view, write the protocol's metrics and the images, and return their folder.
 
-    Writes into ``eval/<protocol>/``: ``result.json``, the whole :class:`~coliags_plugin.results.record.Result`; and of
-    it ``metrics.json`` (means per test set; the main set's also at the top; null where a metric is not available, with
-    the reason) and ``per_frame.csv``; ``light.json``, where the method has learned a law of the light or gains; and the
-    images. An earlier evaluation under the same protocol is replaced once the new one is complete.
+    Writes into ``eval/<protocol>/``: ``result.json``, the whole :class:`~coliags_plugin.results.record.Result`; and
+    of it ``metrics.json`` (means per test set; the main set's also at the top; null where a metric is not available,
+    with the reason) and ``per_frame.csv``; ``light.json``, where the method has learned a law of the light or gains;
+    and the images. An earlier evaluation under the same protocol is replaced once the new one is complete.
 
     Args:
-        trained: The run.
+        trained: The run, which must not be relit.
         protocol_name: Name of the protocol.
         other: A scene with the true depth, whose frames take the place of the run's own
             (:func:`~coliags_plugin.engine.truth.match_truth`); the folder is then ``eval/<protocol>-truth/``.
-
-    Returns:
-        The evaluation's folder.
-
-    Raises:
-        InputError: The protocol is unknown or wants what the renderer cannot deliver, there is no test frame, the
-            folder cannot be written, the run was relit, or the other scene is not of the same world.
     """
     if trained.relit:
         raise InputError(
@@ -101,11 +94,7 @@ def _warn_of_bounds(learned: Mapping[str, Any]) -> None:
 
 
 def check_evaluable(model: Model, scene: Scene, scorer: Scorer) -> None:
-    """Refuse what cannot be evaluated; worth knowing before training.
-
-    Raises:
-        InputError: The protocol wants what the renderer cannot deliver, or there is no test frame.
-    """
+    """Refuse a renderer without the protocol's outputs, and a scene without test frames."""
     model.check_outputs(scorer.wants, f"protocol '{scorer.protocol.name}'")
     if not any(scene.test_sets.values()):
         raise InputError(f"scene '{scene.name}' has no test frames", "a split that holds some out")

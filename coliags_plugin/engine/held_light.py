@@ -22,11 +22,7 @@ _CAMERAS = 16
 
 
 def mean_camera(cameras: Sequence[Camera]) -> Camera:
-    """The first camera at the mean position and the mean rotation of all (the rotation nearest to their mean matrix).
-
-    Args:
-        cameras: At least one.
-    """
+    """The first camera at the mean position and the mean rotation of all, the one nearest to their mean matrix."""
     poses = torch.stack([camera.camera_to_world.double() for camera in cameras])
     left, _, right = torch.linalg.svd(poses[:, :3, :3].mean(0))
     rotation = left @ torch.diag(torch.tensor([1.0, 1.0, float(torch.det(left @ right))], dtype=left.dtype)) @ right
@@ -63,30 +59,14 @@ LIGHTS: Mapping[str, Callable[[Model, Sequence[Camera]], HeldLight]] = {
 
 
 def held_light(name: str, model: Model, cameras: Sequence[Camera]) -> HeldLight:
-    """The light of a name.
-
-    Args:
-        name: ``mean`` or ``flattened``.
-        model: Of Gaussians.
-        cameras: The training cameras.
-
-    Raises:
-        InputError: There is no such light.
-    """
+    """The light of a name in :data:`LIGHTS`, for a model of Gaussians and its training cameras."""
     if name not in LIGHTS:
         raise InputError(f"no light '{name}'", f"one of {', '.join(LIGHTS)}", did_you_mean(name, LIGHTS))
     return LIGHTS[name](model, cameras)
 
 
 def render_held(model: Model, camera: Camera, light: HeldLight, wants: Sequence[str]) -> RenderOutput:
-    """What the field and the renderer of a model show of a view under a held light; view modules are left out.
-
-    Args:
-        model: Of Gaussians, with a splatting renderer.
-        camera: The view.
-        light: What lights it.
-        wants: Names of outputs.
-    """
+    """What the field and the renderer of a model show of a view under a held light; view modules are left out."""
     camera, field, renderer = model.placed(camera), gaussians_of(model), splatting_of(model)
     return renderer.draw(gaussians_under(field, camera, light), camera, wants)
 

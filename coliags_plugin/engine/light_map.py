@@ -63,11 +63,7 @@ class TrueLight:
         return torch.from_numpy(encode(colors.numpy() ** self.gamma, self.gamma, self.knee))
 
     def attenuation(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
-        """Factor of the lamp's direct light on encoded colours, up to a constant. [N]
-
-        Args:
-            points: In camera axes, mm. [N, 3]
-        """
+        """Factor of the lamp's direct light on encoded colours at points in camera axes, mm, up to a constant. [N]"""
         sight = points - points.new_tensor(self.offset)
         distances = sight.norm(dim=1)
         psi = sight @ points.new_tensor(self.axis) / distances
@@ -78,14 +74,7 @@ class TrueLight:
 
 
 def find_true_light(scene: Path) -> TrueLight | None:
-    """The light of the phantom in a folder; None where it is no phantom.
-
-    Args:
-        scene: The folder of a scene.
-
-    Raises:
-        InputError: Its truth is damaged.
-    """
+    """The light of the phantom in a folder; None where it is no phantom."""
     file = scene / "truth" / "light.json"
     if not file.is_file():
         return None
@@ -209,11 +198,7 @@ def light_map(trained: TrainedRun) -> LightMap | None:
 
 
 def write_light_map(trained: TrainedRun, folder: Path) -> None:
-    """Write ``light.json``, and ``light.html`` with charts of law, gains and response, into a folder.
-
-    Raises:
-        InputError: The method has learned none of them, no training frame sees a point, or the files cannot be written.
-    """
+    """Write ``light.json``, and ``light.html`` with charts of law, gains and response, into a folder."""
     found = light_map(trained)
     if found is None:
         raise InputError(

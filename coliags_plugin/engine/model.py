@@ -118,14 +118,9 @@ class Model(nn.Module):
         return self.field.feature_channels
 
     def check_outputs(self, wants: Sequence[str], asking: str) -> None:
-        """Refuse outputs that the renderer does not have for this field, wanted by a caller or a view module.
+        """Refuse outputs that the renderer does not have for this field, wanted by a view module or by ``asking``.
 
-        Args:
-            wants: Names of outputs.
-            asking: Subject of the message about them.
-
-        Raises:
-            InputError: See above.
+        ``asking`` is the subject of the message about ``wants``.
         """
         wanted = {asking: frozenset(wants)}
         wanted |= {f"module '{name}'": module.wants for name, module in self.view_modules.items()}
@@ -140,9 +135,5 @@ class Model(nn.Module):
 
 
 def make_view_modules(config: MethodConfig, scene: Scene, generator: torch.Generator) -> dict[str, ViewModule]:
-    """Fresh view modules of a method for a scene.
-
-    Raises:
-        InputError: One names what the scene does not have.
-    """
+    """Fresh view modules of a method for a scene."""
     return {name: node.target.from_scene(scene, node.settings, generator) for name, node in config.modules.items()}

@@ -28,9 +28,6 @@ class Optimizers:
         settings: Rates by group name; must name exactly the model's groups.
         steps: Over which scheduled rates fall.
         extent: The scene's, for groups whose rates scale with it, scene units.
-
-    Raises:
-        InputError: The groups named are not the model's.
     """
 
     def __init__(self, model: Model, settings: Mapping[str, OptimizerSettings], steps: int, extent: float) -> None:
@@ -61,11 +58,7 @@ class Optimizers:
             optimizer.zero_grad(set_to_none=True)
 
     def check_moments(self) -> None:
-        """Refuse a state of Adam that it cannot go on from.
-
-        Raises:
-            ValueError: A parameter has moments of another shape or type, or lacks some of several.
-        """
+        """Raise ValueError if a parameter has moments of another shape or type, or lacks some of several."""
         for name, adam in self.adam.items():
             for parameter, state in adam.state.items():
                 moment = (tuple(parameter.shape), parameter.dtype)
@@ -75,15 +68,11 @@ class Optimizers:
                     raise ValueError(f"group {name} has {found}, expected {wanted}")
 
     def add_rows(self, rows: Mapping[str, Tensor], parents: Tensor | None = None) -> None:
-        """Append rows, which have no gradient and no momentum.
+        """Append rows, by group, which have no gradient and no momentum.
 
-        With ``parents`` their first Adam steps are as small as their parents': a mean square of zero beside a step
-        count long past its bias correction would make the first steps three times the learning rate, however small the
-        gradient.
-
-        Args:
-            rows: What to append, by group. [B, ...]
-            parents: For each new row, the row whose mean squared gradient it takes over. [B]
+        With ``parents``, each new row takes over the mean squared gradient of a row, so that its first Adam steps are
+        as small: a mean square of zero beside a step count long past its bias correction would make the first steps
+        three times the learning rate, however small the gradient.
         """
         for name, extra in rows.items():
 
@@ -96,22 +85,12 @@ class Optimizers:
             self._change(name, appended)
 
     def keep_rows(self, groups: Sequence[str], keep: Tensor) -> None:
-        """Keep only some rows of parameters, of their gradients and of their moments.
-
-        Args:
-            groups: Names of the groups.
-            keep: True for rows that stay. [M]
-        """
+        """Keep only some rows of parameters, of their gradients and of their moments."""
         for name in groups:
             self._change(name, lambda _, old: old[keep])
 
     def reset_rows(self, group: str, rows: Tensor | None = None) -> None:
-        """Reset the moments of some rows, or of all.
-
-        Args:
-            group: Name of the group.
-            rows: True for those to reset. [M]
-        """
+        """Reset the moments of the rows that are True, or of all."""
         parameter = self._parameter(group)
         state = self.adam[group].state.get(parameter, {})
         for key in (_MOMENTUM, _MEAN_SQUARE):
@@ -120,7 +99,7 @@ class Optimizers:
 
     @torch.no_grad()
     def replace_values(self, group: str, values: Tensor) -> None:
-        """Replace the values of a group and reset their moments. [M, ...]"""
+        """Replace the values of a group and reset their moments."""
         self._parameter(group).copy_(values)
         self.reset_rows(group)
 

@@ -16,16 +16,10 @@ from coliags_plugin.engine.progress_displays import PLAIN_LINE_EVERY, Display, o
 
 
 class ProgressReport:
-    """Progress towards a total, with facts and the remaining time.
+    """Progress from ``start`` towards a total, with facts and the remaining time, as a context manager.
 
-    Use as a context manager; call :meth:`update` as often as you like.
-
-    Args:
-        title: What is being done.
-        total: Where the count ends.
-        start: Where it begins.
-        plain_every: Between lines where there is neither a terminal nor a notebook, seconds.
-        console: Where to; None: standard error.
+    Where there is neither a terminal nor a notebook, a line appears every ``plain_every`` seconds. The console is
+    standard error by default.
     """
 
     def __init__(
@@ -61,8 +55,7 @@ class ProgressReport:
 def progress_callback(after: float = 0.0) -> Iterator[Callable[[str, int, int], None]]:
     """A function ``(title, done, total)`` that shows one report per title, one after the other.
 
-    Args:
-        after: Say nothing about what takes less than so many seconds.
+    Nothing is said about what takes less than ``after`` seconds.
     """
     with ExitStack() as stack:
         current: list[ProgressReport] = []

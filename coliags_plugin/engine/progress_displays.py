@@ -31,15 +31,7 @@ class Display(Protocol):
 def open_display(
     console: Console, title: str, total: int, start: int, plain_every: float = PLAIN_LINE_EVERY
 ) -> Display:
-    """The display that fits where the console writes to.
-
-    Args:
-        console: The console.
-        title: What is being done.
-        total: Where the count ends.
-        start: Where it begins.
-        plain_every: Between plain lines, seconds.
-    """
+    """The display that fits where the console writes to; plain lines come every ``plain_every`` seconds."""
     if console.is_terminal:
         return TerminalBar(console, title, total, start)
     if console.is_jupyter:
@@ -73,16 +65,7 @@ class TerminalBar:
 
 
 class TextDisplay:
-    """A line of text now and then, and one at the end.
-
-    Args:
-        title: What is being done.
-        total: Where the count ends.
-        start: Where it begins.
-        every: Between lines, seconds.
-        show: Shows a line.
-        at_once: Whether the first line is shown at once.
-    """
+    """A line of text every so many seconds, the first one at once or not, and one at the end."""
 
     def __init__(
         self, title: str, total: int, start: int, every: float, show: Callable[[str], None], at_once: bool = False

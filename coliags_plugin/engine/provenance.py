@@ -26,17 +26,7 @@ def run_provenance(
     chosen: ChosenRenderer,
     model: Model,
 ) -> JsonObject:
-    """What a run is and was made with.
-
-    Args:
-        method: The method, resolved.
-        scene: What the run is on.
-        scene_path: Where that was read from.
-        seed: Of every random stream.
-        device: Where it computes.
-        chosen: Its renderer.
-        model: Of the run.
-    """
+    """What a run is and was made with."""
     footprint = scene.pixel_footprint
     return {
         "method": method.name,

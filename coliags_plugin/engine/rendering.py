@@ -52,7 +52,7 @@ def render_run(
     depth_tiff: bool = False,
     light_map: bool = False,
 ) -> None:
-    """Write colour, depth and error images of a set of frames, and a video along the trajectory.
+    """Render colour, depth and error images of a set of frames, and a video along the trajectory.
 
     A relit run has its light in ``lamp.yaml``, and no colour errors, there being no images in that light. Depth is
     hatched where alpha is below 0.5, and has no errors where the scene's own is estimated.
@@ -60,7 +60,7 @@ def render_run(
     Args:
         trained: The run.
         output: The folder to make.
-        frames: ``train``, ``all`` (train and test in video order), or the name of a test set.
+        frames: See :func:`choose_frames`.
         video: Also write ``trajectory.mp4``: every frame's view in video order, rgb beside depth.
         fps: Of the video.
         overwrite: Replace ``output`` where it exists.
@@ -68,10 +68,6 @@ def render_run(
         depth_kind: Which depth (docs/conventions.md 3).
         depth_tiff: Also write depth as float32 TIFF, scene units, of every pixel.
         light_map: Also write the learned light, ``light.html`` and ``light.json``.
-
-    Raises:
-        InputError: No such frames, channel or learned light, the renderer does not deliver that depth, or the folder
-            exists or cannot be written.
     """
     chosen = choose_frames(trained.scene, frames)
     _check_channels(trained, channels)
@@ -135,13 +131,7 @@ def _check_channels(trained: TrainedRun, channels: Sequence[str]) -> None:
 
 @torch.no_grad()
 def render_view(trained: TrainedRun, of: Frame | Camera, wants: Sequence[str] = _WANTS) -> RenderOutput:
-    """What the model of a run renders.
-
-    Args:
-        trained: The run.
-        of: A frame of its scene, or a free camera.
-        wants: Names of outputs.
-    """
+    """What the model of a run renders of a frame of its scene, or from a free camera."""
     if trained.held is not None:
         camera = of if isinstance(of, Camera) else of.camera
         return render_held(trained.model, camera.to(trained.device), trained.held, wants)
@@ -173,13 +163,7 @@ def _write_frame(
 
 
 def depth_picture(output: RenderOutput, depth: str, limits: tuple[float, float]) -> UInt8[np.ndarray, "H W 3"]:
-    """A rendered depth in colours, hatched where alpha is below :data:`OPAQUE_ALPHA`. [H, W, 3]
-
-    Args:
-        output: A rendered view.
-        depth: Name of the output.
-        limits: Depths of the first and the last colour.
-    """
+    """A rendered depth in colours between two limits, hatched where alpha is below :data:`OPAQUE_ALPHA`."""
     known = torch.where(output.alpha >= OPAQUE_ALPHA, output[depth], torch.nan)
     return colorize_depth(known, limits, hatched=True)
 

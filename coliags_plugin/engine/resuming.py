@@ -27,15 +27,7 @@ def resumed_method(
 ) -> LoadedMethod:
     """Load the method config stored in a run folder, with the overrides applied to it.
 
-    Args:
-        run: The run.
-        method: Name or path of the method the user believes it to be of.
-        data: The scene's folder.
-        overrides: ``key.path=value`` assignments.
-        data_format: A data manager's name, or None for the run's own.
-
-    Raises:
-        InputError: The run is of another method, or its config is damaged.
+    ``method`` is what the user believes the run to be of; ``data_format`` replaces the run's own data manager.
     """
     name = method_name(method)
     _check_method(run, name)
@@ -50,11 +42,7 @@ def _check_method(run: RunFolder, name: str) -> None:
 
 
 def check_same_run(run: RunFolder, method: LoadedMethod, scene: Scene, scene_path: str) -> None:
-    """Refuse to resume with another method, other settings (the schedule apart) or other data.
-
-    Raises:
-        InputError: See above.
-    """
+    """Refuse to resume with another method, other settings (the schedule apart) or other data."""
     _check_method(run, method.name)
     ignored = {"schedule", "description"}
     saved = run.method().config.model_dump(exclude=ignored)
@@ -71,16 +59,7 @@ def check_same_run(run: RunFolder, method: LoadedMethod, scene: Scene, scene_pat
 
 
 def record_schedule(run: RunFolder, config: MethodConfig, step: int) -> None:
-    """Write a schedule that differs from the run's own into its config, and the change into its provenance.
-
-    Args:
-        run: The run.
-        config: What it goes on with.
-        step: Steps it has taken.
-
-    Raises:
-        InputError: The schedule ends before that step.
-    """
+    """Write a schedule that differs from the run's own into its config, and the change into its provenance."""
     before, now = run.method().config.schedule, config.schedule
     if now.steps < step:
         raise InputError(f"{run.path} has taken {step} steps already", f"--steps {step} or more, not {now.steps}")

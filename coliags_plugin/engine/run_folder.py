@@ -129,11 +129,7 @@ class RunFolder:
         return folder
 
     def create(self, config_yaml: str, provenance: JsonObject, overwrite: bool) -> None:
-        """Create the folder atomically with config and provenance.
-
-        Raises:
-            InputError: It exists and ``overwrite`` is off, or it cannot be written.
-        """
+        """Create the folder atomically with config and provenance."""
         self.check_free(overwrite)
         provenance = {"format": FORMAT, **provenance}
         if self.path.is_dir() and not any(self.path.iterdir()):
@@ -148,11 +144,7 @@ class RunFolder:
         atomic_write(self.config_file, config_yaml)
 
     def check_free(self, overwrite: bool) -> None:
-        """Refuse a folder that holds anything, or that is not a run and would be overwritten.
-
-        Raises:
-            InputError: See above.
-        """
+        """Refuse a folder that holds anything, or that is not a run and would be overwritten."""
         if not self.path.exists() or (self.path.is_dir() and not any(self.path.iterdir())):
             return
         if not overwrite:

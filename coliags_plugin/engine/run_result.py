@@ -34,17 +34,9 @@ def run_result(
     meter: RenderMeter,
     truth: Truth | None = None,
 ) -> Result:
-    """Compose the result of a run.
+    """Compose the result of a run from its test sets, at least one, and what rendering them cost.
 
-    Args:
-        trained: The run.
-        scorer: What it was scored with.
-        evaluated: Its test sets, at least one.
-        meter: What rendering them cost.
-        truth: What it was evaluated against, if not its own scene.
-
-    Raises:
-        InputError: The training log cannot be read.
+    ``truth`` is what it was evaluated against, if not its own scene.
     """
     protocol, provenance = scorer.protocol, trained.provenance
     config = plain_config(trained.config.model_dump())

@@ -32,15 +32,7 @@ class Scores:
 
 
 class Scorer:
-    """Renders held-out views and scores them under one protocol.
-
-    Args:
-        protocol: Its name.
-        only: Of its metrics only these; all where None.
-
-    Raises:
-        InputError: There is no such protocol, its own name differs, or it names an unknown metric.
-    """
+    """Renders held-out views and scores them under the protocol of a name, by all its metrics or only some."""
 
     def __init__(self, protocol: str, only: Sequence[str] | None = None) -> None:
         self.protocol: Protocol = registry.protocols.get(protocol)()

@@ -66,16 +66,7 @@ class TrainedRun:
 
 
 def load_trained(path: Path, device: torch.device, data: Path | None = None) -> TrainedRun:
-    """Load a run.
-
-    Args:
-        path: The run folder.
-        device: Where to compute.
-        data: The scene's folder, where it has moved since training.
-
-    Raises:
-        InputError: No run, no checkpoint, or the data are gone or have changed.
-    """
+    """Load a run, whose scene is read from ``data`` where it has moved since training."""
     run = RunFolder.existing(path)
     config = run.method().config
     identity, provenance = run.identity(), run.provenance()

@@ -49,16 +49,7 @@ MAX_PSNR = 100.0
 class Trainer:
     """Trains one method on one scene into one run folder.
 
-    Args:
-        method: The method, resolved.
-        scene: What to train on.
-        scene_path: Where it was read from, for the record.
-        run: Where to write.
-        seed: Of every random stream.
-        device: Where to compute.
-
-    Raises:
-        InputError: The components do not fit each other or the scene; found out before anything is written.
+    Whether the components fit each other and the scene is found out before anything is written.
     """
 
     def __init__(
@@ -107,10 +98,6 @@ class Trainer:
         """Resume from the run's newest whole checkpoint, or from the start without one; bitwise identical on the CPU.
 
         A schedule that differs from the run's own is taken as a change on purpose and recorded.
-
-        Raises:
-            InputError: The checkpoint is damaged or of another method, the run's config or data differ, or the run has
-                more steps behind it than the schedule has.
         """
         check_same_run(self.run, self.method, self.scene, self.scene_path)
         saved = checkpoints.take_newest(self.run.checkpoints, self.method.name, self.device)
@@ -179,10 +166,9 @@ class Trainer:
                     )
 
     def take_step(self) -> JsonObject:
-        """Train on the next frame.
+        """Train on the next frame; the row of the log.
 
-        Returns:
-            The row of the log: step, loss, terms, PSNR of this view in dB, what was drawn, what the strategy did.
+        Step, loss, terms, PSNR of this view in dB, what was drawn, what the strategy did.
 
         Raises:
             NotFiniteError: A loss term, or a parameter as the step before left it, is NaN or infinite.
@@ -313,10 +299,7 @@ def _counts(drawn: Splats) -> dict[str, int]:
 
 
 def _resident(frames: list[Frame], device: torch.device) -> list[Frame]:
-    """The frames, moved to the device if they fill at most half of its free memory.
-
-    Images stay uint8 there too.
-    """
+    """The frames, moved to the device if they fill at most half of its free memory; images stay uint8 there too."""
     if device.type != "cuda":
         return frames
     tensors = [(f.image, f.depth, f.depth_at_least, f.mask, f.seen, f.depth_confidence) for f in frames]
@@ -331,12 +314,9 @@ STOPPING = tuple(filter(None, (signal.SIGINT, signal.SIGTERM, _HANGUP)))
 
 @contextmanager
 def deferred_stop() -> Iterator[Callable[[], bool]]:
-    """Defer :data:`STOPPING` signals: the yielded function tells whether one has come; a second one stops at once.
+    """Defer :data:`STOPPING` signals: the yielded function tells whether one has come.
 
-    SIGHUP stays ignored where it is, as under nohup.
-
-    Raises:
-        KeyboardInterrupt: On the second signal.
+    The second one raises KeyboardInterrupt. SIGHUP stays ignored where it is, as under nohup.
     """
     asked = False
 

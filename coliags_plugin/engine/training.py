@@ -72,18 +72,8 @@ def open_training(
     ``continue``  begins                goes on as it was begun
     ============  ====================  ============================================
 
-    Any other folder is refused. No other process can train the run until the block ends.
-
-    Args:
-        request: What to train.
-        folder: The run.
-        device: Where to compute.
-        if_exists: See above.
-        owned: Whether the caller holds the run's lock.
-
-    Raises:
-        InputError: See above; method, data or options are invalid or do not fit each other or the run; or another
-            process trains it. Nothing was written.
+    Any other folder is refused; after a refusal, nothing was written. No other process can train the run until the
+    block ends; ``owned``: the caller holds the run's lock.
     """
     resumes = if_exists == "resume" or (if_exists == "continue" and folder.config_file.is_file())
     if resumes:

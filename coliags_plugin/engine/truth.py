@@ -28,17 +28,10 @@ class Truth:
 
 
 def match_truth(own: Scene, other: Scene) -> Truth:
-    """Find a scene's frames in another one.
+    """Find the frames of a run's scene in another one, which has the true depth.
 
-    The set ``test`` is that of the first scene, further sets are those of the second. Frames are matched by name if all
-    names are there, else by their index in the video if the scenes have equally many frames.
-
-    Args:
-        own: The scene that a run was trained on.
-        other: The scene with the true depth.
-
-    Raises:
-        InputError: The frames cannot be matched, or their cameras are at different places.
+    The set ``test`` is that of the first scene, further sets are those of the second. Frames are matched by name if
+    all names are there, else by their index in the video if the scenes have equally many frames.
     """
     mine, theirs = own.video, other.video
     by_name = {frame.name: frame for frame in theirs}
