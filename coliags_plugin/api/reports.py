@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from coliags_plugin.api.runs import Run
 from coliags_plugin.core.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
     from coliags_plugin.comparison.compare import FinishedComparison
+    from coliags_plugin.comparison.report.report import Format
     from coliags_plugin.reporting.model import Section
-
-#: What a report can be written as.
-Format = Literal["html", "markdown", "latex", "csv"]
 
 
 def report(
@@ -37,7 +35,7 @@ def report(
     Args:
         of: Runs, comparisons, or paths of run folders, results files and folders of comparisons.
         output: File to write; with several formats, its suffix is that of each. None: ``report.html``, ``.md``, ...
-        formats: What to write; CSV has every metric of every frame.
+        formats: ``html``, ``markdown``, ``latex``, ``csv`` with every metric of every frame, ``json`` with the tables.
         methods: Names of methods to show, in this order; empty: all.
         columns: Metrics to show; empty: the default ones.
         reference: Method that the others are compared with; None: ``coliags``, or the best where it is not there.

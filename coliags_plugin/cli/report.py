@@ -11,6 +11,8 @@ import tyro
 from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import print_summary
 
+FormatName = Literal["html", "markdown", "latex", "csv", "json", "all"]
+
 
 @dataclass(frozen=True)
 class ReportCommand:
@@ -37,8 +39,10 @@ class ReportCommand:
     """A remark shown at the top."""
     scene: arguments.OptionalPath = None
     """Run folder whose scene the HTML page lets its reader fly through, offline; needs the extra `viewer`."""
-    format: Annotated[tuple[Literal["html", "markdown", "latex", "csv", "all"], ...], tyro.conf.UseAppendAction] = ()
-    """What to write, repeatable: html (default), markdown, latex (booktabs), csv (every frame), or all."""
+    format: Annotated[
+        tuple[Literal["html", "markdown", "latex", "csv", "json", "all"], ...], tyro.conf.UseAppendAction
+    ] = ()
+    """What to write, repeatable: html (default), markdown, latex (booktabs), csv (every frame), json (tables), all."""
     anonymous: bool = False
     """Leave out absolute paths that results hold (docs/security.md 4)."""
     json: arguments.AsJson = False

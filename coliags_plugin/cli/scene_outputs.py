@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from coliags_plugin.config.assignments import settings_of
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import refuse_overlap
 
 if TYPE_CHECKING:
     from coliags_plugin.core.settings import Settings
@@ -31,10 +32,6 @@ def refuse_output(output: Path, source: Path, overwrite: bool) -> None:
     Raises:
         InputError: It is, contains or is inside the input, or is not empty and ``overwrite`` is off.
     """
-    made, read = output.resolve(), source.resolve()
-    if made == read or made in read.parents or read in made.parents:
-        raise InputError(
-            f"--output {output}, and the input is {source}", "a folder apart from the input", "Choose another"
-        )
+    refuse_overlap(output, source)
     if not overwrite and output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise InputError(f"{output} already exists", "a new or empty folder", "Choose another, or pass --overwrite")

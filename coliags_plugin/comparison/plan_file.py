@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import read_json
@@ -38,8 +38,8 @@ class PlannedCell(_PlanPart):
     seed: int
     protocol: str
     key: str
-    run: str  # run folder, relative to the comparison's
-    result: str  # results file, relative to the comparison's folder; there once the cell is done
+    run: str = Field(pattern=f"^{RUNS}/")  # run folder, relative to the comparison's
+    result: str = Field(pattern=f"^{RESULTS}/")  # results file, likewise; there once the cell is done
 
     @property
     def identity(self) -> tuple[str, str, int, str]:

@@ -34,6 +34,15 @@ if TYPE_CHECKING:
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
+def refuse_overlap(output: Path, source: Path) -> None:
+    """Refuse an output folder that is, contains or is inside the input."""
+    made, read = output.resolve(), source.resolve()
+    if made == read or made in read.parents or read in made.parents:
+        raise InputError(
+            f"--output {output}, and the input is {source}", "a folder apart from the input", "Choose another"
+        )
+
+
 @contextmanager
 def atomic_folder(target: Path, overwrite: bool = False) -> Iterator[Path]:
     """Scratch folder that becomes ``target`` when the block ends without an error; first, killed ones are removed."""

@@ -12,6 +12,7 @@ import torch
 
 from coliags_plugin.config.method_config import load_method
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import refuse_overlap
 from coliags_plugin.core.locks import locked
 from coliags_plugin.core.progress import Progress
 from coliags_plugin.datamanagers.recognition import find_format, recognised
@@ -43,11 +44,7 @@ def reconstruct(
             other settings; or another process works on it.
         InterruptedRunError: Ctrl-C in training, after the state was saved.
     """
-    made, read = out.resolve(), source.resolve()
-    if made == read or made in read.parents or (source.is_dir() and read in made.parents):
-        raise InputError(
-            f"--output {out}, and the input is {source}", "a folder apart from the input", "Choose another"
-        )
+    refuse_overlap(out, source)
     if mask is not None and not mask.is_file():
         raise InputError(f"no file {mask}", "an image, black where pixels are ignored", "Check --mask")
     data_format = find_format(source) if source.is_dir() and recognised(source) else None

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
+from coliags_plugin.reporting.numbers import duration
 from coliags_plugin.results.record import SEEN_SUFFIX, Result
 
 
@@ -42,21 +44,22 @@ def facts(result: Result) -> dict[str, str]:
     cost = result.cost
     threads = "" if cost.threads is None else f", {cost.threads} threads"
     reached = {mark: seconds for mark, seconds in cost.seconds_to_psnr.items() if seconds is not None}
+    mib = None if cost.checkpoint_bytes is None else cost.checkpoint_bytes / 2**20
     texts = {
         "key": result.key,
         "seed": str(result.seed),
         "split": f"{result.scene.split or 'unnamed'}, {len(result.scene.train)} training frames",
         "trained on": f"{cost.device}{threads}",
-        "training": _said(cost.train_seconds, "{:.1f} s"),
-        "psnr reached": ", ".join(f"{mark} dB after {seconds:.1f} s" for mark, seconds in reached.items()),
-        "processor time": _said(cost.processor_seconds, "{:.1f} s"),
-        "peak memory": _said(cost.peak_memory_mib, "{:.0f} MiB"),
-        "rendering": _said(cost.render_fps, "{:.2f} views a second"),
-        "gaussians": _said(cost.gaussians, "{:.0f} in a view"),
-        "checkpoint": _said(None if cost.checkpoint_bytes is None else cost.checkpoint_bytes / 2**20, "{:.1f} MiB"),
+        "training": _said(cost.train_seconds, duration),
+        "psnr reached": ", ".join(f"{mark} dB after {duration(seconds)}" for mark, seconds in reached.items()),
+        "processor time": _said(cost.processor_seconds, duration),
+        "peak memory": _said(cost.peak_memory_mib, "{:.0f} MiB".format),
+        "rendering": _said(cost.render_fps, "{:.2f} views a second".format),
+        "gaussians": _said(cost.gaussians, "{:.0f} in a view".format),
+        "checkpoint": _said(mib, "{:.1f} MiB".format),
     }
     return {name: text for name, text in texts.items() if text}
 
 
-def _said(value: float | None, form: str) -> str:
-    return "" if value is None else form.format(value)
+def _said(value: float | None, text: Callable[[float], str]) -> str:
+    return "" if value is None else text(value)

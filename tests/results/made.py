@@ -43,7 +43,7 @@ def made_result(sets=None, **changes) -> Result:
         "steps": 60,
         "metrics": METRICS,
         "metrics_sha256": metrics_sha256(sets),
-        "cost": CostRecord(device="a processor", train_seconds=12.5, gaussians=1234.5),
+        "cost": CostRecord(device="a processor", train_seconds=72.0, gaussians=1234.5),
         "config": {"schedule": {"steps": 60}},
         "software": {"package_version": "1.0"},
     }

@@ -191,7 +191,7 @@ def test_memory_of_a_gpu_is_named_as_such():
 def test_show_prints_means_and_costs(runs, capsys):
     assert run("results", "show", runs / "one/eval/paper/result.json") == 0
     printed = capsys.readouterr().out
-    for part in ("coliags on wall, seed 0, 60 steps", "30.75", "0123456789abcdef", "12.5 s", "1234 in a view"):
+    for part in ("coliags on wall, seed 0, 60 steps", "30.75", "0123456789abcdef", "1 min 12 s", "1234 in a view"):
         assert part in printed
     assert "processor time" not in printed, "it was not measured"
     assert run("results", "show", runs) == 0

@@ -1,4 +1,4 @@
-"""Reports of evaluated runs as HTML, Markdown, LaTeX and CSV."""
+"""Reports of evaluated runs as HTML, Markdown, LaTeX, CSV and JSON."""
 
 from __future__ import annotations
 
@@ -9,16 +9,17 @@ from typing import Literal, get_args
 from coliags_plugin.comparison.report.frame_tables import per_frame_csv
 from coliags_plugin.comparison.report.page import Choices, screen_page, text_page
 from coliags_plugin.comparison.report.sources import read_study
-from coliags_plugin.core.files import atomic_write
+from coliags_plugin.core.files import atomic_write, write_json
 from coliags_plugin.reporting.html_page import refuse_folder, write_html
+from coliags_plugin.reporting.json_values import page_values
 from coliags_plugin.reporting.latex import latex_text
 from coliags_plugin.reporting.markdown import markdown_text
 from coliags_plugin.reporting.model import Section
 
-Format = Literal["html", "markdown", "latex", "csv"]
+Format = Literal["html", "markdown", "latex", "csv", "json"]
 
 FORMATS: tuple[Format, ...] = get_args(Format)
-SUFFIXES: dict[Format, str] = {"html": ".html", "markdown": ".md", "latex": ".tex", "csv": ".csv"}
+SUFFIXES: dict[Format, str] = {"html": ".html", "markdown": ".md", "latex": ".tex", "csv": ".csv", "json": ".json"}
 
 
 def write_report(
@@ -36,7 +37,7 @@ def write_report(
     Args:
         paths: Run folders, results files, and folders of a comparison.
         output: The file to write, replaced if it is there; with several formats, its suffix is that of each.
-        formats: What to write. CSV has every metric of every frame.
+        formats: What to write. CSV has every metric of every frame, JSON the tables.
         choices: Columns, reference, title, note and number of views.
         protocol: Name of the evaluation to read from folders.
         methods: Names of methods to show, in this order; empty: all.
@@ -62,6 +63,8 @@ def write_report(
             write_html(screen, file)
         elif each == "csv":
             atomic_write(file, per_frame_csv(study))
+        elif each == "json":
+            write_json(file, page_values(text))
         else:
             atomic_write(file, latex_text(text) if each == "latex" else markdown_text(text))
     return [*files.values()]

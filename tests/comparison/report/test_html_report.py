@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import csv
 import io
+import json
 import re
 from html.parser import HTMLParser
 
@@ -355,13 +356,16 @@ def test_the_page_holds_the_values_of_all_frames(tmp_path, two_runs):
 
 
 def test_formats(tmp_path, two_runs):
-    files = write_report(two_runs, tmp_path / "out/tables.html", ("markdown", "html", "latex", "csv"))
+    files = write_report(two_runs, tmp_path / "out/tables.html", ("markdown", "html", "latex", "csv", "json"))
     assert {file.stem for file in files} == {"tables"}
     text = {file.suffix: file.read_text() for file in files}
-    assert list(text) == [".md", ".html", ".tex", ".csv"]
+    assert list(text) == [".md", ".html", ".tex", ".csv", ".json"]
     assert text[".md"].startswith("# 2 methods compared on cecum")
     assert r"\toprule" in text[".tex"]
     assert text[".csv"].startswith("scene,split,set,frame,method,seed,psnr")
+    values = json.loads(text[".json"])
+    (summary, _) = values["sections"][0]["tables"]
+    assert [(row["method"], row["psnr"]) for row in summary["rows"]] == [("coliags", 32.0), ("3dgs", 30.0)]
     assert write_report(two_runs, tmp_path / "table.txt", ("markdown",)) == [tmp_path / "table.txt"]
 
 

@@ -121,6 +121,10 @@ def test_the_plan_gives_order_runs_and_what_is_not_finished(tmp_path):
     for content, match in damaged.items():
         (folder / "plan.json").write_text(content)
         refuses([folder], f"plan.json.*{match}")
+    plan(folder, results)
+    text = (folder / "plan.json").read_text()
+    (folder / "plan.json").write_text(text.replace('"results/', '"elsewhere/'))
+    refuses([folder], "plan.json: cells.0.result: String should match pattern")
 
 
 def test_a_method_under_a_second_name_shows_the_run_of_the_first(tmp_path):
