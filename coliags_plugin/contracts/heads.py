@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import ClassVar
+from typing import ClassVar, Generic
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -11,25 +11,26 @@ from torch import Tensor, nn
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.json_files import JsonObject
 from coliags_plugin.core.scenes import Scene
-from coliags_plugin.core.settings import Settings
+from coliags_plugin.core.settings import Settings, SettingsT
 from coliags_plugin.lighting.lamps import HeldLight
 
 
-class Head(nn.Module, ABC):
-    """Exchangeable decoder within a field, with parameter groups of its own."""
+class Head(nn.Module, ABC, Generic[SettingsT]):
+    """Exchangeable decoder within a field, with parameter groups of its own.
+
+    Made by ``Head(settings, features, children, generator)``.
+    """
 
     Settings: ClassVar[type[Settings]]
+    settings: SettingsT
 
     @abstractmethod
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Trainable parameters by the name that ``optimizers`` uses."""
 
 
-class GeometryHead(Head):
-    """Anchor feature and viewing direction -> opacity, scale and rotation of every child.
-
-    Made by ``Head(settings, features, children, generator)``.
-    """
+class GeometryHead(Head[SettingsT]):
+    """Anchor feature and viewing direction -> opacity, scale and rotation of every child."""
 
     @abstractmethod
     def forward(
@@ -47,11 +48,8 @@ class GeometryHead(Head):
         """
 
 
-class AppearanceHead(Head):
-    """Anchor feature and viewing geometry -> colour of every child.
-
-    Made by ``Head(settings, features, children, generator)``.
-    """
+class AppearanceHead(Head[SettingsT]):
+    """Anchor feature and viewing geometry -> colour of every child."""
 
     @property
     def knows_lamp(self) -> bool:

@@ -16,11 +16,7 @@ MIN_SQUARED_DISTANCE = 1e-7
 
 
 def initial_positions(scene: Scene) -> Float[Tensor, "N 3"]:
-    """Positions of the scene's initial points, scene units. [N, 3]
-
-    Raises:
-        InputError: It has none.
-    """
+    """Positions of the scene's initial points, scene units; refuses scenes without."""
     if len(scene.points) == 0:
         raise InputError(
             "the scene has no initial points",
@@ -31,15 +27,7 @@ def initial_positions(scene: Scene) -> Float[Tensor, "N 3"]:
 
 
 def voxelize(points: Float[Tensor, "N 3"], size: float) -> Float[Tensor, "M 3"]:
-    """One point at the centre of every voxel that holds any, sorted (docs/methods.md 3.1).
-
-    Args:
-        points: Scene units. [N, 3]
-        size: Edge of a voxel, scene units.
-
-    Returns:
-        ``round(x / size) * size``, unique. [M, 3]
-    """
+    """One point, round(x / size) size, at the centre of every voxel that holds any; sorted (docs/methods.md 3.1)."""
     return torch.unique(torch.round(points / size), dim=0) * size
 
 

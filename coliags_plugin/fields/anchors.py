@@ -87,23 +87,13 @@ class AnchorField(GaussianField[AnchorFieldSettings], LampAware):
 
     @classmethod
     def from_scene(cls, scene: Scene, settings: AnchorFieldSettings, generator: torch.Generator) -> Self:
-        """Merge the scene's points into one anchor per voxel.
-
-        Raises:
-            InputError: The scene has no points.
-        """
+        """Merge the scene's points into one anchor per voxel."""
         positions = initial_positions(scene)
-        size = settings.voxel_size
-        if size is None:
-            size = settings.voxel_pixels * scene.pixel_footprint
+        size = settings.voxel_pixels * scene.pixel_footprint if settings.voxel_size is None else settings.voxel_size
         anchors = voxelize(positions, size)
         if len(anchors) > 0.95 * len(scene.points) > 1000:
-            logger.warning(
-                "voxels of %.3g scene units merge almost nothing: %d points make %d anchors",
-                size,
-                len(scene.points),
-                len(anchors),
-            )
+            problem = "voxels of %.3g scene units merge almost nothing: %d points make %d anchors"
+            logger.warning(problem, size, len(scene.points), len(anchors))
         field = cls(settings, len(anchors), generator)
         field.anchors.copy_(anchors)
         if field.normals is not None:
@@ -134,7 +124,7 @@ class AnchorField(GaussianField[AnchorFieldSettings], LampAware):
     @property
     def slots_per_element(self) -> int:
         """Children of an anchor."""
-        return int(self.settings.children)
+        return self.settings.children
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Offsets, features, scalings, and the three MLPs."""
@@ -161,16 +151,15 @@ class AnchorField(GaussianField[AnchorFieldSettings], LampAware):
         return self.appearance_head.attenuation(points)
 
     def child_positions(self) -> Float[Tensor, "M K 3"]:
-        """Positions of all children (paper, Eq. 3), scene units. [M, K, 3]"""
+        """Positions of all children (paper, Eq. 3), scene units."""
         return self.anchors[:, None] + self.offsets * self.scalings[:, None, :3].exp()
 
     @torch.no_grad()
     def visible_anchors(self, camera: Camera) -> Int[Tensor, "V"]:
-        """Indices of anchors of which any child may overlap the image. [V]"""
+        """Indices of anchors of which any child may overlap the image."""
         reach = (self.offsets * self.scalings[:, None, :3].exp()).norm(dim=2).amax(dim=1)
         size = DRAWN_SIGMAS * self.scalings[:, 3:].amax(dim=1).exp()
-        inside = spheres_in_frustum(self.anchors, reach + size, camera)
-        return inside.nonzero().squeeze(1)
+        return spheres_in_frustum(self.anchors, reach + size, camera).nonzero().squeeze(1)
 
     def _distances(self, camera: Camera) -> Float[Tensor, "V"]:
         camera = camera.to(self.anchors.device, self.anchors.dtype)

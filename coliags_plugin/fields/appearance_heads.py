@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from abc import abstractmethod
+from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
+from typing_extensions import TypeVar
 
 from coliags_plugin.contracts import AppearanceHead
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.fields.embedding import cosine_embedding
-from coliags_plugin.fields.mlp import first_layer, mlp
+from coliags_plugin.fields.mlp import cosine_embedding, first_layer, mlp
+
+#: Widths of the lobes of glints: sines of the angle at which each has fallen to 1 / e. The first is narrower than the
+#: lobe of a wet film, the last knows no more than the side from which the wall is seen.
+WIDTHS = (0.03, 0.06, 0.12, 0.25, 0.5, 1.0)
+#: Largest component of a facet's tilt along the wall.
+MAX_TILT = 0.5
 
 
 class AppearanceSettings(Settings):
@@ -26,18 +33,17 @@ class AppearanceSettings(Settings):
     bias_init: Literal["scene_distances", "pytorch"] = "scene_distances"  # see above
 
 
-class PlainAppearanceSettings(AppearanceSettings):
-    """Options of the plain appearance head."""
-
-    distance: bool = False  # Scaffold-GS's add_color_dist: distance as a further input
+#: Settings of an appearance head.
+AppearanceT = TypeVar("AppearanceT", bound=AppearanceSettings, default=AppearanceSettings)
 
 
-class PlainAppearanceHead(AppearanceHead):
-    """Appearance head of Scaffold-GS, optionally with distance as an input (docs/methods.md 3.6)."""
+class MLPAppearanceHead(AppearanceHead[AppearanceT]):
+    """Base class of heads of one MLP, which sees the anchor's feature and an encoding of the viewing geometry."""
 
-    Settings: ClassVar[type[Settings]] = PlainAppearanceSettings
+    #: Channels of :meth:`embed_direction`, which lie between the feature and the distance.
+    direction_channels: ClassVar[int] = 3
 
-    def __init__(self, settings: Any, features: int, children: int, generator: torch.Generator) -> None:
+    def __init__(self, settings: AppearanceT, features: int, children: int, generator: torch.Generator) -> None:
         super().__init__()
         self.settings = settings
         self.children_per_anchor = children
@@ -52,26 +58,11 @@ class PlainAppearanceHead(AppearanceHead):
         """Encoding of the viewing direction that the MLP gets; arguments as of :meth:`forward`."""
         return directions
 
-    @property
-    def direction_channels(self) -> int:
-        """Channels of :meth:`embed_direction`, which lie between the feature and the distance."""
-        return 3
-
+    @abstractmethod
     def embed(
         self, seen: Float[Tensor, "V D"], distances: Float[Tensor, "V 1"], cosines: Float[Tensor, "V 1"]
     ) -> Float[Tensor, "V E"]:
-        """Inputs of the MLP besides the feature, of which the embedded direction comes first."""
-        return torch.cat([seen, distances], dim=1) if self.sees_distance else seen
-
-    @property
-    def sees_distance(self) -> bool:
-        """Whether the distance is among the inputs."""
-        return bool(self.settings.distance)
-
-    @property
-    def knows_lamp(self) -> bool:
-        """True where the distance to the lamp is an input of the MLP."""
-        return self.sees_distance
+        """Inputs of the MLP besides the feature: the embedded direction, then the distance if :attr:`knows_lamp`."""
 
     @torch.no_grad()
     def init_from_distances(self, distances: Float[Tensor, "D"]) -> None:
@@ -79,17 +70,14 @@ class PlainAppearanceHead(AppearanceHead):
 
         Drawn about zero, units see millimetres that outweigh all other inputs: those with a negative weight for the
         distance, about half, are never active and never learn.
-
-        Args:
-            distances: From cameras to anchors in their view, scene units. [D]
         """
-        if not self.sees_distance or self.settings.bias_init == "pytorch" or len(distances) == 0:
+        if not self.knows_lamp or self.settings.bias_init == "pytorch" or len(distances) == 0:
             return
-        first: Any = self.color_mlp[0]
-        units = first.out_features
+        units = self.settings.hidden
         places = (torch.arange(units, device=distances.device) * 2 + 1) * len(distances) // (2 * units)
         kinks = distances.sort().values[places]
-        first.bias -= first.weight[:, self.features + self.direction_channels] * kinks
+        of_distance = self.color_mlp.get_parameter("0.weight")[:, self.features + self.direction_channels]
+        self.color_mlp.get_parameter("0.bias").sub_(of_distance * kinks)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """The MLP."""
@@ -104,11 +92,33 @@ class PlainAppearanceHead(AppearanceHead):
         normals: Float[Tensor, "V 3"] | None,
     ) -> Float[Tensor, "V K 3"]:
         """Decode the children's colours."""
-        layers: list[Any] = list(self.color_mlp)
-        first, activation, last = layers
         embedded = self.embed(self.embed_direction(features, directions, normals), distances, cosines)
-        hidden = activation(first_layer(features, embedded, first.weight, first.bias))
-        return last(hidden).view(len(features), self.children_per_anchor, 3).sigmoid()
+        weight, bias = self.color_mlp.get_parameter("0.weight"), self.color_mlp.get_parameter("0.bias")
+        hidden = first_layer(features, embedded, weight, bias).relu()
+        return self.color_mlp[2](hidden).view(len(features), self.children_per_anchor, 3).sigmoid()
+
+
+class PlainAppearanceSettings(AppearanceSettings):
+    """Options of the plain appearance head."""
+
+    distance: bool = False  # Scaffold-GS's add_color_dist: distance as a further input
+
+
+class PlainAppearanceHead(MLPAppearanceHead[PlainAppearanceSettings]):
+    """Appearance head of Scaffold-GS, optionally with distance as an input (docs/methods.md 3.6)."""
+
+    Settings: ClassVar[type[Settings]] = PlainAppearanceSettings
+
+    @property
+    def knows_lamp(self) -> bool:
+        """True where the distance to the lamp is an input of the MLP."""
+        return self.settings.distance
+
+    def embed(
+        self, seen: Float[Tensor, "V D"], distances: Float[Tensor, "V 1"], cosines: Float[Tensor, "V 1"]
+    ) -> Float[Tensor, "V E"]:
+        """v, and d if that is an input."""
+        return torch.cat([seen, distances], dim=1) if self.settings.distance else seen
 
 
 class IMIAAppearanceSettings(AppearanceSettings):
@@ -117,7 +127,7 @@ class IMIAAppearanceSettings(AppearanceSettings):
     frequencies: int = Field(default=5, ge=0)  # of gamma, for the cosine
 
 
-class IMIAAppearanceHead(PlainAppearanceHead):
+class IMIAAppearanceHead(MLPAppearanceHead[IMIAAppearanceSettings]):
     """Improved appearance Modelling with Illumination Attenuation (paper, Eq. 8; docs/methods.md 3.4).
 
     The MLP sees v, the distance d to the lamp and gamma(cos theta), the angle to the optical axis in which light
@@ -126,13 +136,62 @@ class IMIAAppearanceHead(PlainAppearanceHead):
 
     Settings: ClassVar[type[Settings]] = IMIAAppearanceSettings
 
-    @property
-    def sees_distance(self) -> bool:
-        """Always."""
-        return True
-
     def embed(
         self, seen: Float[Tensor, "V D"], distances: Float[Tensor, "V 1"], cosines: Float[Tensor, "V 1"]
     ) -> Float[Tensor, "V E"]:
         """v, d and gamma(cos theta): 3 + 1 + 11 numbers with five frequencies."""
         return torch.cat([seen, distances, cosine_embedding(cosines, self.settings.frequencies)], dim=1)
+
+
+class GlintAppearanceHead(IMIAAppearanceHead):
+    """IMIA with lobes about the directions in which an anchor's micro-facets throw the lamp's light back.
+
+    The lamp sits at the lens: a facet glints where it is seen along its normal. A layer decodes the tilt of each facet
+    against the wall's normal from the anchor's feature; the MLP sees the components of v along the tilted facet, and
+    Gaussians of their length, of six widths (docs/methods.md 3.8).
+    """
+
+    #: Those of v, of the facets' components and lobes.
+    direction_channels: ClassVar[int] = 3 + 2 + len(WIDTHS)
+
+    def __init__(
+        self, settings: IMIAAppearanceSettings, features: int, children: int, generator: torch.Generator
+    ) -> None:
+        super().__init__(settings, features, children, generator)
+        self.tilt_layer = nn.Linear(features, 2)
+        nn.init.zeros_(self.tilt_layer.weight)
+        nn.init.zeros_(self.tilt_layer.bias)
+
+    @property
+    def uses_normals(self) -> bool:
+        """Always."""
+        return True
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """The MLP with the layer of the tilts."""
+        return {"color_mlp": [*self.color_mlp.parameters(), *self.tilt_layer.parameters()]}
+
+    def embed_direction(
+        self, features: Float[Tensor, "V F"], directions: Float[Tensor, "V 3"], normals: Float[Tensor, "V 3"] | None
+    ) -> Float[Tensor, "V D"]:
+        """v, and the facets' components and lobes."""
+        assert normals is not None, "the field keeps normals, as uses_normals says"
+        tilts = MAX_TILT * self.tilt_layer(features).tanh()
+        across = tangent_components(directions, normals) - tilts
+        squares = across.square().sum(1, keepdim=True)
+        return torch.cat([directions, across, *(torch.exp(squares * -(width**-2)) for width in WIDTHS)], dim=1)
+
+
+def tangent_components(directions: Float[Tensor, "V 3"], normals: Float[Tensor, "V 3"]) -> Float[Tensor, "V 2"]:
+    """Components of directions along two axes that are perpendicular to a normal and to each other.
+
+    The axes follow from the normal alone, and turn smoothly with it except where its z changes sign (Duff et al. 2017,
+    *Building an Orthonormal Basis, Revisited*).
+    """
+    x, y, z = normals.unbind(1)
+    sign = torch.where(z < 0, -1.0, 1.0).to(z)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    first = torch.stack([1.0 + sign * x * x * a, sign * b, -sign * x], dim=1)
+    second = torch.stack([b, sign + y * y * a, -y], dim=1)
+    return torch.stack([(directions * first).sum(1), (directions * second).sum(1)], dim=1)

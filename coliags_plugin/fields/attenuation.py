@@ -35,12 +35,11 @@ class AttenuatedAppearanceSettings(Settings):
     incidence_exponent: float | None = None  # initial c where it is not fitted; null: incidence does not count
     # b, c and the lamp's offset: as above and 0, or fitted to surface points (docs/methods.md 4.8)
     initial: Literal["given", "points"] = "given"
-    channels: Literal[1, 3] = (
-        3  # exponents for each colour, or one pair for all: red falls off slower (docs/methods.md 3.7)
-    )
+    # exponents for each colour, or one pair for all: red falls off slower (docs/methods.md 3.7)
+    channels: Literal[1, 3] = 3
 
 
-class AttenuatedAppearanceHead(AppearanceHead):
+class AttenuatedAppearanceHead(AppearanceHead[AttenuatedAppearanceSettings]):
     """The colours of another head times (d / d_0)^a cos(psi)^b cos(i)^c, a law of all Gaussians (docs/methods.md 3.7).
 
     d is the distance of a Gaussian, not of its anchor, to a lamp whose offset from the optical centre is learned, psi
@@ -89,7 +88,8 @@ class AttenuatedAppearanceHead(AppearanceHead):
         fitted = fit_light(scene) if self.settings.initial == "points" else None
         if fitted is None:
             return
-        for column, found in enumerate((fitted.cosine_exponents, fitted.incidence_exponents)[: self._angles], 1):
+        angles = self.exponents.shape[1] - 1
+        for column, found in enumerate((fitted.cosine_exponents, fitted.incidence_exponents)[:angles], 1):
             bounded = found.clamp(0.0, _LARGEST_EXPONENT)
             self.exponents[:, column] = bounded.mean() if self.settings.channels == 1 else bounded
         self.lamp_offset.copy_(MAX_OFFSET * torch.atanh((fitted.lamp_offset / MAX_OFFSET).clamp(-0.9, 0.9)))
@@ -117,24 +117,12 @@ class AttenuatedAppearanceHead(AppearanceHead):
 
     @property
     def _knows_incidence(self) -> bool:
-        """Whether the law has an exponent of incidence."""
         return self.settings.incidence_exponent is not None
-
-    @property
-    def _angles(self) -> int:
-        """Number of angles that the law knows."""
-        return self.exponents.shape[1] - 1
 
     def law(
         self, distances: Float[Tensor, "N"], cosines: Float[Tensor, "N"], incidences: Float[Tensor, "N"] | None = None
     ) -> Float[Tensor, "N C"]:
-        """The law's factor. [N, C]
-
-        Args:
-            distances: To the lamp, scene units. [N]
-            cosines: Of the angle at the lamp to the optical axis. [N]
-            incidences: Cosines of the angle of incidence; None: 1. [N]
-        """
+        """The law's factor at distances to the lamp, scene units, and cosines of psi and i; without incidences, 1."""
         relative = (distances / self.reference).clamp_min(_MIN_DISTANCE)
         logs = [relative.log(), cosines.clamp_min(_MIN_COSINE).log()]
         if self._knows_incidence:
@@ -150,12 +138,9 @@ class AttenuatedAppearanceHead(AppearanceHead):
     def _along(
         self, rays: Float[Tensor, "N 3"], depths: Float[Tensor, "N"], normals: Float[Tensor, "N 3"] | None
     ) -> Float[Tensor, "N C"]:
-        """The law at the ends of rays from the lamp, in any axes. [N, C]
+        """The law at the ends of rays from the lamp, in any axes, scene units; without normals, the wall faces it.
 
-        Args:
-            rays: Scene units. [N, 3]
-            depths: Their components along the optical axis. [N]
-            normals: Of the wall at the ends, in the axes of the rays; None: it faces the lamp. [N, 3]
+        ``depths`` are the rays' components along the optical axis.
         """
         distances = rays.norm(dim=1).clamp_min(1e-9)
         incidences = None if normals is None else (normals * rays).sum(1).abs() / distances

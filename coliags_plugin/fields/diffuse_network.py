@@ -22,12 +22,6 @@ class DiffuseNetwork(nn.Module):
     """MLP: albedo, lamp distance, normal, direction to the lamp and their cosine -> factor of each channel.
 
     Its last biases start at 1, so that a new network changes little (docs/rivals/pr-endo.md).
-
-    Args:
-        hidden: Units of each hidden layer.
-        hidden_layers: Their number.
-        precision: See :data:`Precision`.
-        generator: Of the initial weights.
     """
 
     INPUTS = 11
@@ -35,9 +29,9 @@ class DiffuseNetwork(nn.Module):
     def __init__(self, hidden: int, hidden_layers: int, precision: Precision, generator: torch.Generator) -> None:
         super().__init__()
         self.precision = precision
-        self.layers = nn.ModuleList(linear_layers((self.INPUTS, *[hidden] * hidden_layers, 3), generator))
-        last: Any = self.layers[-1]
-        nn.init.ones_(last.bias)
+        layers = linear_layers((self.INPUTS, *[hidden] * hidden_layers, 3), generator)
+        nn.init.ones_(layers[-1].bias)
+        self.layers = nn.ModuleList(layers)
 
     def forward(
         self,
@@ -47,14 +41,10 @@ class DiffuseNetwork(nn.Module):
         lamps: Float[Tensor, "N 3"],
         in_training: bool,
     ) -> Float[Tensor, "N 3"]:
-        """Factors, of any sign. [N, 3]
+        """Factors, of any sign.
 
-        Args:
-            albedos: Linear RGB. [N, 3]
-            distances: To the lamp, in extents of the scene. [N, 1]
-            normals: Unit vectors, on the side of the camera. [N, 3]
-            lamps: Unit vectors to the lamp. [N, 3]
-            in_training: Whether products may be of the reduced precision.
+        Albedos are linear RGB, distances in extents of the scene, normals on the side of the camera, and lamps unit
+        vectors to the lamp; only in training may products be of the reduced precision.
         """
         cosines = (normals * lamps).sum(1, keepdim=True)
         inputs = torch.cat([albedos, distances, normals, lamps, cosines], dim=1)

@@ -26,9 +26,8 @@ class ExplicitFieldSettings(Settings):
     """Options of all fields of explicit Gaussians (docs/methods.md 7.1)."""
 
     initial_opacity: float = Option(default=0.1, gt=0, lt=1)  # of every Gaussian
-    normal_neighbours: int | None = Option(
-        default=None, ge=3
-    )  # neighbours from which normals of the initial points are estimated, as references; null: no such normals
+    # neighbours from which normals of the initial points are estimated, as references; null: no such normals
+    normal_neighbours: int | None = Option(default=None, ge=3)
 
 
 #: Settings of a field of explicit Gaussians.
@@ -55,11 +54,7 @@ class ExplicitField(GaussianField[ExplicitT]):
 
     @classmethod
     def from_scene(cls, scene: Scene, settings: ExplicitT, generator: torch.Generator) -> Self:
-        """An isotropic Gaussian at every initial point, scaled to the distance of its neighbours.
-
-        Raises:
-            InputError: The scene has no points, or too few for reference normals.
-        """
+        """An isotropic Gaussian at every initial point, scaled to the distance of its neighbours."""
         positions = initial_positions(scene)
         field = cls(settings, len(positions))
         with torch.no_grad():
@@ -95,21 +90,20 @@ class ExplicitField(GaussianField[ExplicitT]):
             self.references.extend(self.means.detach())
 
     def rows_kept(self, keep: Bool[Tensor, "N"]) -> None:
-        """Remove from what rows have besides parameters the rows that a strategy removed from these. [N]"""
+        """Remove from what rows have besides parameters the rows that a strategy removed from these."""
         if self.references is not None:
             self.references.keep(keep)
 
     def normals(self) -> Float[Tensor, "N 3"]:
-        """Shortest axis of every Gaussian, world frame, of either sign; differentiable in the rotations. [N, 3]"""
+        """Shortest axis of every Gaussian, world frame, of either sign; differentiable in the rotations."""
         return shortest_axes(self.quats, self.scales)
 
     @property
     def normals_and_references(self) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]] | None:
-        """Shortest axes, and the normals of the initial points nearest to each Gaussian at its birth. [N, 3], [N, 3]"""
+        """Shortest axes, and the normals of the initial points nearest to each Gaussian at its birth."""
         return None if self.references is None else (self.normals(), self.references.of_rows)
 
     @torch.no_grad()
     def _visible(self, camera: Camera) -> Tensor:
-        """Rows that the camera may see. [V]"""
         reach = DRAWN_SIGMAS * self.scales.amax(dim=1).exp()
         return spheres_in_frustum(self.means, reach, camera).nonzero().squeeze(1)

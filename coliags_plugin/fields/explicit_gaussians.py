@@ -42,11 +42,7 @@ class ExplicitGaussians(ExplicitField[ExplicitGaussiansSettings]):
 
     @classmethod
     def from_scene(cls, scene: Scene, settings: ExplicitGaussiansSettings, generator: torch.Generator) -> Self:
-        """An isotropic Gaussian at every initial point, with its colour.
-
-        Raises:
-            InputError: The scene has no points, or too few for reference normals.
-        """
+        """An isotropic Gaussian at every initial point, with its colour."""
         field = super().from_scene(scene, settings, generator)
         if scene.points.colors is not None:
             rgb = scene.points.colors.to(torch.float32) / 255.0
@@ -86,11 +82,7 @@ class Surfels(ExplicitGaussians):
 
     @classmethod
     def from_scene(cls, scene: Scene, settings: ExplicitGaussiansSettings, generator: torch.Generator) -> Self:
-        """A round surfel at every initial point, with its colour; quaternions are uniform in [0, 1)^4.
-
-        Raises:
-            InputError: The scene has no points, or too few for reference normals.
-        """
+        """A round surfel at every initial point, with its colour; quaternions are uniform in [0, 1)^4."""
         field = super().from_scene(scene, settings, generator)
         with torch.no_grad():
             field.quats.copy_(torch.rand(field.quats.shape, generator=generator))

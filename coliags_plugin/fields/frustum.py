@@ -17,12 +17,7 @@ DRAWN_SIGMAS = math.sqrt(2.0 * math.log(255.0))
 def spheres_in_frustum(centers: Float[Tensor, "M 3"], radii: Float[Tensor, "M"], camera: Camera) -> Bool[Tensor, "M"]:
     """Whether any part of a sphere may lie inside the viewing pyramid beyond the camera's near plane.
 
-    Conservative: near the pyramid's edges a sphere outside may pass, none inside is refused.
-
-    Args:
-        centers: World positions, scene units. [M, 3]
-        radii: Scene units. [M]
-        camera: The camera.
+    Conservative: near the pyramid's edges a sphere outside may pass, none inside is refused. World frame, scene units.
     """
     x, y, z = ((centers - camera.center) @ camera.camera_to_world[:3, :3]).unbind(-1)
     inside = z + radii > camera.near_plane

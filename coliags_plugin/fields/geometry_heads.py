@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
+from typing_extensions import TypeVar
 
 from coliags_plugin.contracts import GeometryHead
 from coliags_plugin.core.settings import Settings
-from coliags_plugin.fields.embedding import cosine_embedding
-from coliags_plugin.fields.mlp import first_layer, mlp
+from coliags_plugin.fields.mlp import cosine_embedding, first_layer, mlp
 
 
 class PlainGeometrySettings(Settings):
@@ -21,12 +21,16 @@ class PlainGeometrySettings(Settings):
     hidden: int = Field(default=32, ge=1)  # units of each hidden layer
 
 
-class PlainGeometryHead(GeometryHead):
+#: Settings of a geometry head.
+GeometryT = TypeVar("GeometryT", bound=PlainGeometrySettings, default=PlainGeometrySettings)
+
+
+class PlainGeometryHead(GeometryHead[GeometryT]):
     """Geometry head of Scaffold-GS (docs/methods.md 3.6)."""
 
     Settings: ClassVar[type[Settings]] = PlainGeometrySettings
 
-    def __init__(self, settings: Any, features: int, children: int, generator: torch.Generator) -> None:
+    def __init__(self, settings: GeometryT, features: int, children: int, generator: torch.Generator) -> None:
         super().__init__()
         self.settings = settings
         self.children_per_anchor = children
@@ -50,8 +54,8 @@ class PlainGeometryHead(GeometryHead):
     ) -> tuple[Float[Tensor, "V K"], Float[Tensor, "V K 7"]]:
         """Decode the children of the visible anchors."""
         # Both MLPs read the same input: one product for both first layers.
-        first: list[Any] = [self.opacity_mlp[0], self.covariance_mlp[0]]
-        weight, bias = torch.cat([layer.weight for layer in first]), torch.cat([layer.bias for layer in first])
+        mlps = (self.opacity_mlp, self.covariance_mlp)
+        weight, bias = (torch.cat([mlp.get_parameter(name) for mlp in mlps]) for name in ("0.weight", "0.bias"))
         opacity_hidden, covariance_hidden = (
             first_layer(features, self.embed(directions), weight, bias).relu().chunk(2, dim=1)
         )
@@ -65,7 +69,7 @@ class IMVEGeometrySettings(PlainGeometrySettings):
     frequencies: int = Field(default=10, ge=0)  # of gamma, per component of the direction
 
 
-class IMVEGeometryHead(PlainGeometryHead):
+class IMVEGeometryHead(PlainGeometryHead[IMVEGeometrySettings]):
     """Improved geometry Modelling with View Embedding: gamma(v) in place of v (paper, Eq. 7; docs/methods.md 3.4)."""
 
     Settings: ClassVar[type[Settings]] = IMVEGeometrySettings

@@ -102,11 +102,7 @@ class LitGaussians(ExplicitField[LitGaussiansSettings], LitField[LitGaussiansSet
 
     @classmethod
     def from_scene(cls, scene: Scene, settings: LitGaussiansSettings, generator: torch.Generator) -> Self:
-        """A disc at every initial point, of its colour.
-
-        Raises:
-            InputError: The scene has no points, or too few for reference normals; or the cameras do not move.
-        """
+        """A disc at every initial point, of its colour; the unit of length needs cameras that move."""
         if scene.extent == 0.0:
             raise InputError(
                 "all training cameras are at one place", "cameras that move: lengths are measured in their extent"
@@ -201,7 +197,7 @@ class LitGaussians(ExplicitField[LitGaussiansSettings], LitField[LitGaussiansSet
         generator: torch.Generator | None,
         held: HeldLight | None,
     ) -> tuple[Float[Tensor, "V 3"], Float[Tensor, "V 3"]]:
-        """Linear light from Gaussians to the camera, and the factors of their diffuse reflection. [V, 3], [V, 3]"""
+        """Linear light from Gaussians to the camera, and the factors of their diffuse reflection."""
         views = camera.center - means
         facing = (axes * views).sum(1)
         normals = torch.where((facing < 0)[:, None], -axes, axes)
@@ -234,7 +230,7 @@ class LitGaussians(ExplicitField[LitGaussiansSettings], LitField[LitGaussiansSet
         lamps: Float[Tensor, "V 3"],
         generator: torch.Generator | None,
     ) -> Float[Tensor, "V 3"]:
-        """Factors of the diffuse reflection: 1 before the network counts. [V, 3]"""
+        """Factors of the diffuse reflection: 1 before the network counts."""
         if not self.network_on:
             return torch.ones_like(albedos)
         if generator is not None and self.settings.input_noise > 0:
@@ -247,7 +243,7 @@ class LitGaussians(ExplicitField[LitGaussiansSettings], LitField[LitGaussiansSet
 
 
 def _initial_albedos(points: PointCloud, pink_share: float) -> Float[Tensor, "N 3"]:
-    """Colours of the points, mixed with that of mucosa, as linear light; that of mucosa where they have none. [N, 3]"""
+    """Colours of the points, mixed with that of mucosa, as linear light; that of mucosa where they have none."""
     pink = torch.tensor(PINK).expand(len(points), 3)
     if points.colors is None:
         if pink_share < 1.0:

@@ -1,4 +1,4 @@
-"""Layers of the fields' multilayer perceptrons."""
+"""Layers and the cosine embedding gamma of the fields' multilayer perceptrons."""
 
 from __future__ import annotations
 
@@ -53,3 +53,15 @@ def first_layer(
     """
     split = features.shape[1]
     return torch.addmm(nn.functional.linear(embedded, weight[:, split:], bias), features, weight[:, :split].t())
+
+
+def cosine_embedding(x: Float[Tensor, "... D"], frequencies: int) -> Float[Tensor, "... E"]:
+    """``[x, sin(x), cos(x), sin(2x), cos(2x), ..., sin(2^(L-1) x), cos(2^(L-1) x)]``.
+
+    Frequency-major, sine before cosine, no factor pi: the paper's "dimension" is the number of frequencies L
+    (docs/methods.md 3.2), so ten on a direction make 63 numbers and five on an angle make 11. 0 leaves ``x`` as it is.
+    """
+    octaves = 2.0 ** torch.arange(frequencies, device=x.device, dtype=x.dtype)
+    phases = octaves[:, None] * x[..., None, :]
+    waves = torch.stack([phases.sin(), phases.cos()], dim=-2)
+    return torch.cat([x, waves.flatten(start_dim=-3)], dim=-1)

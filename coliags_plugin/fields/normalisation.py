@@ -38,11 +38,7 @@ class SceneNormalisation(nn.Module):
 
     @classmethod
     def from_scene(cls, scene: Scene) -> Self:
-        """The normalisation of a scene's initial points.
-
-        Raises:
-            InputError: It has none, or all are at one place.
-        """
+        """The normalisation of a scene's initial points."""
         points = initial_positions(scene).double()
         center = points.mean(0)
         unit = (points - center).abs().max()
@@ -58,17 +54,14 @@ class SceneNormalisation(nn.Module):
         return made
 
     def forward(self, positions: Float[Tensor, "*P 3"]) -> Float[Tensor, "*P 3"]:
-        """Scene units to normalised coordinates. [..., 3]"""
+        """Scene units to normalised coordinates."""
         return (positions - self.center) / self.unit
 
 
 def surface_distances(scene: Scene) -> Float[Tensor, "2"]:
     """Smallest and largest distance of a training camera from the initial points in its view, times 0.9 and 1.1.
 
-    Occlusion is not tested. Scene units. [2]
-
-    Raises:
-        InputError: No camera has a point in view.
+    Scene units. Occlusion is not tested.
     """
     points = initial_positions(scene).double()
     points = points[:: max(1, len(points) // _POINTS)]

@@ -15,10 +15,6 @@ from coliags_plugin.core.point_normals import point_normals
 class ReferenceNormals(nn.Module):
     """Normal of the initial point nearest to each Gaussian when it was added (docs/rivals/gaussian-pancakes.md).
 
-    Args:
-        points: Number of initial points.
-        rows: Number of Gaussians.
-
     Attributes:
         points: Initial points, scene units. [P, 3]
         normals: Their unit normals, of either sign. [P, 3]
@@ -37,11 +33,7 @@ class ReferenceNormals(nn.Module):
 
     @classmethod
     def of_points(cls, points: Float[Tensor, "P 3"], neighbours: int) -> Self:
-        """The references of one Gaussian at each point.
-
-        Raises:
-            InputError: There are not enough points.
-        """
+        """The references of one Gaussian at each point."""
         references = cls(len(points), len(points))
         references.points.copy_(points)
         references.normals.copy_(point_normals(points, neighbours))
@@ -49,16 +41,12 @@ class ReferenceNormals(nn.Module):
         return references
 
     def extend(self, means: Float[Tensor, "N 3"]) -> None:
-        """Add the references of Gaussians that were appended.
-
-        Args:
-            means: Centres of all Gaussians, scene units. [N, 3]
-        """
+        """Add the references of Gaussians that were appended: ``means`` are the centres of all, scene units."""
         born = means[len(self.of_rows) :]
         _, nearest = cKDTree(self.points.cpu().numpy()).query(born.cpu().numpy(), workers=-1)
         chosen = torch.from_numpy(np.asarray(nearest)).to(self.normals.device)
         self.of_rows = torch.cat([self.of_rows, self.normals[chosen]])
 
     def keep(self, keep: Bool[Tensor, "N"]) -> None:
-        """Keep the references of some Gaussians. [N]"""
+        """Keep the references of some Gaussians."""
         self.of_rows = self.of_rows[keep]

@@ -5,13 +5,14 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
 from pydantic import Field as Option
 from pydantic import model_validator
 from torch import Tensor, nn
+from torch.nn import functional
 from typing_extensions import Self
 
 from coliags_plugin.contracts import RadianceField, RadianceLevel, RadianceSamples
@@ -19,8 +20,8 @@ from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import Scene
 from coliags_plugin.core.settings import Settings
+from coliags_plugin.fields.mlp import cosine_embedding, first_layer, glorot_linear
 from coliags_plugin.fields.normalisation import SceneNormalisation, surface_distances
-from coliags_plugin.fields.radiance_mlp import RadianceMLP
 
 logger = logging.getLogger(__name__)
 
@@ -43,6 +44,66 @@ class ReimNerfFieldSettings(Settings):
         if self.skip is not None and self.skip >= self.layers:
             raise ValueError(f"skip {self.skip} with layers {self.layers}: expected a smaller number, or null")
         return self
+
+
+class RadianceMLP(nn.Module):
+    """NeRF's network: density from the position, colour also from the direction and, where asked, the light's place."""
+
+    def __init__(self, settings: ReimNerfFieldSettings, generator: torch.Generator) -> None:
+        super().__init__()
+        self.settings = settings
+        embedded = _embedding_size(settings.position_frequencies)
+        width, inputs = settings.width, [embedded] + (settings.layers - 1) * [settings.width]
+        if settings.skip is not None:
+            inputs[settings.skip] += embedded
+        self.trunk = nn.ModuleList([glorot_linear(size, width, generator) for size in inputs])
+        self.density = glorot_linear(width, 1, generator)
+        self.feature = glorot_linear(width, width, generator)
+        seen = _embedding_size(settings.direction_frequencies)
+        if settings.light:
+            seen += _embedding_size(settings.light_frequencies)
+        self.color = glorot_linear(width + seen, settings.color_width, generator)
+        self.rgb = glorot_linear(settings.color_width, 3, generator)
+
+    def hidden(self, positions: Float[Tensor, "P S 3"]) -> Float[Tensor, "P*S W"]:
+        """Output of the trunk at normalised coordinates."""
+        embedded = cosine_embedding(positions.flatten(0, 1), self.settings.position_frequencies)
+        hidden = embedded
+        layer: Any
+        for index, layer in enumerate(self.trunk):
+            again = index == self.settings.skip
+            hidden = first_layer(hidden, embedded, layer.weight, layer.bias) if again else layer(hidden)
+            hidden = hidden.relu_()
+        return hidden
+
+    def raw_density(self, hidden: Float[Tensor, "P*S W"], rays: int) -> Float[Tensor, "P S"]:
+        """Density before ReLU, in normalised units, of what :meth:`hidden` gave for P rays."""
+        return functional.linear(hidden, self.density.weight, self.density.bias).view(rays, -1)
+
+    def colors(
+        self, hidden: Float[Tensor, "P*S W"], directions: Float[Tensor, "P 3"], light: Float[Tensor, "3"]
+    ) -> Float[Tensor, "P S 3"]:
+        """Colours in [0, 1] along unit vectors, with the light at normalised coordinates.
+
+        What is the same all along a ray enters the colour layer once per ray. The feature layer has no activation, so
+        its product with the colour layer is one smaller matrix.
+        """
+        settings = self.settings
+        seen = cosine_embedding(directions, settings.direction_frequencies)
+        if settings.light:
+            lamp = cosine_embedding(light, settings.light_frequencies)
+            seen = torch.cat([seen, lamp.expand(len(seen), -1)], dim=1)
+        from_feature, from_ray = self.color.weight[:, : settings.width], self.color.weight[:, settings.width :]
+        constant = self.color.bias + from_feature @ self.feature.bias
+        of_ray = functional.linear(seen, from_ray, constant)
+        of_point = functional.linear(hidden, from_feature @ self.feature.weight)
+        mixed = (of_point.view(len(seen), -1, settings.color_width) + of_ray[:, None]).relu_()
+        return functional.linear(mixed, self.rgb.weight, self.rgb.bias).sigmoid()
+
+
+def _embedding_size(frequencies: int) -> int:
+    """Length of the embedding of three coordinates."""
+    return 3 * (1 + 2 * frequencies)
 
 
 class ReimNerf(RadianceField[ReimNerfFieldSettings]):
@@ -70,11 +131,7 @@ class ReimNerf(RadianceField[ReimNerfFieldSettings]):
 
     @classmethod
     def from_scene(cls, scene: Scene, settings: ReimNerfFieldSettings, generator: torch.Generator) -> Self:
-        """Fresh networks, normalised by the scene's initial points.
-
-        Raises:
-            InputError: The scene has one training frame, or no points in view.
-        """
+        """Fresh networks, normalised by the scene's initial points; one training frame is refused."""
         if len(scene.train) < 2:
             raise InputError(
                 f"{len(scene.train)} training frame of scene '{scene.name}'",
@@ -101,12 +158,12 @@ class ReimNerf(RadianceField[ReimNerfFieldSettings]):
 
     @property
     def length_unit(self) -> Tensor:
-        """Scene units from 0 to 1 of the networks' coordinates. []"""
+        """Scene units from 0 to 1 of the networks' coordinates."""
         return self.normalisation.unit
 
     @property
     def ray_bounds(self) -> Float[Tensor, "2"]:
-        """See :attr:`bounds`. [2]"""
+        """See :attr:`bounds`."""
         return self.bounds
 
     @property
@@ -137,7 +194,7 @@ class ReimNerf(RadianceField[ReimNerfFieldSettings]):
     def query_density(
         self, positions: Float[Tensor, "P S 3"], directions: Float[Tensor, "P 3"], camera: Camera
     ) -> Float[Tensor, "P S"]:
-        """The fine network's density. [P, S]"""
+        """The fine network's density."""
         return self._fine_level.query_density(positions, directions, camera)
 
 
@@ -175,7 +232,7 @@ class _Level(RadianceLevel):
         return RadianceSamples(self._density(hidden, len(positions), generator), rgb)
 
     def _density(self, hidden: Tensor, rays: int, generator: torch.Generator | None) -> Tensor:
-        """Per scene unit. [P, S]"""
+        """Per scene unit."""
         raw = self.network.raw_density(hidden, rays)
         strength = self.network.settings.density_noise
         if generator is not None and strength > 0:

@@ -21,15 +21,9 @@ _Y3 = tuple(
 
 
 def basis(directions: Float[Tensor, "N 3"], degree: int) -> Float[Tensor, "N B"]:
-    """Values of the first (degree + 1)^2 functions.
+    """Values of the first (degree + 1)^2 functions at unit vectors, for degrees from 0 to 3.
 
-    Args:
-        directions: Unit vectors. [N, 3]
-        degree: From 0 to 3.
-
-    Returns:
-        Degree by degree, order m from -degree to degree; odd powers of x and y carry the Condon-Shortley sign, as in
-        3DGS. [N, (degree + 1)^2]
+    Degree by degree, order m from -degree to degree; odd powers of x and y carry the Condon-Shortley sign, as in 3DGS.
     """
     if not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"degree {degree}: expected 0 to {MAX_DEGREE}")
@@ -55,12 +49,9 @@ def basis(directions: Float[Tensor, "N 3"], degree: int) -> Float[Tensor, "N B"]
 
 
 def colors(coefficients: Float[Tensor, "N B 3"], directions: Float[Tensor, "N 3"], degree: int) -> Float[Tensor, "N 3"]:
-    """Colours seen along directions: max(0, sum of coefficients times basis + 0.5) (docs/methods.md 7.1).
+    """Colours seen along unit vectors from the camera, up to a degree (docs/methods.md 7.1).
 
-    Args:
-        coefficients: Of at least the first (degree + 1)^2 functions. [N, B, 3]
-        directions: Unit vectors from the camera. [N, 3]
-        degree: Highest degree that counts.
+    max(0, sum of coefficients times basis + 0.5); coefficients of higher degrees do not count.
     """
     values = basis(directions, degree)
     return ((values[..., None] * coefficients[:, : values.shape[1]]).sum(1) + 0.5).clamp_min(0.0)

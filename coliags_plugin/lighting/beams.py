@@ -14,12 +14,9 @@ _EDGE = float(np.cos(np.radians(72.0)))
 
 
 def beam(cosine: Float[np.ndarray, "N"], law: SpreadLaw, spread: float) -> Float[np.ndarray, "N"]:
-    """Intensity at an angle psi from the beam's axis, 1 on it (docs/phantom.md 2). [N]
+    """Intensity at an angle psi from the beam's axis, 1 on it, from its cosine (docs/phantom.md 2).
 
-    Args:
-        cosine: cos psi. [N]
-        law: cos psi to the power of the spread, or exp(-spread (1 - cos psi)).
-        spread: Of the law.
+    By law, cos psi to the power of the spread, or exp(-spread (1 - cos psi)).
     """
     shape = np.maximum(cosine, 0.0) ** spread if law == "cosine" else np.exp(-spread * (1.0 - cosine))
     return np.asarray(shape * smoothstep(cosine / _EDGE), dtype=cosine.dtype)

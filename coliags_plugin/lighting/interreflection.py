@@ -33,12 +33,7 @@ class Cavity:
 
     @classmethod
     def of(cls, points: Float[Tensor, "P 3"], normals: Float[Tensor, "P 3"]) -> Cavity:
-        """The wall that points lie on.
-
-        Args:
-            points: Spread evenly over the wall, scene units. [P, 3]
-            normals: Unit normals that point away from the wall. [P, 3]
-        """
+        """The wall that points lie on, scene units, spread evenly; unit normals point away from it."""
         every = max(1, len(points) // _PATCHES)
         centres, outward = points[::every], normals[::every]
         nearest = torch.cdist(centres, centres).topk(min(_NEIGHBOURS + 1, len(centres)), largest=False).values
@@ -47,12 +42,7 @@ class Cavity:
         return cls(every, between, _form_factors(points, normals, centres, outward, areas))
 
     def indirect(self, direct: Float[Tensor, "K F"], albedo: float) -> Float[Tensor, "P F"]:
-        """Irradiance of the points by the wall, by radiosity. [P, F]
-
-        Args:
-            direct: Irradiance of the patches by the lamp in each frame. [K, F]
-            albedo: Of the wall.
-        """
+        """Irradiance of the points by a wall of an albedo, by radiosity; direct: of the patches by the lamp."""
         total = direct
         for _ in range(_BOUNCES - 1):
             total = direct + albedo * (self.between @ total)
@@ -66,7 +56,7 @@ def _form_factors(
     outward: Float[Tensor, "K 3"],
     areas: Float[Tensor, "K"],
 ) -> Float[Tensor, "P K"]:
-    """Form factors of discs seen from points; those of a point sum to 1 at most. [P, K]"""
+    """Form factors of discs seen from points; those of a point sum to 1 at most."""
     rays = centres[None] - points[:, None]
     squares = rays.square().sum(-1)
     lengths = squares.sqrt().clamp_min(1e-9)

@@ -43,11 +43,11 @@ class Lamp(Settings):
         return not any(self.offset)
 
     def position(self, camera: Camera) -> Float[Tensor, "3"]:
-        """Position of the lamp in the world, scene units. [3]"""
+        """Position of the lamp in the world, scene units."""
         return camera.center + camera.camera_to_world[:3, :3] @ camera.camera_to_world.new_tensor(self.offset)
 
     def axis(self, camera: Camera) -> Float[Tensor, "3"]:
-        """Axis of the lamp, the direction of most light, as a unit vector in the world. [3]
+        """Axis of the lamp, the direction of most light, as a unit vector in the world.
 
         Turned by (a, b) degrees it is (sin b cos a, -sin a, cos b cos a) in camera axes: a > 0 turns it up (towards
         -y), b > 0 to the right (towards +x).
@@ -57,12 +57,7 @@ class Lamp(Settings):
         return camera.camera_to_world[:3, :3] @ camera.camera_to_world.new_tensor(local)
 
     def spread(self, directions: Float[Tensor, "N 3"], camera: Camera) -> Float[Tensor, "N"]:
-        """Share of its light that goes in each direction, intensity included. [N]
-
-        Args:
-            directions: Unit vectors from the lamp, world frame. [N, 3]
-            camera: The camera that it moves with.
-        """
+        """Share of its light that goes in each direction, a unit vector in the world frame, intensity included."""
         cosines = (directions @ self.axis(camera)).clamp_min(0.0)
         return torch.as_tensor(self.intensity * cosines.pow(self.power))
 
@@ -91,11 +86,7 @@ class HeldLight(ABC):
 
 @dataclass(frozen=True)
 class LightOfCamera(HeldLight):
-    """The lamp on a camera that stays where it is.
-
-    Attributes:
-        camera: At whose optical centre the lamp is, along whose optical axis it shines.
-    """
+    """The lamp at the optical centre of a camera that stays where it is; it shines along the optical axis."""
 
     camera: Camera
 
@@ -118,15 +109,10 @@ class LightOfCamera(HeldLight):
 
 @dataclass(frozen=True)
 class FlattenedLight(HeldLight):
-    """The same light everywhere, which falls on every surface along its normal.
+    """The same light everywhere, which falls on every surface along its normal."""
 
-    Attributes:
-        distance: To the lamp, scene units.
-        cosine: Of the angle to the lamp's axis.
-    """
-
-    distance: float
-    cosine: float
+    distance: float  # to the lamp, scene units
+    cosine: float  # of the angle to the lamp's axis
 
     @property
     def described(self) -> JsonObject:

@@ -47,42 +47,25 @@ _MAX_RESIDUAL_RATIO = 0.975
 
 @dataclass(frozen=True)
 class LightFit:
-    """Light that explains the colours of surface points.
+    """Light that explains the colours of surface points."""
 
-    Attributes:
-        log_gains: Of the training frames, encoded, with a mean of 0. [F]
-        lamp_offset: Of the lamp from the optical centre, camera axes, scene units. [3]
-        cosine_exponents: Of cos(psi), psi the angle at the lamp to the optical axis, for each colour. [3]
-        incidence_exponents: Of the cosine of the angle of incidence, for each colour. [3]
-        albedo: Of the wall in green light, in which it lights itself.
-    """
-
-    log_gains: Float[Tensor, "F"]
-    lamp_offset: Float[Tensor, "3"]
-    cosine_exponents: Float[Tensor, "3"]
-    incidence_exponents: Float[Tensor, "3"]
-    albedo: float
+    log_gains: Float[Tensor, "F"]  # of the training frames, encoded, with a mean of 0
+    lamp_offset: Float[Tensor, "3"]  # of the lamp from the optical centre, camera axes, scene units
+    cosine_exponents: Float[Tensor, "3"]  # of cos(psi), psi the angle at the lamp to the optical axis, for each colour
+    incidence_exponents: Float[Tensor, "3"]  # of the cosine of the angle of incidence, for each colour
+    albedo: float  # of the wall in green light, in which it lights itself
 
 
 @dataclass(frozen=True)
 class _Observations:
-    """Points in the training frames.
+    """Points in the training frames."""
 
-    Attributes:
-        logs: Logarithms of their colours. [P, F, 3]
-        usable: Where they count. [P, F, 3]
-        sights: Positions in camera axes, scene units. [P, F, 3]
-        normals: In camera axes, towards the cameras that see them. [P, F, 3]
-        lit: Where nothing that is seen keeps the lamp's light from them. [P, F]
-        cavity: The wall that they are of.
-    """
-
-    logs: Float[Tensor, "P F 3"]
-    usable: Bool[Tensor, "P F 3"]
-    sights: Float[Tensor, "P F 3"]
-    normals: Float[Tensor, "P F 3"]
-    lit: Bool[Tensor, "P F"]
-    cavity: Cavity
+    logs: Float[Tensor, "P F 3"]  # logarithms of their colours
+    usable: Bool[Tensor, "P F 3"]  # where they count
+    sights: Float[Tensor, "P F 3"]  # positions in camera axes, scene units
+    normals: Float[Tensor, "P F 3"]  # in camera axes, towards the cameras that see them
+    lit: Bool[Tensor, "P F"]  # where nothing that is seen keeps the lamp's light from them
+    cavity: Cavity  # the wall that they are of
 
     def rays(self, offset: Float[Tensor, "3"]) -> tuple[Float[Tensor, "P F"], Float[Tensor, "P F 2"]]:
         """Distances to a lamp at an offset, and cosines of the angles to its axis and to the normals."""
@@ -91,16 +74,11 @@ class _Observations:
         cosines = torch.stack([rays[..., 2], -(self.normals * rays).sum(-1)], dim=-1)
         return distances, cosines / distances[..., None]
 
-    def falloff(self, offset: Float[Tensor, "3"]) -> tuple[Float[Tensor, "P F"], Float[Tensor, "P F 2"]]:
-        """Log fall-off of colours over the distance to a lamp at an offset, and logarithms of the cosines."""
-        return _falloff(*self.rays(offset))
-
     def light(self, parameters: Float[Tensor, "6"], scale: float) -> Float[Tensor, "P F"]:
-        """Logarithm of the light on the points, encoded: the lamp's and the wall's. [P, F]
+        """Logarithm of the light on the points, encoded: the lamp's and the wall's.
 
-        Args:
-            parameters: Offset of the lamp, exponents of the cosines as of colours, albedo. [6]
-            scale: Median distance.
+        Parameters are the lamp's offset, the exponents of the cosines as of colours, and the albedo; scale is the
+        median distance.
         """
         exponents = parameters[3:5]
         distances, cosines = self.rays(parameters[:3])
@@ -133,10 +111,7 @@ def fit_light(scene: Scene) -> LightFit | None:
 
     d and the angles are those at the lamp, whose offset from the lens, b, c and the wall's albedo are found by
     Gauss-Newton steps. Then exponents of each colour are fitted to these gains and this lamp, without E_wall. Only
-    training frames are looked at.
-
-    Args:
-        scene: The scene; it is fitted once.
+    training frames are looked at. A scene is fitted once.
     """
     if scene not in _FITS:
         _FITS[scene] = _fit_scene(scene)
@@ -154,7 +129,7 @@ def _fit_scene(scene: Scene) -> LightFit | None:
         return None
     seen = _observe(scene, points, wall_normals(everything, points))
     parameters, log_gains = _lamp(seen)
-    known, cosines = seen.falloff(parameters[:3])
+    known, cosines = _falloff(*seen.rays(parameters[:3]))
     rest = seen.logs - (known + log_gains)[..., None]
     slopes = torch.stack(
         [_fit(rest[..., color], seen.usable[..., color], cosines, gains=False).slopes for color in range(3)]
@@ -203,7 +178,7 @@ def _seen(
 
 
 def _mean_of_neighbours(image: Float[Tensor, "H W C"]) -> Float[Tensor, "H W C"]:
-    """Mean over 3x3 pixels, over those that there are at the border. [H, W, C]"""
+    """Mean over 3x3 pixels, over those that there are at the border."""
     planes = image.permute(2, 0, 1)[None]
     return torch.nn.functional.avg_pool2d(planes, 3, 1, 1, count_include_pad=False)[0].permute(1, 2, 0)
 

@@ -1,4 +1,4 @@
-"""Losses of the rendered depth against a ground-truth depth map: L1 and Huber."""
+"""Losses of the rendered depth against depth that is known: true, estimated, or at single points."""
 
 from __future__ import annotations
 
@@ -9,11 +9,14 @@ import torch
 from jaxtyping import Bool, Float
 from pydantic import Field
 from torch import Tensor
+from torch.nn import functional
 from typing_extensions import TypeVar
 
 from coliags_plugin.contracts import Loss, LossSettings, TrainingStep
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.masked import weighted_mean, zero_outside
+from coliags_plugin.core.interpolation import interpolated
+from coliags_plugin.core.masked import masked_mean, weighted_mean, zero_outside
+from coliags_plugin.core.pixel_ids import fixed_uniform
 from coliags_plugin.core.scenes import Target
 
 #: :data:`coliags_plugin.core.render_output.DEPTH_KINDS` as a literal type; a test compares the two.
@@ -59,18 +62,14 @@ class DepthLoss(Loss[DepthLossT]):
 
     @abstractmethod
     def penalty(self, differences: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
-        """Penalty of each difference in depth. [H, W]"""
+        """Penalty of each difference in depth."""
 
     def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
-        """The unweighted term; 0 where no valid pixel has a depth that is trusted at all.
-
-        Raises:
-            InputError: The target has no depth at all.
-        """
-        depth, known = known_depth(step.target)
+        """The unweighted term; 0 where no valid pixel has a depth that is trusted at all."""
+        depth, known = _known_depth(step.target)
         rendered = step.output[self.settings.depth]
         if self.settings.depth == "inverse_depth_accumulated":
-            rendered = _reciprocal(rendered, self.settings.empty_depth)
+            rendered = _reciprocal(rendered, rendered > 0, self.settings.empty_depth)
         truth = depth.to(rendered.dtype)
         penalties = self.penalty(zero_outside(rendered, known) - zero_outside(truth, known))
         return weighted_mean(penalties, known, step.target.depth_confidence)
@@ -84,7 +83,7 @@ class DepthL1Loss(DepthLoss):
     """
 
     def penalty(self, differences: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
-        """Their absolute values, mm. [H, W]"""
+        """Their absolute values, mm."""
         return differences.abs()
 
 
@@ -97,21 +96,154 @@ class DepthHuberLoss(DepthLoss[DepthHuberSettings]):
     Settings: ClassVar[type[LossSettings]] = DepthHuberSettings
 
     def penalty(self, differences: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
-        """Huber's function of them, mm squared. [H, W]"""
-        return torch.nn.functional.huber_loss(
-            differences, torch.zeros_like(differences), reduction="none", delta=self.settings.delta
-        )
+        """Huber's function of them, mm squared."""
+        zero = torch.zeros_like(differences)
+        return functional.huber_loss(differences, zero, reduction="none", delta=self.settings.delta)
 
 
-def known_depth(target: Target) -> tuple[Float[Tensor, "H W"], Bool[Tensor, "H W"]]:
-    """The z-depth to compare with, and where it is known and valid.
+class DistanceL1Settings(LossSettings):
+    """Options of the distance loss."""
 
-    Args:
-        target: What is compared with.
+    depth: Literal["depth_accumulated", "depth_accumulated_coarse"] = Field(
+        default="depth_accumulated", description="Rendered depth whose distance is compared: the final or the coarse."
+    )
+    unit: Literal["scene", "field"] = Field(
+        default="scene", description="Unit of the difference: the scene's, mm in metric data, or the field's own."
+    )
+    share: float = Field(
+        default=1.0, gt=0.0, le=1.0, description="Share of the pixels of each frame that count, drawn once."
+    )
+    seed: int = Field(default=0, ge=0, description="Seed of that draw.")
 
-    Raises:
-        InputError: The target has no depth at all.
+
+class DistanceL1Loss(Loss[DistanceL1Settings]):
+    """Mean |t - t_true| over the drawn valid pixels of known depth, t = |r| sum w z = sum w t_i (REIM-NeRF).
+
+    Weighted by the confidence of the depth if it is estimated. |r| is the length of the pixel's ray per z-depth. Which
+    pixels are drawn depends on ``seed``, frame and pixel only, so it is the same at every step and in a resumed run.
     """
+
+    Settings: ClassVar[type[LossSettings]] = DistanceL1Settings
+    needs: ClassVar[frozenset[str]] = frozenset({"depth"})
+    trusts_depth: ClassVar[bool] = True
+
+    @property
+    def wants(self) -> frozenset[str]:
+        """The rendered depth, and the lengths of the rays."""
+        return frozenset({self.settings.depth, "ray_lengths"})
+
+    def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
+        """The unweighted term in ``unit``; 0 where no pixel counts."""
+        depth, known = _known_depth(step.target)
+        if self.settings.share < 1.0:
+            known = known & (fixed_uniform(step.target.ids, self.settings.seed) < self.settings.share)
+        rendered = step.output[self.settings.depth]
+        difference = zero_outside(rendered, known) - zero_outside(depth.to(rendered.dtype), known)
+        error = weighted_mean(difference.abs() * step.output["ray_lengths"], known, step.target.depth_confidence)
+        return error / step.model.field.length_unit if self.settings.unit == "field" else error
+
+
+class EstimatedDepthSettings(LossSettings):
+    """Options of the loss against estimated depth."""
+
+    depth: DepthKind = Field(
+        default="depth_accumulated", description="Which rendered depth is compared; depth_median has no gradient."
+    )
+    floor: float = Field(
+        default=0.1, ge=0.0, le=1.0, description="Weight of a pixel whose confidence is lower than this."
+    )
+    delta: float = Field(
+        default=0.05,
+        gt=0.0,
+        description="Huber threshold of the relative difference: smaller ones are squared and divided by twice this.",
+    )
+
+
+class EstimatedDepthLoss(Loss[EstimatedDepthSettings]):
+    """Mean of max(c, floor) h(|D - z| / z) over the valid pixels of known depth z of confidence c.
+
+    h is Huber's function with slope 1 beyond ``delta`` (docs/methods.md 4.6). Relative to z, it needs no unit of
+    length. Divided by the number of pixels, not by the sum of weights, so that a frame of nothing but prior depth
+    guides weakly, too. Depth without confidence counts as certain.
+    """
+
+    Settings: ClassVar[type[LossSettings]] = EstimatedDepthSettings
+    needs: ClassVar[frozenset[str]] = frozenset({"depth"})
+
+    @property
+    def wants(self) -> frozenset[str]:
+        """The rendered depth that is compared."""
+        return frozenset({self.settings.depth})
+
+    def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
+        """The unweighted term; 0 where no valid pixel has a depth."""
+        depth, known = _known_depth(step.target)
+        known = known & (depth > 0)
+        rendered, options = step.output[self.settings.depth], self.settings
+        estimate = torch.where(known, depth, 1.0).to(rendered.dtype)
+        rendered, known = _where_drawn(rendered, known, options.depth)
+        penalty = _smooth_l1((zero_outside(rendered - estimate, known) / estimate).abs(), options.delta)
+        if step.target.depth_confidence is not None:
+            penalty = penalty * step.target.depth_confidence.to(penalty.dtype).clamp_min(options.floor)
+        return masked_mean(penalty, known)
+
+
+class SparseDepthSettings(LossSettings):
+    """Options of the sparse depth loss."""
+
+    depth: DepthKind = Field(
+        default="depth_expected", description="Which rendered depth is compared; depth_median has no gradient."
+    )
+    huber: float | None = Field(
+        default=None,
+        gt=0.0,
+        description="Huber threshold, of the differences' unit: smaller ones are squared and divided by twice this; "
+        "null: absolute differences.",
+    )
+    relative: bool = Field(
+        default=False,
+        description="Whether differences are divided by the known depth, so that the weight needs no unit of length.",
+    )
+
+
+class SparseDepthLoss(Loss[SparseDepthSettings]):
+    """Mean |D(p) - z|, or |D(p) - z| / z, over the points p of a frame whose z-depth is known (docs/methods.md 4.5).
+
+    After DS-NeRF (Deng et al., "Depth-supervised NeRF: Fewer Views and Faster Training for Free", CVPR 2022). D is
+    interpolated bilinearly at a point, with border pixels replicated. A point is used if all interpolated pixels are
+    valid and have alpha > 0.
+    """
+
+    Settings: ClassVar[type[LossSettings]] = SparseDepthSettings
+    needs: ClassVar[frozenset[str]] = frozenset({"sparse_depth"})
+    whole_image: ClassVar[bool] = True
+
+    @property
+    def wants(self) -> frozenset[str]:
+        """The rendered depth that is compared."""
+        return frozenset({self.settings.depth})
+
+    def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
+        """The unweighted term, scene units unless ``relative``; 0, still part of the graph, if no point is used."""
+        rendered, points = step.output[self.settings.depth], step.target.sparse_depth
+        if points is None or not len(points.depth):
+            return rendered.reshape(-1)[:0].sum()
+        drawn = (step.output.alpha > 0) & step.target.valid & torch.isfinite(rendered)
+        rendered, drawn = _where_drawn(rendered, drawn, self.settings.depth)
+        sampled, counts = interpolated(rendered, drawn, points.pixels)
+        truth = points.depth.to(rendered.dtype)
+        if self.settings.relative:
+            counts = counts & (truth > 0)
+        difference = torch.where(counts, sampled - truth, 0.0).abs()
+        if self.settings.relative:
+            difference = difference / torch.where(counts, truth, 1.0)
+        if self.settings.huber is not None:
+            difference = _smooth_l1(difference, self.settings.huber)
+        return difference.sum() / counts.sum().clamp_min(1)
+
+
+def _known_depth(target: Target) -> tuple[Float[Tensor, "H W"], Bool[Tensor, "H W"]]:
+    """The z-depth to compare with, and where it is known and valid."""
     if target.depth is None:
         raise InputError(
             f"frame '{target.name}' has no depth",
@@ -121,29 +253,21 @@ def known_depth(target: Target) -> tuple[Float[Tensor, "H W"], Bool[Tensor, "H W
     return target.depth, torch.isfinite(target.depth) & target.valid
 
 
-def where_drawn(
+def _where_drawn(
     rendered: Float[Tensor, "H W"], usable: Bool[Tensor, "H W"], kind: str
 ) -> tuple[Float[Tensor, "H W"], Bool[Tensor, "H W"]]:
-    """Rendered depth, of inverse depth the reciprocal, and the usable pixels that have one.
-
-    Args:
-        rendered: An output of one of the kinds of depth. [H, W]
-        usable: Pixels that are compared where something was drawn. [H, W]
-        kind: Name of the output.
-    """
+    """Rendered depth, of inverse depth the reciprocal, and the usable pixels that have one."""
     if kind != "inverse_depth_accumulated":
         return rendered, usable
     usable = usable & (rendered > 0)
-    return 1.0 / torch.where(usable, rendered, 1.0), usable
+    return _reciprocal(rendered, usable, 1.0), usable
 
 
-def smooth_l1(differences: Float[Tensor, "*N"], beta: float) -> Float[Tensor, "*N"]:
-    """Huber's function of slope 1: x^2 / (2 beta) for |x| up to ``beta``, beyond it |x| - beta / 2. [*N]"""
-    zero = torch.zeros_like(differences)
-    return torch.nn.functional.smooth_l1_loss(differences, zero, reduction="none", beta=beta)
+def _reciprocal(values: Float[Tensor, "H W"], where: Bool[Tensor, "H W"], otherwise: float) -> Float[Tensor, "H W"]:
+    """1/E; both operands are masked so that no gradient becomes NaN."""
+    return torch.where(where, 1.0 / torch.where(where, values, 1.0), otherwise)
 
 
-def _reciprocal(inverse_depth: Float[Tensor, "H W"], empty_depth: float) -> Float[Tensor, "H W"]:
-    """1/E where E > 0, else ``empty_depth``; both operands are masked so that no gradient becomes NaN. [H, W]"""
-    drawn = inverse_depth > 0
-    return torch.where(drawn, 1.0 / torch.where(drawn, inverse_depth, 1.0), empty_depth)
+def _smooth_l1(differences: Float[Tensor, "*N"], beta: float) -> Float[Tensor, "*N"]:
+    """Huber's function of slope 1: x^2 / (2 beta) for |x| up to ``beta``, beyond it |x| - beta / 2."""
+    return functional.smooth_l1_loss(differences, torch.zeros_like(differences), reduction="none", beta=beta)

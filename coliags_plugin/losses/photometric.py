@@ -10,6 +10,7 @@ from torch import Tensor
 
 from coliags_plugin.contracts import Loss, LossSettings, TrainingStep
 from coliags_plugin.core.masked import masked_mean, zero_outside
+from coliags_plugin.core.scenes import Target
 from coliags_plugin.core.ssim import ssim_map
 
 
@@ -20,9 +21,7 @@ class L1Loss(Loss):
 
     def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
         """The unweighted term, in units of full scale; 0 where no pixel is valid."""
-        rgb, mask = step.output.rgb, step.target.mask
-        difference = zero_outside(rgb, mask) - zero_outside(step.target.rgb.to(rgb.dtype), mask)
-        return masked_mean(difference.abs(), mask)
+        return masked_mean(_difference(step.output.rgb, step.target).abs(), step.target.mask)
 
 
 class MSESettings(LossSettings):
@@ -45,9 +44,7 @@ class MSELoss(Loss[MSESettings]):
 
     def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
         """The unweighted term, in units of full scale squared; 0 where no pixel is valid."""
-        rgb, mask = step.output[self.settings.image], step.target.mask
-        difference = zero_outside(rgb, mask) - zero_outside(step.target.rgb.to(rgb.dtype), mask)
-        return masked_mean(difference.square(), mask)
+        return masked_mean(_difference(step.output[self.settings.image], step.target).square(), step.target.mask)
 
 
 class DSSIMLoss(Loss):
@@ -63,3 +60,8 @@ class DSSIMLoss(Loss):
         """The unweighted term, from 0 (equal) to 2; 0 where no pixel is valid."""
         rgb, mask = step.output.rgb, step.target.mask
         return masked_mean(1.0 - ssim_map(rgb, step.target.rgb.to(rgb.dtype), mask), mask)
+
+
+def _difference(rgb: Float[Tensor, "H W 3"], target: Target) -> Float[Tensor, "H W 3"]:
+    """Rendered minus true colours; 0 outside the mask."""
+    return zero_outside(rgb, target.mask) - zero_outside(target.rgb.to(rgb.dtype), target.mask)

@@ -30,11 +30,7 @@ class DepthMetric(Metric[SettingsT]):
     unit: ClassVar[str] = "mm"
 
     def __call__(self, comparison: Comparison) -> float:
-        """The metric of one frame.
-
-        Raises:
-            UnavailableError: The frame has no true depth, no pixel counts, or the rendered depth is not finite.
-        """
+        """The metric of one frame; unavailable without true depth or pixels, or if rendered depth is not finite."""
         rendered, truth, counts = comparison.depth, comparison.true_depth, comparison.depth_valid
         if rendered is None or truth is None or counts is None:
             raise UnavailableError(
@@ -44,13 +40,12 @@ class DepthMetric(Metric[SettingsT]):
             raise UnavailableError("no pixel of this frame has a valid ground-truth depth")
         counts = self.select(truth, counts)
         rendered, truth = rendered[counts].double(), truth[counts].double()
-        broken = torch.isfinite(rendered).logical_not().sum()
-        if broken:
+        if broken := (~torch.isfinite(rendered)).sum():
             raise UnavailableError(f"the rendered depth is not finite at {int(broken)} pixels")
         return float(self.error(rendered, truth))
 
     def select(self, truth: Float[Tensor, "H W"], counts: Bool[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
-        """Mask of the pixels that enter the metric: all valid ones unless overridden; at least one. [H, W]"""
+        """Mask of the pixels that enter the metric: all valid ones unless overridden; at least one."""
         return counts
 
     @abstractmethod
@@ -86,11 +81,7 @@ class DepthMSEInner(DepthMSE[DepthMSEInnerSettings]):
     Settings: ClassVar[type[Settings]] = DepthMSEInnerSettings
 
     def select(self, truth: Float[Tensor, "H W"], counts: Bool[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
-        """Valid pixels further than ``margin`` from any depth step. [H, W]
-
-        Raises:
-            UnavailableError: There are none.
-        """
+        """Valid pixels further than ``margin`` from any depth step."""
         steps = depth_steps(truth, counts, self.settings.relative_step)
         inner = counts & ~dilated(steps, self.settings.margin)
         if not inner.any():
@@ -130,11 +121,7 @@ class DepthAbsRel(DepthMetric):
     unit: ClassVar[str] = ""
 
     def error(self, rendered: Float[Tensor, "P"], truth: Float[Tensor, "P"]) -> Float[Tensor, ""]:
-        """Mean of |D - D_true| / D_true.
-
-        Raises:
-            UnavailableError: A true depth is not positive.
-        """
+        """Mean of |D - D_true| / D_true."""
         if (truth <= 0).any():
             raise UnavailableError("a true depth of 0 mm makes the relative error infinite")
         return ((rendered - truth).abs() / truth).mean()
@@ -143,12 +130,7 @@ class DepthAbsRel(DepthMetric):
 def depth_steps(depth: Float[Tensor, "H W"], known: Bool[Tensor, "H W"], relative_step: float) -> Bool[Tensor, "H W"]:
     """Mask of pixels whose 3x3 window holds a depth step: (max - min) / min of its known depths above a threshold.
 
-    Unknown pixels make no step themselves; two known surfaces on either side of one do. [H, W]
-
-    Args:
-        depth: z-depth, mm. [H, W]
-        known: True where the depth is known. [H, W]
-        relative_step: Threshold, for instance 0.12.
+    Unknown pixels make no step themselves; two known surfaces on either side of one do. The depth is z-depth.
     """
     farthest = _window_max(torch.where(known, depth, -torch.inf), 1)
     nearest = -_window_max(torch.where(known, -depth, -torch.inf), 1)
@@ -156,12 +138,12 @@ def depth_steps(depth: Float[Tensor, "H W"], known: Bool[Tensor, "H W"], relativ
 
 
 def dilated(marked: Bool[Tensor, "H W"], reach: int) -> Bool[Tensor, "H W"]:
-    """The mask dilated by ``reach`` rows and columns. [H, W]"""
+    """The mask dilated by ``reach`` rows and columns."""
     return _window_max(marked.to(torch.float32), reach) > 0
 
 
 def _window_max(values: Float[Tensor, "H W"], reach: int) -> Float[Tensor, "H W"]:
-    """Maximum over the square window around every pixel; pixels outside the image do not count. [H, W]"""
+    """Maximum over the square window around every pixel; pixels outside the image do not count."""
     from kornia.morphology import dilation
 
     square = torch.ones(2 * reach + 1, 2 * reach + 1, dtype=values.dtype, device=values.device)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import ClassVar
 
 import torch
-from torch import Tensor
 
 from coliags_plugin.contracts import Comparison, Metric
 from coliags_plugin.core.errors import UnavailableError
@@ -13,26 +12,22 @@ from coliags_plugin.core.settings import Settings
 from coliags_plugin.core.ssim import ssim
 
 
-class PSNRSettings(Settings):
+class ImageMetricSettings(Settings):
     """No options."""
 
 
-class PSNR(Metric[PSNRSettings]):
+class PSNR(Metric[ImageMetricSettings]):
     """Peak signal-to-noise ratio, 10 log10(1 / mse), the mse over all channels of the valid pixels together.
 
     (The authors' in-training report averages one PSNR per channel instead; docs/methods.md 2.4.)
     """
 
-    Settings: ClassVar[type[Settings]] = PSNRSettings
+    Settings: ClassVar[type[Settings]] = ImageMetricSettings
     higher_is_better: ClassVar[bool] = True
     unit: ClassVar[str] = "dB"
 
     def __call__(self, comparison: Comparison) -> float:
-        """PSNR of one frame, dB.
-
-        Raises:
-            UnavailableError: No pixel is valid, the rendered image is not finite, or the images are identical.
-        """
+        """PSNR of one frame, dB; unavailable where :func:`require_image` says so, or the images are identical."""
         require_image(comparison)
         difference = comparison.rgb.double() - comparison.true_rgb.double()
         squared_error = difference[comparison.valid].square().mean()
@@ -41,39 +36,22 @@ class PSNR(Metric[PSNRSettings]):
         return float(-10.0 * torch.log10(squared_error))
 
 
-class SSIMSettings(Settings):
-    """No options."""
-
-
-class SSIM(Metric[SSIMSettings]):
+class SSIM(Metric[ImageMetricSettings]):
     """Structural similarity by :func:`coliags_plugin.core.ssim.ssim`; ignored pixels do not enter the windows."""
 
-    Settings: ClassVar[type[Settings]] = SSIMSettings
+    Settings: ClassVar[type[Settings]] = ImageMetricSettings
     higher_is_better: ClassVar[bool] = True
     unit: ClassVar[str] = ""
 
     def __call__(self, comparison: Comparison) -> float:
-        """SSIM of one frame, at most 1.
-
-        Raises:
-            UnavailableError: No pixel is valid, or the rendered image is not finite.
-        """
+        """SSIM of one frame, at most 1; unavailable where :func:`require_image` says so."""
         require_image(comparison)
         return float(ssim(comparison.rgb.double(), comparison.true_rgb.double(), comparison.valid))
 
 
 def require_image(comparison: Comparison) -> None:
-    """Raise where no image metric can be computed.
-
-    Raises:
-        UnavailableError: No pixel is valid, or a valid pixel of the rendered image is not finite.
-    """
+    """Refuse images without a valid pixel, and rendered ones that are not finite at one (UnavailableError)."""
     if not comparison.valid.any():
         raise UnavailableError("the mask leaves no pixel")
-    broken = _not_finite(comparison.rgb).logical_and(comparison.valid).sum()
-    if broken:
+    if broken := (~torch.isfinite(comparison.rgb).all(dim=-1) & comparison.valid).sum():
         raise UnavailableError(f"the rendered image is not finite at {int(broken)} pixels")
-
-
-def _not_finite(rgb: Tensor) -> Tensor:
-    return torch.isfinite(rgb).all(dim=-1).logical_not()

@@ -55,12 +55,7 @@ class LPIPS(Metric[LPIPSSettings]):
             raise InputError(f"lpips: weights = '{settings.weights}' is not a folder", "a folder with LPIPS weights")
 
     def __call__(self, comparison: Comparison) -> float:
-        """LPIPS of one frame, 0 for equal images.
-
-        Raises:
-            UnavailableError: The weights are not on this machine, the image is too small or not finite, or no pixel is
-                valid.
-        """
+        """LPIPS of one frame, 0 for equal images; unavailable without weights, and for small or unusable images."""
         require_image(comparison)
         height, width = comparison.valid.shape
         if min(height, width) < _SMALLEST:

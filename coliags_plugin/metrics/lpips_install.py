@@ -26,16 +26,10 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Published:
-    """One published file.
-
-    Attributes:
-        url: Where it is.
-        known: SHA-256, or the first digits of it, to path in the folder of weights. The first is what the URL gives,
-            further ones are other files with the same values.
-    """
+    """One published file, and the SHA-256 of it and of other files with the same values."""
 
     url: str
-    known: Mapping[str, str]
+    known: Mapping[str, str]  # checksum, or the first digits of it, to path in the folder of weights; the URL's first
 
     @property
     def sha256(self) -> str:
@@ -81,7 +75,7 @@ SOURCES: dict[str, tuple[Published, Published]] = {
 
 
 def install(nets: Sequence[str], folder: Path | None, origin: Path | None, progress: Progress) -> list[Path]:
-    """Install the weights of some nets where they are missing, and see that the network of each can be loaded.
+    """Install the weights of some nets where they are missing, see that their networks load, and name the new files.
 
     Args:
         nets: Keys of :data:`SOURCES`.
@@ -90,13 +84,6 @@ def install(nets: Sequence[str], folder: Path | None, origin: Path | None, progr
         origin: A folder to copy the files from; nothing is copied unless all that are missing are in it. None: they are
             downloaded.
         progress: Called with what has arrived of a file, and its total, MiB.
-
-    Returns:
-        The files that were installed.
-
-    Raises:
-        InputError: A file cannot be had (:func:`coliags_plugin.core.download.download`), is not the published one, or
-            cannot be loaded.
     """
     if origin is not None and not origin.is_dir():
         raise InputError(f"--from {origin} is not a folder", "a folder with LPIPS weights")
@@ -152,11 +139,7 @@ def _copy(missing: Sequence[tuple[str, int]], origin: Path, target: Path) -> lis
 
 
 def _path(published: Published, file: Path) -> str:
-    """Where a file belongs in the folder of weights.
-
-    Raises:
-        InputError: It is not a published one.
-    """
+    """Where a published file belongs in the folder of weights."""
     digest = file_sha256(file)
     path = published.path_of(digest)
     if path is None:

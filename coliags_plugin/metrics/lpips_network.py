@@ -29,13 +29,8 @@ _SCALE = (0.458, 0.448, 0.450)
 class LPIPSNetwork(nn.Module):
     """Frozen backbone and linear heads of one LPIPS variant.
 
-    Args:
-        net: A key of :data:`TAPS`.
-        backbone: torchvision's ``features`` weights, keys like ``"0.weight"``.
-        heads: One non-negative weight per channel and tap, in the order of the taps. Each [1, C, 1, 1]
-
-    Raises:
-        RuntimeError: The backbone's weights do not fit; the message names them.
+    The backbone has torchvision's ``features`` weights, keys like ``"0.weight"``; where these do not fit, torch's
+    RuntimeError names them. Heads have one non-negative weight per channel of each tap, in order, each [1, C, 1, 1].
     """
 
     def __init__(self, net: str, backbone: Mapping[str, Tensor], heads: list[Tensor]) -> None:
@@ -54,12 +49,9 @@ class LPIPSNetwork(nn.Module):
     def forward(
         self, first: Float[Tensor, "1 3 H W"], second: Float[Tensor, "1 3 H W"], mask: Bool[Tensor, "H W"]
     ) -> Float[Tensor, ""]:
-        """Distance between two images, 0 for equal ones.
+        """Distance between two images in the input range of the variant, 0 for equal ones.
 
-        Args:
-            first: In the input range of the variant. [1, 3, H, W]
-            second: In the same range. [1, 3, H, W]
-            mask: Where the distance is averaged; at each tap, a cell counts by the share of it that is True. [H, W]
+        It is averaged over the mask: at each tap, a cell counts by the share of it that is True.
         """
         shares = mask.to(first.dtype)[None, None]
         x, y = self._standardised(first), self._standardised(second)
@@ -94,54 +86,40 @@ def _vgg16() -> nn.Sequential:
         if layers:
             layers.append(nn.MaxPool2d(2))
         for width in block:
-            layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU(inplace=True)]
+            layers += _convolution(channels, width, 3, padding=1)
             channels = width
     return nn.Sequential(*layers)
 
 
+def _convolution(inputs: int, outputs: int, size: int, stride: int = 1, padding: int = 0) -> list[nn.Module]:
+    return [nn.Conv2d(inputs, outputs, size, stride, padding), nn.ReLU(inplace=True)]
+
+
 def _alexnet() -> nn.Sequential:
     return nn.Sequential(
-        nn.Conv2d(3, 64, 11, stride=4, padding=2),
-        nn.ReLU(inplace=True),
+        *_convolution(3, 64, 11, stride=4, padding=2),
         nn.MaxPool2d(3, stride=2),
-        nn.Conv2d(64, 192, 5, padding=2),
-        nn.ReLU(inplace=True),
+        *_convolution(64, 192, 5, padding=2),
         nn.MaxPool2d(3, stride=2),
-        nn.Conv2d(192, 384, 3, padding=1),
-        nn.ReLU(inplace=True),
-        nn.Conv2d(384, 256, 3, padding=1),
-        nn.ReLU(inplace=True),
-        nn.Conv2d(256, 256, 3, padding=1),
-        nn.ReLU(inplace=True),
+        *_convolution(192, 384, 3, padding=1),
+        *_convolution(384, 256, 3, padding=1),
+        *_convolution(256, 256, 3, padding=1),
     )
 
 
 def _squeezenet() -> nn.Sequential:
-    return nn.Sequential(
-        nn.Conv2d(3, 64, 3, stride=2),
-        nn.ReLU(inplace=True),
-        nn.MaxPool2d(3, stride=2, ceil_mode=True),
-        Fire(64, 16, 64),
-        Fire(128, 16, 64),
-        nn.MaxPool2d(3, stride=2, ceil_mode=True),
-        Fire(128, 32, 128),
-        Fire(256, 32, 128),
-        nn.MaxPool2d(3, stride=2, ceil_mode=True),
-        Fire(256, 48, 192),
-        Fire(384, 48, 192),
-        Fire(384, 64, 256),
-        Fire(512, 64, 256),
-    )
+    layers = _convolution(3, 64, 3, stride=2)
+    inputs = 64
+    for block in (((16, 64), (16, 64)), ((32, 128), (32, 128)), ((48, 192), (48, 192), (64, 256), (64, 256))):
+        layers.append(nn.MaxPool2d(3, stride=2, ceil_mode=True))
+        for squeezed, expanded in block:
+            layers.append(Fire(inputs, squeezed, expanded))
+            inputs = 2 * expanded
+    return nn.Sequential(*layers)
 
 
 class Fire(nn.Module):
-    """SqueezeNet's fire module: a 1x1 squeeze, then 1x1 and 3x3 expansions in parallel.
-
-    Args:
-        inputs: Channels in.
-        squeezed: Channels in between.
-        expanded: Channels out of each of the two expansions.
-    """
+    """SqueezeNet's fire module: a 1x1 squeeze, then 1x1 and 3x3 expansions in parallel, each ``expanded`` wide."""
 
     def __init__(self, inputs: int, squeezed: int, expanded: int) -> None:
         super().__init__()

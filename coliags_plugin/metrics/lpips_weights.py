@@ -33,21 +33,12 @@ def find_weights(net: str, folder: str | Path | None = None) -> tuple[Path, Path
     Searched in ``folder``, then in the folder that ``COLIAGS_LPIPS_WEIGHTS`` names, then where ``torch.hub`` keeps
     downloads, and the heads also in an installed ``lpips`` package. A backbone is a file under torchvision's name, or
     any ``.pth`` with the net's name and "backbone" in its own; heads are ``{net}.pth`` or ``lpips_{net}.pth``, directly
-    or in ``v0.1/``.
-
-    Raises:
-        UnavailableError: One is missing; names the file and the command that installs it.
+    or in ``v0.1/``. Where one is missing, UnavailableError names it and the command that installs it.
     """
     backbone, heads = search(net, folder)
     if backbone is None or heads is None:
-        missing = [
-            f"{what} ({name})"
-            for what, name, file in (
-                ("backbone", BACKBONE_FILES[net][0], backbone),
-                ("linear heads", f"v0.1/{net}.pth", heads),
-            )
-            if file is None
-        ]
+        names = {f"backbone ({BACKBONE_FILES[net][0]})": backbone, f"linear heads (v0.1/{net}.pth)": heads}
+        missing = [name for name, file in names.items() if file is None]
         command = "coliags weights lpips" + ("" if net in DEFAULT_NETS else f" --net {net}")
         # Recorded with results, which are to be the same on every machine: no folders here.
         raise UnavailableError(
@@ -75,11 +66,7 @@ def default_folder() -> Path:
 
 
 def load_network(net: str, backbone: Path, heads: Path) -> LPIPSNetwork:
-    """Load the network with these weights.
-
-    Raises:
-        UnavailableError: A file cannot be read or holds something else.
-    """
+    """Load the network with these weights; UnavailableError where a file cannot be read or holds something else."""
     state = _read(backbone)
     prefix = "features."
     if any(key.startswith(prefix) for key in state):

@@ -25,6 +25,8 @@ MetricTable = Mapping[str, tuple[str, Mapping[str, Any]]]
 # The splatting papers' variant: VGG fed [0, 1] unmapped (docs/methods.md 2.4).
 _LPIPS_OF_THE_PAPERS = {"net": "vgg", "input_range": "zero-one"}
 
+_DEPTH_METRICS = ("depth_mse", "depth_mse_inner", "depth_median_error", "depth_rmse", "depth_mae", "depth_abs_rel")
+
 
 class PaperProtocol(Protocol):
     """The metrics as the paper defines them, on float images and valid pixels.
@@ -46,13 +48,8 @@ class PaperProtocol(Protocol):
             "lpips": ("lpips", _LPIPS_OF_THE_PAPERS),
             # Not in the paper: its weights are small and easier to obtain than VGG's.
             "lpips_squeeze": ("lpips", {"net": "squeeze", "input_range": "zero-one"}),
-            "depth_mse": ("depth_mse", {}),
-            "depth_mse_inner": ("depth_mse_inner", {}),
-            "depth_median_error": ("depth_median_error", {}),
-            "depth_rmse": ("depth_rmse", {}),
-            "depth_mae": ("depth_mae", {}),
-            "depth_abs_rel": ("depth_abs_rel", {}),
         }
+        | {name: (name, {}) for name in _DEPTH_METRICS}
     )
     optional_metrics: ClassVar[MetricTable] = MappingProxyType(
         {
@@ -112,10 +109,8 @@ class AuthorsCodeProtocol(Protocol):
         if frame.depth_at_least is not None:
             known = torch.where(torch.isfinite(frame.depth_at_least), frame.depth_at_least, known)
         known = torch.where(torch.isfinite(known), known, 0.0)
-        return Comparison(
-            image.rgb,
-            image.true_rgb,
-            image.valid,
+        return replace(
+            image,
             depth=through_16_bit(rendered, self.rendered_full_scale),
             true_depth=through_16_bit(known, self.true_full_scale),
             depth_valid=everywhere,
@@ -125,7 +120,7 @@ class AuthorsCodeProtocol(Protocol):
 def _at_points(
     depth: Float[Tensor, "H W"], alpha: Float[Tensor, "H W"], valid: Bool[Tensor, "H W"], points: SparseDepth
 ) -> tuple[Float[Tensor, "K"], Float[Tensor, "K"]]:
-    """Rendered and known depth at the points where all interpolated pixels are drawn and valid. [K] each"""
+    """Rendered and known depth at the points where all interpolated pixels are drawn and valid."""
     sampled, usable = interpolated(depth, (alpha > 0) & torch.isfinite(depth) & valid, points.pixels)
     usable = usable & (points.depth > 0)
     return sampled[usable], points.depth[usable]
@@ -138,9 +133,6 @@ def through_8_bit(rgb: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
     """Image written as 8 bit by torchvision's ``save_image`` (times 255, plus 0.5, clamped, truncated) and read back.
 
     NaN stays NaN, so that the metrics refuse it.
-
-    Args:
-        rgb: In [0, 1]; beyond that it is clamped. [H, W, 3]
     """
     return (rgb * 255.0 + 0.5).clamp(0.0, 255.0).floor() / 255.0
 
@@ -150,11 +142,7 @@ def through_16_bit(depth: Float[Tensor, "H W"], full_scale: float) -> Float[Tens
 
     The cast truncates. It does not clamp: beyond full scale it keeps the lower 16 bits, so 151 mm at a scale of 150 mm
     comes back as 1 mm. That, and 0 for what a 32-bit integer cannot hold (infinity, NaN), is what numpy gives on
-    x86-64, where the published values were computed; C leaves both undefined.
-
-    Args:
-        depth: mm. [H, W]
-        full_scale: Depth of level 65535, mm.
+    x86-64, where the published values were computed; C leaves both undefined. ``full_scale``: of level 65535, mm.
     """
     levels = (depth.float() / full_scale * _LEVELS).trunc()
     fits = levels.abs() < 2.0**31  # False for NaN

@@ -26,11 +26,7 @@ class SparseDepthError(Metric[SparseDepthErrorSettings]):
     unit: ClassVar[str] = "%"
 
     def __call__(self, comparison: Comparison) -> float:
-        """The metric of one frame.
-
-        Raises:
-            UnavailableError: The frame has no points, or at none of them something was drawn.
-        """
+        """The metric of one frame; unavailable without points, or if nothing was drawn at any."""
         rendered, known = comparison.point_depth, comparison.true_point_depth
         if rendered is None or known is None:
             raise UnavailableError("this frame has no points of known depth")

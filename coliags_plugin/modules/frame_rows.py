@@ -12,13 +12,9 @@ from coliags_plugin.core.scenes import Scene, View
 
 
 class FrameRows:
-    """Lookup of parameter rows by view.
+    """Lookup of parameter rows by view: one for each training frame, in their order.
 
-    Args:
-        scene: Scene whose training frames have one row each, in their order.
-
-    Attributes:
-        times: Index in the video of every training frame, by row.
+    ``times`` are the frames' indices in the video, by row.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -57,11 +53,7 @@ class FrameRows:
         return self._rows_by_time[before], self._rows_by_time[after], share
 
     def require(self, name: str, asking: str) -> int:
-        """The row of a frame that settings name.
-
-        Raises:
-            InputError: No training frame has that name.
-        """
+        """The row of a training frame that settings name."""
         if name in self.rows:
             return self.rows[name]
         shown = ", ".join(list(self.rows)[:6]) + (", ..." if len(self.rows) > 6 else "")

@@ -66,11 +66,7 @@ class FrameGain(GainModule[FrameGainSettings]):
 
     @classmethod
     def from_scene(cls, scene: Scene, settings: FrameGainSettings, generator: torch.Generator) -> Self:
-        """Module with gains of 1.
-
-        Raises:
-            InputError: ``reference`` is no training frame.
-        """
+        """Module with gains of 1."""
         return cls(settings, scene)
 
     @torch.no_grad()
@@ -102,18 +98,18 @@ class FrameGain(GainModule[FrameGainSettings]):
         return self.frames.times
 
     def log_gains(self) -> Float[Tensor, "F C"]:
-        """Logarithm of every training frame's gain, relative to the reference, within its bounds. [F, C]"""
+        """Logarithm of every training frame's gain, relative to the reference, within its bounds."""
         logs = self.fitted + self.rate * self.log_gain
         zero = logs.mean(0) if self._reference is None else logs[self._reference]
         limit = math.log(self.settings.max_gain)
         return (logs - zero).clamp(-limit, limit)
 
     def gains(self) -> Float[Tensor, "F C"]:
-        """The gain of every training frame, in their order. [F, C]"""
+        """The gain of every training frame, in their order."""
         return self.log_gains().exp()
 
     def gain(self, view: View | None) -> Float[Tensor, "C"]:
-        """The gain of a view. [C]"""
+        """The gain of a view."""
         log_gains = self.log_gains()
         row = self.frames.row(view)
         if row is not None:

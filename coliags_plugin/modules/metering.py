@@ -21,11 +21,7 @@ class Metering(nn.Module):
     """Correction of gains interpolated in time, from the brightness of a rendered view (docs/methods.md 4.7).
 
     Brightness is that of renderings before gain and response curve, of training frames too: what these recorded is
-    compressed where it is bright, and clipped.
-
-    Args:
-        scene: The scene; brightness is measured where all masks of its training frames are True.
-        frames: Rows of the training frames.
+    compressed where it is bright, and clipped. It is measured where all masks of the training frames are True.
 
     Attributes:
         brightness: Mean colour of every training frame when it was last rendered in training; 0 before that. [F]
@@ -40,20 +36,20 @@ class Metering(nn.Module):
 
     @cached_property
     def _valid(self) -> Bool[Tensor, "H W"] | None:
-        return _common_valid(self._scene)
+        """Where all training frames are valid; None where that is everywhere, nowhere, or their sizes differ."""
+        masks = [frame.mask.cpu() for frame in self._scene.train if frame.mask is not None]
+        if not masks or any(mask.shape != masks[0].shape for mask in masks):
+            return None
+        common = torch.stack(masks).all(0)
+        return common if common.any() else None
 
     @torch.no_grad()
     def remember(self, row: int, rgb: Float[Tensor, "H W 3"]) -> None:
-        """Keep the brightness of a training frame.
-
-        Args:
-            row: Of the frame.
-            rgb: Its rendering before its gain.
-        """
+        """Keep the brightness of a training frame, rendered before its gain."""
         self.brightness[row] = self._measure(rgb)
 
     def _measure(self, rgb: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
-        """Mean colour over the pixels that are valid in every training frame. []"""
+        """Mean colour over the pixels that are valid in every training frame."""
         valid = self._valid
         colors = rgb if valid is None or valid.shape != rgb.shape[:2] else rgb[valid.to(rgb.device)]
         return colors.mean().clamp_min(_DARKEST)
@@ -63,15 +59,9 @@ class Metering(nn.Module):
     ) -> float:
         """Correction of the log gain of a held-out view, to add to the one interpolated in time.
 
-        A view that is brighter than interpolation between the two frames would make it has a smaller gain, by as much
-        as training frames had that lie as far from others. 0 until every training frame has been rendered in training.
-
-        Args:
-            log_gains: Of the training frames. [F, C]
-            rgb: The view before its gain.
-            before: Row of the frame before.
-            after: Row of the frame after.
-            share: Place of the view between them, in [0, 1].
+        A view, before its gain, that is brighter than interpolation at a share between the frames before and after
+        would make it has a smaller gain, by as much as training frames had that lie as far from others. 0 until every
+        training frame has been rendered in training.
         """
         if not self.brightness.all():
             return 0.0
@@ -82,19 +72,13 @@ class Metering(nn.Module):
 
     @property
     def _log_brightness(self) -> Float[Tensor, "F"]:
-        """Logarithm of the brightness of the training frames. [F]"""
         return self.brightness.cpu().double().log()
 
     def response(self, gains: Float[Tensor, "F"], before: int, after: int) -> float:
-        """Change of the log gain per change of log brightness over a gap in time, from -1 to 0.
+        """Change of the log gain per change of log brightness over the gap between two frames, from -1 to 0.
 
-        Least squares over the training frames, each against what its neighbours at half the gap on either side
-        predict; 0 where the video is too short for that.
-
-        Args:
-            gains: Logarithms, of the training frames. [F]
-            before: Row of the frame at the gap's start.
-            after: Row of the frame at its end.
+        Least squares over the logarithms of the training frames' gains, each against what its neighbours at half the
+        gap on either side predict; 0 where the video is too short for that.
         """
         times = torch.tensor(self._frames.times, dtype=torch.float64)
         gap = float(times[after] - times[before])
@@ -108,12 +92,3 @@ class Metering(nn.Module):
         expected = torch.lerp(levels[:, : -2 * reach], levels[:, 2 * reach :], (times[middle] - first) / (last - first))
         gain, brightness = levels[:, middle] - expected
         return float((gain @ brightness / (brightness @ brightness).clamp_min(1e-12)).clamp(-1.0, 0.0))
-
-
-def _common_valid(scene: Scene) -> Bool[Tensor, "H W"] | None:
-    """Where all training frames are valid; None where that is everywhere, nowhere, or their sizes differ."""
-    masks = [frame.mask.cpu() for frame in scene.train if frame.mask is not None]
-    if not masks or any(mask.shape != masks[0].shape for mask in masks):
-        return None
-    common = torch.stack(masks).all(0)
-    return common if common.any() else None

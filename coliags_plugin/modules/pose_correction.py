@@ -58,11 +58,7 @@ class PoseCorrection(ViewModule[PoseCorrectionSettings]):
 
     @classmethod
     def from_scene(cls, scene: Scene, settings: PoseCorrectionSettings, generator: torch.Generator) -> Self:
-        """Module with zero corrections.
-
-        Raises:
-            InputError: A frame in ``fixed`` is no training frame.
-        """
+        """Module with zero corrections."""
         return cls(settings, scene)
 
     @property
@@ -103,7 +99,7 @@ class PoseCorrection(ViewModule[PoseCorrectionSettings]):
     def corrections(self) -> tuple[Float[Tensor, "F 3"], Float[Tensor, "F 3"]]:
         """Rotation vectors (radians) and translations (scene units) of the training frames, in their order.
 
-        0 for the ``fixed`` frames; without any, they are zero on average. [F, 3], [F, 3]
+        0 for the ``fixed`` frames; without any, they are zero on average.
         """
         if self._fixed:
             free = self.rotation.new_tensor([[row not in self._fixed] for row in range(len(self.frames))])
@@ -126,7 +122,7 @@ def _median_depth(camera: Camera, scene: Scene) -> float:
 
 
 def rotation_matrix(vector: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """The rotation of a rotation vector (axis times angle, radians), smooth about zero. [3, 3]"""
+    """The rotation of a rotation vector (axis times angle, radians), smooth about zero."""
     x, y, z = vector.unbind()
     zero = torch.zeros_like(x)
     return torch.linalg.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3))

@@ -33,9 +33,8 @@ class AdaptiveDensitySettings(Settings):
     reset_opacity: float = Field(default=0.01, gt=0, lt=1)  # the most that a reset leaves
     max_radius: float | None = Field(default=20.0, gt=0)  # pixels; larger ones go after the first reset
     max_scale_share: float | None = Field(default=0.1, gt=0)  # of the extent; likewise
-    split_normal_share: float = Field(
-        default=1.0, ge=0
-    )  # of a split Gaussian's smallest deviation, in which its parts are spread along that axis
+    # of a split Gaussian's smallest deviation, in which its parts are spread along that axis
+    split_normal_share: float = Field(default=1.0, ge=0)
     prune_above: int = Field(default=0, ge=0)  # an event prunes only where more Gaussians than this would stay
 
 
@@ -113,8 +112,7 @@ class AdaptiveDensity(Strategy[AdaptiveDensitySettings, ExplicitRows]):
         return done
 
     def _forget(self, like: Tensor) -> None:
-        for name in self.counters:
-            setattr(self, name, like.new_zeros(len(like)))
+        self.load_state_dict({name: like.new_zeros(len(like)) for name in self.counters})
 
     def _count(self, output: RenderOutput) -> None:
         splats, lengths = output.drawn, gradient_lengths(output)
@@ -147,7 +145,7 @@ class AdaptiveDensity(Strategy[AdaptiveDensitySettings, ExplicitRows]):
         return len(field.means) - before
 
     def _shifts(self, scales: Tensor, quats: Tensor) -> Tensor:
-        """Random offsets sampled from Gaussians, relative to their means; surfels' lie in their planes. [S, 3]"""
+        """Random offsets sampled from Gaussians, relative to their means; surfels' lie in their planes."""
         points = torch.randn(len(scales), 3, generator=self.generator).to(scales)
         deviations = scales.exp()
         if scales.shape[1] == 3 and self.settings.split_normal_share != 1.0:
@@ -171,13 +169,13 @@ class AdaptiveDensity(Strategy[AdaptiveDensitySettings, ExplicitRows]):
         return int(gone.sum())
 
     def _extend(self, count: int) -> None:
-        for name, value in self.state_dict().items():
-            setattr(self, name, torch.cat([value, value.new_zeros(count)]))
+        self.load_state_dict(
+            {name: torch.cat([value, value.new_zeros(count)]) for name, value in self.state_dict().items()}
+        )
 
     def _keep(self, field: ExplicitRows, rows: ParameterRows, keep: Tensor) -> None:
         if keep.all():
             return
-        for name, value in self.state_dict().items():
-            setattr(self, name, value[keep])
+        self.load_state_dict({name: value[keep] for name, value in self.state_dict().items()})
         rows.keep_rows(field.row_parameters, keep)
         field.rows_kept(keep)

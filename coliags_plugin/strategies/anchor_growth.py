@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
 import torch
@@ -25,9 +24,8 @@ class AnchorGrowthSettings(Settings):
     until: int = Field(default=15_000, ge=0)  # step before which the last event is
     every: int = Field(default=100, ge=1)  # steps between events, whatever the run's length
     gradient_threshold: float = Field(default=0.0002, gt=0)  # of the centres' gradient, normalised image units
-    success_share: float = Field(
-        default=0.8, gt=0, le=1
-    )  # share of ``every`` steps with an anchor in view for pruning, half of it for growing (docs/methods.md 4.3)
+    # share of ``every`` steps with an anchor in view for pruning, half of it for growing (docs/methods.md 4.3)
+    success_share: float = Field(default=0.8, gt=0, le=1)
     min_opacity: float = Field(default=0.005, ge=0)  # mean of an anchor's that stays
     levels: int = Field(default=3, ge=1)  # cells of the anchors' spacing, and each further level a quarter of that
     finest_cell: float = Field(default=0.25, ge=0)  # in voxels; finer levels are left out
@@ -113,12 +111,10 @@ class AnchorGrowth(Strategy[AnchorGrowthSettings, Anchors]):
 
     def _resize(self, anchors: int, children: int, device: torch.device) -> None:
         """Extend the counters to new anchors."""
-        for name, per_anchor in (("opacity_sum", 1), ("seen", 1), ("gradient_sum", children), ("drawn", children)):
-            old = getattr(self, name).to(device)
-            if len(old) == anchors * per_anchor:
-                setattr(self, name, old)
-                continue
-            setattr(self, name, torch.cat([old, old.new_zeros(anchors * per_anchor - len(old))]))
+        for name, per_anchor in zip(self.counters, (1, 1, children, children), strict=True):
+            values = getattr(self, name).to(device)
+            missing = anchors * per_anchor - len(values)
+            setattr(self, name, torch.cat([values, values.new_zeros(missing)]) if missing else values)
 
     def _count(self, output: RenderOutput, children: int) -> None:
         gaussians, lengths = output.drawn.gaussians, gradient_lengths(output)
@@ -141,26 +137,23 @@ class AnchorGrowth(Strategy[AnchorGrowthSettings, Anchors]):
             if left == 0 or cell < options.finest_cell * float(field.voxel_size):
                 break
             slots = (ready & (gradient >= options.gradient_threshold * 2.0**level)).nonzero().squeeze(1)
-            births = one_per_free_cell(field.anchors, positions[slots], gradient[slots], cell, left)
-            self._add(field, rows, births, slots // children, cell)
+            chosen = slots[one_per_free_cell(field.anchors, positions[slots], gradient[slots], cell, left)]
+            if len(chosen):
+                self._add(field, rows, positions[chosen], chosen // children, cell)
         self.gradient_sum[ready] = 0.0
         self.drawn[ready] = 0.0
         self._resize(len(field.anchors), children, field.anchors.device)
         return len(field.anchors) - first_count
 
-    def _add(self, field: Anchors, rows: ParameterRows, births: Births, anchor_of: Tensor, cell: float) -> None:
+    def _add(self, field: Anchors, rows: ParameterRows, positions: Tensor, parents: Tensor, cell: float) -> None:
         """Append anchors with their parents' features, normals and Adam second moments, at most the size of a cell."""
-        if len(births) == 0:
-            return
-        parents = anchor_of[births.candidates]
-        scalings = field.scalings[parents].clamp_max(math.log(cell))
-        field.anchors = torch.cat([field.anchors, births.positions])
+        field.anchors = torch.cat([field.anchors, positions])
         if field.normals is not None:
             field.normals = torch.cat([field.normals, field.normals[parents]])
         born = {
-            "offsets": field.offsets.new_zeros(len(births), *field.offsets.shape[1:]),
+            "offsets": field.offsets.new_zeros(len(parents), *field.offsets.shape[1:]),
             "features": field.features[parents],
-            "scalings": scalings,
+            "scalings": field.scalings[parents].clamp_max(math.log(cell)),
         }
         rows.add_rows(born, parents)
 
@@ -185,35 +178,19 @@ class AnchorGrowth(Strategy[AnchorGrowthSettings, Anchors]):
         return int(faint.sum())
 
 
-@dataclass(frozen=True)
-class Births:
-    """New anchors.
-
-    Attributes:
-        positions: Scene units. [B, 3]
-        candidates: For each, the candidate with the largest gradient in its cell. [B]
-    """
-
-    positions: Float[Tensor, "B 3"]
-    candidates: Int[Tensor, "B"]
-
-    def __len__(self) -> int:
-        return len(self.positions)
-
-
 def one_per_free_cell(
     anchors: Float[Tensor, "M 3"],
     positions: Float[Tensor, "C 3"],
     gradients: Float[Tensor, "C"],
     cell: float,
     limit: int,
-) -> Births:
-    """The strongest candidate of every cell without an anchor, the strongest cells first.
+) -> Int[Tensor, "B"]:
+    """Indices of the candidate of the largest gradient in each cell without an anchor, the strongest cells first.
 
     Args:
-        anchors: Existing anchors, scene units. [M, 3]
-        positions: Candidates, scene units. [C, 3]
-        gradients: Gradient statistic of each candidate. [C]
+        anchors: Existing anchors, scene units.
+        positions: Candidates, scene units.
+        gradients: Gradient statistic of each candidate.
         cell: Edge of a cell, scene units.
         limit: Largest number of new anchors.
     """
@@ -228,5 +205,4 @@ def one_per_free_cell(
     order = order[free[member_of[order]]]
     first = torch.full((len(cells),), len(order), device=cells.device)
     first.scatter_reduce_(0, member_of[order], torch.arange(len(order), device=cells.device), "amin")
-    chosen = order[first[first < len(order)].sort().values[:limit]]
-    return Births(positions[chosen], chosen)
+    return order[first[first < len(order)].sort().values[:limit]]

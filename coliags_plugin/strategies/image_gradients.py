@@ -13,7 +13,7 @@ def gradient_lengths(output: RenderOutput) -> Float[Tensor, "N"] | None:
     """Length of the gradient of each projected centre in units of half the image; 0 where a Gaussian was not drawn.
 
     These are the units of 3DGS's and Scaffold-GS's thresholds (docs/methods.md 4.3). None before ``backward``, or if no
-    gradient reached the centres. [N]
+    gradient reached the centres.
     """
     splats = output.drawn
     gradient = splats.means2d.grad

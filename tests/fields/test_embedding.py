@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from coliags_plugin.fields.embedding import cosine_embedding
+from coliags_plugin.fields.mlp import cosine_embedding
 
 #: Computed by hand from the definition for cos theta = 0.5 and five frequencies.
 HALF = [0.5, 0.479426, 0.877583, 0.841471, 0.540302, 0.909297, -0.416147, -0.756802, -0.653644, 0.989358, -0.145500]

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coliags_plugin.config.components import make_component
-from coliags_plugin.fields.glints import MAX_TILT, WIDTHS, GlintAppearanceHead, tangent_components
+from coliags_plugin.fields.appearance_heads import MAX_TILT, WIDTHS, GlintAppearanceHead, tangent_components
 from tests.scenes import camera_at, wall_scene
 
 FIELD = {"name": "anchors", "geometry_head": "plain", "appearance_head": "imia-glints"}

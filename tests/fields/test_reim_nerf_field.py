@@ -14,10 +14,9 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.engine.run_folder import RunFolder
 from coliags_plugin.engine.trainer import Trainer
-from coliags_plugin.fields.embedding import cosine_embedding
+from coliags_plugin.fields.mlp import cosine_embedding
 from coliags_plugin.fields.normalisation import surface_distances
-from coliags_plugin.fields.radiance_mlp import RadianceMLP
-from coliags_plugin.fields.reim_nerf import ReimNerf, ReimNerfFieldSettings
+from coliags_plugin.fields.reim_nerf import RadianceMLP, ReimNerf, ReimNerfFieldSettings
 from coliags_plugin.renderers.volume_renderer import VolumeRenderer, VolumeRendererSettings
 from tests.renderers.test_volume_renderer import sphere_scene
 from tests.scenes import camera_at, wall_scene

@@ -9,7 +9,7 @@ import torch
 
 from coliags_plugin.contracts import Schedule, TrainingStep
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.losses.smooth_gain import SmoothGainLoss
+from coliags_plugin.losses.regularization import SmoothGainLoss
 from coliags_plugin.modules.gain import FrameGain
 from tests.scenes import wall_scene
 

@@ -12,7 +12,7 @@ from coliags_plugin.contracts import Schedule, TrainingStep
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
-from coliags_plugin.losses.surfel_regularization import depth_normals
+from coliags_plugin.losses.regularization import depth_normals
 from coliags_plugin.renderers.torch_renderer import render_gaussians
 from tests.losses.terms import make, make_output
 from tests.renderers.test_torch_renderer import rigid

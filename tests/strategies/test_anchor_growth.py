@@ -9,7 +9,7 @@ from coliags_plugin.config.components import make_component
 from coliags_plugin.contracts import Schedule
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput, Splats
-from coliags_plugin.strategies.anchor_growth import Births, one_per_free_cell
+from coliags_plugin.strategies.anchor_growth import one_per_free_cell
 from tests.scenes import wall_scene
 from tests.strategies.steps import after_backward, stepped_optimizers
 
@@ -195,10 +195,9 @@ def test_strongest_candidate_of_each_free_cell_strongest_cells_first():
     anchors = torch.tensor([[0.0, 0.0, 0.0]])
     positions = torch.tensor([[0.1, 0, 0], [2.1, 0, 0], [1.9, 0, 0], [4.0, 0, 0], [6.2, 0, 0], [5.8, 0, 0]])
     gradients = torch.tensor([9.0, 1.0, 3.0, 5.0, 4.0, 2.0])
-    births = one_per_free_cell(anchors, positions, gradients, 2.0, 10)
-    assert births.candidates.tolist() == [3, 4, 2]  # cells of 4, 6 and 2; that of 0 is taken
-    assert torch.equal(births.positions, positions[[3, 4, 2]])
-    assert one_per_free_cell(anchors, positions, gradients, 2.0, 2).candidates.tolist() == [3, 4]
+    born = one_per_free_cell(anchors, positions, gradients, 2.0, 10)
+    assert born.tolist() == [3, 4, 2]  # cells of 4, 6 and 2; that of 0 is taken
+    assert one_per_free_cell(anchors, positions, gradients, 2.0, 2).tolist() == [3, 4]
     assert len(one_per_free_cell(anchors, positions[:0], gradients[:0], 2.0, 2)) == 0
 
 
@@ -210,7 +209,7 @@ def test_births_have_their_parents_normal_and_survivors_keep_theirs():
     before = field.normals.clone()
     strategy = make_strategy(statistics_from=0, growth_from=0)
     far = torch.tensor([[0.0, 0.0, 200.0]])
-    strategy._add(field, rows, Births(far, torch.tensor([1])), torch.tensor([5, 3]), 1.0)
+    strategy._add(field, rows, far, torch.tensor([3]), 1.0)
     assert torch.equal(field.normals, torch.cat([before, before[3:4]]))
     strategy._resize(len(field.anchors), CHILDREN, torch.device("cpu"))
     strategy.seen.fill_(81.0)

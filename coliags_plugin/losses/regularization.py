@@ -1,4 +1,4 @@
-"""Regularization losses of 2D Gaussian Splatting: consistency of normals with depth, and depth distortion."""
+"""Regularization losses of rendered maps, normals and distortion as in 2D Gaussian Splatting, and of gains."""
 
 from __future__ import annotations
 
@@ -7,12 +7,26 @@ from typing import ClassVar, Literal
 
 import torch
 from jaxtyping import Bool, Float
+from pydantic import Field
 from torch import Tensor
 
-from coliags_plugin.contracts import Loss, LossSettings, TrainingStep
+from coliags_plugin.contracts import GainModule, Loss, LossSettings, TrainedModel, TrainingStep
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.core.masked import masked_mean, zero_outside
+
+
+class OpacityLoss(Loss):
+    """Mean of 1 - alpha over the valid pixels: a colon is closed, so that every ray ends on tissue.
+
+    Without it, a dark lumen is matched as well by nothing in front of the black background (docs/methods.md 4.6).
+    """
+
+    Settings: ClassVar[type[LossSettings]] = LossSettings
+
+    def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
+        """The unweighted term, from 0 (opaque) to 1; 0 where no pixel is valid."""
+        return masked_mean(1.0 - step.output.alpha, step.target.mask)
 
 
 class NormalConsistencySettings(LossSettings):
@@ -37,11 +51,7 @@ class NormalConsistencyLoss(Loss[NormalConsistencySettings]):
         return frozenset({"normals", self.settings.depth})
 
     def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
-        """The unweighted term, from 0 (consistent and opaque) to 2.
-
-        Raises:
-            InputError: The output is of pixels of several cameras.
-        """
+        """The unweighted term, from 0 (consistent and opaque) to 2; refuses pixels of several cameras."""
         output, mask = step.output, step.target.mask
         if output.camera is None:
             raise InputError("normals of single pixels", "whole images", "Set --set sampler=frames")
@@ -70,18 +80,53 @@ class DistortionLoss(Loss):
         return masked_mean(step.output["distortion"], step.target.mask)
 
 
+class SmoothGainSettings(LossSettings):
+    """Options of the loss on gains."""
+
+    module: str = Field(default="exposure", description="Name of the view module 'gain' in the method config.")
+
+
+class SmoothGainLoss(Loss[SmoothGainSettings]):
+    """Mean squared change of slope of the log gain over time, per frame of the video (docs/methods.md 4.7).
+
+    Slopes are those between training frames that follow each other; 0 with fewer than three.
+    """
+
+    Settings: ClassVar[type[LossSettings]] = SmoothGainSettings
+
+    def check(self, model: TrainedModel) -> None:
+        """Refuse methods without that module."""
+        self._gains(model)
+
+    def _gains(self, model: TrainedModel) -> GainModule:
+        module = model.view_modules.get(self.settings.module)
+        if not isinstance(module, GainModule):
+            known = [name for name, part in model.view_modules.items() if isinstance(part, GainModule)]
+            raise InputError(
+                f"loss 'smooth-gain' reads the gains of module '{self.settings.module}'",
+                f"the name of a module 'gain', one of {', '.join(known)}" if known else "a module 'gain'",
+                did_you_mean(self.settings.module, known),
+            )
+        return module
+
+    def __call__(self, step: TrainingStep) -> Float[Tensor, ""]:
+        """The unweighted term."""
+        module = self._gains(step.model)
+        log_gains = module.log_gains()
+        if len(log_gains) < 3:
+            return log_gains.sum() * 0.0
+        gaps = log_gains.new_tensor(module.times).diff().clamp_min(1.0)[:, None]
+        slopes = log_gains.diff(dim=0) / gaps
+        return slopes.diff(dim=0).square().mean()
+
+
 def depth_normals(
     depth: Float[Tensor, "H W"], camera: Camera, known: Bool[Tensor, "H W"] | None = None
 ) -> Float[Tensor, "H W 3"]:
     """Unit normals in camera axes, facing the camera: cross products of central differences of unprojected pixels.
 
-    0 at the border, and where a neighbour above, below, to the left or to the right is unknown. Differentiable in the
-    depth; values at unknown pixels have no influence, not even NaN.
-
-    Args:
-        depth: z-depth, scene units. [H, W]
-        camera: Whose pixels these are.
-        known: Where the depth is usable; None: everywhere. [H, W]
+    0 at the border, and where a neighbour above, below, to the left or to the right of the z-depth is unknown.
+    Differentiable in the depth; values at unknown pixels have no influence, not even NaN.
     """
     height, width = depth.shape
     if height < 3 or width < 3:
