@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -10,9 +11,10 @@ import torch
 from coliags_plugin.config.components import make_component
 from coliags_plugin.fields.attenuation import MAX_OFFSET, AttenuatedAppearanceHead
 from coliags_plugin.lighting.lamps import FlattenedLight, LightOfCamera
-from tests.scenes import camera_at, wall_scene
+from tests.fields.made import make_field
+from tests.scenes import camera_at
 
-PLAIN = {"name": "anchors", "geometry_head": "plain", "appearance_head": "plain"}
+make_anchors = partial(make_field, "anchors", geometry_head="plain")
 
 
 def make_head(**options) -> AttenuatedAppearanceHead:
@@ -22,11 +24,6 @@ def make_head(**options) -> AttenuatedAppearanceHead:
 
 def turned_camera():
     return camera_at(1.0, 2.0, 3.0, yaw=0.4).to("cpu", torch.float32)
-
-
-def make_field(appearance):
-    component = make_component("fields", {**PLAIN, "appearance_head": appearance})
-    return component.target.from_scene(wall_scene(), component.settings, torch.Generator().manual_seed(0))
 
 
 def test_the_factor_is_the_law_about_the_median_distance():
@@ -81,11 +78,14 @@ def test_incidence_counts_on_either_side_of_the_wall_and_not_under_a_flattened_l
 
 
 def test_normals_of_anchors_are_the_walls():
-    field = make_field({"name": "attenuated", "head": "plain", "incidence_exponent": 0.3})
+    field = make_anchors(appearance_head={"name": "attenuated", "head": "plain", "incidence_exponent": 0.3})
     torch.testing.assert_close(field.normals[:, 2].abs(), torch.ones(len(field.anchors)))
     again = type(field).from_state(field.state_dict(), field.settings)
     assert torch.equal(again.normals, field.normals)
-    assert make_field("plain").normals is None and "normals" not in make_field("plain").state_dict()
+    assert (
+        make_anchors(appearance_head="plain").normals is None
+        and "normals" not in make_anchors(appearance_head="plain").state_dict()
+    )
 
 
 def test_the_lamp_stays_within_its_bounds_and_nothing_overflows():
@@ -102,7 +102,10 @@ def test_the_lamp_stays_within_its_bounds_and_nothing_overflows():
 @pytest.mark.parametrize("inner", ["plain", "imia"])
 def test_exponents_of_zero_are_the_head_alone(inner):
     options = {"distance_exponent": 0.0, "cosine_exponent": 0.0}
-    plain, lit = make_field(inner), make_field({"name": "attenuated", "head": inner, **options})
+    plain, lit = (
+        make_anchors(appearance_head=inner),
+        make_anchors(appearance_head={"name": "attenuated", "head": inner, **options}),
+    )
     camera = camera_at(0.5, 0.0, 1.0)
     first, second = plain.gaussians(camera), lit.gaussians(camera)
     assert torch.equal(first.colors, second.colors) and torch.equal(first.means, second.means)
@@ -111,7 +114,7 @@ def test_exponents_of_zero_are_the_head_alone(inner):
 
 
 def test_colors_do_not_move_gaussians():
-    field = make_field({"name": "attenuated", "head": "plain"})
+    field = make_anchors(appearance_head={"name": "attenuated", "head": "plain"})
     field.gaussians(camera_at(0.0, 0.0, 0.0)).colors.sum().backward()
     assert field.offsets.grad is None and field.appearance_head.exponents.grad.abs().max() > 0
 

@@ -1,4 +1,4 @@
-"""Explicit Gaussians: their start, what a camera sees of them, and degrees that come one by one."""
+"""Explicit Gaussians and surfels: their start, what a camera sees of them, and degrees that come one by one."""
 
 from __future__ import annotations
 
@@ -8,25 +8,17 @@ from dataclasses import replace
 import pytest
 import torch
 
-from coliags_plugin.config.components import make_component
 from coliags_plugin.contracts import Schedule
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.fields.spherical_harmonics import basis
 from coliags_plugin.renderers.torch_renderer import render_gaussians
+from tests.fields.made import colored_wall, make_field
 from tests.scenes import camera_at, wall_scene
 
 
 def make(scene=None, **options):
-    component = make_component("fields", {"name": "gaussians", **options})
-    return component.target.from_scene(scene or colored_wall(), component.settings, torch.Generator())
-
-
-def colored_wall():
-    scene = wall_scene()
-    count = len(scene.points)
-    colors = torch.randint(0, 256, (count, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
-    return replace(scene, points=PointCloud(scene.points.positions, colors))
+    return make_field("gaussians", scene or colored_wall(), **options)
 
 
 def test_one_faint_round_gaussian_at_every_point():
@@ -119,3 +111,50 @@ def test_gradients_of_logarithms_and_logits():
 
 def test_parameter_groups_are_named_as_in_gsplat():
     assert list(make().parameter_groups()) == ["means", "scales", "quats", "opacities", "sh0", "shN"]
+
+
+# Surfels
+
+
+def test_one_faint_round_disc_at_every_point_turned_at_random():
+    scene, field = wall_scene(), make_field("surfels")
+    assert field.primitive == "surfels" and field.elements == "gaussians"
+    seen = field.gaussians(camera_at(0, 0, -50))
+    assert seen.scales.shape == (len(seen), 2) and torch.equal(seen.scales[:, 0], seen.scales[:, 1])
+    torch.testing.assert_close(seen.means, scene.points.positions[seen.source_index])
+    torch.testing.assert_close(seen.opacities, torch.full((len(seen),), 0.1))
+    # Points on a grid of 0.5 mm: inner ones have three neighbours at that distance.
+    assert seen.scales.median().item() == pytest.approx(0.5, rel=1e-5)
+    quats = field.quats.detach()
+    assert 0 <= quats.min() < 0.01 and 0.99 < quats.max() < 1
+    torch.testing.assert_close(quats.mean(0), torch.full((4,), 0.5), rtol=0, atol=0.03)
+    assert torch.equal(make_field("surfels").quats, field.quats) and not torch.equal(
+        make_field("surfels", seed=1).quats, field.quats
+    )
+
+
+def test_their_normals_are_those_that_are_drawn():
+    field = make_field("surfels")
+    with torch.no_grad():
+        field.opacities.fill_(5.0)
+    camera = camera_at(0.0, 0.0, 0.0)
+    seen = field.gaussians(camera.to(dtype=torch.float32))
+    index = int(seen.means[:, :2].norm(dim=1).argmin())
+    normal = field.normals()[seen.source_index[index]].detach()
+    kept = {k: getattr(seen, k)[index : index + 1] for k in ("means", "quats_wxyz", "scales", "opacities", "colors")}
+    output = render_gaussians(replace(seen, **kept), camera, ("normals",))
+    row, column = divmod(int(output.alpha.argmax()), output.alpha.shape[1])
+    drawn = output["normals"][row, column] / output.alpha[row, column]
+    torch.testing.assert_close(drawn, normal if normal[2] < 0 else -normal, rtol=1e-4, atol=1e-5)
+
+
+def test_from_state_restores_any_number():
+    field = make_field("surfels")
+    state = {name: value[:7] if value.ndim else value for name, value in field.state_dict().items()}
+    other = type(field).from_state(state, field.settings)
+    assert other.element_count == 7 and other.scales.shape == (7, 2)
+
+
+def test_references_work_for_surfels_too():
+    field = make_field("surfels", normal_neighbours=8)
+    assert field.references.of_rows.shape == (field.element_count, 3)

@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 
 from coliags_plugin.config.components import make_component
 from coliags_plugin.fields.appearance_heads import MAX_TILT, WIDTHS, GlintAppearanceHead, tangent_components
-from tests.scenes import camera_at, wall_scene
-
-FIELD = {"name": "anchors", "geometry_head": "plain", "appearance_head": "imia-glints"}
+from tests.fields.made import make_field
+from tests.scenes import camera_at
 
 
 def make_head(name: str = "imia-glints") -> Any:
@@ -94,12 +93,10 @@ def test_a_glint_beside_the_normal_is_learned():
 
 def test_a_field_keeps_normals_for_it_alone_or_below_a_law():
     for appearance in ("imia-glints", {"name": "attenuated", "head": "imia-glints"}):
-        component = make_component("fields", {**FIELD, "appearance_head": appearance})
-        field = component.target.from_scene(wall_scene(), component.settings, torch.Generator().manual_seed(0))
+        field = make_field("anchors", geometry_head="plain", appearance_head=appearance)
         torch.testing.assert_close(field.normals[:, 2].abs(), torch.ones(len(field.anchors)))
         gaussians = field.gaussians(camera_at(0.5, 0.0, 1.0))
         assert gaussians.colors.isfinite().all()
         gaussians.colors.sum().backward()
-        assert all(
-            value.grad.isfinite().all() for value in field.appearance_head.parameters() if value.grad is not None
-        )
+        gradients = [value.grad for value in field.appearance_head.parameters() if value.grad is not None]
+        assert all(gradient.isfinite().all() for gradient in gradients)

@@ -10,7 +10,6 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from coliags_plugin.config.components import make_component
 from coliags_plugin.contracts import Schedule
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.scenes import PointCloud
@@ -19,6 +18,7 @@ from coliags_plugin.fields.diffuse_network import _ROWS, DiffuseNetwork
 from coliags_plugin.fields.lit_gaussians import GAMMA, PINK, THICKNESS
 from coliags_plugin.lighting.lamps import Lamp
 from coliags_plugin.renderers.torch_renderer import render_gaussians
+from tests.fields.made import colored_wall, make_field
 from tests.fields.test_cook_torrance import by_hand
 from tests.scenes import camera_at, wall_scene
 
@@ -26,16 +26,8 @@ SCHEDULE = Schedule(100, 100)
 OPTIONS = {"network_from": 50, "hidden": 16, "hidden_layers": 2, "network_precision": "float32"}
 
 
-def colored_wall():
-    scene = wall_scene()
-    count = len(scene.points)
-    colors = torch.randint(0, 256, (count, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
-    return replace(scene, points=PointCloud(scene.points.positions, colors))
-
-
 def make(scene=None, **options):
-    component = make_component("fields", {"name": "lit-gaussians", **OPTIONS, **options})
-    return component.target.from_scene(scene or colored_wall(), component.settings, torch.Generator().manual_seed(3))
+    return make_field("lit-gaussians", scene or colored_wall(), 3, **{**OPTIONS, **options})
 
 
 def varied(**options):

@@ -7,11 +7,10 @@ import math
 import pytest
 import torch
 
-from coliags_plugin.config.components import make_component
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.point_normals import point_normals, wall_normals
 from coliags_plugin.fields.reference_normals import ReferenceNormals
-from tests.scenes import wall_scene
+from tests.fields.made import make_field
 
 
 def cylinder(turns=120, rings=60, radius=20.0):
@@ -71,8 +70,7 @@ def test_new_gaussians_take_the_normal_of_the_nearest_initial_point_and_keep_it(
 
 
 def test_fields_carry_them_through_checkpoints():
-    component = make_component("fields", {"name": "gaussians", "normal_neighbours": 10})
-    field = component.target.from_scene(wall_scene(), component.settings, torch.Generator())
+    field = make_field("gaussians", normal_neighbours=10)
     torch.testing.assert_close(field.references.of_rows[:, 2].abs(), torch.ones(len(field.means)))
     field.rows_kept(torch.arange(len(field.means)) % 3 == 0)
     with torch.no_grad():
@@ -84,7 +82,6 @@ def test_fields_carry_them_through_checkpoints():
 
 
 def test_without_neighbours_there_are_none():
-    component = make_component("fields", "gaussians")
-    field = component.target.from_scene(wall_scene(), component.settings, torch.Generator())
+    field = make_field("gaussians")
     assert field.references is None
     assert not any(name.startswith("references") for name in field.state_dict())

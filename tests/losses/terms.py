@@ -12,6 +12,11 @@ from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput, Splats
 
 
+def step(output, target=None, model=None, number=1, schedule=None):
+    """A training step; the only one of its run without a number and a schedule."""
+    return TrainingStep(output, target, model, number, schedule or Schedule(number, number))
+
+
 @dataclass(frozen=True)
 class Term:
     """A loss that is given an output and a frame."""
@@ -19,7 +24,7 @@ class Term:
     loss: Loss
 
     def __call__(self, output, frame):
-        return self.loss(TrainingStep(output, frame.target, None, 1, Schedule(1, 1)))
+        return self.loss(step(output, frame.target))
 
 
 def make(name, **options):

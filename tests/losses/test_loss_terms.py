@@ -8,15 +8,16 @@ import torch
 from pydantic import ValidationError
 
 from coliags_plugin.config import registry
-from coliags_plugin.config.components import make_component
-from coliags_plugin.contracts import LossSettings, Schedule, TrainingStep, log_linear
+from coliags_plugin.contracts import LossSettings, log_linear
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.render_output import DEPTH_KINDS
+from coliags_plugin.core.render_output import DEPTH_KINDS, RenderOutput
 from coliags_plugin.core.scenes import SparseDepth
 from coliags_plugin.core.ssim import ssim
 from coliags_plugin.engine.model import Model
 from coliags_plugin.losses.depth import DepthKind
 from coliags_plugin.modules.gain import FrameGain
+from tests.fields.made import make_field
+from tests.losses import terms
 from tests.losses.terms import make, make_output
 from tests.scenes import plain_frame as make_frame
 from tests.scenes import wall_scene
@@ -53,8 +54,7 @@ LOSSES = {name: registry.losses.get(name) for name in registry.losses}
 def model():
     """A model with everything that losses read of one."""
     scene = wall_scene()
-    component = make_component("fields", {"name": "gaussians", "normal_neighbours": 10})
-    field = component.target.from_scene(scene, component.settings, torch.Generator())
+    field = make_field("gaussians", scene, normal_neighbours=10)
     return Model(field, None, {"exposure": FrameGain.from_scene(scene, FrameGain.Settings(), torch.Generator())})
 
 
@@ -89,8 +89,8 @@ def evaluate(model):
         output = make_output(scales=rows.pop("scales"), **drawn)
         splats = replace(output.splats, gaussians=replace(output.splats.gaussians, features=rows))
         output = replace(output, camera=frame.camera, splats=splats)
-        step = TrainingStep(output, frame.target, copy.deepcopy(model).to(dtype), 1, Schedule(1, 1))
-        return loss(step), drawn, output.splats.gaussians
+        term = loss(terms.step(output, frame.target, copy.deepcopy(model).to(dtype)))
+        return term, drawn, output.splats.gaussians
 
     return evaluate
 
@@ -147,6 +147,19 @@ def test_l1_is_the_mean_over_valid_pixels_and_channels():
     assert make("l1")(make_output(rgb), make_frame(image, mask=mask)).item() == pytest.approx((1.0 + 0.2) / 3)
 
 
+def test_the_mean_square_of_either_image():
+    image = torch.zeros(1, 2, 3, dtype=torch.uint8)
+    image[0, 0] = torch.tensor([255, 51, 0])
+    rgb, coarse = torch.zeros(1, 2, 3), torch.full((1, 2, 3), 0.5)
+    seen = RenderOutput(rgb, torch.ones(1, 2), None, {"rgb_coarse": coarse})
+    mean = make("mse")(seen, make_frame(image, mask=torch.tensor([[True, False]])))
+    assert mean.item() == pytest.approx((1.0 + 0.04) / 3)
+    other = make("mse", image="rgb_coarse")
+    assert other(seen, make_frame(image)).item() == pytest.approx((0.25 + 0.09 + 0.25 + 3 * 0.25) / 6)
+    assert other.loss.wants == {"rgb_coarse"} and make("mse").loss.wants == frozenset()
+    assert registry.losses.get("mse").needs == frozenset()
+
+
 def test_d_ssim_is_one_minus_the_ssim_that_is_reported(generator, image, rgb):
     mask = torch.rand(HEIGHT, WIDTH, generator=generator) < 0.6
     frame = make_frame(image, mask=mask)
@@ -184,21 +197,6 @@ def test_inverse_depth_is_inverted_and_emptiness_is_a_constant():
     assert inverse.grad[0].tolist() == pytest.approx([-0.5 / 0.04**2, 0.0, 0.0])
     nearer = make("depth-l1", depth="inverse_depth_accumulated", empty_depth=50.0)(output, make_frame(image, truth))
     assert nearer.item() == pytest.approx((5.0 + 20.0) / 2)
-
-
-# ------------------------------------------------------------------------------------------------------- scale volume
-
-
-def test_scale_volume_is_the_mean_product(image, rgb):
-    scales = torch.tensor([[1.0, 2.0, 3.0], [0.5, 0.5, 4.0]])
-    assert make("scale-volume")(make_output(rgb, scales), make_frame(image)).item() == (6.0 + 1.0) / 2
-    assert make("scale-volume")(make_output(rgb, scales[:, :2]), make_frame(image)).item() == (2.0 + 0.25) / 2
-
-
-def test_a_scale_of_zero_keeps_its_gradient_finite(image, rgb):
-    scales = torch.tensor([[0.0, 2.0, 3.0]], requires_grad=True)
-    make("scale-volume")(make_output(rgb, scales), make_frame(image)).backward()
-    assert scales.grad.tolist() == [[6.0, 0.0, 0.0]]
 
 
 # ----------------------------------------------------------------------------------------------------------- schedule

@@ -12,15 +12,14 @@ from coliags_plugin.contracts import Schedule
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput, Splats
 from coliags_plugin.core.rotations import rotation_matrices
-from tests.scenes import wall_scene
+from tests.fields.made import make_field
 from tests.strategies.steps import after_backward, stepped_optimizers
 
 EXTENT = 10.0
 
 
-def make_field():
-    component = make_component("fields", "gaussians")
-    field = component.target.from_scene(wall_scene(), component.settings, torch.Generator())
+def make(**options):
+    field = make_field("gaussians", **options)
     with torch.no_grad():
         field.opacities.fill_(0.0)
         field.scales.fill_(math.log(0.05))  # small: below 0.01 of the extent
@@ -46,7 +45,7 @@ def make_output(slots, gradients, radii=None, width=200, height=100):
 
 
 def test_small_ones_are_cloned():
-    field, rows = make_field()
+    field, rows = make()
     strategy, before = make_strategy(), field.means.detach().clone()
     done = after_backward(strategy, 600, field, rows, make_output([3, 7, 9], [0.0003, 0.0001, 0.0002]))
     assert done == {"grown": 2, "pruned": 0}
@@ -58,7 +57,7 @@ def test_small_ones_are_cloned():
 
 
 def test_large_ones_are_split_into_two_smaller_within_them():
-    field, rows = make_field()
+    field, rows = make()
     with torch.no_grad():
         field.scales[5] = torch.tensor([0.5, 0.1, 0.1]).log()
         field.quats[5] = torch.tensor([math.cos(math.pi / 4), 0.0, 0.0, math.sin(math.pi / 4)])  # x becomes y
@@ -82,7 +81,7 @@ def _split_shifts(seed):
 
 
 def test_faint_ones_go_and_after_the_first_reset_oversized_ones_too():
-    field, rows = make_field()
+    field, rows = make()
     with torch.no_grad():
         field.opacities[2] = -6.0  # 0.0025
         field.scales[4] = math.log(1.1)  # above a tenth of the extent
@@ -95,7 +94,7 @@ def test_faint_ones_go_and_after_the_first_reset_oversized_ones_too():
 
 
 def test_opacities_are_reset_and_adam_forgets_them():
-    field, rows = make_field()
+    field, rows = make()
     with torch.no_grad():
         field.opacities[1] = -5.0  # 0.0067: below the reset, above the pruning
     strategy = make_strategy()
@@ -117,7 +116,7 @@ def test_opacities_are_reset_and_adam_forgets_them():
     ],
 )  # fmt: skip
 def test_the_plan_is_what_happens(steps, plan, first_and_last):
-    strategy, (field, rows) = make_strategy(steps=steps), make_field()
+    strategy, (field, rows) = make_strategy(steps=steps), make()
     assert plan in strategy.plan()
     steps_done = range(50, steps + 1, 50)
     events = [step for step in steps_done if after_backward(strategy, step, field, rows, make_output([0], [0.0]))]
@@ -125,7 +124,7 @@ def test_the_plan_is_what_happens(steps, plan, first_and_last):
 
 
 def test_statistics_are_means_over_the_views_that_draw():
-    field, rows = make_field()
+    field, rows = make()
     strategy = make_strategy()
     for gradient, radius in ((0.0003, 2.0), (0.00005, 2.0), (0.9, 0.0)):
         after_backward(strategy, 599, field, rows, make_output([8], [gradient], radii=[radius]))
@@ -138,7 +137,7 @@ def test_statistics_are_means_over_the_views_that_draw():
 
 
 def test_never_prunes_everything():
-    field, rows = make_field()
+    field, rows = make()
     with torch.no_grad():
         field.opacities.fill_(-9.0)
     count = len(field.means)
@@ -164,7 +163,7 @@ def test_parts_of_surfels_stay_in_their_planes():
 
 def test_prunes_only_where_enough_would_stay():
     for prune_above, pruned in ((10_000, 0), (0, 1)):
-        field, rows = make_field()
+        field, rows = make()
         with torch.no_grad():
             field.opacities[2] = -6.0
         strategy = make_strategy(prune_above=prune_above)
@@ -172,12 +171,8 @@ def test_prunes_only_where_enough_would_stay():
 
 
 def test_reference_normals_follow_their_gaussians():
-    component = make_component("fields", {"name": "gaussians", "normal_neighbours": 10})
-    field = component.target.from_scene(wall_scene(), component.settings, torch.Generator())
-    rows, strategy = stepped_optimizers(field, 0.0), make_strategy()
+    (field, rows), strategy = make(normal_neighbours=10), make_strategy()
     with torch.no_grad():
-        field.opacities.fill_(0.0)
-        field.scales.fill_(math.log(0.05))
         field.scales[5] = math.log(0.5)
         field.opacities[2] = -6.0
         marks = torch.arange(len(field.means), dtype=torch.float32)

@@ -10,22 +10,29 @@ from coliags_plugin.contracts import Schedule
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.core.render_output import RenderOutput, Splats
 from coliags_plugin.strategies.anchor_growth import one_per_free_cell
-from tests.scenes import wall_scene
+from tests.fields.made import make_field
 from tests.strategies.steps import after_backward, stepped_optimizers
 
 CHILDREN = 10
 
 
-def make_field(voxel=2.0, appearance="plain"):
-    node = {"name": "anchors", "geometry_head": "plain", "appearance_head": appearance, "voxel_size": voxel}
-    component = make_component("fields", node)
-    field = component.target.from_scene(wall_scene(), component.settings, torch.Generator().manual_seed(0))
+def make(appearance="plain"):
+    field = make_field("anchors", geometry_head="plain", appearance_head=appearance, voxel_size=2.0)
     return field, stepped_optimizers(field, 0.01)
 
 
 def make_strategy(steps=30_000, **options):
     component = make_component("strategies", {"name": "anchor-growth", **options})
     return component.target(component.settings, torch.Generator(), Schedule(steps, 30_000), 10.0)
+
+
+def make_judged(field, drawn=0.0, gradient=0.0, seen=0.0, **options):
+    """A strategy, at work from the first step, with these counts of every anchor and child."""
+    strategy = make_strategy(statistics_from=0, growth_from=0, **options)
+    strategy._resize(len(field.anchors), CHILDREN, torch.device("cpu"))
+    for name, value in (("drawn", drawn), ("gradient_sum", gradient), ("seen", seen), ("opacity_sum", seen)):
+        getattr(strategy, name).fill_(value)
+    return strategy
 
 
 def make_output(slots, gradients, opacity=0.5, visible=None, radii=None, width=200, height=100):
@@ -45,7 +52,7 @@ def make_output(slots, gradients, opacity=0.5, visible=None, radii=None, width=2
 
 
 def test_counts_only_inside_the_window():
-    field, rows = make_field()
+    field, rows = make()
     strategy = make_strategy()
     for step in (500, 15_000, 20_000):
         assert after_backward(strategy, step, field, rows, make_output([0], [1.0])) == {}
@@ -60,7 +67,7 @@ def test_counts_only_inside_the_window():
 
 @pytest.mark.parametrize(("steps", "first", "last"), [(1600, 27, 800), (30_000, 500, 15_000), (60_000, 1000, 30_000)])
 def test_statistics_keep_their_share_of_the_run(steps, first, last):
-    field, rows = make_field()
+    field, rows = make()
     strategy = make_strategy(steps=steps)
     for step, seen in ((first, 0), (first + 1, 1), (last - 1, 2), (last, 2)):
         after_backward(strategy, step, field, rows, make_output([0], [1.0]))
@@ -79,14 +86,14 @@ def test_statistics_keep_their_share_of_the_run(steps, first, last):
 def test_the_plan_is_what_happens(steps, plan, first_and_last):
     strategy = make_strategy(steps=steps)
     assert plan in strategy.plan()
-    field, rows = make_field()
+    field, rows = make()
     events = [s for s in range(0, steps + 1, 50) if after_backward(strategy, s, field, rows, make_output([0], [0.0]))]
     assert events[:1] + events[-1:] == first_and_last
     assert all(step % 100 == 0 for step in events)
 
 
 def test_undrawn_children_and_childless_anchors():
-    field, rows = make_field()
+    field, rows = make()
     strategy = make_strategy()
     output = make_output([0, 1], [0.01, 0.01], visible=torch.tensor([0, 5]), radii=[3.0, 0.0])
     after_backward(strategy, 600, field, rows, output)
@@ -97,14 +104,13 @@ def test_undrawn_children_and_childless_anchors():
 
 def grow_once(gradient, **options):
     """One child of anchor 3, far from every anchor, drawn often enough with one gradient; returns what grew."""
-    field, rows = make_field()
+    field, rows = make()
     with torch.no_grad():
         field.offsets.zero_()
         field.offsets[3, 4] = torch.tensor([0.0, 0.0, 200.0]) / field.scalings[3, :3].exp()
         field.features.copy_(torch.rand(field.features.shape, generator=torch.Generator().manual_seed(2)))
     before = len(field.anchors)
-    strategy = make_strategy(statistics_from=0, growth_from=0, min_opacity=0.0, **options)
-    strategy._resize(before, CHILDREN, torch.device("cpu"))
+    strategy = make_judged(field, min_opacity=0.0, **options)
     strategy.drawn[34] = 41.0  # one more than 100 * 0.8 * 0.5
     strategy.gradient_sum[34] = 41.0 * gradient
     done = after_backward(strategy, 100, field, rows, make_output([0], [0.0]))
@@ -140,9 +146,8 @@ def test_adam_moves_a_birth_no_faster_than_its_parent():
 @pytest.mark.parametrize(("thresholds", "grown"), [(1.05, 0), (2.05, 1), (4.05, 1)])
 def test_finer_cells_ask_for_larger_gradients(thresholds, grown):
     """A child beside an anchor, in its cell but not in its quarter: the second level's, from two thresholds on."""
-    field, rows = make_field()
-    strategy = make_strategy(statistics_from=0, growth_from=0, min_opacity=0.0)
-    strategy._resize(len(field.anchors), CHILDREN, torch.device("cpu"))
+    field, rows = make()
+    strategy = make_judged(field, min_opacity=0.0)
     spacing = field.spacing.item()
     center = torch.tensor([0.0, 0.0, 100 * spacing])
     side = torch.tensor([0.2 * spacing, 0.0, 0.0])
@@ -158,35 +163,25 @@ def test_finer_cells_ask_for_larger_gradients(thresholds, grown):
         assert (field.scalings[-1].exp() <= 0.2501 * spacing).all()
 
 
-def test_cells_below_a_quarter_of_a_voxel_are_left_out():
+def test_small_gradients_and_cells_below_a_quarter_of_a_voxel_grow_nothing():
     assert grow_once(1.0, levels=1, finest_cell=0.9)[3]["grown"] == 1
-    assert grow_once(1.0, levels=1, finest_cell=9.0)[3]["grown"] == 0
-
-
-def test_small_gradients_grow_nothing():
-    assert grow_once(0.00019)[3]["grown"] == 0
+    assert grow_once(1.0, levels=1, finest_cell=9.0)[3]["grown"] == grow_once(0.00019)[3]["grown"] == 0
 
 
 def test_occupied_cells_grow_nothing():
-    field, rows = make_field()
+    field, rows = make()
     with torch.no_grad():
         field.offsets.zero_()  # every child sits on its own anchor
-    strategy = make_strategy(statistics_from=0, growth_from=0, min_opacity=0.0)
-    strategy._resize(len(field.anchors), CHILDREN, torch.device("cpu"))
-    strategy.drawn.fill_(50.0)
-    strategy.gradient_sum.fill_(50.0)
+    strategy = make_judged(field, drawn=50.0, gradient=50.0, min_opacity=0.0)
     assert after_backward(strategy, 100, field, rows, make_output([0], [0.0]))["grown"] == 0
     assert strategy.drawn.sum() == 0  # used candidates start counting anew
 
 
 def test_an_event_adds_at_most_one_anchor_for_so_many_pixels():
-    field, rows = make_field()
+    field, rows = make()
     with torch.no_grad():
         field.offsets.copy_(torch.rand(field.offsets.shape, generator=torch.Generator().manual_seed(3)) * 60)
-    strategy = make_strategy(statistics_from=0, growth_from=0, min_opacity=0.0, pixels_per_birth=1000)
-    strategy._resize(len(field.anchors), CHILDREN, torch.device("cpu"))
-    strategy.drawn.fill_(50.0)
-    strategy.gradient_sum.fill_(50.0)
+    strategy = make_judged(field, drawn=50.0, gradient=50.0, min_opacity=0.0, pixels_per_birth=1000)
     # 200 x 100 pixels
     assert after_backward(strategy, 100, field, rows, make_output([0], [0.0]))["grown"] == 20
 
@@ -204,7 +199,7 @@ def test_strongest_candidate_of_each_free_cell_strongest_cells_first():
 @torch.no_grad()
 def test_births_have_their_parents_normal_and_survivors_keep_theirs():
     head = {"name": "attenuated", "head": "plain", "incidence_exponent": 0.3}
-    field, rows = make_field(appearance=head)
+    field, rows = make(head)
     field.normals = torch.nn.functional.normalize(torch.rand(field.normals.shape), dim=1)
     before = field.normals.clone()
     strategy = make_strategy(statistics_from=0, growth_from=0)
@@ -220,7 +215,7 @@ def test_births_have_their_parents_normal_and_survivors_keep_theirs():
 
 
 def test_base_scales_are_capped_in_spacings():
-    field, rows = make_field()
+    field, rows = make()
     with torch.no_grad():
         field.scalings[5, 3:] = 9.0
     strategy = make_strategy(statistics_from=0, growth_from=0)
@@ -232,13 +227,10 @@ def test_base_scales_are_capped_in_spacings():
 
 
 def test_faint_anchors_go_and_the_rest_keeps_its_moments():
-    field, rows = make_field()
+    field, rows = make()
     before = field.features.detach().clone()
     moments = rows.adam["features"].state[field.features]["exp_avg"].clone()
-    strategy = make_strategy(statistics_from=0, growth_from=0)
-    strategy._resize(len(before), CHILDREN, torch.device("cpu"))
-    strategy.seen.fill_(81.0)
-    strategy.opacity_sum.fill_(81.0)
+    strategy = make_judged(field, seen=81.0)
     strategy.opacity_sum[[2, 7]] = 81.0 * 0.004
     strategy.seen[9] = 10.0  # too rarely seen to judge
     strategy.opacity_sum[9] = 0.0
@@ -253,9 +245,8 @@ def test_faint_anchors_go_and_the_rest_keeps_its_moments():
 
 
 def test_never_prunes_everything():
-    field, rows = make_field()
-    strategy = make_strategy(statistics_from=0, growth_from=0)
-    strategy._resize(len(field.anchors), CHILDREN, torch.device("cpu"))
+    field, rows = make()
+    strategy = make_judged(field)
     strategy.seen.fill_(100.0)
     count = len(field.anchors)
     output = make_output([], [], visible=torch.zeros(0, dtype=torch.long))
@@ -264,7 +255,7 @@ def test_never_prunes_everything():
 
 
 def test_state_round_trip():
-    field, rows = make_field()
+    field, rows = make()
     strategy, other = make_strategy(), make_strategy()
     after_backward(strategy, 600, field, rows, make_output([0, 11], [0.01, 0.02]))
     other.load_state_dict(strategy.state_dict())

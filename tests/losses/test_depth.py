@@ -1,8 +1,10 @@
-"""Losses against depth of a confidence: weighted means, the robust relative loss, and the opacity."""
+"""Losses of depth: weighted by confidence, relative to it, and of the distance along the ray."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -10,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn.functional import huber_loss
 
-from coliags_plugin.contracts import Schedule, TrainingStep
 from coliags_plugin.core.masked import masked_mean, weighted_mean
-from coliags_plugin.core.render_output import RenderOutput
+from coliags_plugin.core.render_output import RenderOutput, concatenate_pixels
 from coliags_plugin.core.scenes import concatenate_targets
-from tests.losses.terms import make, make_output
+from tests.losses.terms import make, make_output, step
+from tests.scenes import camera_at, wall_scene
 from tests.scenes import plain_frame as make_frame
 
 HEIGHT, WIDTH = 7, 9
@@ -173,18 +175,63 @@ def test_pixel_batches_of_several_frames(case):
     seen = RenderOutput(rgb, alpha, None, {"depth_accumulated": depth})
     target = concatenate_targets([frame.target_at(pixels), frame.target_at(pixels)])
     loss = make("estimated-depth").loss
-    batch = loss(TrainingStep(seen, target, None, 1, Schedule(1, 1))).item()
+    batch = loss(step(seen, target)).item()
     assert batch == pytest.approx(make("estimated-depth")(output, frame).item(), rel=1e-12)
 
 
-# Opacity
+# The distance along the ray
+
+make_distance = partial(make, "distance-l1")
 
 
-def test_opacity_is_the_mean_transparency_of_valid_pixels():
-    alpha = torch.tensor([[1.0, 0.75], [0.25, torch.nan]], requires_grad=True)
-    mask = torch.tensor([[True, True], [True, False]])
-    frame = make_frame(torch.zeros(2, 2, 3, dtype=torch.uint8), mask=mask)
-    term = make("opacity")(make_output(torch.zeros(2, 2, 3), alpha=alpha), frame)
-    term.backward()
-    assert term.item() == pytest.approx((0.0 + 0.25 + 0.75) / 3)
-    assert alpha.grad.flatten().tolist() == pytest.approx([-1 / 3, -1 / 3, -1 / 3, 0.0])
+def seen_along(depth, lengths, kind="depth_accumulated"):
+    return make_output(torch.zeros(*depth.shape, 3), **{kind: depth, "ray_lengths": lengths})
+
+
+def test_it_is_the_distance_between_points_on_the_ray():
+    camera = camera_at(1.0, 2.0, 3.0, 6, 5, yaw=0.4)
+    generator = torch.Generator().manual_seed(0)
+    true, drawn = 20 + 5 * torch.rand(2, 5, 6, generator=generator, dtype=torch.float64)
+    lengths = camera.rays().norm(dim=-1)
+    frame = make_frame(torch.zeros(5, 6, 3, dtype=torch.uint8), true)
+    found = make_distance()(seen_along(drawn, lengths), frame)
+    apart = (camera.unproject(drawn) - camera.unproject(true)).norm(dim=-1)
+    torch.testing.assert_close(found, apart.mean())
+    coarse = make_distance(depth="depth_accumulated_coarse")
+    assert coarse(seen_along(drawn, lengths, "depth_accumulated_coarse"), frame) == found
+    assert coarse.loss.wants == {"depth_accumulated_coarse", "ray_lengths"} and coarse.loss.needs == {"depth"}
+
+
+def test_in_the_fields_unit_it_is_divided_by_it():
+    frame = make_frame(torch.zeros(1, 2, 3, dtype=torch.uint8), torch.tensor([[10.0, 20.0]]))
+    loss = make_distance(unit="field").loss
+    model = SimpleNamespace(field=SimpleNamespace(length_unit=torch.tensor(50.0)))
+    seen = seen_along(torch.tensor([[12.0, 20.0]]), torch.tensor([[1.5, 1.0]]))
+    assert loss(step(seen, frame.target, model)).item() == pytest.approx(1.5 / 50)
+
+
+def test_a_share_of_each_image_counts_and_is_always_the_same():
+    scene = wall_scene(frames=3, width=300, height=200)
+    loss = make_distance(share=0.03).loss
+    counted = []
+    for frame in scene.train:
+        depth = frame.depth.clone().requires_grad_()
+        seen = seen_along(depth + 1.0, torch.ones_like(depth))
+        term = loss(step(seen, frame.target))
+        assert term.item() == pytest.approx(1.0, abs=1e-4)
+        (gradient,) = torch.autograd.grad(term, depth)
+        counted.append(gradient != 0)
+        assert counted[-1].float().mean().item() == pytest.approx(0.03, abs=0.003)
+    assert 0.02 < (counted[0] & counted[1]).sum() / counted[0].sum() < 0.045  # drawn for each frame by itself
+    # Pixels of several frames, as of another step: the same ones count.
+    pixels = torch.randint(200, (5000, 2), generator=torch.Generator().manual_seed(0))
+    parts = [frame.target_at(pixels) for frame in scene.train]
+    depth = torch.cat([part.depth for part in parts]).requires_grad_()
+    seen = concatenate_pixels([seen_along(depth + 1.0, torch.ones_like(depth))])
+    term = loss(step(seen, concatenate_targets(parts), number=2))
+    (gradient,) = torch.autograd.grad(term, depth)
+    expected = torch.cat([inside[pixels[:, 1], pixels[:, 0]] for inside in counted])
+    assert torch.equal(gradient[:, 0] != 0, expected)
+    other = make_distance(share=0.03, seed=1).loss(step(seen, concatenate_targets(parts), number=2))
+    (gradient,) = torch.autograd.grad(other, depth)
+    assert not torch.equal(gradient[:, 0] != 0, expected)

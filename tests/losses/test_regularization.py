@@ -1,22 +1,25 @@
-"""Normals of depth maps, and the regularization losses of surfels."""
+"""Normals of depth maps, and the regularization losses: of surfels, opacity and gains."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
 
-from coliags_plugin.contracts import Schedule, TrainingStep
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.gaussians import Gaussians
 from coliags_plugin.losses.regularization import depth_normals
+from coliags_plugin.modules.gain import FrameGain
 from coliags_plugin.renderers.torch_renderer import render_gaussians
+from tests.losses import terms
 from tests.losses.terms import make, make_output
 from tests.renderers.test_torch_renderer import rigid
 from tests.scenes import plain_frame as make_frame
+from tests.scenes import wall_scene
 
 
 def off_centre(width=23, height=17, pose=None):
@@ -183,6 +186,58 @@ def test_distortion_draws_the_surfels_of_a_ray_together():
 def test_single_pixels_are_refused():
     output = make_output(torch.zeros(4, 1, 3), normals=torch.zeros(4, 1, 3), depth_expected=torch.zeros(4, 1))
     with pytest.raises(InputError, match="whole images"):
-        make("normal-consistency").loss(
-            TrainingStep(output, make_frame(torch.zeros(4, 1, 3)).target, None, 1, Schedule(1, 1))
-        )
+        make("normal-consistency")(output, make_frame(torch.zeros(4, 1, 3)))
+
+
+# --- opacity ----------------------------------------------------------------------------------------------------------
+
+
+def test_opacity_is_the_mean_transparency_of_valid_pixels():
+    alpha = torch.tensor([[1.0, 0.75], [0.25, torch.nan]], requires_grad=True)
+    mask = torch.tensor([[True, True], [True, False]])
+    frame = make_frame(torch.zeros(2, 2, 3, dtype=torch.uint8), mask=mask)
+    term = make("opacity")(make_output(torch.zeros(2, 2, 3), alpha=alpha), frame)
+    term.backward()
+    assert term.item() == pytest.approx((0.0 + 0.25 + 0.75) / 3)
+    assert alpha.grad.flatten().tolist() == pytest.approx([-1 / 3, -1 / 3, -1 / 3, 0.0])
+
+
+# --- gains ------------------------------------------------------------------------------------------------------------
+
+
+def of_gains(values, frames=9, **options):
+    module = FrameGain.from_scene(wall_scene(frames), FrameGain.Settings(**options), torch.Generator())
+    with torch.no_grad():
+        module.log_gain.copy_(values)
+    model = SimpleNamespace(view_modules={"exposure": module}, field=None)
+    loss = make("smooth-gain").loss
+    loss.check(model)
+    return loss(terms.step(None, model=model))
+
+
+def test_steady_changes_cost_nothing_and_others_their_squared_change_of_slope():
+    steady = 0.05 * torch.arange(1.0, 8.0)[:, None]
+    assert of_gains(steady).item() == pytest.approx(0.0, abs=1e-12)
+    bent = steady + torch.tensor([0, 0, 0, 0.1, 0, 0, 0])[:, None]  # changes of slope .1, -.2, .1 of five
+    assert of_gains(bent).item() == pytest.approx((0.01 + 0.04 + 0.01) / 5, rel=1e-5)
+    assert of_gains(bent.expand(-1, 3), channels=3).item() == pytest.approx((0.01 + 0.04 + 0.01) / 5, rel=1e-5)
+
+
+def test_slopes_are_per_frame_of_the_video():
+    """Frame 8 of ten is held out: a straight line over the gap costs nothing."""
+    times = torch.tensor([float(frame.index) for frame in wall_scene(11).train])
+    assert of_gains(0.1 * times[:, None], frames=11).item() == pytest.approx(0.0, abs=1e-10)
+
+
+def test_few_frames_have_no_slope_to_change():
+    value = of_gains(torch.tensor([[0.3]]), frames=2)
+    assert value.item() == 0.0 and value.requires_grad
+
+
+def test_other_methods_are_refused():
+    loss = make("smooth-gain", module="exposur").loss
+    module = FrameGain.from_scene(wall_scene(), FrameGain.Settings(), torch.Generator())
+    with pytest.raises(InputError, match="module 'exposur'"):
+        loss.check(SimpleNamespace(view_modules={"exposure": module}, field=None))
+    with pytest.raises(InputError, match="a module 'gain'"):
+        loss.check(SimpleNamespace(view_modules={}, field=None))
