@@ -262,7 +262,7 @@ metrics = Registry(
         "depth_rmse": "coliags_plugin.metrics.depth:DepthRMSE",
         "depth_mae": "coliags_plugin.metrics.depth:DepthMAE",
         "depth_median_error": "coliags_plugin.metrics.depth:DepthMedianError",
-        "sparse_depth": "coliags_plugin.metrics.sparse_depth:SparseDepthError",
+        "sparse_depth": "coliags_plugin.metrics.depth:SparseDepthError",
         "depth_abs_rel": "coliags_plugin.metrics.depth:DepthAbsRel",
     },
     noun="metric",

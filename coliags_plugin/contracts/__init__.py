@@ -3,8 +3,11 @@
 from coliags_plugin.contracts.data import DataManager
 from coliags_plugin.contracts.evaluation import Comparison, Metric, Protocol
 from coliags_plugin.contracts.fields import (
+    AppearanceHead,
     Field,
     GaussianField,
+    GeometryHead,
+    Head,
     LampAware,
     LitField,
     RadianceField,
@@ -13,7 +16,6 @@ from coliags_plugin.contracts.fields import (
     gaussians_under,
     knows_lamp,
 )
-from coliags_plugin.contracts.heads import AppearanceHead, GeometryHead, Head
 from coliags_plugin.contracts.losses import Loss, LossSettings
 from coliags_plugin.contracts.rendering import Availability, GainModule, Renderer, ResponseModule, ViewModule
 from coliags_plugin.contracts.schedule import Schedule, log_linear

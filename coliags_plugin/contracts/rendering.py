@@ -53,21 +53,12 @@ class Renderer(ABC, Generic[SettingsT, RenderedT]):
 
     @classmethod
     def outputs_of(cls, primitive: str) -> frozenset[str]:
-        """Outputs of a field, its own feature channels not counted.
-
-        Args:
-            primitive: Of the field.
-        """
+        """Outputs of a field of a primitive, its own feature channels not counted."""
         return cls.outputs
 
     @classmethod
     def obstacle(cls, primitive: str, device: torch.device) -> str:
-        """Reason why it cannot render a field on a device, to follow its name in a message; empty without one.
-
-        Args:
-            primitive: Of the field.
-            device: Of the field.
-        """
+        """Reason why it cannot render a field on its device, to follow its name in a message; empty without one."""
         if primitive not in cls.primitives:
             return f"draws {', '.join(sorted(cls.primitives))}, the field is made of {primitive}"
         if device.type not in cls.devices:
@@ -116,7 +107,7 @@ class Renderer(ABC, Generic[SettingsT, RenderedT]):
             near_plane: z-depth, scene units.
 
         Raises:
-            InputError: See above.
+            InputError: They do not.
         """
 
 

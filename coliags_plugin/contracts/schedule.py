@@ -38,8 +38,7 @@ class Schedule:
 def log_linear(start: float, end: float, progress: float) -> float:
     """``start`` to ``end`` on a straight line in the logarithm; progress is clipped to [0, 1] (docs/methods.md 2.3).
 
-    Raises:
-        ValueError: An end is not above 0: it has no logarithm.
+    An end that is not above 0 has no logarithm: ValueError.
     """
     if not (start > 0.0 and end > 0.0):
         raise ValueError(f"log_linear({start}, {end}): expected both ends above 0")

@@ -72,12 +72,7 @@ class ParameterRows(TypingProtocol):
         """
 
     def keep_rows(self, groups: Sequence[str], keep: Bool[Tensor, "M"]) -> None:
-        """Keep only some rows.
-
-        Args:
-            groups: Names of the groups.
-            keep: True for rows that stay. [M]
-        """
+        """Keep only the rows of some groups where ``keep`` is True. [M]"""
 
     def reset_rows(self, group: str, rows: Bool[Tensor, "M"] | None = None) -> None:
         """Reset Adam's moments of some rows, or of all rows without ``rows``. [M]"""

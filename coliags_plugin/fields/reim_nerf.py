@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -106,7 +107,52 @@ def _embedding_size(frequencies: int) -> int:
     return 3 * (1 + 2 * frequencies)
 
 
-class ReimNerf(RadianceField[ReimNerfFieldSettings]):
+class _NetworkLevel(RadianceLevel):
+    """Density and colour of one network, in scene units."""
+
+    @abstractmethod
+    def _parts(self) -> tuple[SceneNormalisation, RadianceMLP]:
+        """Scene units to the network's coordinates, and the network."""
+
+    def query(
+        self, positions: Float[Tensor, "P S 3"], directions: Float[Tensor, "P 3"], camera: Camera
+    ) -> RadianceSamples:
+        return self._samples(positions, directions, camera, None)
+
+    def query_in_training(
+        self,
+        positions: Float[Tensor, "P S 3"],
+        directions: Float[Tensor, "P 3"],
+        camera: Camera,
+        generator: torch.Generator,
+    ) -> RadianceSamples:
+        return self._samples(positions, directions, camera, generator)
+
+    def query_density(
+        self, positions: Float[Tensor, "P S 3"], directions: Float[Tensor, "P 3"], camera: Camera
+    ) -> Float[Tensor, "P S"]:
+        normalisation, network = self._parts()
+        return self._density(network.hidden(normalisation(positions)), len(positions), None)
+
+    def _samples(
+        self, positions: Tensor, directions: Tensor, camera: Camera, generator: torch.Generator | None
+    ) -> RadianceSamples:
+        normalisation, network = self._parts()
+        hidden = network.hidden(normalisation(positions))
+        rgb = network.colors(hidden, directions, normalisation(camera.center))
+        return RadianceSamples(self._density(hidden, len(positions), generator), rgb)
+
+    def _density(self, hidden: Tensor, rays: int, generator: torch.Generator | None) -> Tensor:
+        """Per scene unit."""
+        normalisation, network = self._parts()
+        raw = network.raw_density(hidden, rays)
+        strength = network.settings.density_noise
+        if generator is not None and strength > 0:
+            raw = raw + strength * torch.randn(raw.shape, generator=generator, dtype=raw.dtype).to(raw.device)
+        return raw.relu() / normalisation.unit
+
+
+class ReimNerf(_NetworkLevel, RadianceField[ReimNerfFieldSettings]):
     """Two networks from position to density, and from position, direction and lamp position to colour.
 
     After Psychogyios et al., "Realistic Endoscopic Illumination Modeling for NeRF-Based Data Generation" (MICCAI 2023).
@@ -169,72 +215,15 @@ class ReimNerf(RadianceField[ReimNerfFieldSettings]):
     @property
     def coarse_level(self) -> RadianceLevel:
         """The coarse network."""
-        return _Level(self.normalisation, self.coarse_network)
+        return _CoarseLevel(self)
 
-    @property
-    def _fine_level(self) -> RadianceLevel:
-        return _Level(self.normalisation, self.fine_network)
-
-    def query(
-        self, positions: Float[Tensor, "P S 3"], directions: Float[Tensor, "P 3"], camera: Camera
-    ) -> RadianceSamples:
-        """The fine network's density and colour."""
-        return self._fine_level.query(positions, directions, camera)
-
-    def query_in_training(
-        self,
-        positions: Float[Tensor, "P S 3"],
-        directions: Float[Tensor, "P 3"],
-        camera: Camera,
-        generator: torch.Generator,
-    ) -> RadianceSamples:
-        """The fine network's, with noise."""
-        return self._fine_level.query_in_training(positions, directions, camera, generator)
-
-    def query_density(
-        self, positions: Float[Tensor, "P S 3"], directions: Float[Tensor, "P 3"], camera: Camera
-    ) -> Float[Tensor, "P S"]:
-        """The fine network's density."""
-        return self._fine_level.query_density(positions, directions, camera)
+    def _parts(self) -> tuple[SceneNormalisation, RadianceMLP]:
+        return self.normalisation, self.fine_network
 
 
 @dataclass(frozen=True)
-class _Level(RadianceLevel):
-    """One of the networks, in scene units."""
+class _CoarseLevel(_NetworkLevel):
+    field: ReimNerf
 
-    normalisation: SceneNormalisation
-    network: RadianceMLP
-
-    def query(
-        self, positions: Float[Tensor, "P S 3"], directions: Float[Tensor, "P 3"], camera: Camera
-    ) -> RadianceSamples:
-        return self._samples(positions, directions, camera, None)
-
-    def query_in_training(
-        self,
-        positions: Float[Tensor, "P S 3"],
-        directions: Float[Tensor, "P 3"],
-        camera: Camera,
-        generator: torch.Generator,
-    ) -> RadianceSamples:
-        return self._samples(positions, directions, camera, generator)
-
-    def query_density(
-        self, positions: Float[Tensor, "P S 3"], directions: Float[Tensor, "P 3"], camera: Camera
-    ) -> Float[Tensor, "P S"]:
-        return self._density(self.network.hidden(self.normalisation(positions)), len(positions), None)
-
-    def _samples(
-        self, positions: Tensor, directions: Tensor, camera: Camera, generator: torch.Generator | None
-    ) -> RadianceSamples:
-        hidden = self.network.hidden(self.normalisation(positions))
-        rgb = self.network.colors(hidden, directions, self.normalisation(camera.center))
-        return RadianceSamples(self._density(hidden, len(positions), generator), rgb)
-
-    def _density(self, hidden: Tensor, rays: int, generator: torch.Generator | None) -> Tensor:
-        """Per scene unit."""
-        raw = self.network.raw_density(hidden, rays)
-        strength = self.network.settings.density_noise
-        if generator is not None and strength > 0:
-            raw = raw + strength * torch.randn(raw.shape, generator=generator, dtype=raw.dtype).to(raw.device)
-        return raw.relu() / self.normalisation.unit
+    def _parts(self) -> tuple[SceneNormalisation, RadianceMLP]:
+        return self.field.normalisation, self.field.coarse_network

@@ -1,6 +1,6 @@
-"""Depth error metrics of a rendered depth map against ground truth.
+"""Depth error metrics of a rendered depth map against ground truth, or against single points of known depth.
 
-All are computed over the pixels of ``Comparison.depth_valid`` in float64, mm, without aligning scale or shift.
+All are computed in float64 without aligning scale or shift: maps over ``Comparison.depth_valid``, in mm.
 """
 
 from __future__ import annotations
@@ -125,6 +125,30 @@ class DepthAbsRel(DepthMetric):
         if (truth <= 0).any():
             raise UnavailableError("a true depth of 0 mm makes the relative error infinite")
         return ((rendered - truth).abs() / truth).mean()
+
+
+class SparseDepthErrorSettings(Settings):
+    """Which quantile of the errors."""
+
+    quantile: float = Field(default=0.5, ge=0.0, le=1.0, description="0.5: the median.")
+
+
+class SparseDepthError(Metric[SparseDepthErrorSettings]):
+    """A quantile of |D(p) - z| / z over a frame's points p of known depth z, in percent."""
+
+    Settings: ClassVar[type[Settings]] = SparseDepthErrorSettings
+    higher_is_better: ClassVar[bool] = False
+    unit: ClassVar[str] = "%"
+
+    def __call__(self, comparison: Comparison) -> float:
+        """The metric of one frame; unavailable without points, or if nothing was drawn at any."""
+        rendered, known = comparison.point_depth, comparison.true_point_depth
+        if rendered is None or known is None:
+            raise UnavailableError("this frame has no points of known depth")
+        if not len(known):
+            raise UnavailableError("nothing was drawn at the points of known depth")
+        errors = (rendered.double() - known.double()).abs() / known.double()
+        return 100.0 * float(torch.quantile(errors, self.settings.quantile))
 
 
 def depth_steps(depth: Float[Tensor, "H W"], known: Bool[Tensor, "H W"], relative_step: float) -> Bool[Tensor, "H W"]:

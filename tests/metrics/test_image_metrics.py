@@ -57,12 +57,9 @@ def test_identical_images_have_no_psnr(pair):
 
 
 def test_every_metric_says_its_direction_and_unit():
-    said = {name: (registry.metrics.get(name).higher_is_better, registry.metrics.get(name).unit) for name in (
-        "psnr", "ssim", "lpips", "depth_mse", "depth_mse_inner", "depth_rmse", "depth_mae", "depth_median_error",
-        "depth_abs_rel",
-    )}  # fmt: skip
-    assert said == {
+    metrics = {name: registry.metrics.get(name) for name in registry.metrics}
+    assert {name: (metric.higher_is_better, metric.unit) for name, metric in metrics.items()} == {
         "psnr": (True, "dB"), "ssim": (True, ""), "lpips": (False, ""), "depth_mse": (False, "mm^2"),
         "depth_mse_inner": (False, "mm^2"), "depth_rmse": (False, "mm"), "depth_mae": (False, "mm"),
-        "depth_median_error": (False, "mm"), "depth_abs_rel": (False, ""),
+        "depth_median_error": (False, "mm"), "depth_abs_rel": (False, ""), "sparse_depth": (False, "%"),
     }  # fmt: skip

@@ -1,14 +1,17 @@
-import dataclasses
-from dataclasses import replace
+import platform
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from coliags_plugin.config import registry
 from coliags_plugin.core.errors import UnavailableError
 from coliags_plugin.core.render_output import OUTPUTS
-from tests.metrics.made import make_output
+from coliags_plugin.metrics.protocols import through_8_bit, through_16_bit
+from tests.metrics.made import make, make_output
 from tests.scenes import plain_frame as make_frame
 
 HEIGHT, WIDTH = 12, 15
@@ -21,8 +24,7 @@ def protocol(name):
 
 def score(name, metric, comparison):
     kind, options = protocol(name).metrics[metric]
-    scorer = registry.metrics.get(kind)
-    return scorer(scorer.Settings(**options))(comparison)
+    return make(kind, **options)(comparison)
 
 
 @pytest.fixture
@@ -48,8 +50,7 @@ def test_what_a_protocol_promises(name):
     assert made.description
     assert made.wants <= set(OUTPUTS)
     for metric, options in made.metrics.values():
-        scorer = registry.metrics.get(metric)
-        scorer(scorer.Settings(**options))
+        make(metric, **options)
 
 
 def test_the_metrics_of_each():
@@ -65,17 +66,15 @@ def test_the_metrics_of_each():
 @pytest.mark.parametrize("name", NAMES)
 def test_nothing_compared_carries_a_graph(name, scene):
     comparison = protocol(name).compare(*scene)
-    values = [getattr(comparison, field.name) for field in dataclasses.fields(comparison)]
+    values = [getattr(comparison, field.name) for field in fields(comparison)]
     assert not any(value.requires_grad for value in values if isinstance(value, torch.Tensor))
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_frame_without_depth_has_images_only(name, scene):
     output, frame = scene
-    comparison = protocol(name).compare(output, dataclasses.replace(frame, depth=None))
-    assert comparison.depth is None
-    assert comparison.true_depth is None
-    assert comparison.depth_valid is None
+    comparison = protocol(name).compare(output, replace(frame, depth=None))
+    assert comparison.depth is comparison.true_depth is comparison.depth_valid is None
     assert score(name, "psnr", comparison) > 0
     with pytest.raises(UnavailableError, match="no ground-truth depth"):
         score(name, "depth_mse", comparison)
@@ -89,6 +88,7 @@ def test_paper_compares_floats_where_truth_is_known(scene):
     comparison = protocol("paper").compare(output, frame)
     assert torch.equal(comparison.rgb, output.rgb.detach())
     assert torch.equal(comparison.valid, frame.mask)
+    assert protocol("paper").compare(output, replace(frame, mask=None)).valid.all()
     assert torch.equal(comparison.depth, output["depth_accumulated"])
     assert (~comparison.depth_valid).nonzero().tolist() == [[2, 3], [5, 6]]
     assert score("paper", "depth_mse", comparison) == 1.0
@@ -102,11 +102,6 @@ def test_paper_clamps_the_render(scene):
     rgb[0] = -0.5
     output = make_output(rgb, depth_accumulated=torch.zeros(HEIGHT, WIDTH))
     assert protocol("paper").compare(output, frame).rgb.unique().tolist() == [0.0, 1.0]
-
-
-def test_paper_counts_every_pixel_where_there_is_no_mask(scene):
-    output, frame = scene
-    assert protocol("paper").compare(output, dataclasses.replace(frame, mask=None)).valid.all()
 
 
 # ------------------------------------------------------------------------------------------------------- authors' code
@@ -168,8 +163,62 @@ def test_authors_code_wraps_a_surface_beyond_150_mm_to_the_camera(scene):
 
 def test_authors_code_wraps_true_depth_beyond_100_mm_too(scene):
     output, frame = scene
-    beyond = dataclasses.replace(frame, depth=torch.full((HEIGHT, WIDTH), 101.0))
+    beyond = replace(frame, depth=torch.full((HEIGHT, WIDTH), 101.0))
     # 101 / 100 * 65535 = 66190.35, less 65536
     assert protocol("authors-code").compare(output, beyond).true_depth[0, 0].item() == pytest.approx(
         654 / 65535 * 100, abs=1e-5
     )
+
+
+# -------------------------------------------------------------------------------------------------------- quantisation
+
+
+def one(value):
+    return torch.tensor([[value]], dtype=torch.float32)
+
+
+@pytest.mark.parametrize(
+    ("value", "level"),
+    [(0.0, 0), (1.0, 255), (-0.2, 0), (1.7, 255), (0.4 / 255, 0), (0.6 / 255, 1), (99.4 / 255, 99), (99.6 / 255, 100)],
+)
+def test_eight_bits_round_to_the_nearest_level_and_clamp(value, level):
+    assert through_8_bit(one(value)).item() == pytest.approx(level / 255, abs=1e-7)
+
+
+def test_every_eight_bit_level_comes_back_exactly():
+    levels = torch.arange(256) / 255
+    assert torch.equal(through_8_bit(levels), levels)
+
+
+def test_nan_is_left_for_the_metrics_to_refuse():
+    assert through_8_bit(one(torch.nan)).isnan().all()
+
+
+@pytest.mark.parametrize("scale", [100.0, 150.0])
+def test_sixteen_bits_truncate(scale):
+    step = scale / 65535
+    assert through_16_bit(one(1000.9 * step), scale).item() == pytest.approx(1000 * step, rel=1e-6)
+    assert through_16_bit(one(scale), scale).item() == scale
+    assert through_16_bit(one(0.0), scale).item() == 0.0
+
+
+def test_beyond_full_scale_it_wraps_around():
+    """151 mm over 150 is level floor(151 / 150 * 65535) = 65971, of which 16 bits keep 435: 0.9957 mm."""
+    assert through_16_bit(one(151.0), 150.0).item() == pytest.approx(435 / 65535 * 150, abs=1e-6)
+    assert through_16_bit(one(330.0), 150.0).item() == pytest.approx((144177 - 2 * 65536) / 65535 * 150, abs=1e-6)
+
+
+@pytest.mark.parametrize("value", [torch.inf, -torch.inf, torch.nan, 1e12])
+def test_what_no_integer_holds_becomes_zero(value):
+    assert through_16_bit(one(value), 150.0).item() == 0.0
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="the cast is undefined in C; x86-64 is meant")
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.floats(0, 1e7, width=32), min_size=1, max_size=40))
+def test_the_cast_is_numpy_s(depths):
+    depth = np.array(depths, np.float32)
+    with np.errstate(invalid="ignore"):
+        stored = (depth / np.float32(150) * np.float32(65535)).astype(np.uint16)
+    expected = stored.astype(np.float32) / np.float32(65535) * np.float32(150)
+    np.testing.assert_array_equal(through_16_bit(torch.from_numpy(depth), 150.0).numpy(), expected)

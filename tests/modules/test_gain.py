@@ -18,14 +18,20 @@ from coliags_plugin.modules.gain import FrameGain, FrameGainSettings
 from tests.scenes import wall_scene
 
 
-def make(**options):
-    return FrameGain.from_scene(wall_scene(), FrameGainSettings(**options), torch.Generator())
+def make(logs=None, scene=None, **options):
+    """The module of a scene, by default the wall's frames 1 to 7, with these logarithms."""
+    module = FrameGain.from_scene(scene or wall_scene(), FrameGainSettings(**options), torch.Generator())
+    if logs is not None:
+        with torch.no_grad():
+            module.log_gain.copy_(torch.as_tensor(logs).reshape(module.log_gain.shape))
+    return module
+
+
+LOGS = (0.1, 0.3, -0.2, 0.0, 0.4, -0.5, -0.1)
 
 
 def test_gains_of_other_views():
-    module = make()  # frames 1 to 7
-    with torch.no_grad():
-        module.log_gain.copy_(torch.tensor([0.1, 0.3, -0.2, 0.0, 0.4, -0.5, -0.1])[:, None])
+    module = make(LOGS)
     zero = module.log_gain.mean()
     trained = module.gain(View("0003", 3.0, True)).log().item()
     assert trained == pytest.approx((module.log_gain[2] - zero).item())
@@ -39,16 +45,14 @@ def test_gains_of_other_views():
 
 
 def test_options():
-    module = make(untrained="mean", reference="0002")
-    with torch.no_grad():
-        module.log_gain.copy_(torch.linspace(0.0, 0.6, 7)[:, None])
+    module = make(torch.linspace(0.0, 0.6, 7), untrained="mean", reference="0002")
     assert module.gain(View("0002", 2.0, True)).item() == 1.0
     assert module.gain(View("x", 6.0, False)).log().item() == pytest.approx(0.3 - 0.1)
     with pytest.raises(InputError, match="gain names frame 'nobody'"):
         make(reference="nobody")
     (held_out, *_) = wall_scene().test_sets["test"]
     with pytest.raises(InputError, match=f"gain names frame '{held_out.name}', which is held out"):
-        FrameGain.from_scene(wall_scene(), FrameGain.Settings(reference=held_out.name), torch.Generator())
+        make(reference=held_out.name)
 
 
 def test_shading_multiplies_the_colours_alone():
@@ -65,18 +69,12 @@ def test_shading_multiplies_the_colours_alone():
 def test_views_beside_the_video_have_the_gain_of_the_nearest_training_camera():
     scene = wall_scene()
     aside = replace(scene.train[4], name="turned-0", index=0)  # taken where the fifth training frame was
-    module = FrameGain.from_scene(
-        replace(scene, test_sets={**scene.test_sets, "rotation": [aside]}), FrameGainSettings(), torch.Generator()
-    )
-    with torch.no_grad():
-        module.log_gain.copy_(torch.tensor([0.1, 0.3, -0.2, 0.0, 0.4, -0.5, -0.1])[:, None])
+    module = make(LOGS, replace(scene, test_sets={**scene.test_sets, "rotation": [aside]}))
     assert module.gain(aside.view(trained=False)).item() == pytest.approx(module.gains()[4].item())
 
 
 def test_each_colour_has_its_own_gain():
-    module = make(channels=3)
-    with torch.no_grad():
-        module.log_gain.copy_(torch.linspace(-0.4, 0.4, 21).view(7, 3))
+    module = make(torch.linspace(-0.4, 0.4, 21), channels=3)
     output = RenderOutput(torch.rand(2, 3, 3), torch.rand(2, 3), None, {})
     view = View("0003", 3.0, True)
     expected = output.rgb * (module.log_gain[2] - module.log_gain.mean(0)).exp()
@@ -102,13 +100,9 @@ def test_known_gains_are_found(tmp_path):
         replace(frame, image=(frame.rgb * gain * 255).round().to(torch.uint8))
         for frame, gain in zip(scene.train, gains, strict=True)
     ]
-    overrides = ("schedule.steps=400", "datamanager.points_count=1000", "strategy=none", "field.sh_degree=0")
-    rates = (
-        "optimizers.sh0.lr=0.01",
-        "modules.exposure=gain",
-        'optimizers."exposure.gain"={lr: 0.02, final_lr: 0.0005}',
-    )
-    method = load_method("3dgs-depth", [*overrides, *rates])
+    overrides = ["schedule.steps=400", "datamanager.points_count=1000", "strategy=none", "field.sh_degree=0"]
+    overrides += ["optimizers.sh0.lr=0.01", "modules.exposure=gain"]
+    method = load_method("3dgs-depth", [*overrides, 'optimizers."exposure.gain"={lr: 0.02, final_lr: 0.0005}'])
     trainer = Trainer(method, replace(scene, train=train), "wall", RunFolder(tmp_path / "run"), 0, torch.device("cpu"))
     for _ in range(400):
         trainer.take_step()
@@ -127,7 +121,7 @@ def exposed(frames=33, answer=-0.6, gap=1):
     scene = wall_scene(frames)
     kept = range(0, len(scene.train), gap)
     scene = replace(scene, train=[scene.train[index] for index in kept])
-    module = FrameGain.from_scene(scene, FrameGainSettings(untrained="metered"), torch.Generator())
+    module = make(scene=scene, untrained="metered")
     levels = torch.tensor([0.5 + 0.2 * math.sin(0.9 * index) for index in kept])
     for frame, level in zip(scene.train, levels, strict=True):
         module.after_step(frame.view(trained=True), rendering(float(level)))
@@ -150,9 +144,7 @@ def test_held_out_frames_are_exposed_as_training_frames_of_their_brightness(answ
 def test_metering_leaves_other_views_alone():
     module, scene, _ = exposed()
     output = rendering(0.3)
-    plain = FrameGain.from_scene(scene, FrameGainSettings(), torch.Generator())
-    with torch.no_grad():
-        plain.log_gain.copy_(module.log_gain)
+    plain = make(module.log_gain.detach(), scene)
     for view in (scene.train[3].view(trained=True), None):
         assert torch.equal(module.shade(output, view).rgb, plain.shade(output, view).rgb)
     fixed, scene, _ = exposed(answer=0.0)
