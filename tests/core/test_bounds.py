@@ -16,7 +16,7 @@ from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.core.scenes import PointCloud
 from coliags_plugin.datamanagers.fusion import subsampled
 from coliags_plugin.geometry.lenses.models import FisheyeLens
-from coliags_plugin.geometry.lenses.opencv import OpenCVLens
+from coliags_plugin.geometry.lenses.tabulated import OpenCVLens
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 
 

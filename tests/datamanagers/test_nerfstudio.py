@@ -20,7 +20,7 @@ from coliags_plugin.datamanagers.fusion import load_points
 from coliags_plugin.datamanagers.nerfstudio.reader import NerfstudioDataManager, NerfstudioSettings
 from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens
-from coliags_plugin.geometry.lenses.opencv import OpenCVLens
+from coliags_plugin.geometry.lenses.tabulated import OpenCVLens
 from coliags_plugin.geometry.lenses.undistortion import Undistortion
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
 from tests.datamanagers.real_frames import real_lens

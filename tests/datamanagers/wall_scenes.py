@@ -10,8 +10,7 @@ import numpy as np
 
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.datamanagers.c3vd.writer import depth_steps, write_c3vd_scene
-from coliags_plugin.geometry.lenses.models import LENSES, Lens, octagon_mask
-from coliags_plugin.geometry.lenses.pinhole import PinholeLens
+from coliags_plugin.geometry.lenses.models import LENSES, Lens, PinholeLens, octagon_mask
 
 #: The wall is where NORMAL . x = OFFSET (mm).
 NORMAL = np.array([0.2, -0.1, 1.0])

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from coliags_plugin.config.method_files import method_folder
 from coliags_plugin.config.yaml_tree import read_tree
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.geometry.lenses.pinhole import PinholeLens
+from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.lighting.tone_curve import encode
 from coliags_plugin.phantom.colon import ColonSurface, build_surface, grow_anatomy
 from coliags_plugin.phantom.imaging import Sensor, World, expose

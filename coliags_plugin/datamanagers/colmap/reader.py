@@ -27,7 +27,7 @@ from coliags_plugin.datamanagers.recording import Recording, Shot, fingerprint
 from coliags_plugin.datamanagers.rectification import Rectification, rectifications
 from coliags_plugin.datamanagers.scene_settings import InitialPoints, SceneSettings
 from coliags_plugin.datamanagers.seen_masks import find_seen_masks
-from coliags_plugin.geometry.lenses.pinhole import PinholeLens
+from coliags_plugin.geometry.lenses.models import PinholeLens
 
 log = logging.getLogger(__name__)
 

@@ -8,9 +8,8 @@ from typing import Any, Literal
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.json_files import image_size, read_number
-from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens
-from coliags_plugin.geometry.lenses.opencv import OpenCVLens
-from coliags_plugin.geometry.lenses.pinhole import PinholeLens
+from coliags_plugin.geometry.lenses.models import FisheyeLens, Lens, PinholeLens
+from coliags_plugin.geometry.lenses.tabulated import OpenCVLens
 
 PixelCenters = Literal["half", "integer"]
 

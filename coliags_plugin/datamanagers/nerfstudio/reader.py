@@ -22,7 +22,7 @@ from coliags_plugin.datamanagers.rectification import rectifications
 from coliags_plugin.datamanagers.scene_settings import POINTS_FILE, SceneSettings
 from coliags_plugin.datamanagers.seen_masks import find_seen_masks
 from coliags_plugin.datamanagers.units import printed_unit
-from coliags_plugin.geometry.lenses.pinhole import PinholeLens
+from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.poses import nerfstudio as nerfstudio_poses
 
 #: Files that identify RotateColon instead, whose images are named by number and whose depth is scaled.

@@ -40,13 +40,7 @@ class GaussianAverages:
 
     Centres, colours and logarithms of scales are means, rotations the main axes of the quaternions' outer products.
     Opacities are weighted by the weight of the whole element: a child that an anchor does not yield in a view counts
-    with 0.
-
-    Args:
-        elements: Of the field, E.
-        per_element: Slots of each.
-        scales: Of each Gaussian: three, two for surfels.
-        device: Of the Gaussians.
+    with 0. Each element has ``per_element`` slots, each slot so many scales: three, two for surfels.
     """
 
     def __init__(self, elements: int, per_element: int, scales: int, device: torch.device) -> None:
@@ -61,12 +55,7 @@ class GaussianAverages:
         self._colors = zeros(slots, 3)
 
     def add(self, gaussians: Gaussians, weights: Float[Tensor, "N"]) -> None:
-        """Add a view.
-
-        Args:
-            gaussians: Of the view.
-            weights: Their :func:`blending_weights`, or others. [N]
-        """
+        """Add a view's Gaussians by their :func:`blending_weights`, or other weights."""
         slots = gaussians.source_index
         elements = slots // self._per_element
         shown = torch.zeros_like(self._element_weights).index_add_(0, elements, weights)
@@ -86,22 +75,14 @@ class GaussianAverages:
         return visible.nonzero().squeeze(1)
 
     def kept(self) -> Int[Tensor, "N"]:
-        """The same, at least one. [N]
-
-        Raises:
-            InputError: There are none.
-        """
+        """The same, at least one; refuses a run of which nothing is visible. [N]"""
         visible = self.visible()
         if not len(visible):
             raise InputError("no Gaussian of this run is visible in a training view", "a trained run")
         return visible
 
     def gaussians(self, kept: Int[Tensor, "N"]) -> Gaussians:
-        """The averages, of no view in particular.
-
-        Args:
-            kept: Slots. [N]
-        """
+        """The averages of some slots, of no view in particular."""
         weights = self._weights[kept][:, None]
         return Gaussians(
             means=self._means[kept] / weights,
@@ -118,12 +99,7 @@ class GaussianAverages:
         return self._opacities / shown.clamp_min(_NONE)
 
     def field(self, kept: Int[Tensor, "N"], harmonics: Float[Tensor, "N B 3"]) -> ExplicitGaussians:
-        """The averages as an explicit field.
-
-        Args:
-            kept: Slots of its Gaussians. [N]
-            harmonics: Their colours, to degree D, B = (D + 1)^2. [N, B, 3]
-        """
+        """The averages of some slots as an explicit field, with colours to degree D, B = (D + 1)^2."""
         degree = round(harmonics.shape[1] ** 0.5) - 1
         made = ExplicitGaussians(ExplicitGaussiansSettings(sh_degree=degree), len(kept)).to(kept.device)
         mean = self.gaussians(kept)
@@ -142,10 +118,7 @@ class GaussianAverages:
 def mean_gaussians(field: GaussianField, cameras: Sequence[Camera], light: HeldLight | None = None) -> Gaussians:
     """The Gaussians of a field for no view in particular: averages over views, weighted by their opacities there.
 
-    Args:
-        field: What is decoded.
-        cameras: From where; at least one.
-        light: What lights it; None: the lamp of each camera, so that colours are of the average light.
+    Without a light to hold, the lamp of each camera lights them, so that colours are of the average light.
     """
     views = [gaussians_under(field, camera, light) for camera in cameras]
     slots = max((int(view.source_index.max()) + 1 for view in views if len(view)), default=0)

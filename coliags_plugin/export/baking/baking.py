@@ -25,22 +25,12 @@ _VIEWS, _COLOR_VIEWS = 120, 30
 
 
 def bake(trained: TrainedRun, light: HeldLight) -> tuple[SplatCloud, dict[str, Any]]:
-    """One cloud of Gaussians for all views, under a held light.
+    """One cloud of Gaussians for all views, under a held light, and facts for its record.
 
     Every Gaussian is averaged over training views, and its colours are fitted with spherical harmonics by least
     squares, both weighted by how much each view shows of it. Where these averages lose much, as they do of Gaussians
     that are others in every view, they are refined on the training views
     (:mod:`~coliags_plugin.export.baking.refinement`).
-
-    Args:
-        trained: The run, of Gaussians.
-        light: What lights it.
-
-    Returns:
-        The cloud, and facts for its record.
-
-    Raises:
-        InputError: The run has no Gaussians, or none of them is seen in training.
     """
     views = trained.scene.train[:: -(-len(trained.scene.train) // _VIEWS)]
     field = _averaged(trained, views, light)

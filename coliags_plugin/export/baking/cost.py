@@ -31,11 +31,6 @@ def export_cost(trained: TrainedRun, cloud: SplatCloud, light: HeldLight | None)
     frames brought to that light: the run's own render there, plus what the run's render misses of the frame. By that
     the run's PSNR is that of its evaluation, and the cloud's differs by baking alone.
 
-    Args:
-        trained: The run.
-        cloud: Made of it.
-        light: That it was baked in; None where the run's colours know no lamp.
-
     Returns:
         By test set: ``frames`` (their number), ``run`` and ``export`` (means by metric), ``cost`` (dB that PSNR falls,
         mm^2 that the squared error of depth rises), ``psnr_between`` (of the cloud against the run under that light)

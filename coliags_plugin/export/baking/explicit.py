@@ -21,12 +21,7 @@ def cloud_of_field(field: ExplicitGaussians) -> SplatCloud:
 
 
 def load_cloud(field: ExplicitGaussians, cloud: SplatCloud) -> None:
-    """Put a cloud into a field of as many Gaussians, of at least its degree, and as many scales.
-
-    Args:
-        field: Made for the cloud: ``Field(settings, len(cloud))``.
-        cloud: All finite.
-    """
+    """Put a cloud, all finite, into a field of as many Gaussians, of at least its degree, and as many scales."""
     first, higher = cloud.harmonics[:, :1], cloud.harmonics[:, 1:]
     with torch.no_grad():
         field.means.copy_(torch.from_numpy(cloud.means))

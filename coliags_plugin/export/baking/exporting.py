@@ -19,7 +19,7 @@ from coliags_plugin.export.baking.baking import bake
 from coliags_plugin.export.baking.cost import export_cost
 from coliags_plugin.export.baking.explicit import cloud_of_field
 from coliags_plugin.export.splats.cloud import SplatCloud
-from coliags_plugin.export.splats.files import FORMATS, THICKNESS_SHARE, check_format, kept_by, write_splats
+from coliags_plugin.export.splats.files import FORMATS, THICKNESS_SHARE, check_format, write_splats
 from coliags_plugin.fields.explicit_gaussians import ExplicitGaussians
 from coliags_plugin.lighting.lamps import HeldLight
 
@@ -31,13 +31,7 @@ RECORD_VERSION = 1
 
 @dataclass(frozen=True)
 class Exported:
-    """A written file of Gaussians.
-
-    Attributes:
-        file: The file.
-        record_file: The JSON file beside it.
-        record: Content of that.
-    """
+    """A written file of Gaussians, and the JSON file beside it with its content."""
 
     file: Path
     record_file: Path
@@ -59,10 +53,6 @@ def export_run(
         light: Name of the light to bake in; of no effect where colours know no lamp.
         measure: Compare the file with the run on the held-out views, for the record.
         overwrite: Replace a file that is there.
-
-    Raises:
-        InputError: The run's field has no Gaussians; there is no such format or light; or the file exists or cannot be
-            written.
     """
     check_format(form)
     record_file = output.with_name(f"{output.name}.json")
@@ -83,6 +73,8 @@ def export_run(
     unit = trained.scene.length_unit
     comment = f"{trained.method} on {trained.scene.name}, exported by coliags_plugin; lengths in {unit}"
     write_splats(output, cloud, form, comment)
+    read = FORMATS[form].read
+    kept = cloud if read is None else read(output)
     record = {
         "format": "coliags-export",
         "version": RECORD_VERSION,
@@ -107,7 +99,7 @@ def export_run(
         },
         "baking": baking,
         "left_out": {name: module.untrained_views for name, module in trained.model.view_modules.items()},
-        "cost": export_cost(trained, kept_by(form, output, cloud), held) if measure else None,
+        "cost": export_cost(trained, kept, held) if measure else None,
         "software": software(),
     }
     write_json(record_file, record)
@@ -134,11 +126,7 @@ def _gaussian_field(trained: TrainedRun) -> GaussianField:
 
 
 def _checked(cloud: SplatCloud, trained: TrainedRun) -> SplatCloud:
-    """The Gaussians that are finite.
-
-    Raises:
-        InputError: There are none.
-    """
+    """The Gaussians that are finite, at least one."""
     usable = cloud.usable()
     if not usable.any():
         raise InputError(f"{trained.run.path} has no Gaussian to write", "a run whose field holds at least one")

@@ -22,14 +22,7 @@ _CHUNK = 1 << 16
 
 @dataclass(frozen=True)
 class SeenColors:
-    """Colours of some Gaussians in one view.
-
-    Attributes:
-        slots: Which Gaussians. [V]
-        weights: How much the view shows of each. [V]
-        directions: From the camera, unit vectors. [V, 3]
-        colors: RGB. [V, 3]
-    """
+    """Colours (RGB) of some Gaussians in one view, how much it shows of each, and unit directions from the camera."""
 
     slots: Int[Tensor, "V"]
     weights: Float[Tensor, "V"]
@@ -38,13 +31,7 @@ class SeenColors:
 
     @classmethod
     def of(cls, gaussians: Gaussians, weights: Float[Tensor, "N"], camera: Camera) -> SeenColors:
-        """The colours of those that a view shows.
-
-        Args:
-            gaussians: Of the view.
-            weights: How much it shows of each. [N]
-            camera: The view.
-        """
+        """The colours of those that a view shows."""
         shown = weights > 0
         directions = torch.nn.functional.normalize(gaussians.means[shown] - camera.center, dim=1)
         return cls(gaussians.source_index[shown], weights[shown], directions, gaussians.colors[shown])
@@ -57,12 +44,9 @@ def fit_harmonics(
 
     Args:
         views: At least one.
-        kept: Slots to fit, ascending. [N]
-        mean_colors: Their colours where no view shows them. [N, 3]
-        degree: Of the harmonics.
-
-    Returns:
-        B = (degree + 1)^2. [N, B, 3]
+        kept: Slots to fit, ascending.
+        mean_colors: Their colours where no view shows them.
+        degree: Of the harmonics, B = (degree + 1)^2.
     """
     bases = (degree + 1) ** 2
     rows = torch.full((int(kept[-1]) + 1,), -1, dtype=torch.int64, device=kept.device)

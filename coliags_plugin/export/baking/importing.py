@@ -50,9 +50,6 @@ def import_run(
         data_format: Name of a data manager; None: the one that recognises the folder.
         overwrite: Replace an existing run folder.
         anonymous: Keep absolute paths out of the run.
-
-    Raises:
-        InputError: The file or the scene cannot be read, or the folder exists or cannot be written.
     """
     output.check_free(overwrite)
     cloud = read_splats(file)

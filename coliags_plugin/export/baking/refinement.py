@@ -38,34 +38,19 @@ _WANTS = ("rgb", "alpha", "depth_accumulated")
 
 @dataclass(frozen=True)
 class _Target:
-    """A training view in the held light.
+    """A training view in the held light."""
 
-    Attributes:
-        camera: Of the frame, as the run's view modules adjust it.
-        rgb: The frame, brought to the light. [H, W, 3]
-        depth: Accumulated depth that the run renders. [H, W]
-        mask: Of the frame. [H, W]
-    """
-
-    camera: Camera
-    rgb: Float[Tensor, "H W 3"]
-    depth: Float[Tensor, "H W"]
-    mask: Bool[Tensor, "H W"] | None
+    camera: Camera  # of the frame, as the run's view modules adjust it
+    rgb: Float[Tensor, "H W 3"]  # the frame, brought to the light
+    depth: Float[Tensor, "H W"]  # accumulated depth that the run renders
+    mask: Bool[Tensor, "H W"] | None  # of the frame
 
 
 def refine(field: ExplicitGaussians, trained: TrainedRun, light: HeldLight) -> int:
-    """Fit baked Gaussians to training frames in the held light, and to the depth that the run renders of them.
+    """Fit baked Gaussians, in place, to training frames in the held light, and to the depth that the run renders there.
 
     Frames are brought to that light as the held-out ones are that a file is compared with: the run's render there, plus
-    what the run's render as recorded misses of the frame.
-
-    Args:
-        field: Changed in place.
-        trained: The run that it was baked from.
-        light: What lights it.
-
-    Returns:
-        Steps taken.
+    what the run's render as recorded misses of the frame. Returns the steps taken.
 
     Raises:
         NotFiniteError: The loss became NaN or infinite.
@@ -112,13 +97,7 @@ def _some_frames(frames: list[Frame]) -> list[Frame]:
 
 @torch.no_grad()
 def needs_refinement(field: ExplicitGaussians, trained: TrainedRun, light: HeldLight) -> bool:
-    """Whether baked Gaussians miss training frames in the held light by more than the run does.
-
-    Args:
-        field: The baked Gaussians.
-        trained: The run that they were baked from.
-        light: What lights them.
-    """
+    """Whether baked Gaussians miss training frames in the held light by more than the run does."""
     renderer, frames = splatting_of(trained.model), trained.scene.train
     own, baked = [], []
     for frame in frames[:: -(-len(frames) // _COMPARED)]:

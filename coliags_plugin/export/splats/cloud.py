@@ -26,11 +26,11 @@ class SplatCloud:
     and the signs of 3DGS.
 
     Attributes:
-        means: Centres. [N, 3]
-        quats_wxyz: Rotations; need not be normalised. [N, 4]
-        scales: Standard deviations along the local axes; two for surfels. [N, 3] or [N, 2]
-        opacities: In [0, 1]. [N]
-        harmonics: Coefficients of spherical harmonics to degree D, B = (D + 1)^2. [N, B, 3]
+        means: Centres.
+        quats_wxyz: Rotations; need not be normalised.
+        scales: Standard deviations along the local axes, three; two for surfels.
+        opacities: In [0, 1].
+        harmonics: Coefficients of spherical harmonics to degree D, B = (D + 1)^2.
     """
 
     means: Float32[np.ndarray, "N 3"]
@@ -40,7 +40,6 @@ class SplatCloud:
     harmonics: Float32[np.ndarray, "N B 3"]
 
     def __len__(self) -> int:
-        """Number of Gaussians."""
         return len(self.means)
 
     @property
@@ -79,22 +78,14 @@ class SplatCloud:
 
     @classmethod
     def of(cls, gaussians: Gaussians) -> SplatCloud:
-        """Gaussians of a view, or of none in particular, with harmonics of degree 0.
-
-        Args:
-            gaussians: Of any device; those with a number that is not finite are left out.
-        """
+        """Finite Gaussians of a view, or of none in particular, of any device, with harmonics of degree 0."""
         parts = (gaussians.means, gaussians.quats_wxyz, gaussians.scales, gaussians.opacities, gaussians.colors)
         means, quats, scales, opacities, colors = (part.detach().cpu().float().numpy() for part in parts)
         cloud = cls(means, quats, scales, opacities, harmonics_of_colors(colors))
         return cloud.part(cloud._finite())
 
     def part(self, kept: Bool[np.ndarray, "N"]) -> SplatCloud:
-        """Some of the Gaussians.
-
-        Args:
-            kept: True for those to keep. [N]
-        """
+        """Some of the Gaussians."""
         return SplatCloud(*(values[kept] for values in vars(self).values()))
 
     def concat(self, others: SplatCloud) -> SplatCloud:
@@ -118,11 +109,7 @@ class SplatCloud:
         return usable
 
     def with_thickness(self, share: float) -> SplatCloud:
-        """Surfels as flat Gaussians; Gaussians unchanged.
-
-        Args:
-            share: Third scale as a share of the smaller one of the other two.
-        """
+        """Surfels as flat Gaussians, their third scale a share of the smaller other one; Gaussians unchanged."""
         if self.scales.shape[1] == 3:
             return self
         third = share * self.scales.min(axis=1, keepdims=True)
@@ -135,9 +122,5 @@ def sigmoid(logits: Float32[np.ndarray, "N"]) -> Float32[np.ndarray, "N"]:
 
 
 def harmonics_of_colors(colors: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 1 3"]:
-    """Coefficients of degree 0 of colours that do not depend on the direction. [N, 1, 3]
-
-    Args:
-        colors: RGB in [0, 1]. [N, 3]
-    """
+    """Coefficients of degree 0 of colours in [0, 1] that do not depend on the direction. [N, 1, 3]"""
     return ((colors - 0.5) / Y0)[:, None].astype(np.float32)

@@ -16,15 +16,8 @@ _ROW = np.dtype([("mean", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("
 def write_dot_splat(path: Path, cloud: SplatCloud, comment: str = "") -> None:
     """Write means, scales, 8-bit colours and opacities, and 8-bit rotations (w first, 128 (q + 1)), most visible first.
 
-    The order is that of opacity times volume, falling, as viewers that draw while loading expect it.
-
-    Args:
-        path: Where to.
-        cloud: With three scales each.
-        comment: Not written: the format has no place for it.
-
-    Raises:
-        InputError: The folder cannot be written.
+    The order is that of opacity times volume, falling, as viewers that draw while loading expect it. The format has no
+    place for a comment.
     """
     order = np.argsort(-cloud.opacities * cloud.scales.prod(axis=1), kind="stable")
     rows = np.empty(len(cloud), _ROW)
@@ -36,11 +29,7 @@ def write_dot_splat(path: Path, cloud: SplatCloud, comment: str = "") -> None:
 
 
 def read_dot_splat(path: Path) -> SplatCloud:
-    """Read Gaussians with harmonics of degree 0.
-
-    Raises:
-        InputError: The file cannot be read, or is no whole number of rows.
-    """
+    """Read Gaussians with harmonics of degree 0."""
     try:
         data = path.read_bytes()
     except OSError as error:

@@ -22,13 +22,7 @@ THICKNESS_SHARE = 0.01
 
 @dataclass(frozen=True)
 class SplatFormat:
-    """A format of files of Gaussians.
-
-    Attributes:
-        write: Takes path, cloud and comment.
-        read: None where such files are only written.
-        keeps: What of the numbers it keeps, for the user.
-    """
+    """A writer of path, cloud and comment, a reader where such files are read, and what of the numbers is kept."""
 
     write: Callable[[Path, SplatCloud, str], None]
     read: Callable[[Path], SplatCloud] | None
@@ -53,33 +47,13 @@ FORMATS: Mapping[str, SplatFormat] = {
 
 
 def check_format(name: str) -> None:
-    """Refuse a name of no format.
-
-    Raises:
-        InputError: See above.
-    """
+    """Refuse a name of no format."""
     if name not in FORMATS:
         raise InputError(f"no format '{name}'", f"one of {', '.join(FORMATS)}", did_you_mean(name, FORMATS))
 
 
-def kept_by(name: str, path: Path, cloud: SplatCloud) -> SplatCloud:
-    """What a file that was just written holds of a cloud: as read back, or the cloud where the format is not read."""
-    reader = FORMATS[name].read
-    return cloud if reader is None else reader(path)
-
-
 def write_splats(path: Path, cloud: SplatCloud, name: str, comment: str = "") -> None:
-    """Write Gaussians; surfels become flat Gaussians.
-
-    Args:
-        path: Where to; its suffix is not looked at.
-        cloud: At least one Gaussian, all finite.
-        name: Of the format.
-        comment: For formats with a place for it.
-
-    Raises:
-        InputError: There is no such format, nothing to write, or the file cannot be written.
-    """
+    """Write at least one Gaussian, all finite, in a named format; surfels become flat Gaussians."""
     check_format(name)
     if not len(cloud):
         raise InputError("no Gaussian to write", "at least one")
@@ -87,12 +61,7 @@ def write_splats(path: Path, cloud: SplatCloud, name: str, comment: str = "") ->
 
 
 def read_splats(path: Path) -> SplatCloud:
-    """Read Gaussians, in the format of the suffix; rows that are not finite are dropped with a warning.
-
-    Raises:
-        InputError: The suffix is of no format that is read, the file is damaged or of something else, or no row is
-            usable.
-    """
+    """Read Gaussians, in the format of the suffix; rows that are not finite are dropped with a warning."""
     readers = {f".{name}": known.read for name, known in FORMATS.items() if known.read is not None}
     reader = readers.get(path.suffix.lower())
     if reader is None:

@@ -18,18 +18,10 @@ UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 
 def write_splat_glb(path: Path, cloud: SplatCloud, comment: str = "") -> None:
-    """Write Gaussians as one primitive of points, float32.
+    """Write Gaussians as one primitive of points, float32, with the comment in ``asset.extras``.
 
     Attributes keep the world frame and unit of the cloud. The node turns them by half a turn about x, so that y is up
     as glTF has it. Readers without the extension see plain points in the colours of ``COLOR_0``.
-
-    Args:
-        path: Where to.
-        cloud: With three scales each.
-        comment: For ``asset.extras``.
-
-    Raises:
-        InputError: The folder cannot be written.
     """
     attributes = _attributes(cloud)
     primitive = {

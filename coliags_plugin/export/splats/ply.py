@@ -30,18 +30,10 @@ _OTHER_KINDS = {
 
 
 def write_splat_ply(path: Path, cloud: SplatCloud, comment: str = "") -> None:
-    """Write Gaussians in 3DGS's order of attributes, binary little-endian.
+    """Write Gaussians in 3DGS's order of attributes, binary little-endian, with the comment in the header.
 
     ``x y z nx ny nz f_dc_* f_rest_* opacity scale_* rot_*``: normals are 0, ``f_rest`` is channel by channel, opacities
     are logits, scales logarithms, and rotations w first.
-
-    Args:
-        path: Where to.
-        cloud: With three scales each.
-        comment: A line for the header.
-
-    Raises:
-        InputError: The folder cannot be written.
     """
     rest = cloud.harmonics[:, 1:].transpose(0, 2, 1).reshape(len(cloud), -1)
     zeros = np.zeros(len(cloud), np.float32)
@@ -64,9 +56,6 @@ def read_splat_ply(path: Path) -> SplatCloud:
     """Read Gaussians, or surfels (without ``scale_2``), of 3DGS's lineage; normals and other properties are ignored.
 
     Rows may have numbers that are not finite: :meth:`SplatCloud.usable`.
-
-    Raises:
-        InputError: The file is damaged, compressed, or of something else.
     """
     _refuse_other_kinds(path)
     columns = read_vertices(path, needed=_NEEDED)

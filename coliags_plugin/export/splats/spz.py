@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_copy
@@ -28,15 +27,7 @@ def write_spz(path: Path, cloud: SplatCloud, comment: str = "") -> None:
     """Write Gaussians quantised: positions to 1/4096 of a unit, log scales to 1/16 in [-10, 5.9], all else to 8 bits.
 
     SPZ's axes are right, up, back: what is written is turned by half a turn about x, and turned back when read. Clouds
-    of more than 2048 units from the origin get coarser positions.
-
-    Args:
-        path: Where to.
-        cloud: With three scales each.
-        comment: Not written: the format has no place for it.
-
-    Raises:
-        InputError: gsply is missing, positions do not fit, or the folder cannot be written.
+    of more than 2048 units from the origin get coarser positions. The format has no place for a comment.
     """
     gsply = _library()
     reach = float(np.abs(cloud.means).max())
@@ -62,11 +53,7 @@ def write_spz(path: Path, cloud: SplatCloud, comment: str = "") -> None:
 
 
 def read_splat_spz(path: Path) -> SplatCloud:
-    """Read Gaussians, turned from SPZ's axes as :func:`write_spz` turned them.
-
-    Raises:
-        InputError: gsply is missing, or the file cannot be read or is no SPZ file.
-    """
+    """Read Gaussians, turned from SPZ's axes as :func:`write_spz` turned them."""
     gsply = _library()
     try:
         data = gsply.read_spz(path)
@@ -96,12 +83,8 @@ def _half_turn(cloud: SplatCloud) -> SplatCloud:
         quats_wxyz=np.stack([w, x, -y, -z], axis=1),
         scales=cloud.scales,
         opacities=cloud.opacities,
-        harmonics=cloud.harmonics * _signs(cloud)[:, None],
+        harmonics=cloud.harmonics * _TURNED[: cloud.harmonics.shape[1], None],
     )
-
-
-def _signs(cloud: SplatCloud) -> Float32[np.ndarray, "B"]:
-    return _TURNED[: cloud.harmonics.shape[1]]
 
 
 def _library() -> Any:

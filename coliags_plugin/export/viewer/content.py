@@ -22,17 +22,14 @@ from coliags_plugin.engine.held_light import flattened_light, gaussians_of
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.export.baking.averages import mean_gaussians
 from coliags_plugin.export.splats.cloud import SplatCloud
-from coliags_plugin.export.viewer.decoding import ViewDecoder
 from coliags_plugin.export.viewer.merging import merged_to
 from coliags_plugin.export.viewer.pictures import FramePictures
-from coliags_plugin.export.viewer.splats import shown, wire_unit
+from coliags_plugin.export.viewer.splats import ViewDecoder, shown, wire_unit
 from coliags_plugin.lighting.lamps import HeldLight
 from coliags_plugin.outputs.image_files import as_array
 
 logger = logging.getLogger(__name__)
 
-#: Distance of the point that the browser's camera turns about, where nothing is in view: as a share of the extent.
-_DEFAULT_DISTANCE = 1.0
 #: Training views that are decoded for the Gaussians of no view in particular, at most.
 VIEWS = 16
 #: Gaussians beside a view, at most: they are seen only until the next decoding.
@@ -45,25 +42,17 @@ _NOTHING = SplatCloud(*(np.zeros((0, *shape), np.float32) for shape in ((3,), (4
 
 @dataclass(frozen=True)
 class ViewerContent:
-    """A run, ready to be shown.
-
-    Attributes:
-        trained: The run.
-        frames: Of the video, in its order.
-        baked: Its Gaussians for no view in particular, under the light that they got on average; none for a method
-            without Gaussians.
-        decoder: Its Gaussians for a view; None for a method without Gaussians.
-        pictures: Of the frames.
-        unit: See :func:`~coliags_plugin.export.viewer.splats.wire_unit`.
-        lock: Held while something is computed: browsers take turns.
-    """
+    """A run, ready to be shown."""
 
     trained: TrainedRun
-    frames: list[Frame]
+    frames: list[Frame]  # of the video, in its order
+    # Its Gaussians for no view in particular, under the light that they got on average; none for a method without
+    # Gaussians.
     baked: SplatCloud
-    decoder: ViewDecoder | None
-    pictures: FramePictures
-    unit: float
+    decoder: ViewDecoder | None  # its Gaussians for a view; None for a method without Gaussians
+    pictures: FramePictures  # of the frames
+    unit: float  # see :func:`~coliags_plugin.export.viewer.splats.wire_unit`
+    # Held while something is computed: browsers take turns.
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     @classmethod
@@ -120,7 +109,7 @@ class ViewerContent:
         depth, seen = camera.to("cpu", torch.float64).sees(centers)
         if seen.any():
             return float(depth[seen].median())
-        return _DEFAULT_DISTANCE * self.trained.scene.extent or 1.0
+        return self.trained.scene.extent or 1.0
 
     @cached_property
     def flattened(self) -> HeldLight:
@@ -139,12 +128,7 @@ class ViewerContent:
 
 
 def distances(splats: SplatCloud, cameras: Sequence[Camera]) -> Float[np.ndarray, "N"]:
-    """Distance of each splat to the nearest camera, the nearest fifth counted alike. [N]
-
-    Args:
-        splats: Scene units.
-        cameras: At least one.
-    """
+    """Distance of each splat to the nearest camera, scene units, the nearest fifth counted alike. [N]"""
     centers = np.stack([as_array(camera.center).astype(np.float64) for camera in cameras])
     nearest = np.asarray(cKDTree(centers).query(splats.means)[0])
     return np.maximum(nearest, np.quantile(nearest, _NEAR_SHARE)) if len(nearest) else nearest
@@ -159,11 +143,6 @@ def spread(cameras: Sequence[Camera]) -> list[Camera]:
 def vertical_fov(camera: Camera) -> float:
     """Vertical field of view of a camera, radians; the browser's camera has its principal point in the middle."""
     return 2.0 * math.atan(0.5 * camera.height / camera.fy)
-
-
-def aspect(camera: Camera) -> float:
-    """Width of the image over its height, of pixels as wide as they are high."""
-    return camera.width / camera.fx * camera.fy / camera.height
 
 
 def mesh_files(run: Path) -> dict[str, Path]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -21,29 +22,18 @@ _LARGEST_THRESHOLD = 0.9
 _HIDING_SIZES = 3.0
 
 
-class Listener(Protocol):
-    """What the controls tell of changes."""
-
-    def options_changed(self) -> None:
-        """Light, threshold or kind of picture has changed."""
-
-    def go_to(self, index: int) -> None:
-        """Another frame was chosen."""
-
-
 class Controls:
-    """Slider through the video, light, threshold, layers and pictures.
+    """Slider through the video, light, threshold, layers and pictures, in viser's panel of one browser.
 
-    Args:
-        client: viser's handle of the browser.
-        content: What is shown.
-        listener: Told of changes.
+    ``changed`` is told of another light, threshold or kind of picture, ``go_to`` of another frame.
     """
 
-    def __init__(self, client: Any, content: ViewerContent, listener: Listener) -> None:
+    def __init__(
+        self, client: Any, content: ViewerContent, changed: Callable[[], None], go_to: Callable[[int], None]
+    ) -> None:
         self._content = content
         self._client = client
-        self._listener = listener
+        self._go_to = go_to
         self._layers: dict[str, list[Any]] = {}
         gui, trained = client.gui, content.trained
         held_out = len(content.frames) - len(trained.scene.train)
@@ -57,16 +47,16 @@ class Controls:
         self._light = self._threshold = None
         if content.knows_lamp:
             self._light = gui.add_dropdown("Light", (AT_CAMERA, FLATTENED))
-            self._light.on_update(lambda _: listener.options_changed())
+            self._light.on_update(lambda _: changed())
         if content.decoder is not None:
             self._threshold = gui.add_slider("Least opacity", 0.0, _LARGEST_THRESHOLD, 0.01, 0.0)
-            self._threshold.on_update(lambda _: listener.options_changed())
+            self._threshold.on_update(lambda _: changed())
         with gui.add_folder("Layers"):
             self._add_layers(gui)
         with gui.add_folder("Pictures of the frame"):
             self._recorded = gui.add_image(as_array(content.frames[0].image), label="recorded")
             self._picture = gui.add_dropdown("Beside it", content.pictures.kinds)
-            self._picture.on_update(lambda _: listener.options_changed())
+            self._picture.on_update(lambda _: changed())
             self._rendered = gui.add_image(as_array(content.frames[0].image) // 4, label="is being rendered")
         self._status = gui.add_markdown("")
 
@@ -105,18 +95,14 @@ class Controls:
         self._rendered.label = picture.caption
 
     def choose(self, index: int) -> None:
-        """Choose a frame, as the slider does.
-
-        Args:
-            index: Of the frame in the video.
-        """
+        """Choose a frame of the video by its index, as the slider does."""
         self._frame.value = index
         self._frame_chosen()
 
     def _frame_chosen(self) -> None:
         self._about_frame.content = self._frame_text()
         self._recorded.image = as_array(self._content.frames[self.frame].image)
-        self._listener.go_to(self.frame)
+        self._go_to(self.frame)
 
     def _frame_text(self) -> str:
         frame = self._content.frames[self.frame]
@@ -147,11 +133,7 @@ class Controls:
         self.camera_rests(self._client.camera.position)
 
     def camera_rests(self, position: Float[np.ndarray, "3"]) -> None:
-        """Hide the frusta that the browser's camera is in or behind, whose pictures would fill the view.
-
-        Args:
-            position: Of the browser's camera, world frame. [3]
-        """
+        """Hide the frusta that the browser's camera, at this place, is in or behind: their pictures fill the view."""
         for handle in self._layers.get("cameras", ()):
             near = np.linalg.norm(np.asarray(handle.position) - position) < _HIDING_SIZES * handle.scale
             handle.visible = self._cameras.value and not near

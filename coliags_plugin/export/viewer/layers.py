@@ -7,11 +7,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from coliags_plugin.core.cameras import Camera
-from coliags_plugin.core.scenes import Frame
-from coliags_plugin.export.viewer.content import ViewerContent, aspect, vertical_fov
+from coliags_plugin.export.viewer.content import ViewerContent, vertical_fov
 from coliags_plugin.export.viewer.library import import_viser
 from coliags_plugin.geometry.meshes.files import encode_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
@@ -32,17 +31,27 @@ _AMBIENT, _HEADLIGHT = 1.4, 1.8
 def add_cameras(scene: Any, content: ViewerContent, chosen: Callable[[int], None] | None = None) -> list[Any]:
     """Add a frustum with its picture for the frames of the video, or for every n-th of many.
 
-    Args:
-        scene: viser's, of a server or a client.
-        content: What is shown.
-        chosen: Called with the index of a frame in the video whose frustum was clicked.
+    ``chosen`` is called with the index, in the video, of a frame whose frustum was clicked.
     """
     frames = content.frames
     indices = range(0, len(frames), -(-len(frames) // MOST_CAMERAS))
     size = frustum_size([frames[index].camera for index in indices], content.look_distance)
     handles = []
     for index in indices:
-        handle = _add_frustum(scene, f"/cameras/{frames[index].name}", frames[index], size)
+        camera, image = frames[index].camera, as_array(frames[index].image)
+        small = _PICTURE_WIDTH, max(1, round(image.shape[0] * _PICTURE_WIDTH / image.shape[1]))
+        wxyz, position = pose(camera)
+        handle = scene.add_camera_frustum(
+            f"/cameras/{frames[index].name}",
+            vertical_fov(camera),
+            camera.width / camera.fx * camera.fy / camera.height,
+            scale=size,
+            thickness=_LINE_SHARE * size,
+            color=_COLOR,
+            image=cv2.resize(image, small, interpolation=cv2.INTER_AREA),
+            wxyz=wxyz,
+            position=position,
+        )
         if chosen is not None:
             handle.on_click(lambda _, index=index: chosen(index))
         handles.append(handle)
@@ -50,32 +59,15 @@ def add_cameras(scene: Any, content: ViewerContent, chosen: Callable[[int], None
 
 
 def frustum_size(cameras: Sequence[Camera], distance: float) -> float:
-    """Length of the frusta, scene units, such that they neither merge nor fill the view.
+    """Length of frusta along the path, scene units, such that they neither merge nor fill the view.
 
-    Args:
-        cameras: Of the frusta, along the path.
-        distance: That the first of them sees.
+    ``distance`` is that which the first of them sees.
     """
     centers = np.stack([as_array(camera.center).astype(np.float64) for camera in cameras])
     largest = _SIZE_OF_DEPTH * distance
     steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
     step = float(np.median(steps)) if len(steps) else 0.0
     return min(largest, _SIZE_OF_STEP * step) if step > 0.0 else largest
-
-
-def _add_frustum(scene: Any, name: str, frame: Frame, size: float) -> Any:
-    wxyz, position = pose(frame.camera)
-    return scene.add_camera_frustum(
-        name,
-        vertical_fov(frame.camera),
-        aspect(frame.camera),
-        scale=size,
-        thickness=_LINE_SHARE * size,
-        color=_COLOR,
-        image=_small(as_array(frame.image)),
-        wxyz=wxyz,
-        position=position,
-    )
 
 
 def pose(camera: Camera) -> tuple[Float[np.ndarray, "4"], Float[np.ndarray, "3"]]:
@@ -85,29 +77,13 @@ def pose(camera: Camera) -> tuple[Float[np.ndarray, "4"], Float[np.ndarray, "3"]
     return viser.transforms.SO3.from_matrix(matrix[:3, :3]).wxyz, matrix[:3, 3]
 
 
-def _small(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    height = max(1, round(image.shape[0] * _PICTURE_WIDTH / image.shape[1]))
-    return np.asarray(cv2.resize(image, (_PICTURE_WIDTH, height), interpolation=cv2.INTER_AREA))
-
-
 def add_mesh(scene: Any, name: str, mesh: TriangleMesh) -> Any:
-    """Add a mesh, with the colours of its vertices where it has any, seen from both sides.
-
-    Args:
-        scene: viser's, of a server or a client.
-        name: Of the layer.
-        mesh: The mesh.
-    """
+    """Add a mesh as a layer, with the colours of its vertices where it has any, seen from both sides."""
     node = "/" + name.replace(": ", "/").replace(" ", "-")
     return scene.add_glb(node, encode_mesh(mesh), cast_shadow=False, receive_shadow=False)
 
 
 def add_headlight(scene: Any, position: tuple[float, float, float]) -> Any:
-    """Add a light for meshes that is to move with the camera, alike at all distances, and dim light from everywhere.
-
-    Args:
-        scene: viser's, of a client.
-        position: Of the camera.
-    """
+    """Add a light for meshes that is to move with the camera, alike at all distances, and dim light from everywhere."""
     scene.add_light_ambient("/lights/everywhere", intensity=_AMBIENT)
     return scene.add_light_point("/lights/camera", intensity=_HEADLIGHT, decay=0.0, position=position)

@@ -14,11 +14,7 @@ from coliags_plugin.core.errors import InputError
 
 
 def import_viser() -> Any:
-    """viser, the optional library that serves the browser view.
-
-    Raises:
-        InputError: It cannot be imported.
-    """
+    """viser, the optional library that serves the browser view."""
     try:
         import viser
     except ImportError as error:
@@ -31,16 +27,9 @@ def import_viser() -> Any:
 
 
 def start_server(host: str, port: int) -> Any:
-    """A running ``viser.ViserServer`` at exactly this address.
+    """A running ``viser.ViserServer`` at exactly this address, or any free port for 0.
 
     viser itself would take the next free port, and print.
-
-    Args:
-        host: Name or address to listen on.
-        port: 0: any free one.
-
-    Raises:
-        InputError: viser cannot be imported, the port is in use or not allowed, or the host is not of this machine.
     """
     viser = import_viser()
     # A browser may leave while something is computed for it.

@@ -23,11 +23,6 @@ def merged_to(splats: SplatCloud, count: int, distances: Float[np.ndarray, "N"])
 
     The cells are the smallest for which there are few enough. Those at twice the distance are twice as large, so that
     all look alike in size.
-
-    Args:
-        splats: Scene units.
-        count: At least 1.
-        distances: From where the splats are looked at. [N]
     """
     if len(splats) <= count:
         return splats
@@ -57,11 +52,7 @@ def merged(splats: SplatCloud, groups: Int[np.ndarray, "N"]) -> SplatCloud:
     """One splat for each group, of the same mean, covariance and colour as its members together.
 
     Members weigh by their optical depth -ln(1 - opacity) times the area they cover; the group's optical depth spreads
-    the sum of these over the area of the merged splat.
-
-    Args:
-        splats: The members.
-        groups: Of each, from 0 on without gaps. [N]
+    the sum of these over the area of the merged splat. Groups are numbered from 0 on without gaps.
     """
     depth = -np.log1p(-np.minimum(splats.opacities.astype(np.float64), _MOST_OPAQUE))
     weights = depth * area(splats.scales)
@@ -101,12 +92,7 @@ def _octaves(lengths: Float[np.ndarray, "N"]) -> Int[np.ndarray, "N"]:
 
 
 def _cells(scaled: Float[np.ndarray, "N 3"], classes: Int[np.ndarray, "N C"]) -> Int[np.ndarray, "N"]:
-    """Number of the cell and class of each splat, without gaps.
-
-    Args:
-        scaled: In edges of the cells. [N, 3]
-        classes: Splats of different ones are not merged. [N, C]
-    """
+    """Number of the cell and class of each splat, without gaps; places are in edges of the cells."""
     keys = np.floor(scaled - scaled.min(0)).astype(np.int64)
     keys = np.concatenate([keys, classes], axis=1)
     spans = tuple(int(span) for span in keys.max(0) + 1)

@@ -28,23 +28,14 @@ _SAMPLED = 4
 
 @dataclass(frozen=True)
 class Picture:
-    """An image and what its colours mean.
-
-    Attributes:
-        image: RGB. [H, W, 3]
-        caption: Plain text.
-    """
+    """An RGB image, and what its colours mean in plain text."""
 
     image: UInt8[np.ndarray, "H W 3"]
     caption: str
 
 
 class FramePictures:
-    """What can be shown of a frame: its render, errors and depth, as far as the run and its scene have them.
-
-    Args:
-        trained: The run.
-    """
+    """What can be shown of a frame: its render, errors and depth, as far as the run and its scene have them."""
 
     def __init__(self, trained: TrainedRun) -> None:
         self._trained = trained
@@ -63,12 +54,7 @@ class FramePictures:
         return tuple(self._makers)
 
     def of(self, frame: Frame, kind: str) -> Picture:
-        """A picture of a frame.
-
-        Args:
-            frame: Of the run's scene.
-            kind: One of :attr:`kinds`.
-        """
+        """A picture of a frame of the run's scene, of one of the :attr:`kinds`."""
         return self._makers[kind](frame, self._render(frame))
 
     def _render(self, frame: Frame) -> RenderOutput:

@@ -32,16 +32,7 @@ _FEWEST_BYTES = 30
 
 
 def save_page(trained: TrainedRun, output: Path, largest: int = LARGEST_PAGE) -> Path:
-    """Write :func:`scene_page` to a file.
-
-    Args:
-        trained: The run.
-        output: The file; an existing one is replaced.
-        largest: Size of the page, bytes.
-
-    Raises:
-        InputError: See :func:`scene_page`; or the file cannot be written.
-    """
+    """Write :func:`scene_page` to a file; an existing one is replaced."""
     refuse_folder(output)
     atomic_write(output, scene_page(trained, largest))
     return output
@@ -50,14 +41,7 @@ def save_page(trained: TrainedRun, output: Path, largest: int = LARGEST_PAGE) ->
 def scene_page(trained: TrainedRun, largest: int = LARGEST_PAGE) -> str:
     """The Gaussians of a run as an HTML page; under the same light everywhere, where their colours know a lamp.
 
-    Where the page would be too large, neighbouring Gaussians are merged.
-
-    Args:
-        trained: The run.
-        largest: Size of the page, bytes.
-
-    Raises:
-        InputError: viser cannot be imported, the method has no Gaussians, or not even a few fit.
+    Where the page would be larger than so many bytes, neighbouring Gaussians are merged.
     """
     if not isinstance(trained.model.field, GaussianField):
         raise InputError(
@@ -77,11 +61,7 @@ def scene_page(trained: TrainedRun, largest: int = LARGEST_PAGE) -> str:
 
 
 def fitting_page(content: ViewerContent, largest: int) -> tuple[SplatCloud, str]:
-    """The Gaussians of a run, merged into fewer where their page would be too large, and the page.
-
-    Raises:
-        InputError: Not even a few fit.
-    """
+    """The Gaussians of a run, merged into fewer where their page would be too large, and the page."""
     nothing = content.baked.part(np.zeros(len(content.baked), bool))
     empty = len(_page(content, nothing).encode())
     count = min(len(content.baked), max(0, largest - empty) // _FEWEST_BYTES)

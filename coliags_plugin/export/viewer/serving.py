@@ -111,12 +111,7 @@ class Viewer:
 
 
 def set_start(server: Any, content: ViewerContent) -> None:
-    """Let browsers start at the first training frame, upright there, before black, with a plain panel and no lights.
-
-    Args:
-        server: viser's.
-        content: What is shown.
-    """
+    """Let browsers start at the first training frame, upright there, before black, with a plain panel and no lights."""
     camera = content.first_camera
     _, position = pose(camera)
     axis = camera.optical_axis.double().cpu().numpy()

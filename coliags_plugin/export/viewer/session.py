@@ -31,13 +31,7 @@ EVERY = 0.5
 
 @dataclass
 class Update:
-    """What the last decoding and sending of splats cost.
-
-    Attributes:
-        count: Of splats.
-        decoding: Seconds.
-        sending: Seconds until they were handed to the connection.
-    """
+    """What the last decoding and sending of splats cost, seconds; sending: until they were handed to the connection."""
 
     count: int
     decoding: float
@@ -52,14 +46,9 @@ class Update:
 
 
 class Pace:
-    """Decides when work wanted by a moving camera is due: once it rests, and not too often.
+    """Decides when work wanted by a moving camera is due: once it rests, and not too often. Thread-safe; seconds.
 
-    Thread-safe.
-
-    Args:
-        rest: Seconds without a movement after which the camera rests.
-        every: Least seconds between the end of one piece of work and the start of the next.
-        clock: Seconds, ascending.
+    It rests ``rest`` after a movement, and work pauses for ``every`` at least.
     """
 
     def __init__(self, rest: float, every: float, clock: Callable[[], float] = time.monotonic) -> None:
@@ -103,10 +92,6 @@ class Session:
     """A browser's splats, controls and pictures, kept up to date by a thread of its own.
 
     Callbacks only note what has changed; the thread computes it, the newest state only.
-
-    Args:
-        client: viser's handle of the browser.
-        content: What is shown.
     """
 
     def __init__(self, client: Any, content: ViewerContent) -> None:
@@ -119,7 +104,7 @@ class Session:
         self._splats: Any = None
         self._headlight = add_headlight(client.scene, tuple(client.camera.position))
         self.last_update: Update | None = None
-        self.controls = Controls(client, content, self)
+        self.controls = Controls(client, content, self.options_changed, self.go_to)
         client.camera.on_update(lambda _: self.camera_moved())
         if content.decoder is not None:
             self._send(content.decoder.beside, 0.0)
@@ -139,11 +124,7 @@ class Session:
         self._wake.set()
 
     def go_to(self, index: int) -> None:
-        """Move the browser's camera to the pose of a frame of the video.
-
-        Args:
-            index: Of the frame in the video.
-        """
+        """Move the browser's camera to the pose of a frame of the video."""
         camera = self._content.frames[index].camera
         wxyz, position = pose(camera)
         axes = camera.camera_to_world[:3, :3].double().cpu().numpy()
@@ -178,11 +159,7 @@ class Session:
             self._wake.clear()
 
     def step(self) -> float | None:
-        """Do what is due.
-
-        Returns:
-            Seconds until more is due; None until something changes.
-        """
+        """Do what is due. Returns seconds until more is due; None until something changes."""
         wanted = (self.controls.frame, self.controls.picture)
         if self._pace.wait() == 0.0:
             self._pace.begin()

@@ -85,10 +85,8 @@ def _read_glb(path: Path) -> TriangleMesh:
     vertices = np.asarray(read.vertices).astype(np.float32)
     if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(vertices)):
         raise InputError(f"{path} has triangles of vertices that are not there", "a mesh", "Fetch it again")
-    colors = np.rint(np.asarray(read.vertex_colors) * 255.0).clip(0, 255).astype(np.uint8)
-    if len(colors):
-        colors = _encoded(colors / 255.0)
-    return TriangleMesh(vertices, triangles.astype(np.int64), colors if len(colors) else None)
+    linear = np.rint(np.asarray(read.vertex_colors) * 255.0).clip(0, 255) / 255.0
+    return TriangleMesh(vertices, triangles.astype(np.int64), _encoded(linear) if len(linear) else None)
 
 
 def encode_mesh(mesh: TriangleMesh) -> bytes:

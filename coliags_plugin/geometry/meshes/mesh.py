@@ -67,7 +67,6 @@ class TriangleMesh:
     colors: UInt8[np.ndarray, "V 3"] | None = None
 
     def __len__(self) -> int:
-        """Number of triangles."""
         return len(self.triangles)
 
     @cached_property

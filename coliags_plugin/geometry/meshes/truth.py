@@ -21,19 +21,12 @@ _OBSERVED, _UNOBSERVED = 1, 2
 
 @dataclass(frozen=True, eq=False)
 class TrueSurface:
-    """The true surface of a scene.
+    """The true surface of a scene."""
 
-    Attributes:
-        path: Where it was read from.
-        mesh: World frame of the scene, mm.
-        seen: True for triangles that the camera saw. [F]
-        seen_by: How that is known; empty where it is not, and ``seen`` is all True.
-    """
-
-    path: Path
-    mesh: TriangleMesh
-    seen: Bool[np.ndarray, "F"]
-    seen_by: str
+    path: Path  # where it was read from
+    mesh: TriangleMesh  # world frame of the scene, mm
+    seen: Bool[np.ndarray, "F"]  # True for triangles that the camera saw
+    seen_by: str  # how that is known; empty where it is not, and ``seen`` is all True
 
 
 def find_true_surface(scene: Path) -> Path | None:

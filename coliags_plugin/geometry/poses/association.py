@@ -22,21 +22,15 @@ FEWEST_MATCHES = 3
 
 @dataclass(frozen=True, eq=False)
 class FrameMatches:
-    """Matched frames of two trajectories.
+    """Matched frames of two trajectories."""
 
-    Attributes:
-        first, second: Indices into the two, in the order of the first. [M]
-        by: ``name``, ``time``, ``index`` or ``endogslam-train``.
-        skipped: Criteria tried before, and why they failed.
-    """
-
+    # Indices into the two, in the order of the first
     first: Int[np.ndarray, "M"]
     second: Int[np.ndarray, "M"]
-    by: str
-    skipped: tuple[str, ...] = ()
+    by: str  # ``name``, ``time``, ``index`` or ``endogslam-train``
+    skipped: tuple[str, ...] = ()  # criteria tried before, and why they failed
 
     def __len__(self) -> int:
-        """Number of pairs."""
         return len(self.first)
 
 

@@ -19,17 +19,11 @@ from coliags_plugin.geometry.poses.trajectory import Trajectory
 
 @dataclass(frozen=True)
 class C3vdPoses:
-    """The poses of one file.
+    """The poses of one file."""
 
-    Attributes:
-        camera_to_world: Rigid, OpenCV axes, mm. [N, 4, 4]
-        convention: ``column-major`` (the current release) or ``row-major`` (the one under review).
-        evidence: Measurements behind that choice, and a summary of the trajectory.
-    """
-
-    camera_to_world: Float[np.ndarray, "N 4 4"]
-    convention: str
-    evidence: dict[str, Any]
+    camera_to_world: Float[np.ndarray, "N 4 4"]  # rigid, OpenCV axes, mm
+    convention: str  # ``column-major`` (the current release) or ``row-major`` (the one under review)
+    evidence: dict[str, Any]  # measurements behind that choice, and a summary of the trajectory
 
 
 def read_poses(path: Path) -> C3vdPoses:

@@ -38,25 +38,15 @@ class ColmapCamera(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ColmapImage:
-    """A registered image.
+    """A registered image."""
 
-    Attributes:
-        source: Its file, and line or ID, for messages.
-        quat_wxyz: World to camera, as stored. [4]
-        translation: World to camera. [3]
-        camera: ID of its camera.
-        name: Path relative to the folder of images.
-        observed: Observed keypoints of points, pixels, centres at integers + 0.5. [K, 2]
-        points: Their points' IDs. [K]
-    """
-
-    source: str
-    quat_wxyz: tuple[float, ...]
-    translation: tuple[float, ...]
-    camera: int
-    name: str
-    observed: Float[np.ndarray, "K 2"]
-    points: Int[np.ndarray, "K"]
+    source: str  # its file, and line or ID, for messages
+    quat_wxyz: tuple[float, ...]  # world to camera, as stored
+    translation: tuple[float, ...]  # world to camera
+    camera: int  # ID of its camera
+    name: str  # path relative to the folder of images
+    observed: Float[np.ndarray, "K 2"]  # observed keypoints of points, pixels, centres at integers + 0.5
+    points: Int[np.ndarray, "K"]  # their points' IDs
 
 
 class ColmapPoint(NamedTuple):

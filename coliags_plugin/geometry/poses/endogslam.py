@@ -44,25 +44,16 @@ _HELD_OUT_EVERY = 8
 
 @dataclass(frozen=True, eq=False)
 class EndoGslamParams:
-    """Contents of a ``params.npz``, in this package's conventions: the world is the first camera, lengths are mm.
+    """Contents of a ``params.npz``, in this package's conventions: the world is the first camera, lengths are mm."""
 
-    Attributes:
-        camera_to_world: Estimated poses, rigid, OpenCV axes.
-        true_camera_to_world: The data set's poses of the same frames in the same world.
-        intrinsics: Of all images.
-        means: Centres of the Gaussians; N may be 0. float64.
-        rgb_colors: Colours, nominally in [0, 1]; may lie a little outside. float64.
-        log_scales: Logarithms of the standard deviations, one column if Gaussians are isotropic; None if missing.
-        keyframes: Indices of keyframes; None if missing.
-    """
-
-    camera_to_world: Float[np.ndarray, "F 4 4"]
-    true_camera_to_world: Float[np.ndarray, "F 4 4"]
-    intrinsics: Intrinsics
-    means: Float[np.ndarray, "N 3"]
-    rgb_colors: Float[np.ndarray, "N 3"]
+    camera_to_world: Float[np.ndarray, "F 4 4"]  # estimated poses, rigid, OpenCV axes
+    true_camera_to_world: Float[np.ndarray, "F 4 4"]  # the data set's poses of the same frames in the same world
+    intrinsics: Intrinsics  # of all images
+    means: Float[np.ndarray, "N 3"]  # centres of the Gaussians; N may be 0. float64
+    rgb_colors: Float[np.ndarray, "N 3"]  # colours, nominally in [0, 1]; may lie a little outside. float64
+    # Logarithms of the standard deviations, one column if Gaussians are isotropic; None if missing.
     log_scales: Float[np.ndarray, "N C"] | None
-    keyframes: Int[np.ndarray, "K"] | None
+    keyframes: Int[np.ndarray, "K"] | None  # indices of keyframes; None if missing
 
 
 def read_params(path: Path) -> EndoGslamParams:

@@ -29,23 +29,17 @@ By = Literal["positions", "orientations about the path", "orientations"]
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """x -> scale * rotation @ x + translation.
+    """x -> scale * rotation @ x + translation."""
 
-    Attributes:
-        scale: 1 for a rigid transform.
-        rotation: Rotation matrix, det 1. [3, 3]
-        translation: Units of the target. [3]
-        undetermined: Why the points do not determine the rotation, or an empty string. The rotation is then the
-            smallest among those that fit equally well.
-        axis: Main direction of the target's points, unit length; zero where they do not determine one. [3]
-        spread: Extent of the points across that direction relative to that along it (standard deviations), 0 to 1.
-    """
-
-    scale: float
-    rotation: Float[np.ndarray, "3 3"]
-    translation: Float[np.ndarray, "3"]
+    scale: float  # 1 for a rigid transform
+    rotation: Float[np.ndarray, "3 3"]  # rotation matrix, det 1
+    translation: Float[np.ndarray, "3"]  # units of the target
+    # Why the points do not determine the rotation, or an empty string. The rotation is then the smallest among those
+    # that fit equally well.
     undetermined: str = ""
+    # Main direction of the target's points, unit length; zero where they do not determine one
     axis: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    # Extent of the points across that direction relative to that along it (standard deviations), 0 to 1.
     spread: float = 1.0
 
     def points(self, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
@@ -119,18 +113,13 @@ def _still(points: np.ndarray, centered: np.ndarray) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class WorldRotation:
-    """Rotation from the estimate's world to the reference's, with which rotation errors are computed.
+    """Rotation from the estimate's world to the reference's, with which rotation errors are computed."""
 
-    Attributes:
-        rotation: Rotation matrix, det 1.
-        by: What determined it. ``positions``: those alone. ``orientations about the path``: positions determined the
-            direction of the path, the cameras' orientations the rotation about it. ``orientations``: those alone.
-        reason: Why positions alone did not, or an empty string.
-    """
-
-    rotation: Float[np.ndarray, "3 3"]
+    rotation: Float[np.ndarray, "3 3"]  # rotation matrix, det 1
+    # What determined it. ``positions``: those alone. ``orientations about the path``: positions determined the
+    # direction of the path, the cameras' orientations the rotation about it. ``orientations``: those alone.
     by: By
-    reason: str = ""
+    reason: str = ""  # why positions alone did not, or an empty string
 
 
 def world_rotation(

@@ -55,7 +55,6 @@ class Trajectory:
             object.__setattr__(self, "timestamps", timestamps)
 
     def __len__(self) -> int:
-        """Number of poses."""
         return len(self.camera_to_world)
 
     @property

@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from coliags_plugin.core.intrinsics import Intrinsics
-from coliags_plugin.geometry.lenses.models import Lens
-from coliags_plugin.geometry.lenses.pinhole import PinholeLens
+from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
 from coliags_plugin.phantom.trajectory import every_8th
 
 #: ``video``: the sequence itself. ``rotation``: the rotated test views at its positions.

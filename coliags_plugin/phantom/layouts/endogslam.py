@@ -14,8 +14,7 @@ from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.datamanagers.c3vd.writer import write_poses
 from coliags_plugin.datamanagers.c3vd_endogslam.files import OPTIMIZED, PARAMS
 from coliags_plugin.datamanagers.c3vd_endogslam.reader import PREPARED_DEPTH, PREPARED_PINHOLE, SH0
-from coliags_plugin.geometry.lenses.models import Lens
-from coliags_plugin.geometry.lenses.pinhole import PinholeLens
+from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
 from coliags_plugin.geometry.poses import endogslam
 from coliags_plugin.geometry.poses.rigid import inverse
 from coliags_plugin.geometry.poses.trajectory import Trajectory

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from coliags_plugin.core.files import write_json
 from coliags_plugin.core.images import write_image
 from coliags_plugin.geometry.lenses.models import Lens
-from coliags_plugin.geometry.lenses.opencv import OpenCVLens
+from coliags_plugin.geometry.lenses.tabulated import OpenCVLens
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame
 

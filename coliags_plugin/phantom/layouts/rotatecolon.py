@@ -13,8 +13,7 @@ from coliags_plugin.core.images import write_image
 from coliags_plugin.core.ply import point_properties, write_ply
 from coliags_plugin.datamanagers.rotatecolon.exr_depth import write_exr_channels
 from coliags_plugin.datamanagers.rotatecolon.files import POINTS, TEST, TRAIN, TRAIN_DEPTH, TRAIN_VIEWS
-from coliags_plugin.geometry.lenses.models import Lens
-from coliags_plugin.geometry.lenses.pinhole import PinholeLens
+from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
 from coliags_plugin.geometry.poses.rigid import FLIP_Y_AND_Z
 from coliags_plugin.phantom.layouts.base import Layout, Part, PhantomFrame, WallPoints
 

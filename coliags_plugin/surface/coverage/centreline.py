@@ -33,22 +33,17 @@ Array = Float64[np.ndarray, "..."]
 
 @dataclass(frozen=True)
 class Centreline:
-    """A curve through the lumen with frames that do not turn about it.
+    """A curve through the lumen with frames that do not turn about it."""
 
-    Attributes:
-        points: World, mm, ``STEP`` apart. [M, 3]
-        frames: Columns: the direction of clock 0, that of clock 90 degrees, and the tangent. [M, 3, 3]
-        arc: Place along the curve, mm; 0 where it passes the shallowest camera. [M]
-    """
-
-    points: Float[np.ndarray, "M 3"]
+    points: Float[np.ndarray, "M 3"]  # world, mm, ``STEP`` apart
+    # Columns: the direction of clock 0, that of clock 90 degrees, and the tangent
     frames: Float[np.ndarray, "M 3 3"]
-    arc: Float[np.ndarray, "M"]
+    arc: Float[np.ndarray, "M"]  # place along the curve, mm; 0 where it passes the shallowest camera
 
     def unroll(
         self, points: Float[np.ndarray, "N 3"]
     ) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
-        """Place along the curve (mm), clock angle (degrees, 0 to 360) and distance from it (mm). [N] each
+        """Place along the curve (mm), clock angle (degrees, 0 to 360) and distance from it (mm) of each point.
 
         Points beyond an end are on the plane of that end or behind it: their place is extrapolated along the tangent.
         """
@@ -62,12 +57,7 @@ class Centreline:
         return self.arc[nearest] + ahead, clock, np.hypot(local[:, 0], local[:, 1])
 
     def directions(self, index: int, clock: Float[np.ndarray, "C"]) -> Float[np.ndarray, "C 3"]:
-        """Unit directions across the curve at one of its points.
-
-        Args:
-            index: Of the point.
-            clock: Angles, degrees. [C]
-        """
+        """Unit directions across the curve at one of its points, by clock angles in degrees."""
         angle = np.radians(clock)[:, None]
         frame = self.frames[index]
         return np.asarray(np.cos(angle) * frame[:, 0] + np.sin(angle) * frame[:, 1])
@@ -79,14 +69,7 @@ def find_centreline(mesh: TriangleMesh, cameras_to_world: Float[np.ndarray, "T 4
     In strides of 2 mm, the curve is drawn to the middle of the ring of wall around it; it goes straight on where less
     than half of a ring is there, for at most 24 mm. Places increase in the mean viewing direction of the cameras.
     Clock 0 (12 o'clock) is the mean upward direction of the images, and the clock runs as a viewer sees it who looks
-    in that direction.
-
-    Args:
-        mesh: The wall, world frame, mm; holes do not matter.
-        cameras_to_world: Poses inside the tube, OpenCV axes. [T, 4, 4]
-
-    Raises:
-        InputError: There is not enough wall around the cameras to be a tube.
+    in that direction. Holes of the wall do not matter; poses are OpenCV's, lengths mm.
     """
     poses = np.asarray(cameras_to_world, np.float64)
     centers = poses[:, :3, 3]
@@ -127,12 +110,9 @@ def find_section(
     """From the first to the last place at which half of the wall was seen, over windows of 10 mm.
 
     Args:
-        arc: Place of each triangle along the centreline, mm. [F]
-        areas: Of the triangles, mm^2; those that are missing have to be among them. [F]
-        seen: Which triangles were seen. [F]
-
-    Raises:
-        InputError: Nowhere was half of the wall seen.
+        arc: Place of each triangle along the centreline, mm.
+        areas: Of the triangles, mm^2; those that are missing have to be among them.
+        seen: Which triangles were seen.
     """
     first = float(np.floor(arc.min()))
     index = (arc - first).astype(int)

@@ -58,24 +58,12 @@ class CoverageEvaluation:
         return {
             "section_mm": [round(self.section.start, 2), round(self.section.end, 2)],
             "unseen_share": self.unseen_share,
-            "surface": self.surface.as_json(),
-            "rays": self.rays.as_json(),
-            "all_unseen": self.all_unseen.as_json(),
-            "random": self.random.as_json(),
+            **{name: getattr(self, name).as_json() for name in ("surface", "rays", "all_unseen", "random")},
         }
 
 
 def evaluate_coverage(coverage: WallCoverage, truth: TrueSurface, views: Sequence[CoverageView]) -> CoverageEvaluation:
-    """Compare measured coverage with the truth.
-
-    Args:
-        coverage: The measured coverage.
-        truth: True surface, in the same world. Where it does not tell what was seen, its own coverage is measured.
-        views: The frames that it was measured from.
-
-    Raises:
-        InputError: The truth is not the wall around the cameras.
-    """
+    """Compare measured coverage with the truth of the same world; what was seen is measured where it does not say."""
     mesh = facing_cameras(truth.mesh, views, coverage.settings)
     seen = truth.seen if truth.seen_by else see_faces(mesh, views, coverage.settings).seen
     poses = np.stack([np.asarray(view.camera_to_world, np.float64) for view in views])
@@ -146,7 +134,7 @@ def _mean(draws: Sequence[CoverageScores]) -> CoverageScores:
     rows = [draw.as_json() for draw in draws]
     means: dict[str, Any] = {}
     for name in rows[0]:
-        values = [row[name] for row in rows if row[name] is not None]
-        means[name] = float(np.mean([float(value) for value in values if value is not None])) if values else None
+        values = [float(value) for row in rows if (value := row[name]) is not None]
+        means[name] = float(np.mean(values)) if values else None
     counts = {name: round(means[name]) for name in ("true_regions", "predicted_regions")}
     return CoverageScores(**{**means, **counts})

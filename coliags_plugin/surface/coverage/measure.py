@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -29,10 +29,10 @@ class MissedRegion:
     """A connected piece of the section that no frame shows.
 
     Attributes:
-        triangles: Indices in :attr:`WallCoverage.mesh`. [K]
+        triangles: Indices in :attr:`WallCoverage.mesh`.
         area: mm^2.
         guessed_area: Area of it whose place is a guess, mm^2.
-        centroid: World, mm. [3]
+        centroid: World, mm.
         arc: Place of the centroid along the centreline, mm.
         clock: Its clock angle, degrees; 0 is up.
         reach: From where to where along the centreline, mm.
@@ -62,11 +62,11 @@ class WallCoverage:
 
     Attributes:
         mesh: The reconstructed wall and, behind it in the order of triangles, the guessed wall.
-        guessed: Triangles whose place is a guess, because nothing was reconstructed there. [F]
+        guessed: Triangles whose place is a guess, because nothing was reconstructed there.
         views: How the frames saw each triangle; guessed ones are unseen.
-        level: The values of :class:`Level`. [F]
+        level: The values of :class:`Level`.
         line: Centreline of the lumen.
-        arc, clock: Place along it, mm, and clock angle, degrees, of each triangle. [F], [F]
+        arc, clock: Place along it, mm, and clock angle, degrees, of each triangle.
         section: What part of the lumen is measured.
         grid: The wall, guessed or not, around the centreline.
         regions: Missed regions of the section, the largest first.
@@ -103,20 +103,13 @@ def measure_coverage(
     settings: CoverageSettings | None = None,
     progress: Progress | None = None,
 ) -> WallCoverage:
-    """Measure what a recording shows of the wall of a lumen, and what it misses.
+    """Measure what a recording shows of the wall of a lumen, in the world frame and mm, and what it misses.
 
     Where the mesh has no wall, a guess of it closes the lumen (:func:`guessed_wall`), since only surface that is there
-    can be called unseen; guessed wall always is.
-
-    Args:
-        mesh: The reconstructed wall, world frame, mm.
-        views: The frames of the recording.
-        settings: What counts as seen; None: the defaults.
-        progress: Called after every frame.
+    can be called unseen; guessed wall always is. ``progress`` is called after every frame.
 
     Raises:
-        InputError: There is no frame, the mesh is empty, is not where the cameras look or is no tube around them, or
-            open3d cannot be imported.
+        InputError: There is no frame, the mesh is empty, is not where the cameras look or is no tube around them.
     """
     settings = settings or CoverageSettings()
     mesh = facing_cameras(mesh, views, settings)
@@ -154,13 +147,8 @@ def _joined(mesh: TriangleMesh, guess: TriangleMesh) -> tuple[TriangleMesh, Bool
 def _extended(views: FaceViews, more: int) -> FaceViews:
     """The same with unseen triangles behind."""
     unseen = {"best_frame": -1, "frames": 0, "clear_frames": 0, "good_frames": 0}
-    values = {field.name: getattr(views, field.name) for field in fields(views)}
-    return FaceViews(
-        **{
-            name: np.concatenate([array, np.full(more, unseen.get(name, np.nan), array.dtype)])
-            for name, array in values.items()
-        }
-    )
+    added = {name: np.full(more, unseen.get(name, np.nan), array.dtype) for name, array in vars(views).items()}
+    return FaceViews(**{name: np.concatenate([array, added[name]]) for name, array in vars(views).items()})
 
 
 def _described(

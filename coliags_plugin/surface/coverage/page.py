@@ -38,17 +38,7 @@ _PICTURED, _WIDTH, _OPACITY = 12, 480, 0.55
 def coverage_page(
     coverage: WallCoverage, views: Sequence[CoverageView], name: str, evaluation: CoverageEvaluation | None = None
 ) -> Page:
-    """The page.
-
-    Args:
-        coverage: The measurement.
-        views: The frames that it was measured from, for pictures.
-        name: Of the scene or run, for the title.
-        evaluation: Against the truth, where there is one.
-
-    Raises:
-        InputError: An image of a frame cannot be read.
-    """
+    """The page of a measurement, with pictures of the frames it was measured from, named after the scene or run."""
     settings = coverage.settings
     map_note = (
         "The wall, cut open at 12 o'clock and laid flat: along the lumen from left to right, round the clock from top "
@@ -201,16 +191,7 @@ def _against_truth(evaluation: CoverageEvaluation) -> list[Block]:
 def region_picture(
     coverage: WallCoverage, region: MissedRegion, view: CoverageView
 ) -> UInt8[np.ndarray, "H W 3"] | None:
-    """The recorded frame nearest to a region, with the region drawn over it where it lies, hidden or not.
-
-    Args:
-        coverage: The measurement.
-        region: One of its regions.
-        view: The frame, that of ``region.nearest``.
-
-    Returns:
-        RGB; None where the recording has no images. [H, W, 3]
-    """
+    """The recorded frame nearest to a region, with the region drawn over it where it lies, hidden or not; RGB."""
     if view.read_image is None:
         return None
     image = view.read_image()

@@ -26,14 +26,7 @@ def neighbours(mesh: TriangleMesh) -> Int[np.ndarray, "E 2"]:
 def near_pairs(
     centers: Float[np.ndarray, "F 3"], one: Bool[np.ndarray, "F"], other: Bool[np.ndarray, "F"], within: float
 ) -> Int[np.ndarray, "E 2"]:
-    """Pairs of triangles of two sets whose centroids are near: each of the first with the nearest of the second. [E, 2]
-
-    Args:
-        centers: Centroids, mm. [F, 3]
-        one: The first set. [F]
-        other: The second set. [F]
-        within: Largest distance, mm.
-    """
+    """Each triangle of one set and the nearest of the other, where their centroids are within a distance, mm. [E, 2]"""
     first, second = np.flatnonzero(one), np.flatnonzero(other)
     if not len(first) or not len(second):
         return np.zeros((0, 2), np.int64)
@@ -43,12 +36,7 @@ def near_pairs(
 
 
 def connected(chosen: Bool[np.ndarray, "F"], pairs: Int[np.ndarray, "E 2"]) -> Int[np.ndarray, "F"]:
-    """Number of the connected region of each chosen triangle, from 0; -1 for the others. [F]
-
-    Args:
-        chosen: Triangles to join. [F]
-        pairs: Triangles that touch. [E, 2]
-    """
+    """Number of the connected region of each chosen triangle, from 0; -1 for the others. [F]"""
     both = chosen[pairs[:, 0]] & chosen[pairs[:, 1]]
     first, second = pairs[both].T
     graph = coo_matrix((np.ones(len(first), np.int8), (first, second)), shape=(len(chosen), len(chosen)))
@@ -61,14 +49,7 @@ def connected(chosen: Bool[np.ndarray, "F"], pairs: Int[np.ndarray, "E 2"]) -> I
 def large_regions(
     chosen: Bool[np.ndarray, "F"], pairs: Int[np.ndarray, "E 2"], areas: Float[np.ndarray, "F"], smallest: float
 ) -> list[Int[np.ndarray, "K"]]:
-    """Connected regions above an area, the largest first, each as the indices of its triangles.
-
-    Args:
-        chosen: Triangles to join. [F]
-        pairs: Triangles that touch. [E, 2]
-        areas: Of the triangles, mm^2. [F]
-        smallest: Area that a region must exceed, mm^2.
-    """
+    """Connected regions above an area, mm^2, the largest first, each as the indices of its triangles."""
     numbers = connected(chosen, pairs)
     inside = np.flatnonzero(numbers >= 0)
     if not len(inside):

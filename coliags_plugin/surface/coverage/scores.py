@@ -62,14 +62,9 @@ def score_unseen(
     pairs: Int[np.ndarray, "E 2"],
     smallest: float,
 ) -> CoverageScores:
-    """Compare predicted with true unseen triangles.
+    """Compare predicted with true unseen triangles; only regions larger than ``smallest`` mm^2 are regions.
 
-    Args:
-        predicted: Triangles called unseen. [F]
-        true: Triangles that are unseen. [F]
-        areas: Of the triangles, mm^2; 0 for those that do not count. [F]
-        pairs: Triangles with a common edge. [E, 2]
-        smallest: Area that a region must exceed, mm^2.
+    Triangles of area 0 do not count; ``pairs`` are those with a common edge.
     """
     counted = areas > 0.0
     predicted, true = predicted & counted, true & counted

@@ -24,22 +24,11 @@ _BLEND = 3.0
 
 @dataclass(frozen=True, eq=False)
 class TubeGrid:
-    """First wall around a centreline: rays outwards from each of its points, M places by C clock angles.
-
-    Attributes:
-        line: The centreline.
-        radius: Distance of the wall from it, mm; NaN where there is none. [M, C]
-        triangle: The triangle hit; -1 where there is none. [M, C]
-    """
+    """First wall around a centreline: rays outwards from each of its points, M places by C clock angles."""
 
     line: Centreline
-    radius: Float[np.ndarray, "M C"]
-    triangle: Int[np.ndarray, "M C"]
-
-    @property
-    def clock(self) -> Float[np.ndarray, "C"]:
-        """Clock angles, degrees. [C]"""
-        return _clocks()
+    radius: Float[np.ndarray, "M C"]  # distance of the wall from it, mm; NaN where there is none
+    triangle: Int[np.ndarray, "M C"]  # the triangle hit; -1 where there is none
 
     @property
     def there(self) -> Bool[np.ndarray, "M C"]:
@@ -50,7 +39,7 @@ class TubeGrid:
 def wall_around(mesh: TriangleMesh, line: Centreline) -> TubeGrid:
     """Cast rays outwards from a centreline."""
     origins = np.repeat(line.points, CLOCKS, axis=0)
-    directions = np.concatenate([line.directions(index, _clocks()) for index in range(len(line.points))])
+    directions = _outward(line).reshape(-1, 3)
     triangle, distance = mesh.rays.cast(origins, directions)
     hit = (triangle >= 0) & (distance <= _WIDEST)
     shape = (len(line.points), CLOCKS)
@@ -59,31 +48,22 @@ def wall_around(mesh: TriangleMesh, line: Centreline) -> TubeGrid:
 
 
 def guessed_wall(grid: TubeGrid) -> TriangleMesh:
-    """A guess of the wall where a grid has none, as a mesh.
+    """A guess of the wall where the grid of a reconstruction has none; without triangles where there is no gap.
 
     Next to reconstructed wall the guess has its radius; within about 3 mm it goes over to the calibre of the lumen
     around there, a high percentile of the radius of the wall within 15 mm along and 30 degrees around. So a fold that
-    hides what is behind it is not prolonged into a funnel.
-
-    Args:
-        grid: Of the reconstructed wall.
-
-    Returns:
-        Triangles counter-clockwise seen from the lumen, one cell of the grid apart from the reconstructed wall at most;
-        without triangles where the grid has no gap.
+    hides what is behind it is not prolonged into a funnel. Triangles are counter-clockwise seen from the lumen, one
+    cell of the grid apart from the reconstructed wall at most.
     """
     there = grid.there
     if there.all() or not there.any():
         return TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
-    radius = _filled(grid)
-    line = grid.line
-    outward = np.stack([line.directions(index, grid.clock) for index in range(len(line.points))])
-    vertices = line.points[:, None] + radius[..., None] * outward
+    radius, line = _filled(grid), grid.line
+    vertices = line.points[:, None] + radius[..., None] * _outward(line)
     # Cells with a corner in a gap; the others are reconstructed.
     gap = ~there
     following = np.roll(gap, -1, axis=1)
-    cells = gap[:-1] | following[:-1] | gap[1:] | following[1:]
-    row, column = np.nonzero(cells)
+    row, column = np.nonzero(gap[:-1] | following[:-1] | gap[1:] | following[1:])
     beside = (column + 1) % CLOCKS
     a, b = row * CLOCKS + column, (row + 1) * CLOCKS + column
     c, d = row * CLOCKS + beside, (row + 1) * CLOCKS + beside
@@ -109,5 +89,7 @@ def _filled(grid: TubeGrid) -> Float64[np.ndarray, "M C"]:
     return np.asarray(np.where(gap, guess, at)[:, wide : wide + CLOCKS])
 
 
-def _clocks() -> Float64[np.ndarray, "C"]:
-    return np.arange(CLOCKS) * (360.0 / CLOCKS)
+def _outward(line: Centreline) -> Float64[np.ndarray, "M C 3"]:
+    """Directions from each point of a centreline at each clock angle. [M, C, 3]"""
+    clock = np.arange(CLOCKS) * (360.0 / CLOCKS)
+    return np.stack([line.directions(index, clock) for index in range(len(line.points))])

@@ -14,28 +14,19 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.datamanagers.reading.images import read_mask
-from coliags_plugin.datamanagers.recording import Shot
 from coliags_plugin.datamanagers.stored_frames import StoredFrame
-from coliags_plugin.geometry.lenses.models import Lens
-from coliags_plugin.geometry.lenses.pinhole import PinholeLens
+from coliags_plugin.geometry.lenses.models import Lens, PinholeLens
 
 
 @dataclass(frozen=True)
 class CoverageView:
-    """One recorded frame.
-
-    Attributes:
-        name: Of the frame.
-        camera_to_world: Pose, OpenCV axes, mm. [4, 4]
-        lens: The lens it was taken through, at the size of the image.
-        mask: Pixels with image content; None for all. [H, W]
-        read_image: Reads the image through that lens; None where there is none. [H, W, 3]
-    """
+    """One recorded frame."""
 
     name: str
-    camera_to_world: Float[np.ndarray, "4 4"]
-    lens: Lens
-    mask: Bool[np.ndarray, "H W"] | None = None
+    camera_to_world: Float[np.ndarray, "4 4"]  # pose, OpenCV axes, mm
+    lens: Lens  # the lens it was taken through, at the size of the image
+    mask: Bool[np.ndarray, "H W"] | None = None  # pixels with image content; None for all
+    # Reads the image through that lens; None where there is none.
     read_image: Callable[[], UInt8[np.ndarray, "H W 3"]] | None = field(default=None, repr=False)
 
     @property
@@ -46,29 +37,16 @@ class CoverageView:
 
 @dataclass(frozen=True)
 class RayGrid:
-    """Viewing rays on an even grid over the image of a lens, R of them where the image has content.
+    """Viewing rays on an even grid over the image of a lens, R of them where the image has content."""
 
-    Attributes:
-        size: Width and height of the grid.
-        cells: Indices in the grid, row by row. [R]
-        directions: Camera axes, z = 1. [R, 3]
-        pixel_angles: Solid angle of one pixel of the image along each ray, steradians. [R]
-    """
-
-    size: tuple[int, int]
-    cells: Int[np.ndarray, "R"]
-    directions: Float32[np.ndarray, "R 3"]
-    pixel_angles: Float32[np.ndarray, "R"]
+    size: tuple[int, int]  # width and height of the grid
+    cells: Int[np.ndarray, "R"]  # indices in the grid, row by row
+    directions: Float32[np.ndarray, "R 3"]  # camera axes, z = 1
+    pixel_angles: Float32[np.ndarray, "R"]  # solid angle of one pixel of the image along each ray, steradians
 
     @classmethod
     def of(cls, lens: Lens, mask: Bool[np.ndarray, "H W"] | None, most: int) -> RayGrid:
-        """The grid of a lens, with at most about ``most`` rays and no more than 2 x 2 in a pixel.
-
-        Args:
-            lens: Of the image.
-            mask: Pixels with image content; None for all. [H, W]
-            most: Number of rays.
-        """
+        """The grid of a lens and mask, with at most about ``most`` rays and no more than 2 x 2 in a pixel."""
         scale = min(2.0, (most / (lens.width * lens.height)) ** 0.5)
         # Whole rays per pixel where there is one or more, so that every pixel is sampled alike.
         scale = scale if scale < 1.0 else float(int(scale))
@@ -123,20 +101,14 @@ def _pixel_angles(
     lens: Lens, pixels: Float[np.ndarray, "R 2"], directions: Float[np.ndarray, "R 3"]
 ) -> Float[np.ndarray, "R"]:
     """Solid angles of pixels, from directions half a pixel aside; 0 where the lens ends there. [R]"""
-    step = 0.5
-    right = lens.unproject(pixels + np.array([step, 0.0])) - lens.unproject(pixels - np.array([step, 0.0]))
-    down = lens.unproject(pixels + np.array([0.0, step])) - lens.unproject(pixels - np.array([0.0, step]))
+    right, down = (lens.unproject(pixels + aside) - lens.unproject(pixels - aside) for aside in 0.5 * np.eye(2))
     area = np.abs(right[:, 0] * down[:, 1] - right[:, 1] * down[:, 0])
     angles = area / np.linalg.norm(directions, axis=1) ** 3
     return np.asarray(np.nan_to_num(angles))
 
 
 def recorded_views(scene: Scene) -> list[CoverageView]:
-    """Views of all frames of the video, held out or not, in its order.
-
-    Raises:
-        InputError: The unit of length is unknown, or there are fewer than two frames.
-    """
+    """Views of all frames of the video, held out or not, in its order; not of unknown unit, nor of one frame."""
     if not scene.is_metric:
         raise InputError(
             f"the unit of length of scene '{scene.name}' is unknown, and coverage is in mm",
@@ -149,23 +121,21 @@ def recorded_views(scene: Scene) -> list[CoverageView]:
 
 
 def _view(frame: Frame) -> CoverageView:
-    if isinstance(frame, StoredFrame):
-        return _stored_view(frame.shot)
-    camera = frame.camera
-    mask = None if frame.mask is None else frame.mask.numpy()
-    pose = camera.camera_to_world.double().numpy()
-    return CoverageView(frame.name, pose, PinholeLens.of(camera.intrinsics), mask, frame.image.numpy)
-
-
-def _stored_view(shot: Shot) -> CoverageView:
-    rectification = shot.rectification
+    if not isinstance(frame, StoredFrame):
+        camera = frame.camera
+        mask = None if frame.mask is None else frame.mask.numpy()
+        pose = camera.camera_to_world.double().numpy()
+        return CoverageView(frame.name, pose, PinholeLens.of(camera.intrinsics), mask, frame.image.numpy)
+    shot, rectification = frame.shot, frame.shot.rectification
     content = rectification.stored_content
     if shot.mask is not None:
         mask = rectification.checked(shot.mask, read_mask(shot.mask))
         content = mask if content is None else mask & content
     pose = np.asarray(shot.camera_to_world, np.float64)
-    return CoverageView(shot.name, pose, rectification.stored_lens, content, _reader(shot))
-
-
-def _reader(shot: Shot) -> Callable[[], UInt8[np.ndarray, "H W 3"]]:
-    return lambda: shot.rectification.checked(shot.image, read_rgb(shot.image))
+    return CoverageView(
+        shot.name,
+        pose,
+        rectification.stored_lens,
+        content,
+        lambda: rectification.checked(shot.image, read_rgb(shot.image)),
+    )

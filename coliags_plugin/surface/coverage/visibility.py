@@ -20,27 +20,17 @@ _PROBE_FRAMES, _PROBE_RAYS = 8, 20_000
 
 @dataclass(frozen=True, eq=False)
 class FaceViews:
-    """How the frames of a recording saw each triangle of a mesh. All [F].
+    """How the frames of a recording saw each triangle of a mesh. All [F]."""
 
-    Attributes:
-        frames: Number of frames that saw it at all.
-        clear_frames: Those that saw it near enough and bright enough.
-        good_frames: Those of the latter that saw it under a steep enough angle.
-        distance: Smallest distance to a camera that saw it, mm; NaN where unseen, here and below.
-        incidence: Smallest angle between viewing ray and normal, degrees.
-        pixels_per_mm: Finest sampling of the surface by the pixels of an image, pixels per mm.
-        brightness: Highest grey value, 0 to 1; NaN also without images.
-        best_frame: Index of the frame that sampled it most finely; -1 where unseen.
-    """
-
-    frames: Int[np.ndarray, "F"]
-    clear_frames: Int[np.ndarray, "F"]
-    good_frames: Int[np.ndarray, "F"]
+    frames: Int[np.ndarray, "F"]  # number of frames that saw it at all
+    clear_frames: Int[np.ndarray, "F"]  # those that saw it near enough and bright enough
+    good_frames: Int[np.ndarray, "F"]  # those of the latter that saw it under a steep enough angle
+    # Smallest distance to a camera that saw it, mm; NaN where unseen, here and below.
     distance: Float32[np.ndarray, "F"]
-    incidence: Float32[np.ndarray, "F"]
-    pixels_per_mm: Float32[np.ndarray, "F"]
-    brightness: Float32[np.ndarray, "F"]
-    best_frame: Int[np.ndarray, "F"]
+    incidence: Float32[np.ndarray, "F"]  # smallest angle between viewing ray and normal, degrees
+    pixels_per_mm: Float32[np.ndarray, "F"]  # finest sampling of the surface by the pixels of an image, pixels per mm
+    brightness: Float32[np.ndarray, "F"]  # highest grey value, 0 to 1; NaN also without images
+    best_frame: Int[np.ndarray, "F"]  # index of the frame that sampled it most finely; -1 where unseen
 
     @property
     def seen(self) -> Bool[np.ndarray, "F"]:
@@ -50,33 +40,18 @@ class FaceViews:
 
 @dataclass(frozen=True)
 class RayHits:
-    """Rays of one frame that hit a triangle within the range. All [N].
+    """Rays of one frame that hit a triangle within the range. All [N]."""
 
-    Attributes:
-        triangle: What they hit.
-        ray: Their indices among the rays of the grid.
-        distance: mm.
-        cosine: Of the angle between ray and normal, 1 where perpendicular to the surface.
-    """
-
-    triangle: Int[np.ndarray, "N"]
-    ray: Int[np.ndarray, "N"]
-    distance: Float32[np.ndarray, "N"]
-    cosine: Float32[np.ndarray, "N"]
+    triangle: Int[np.ndarray, "N"]  # what they hit
+    ray: Int[np.ndarray, "N"]  # their indices among the rays of the grid
+    distance: Float32[np.ndarray, "N"]  # mm
+    cosine: Float32[np.ndarray, "N"]  # of the angle between ray and normal, 1 where perpendicular to the surface
 
 
 def view_hits(
     mesh: TriangleMesh, view: CoverageView, grid: RayGrid, max_depth: float, both_sides: bool = False
 ) -> RayHits:
-    """What the rays of a view hit first, from the front.
-
-    Args:
-        mesh: The surface.
-        view: The frame.
-        grid: Rays of its lens.
-        max_depth: z-depth up to which surface counts, mm.
-        both_sides: Also triangles seen from behind; their cosines are negative.
-    """
+    """What the rays of a view hit first, up to a z-depth in mm, from the front; or, cosines below 0, from behind."""
     rays = grid.world_rays(view)
     triangle, z_depth = mesh.rays.cast(view.center, rays)
     hit = np.flatnonzero((triangle >= 0) & (z_depth <= max_depth))
@@ -110,13 +85,8 @@ def facing_cameras(
 ) -> TriangleMesh:
     """The mesh with its triangles counter-clockwise from the side of the cameras, as most rays of a few frames see it.
 
-    Args:
-        mesh: Of one orientation, whichever it is.
-        views: The frames.
-        settings: See :func:`see_faces`.
-
     Raises:
-        InputError: There is no frame, the mesh is empty, no ray hits it, or open3d cannot be imported.
+        InputError: There is no frame, the mesh is empty, or no ray hits it.
     """
     settings = settings or CoverageSettings()
     if not views:
@@ -143,20 +113,11 @@ def see_faces(
     settings: CoverageSettings | None = None,
     progress: Progress | None = None,
 ) -> FaceViews:
-    """Find which triangles the frames of a recording see.
+    """Find which triangles of a mesh, in the world frame and mm, the frames of a recording see.
 
-    A frame sees a triangle if one of its viewing rays hits that first, from the front, within
+    A frame sees a triangle if one of its viewing rays hits that first, from the front (counter-clockwise), within
     ``settings.max_distance``. Of triangles that no ray of any frame hits, because they lie between the rays, those
-    whose centroid is in view count as seen.
-
-    Args:
-        mesh: The surface, world frame, mm; triangles counter-clockwise from the side that is seen.
-        views: The frames.
-        settings: What counts as seen; None: the defaults.
-        progress: Called after every frame.
-
-    Raises:
-        InputError: The mesh is empty, or open3d cannot be imported.
+    whose centroid is in view count as seen. ``progress`` is called after every frame.
     """
     settings = settings or CoverageSettings()
     _check_not_empty(mesh)
@@ -180,11 +141,7 @@ def _check_not_empty(mesh: TriangleMesh) -> None:
 
 
 class RayGrids:
-    """The ray grid of the last lens asked for, as frames of one lens usually follow each other.
-
-    Args:
-        most: See :meth:`RayGrid.of`.
-    """
+    """The ray grid of the last lens asked for, as frames of one lens usually follow each other."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -211,7 +168,6 @@ class _Tally:
         self.best = np.full(faces, -1, np.int32)
 
     def add(self, number: int, hits: RayHits, grid: RayGrid, view: CoverageView, settings: CoverageSettings) -> None:
-        """Count what frame ``number`` sees."""
         face = hits.triangle
         if not len(face):
             return
@@ -232,7 +188,6 @@ class _Tally:
         self.best[self.fineness > before] = number
 
     def result(self) -> FaceViews:
-        """Counts and extremes, NaN where there are none."""
         frames, clear, good = self.counts
         incidence = np.degrees(np.arccos(np.clip(self.cosine, -1.0, 1.0)))
         distance, incidence, fineness = (

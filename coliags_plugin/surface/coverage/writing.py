@@ -28,7 +28,7 @@ from coliags_plugin.surface.coverage.map import draw_map, face_colors
 from coliags_plugin.surface.coverage.measure import WallCoverage, measure_coverage
 from coliags_plugin.surface.coverage.page import RESEARCH_USE, coverage_page
 from coliags_plugin.surface.coverage.settings import CoverageSettings
-from coliags_plugin.surface.coverage.views import CoverageView, recorded_views
+from coliags_plugin.surface.coverage.views import recorded_views
 
 
 @dataclass(frozen=True)
@@ -64,10 +64,6 @@ def measure_scene(
         truth: True surface: a mesh in the world of the scene, mm, or the folder of a scene with one; None: that of the
             scene, where there is one.
         overwrite: Replace the folder where it exists.
-
-    Raises:
-        InputError: The unit of length is unknown, the mesh is not where the cameras look or is no tube around them, the
-            truth cannot be read or is of another world, or the folder exists or cannot be written.
     """
     check_free(output, overwrite)
     views = recorded_views(scene)
@@ -76,57 +72,25 @@ def measure_scene(
     with progress_callback() as progress:
         coverage = measure_coverage(mesh, views, settings, progress)
     evaluation = None if true is None else evaluate_coverage(coverage, true, views)
-    write_coverage(coverage, views, output, scene.name, evaluation, overwrite)
-    return MeasuredCoverage(output, coverage, evaluation)
-
-
-def open_recording(path: Path) -> Scene:
-    """A scene without initial points, whose images are read when they are used.
-
-    Raises:
-        InputError: It cannot be read.
-    """
-    return open_scene(path, None, ("initial_points=none", "keep_pixels=false"))
-
-
-def check_free(folder: Path, overwrite: bool) -> None:
-    """Refuse an output folder that exists, before any work is done.
-
-    Raises:
-        InputError: It exists and ``overwrite`` is off.
-    """
-    if not overwrite and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder} already exists", "a new or empty folder", "Choose another, or pass --overwrite")
-
-
-def write_coverage(
-    coverage: WallCoverage,
-    views: Sequence[CoverageView],
-    output: Path,
-    name: str,
-    evaluation: CoverageEvaluation | None = None,
-    overwrite: bool = False,
-) -> None:
-    """Write ``coverage.json``, ``regions.csv``, ``map.png``, ``coverage.ply`` and ``coverage.html``, atomically.
-
-    Args:
-        coverage: The measurement.
-        views: The frames that it was measured from.
-        output: The folder to make.
-        name: Of the scene or run, for titles.
-        evaluation: Against the truth, where there is one.
-        overwrite: Replace the folder where it exists.
-
-    Raises:
-        InputError: The folder exists or cannot be written, or an image of a frame cannot be read.
-    """
     with atomic_folder(output, overwrite) as folder:
         values = coverage_values(coverage, evaluation)
         write_json(folder / "coverage.json", values)
         atomic_write(folder / "regions.csv", _regions_csv(values["regions"]))
         write_png(folder / "map.png", draw_map(coverage))
         write_mesh(folder / "coverage.ply", colored_mesh(coverage))
-        write_html(coverage_page(coverage, views, name, evaluation), folder / "coverage.html")
+        write_html(coverage_page(coverage, views, scene.name, evaluation), folder / "coverage.html")
+    return MeasuredCoverage(output, coverage, evaluation)
+
+
+def open_recording(path: Path) -> Scene:
+    """A scene without initial points, whose images are read when they are used."""
+    return open_scene(path, None, ("initial_points=none", "keep_pixels=false"))
+
+
+def check_free(folder: Path, overwrite: bool) -> None:
+    """Refuse an output folder that exists, before any work is done."""
+    if not overwrite and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"{folder} already exists", "a new or empty folder", "Choose another, or pass --overwrite")
 
 
 def colored_mesh(coverage: WallCoverage) -> TriangleMesh:
@@ -194,9 +158,9 @@ def _regions_csv(regions: Sequence[Mapping[str, Any]]) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     lengths = ("area_mm2", "diameter_mm", "guessed_area_mm2", "along_mm", "clock_degrees", "from_mm", "to_mm")
+    keys = ("area", "diameter", "guessed_area", "along", "clock_degrees", "from", "to")
     writer.writerow(["number", *lengths, "x_mm", "y_mm", "z_mm", "nearest_frame"])
     for region in regions:
-        numbers = [region[key] for key in ("area", "diameter", "guessed_area", "along", "clock_degrees", "from", "to")]
-        rounded = [f"{value:.3f}" for value in (*numbers, *region["centroid"])]
+        rounded = [f"{value:.3f}" for value in (*(region[key] for key in keys), *region["centroid"])]
         writer.writerow([region["number"], *rounded, region["nearest_frame"]])
     return text.getvalue()

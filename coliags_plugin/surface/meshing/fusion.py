@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -11,7 +9,6 @@ from torch import Tensor
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.render_output import RenderOutput
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.engine.held_light import held_light, render_held
 from coliags_plugin.engine.progress import ProgressReport
@@ -26,13 +23,8 @@ from coliags_plugin.surface.meshing.volume import Volume
 def fuse_run(trained: TrainedRun, settings: MeshSettings | None = None) -> TriangleMesh:
     """The surface of a run: a truncated signed distance field of the depth rendered from all training poses.
 
-    Args:
-        trained: The run.
-        settings: Options; None: the defaults.
-
-    Returns:
-        Mesh in the world of the poses, scene units, coloured by the rendered views. Triangles are counter-clockwise
-        seen from where the cameras were.
+    The mesh is in the world of the poses, scene units, coloured by the rendered views, its triangles counter-clockwise
+    seen from where the cameras were.
 
     Raises:
         InputError: The method renders no such depth, or no such colours; there are fewer than two training views, the
@@ -47,13 +39,19 @@ def fuse_run(trained: TrainedRun, settings: MeshSettings | None = None) -> Trian
         raise InputError(f"scene '{trained.scene.name}' has {len(frames)} training view", "two views or more to fuse")
     size, reach = voxel_size_of(settings, trained.scene), max_depth_of(settings, trained.scene)
     volume = Volume(size, settings.truncation)
-    colors = _rendered if settings.color == "plain" else _flattened(trained)
+    light = None
+    if settings.color == "flattened":
+        light = held_light("flattened", trained.model, [frame.camera for frame in frames])
     with ProgressReport("fuse depth", len(frames)) as progress:
         for count, frame in enumerate(frames, start=1):
             output = render_view(trained, frame, wants)
             camera = frame.camera if output.camera is None else output.camera
             known = _usable(output[depth], output.alpha, frame, camera, settings, reach)
-            volume.add(known, eight_bit(colors(output, camera)).cpu().numpy(), camera)
+            colors = output.rgb
+            if light is not None:
+                with torch.no_grad():
+                    colors = render_held(trained.model, camera.to(trained.device, torch.float32), light, ("rgb",)).rgb
+            volume.add(known, eight_bit(colors).cpu().numpy(), camera)
             progress.update(count)
     mesh = volume.mesh(min(settings.min_views, len(frames)))
     if not len(mesh):
@@ -63,21 +61,6 @@ def fuse_run(trained: TrainedRun, settings: MeshSettings | None = None) -> Trian
             "Look at `coliags render RUN`; perhaps train longer, or lower min_views or min_alpha",
         )
     return mesh.without_small_parts(settings.min_part)
-
-
-def _rendered(output: RenderOutput, camera: Camera) -> Float[Tensor, "H W 3"]:
-    return output.rgb
-
-
-def _flattened(trained: TrainedRun) -> Callable[[RenderOutput, Camera], Float[Tensor, "H W 3"]]:
-    """Renders the colours of a view under the same light everywhere."""
-    light = held_light("flattened", trained.model, [frame.camera for frame in trained.scene.train])
-
-    @torch.no_grad()
-    def colors(output: RenderOutput, camera: Camera) -> Float[Tensor, "H W 3"]:
-        return render_held(trained.model, camera.to(trained.device, torch.float32), light, ("rgb",)).rgb
-
-    return colors
 
 
 def _usable(
@@ -109,10 +92,8 @@ def _smaller_step(points: Float[Tensor, "H W 3"], depth: Float[Tensor, "H W"], a
     """From each point to the next along an axis, or from the last one to it: whichever depths differ less. [H, W, 3]"""
     steps, jumps = torch.diff(points, dim=axis), torch.diff(depth, dim=axis).abs()
     jumps = torch.where(jumps.isfinite(), jumps, torch.inf)
-    nothing, endless = (
-        torch.full_like(points.narrow(axis, 0, 1), torch.nan),
-        torch.full_like(depth.narrow(axis, 0, 1), torch.inf),
-    )
+    nothing = torch.full_like(points.narrow(axis, 0, 1), torch.nan)
+    endless = torch.full_like(depth.narrow(axis, 0, 1), torch.inf)
     ahead, behind = torch.cat([steps, nothing], axis), torch.cat([nothing, steps], axis)
     nearer = torch.cat([jumps, endless], axis) <= torch.cat([endless, jumps], axis)
     return torch.where(nearer[..., None], ahead, behind)

@@ -30,12 +30,7 @@ _AMBIENT = 0.45
 def distance_colors(
     distances: Float[np.ndarray, "N"], known: Bool[np.ndarray, "N"] | None = None
 ) -> UInt8[np.ndarray, "N 3"]:
-    """Colours of distances on the scale of depth errors, 0 to 2 mm; grey where not known.
-
-    Args:
-        distances: mm. [N]
-        known: None: all. [N]
-    """
+    """Colours of distances in mm on the scale of depth errors, 0 to 2 mm; grey where not known."""
     share = np.clip(distances / DEPTH_ERROR_LIMIT_MM, 0.0, 1.0)
     colors = color_table("error")[np.rint(share * 255.0).astype(np.uint8)]
     if known is not None:
@@ -44,13 +39,7 @@ def distance_colors(
 
 
 def comparison_picture(mesh: TriangleMesh, truth: TrueSurface, cameras: Sequence[Camera]) -> UInt8[np.ndarray, "H W 3"]:
-    """True surface, reconstructed surface and its colours, from cameras within and from two sides without.
-
-    Args:
-        mesh: Reconstructed, in the frame of the truth, mm.
-        truth: Its unseen part is grey.
-        cameras: Views from within, in order.
-    """
+    """True surface, its unseen part grey, mesh and its colours, from cameras within and from two sides without."""
     views = [("inside", camera.resized(round(camera.width * _HEIGHT / camera.height), _HEIGHT)) for camera in cameras]
     width = max((camera.width for _, camera in views), default=_HEIGHT)
     views += [("outside", camera) for camera in outside_cameras(truth.mesh.part(truth.seen), width)]
@@ -79,12 +68,7 @@ def comparison_picture(mesh: TriangleMesh, truth: TrueSurface, cameras: Sequence
 
 
 def outside_cameras(mesh: TriangleMesh, width: int) -> list[Camera]:
-    """Two cameras that see a whole mesh from outside, at right angles to its longest direction and to each other.
-
-    Args:
-        mesh: With triangles.
-        width: Of the pictures, px.
-    """
+    """Two cameras that see a whole mesh from outside, at right angles to its longest direction and to each other."""
     center = mesh.centers.mean(axis=0)
     longest, middle, shortest = np.linalg.svd(mesh.centers[:: max(1, len(mesh) // 5000)] - center)[2]
     radius = float(np.linalg.norm(mesh.centers - center, axis=1).max())

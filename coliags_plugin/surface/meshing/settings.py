@@ -30,11 +30,7 @@ class MeshSettings(Settings):
 
 
 def voxel_size_of(settings: MeshSettings, scene: Scene) -> float:
-    """Edge of a voxel, scene units.
-
-    Raises:
-        InputError: Neither is it given nor has the scene points to compute it from.
-    """
+    """Edge of a voxel, scene units: as given, or by the scene's points."""
     if settings.voxel_size is not None:
         return settings.voxel_size
     if not len(scene.points):

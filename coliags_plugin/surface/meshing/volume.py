@@ -18,8 +18,6 @@ from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 _BLOCK = 8
 #: A block of distance, weight and colour, all float32, is 10 kB: at most 3 GB.
 _MAX_BLOCKS = 300_000
-#: open3d divides depth by this; ours is in scene units already.
-_DEPTH_SCALE = 1.0
 #: Blocks are counted from minus this along each axis, so that a key of 60 bits holds all three.
 _HALF_RANGE = 2**19
 _KEY = np.array([4 * _HALF_RANGE**2, 2 * _HALF_RANGE, 1])
@@ -28,9 +26,7 @@ _KEY = np.array([4 * _HALF_RANGE**2, 2 * _HALF_RANGE, 1])
 class Volume:
     """Average of the signed distances to the surfaces of depth images, near those surfaces (open3d's VoxelBlockGrid).
 
-    Args:
-        voxel_size: Edge of a voxel, scene units.
-        truncation: Distance from the surface up to which voxels are updated, voxels.
+    Voxels, of an edge in scene units, are updated up to ``truncation`` voxels from a surface.
     """
 
     def __init__(self, voxel_size: float, truncation: float) -> None:
@@ -48,16 +44,7 @@ class Volume:
         )
 
     def add(self, depth: Float[np.ndarray, "H W"], colors: UInt8[np.ndarray, "H W 3"], camera: Camera) -> None:
-        """Add a view.
-
-        Args:
-            depth: z-depth, scene units; 0 where unknown. [H, W]
-            colors: RGB. [H, W, 3]
-            camera: Its camera.
-
-        Raises:
-            InputError: The voxels are too small for the memory.
-        """
+        """Add a view: z-depth in scene units, 0 where unknown, and RGB; refuses voxels too small for the memory."""
         if not (depth > 0).any():
             return
         image, tensor = self._open3d.t.geometry.Image, self._open3d.core.Tensor
@@ -70,11 +57,15 @@ class Volume:
         reach = float(depth.max()) * 1.001 + self.voxel_size
         blocks = self._blocks_near(depth, camera)
         if self._grid.hashmap().size() + len(blocks) > _MAX_BLOCKS:
-            self._refuse_more()
+            raise InputError(
+                f"voxels of {self.voxel_size:.3g} scene units need more than {_MAX_BLOCKS:,} blocks of {_BLOCK}^3 "
+                "voxels",
+                "larger voxels",
+                f"Try --voxel {2 * self.voxel_size:.2g}",
+            )
         color_image = image(tensor(np.ascontiguousarray(colors, np.float32) / np.float32(255.0)))
-        self._grid.integrate(
-            tensor(blocks), depth_image, color_image, pose[0], *pose, _DEPTH_SCALE, reach, self.truncation
-        )
+        # open3d divides depth by 1.0: ours is in scene units already.
+        self._grid.integrate(tensor(blocks), depth_image, color_image, pose[0], *pose, 1.0, reach, self.truncation)
 
     def _blocks_near(self, depth: Float[np.ndarray, "H W"], camera: Camera) -> Int[np.ndarray, "B 3"]:
         """Blocks within the truncation of a pixel's surface point along its ray. [B, 3]
@@ -94,23 +85,16 @@ class Volume:
         keys = np.unique(np.concatenate(found))
         return np.asarray(np.stack(np.unravel_index(keys, (2 * _HALF_RANGE,) * 3), axis=1) - _HALF_RANGE, np.int32)
 
-    def _refuse_more(self) -> None:
-        raise InputError(
-            f"voxels of {self.voxel_size:.3g} scene units need more than {_MAX_BLOCKS:,} blocks of {_BLOCK}^3 voxels",
-            "larger voxels",
-            f"Try --voxel {2 * self.voxel_size:.2g}",
-        )
-
     def mesh(self, min_views: int) -> TriangleMesh:
         """The zero level of the distance, where at least so many views were averaged.
 
         Triangles are counter-clockwise seen from the side of the cameras; vertices between neighbouring voxels are
         shared.
         """
-        if self._grid.hashmap().size() == 0:
-            return TriangleMesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int64))
-        made: Any = self._grid.extract_triangle_mesh(weight_threshold=float(min_views) - 0.5)
-        if "indices" not in made.triangle or len(made.triangle.indices) == 0:
+        made: Any = None
+        if self._grid.hashmap().size():
+            made = self._grid.extract_triangle_mesh(weight_threshold=float(min_views) - 0.5)
+        if made is None or "indices" not in made.triangle or len(made.triangle.indices) == 0:
             return TriangleMesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int64))
         vertices, triangles = made.vertex.positions.numpy(), made.triangle.indices.numpy().astype(np.int64)
         colors = np.rint(made.vertex.colors.numpy() * 255.0).clip(0, 255).astype(np.uint8)

@@ -67,11 +67,6 @@ def mesh_run(
         truth: The true surface: a mesh in the world of the scene in mm, or the folder of a scene with one. None: that
             of the run's own scene, where there is one.
         overwrite: Replace ``output`` where it exists.
-
-    Raises:
-        InputError: See :func:`~coliags_plugin.surface.meshing.fusion.fuse_run` and
-            :func:`~coliags_plugin.geometry.meshes.comparison.compare_meshes`; the truth cannot be read; its unit is not
-            the scene's; or the folder exists or cannot be written.
     """
     scene = trained.scene
     settings = settings or MeshSettings()
@@ -106,12 +101,7 @@ def _true_surface(scene: Scene, given: Path | None) -> TrueSurface | None:
 
 
 def first_hits(mesh: TriangleMesh, frames: Sequence[Frame]) -> Bool[np.ndarray, "F"]:
-    """Triangles that are the first hit of the ray through the centre of an unmasked pixel of any frame. [F]
-
-    Args:
-        mesh: In the world of the poses.
-        frames: The views.
-    """
+    """Triangles that are the first hit of the ray through the centre of an unmasked pixel of any frame. [F]"""
     seen = np.zeros(len(mesh), bool)
     for frame in frames:
         camera = frame.camera.to("cpu", torch.float64)

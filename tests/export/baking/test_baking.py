@@ -17,23 +17,12 @@ from coliags_plugin.export.baking.harmonics import SeenColors, fit_harmonics
 from coliags_plugin.fields.spherical_harmonics import basis, colors
 from coliags_plugin.lighting.lamps import FlattenedLight, LightOfCamera
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings
+from tests.export.viewer.made import some_gaussians
 from tests.scenes import camera_at
 
 
 def random(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
-
-
-def some_gaussians(count: int = 12) -> Gaussians:
-    return Gaussians(
-        means=random(count, 3) * 3 + torch.tensor([0.0, 0.0, 15.0]),
-        quats_wxyz=random(count, 4, seed=1),
-        scales=random(count, 3, seed=2).exp() * 0.5,
-        opacities=random(count, seed=3).sigmoid(),
-        colors=random(count, 3, seed=4).sigmoid(),
-        source_index=torch.arange(count),
-        visible_sources=torch.arange(count),
-    )
 
 
 def test_harmonics_reproduce_colours_of_their_own_kind():
@@ -62,7 +51,7 @@ def test_one_view_gives_its_colour_and_none_the_mean():
 
 
 def test_blending_weights_add_up_to_alpha():
-    gaussians, camera = some_gaussians(), camera_at(0.0, 0.0, 0.0)
+    gaussians, camera = some_gaussians(12), camera_at(0.0, 0.0, -15.0)
     renderer = TorchRenderer(TorchRendererSettings())
     weights = blending_weights(renderer, gaussians, camera)
     alpha = renderer.draw(gaussians, camera, ("rgb", "alpha")).alpha
@@ -71,7 +60,7 @@ def test_blending_weights_add_up_to_alpha():
 
 
 def test_averages_of_the_same_gaussians_are_these():
-    gaussians = some_gaussians()
+    gaussians = some_gaussians(12)
     averages = GaussianAverages(12, 1, 3, torch.device("cpu"))
     for flip in (1.0, -1.0, 2.5):  # a quaternion and its negative are the same rotation
         averages.add(replace(gaussians, quats_wxyz=flip * gaussians.quats_wxyz), torch.rand(12) + 0.1)

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import struct
+from pathlib import Path
+
 import numpy as np
 
 from coliags_plugin.export.splats.cloud import SplatCloud
@@ -34,3 +38,21 @@ def covariances(cloud: SplatCloud) -> np.ndarray:
     ).reshape(-1, 3, 3)
     stretched = rotations * cloud.scales[:, None].astype(np.float64)
     return stretched @ stretched.transpose(0, 2, 1)
+
+
+def read_glb(path: Path) -> tuple[dict, dict[str, np.ndarray], dict]:
+    """The document of a GLB file, the attributes of its one primitive, and its extension of Gaussians."""
+    data = path.read_bytes()
+    (size,) = struct.unpack_from("<I", data, 12)
+    document, body = json.loads(data[20 : 20 + size]), data[28 + size :]
+    (primitive,) = document["meshes"][0]["primitives"]
+    values = {}
+    for name, index in primitive["attributes"].items():
+        accessor = document["accessors"][index]
+        view = document["bufferViews"][accessor["bufferView"]]
+        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+        kind = {5126: "<f4", 5121: "u1"}[accessor["componentType"]]
+        rows = np.frombuffer(body, kind, accessor["count"] * width, view["byteOffset"])
+        assert view["byteLength"] == rows.nbytes
+        values[name] = rows.reshape(-1, width)
+    return document, values, primitive["extensions"]["KHR_gaussian_splatting"]

@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import struct
 import subprocess
 import time
 from pathlib import Path
@@ -20,7 +19,7 @@ from coliags_plugin.core.images import read_rgb
 from coliags_plugin.export.splats.cloud import SplatCloud, harmonics_of_colors
 from coliags_plugin.export.splats.files import write_splats
 from tests.browser import SOFTWARE_WEBGL, Browser, find_chromium
-from tests.export.splats.clouds import covariances, random_cloud
+from tests.export.splats.clouds import covariances, random_cloud, read_glb
 
 PROGRAM = shutil.which("splat-transform")
 pytestmark = pytest.mark.skipif(PROGRAM is None, reason="no splat-transform on the PATH")
@@ -86,31 +85,14 @@ def test_dot_splat(tmp_path):
     np.testing.assert_allclose(means.max(axis=0), cloud.means.max(axis=0), rtol=1e-6)
 
 
-def glb_attributes(path: Path) -> tuple[dict[str, np.ndarray], dict]:
-    """Attributes of the one primitive of a GLB file, and its extension."""
-    data = path.read_bytes()
-    (size,) = struct.unpack_from("<I", data, 12)
-    document, body = json.loads(data[20 : 20 + size]), data[28 + size :]
-    (primitive,) = document["meshes"][0]["primitives"]
-    values = {}
-    for name, index in primitive["attributes"].items():
-        accessor = document["accessors"][index]
-        view = document["bufferViews"][accessor["bufferView"]]
-        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
-        kind = {5126: "<f4", 5121: "u1"}[accessor["componentType"]]
-        rows = np.frombuffer(body, kind, accessor["count"] * width, view["byteOffset"])
-        values[name] = rows.reshape(-1, width)
-    return values, primitive["extensions"]["KHR_gaussian_splatting"]
-
-
 def test_glb_has_what_the_program_writes(tmp_path):
     """It writes GLB and does not read it: the same attributes of the same Gaussians, but for its turn about z."""
     cloud = random_cloud(60)
     write_splats(tmp_path / "a.ply", cloud, "ply")
     write_splats(tmp_path / "ours.glb", cloud, "glb")
     transform(tmp_path / "a.ply", tmp_path / "theirs.glb")
-    ours, extension = glb_attributes(tmp_path / "ours.glb")
-    theirs, their_extension = glb_attributes(tmp_path / "theirs.glb")
+    _, ours, extension = read_glb(tmp_path / "ours.glb")
+    _, theirs, their_extension = read_glb(tmp_path / "theirs.glb")
     assert ours.keys() == theirs.keys()
     assert extension.items() <= their_extension.items()
     np.testing.assert_allclose(theirs["POSITION"], ours["POSITION"] * [-1, -1, 1], rtol=1e-5)

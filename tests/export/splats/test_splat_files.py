@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import gzip
-import json
 import logging
 import struct
 from dataclasses import replace
@@ -19,7 +18,7 @@ from coliags_plugin.export.splats.cloud import SplatCloud
 from coliags_plugin.export.splats.files import FORMATS, THICKNESS_SHARE, read_splats, write_splats
 from coliags_plugin.export.splats.ply import read_splat_ply, write_splat_ply
 from coliags_plugin.fields import spherical_harmonics
-from tests.export.splats.clouds import covariances, random_cloud
+from tests.export.splats.clouds import covariances, random_cloud, read_glb
 
 PARTS = ("means", "quats_wxyz", "scales", "opacities", "harmonics")
 
@@ -91,20 +90,15 @@ def test_surfels_get_a_third_scale_that_is_finite(tmp_path):
 
 def test_files_of_surfels_and_without_normals_are_read(tmp_path):
     cloud = random_cloud(5, scales=2)
-    path = tmp_path / "surfels.ply"
-    logs = cloud.log_scales.T
-    write_ply(
-        path,
-        {
-            **dict(zip("xyz", cloud.means.T, strict=True)),
-            **{f"f_dc_{index}": cloud.harmonics[:, 0, index] for index in range(3)},
-            "opacity": cloud.logits,
-            "scale_0": logs[0],
-            "scale_1": logs[1],
-            **{f"rot_{index}": cloud.quats_wxyz[:, index] for index in range(4)},
-        },
-    )
-    again = read_splats(path)
+    columns = {
+        **dict(zip("xyz", cloud.means.T, strict=True)),
+        **{f"f_dc_{index}": cloud.harmonics[:, 0, index] for index in range(3)},
+        "opacity": cloud.logits,
+        **{f"scale_{index}": cloud.log_scales[:, index] for index in range(2)},
+        **{f"rot_{index}": cloud.quats_wxyz[:, index] for index in range(4)},
+    }
+    write_ply(tmp_path / "surfels.ply", columns)
+    again = read_splats(tmp_path / "surfels.ply")
     assert again.degree == 0
     np.testing.assert_allclose(again.scales, cloud.scales, rtol=1e-5)
 
@@ -112,8 +106,7 @@ def test_files_of_surfels_and_without_normals_are_read(tmp_path):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_spz_round_trip_to_its_quantisation(tmp_path, degree):
     cloud = random_cloud(300, degree)
-    path = written(tmp_path, cloud, "spz")
-    again = read_splats(path)
+    again = read_splats(written(tmp_path, cloud, "spz"))
     assert again.degree == degree
     np.testing.assert_allclose(again.means, cloud.means, atol=0.5 / 4096 + 1e-5)
     np.testing.assert_allclose(np.log(again.scales), np.log(cloud.scales), atol=0.5 / 16 + 1e-5)
@@ -166,36 +159,18 @@ def test_dot_splat_round_trip(tmp_path):
 
 def test_glb_follows_the_extension(tmp_path):
     cloud = random_cloud(7, 2)
-    data = written(tmp_path, cloud, "glb").read_bytes()
-    magic, version, length = struct.unpack_from("<III", data)
-    assert (magic, version, length) == (0x46546C67, 2, len(data))
-    size, kind = struct.unpack_from("<II", data, 12)
-    assert kind == 0x4E4F534A and size % 4 == 0
-    document, body = json.loads(data[20 : 20 + size]), data[28 + size :]
-    assert len(body) % 4 == 0
+    document, values, extension = read_glb(written(tmp_path, cloud, "glb"))
     primitive = document["meshes"][0]["primitives"][0]
     assert primitive["mode"] == 0 and document["extensionsUsed"] == ["KHR_gaussian_splatting"]
-    extension = primitive["extensions"]["KHR_gaussian_splatting"]
     assert extension == {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-
-    def values(name):
-        accessor = document["accessors"][primitive["attributes"][name]]
-        view = document["bufferViews"][accessor["bufferView"]]
-        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
-        assert accessor["count"] == 7 and view["byteLength"] == 4 * width * 7
-        return np.frombuffer(body, "<f4", 7 * width, view["byteOffset"]).reshape(7, width)
-
-    np.testing.assert_array_equal(values("POSITION"), cloud.means)
-    np.testing.assert_allclose(values("KHR_gaussian_splatting:ROTATION"), cloud.quats_wxyz[:, [1, 2, 3, 0]], atol=1e-6)
-    np.testing.assert_array_equal(values("KHR_gaussian_splatting:SCALE"), cloud.scales)
-    np.testing.assert_array_equal(values("KHR_gaussian_splatting:OPACITY")[:, 0], cloud.opacities)
-    found = [
-        values(f"KHR_gaussian_splatting:SH_DEGREE_{degree}_COEF_{order}")
-        for degree in range(3)
-        for order in range(2 * degree + 1)
-    ]
+    np.testing.assert_array_equal(values["POSITION"], cloud.means)
+    np.testing.assert_allclose(values["KHR_gaussian_splatting:ROTATION"], cloud.quats_wxyz[:, [1, 2, 3, 0]], atol=1e-6)
+    np.testing.assert_array_equal(values["KHR_gaussian_splatting:SCALE"], cloud.scales)
+    np.testing.assert_array_equal(values["KHR_gaussian_splatting:OPACITY"][:, 0], cloud.opacities)
+    orders = [(degree, order) for degree in range(3) for order in range(2 * degree + 1)]
+    found = [values[f"KHR_gaussian_splatting:SH_DEGREE_{degree}_COEF_{order}"] for degree, order in orders]
     np.testing.assert_array_equal(np.stack(found, axis=1), cloud.harmonics)
-    assert not any("SH_DEGREE_3" in name for name in primitive["attributes"])
+    assert not any("SH_DEGREE_3" in name for name in values)
     bounds = document["accessors"][primitive["attributes"]["POSITION"]]
     np.testing.assert_allclose(bounds["min"], cloud.means.min(axis=0))
     np.testing.assert_allclose(bounds["max"], cloud.means.max(axis=0))
@@ -213,23 +188,15 @@ def test_another_library_reads_the_points_of_the_glb(tmp_path):
 def test_rows_that_are_not_finite_are_dropped_with_their_number(tmp_path, caplog):
     cloud = random_cloud(6)
     cloud.means[1, 2], cloud.quats_wxyz[4] = np.nan, 0.0
-    write_splat_ply(tmp_path / "holes.ply", replace(cloud, quats_wxyz=cloud.quats_wxyz))
+    write_splat_ply(tmp_path / "holes.ply", cloud)
     with caplog.at_level(logging.WARNING):
         again = read_splats(tmp_path / "holes.ply")
     assert len(again) == 4 and "dropped 2 of 6" in caplog.text
     np.testing.assert_array_equal(again.means, cloud.means[[0, 2, 3, 5]])
-
-
-def test_a_file_of_nothing_usable_is_refused(tmp_path):
-    cloud = random_cloud(2)
     cloud.means[:] = np.inf
     write_splat_ply(tmp_path / "bad.ply", cloud)
     with pytest.raises(InputError, match="none of which is usable"):
         read_splats(tmp_path / "bad.ply")
-
-
-def header(*lines: str) -> bytes:
-    return "\n".join(["ply", "format binary_little_endian 1.0", *lines, "end_header\n"]).encode()
 
 
 @pytest.mark.parametrize(
@@ -244,7 +211,8 @@ def header(*lines: str) -> bytes:
 )
 def test_files_of_other_lineage_are_refused_by_name(tmp_path, lines, said):
     path = tmp_path / "other.ply"
-    path.write_bytes(header(*lines) + bytes(64))
+    header = "\n".join(["ply", "format binary_little_endian 1.0", *lines, "end_header\n"]).encode()
+    path.write_bytes(header + bytes(64))
     with pytest.raises(InputError, match=said):
         read_splats(path)
 

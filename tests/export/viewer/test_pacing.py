@@ -10,8 +10,7 @@ from coliags_plugin.export.viewer.session import Pace
 
 
 class Clock:
-    def __init__(self):
-        self.now = 100.0
+    now = 100.0
 
     def __call__(self):
         return self.now
@@ -22,12 +21,9 @@ def clock():
     return Clock()
 
 
-def test_nothing_is_wanted_at_first(clock):
-    assert Pace(0.2, 0.5, clock).wait() is None
-
-
 def test_a_camera_that_moves_on_is_waited_for(clock):
     pace = Pace(0.2, 0.5, clock)
+    assert pace.wait() is None
     for _ in range(5):
         pace.moved()
         clock.now += 0.15
@@ -36,15 +32,10 @@ def test_a_camera_that_moves_on_is_waited_for(clock):
     assert pace.wait() == 0.0
 
 
-def test_a_change_of_options_needs_no_rest(clock):
+def test_a_change_of_options_needs_no_rest_but_work_pauses_after_work(clock):
     pace = Pace(0.2, 0.5, clock)
     pace.want()
     assert pace.wait() == 0.0
-
-
-def test_work_pauses_after_work(clock):
-    pace = Pace(0.2, 0.5, clock)
-    pace.want()
     pace.begin()
     assert pace.wait() is None
     clock.now += 3.0

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import signal
 import socket
+import subprocess
 import sys
 import time
 import urllib.request
@@ -14,8 +16,7 @@ import pytest
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.export.viewer import serving
-from coliags_plugin.export.viewer.decoding import in_view, widened
-from coliags_plugin.export.viewer.splats import shown
+from coliags_plugin.export.viewer.splats import in_view, shown, widened
 from coliags_plugin.geometry.meshes.files import read_mesh, write_mesh
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.outputs.image_files import as_array
@@ -202,3 +203,19 @@ def test_no_browser_is_opened_without_a_display(viewer, monkeypatch):
 
 def test_nothing_is_printed(viewer, capsys):
     assert capsys.readouterr().out == ""
+
+
+def test_ctrl_c_ends_the_command_cleanly(anchors, request):
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job ignores it
+    request.addfinalizer(lambda: signal.signal(signal.SIGINT, before))
+    command = [sys.executable, "-c", "from coliags_plugin.cli import main; main()", "view", str(anchors.path)]
+    process = subprocess.Popen(
+        [*command, "--port", "0", "--no-open"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    line = process.stdout.readline()
+    with urllib.request.urlopen(line.split()[0], timeout=20) as answer:
+        assert answer.status == 200
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert out == "ended\n" and "Traceback" not in err and "server" not in err

@@ -9,23 +9,17 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from coliags_plugin.export.viewer.splats import on_wire, shown, wire_unit
+from tests.export.splats.clouds import covariances
 from tests.export.viewer.made import some_gaussians
-
-
-def true_covariances(gaussians):
-    turns = Rotation.from_quat(gaussians.quats_wxyz[:, [1, 2, 3, 0]].numpy()).as_matrix()
-    scales = np.zeros((len(gaussians), 3))
-    scales[:, : gaussians.scales.shape[1]] = gaussians.scales.numpy()
-    return np.einsum("nij,nj,nkj->nik", turns, scales**2, turns)
 
 
 @pytest.mark.parametrize("scales", [2, 3])
 def test_covariances(scales):
     gaussians = some_gaussians(20, scales)
-    np.testing.assert_allclose(shown(gaussians).covariances, true_covariances(gaussians), atol=1e-6)
+    assert shown(gaussians).scales.shape == (20, 3)
+    np.testing.assert_allclose(shown(gaussians).covariances, covariances(shown(gaussians)), atol=1e-6)
 
 
 def test_what_is_not_finite_is_left_out():
@@ -45,7 +39,7 @@ def test_half_precision_holds_scenes_of_every_unit_of_length(exponent):
     unit = wire_unit(scaled)
     sent = on_wire(scaled, unit)
     halves = sent["covariances"].astype(np.float16).astype(np.float64) * unit**2
-    expected = true_covariances(gaussians) * factor**2
+    expected = covariances(shown(gaussians)) * factor**2
     np.testing.assert_allclose(halves, expected, atol=5e-3 * np.abs(expected).max())
     np.testing.assert_allclose(sent["centers"] * unit, scaled.means, rtol=1e-6)
 

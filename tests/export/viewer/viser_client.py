@@ -21,18 +21,13 @@ WIDTH, HEIGHT = 64, 48
 
 
 class ViserClient:
-    """A connection to a server. Use it as a context manager.
-
-    Args:
-        port: Of the server, on this machine.
-    """
+    """A connection to a server on this machine. Use it as a context manager."""
 
     def __init__(self, port: int) -> None:
         self._socket = connect(
             f"ws://127.0.0.1:{port}", subprotocols=[f"viser-v{viser.__version__}"], max_size=None, compression=None
         )
         self.messages: list[dict[str, Any]] = []
-        self.bytes = 0
 
     def __enter__(self) -> ViserClient:
         return self
@@ -79,7 +74,6 @@ class ViserClient:
     def _received(self, seconds: float) -> list[dict[str, Any]]:
         """Messages of one packet, arrays in their places."""
         data = self._socket.recv(timeout=max(0.0, seconds))
-        self.bytes += len(data)
         size, packed = (int.from_bytes(data[at : at + 8], "little") for at in (0, 8))
         found = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(data[16 : 16 + packed], size))
         buffers, at = [], 16 + packed

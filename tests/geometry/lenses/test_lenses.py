@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coliags_plugin.core.intrinsics import Intrinsics
-from coliags_plugin.geometry.lenses.models import LENSES, NOWHERE, octagon_mask, undistortion_map
-from coliags_plugin.geometry.lenses.pinhole import PinholeLens
+from coliags_plugin.geometry.lenses.models import LENSES, NOWHERE, PinholeLens, octagon_mask, undistortion_map
 
 NAMES = sorted(LENSES)
 PINHOLE = PinholeLens(fx=61.0, fy=55.0, cx=33.5, cy=21.5, width=64, height=48)

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from coliags_plugin.core.intrinsics import Intrinsics
 from coliags_plugin.geometry.lenses.models import LENSES, BrownLens, FisheyeLens
-from coliags_plugin.geometry.lenses.opencv import OpenCVLens
-from coliags_plugin.geometry.lenses.tabulated import MappedLens
+from coliags_plugin.geometry.lenses.tabulated import MappedLens, OpenCVLens
 
 SIZE = {"width": 1350, "height": 1080}
 VIEW = {"fx": 802.3, "fy": 790.1, "cx": 668.3, "cy": 547.7}

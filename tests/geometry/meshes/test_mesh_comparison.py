@@ -15,19 +15,14 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.meshes.comparison import angles_between, compare_meshes, sample_surface
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.geometry.meshes.truth import TrueSurface
+from tests.surface.coverage.tubes import plane as square
 
 COUNT = 100_000
 
 
-def plane(z: float = 0.0, size: float = 40.0, cells: int = 20) -> TriangleMesh:
-    """A square about the origin."""
-    line = np.linspace(-size / 2, size / 2, cells + 1)
-    x, y = np.meshgrid(line, line)
-    vertices = np.stack([x.ravel(), y.ravel(), np.full(x.size, z)], axis=1).astype(np.float32)
-    first = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
-    lower = np.stack([first, first + 1, first + cells + 2], axis=1)
-    upper = np.stack([first, first + cells + 2, first + cells + 1], axis=1)
-    return TriangleMesh(vertices, np.concatenate([lower, upper]))
+def plane(z: float = 0.0, size: float = 40.0) -> TriangleMesh:
+    """A square about the origin, in 20 x 20 cells."""
+    return square(z, size / 2, size / 20)
 
 
 def sphere(radius: float) -> TriangleMesh:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tubes import plane
 
 from coliags_plugin.surface.coverage.regions import connected, large_regions, near_pairs, neighbours
 from coliags_plugin.surface.coverage.scores import score_unseen
+from tests.surface.coverage.tubes import plane
 
 N = 20
 CHAIN = np.stack([np.arange(N - 1), np.arange(1, N)], axis=1)

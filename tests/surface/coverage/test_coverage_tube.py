@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tubes import grid_mesh, pinhole, plane, tube, view_at
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
@@ -14,6 +13,7 @@ from coliags_plugin.surface.coverage.map import draw_map
 from coliags_plugin.surface.coverage.measure import measure_coverage
 from coliags_plugin.surface.coverage.settings import CoverageSettings
 from coliags_plugin.surface.coverage.tube import guessed_wall, wall_around
+from tests.surface.coverage.tubes import grid_mesh, pinhole, plane, tube, view_at
 
 FEW_RAYS = CoverageSettings(rays=20_000)
 

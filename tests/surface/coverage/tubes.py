@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from coliags_plugin.geometry.lenses.pinhole import PinholeLens
+from coliags_plugin.geometry.lenses.models import PinholeLens
 from coliags_plugin.geometry.meshes.mesh import TriangleMesh
 from coliags_plugin.surface.coverage.views import CoverageView
 

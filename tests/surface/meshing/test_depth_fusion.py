@@ -64,11 +64,6 @@ def test_what_lies_too_far_is_not_fused():
     assert mesh.vertices[:, 2].max() < 16
 
 
-@pytest.mark.parametrize("kind", ["expected", "median"])
-def test_either_kind_of_depth(kind):
-    assert len(fuse_run(exact_run(frames=9), MeshSettings(depth=kind)))
-
-
 def test_transparent_views_have_no_surface():
     with pytest.raises(InputError, match=r"no surface.*units|no surface.*mm"):
         fuse_run(exact_run(alpha=0.7))
@@ -99,6 +94,7 @@ def test_flattened_colours_are_those_of_a_held_light(monkeypatch):
 
 
 def test_too_few_views_and_methods_without_depth_are_refused():
+    assert len(fuse_run(exact_run(frames=9), MeshSettings(depth="expected")))
     scene = wall_scene(9, 160, 120)
     with pytest.raises(InputError, match="1 training view"):
         fuse_run(exact_run(scene=replace(scene, train=scene.train[:1])))

@@ -17,19 +17,15 @@ from coliags_plugin.reporting.terminal import terminal_text
 from coliags_plugin.surface.meshing.settings import MeshSettings
 from coliags_plugin.surface.meshing.writing import comparison_blocks, first_hits, mesh_run
 from tests.scenes import wall_scene, write_wall
+from tests.surface.coverage.tubes import plane
 from tests.surface.meshing.exact import exact_run, with_provenance
 
 SETTINGS = MeshSettings(voxel_size=0.4)
 
 
-def wall_mesh(size: float = 60.0, cells: int = 100) -> TriangleMesh:
-    """The wall z = 20 as a grid of triangles of half a millimetre squared."""
-    line = np.linspace(-size / 2, size / 2, cells + 1)
-    x, y = np.meshgrid(line, line)
-    vertices = np.stack([x.ravel(), y.ravel(), np.full(x.size, 20.0)], axis=1).astype(np.float32)
-    first = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
-    lower = np.stack([first, first + 1, first + cells + 2], axis=1)
-    return TriangleMesh(vertices, np.concatenate([lower, lower[:, [0, 2, 1]] + [0, 0, cells]]))
+def wall_mesh() -> TriangleMesh:
+    """The wall z = 20, of 60 mm, as a grid of triangles of half a millimetre squared."""
+    return plane(20.0, 30.0, 0.6)
 
 
 @pytest.fixture(scope="module")
