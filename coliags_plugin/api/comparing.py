@@ -56,7 +56,8 @@ def compare(
         InterruptedRunError: Ctrl-C; all runs are saved, and the same call goes on with them.
     """
     from coliags_plugin.comparison.cells import Variant
-    from coliags_plugin.comparison.compare import ExecutionOptions, carry_out, make_request
+    from coliags_plugin.comparison.compare import carry_out, make_request
+    from coliags_plugin.comparison.executors import ExecutionOptions
     from coliags_plugin.comparison.folder import ComparisonFolder
 
     methods = [methods] if isinstance(methods, (str, Variant)) else methods

@@ -53,7 +53,8 @@ class ComparisonArguments:
 
     def carry_out(self, methods: Sequence[str | Variant]) -> None:
         """Compare and print a summary; exit with status 1 if a cell failed."""
-        from coliags_plugin.comparison.compare import ExecutionOptions, carry_out, dry_run, make_request
+        from coliags_plugin.comparison.compare import carry_out, dry_run, make_request
+        from coliags_plugin.comparison.executors import ExecutionOptions
         from coliags_plugin.comparison.folder import ComparisonFolder
 
         request = make_request(

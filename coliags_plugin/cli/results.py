@@ -22,7 +22,7 @@ class ResultsShowCommand:
 
     def run(self) -> None:
         """Print a table for each."""
-        from coliags_plugin.results.finding import find_results
+        from coliags_plugin.results.reading import find_results
         from coliags_plugin.results.summaries import facts, means_summary
 
         results = find_results([self.path])
@@ -49,8 +49,8 @@ class ResultsExportCommand:
     def run(self) -> None:
         """Write the files."""
         from coliags_plugin.core.errors import InputError
-        from coliags_plugin.results.finding import find_results
         from coliags_plugin.results.nerfbaselines import write_nerfbaselines
+        from coliags_plugin.results.reading import find_results
         from coliags_plugin.results.tables import write_csv, write_parquet
 
         if not self.paths:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 from typing import Any
 
-from coliags_plugin.comparison.named_files import is_path
 from coliags_plugin.comparison.scenes import SceneSource
 from coliags_plugin.config.method_config import MethodConfig
 
@@ -31,7 +30,7 @@ class Variant:
 
 @dataclass(frozen=True)
 class CellKeys:
-    """Hashes that identify a cell's scene, run and result; see :mod:`coliags_plugin.results.identity`."""
+    """Hashes that identify a cell's scene, run and result; see :mod:`coliags_plugin.results.hashing`."""
 
     fingerprint: str
     training: str
@@ -101,8 +100,3 @@ class ComparisonCell:
 def file_name(variant: str) -> str:
     """A variant's name as part of a path: ``ablations/depth`` is ``ablations-depth``."""
     return variant.replace("/", "-")
-
-
-def absolute_method(method: str) -> str:
-    """A method by a name or path that holds in every working folder."""
-    return str(Path(method).resolve()) if is_path(method) else method

@@ -12,12 +12,12 @@ from typing import Literal, get_args
 
 from coliags_plugin.comparison.cells import ComparisonCell, Variant
 from coliags_plugin.comparison.dry_run import DryRun, RunSizes, forecast
-from coliags_plugin.comparison.executors import Executor, LocalExecutor
+from coliags_plugin.comparison.executors import ExecutionOptions, Executor, LocalExecutor
 from coliags_plugin.comparison.folder import ComparisonFolder
 from coliags_plugin.comparison.plan import Request, make_cells
 from coliags_plugin.comparison.plan_file import FailureRecord
 from coliags_plugin.comparison.ray_executor import RayExecutor
-from coliags_plugin.comparison.runner import RunnerConfig, run_cells
+from coliags_plugin.comparison.runner import run_cells
 from coliags_plugin.comparison.scenes import find_scenes, make_phantoms
 from coliags_plugin.config.method_config import method_name
 from coliags_plugin.core.errors import InputError, did_you_mean
@@ -93,19 +93,6 @@ def _mean(results: Sequence[Result], metric: str) -> float | None:
     return sum(means) / len(means) if means else None
 
 
-@dataclass(frozen=True)
-class ExecutionOptions:
-    """How a comparison is carried out."""
-
-    jobs: int | None = None  # runs at a time; None: one per CPU, or per GPU
-    threads: int | None = None  # CPU threads of each; None: the CPUs divided by the runs at a time
-    device: str = "auto"
-    executor: str = "local"
-    ray_address: str | None = None  # HOST:PORT of the head; None: RAY_ADDRESS, or the cluster of this machine
-    retries: int = 2  # how often a cell whose process died is tried again
-    save_seconds: float = 60.0  # largest time between two checkpoints of a run
-
-
 def carry_out(request: Request, folder: ComparisonFolder, options: ExecutionOptions) -> FinishedComparison:
     """Train and evaluate methods on scenes, as far as that is not done in a folder, which is new or extended.
 
@@ -129,8 +116,7 @@ def carry_out(request: Request, folder: ComparisonFolder, options: ExecutionOpti
         if scenes:
             executor.check(folder.path, sorted(scenes))
         folder.record(request, cells)
-        config = RunnerConfig(folder, executor, options.device, options.retries, options.save_seconds)
-        failures = run_cells(config, cells, finished, sizes)
+        failures = run_cells(folder, executor, options, cells, finished, sizes)
         results = [result for cell in cells if (result := finished.of(cell)) is not None]
     return FinishedComparison(folder.path, cells, results, failures)
 

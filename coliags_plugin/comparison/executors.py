@@ -8,6 +8,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
@@ -16,6 +17,19 @@ from coliags_plugin.comparison.tasks import Task, TaskOutcome, read_outcome
 #: For workers to save and end once they were asked to, seconds; then they are killed.
 STOPPING = 45.0
 _PAUSE = 0.1
+
+
+@dataclass(frozen=True)
+class ExecutionOptions:
+    """How a comparison is carried out."""
+
+    jobs: int | None = None  # runs at a time; None: one per CPU, or per GPU
+    threads: int | None = None  # CPU threads of each; None: the CPUs divided by the runs at a time
+    device: str = "auto"
+    executor: str = "local"
+    ray_address: str | None = None  # HOST:PORT of the head; None: RAY_ADDRESS, or the cluster of this machine
+    retries: int = 2  # how often a cell whose process died is tried again
+    save_seconds: float = 60.0  # largest time between two checkpoints of a run
 
 
 class Executor(ABC):

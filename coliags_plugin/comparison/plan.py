@@ -14,7 +14,7 @@ from coliags_plugin.config import registry
 from coliags_plugin.config.components import Component
 from coliags_plugin.config.method_config import MethodConfig, load_method
 from coliags_plugin.engine.data_formats import data_manager, load_method_for
-from coliags_plugin.results.identity import result_key, training_key
+from coliags_plugin.results.hashing import result_key, training_key
 
 #: The fingerprint of a scene that is not there, as recorded when it was; None where it never was.
 RecordedFingerprint = Callable[[SceneSource], str | None]

@@ -9,13 +9,14 @@ import signal
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
-from coliags_plugin.comparison.cells import ComparisonCell, absolute_method
+from coliags_plugin.comparison.cells import ComparisonCell
 from coliags_plugin.comparison.dry_run import RunSizes
-from coliags_plugin.comparison.executors import Executor
+from coliags_plugin.comparison.executors import ExecutionOptions, Executor
 from coliags_plugin.comparison.folder import ComparisonFolder, FinishedCells
+from coliags_plugin.comparison.named_files import is_path
 from coliags_plugin.comparison.plan_file import FailureRecord
 from coliags_plugin.comparison.tasks import Task, TaskOutcome
 from coliags_plugin.core.errors import InputError, InterruptedRunError
@@ -33,50 +34,20 @@ POLL_INTERVAL_S = 1.0
 _PLAIN_LINE_EVERY_S = 60.0
 
 
-@dataclass(frozen=True)
-class RunnerConfig:
-    """Where and how cells are run."""
-
-    folder: ComparisonFolder
-    executor: Executor
-    device: str = "auto"
-    retries: int = 2  # how often a cell whose process died is tried again
-    save_seconds: float = 60.0  # largest time between two checkpoints
-
-    def task(self, cell: ComparisonCell) -> Task:
-        """What a worker is told of a cell."""
-        run = self.folder.run(cell)
-        return Task(
-            title=cell.title,
-            name=cell.variant.name,
-            method=absolute_method(cell.variant.method),
-            overrides=cell.overrides,
-            scene=cell.scene.name,
-            data=str(cell.scene.path),
-            data_format=cell.scene.data_format,
-            seed=cell.seed,
-            device=self.device,
-            protocol=cell.protocol,
-            run=str(run.path),
-            result=str(self.folder.result(cell)),
-            result_key=cell.known_keys.result,
-            log=str(self.folder.log(cell)),
-            threads=self.executor.threads,
-            variables={name: value for name, value in os.environ.items() if name.startswith("COLIAGS_")},
-            save_seconds=self.save_seconds,
-        )
-
-
 def run_cells(
-    config: RunnerConfig, cells: Sequence[ComparisonCell], finished: FinishedCells, sizes: RunSizes
+    folder: ComparisonFolder,
+    executor: Executor,
+    options: ExecutionOptions,
+    cells: Sequence[ComparisonCell],
+    finished: FinishedCells,
+    sizes: RunSizes,
 ) -> list[FailureRecord]:
     """Complete all cells, whose scenes are there, and add their results to the finished ones; returns the failures.
 
     Raises:
         InterruptedRunError: Ctrl-C, or the system's request to end; all runs are saved.
     """
-    queue = _CellQueue(config, cells, finished, sizes)
-    executor = config.executor
+    queue = _CellQueue(folder, executor, options, cells, finished, sizes)
     total = sum(cell.steps for cell in cells)
     with (
         _sigterm_as_interrupt(),
@@ -106,9 +77,16 @@ class _CellQueue:
     """
 
     def __init__(
-        self, config: RunnerConfig, cells: Sequence[ComparisonCell], finished: FinishedCells, sizes: RunSizes
+        self,
+        folder: ComparisonFolder,
+        executor: Executor,
+        options: ExecutionOptions,
+        cells: Sequence[ComparisonCell],
+        finished: FinishedCells,
+        sizes: RunSizes,
     ) -> None:
-        self._config, self._finished, self._sizes = config, finished, sizes
+        self._folder, self._executor, self._options = folder, executor, options
+        self._finished, self._sizes = finished, sizes
         self._cells = cells
         self._phases: dict[tuple[str, str, int, str], Phase] = {cell.identity: "waiting" for cell in cells}
         self._equal: dict[str, list[ComparisonCell]] = {}
@@ -132,7 +110,7 @@ class _CellQueue:
         """Steps that are over in all cells: all of a failed cell, and the last one of a cell with its evaluation."""
         over = [cell.steps for cell in self._cells if self._phases[cell.identity] in ("done", "failed")]
         running = self._running.values()
-        return sum(over) + sum(min(self._config.folder.run(cell).logged_step, cell.steps - 1) for cell in running)
+        return sum(over) + sum(min(self._folder.run(cell).logged_step, cell.steps - 1) for cell in running)
 
     @property
     def counts(self) -> str:
@@ -145,7 +123,7 @@ class _CellQueue:
 
     def start_next(self) -> bool:
         """Start what can be started; whether there is anything left to wait for."""
-        while self._waiting and len(self._running) < self._config.executor.slots:
+        while self._waiting and len(self._running) < self._executor.slots:
             self._start(self._waiting.popleft())
         return bool(self._running)
 
@@ -158,7 +136,7 @@ class _CellQueue:
                 self._complete(cell)
             elif outcome.ending == "failed":
                 self._fail(cell, outcome.reason)
-            elif attempts > self._config.retries:
+            elif attempts > self._options.retries:
                 self._fail(cell, f"{reason}, {attempts} times")
             else:
                 log.warning("%s: %s; trying again", cell.title, reason)
@@ -168,21 +146,42 @@ class _CellQueue:
     def _start(self, cell: ComparisonCell) -> None:
         key = cell.known_keys.result
         self._attempts[key] += 1
-        needed, free = 2 * self._sizes.of(cell), shutil.disk_usage(self._config.folder.path).free
+        needed, free = 2 * self._sizes.of(cell), shutil.disk_usage(self._folder.path).free
         if free < needed:
             self._fail(cell, f"the disk is full: {file_size(free)} left, about {file_size(needed)} needed")
             return
         try:
-            self._config.executor.start(self._config.task(cell))
+            self._executor.start(self._task(cell))
         except OSError as error:
             self._fail(cell, f"cannot be started: {error.strerror or error}")
             return
         self._running[key] = cell
         self._set(cell, "running")
 
+    def _task(self, cell: ComparisonCell) -> Task:
+        return Task(
+            title=cell.title,
+            name=cell.variant.name,
+            method=str(Path(cell.variant.method).resolve()) if is_path(cell.variant.method) else cell.variant.method,
+            overrides=cell.overrides,
+            scene=cell.scene.name,
+            data=str(cell.scene.path),
+            data_format=cell.scene.data_format,
+            seed=cell.seed,
+            device=self._options.device,
+            protocol=cell.protocol,
+            run=str(self._folder.run(cell).path),
+            result=str(self._folder.result(cell)),
+            result_key=cell.known_keys.result,
+            log=str(self._folder.log(cell)),
+            threads=self._executor.threads,
+            variables={name: value for name, value in os.environ.items() if name.startswith("COLIAGS_")},
+            save_seconds=self._options.save_seconds,
+        )
+
     def _complete(self, cell: ComparisonCell) -> None:
         try:
-            result = read_result(self._config.folder.result(cell))
+            result = read_result(self._folder.result(cell))
             for equal in self._equal[cell.known_keys.result]:
                 self._finished.add(equal, result)
                 self._set(equal, "done")
@@ -192,7 +191,7 @@ class _CellQueue:
     def _fail(self, cell: ComparisonCell, reason: str) -> None:
         key = cell.known_keys.result
         for equal in self._equal[key]:
-            self.failures.append(self._config.folder.fail(equal, reason, self._attempts[key]))
+            self.failures.append(self._folder.fail(equal, reason, self._attempts[key]))
             self._set(equal, "failed", f": {reason}")
 
     def _set(self, cell: ComparisonCell, phase: Phase, reason: str = "") -> None:

@@ -19,8 +19,7 @@ from coliags_plugin.engine.provenance import software
 from coliags_plugin.engine.scoring import Scorer
 from coliags_plugin.engine.trained import TrainedRun
 from coliags_plugin.engine.truth import Truth
-from coliags_plugin.results.hashing import metrics_sha256
-from coliags_plugin.results.identity import plain_config, result_key
+from coliags_plugin.results.hashing import metrics_sha256, plain_config, result_key
 from coliags_plugin.results.record import SEEN_SUFFIX, CostRecord, MetricRecord, ProtocolRecord, Result, SceneRecord
 
 #: Keys of the provenance of a run and of its scene that a result has in another place, or that name a local path.

@@ -181,7 +181,7 @@ class Result(_Part):
     Attributes:
         format: Marks the file.
         version: Of the schema.
-        key: Hash of everything that determines the result; see :mod:`coliags_plugin.results.identity`.
+        key: Hash of everything that determines the result; see :mod:`coliags_plugin.results.hashing`.
         metrics: Metrics by name, in the protocol's order; then those over seen pixels, ``<name>_seen``.
         metrics_sha256: Hash of the raw values of all test sets.
         steps: Training steps taken.

@@ -16,7 +16,7 @@ import tarfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from coliags_plugin.results.finding import find_results
+from coliags_plugin.results.reading import find_results
 from coliags_plugin.results.record import Result
 
 FOLDER = Path(__file__).parents[1] / "results"

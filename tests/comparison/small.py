@@ -14,8 +14,8 @@ import pytest
 import torch
 
 from coliags_plugin.comparison import compare
-from coliags_plugin.comparison.compare import ExecutionOptions, carry_out, make_request
-from coliags_plugin.comparison.executors import Executor
+from coliags_plugin.comparison.compare import carry_out, make_request
+from coliags_plugin.comparison.executors import ExecutionOptions, Executor
 from coliags_plugin.comparison.folder import ComparisonFolder
 from coliags_plugin.comparison.tasks import Task, TaskOutcome
 from coliags_plugin.comparison.worker import work

@@ -19,7 +19,7 @@ from coliags_plugin.engine.devices import device_name
 from coliags_plugin.engine.evaluator import evaluate
 from coliags_plugin.engine.scoring import Scorer
 from coliags_plugin.engine.trained import load_trained
-from coliags_plugin.results.identity import result_key
+from coliags_plugin.results.hashing import result_key
 from coliags_plugin.results.reading import RESULT_FILE, read_result
 from coliags_plugin.results.summaries import means_summary
 from coliags_plugin.results.tables import per_frame_table

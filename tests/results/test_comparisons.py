@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from scipy import stats
 from statsmodels.stats.multitest import multipletests
 
-from coliags_plugin.results.comparisons import compare_with_rivals
-from coliags_plugin.results.spread import common_scenes, scene_means, spread
+from coliags_plugin.results.comparisons import common_scenes, compare_with_rivals, scene_means, spread
 
 
 def one_seed(values):

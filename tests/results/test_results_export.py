@@ -13,9 +13,8 @@ import sys
 import pytest
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.results.finding import find_results
 from coliags_plugin.results.nerfbaselines import nerfbaselines_result
-from coliags_plugin.results.reading import write_result
+from coliags_plugin.results.reading import find_results, write_result
 from coliags_plugin.results.record import CostRecord, MetricRecord, ProtocolRecord
 from coliags_plugin.results.tables import FrameValue, rows, write_csv, write_parquet
 from tests.commands import refused, run

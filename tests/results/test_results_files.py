@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.results.hashing import ArraysHash, metrics_sha256
-from coliags_plugin.results.identity import result_key
+from coliags_plugin.results.hashing import ArraysHash, metrics_sha256, result_key
 from coliags_plugin.results.reading import read_result, write_result
 from coliags_plugin.results.record import VERSION, MetricRecord, ProfileRecord, Result
 from coliags_plugin.results.summaries import means_summary

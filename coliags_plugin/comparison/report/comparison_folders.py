@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
+from coliags_plugin.comparison.cells import file_name
 from coliags_plugin.comparison.plan_file import FAILURES, PLAN_FILE, RESULTS, RUNS, PlannedCell, read_plan
 from coliags_plugin.comparison.report.study import MissingResult, StudyRun
 from coliags_plugin.core.errors import InputError
@@ -18,20 +19,12 @@ _CELL = "*/*/s*-*.json"
 _SEED = re.compile(r"s(\d+)-")
 
 
-@dataclass(frozen=True)
-class ResultSource:
-    """A results file and what it holds."""
-
-    file: Path
-    run: StudyRun
-
-
 def is_comparison(folder: Path) -> bool:
     """Whether a folder is that of a comparison, or holds its results alone."""
     return (folder / PLAN_FILE).is_file() or (folder / RESULTS).is_dir() or any(folder.glob(_CELL))
 
 
-def read_comparison(folder: Path, protocol: str) -> tuple[list[ResultSource], list[MissingResult]]:
+def read_comparison(folder: Path, protocol: str) -> tuple[list[StudyRun], list[MissingResult]]:
     """Results and failures of one protocol: those of the plan, in its order; all that are there without a plan."""
     plan = read_plan(folder)
     if plan is not None:
@@ -41,50 +34,45 @@ def read_comparison(folder: Path, protocol: str) -> tuple[list[ResultSource], li
     return _read_unplanned(folder, None, protocol), []
 
 
-def read_file(file: Path, stamp: str, run: Path | None = None) -> ResultSource:
+def read_file(file: Path, stamp: str, run: Path | None = None) -> StudyRun:
     """A results file under the name of its method."""
     result = read_result(file)
-    return ResultSource(file, StudyRun(result.method, result, stamp, run))
+    return StudyRun(result.method, result, file, stamp, run)
 
 
 def _read_planned(
     folder: Path, cells: Sequence[PlannedCell], protocol: str
-) -> tuple[list[ResultSource], list[MissingResult]]:
-    sources, missing = [], []
+) -> tuple[list[StudyRun], list[MissingResult]]:
+    found, missing = [], []
     runs: dict[str, Path] = {}  # by key: what is the same as another method under a second name has no run of its own
     for entry in (entry for entry in cells if entry.protocol == protocol):
         file = folder / entry.result
         if file.is_file():
-            source = read_file(file, file.stem)
             own = _with_images(folder / entry.run, protocol)
+            one = replace(read_file(file, file.stem, own), method=entry.method)
             if own is not None:
-                runs[source.run.result.key] = own
-            sources.append(replace(source, run=replace(source.run, method=entry.method, run=own)))
+                runs[one.result.key] = own
+            found.append(one)
         else:
             failure = folder / FAILURES / Path(entry.result).relative_to(RESULTS)
             reason = _failure_reason(failure) if failure.is_file() else None
             missing.append(MissingResult(entry.scene, entry.method, entry.seed, reason))
     _refuse_other_protocols(folder, protocol, {entry.protocol for entry in cells})
-    with_runs = [replace(one.run, run=one.run.run or runs.get(one.run.result.key)) for one in sources]
-    return [replace(one, run=run) for one, run in zip(sources, with_runs, strict=True)], missing
+    return [replace(one, run=one.run or runs.get(one.result.key)) for one in found], missing
 
 
-def _read_unplanned(folder: Path, runs: Path | None, protocol: str) -> list[ResultSource]:
+def _read_unplanned(folder: Path, runs: Path | None, protocol: str) -> list[StudyRun]:
     """The name of a method's folder tells variants of one method apart."""
-    sources, protocols = [], set()
-    for file in sorted(folder.glob(_CELL)):
-        source = read_file(file, file.stem)
-        result, directory = source.run.result, file.parent.name
-        protocols.add(result.protocol.name)
-        if result.protocol.name != protocol:
-            continue
-        method = result.method if result.method.replace("/", "-") == directory else directory
-        own = (
-            None if runs is None else _find_run(runs / file.parent.relative_to(folder), file.stem, result.key, protocol)
-        )
-        sources.append(replace(source, run=replace(source.run, method=method, run=own)))
-    _refuse_other_protocols(folder, protocol, protocols)
-    return sources
+    found = [read_file(file, file.stem) for file in sorted(folder.glob(_CELL))]
+    _refuse_other_protocols(folder, protocol, {one.result.protocol.name for one in found})
+    named = []
+    for one in found:
+        if one.result.protocol.name == protocol:
+            place = one.file.parent
+            method = one.method if file_name(one.method) == place.name else place.name
+            run = runs and _find_run(runs / place.relative_to(folder), one.stamp, one.result.key, protocol)
+            named.append(replace(one, method=method, run=run))
+    return named
 
 
 def _refuse_other_protocols(folder: Path, protocol: str, protocols: set[str]) -> None:

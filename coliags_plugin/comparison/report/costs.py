@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import Literal
 
 import numpy as np
@@ -38,31 +39,17 @@ def _mark_column(mark: str) -> _CostColumn:
     return _CostColumn(column, lambda cost: cost.seconds_to_psnr.get(mark), duration, "training", "not reached")
 
 
-_TIMES = (
-    _CostColumn(
-        Column("train_seconds", "Training", "", "lower"), lambda cost: cost.train_seconds, duration, "training"
-    ),
-    _CostColumn(
-        Column("processor_seconds", "Processor time", "", "lower"),
-        lambda cost: cost.processor_seconds,
-        duration,
-        "training",
-    ),
-)
+def _time(key: str, title: str) -> _CostColumn:
+    return _CostColumn(Column(key, title, "", "lower"), attrgetter(key), duration, "training")
+
+
+_TIMES = (_time("train_seconds", "Training"), _time("processor_seconds", "Processor time"))
+_NO_GAUSSIANS = "not counted, or a radiance field, which has none"
+_FPS, _MEMORY = Column("fps", "Rendering", "views/s", "higher"), Column("memory", "Peak memory", "MiB", "lower")
 _OTHERS = (
-    _CostColumn(
-        Column("fps", "Rendering", "views/s", "higher"), lambda cost: cost.render_fps, "{:.3g}".format, "rendering"
-    ),
-    _CostColumn(
-        Column("memory", "Peak memory", "MiB", "lower"), lambda cost: cost.peak_memory_mib, "{:,.0f}".format, "training"
-    ),
-    _CostColumn(
-        Column("gaussians", "Gaussians"),
-        lambda cost: cost.gaussians,
-        "{:,.0f}".format,
-        None,
-        "not counted, or a radiance field, which has none",
-    ),
+    _CostColumn(_FPS, attrgetter("render_fps"), "{:.3g}".format, "rendering"),
+    _CostColumn(_MEMORY, attrgetter("peak_memory_mib"), "{:,.0f}".format, "training"),
+    _CostColumn(Column("gaussians", "Gaussians"), attrgetter("gaussians"), "{:,.0f}".format, None, _NO_GAUSSIANS),
     _CostColumn(Column("checkpoint", "Checkpoint", "MiB", "lower"), _mib, "{:,.1f}".format, None),
 )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import starmap
 
 from coliags_plugin.comparison.report.metric_columns import metric_columns
 from coliags_plugin.comparison.report.metric_tables import shared_scenes
@@ -10,9 +11,8 @@ from coliags_plugin.comparison.report.study import Part, Study
 from coliags_plugin.core.errors import InputError, did_you_mean
 from coliags_plugin.reporting.model import Column, Table, TableCell
 from coliags_plugin.reporting.numbers import column_decimals, counted, number_text, unit_text
-from coliags_plugin.results.comparisons import LEVELS, RivalComparison, compare_with_rivals
+from coliags_plugin.results.comparisons import LEVELS, PairedTests, RivalComparison, compare_with_rivals, spread
 from coliags_plugin.results.paired import FEWEST_SCENES, RESAMPLES, smallest_p
-from coliags_plugin.results.spread import spread
 
 #: The reference where it is among the methods.
 PREFERRED = "coliags"
@@ -25,6 +25,15 @@ EXPLANATION = (
     "correlation, 1 where the reference is better on every scene."
 )
 _SMALLEST_PRINTED = 1e-4
+_TESTS = {
+    "smallest": "Smallest p",
+    "wilcoxon": "Wilcoxon p",
+    "wilcoxon_holm": "Holm",
+    "t_test": "t-test p",
+    "t_test_holm": "Holm",
+    "cohen_dz": "Cohen's d",
+    "rank_biserial": "Rank-biserial",
+}
 
 
 def choose_reference(study: Study, chosen: str | None) -> str:
@@ -68,16 +77,7 @@ def lead_table(part: Part, column: Column, compared: Sequence[RivalComparison], 
         Column("better", "Better on"),
     ]
     if any(row.tests for row in compared):
-        columns += [
-            Column("interval", "95 % interval", column.unit),
-            Column("smallest", "Smallest p"),
-            Column("wilcoxon", "Wilcoxon p"),
-            Column("wilcoxon_holm", "Holm"),
-            Column("t_test", "t-test p"),
-            Column("t_test_holm", "Holm"),
-            Column("cohen_dz", "Cohen's d"),
-            Column("rank_biserial", "Rank-biserial"),
-        ]
+        columns += [Column("interval", "95 % interval", column.unit), *starmap(Column, _TESTS.items())]
     decimals = column_decimals(column.unit, [row.lead for row in compared])
     untested = dict.fromkeys(
         [each.key for each in columns[4:]], TableCell(note=f"fewer than {FEWEST_SCENES} scenes in common")
@@ -91,7 +91,7 @@ def lead_table(part: Part, column: Column, compared: Sequence[RivalComparison], 
                 "scenes": len(row.scenes),
                 "lead": TableCell(note="no scene in common") if row.lead is None else _signed(row.lead, decimals),
                 "better": TableCell(f"{row.better_on} of {len(row.scenes)}", row.better_on),
-                **(untested if row.tests is None else _test_cells(row, decimals)),
+                **(untested if row.tests is None else _test_cells(row, row.tests, decimals)),
             }
             for row in compared
         ],
@@ -100,21 +100,17 @@ def lead_table(part: Part, column: Column, compared: Sequence[RivalComparison], 
     )
 
 
-def _test_cells(row: RivalComparison, decimals: int) -> dict[str, TableCell]:
-    if row.tests is None:
-        return {}
-    tests, scenes = row.tests, len(row.scenes)
+def _test_cells(row: RivalComparison, tests: PairedTests, decimals: int) -> dict[str, TableCell]:
+    scenes = len(row.scenes)
     low, high = (_signed(end, decimals) for end in tests.interval)
     undefined = TableCell(note="all differences are equal")
+    t_tests = {"t_test": tests.t_test, "t_test_holm": tests.t_test_holm}
     return {
         "interval": TableCell(f"{low.text} to {high.text}", low.value),
         "smallest": TableCell(smallest_p_text(scenes), smallest_p(scenes)),
         "wilcoxon": TableCell(p_text(tests.wilcoxon), tests.wilcoxon),
         "wilcoxon_holm": TableCell(p_text(tests.wilcoxon_holm), tests.wilcoxon_holm, stars=row.stars),
-        "t_test": undefined if tests.t_test is None else TableCell(p_text(tests.t_test), tests.t_test),
-        "t_test_holm": undefined
-        if tests.t_test_holm is None
-        else TableCell(p_text(tests.t_test_holm), tests.t_test_holm),
+        **{name: undefined if p is None else TableCell(p_text(p), p) for name, p in t_tests.items()},
         "cohen_dz": undefined if tests.cohen_dz is None else _signed(tests.cohen_dz, 2),
         "rank_biserial": _signed(tests.rank_biserial, 2),
     }

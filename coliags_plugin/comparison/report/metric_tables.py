@@ -10,8 +10,7 @@ from coliags_plugin.comparison.report.published import PublishedBenchmark
 from coliags_plugin.comparison.report.study import Part, Study
 from coliags_plugin.reporting.model import Column, Table, TableCell, ranked_cells
 from coliags_plugin.reporting.numbers import counted
-from coliags_plugin.results.comparisons import LEVELS, RivalComparison
-from coliags_plugin.results.spread import BySeed, common_scenes, spread
+from coliags_plugin.results.comparisons import LEVELS, BySeed, RivalComparison, common_scenes, spread
 
 #: Labels the rows.
 METHOD = Column("method", "Method", words=True)

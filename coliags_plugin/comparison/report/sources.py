@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from coliags_plugin.comparison.report.comparability import refuse_incomparable
-from coliags_plugin.comparison.report.comparison_folders import ResultSource, is_comparison, read_comparison, read_file
-from coliags_plugin.comparison.report.labels import disambiguate_labels
+from coliags_plugin.comparison.report.comparison_folders import is_comparison, read_comparison, read_file
 from coliags_plugin.comparison.report.study import MissingResult, Study, StudyRun
 from coliags_plugin.core.errors import InputError, did_you_mean
+from coliags_plugin.results.hashing import training_config
 from coliags_plugin.results.reading import RESULT_FILE
 from coliags_plugin.results.record import TRUTH_SUFFIX
 
@@ -21,21 +24,21 @@ def read_study(paths: Sequence[Path], protocol: str = "paper", methods: Sequence
     """
     if not paths:
         raise InputError("no results", "run folders, results files or the folder of a comparison", "Name at least one")
+    runs: list[StudyRun] = []
     missing: list[MissingResult] = []
-    sources: list[ResultSource] = []
     for path in paths:
         if not path.is_dir():
-            sources.append(read_file(path, path.stem))
+            runs.append(read_file(path, path.stem))
         elif is_comparison(path):
             results, failed = read_comparison(path, protocol)
-            sources += results
+            runs += results
             missing += failed
         else:
-            sources.append(_read_run(path, protocol))
-    _refuse_twice(sources)
-    if not sources:
+            runs.append(_read_run(path, protocol))
+    _refuse_twice(runs)
+    if not runs:
         raise _nothing_yet(paths, missing)
-    runs = disambiguate_labels([source.run for source in sources])
+    runs = disambiguate_labels(runs)
     if methods:
         runs, missing = _only(methods, runs, missing)
     refuse_incomparable(runs)
@@ -55,7 +58,7 @@ def _only(
     return kept, [one for one in missing if one.method in methods]
 
 
-def _read_run(folder: Path, protocol: str) -> ResultSource:
+def _read_run(folder: Path, protocol: str) -> StudyRun:
     evaluation = folder / "eval" / protocol
     file = evaluation / RESULT_FILE
     if file.is_file():
@@ -81,12 +84,12 @@ def _read_run(folder: Path, protocol: str) -> ResultSource:
     )
 
 
-def _refuse_twice(sources: Iterable[ResultSource]) -> None:
+def _refuse_twice(runs: Iterable[StudyRun]) -> None:
     files: set[Path] = set()
-    for source in sources:
-        file = source.file.resolve()
+    for one in runs:
+        file = one.file.resolve()
         if file in files:
-            raise InputError(f"{source.run.run or source.file} is given twice", "each result once")
+            raise InputError(f"{one.run or one.file} is given twice", "each result once")
         files.add(file)
 
 
@@ -100,3 +103,55 @@ def _nothing_yet(paths: Sequence[Path], missing: Sequence[MissingResult]) -> Inp
             "at least one",
         )
     return InputError(f"{where} holds no results", "at least one finished cell", "Wait, or run `coliags compare` again")
+
+
+def disambiguate_labels(runs: Sequence[StudyRun]) -> list[StudyRun]:
+    """The runs with labels under which every method has one config and one run per scene, split and seed.
+
+    Runs of one config that differ in seed share a label. Where a method has several configs or several runs of one
+    seed, its label is followed by what tells them apart: steps, the stamp of the run, or a hash of the config.
+    """
+    groups: dict[str, list[int]] = {}
+    for index, run in enumerate(runs):
+        groups.setdefault(run.method, []).append(index)
+    labelled = list(runs)
+    for own in groups.values():
+        group = [runs[index] for index in own]
+        if not _is_one_method(group):
+            for index, label in zip(own, _distinct_labels(group), strict=True):
+                labelled[index] = replace(labelled[index], method=label)
+    return labelled
+
+
+def _is_one_method(runs: Sequence[StudyRun]) -> bool:
+    """Whether runs of one label are one method: one config on each scene and split, and one run per seed."""
+    configs: dict[tuple[str, str], str] = {}
+    seeds = set()
+    for run in runs:
+        scene = run.result.scene
+        key, config = (scene.name, scene.split), _config_hash(run)
+        if configs.setdefault(key, config) != config or (key, run.result.seed) in seeds:
+            return False
+        seeds.add((key, run.result.seed))
+    return True
+
+
+def _distinct_labels(runs: Sequence[StudyRun]) -> list[str]:
+    one_scene = len({run.scene for run in runs}) == 1
+    steps, stamps = [f"{run.result.steps:,} steps" for run in runs], [run.stamp for run in runs]
+    configs = [f"config {_config_hash(run)[:8]}" for run in runs]
+    for suffixes in (steps, stamps, configs) if one_scene else (steps, configs, stamps):
+        labels = [f"{run.method} · {suffix}" for run, suffix in zip(runs, suffixes, strict=True)]
+        groups = ([run for run, own in zip(runs, labels, strict=True) if own == label] for label in set(labels))
+        if all(map(_is_one_method, groups)):
+            return labels
+    labels = [f"{run.method} · {run.stamp}" for run in runs]
+    return [
+        f"{label} ({labels[: index + 1].count(label)})" if labels.count(label) > 1 else label
+        for index, label in enumerate(labels)
+    ]
+
+
+def _config_hash(run: StudyRun) -> str:
+    text = json.dumps([training_config(run.result.config), run.result.steps], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -8,8 +8,8 @@ from functools import cached_property
 from pathlib import Path
 
 from coliags_plugin.core.anonymity import without_places
+from coliags_plugin.results.comparisons import BySeed
 from coliags_plugin.results.record import MAIN_SET, SEEN_SUFFIX, MetricRecord, ProtocolRecord, Result, SetRecord
-from coliags_plugin.results.spread import BySeed
 
 _SET_TITLES = {"test": "held out along the path", "rotation": "beyond the path"}
 
@@ -18,8 +18,9 @@ _SET_TITLES = {"test": "held out along the path", "rotation": "beyond the path"}
 class StudyRun:
     """One evaluated run."""
 
-    method: str  # name in the report, see labels.disambiguate_labels
+    method: str  # name in the report, see sources.disambiguate_labels
     result: Result
+    file: Path  # its results file
     stamp: str  # name of its run folder or results file
     run: Path | None = None  # folder with the images of this evaluation; None: only the results file is there
 

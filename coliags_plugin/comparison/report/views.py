@@ -12,8 +12,7 @@ import numpy as np
 
 from coliags_plugin.comparison.report.metric_columns import metric_title
 from coliags_plugin.comparison.report.study import Part, Study, StudyRun
-from coliags_plugin.comparison.report.view_pixels import ViewPixels, read_pixels, reduction
-from coliags_plugin.comparison.report.view_selection import ChosenFrame, choose_frames
+from coliags_plugin.comparison.report.view_pixels import ChosenFrame, ViewPixels, choose_frames, read_pixels, reduction
 from coliags_plugin.outputs.axis_ticks import linear_ticks, round_up
 from coliags_plugin.outputs.colormaps import colorize_depth, colorize_error, common_limits, hatch
 from coliags_plugin.outputs.image_files import encode_jpeg, encode_webp

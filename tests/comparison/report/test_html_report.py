@@ -15,7 +15,7 @@ import pytest
 
 from coliags_plugin.comparison.report.page import Choices
 from coliags_plugin.comparison.report.report import write_report
-from coliags_plugin.comparison.report.view_selection import evenly
+from coliags_plugin.comparison.report.view_pixels import evenly
 from coliags_plugin.comparison.report.views import error_limit
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.outputs.colormaps import color_table, hatch
