@@ -54,7 +54,7 @@ class ReconstructCommand:
         """Run the stages that are not done, and print what there is."""
         from coliags_plugin.api.reconstructing import reconstruct
         from coliags_plugin.config.assignments import parse_assignments
-        from coliags_plugin.pipeline.page import PAGE_FILE
+        from coliags_plugin.pipeline.stages import PAGE_FILE
 
         given: dict[str, Any] = {
             "sfm.camera.model": self.camera,

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import product
 
 from coliags_plugin._version import __version__
 from coliags_plugin.comparison.cells import CellKeys, ComparisonCell, Variant
@@ -44,12 +45,9 @@ def make_cells(request: Request, recorded: RecordedFingerprint | None = None) ->
     fingerprints = _Fingerprints(recorded or (lambda scene: None))
     cells: list[ComparisonCell] = []
     with _warnings_only():
-        for scene in request.scenes:
-            for split in request.splits or (None,):
-                for variant in request.variants:
-                    cells += _seeds(request, scene, split, variant, fingerprints, protocol.version)
-    order = {seed: number for number, seed in enumerate(request.seeds)}
-    return sorted(cells, key=lambda cell: order[cell.seed])
+        for scene, split, variant in product(request.scenes, request.splits or (None,), request.variants):
+            cells += _seeds(request, scene, split, variant, fingerprints, protocol.version)
+    return sorted(cells, key=lambda cell: request.seeds.index(cell.seed))
 
 
 def _seeds(

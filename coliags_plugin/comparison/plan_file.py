@@ -30,14 +30,17 @@ class PlannedScene(_PlanPart):
     package_version: str  # that computed the fingerprint
 
 
-class PlannedCell(_PlanPart):
-    """A cell of a plan."""
-
-    scene: str  # name of the scene; with that of the split where it is not the scene's own
+class _NamedCell(_PlanPart):
+    scene: str  # with the name of the split where it is not the scene's own
     method: str
     seed: int
     protocol: str
-    key: str
+    key: str  # of the result
+
+
+class PlannedCell(_NamedCell):
+    """A cell of a plan."""
+
     run: str = Field(pattern=f"^{RUNS}/")  # run folder, relative to the comparison's
     result: str = Field(pattern=f"^{RESULTS}/")  # results file, likewise; there once the cell is done
 
@@ -58,15 +61,10 @@ class ComparisonPlan(_PlanPart):
     cells: tuple[PlannedCell, ...] = ()  # in the order in which they were asked for
 
 
-class FailureRecord(_PlanPart):
+class FailureRecord(_NamedCell):
     """Why a cell failed."""
 
-    scene: str
-    method: str
-    seed: int
-    protocol: str
-    key: str
-    reason: str
+    reason: str  # one line
     attempts: int  # processes that tried
     log: str  # their messages, relative to the comparison's folder
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -34,14 +33,6 @@ IMAGES, MASK, RECORD = "images", "mask.png", "frames.json"
 FEWEST = 4
 
 
-@dataclass(frozen=True)
-class _Survey:
-    """What the first pass over a video finds."""
-
-    sharpness: list[float]
-    brightest: UInt8[np.ndarray, "H W"]
-
-
 def write_frames(
     source: FrameSource,
     folder: Path,
@@ -55,18 +46,18 @@ def write_frames(
     surroundings of the lens's image are found. Replaces the folder; returns a summary of one line.
     """
     given = None if mask is None else read_mask(mask)
-    survey = _survey(source, progress)
-    size = survey.brightest.shape
+    sharpnesses, brightest = _survey(source, progress)
+    size, total = brightest.shape, len(sharpnesses)
     if given is not None and given.shape != size:
         raise InputError(
             f"{mask} is {given.shape[1]} x {given.shape[0]}, the frames {size[1]} x {size[0]}",
             "a mask of the frames' size",
         )
-    used = lens_mask(survey.brightest) if given is None else given
-    chosen, dropped = sharp_frames(survey.sharpness, settings)
+    used = lens_mask(brightest) if given is None else given
+    chosen, dropped = sharp_frames(sharpnesses, settings)
     with atomic_folder(folder, overwrite=True) as scratch:
         kept = []
-        for index, name, image, moved in _moving(source, set(chosen), settings, progress, len(survey.sharpness)):
+        for index, name, image, moved in _moving(source, set(chosen), settings, progress, total):
             if not moved:
                 dropped[index] = RESTING
                 continue
@@ -76,7 +67,7 @@ def write_frames(
         why = ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items()))
         if len(kept) < FEWEST:
             raise InputError(
-                f"{len(kept)} of {len(survey.sharpness)} frames of {source.path} are of use: {why or 'it has no more'}",
+                f"{len(kept)} of {total} frames of {source.path} are of use: {why or 'it has no more'}",
                 f"at least {FEWEST}",
                 "Give a longer part of the video in which the camera moves, or keep more frames with --every, "
                 "--set frames.least_motion=0 or --set frames.least_sharpness=0",
@@ -87,22 +78,20 @@ def write_frames(
             scratch / RECORD,
             {
                 "source": source.path.name,
-                "frames": len(survey.sharpness),
-                "every": interval(len(survey.sharpness), settings),
+                "frames": total,
+                "every": interval(total, settings),
                 "size": [size[1], size[0]],
                 "masked": None if used is None else round(float(1.0 - used.mean()), 4),
-                "kept": [{"frame": index, "name": name, "sharpness": survey.sharpness[index]} for index, name in kept],
+                "kept": [{"frame": index, "name": name, "sharpness": sharpnesses[index]} for index, name in kept],
                 "dropped": [
-                    {"frame": index, "why": why, "sharpness": survey.sharpness[index]}
+                    {"frame": index, "why": why, "sharpness": sharpnesses[index]}
                     for index, why in sorted(dropped.items())
                     if why != THINNED
                 ],
             },
         )
     outside = "" if used is None else f"; {100.0 * (1.0 - used.mean()):.0f} % of the image masked"
-    return (
-        f"{len(kept)} of {len(survey.sharpness)} frames, {size[1]} x {size[0]} px{f'; {why}' if why else ''}{outside}"
-    )
+    return f"{len(kept)} of {total} frames, {size[1]} x {size[0]} px{f'; {why}' if why else ''}{outside}"
 
 
 def read_lens_mask(folder: Path) -> Bool[np.ndarray, "H W"] | None:
@@ -110,7 +99,7 @@ def read_lens_mask(folder: Path) -> Bool[np.ndarray, "H W"] | None:
     return read_mask(folder / MASK) if (folder / MASK).is_file() else None
 
 
-def _survey(source: FrameSource, progress: Progress | None) -> _Survey:
+def _survey(source: FrameSource, progress: Progress | None) -> tuple[list[float], UInt8[np.ndarray, "H W"]]:
     """Sharpness of all frames, and the brightest value of each pixel."""
     total = source.expected
     values: list[float] = []
@@ -123,7 +112,7 @@ def _survey(source: FrameSource, progress: Progress | None) -> _Survey:
             progress("look at frames", done, max(done, total))
     if brightest is None:
         raise InputError(f"no frames in {source.path}", "a video")
-    return _Survey(values, brightest)
+    return values, brightest
 
 
 def _moving(

@@ -21,6 +21,8 @@ log = logging.getLogger(__name__)
 
 #: Name of the file, and version of its schema.
 RECORD_FILE, _FORMAT = "reconstruction.json", 1
+#: Page that leads to everything a reconstruction has made.
+PAGE_FILE = "index.html"
 #: Lock that a process holds while it works in the folder.
 LOCK_FILE = ".lock"
 

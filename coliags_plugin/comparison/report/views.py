@@ -6,12 +6,13 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
 
 from coliags_plugin.comparison.report.metric_columns import metric_title
-from coliags_plugin.comparison.report.study import Part, Study, StudyRun
+from coliags_plugin.comparison.report.study import Study, StudyRun
 from coliags_plugin.comparison.report.view_pixels import ChosenFrame, ViewPixels, choose_frames, read_pixels, reduction
 from coliags_plugin.outputs.axis_ticks import linear_ticks, round_up
 from coliags_plugin.outputs.colormaps import colorize_depth, colorize_error, common_limits, hatch
@@ -64,16 +65,23 @@ def view_section(study: Study, reference: str, count: int) -> Section:
     if not views:
         text = "No images: only results files are here, without the run folders."
         return Section(title, [Paragraph(text)], screen_only=True)
+    expected = [depth for view in views for depth in view.expected if depth is not None]
     scales = _Scales(
         depth_error=_scale_end([view for view in views if view.of_depth]),
         rgb_error=_scale_end([view for view in views if not view.of_depth]),
         depth=_depth_limits(view.true_depth for view in views if view.true_depth is not None)
-        or _expected_limits([depth for view in views for depth in view.expected if depth is not None]),
+        or (common_limits(expected) if expected else None),
         unit=_depth_unit(study),
     )
     scenes = [
-        (scene, [(part.title, [_view(view, scales, reference) for view in same]) for part, same in groupby(own, _part)])
-        for scene, own in groupby(views, lambda view: view.frame.scene)
+        (
+            scene,
+            [
+                (part.title, [_view(view, scales, reference) for view in same])
+                for part, same in groupby(own, attrgetter("frame.part"))
+            ],
+        )
+        for scene, own in groupby(views, attrgetter("frame.scene"))
     ]
     values = {
         "bars": scales.bars,
@@ -90,10 +98,6 @@ def _runs_with_images(study: Study, frame: ChosenFrame) -> list[StudyRun]:
     """One run of every method: that of the first seed with images."""
     by_method = ([run for run in frame.part.runs(frame.scene, method) if run.run] for method in study.methods)
     return [runs[0] for runs in by_method if runs]
-
-
-def _part(view: ViewPixels) -> Part:
-    return view.frame.part
 
 
 def _explanation(study: Study, views: Sequence[ViewPixels], scales: _Scales, reference: str) -> str:
@@ -213,10 +217,6 @@ def _depth_limits(depths: Iterable[np.ndarray]) -> tuple[float, float] | None:
     ticks = linear_ticks(low, high)
     step = ticks[1] - ticks[0] if len(ticks) > 1 else round_up(high - low)
     return math.floor(low / step) * step, math.ceil(high / step) * step
-
-
-def _expected_limits(depths: Sequence[np.ndarray]) -> tuple[float, float] | None:
-    return common_limits(depths) if depths else None
 
 
 def _depth_unit(study: Study) -> str:
