@@ -23,11 +23,6 @@ from tests.scenes import write_wall
 
 
 @pytest.fixture(scope="module")
-def wall(tmp_path_factory):
-    return write_wall(tmp_path_factory.mktemp("data") / "wall")
-
-
-@pytest.fixture(scope="module")
 def bare(tmp_path_factory):
     """A scene without depth."""
     return write_wall(tmp_path_factory.mktemp("data") / "bare", depth=False)

@@ -18,11 +18,6 @@ from tests.scenes import write_wall
 
 
 @pytest.fixture(scope="module")
-def wall(tmp_path_factory):
-    return write_wall(tmp_path_factory.mktemp("data") / "wall")
-
-
-@pytest.fixture(scope="module")
 def cells(wall):
     return make_cells(make_request(["coliags", "3dgs", "scaffold-gs"], [wall], steps=100))
 

@@ -11,17 +11,11 @@ import coliags_plugin as cp
 from coliags_plugin.config.assignments import parse_assignments
 from coliags_plugin.engine.run_folder import RunFolder
 from tests.comparison.small import OFTEN, check_logs, hashes, start_compare, trainings, undisturbed_hashes, until
-from tests.scenes import write_wall
 
 pytestmark = pytest.mark.thorough
 
 STEPS = 120
 METHODS = ("coliags", "scaffold-gs-depth")
-
-
-@pytest.fixture
-def wall(tmp_path):
-    return write_wall(tmp_path / "wall")
 
 
 @pytest.fixture

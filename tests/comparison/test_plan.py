@@ -14,11 +14,6 @@ from coliags_plugin.phantom.settings import PhantomSettings
 from tests.scenes import write_wall
 
 
-@pytest.fixture(scope="module")
-def wall(tmp_path_factory):
-    return write_wall(tmp_path_factory.mktemp("data") / "wall")
-
-
 def cells(wall, methods=("coliags",), *, seeds=1, protocol="paper", splits=(), steps=5, overrides=()):
     return make_cells(make_request(methods, [wall], None, seeds, protocol, splits, steps, overrides))
 

@@ -20,23 +20,20 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.engine.run_folder import RunFolder
 from tests.commands import refused
 from tests.comparison.small import OFTEN, TINY, check_logs, hashes, start_compare, trainings, undisturbed_hashes, until
-from tests.scenes import write_wall
 
 STEPS = 300
 METHODS = ("coliags", "scaffold-gs-depth", "scaffold-gs", "scaffold-gs-distance")
 
 
-def test_ray_that_is_not_installed_is_told_how_to_get(tmp_path, capsys, monkeypatch):
+def test_ray_that_is_not_installed_is_told_how_to_get(wall, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    wall = write_wall(tmp_path / "wall")
     told = refused(capsys, "compare", "coliags", "--scenes", wall, "--output", tmp_path / "x", "--executor", "ray")
     assert 'pip install "coliags_plugin[sweep]"' in told and not (tmp_path / "x").exists()
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "nowhere"])
-def test_a_cluster_that_cannot_be_reached(tmp_path, capsys, address):
+def test_a_cluster_that_cannot_be_reached(wall, tmp_path, capsys, address):
     pytest.importorskip("ray")
-    wall = write_wall(tmp_path / "wall")
     words = ("compare", "coliags", "--scenes", wall, "--output", tmp_path / "x", "--executor", "ray")
     told = refused(capsys, *words, "--ray-address", address)
     assert f"no Ray cluster at {address}" in told and "ray start --head" in told
@@ -66,11 +63,6 @@ def cluster():
     yield made, nodes
     ray.shutdown()
     made.shutdown()
-
-
-@pytest.fixture
-def wall(tmp_path):
-    return write_wall(tmp_path / "wall")
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Benchmarks: the shipped ones are those of the publications, and a file with a fault is refused by line and key."""
+"""Benchmarks and ablations: the shipped ones are the publications'; faults of files are told by line and key."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from coliags_plugin.comparison.ablations import ABLATIONS, load_ablation
 from coliags_plugin.comparison.benchmarks import load_benchmark
 from coliags_plugin.comparison.named_files import descriptions, shipped
 from coliags_plugin.comparison.scenes import find_scenes
@@ -41,15 +42,6 @@ def test_the_ten_of_endogslam_are_of_c3vd():
     assert (ten.split, ten.format) == ("endogslam", "c3vd-endogslam")
 
 
-@pytest.fixture
-def written(tmp_path):
-    def write(text, name="mine.yaml"):
-        (tmp_path / name).write_text(text)
-        return str(tmp_path / name)
-
-    return write
-
-
 def test_options_become_changes_of_the_data_manager(written):
     name = written(
         "description: mine\nsplit: block\noptions: {block: [0.2, 0.4], width: 84, height: 67}\n"
@@ -65,28 +57,85 @@ def test_options_become_changes_of_the_data_manager(written):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("load", "text", "told"),
     [
-        ("scenes: {a: {}}", "mine.yaml:1: description: is missing"),
-        ("description: x", "mine.yaml:1: scenes: is missing"),
-        ("description: x\nscenes: {}", "mine.yaml:2: scenes"),
-        ("description: x\nscenes:\n  a: {phantm: {seed: 0}}", r"mine.yaml:3: scenes.a.phantm: unknown key 'phantm'"),
-        ("description: x\nscenes:\n  a:\n    phantom: {seeds: 0}", "mine.yaml:4: scenes.a.phantom: .*'seeds'"),
-        ("description: x\nscenes:\n  a: {phantom: {light: sun}}", "scenes.a.phantom: phantom setting light"),
-        ("description: x\nscenes: {../a: {}}", r"scene name '\.\./a'"),
-        ("description: x\nformat: c3dv\nscenes: {a: {}}", "mine.yaml:2: format: .*Did you mean 'c3vd'"),
-        ("description: x\nscenes: [a]", "mine.yaml:2: scenes"),
-        ("description: x\nscenes: {a: {}}\nscenes: {a: {}}", "key 'scenes' is there twice"),
+        (load_benchmark, "", "mine.yaml:1: scenes: is missing"),
+        (load_benchmark, "scenes: {}", "mine.yaml:2: scenes"),
+        (load_benchmark, "scenes:\n  a: {phantm: {seed: 0}}", r"mine.yaml:3: scenes.a.phantm: unknown key 'phantm'"),
+        (load_benchmark, "scenes:\n  a:\n    phantom: {seeds: 0}", "mine.yaml:4: scenes.a.phantom: .*'seeds'"),
+        (load_benchmark, "scenes:\n  a: {phantom: {light: sun}}", "scenes.a.phantom: phantom setting light"),
+        (load_benchmark, "scenes: {../a: {}}", r"scene name '\.\./a'"),
+        (load_benchmark, "format: c3dv\nscenes: {a: {}}", "mine.yaml:2: format: .*Did you mean 'c3vd'"),
+        (load_benchmark, "scenes: [a]", "mine.yaml:2: scenes"),
+        (load_benchmark, "scenes: {a: {}}\nscenes: {a: {}}", "key 'scenes' is there twice"),
+        (load_ablation, "variants: {a: [field.features=8]}", "variant 'a' names no method, and there is no base"),
+        (load_ablation, "base: coliags\nvariants: {}", "mine.yaml:3: variants"),
+        (load_ablation, "base: coliags\nvariants: {a: {sets: []}}", "unknown key 'sets'.*Did you mean 'set'"),
+        (load_ablation, "base: coliags\nvariants: {a: 3}", "mine.yaml:3: variants.a"),
     ],
 )
-def test_faults_are_named_by_line_and_key(written, text, told):
+def test_faults_are_named_by_line_and_key(written, load, text, told):
     with pytest.raises(InputError, match=told):
-        load_benchmark(written(text))
+        load(written(f"description: x\n{text}"))
+
+
+def test_a_description_is_needed(written):
+    with pytest.raises(InputError, match=r"mine.yaml:1: description: is missing"):
+        load_benchmark(written("scenes: {a: {}}"))
 
 
 def test_an_unknown_name_says_which_was_meant():
     with pytest.raises(InputError, match=r"no benchmark 'c3dv'.*Did you mean 'c3vd'"):
         load_benchmark("c3dv")
+    with pytest.raises(InputError, match=r"no ablation 'paper-row'.*Did you mean 'paper-rows'"):
+        load_ablation("paper-row")
+
+
+# Ablations
+
+
+@pytest.mark.parametrize("name", shipped(ABLATIONS))
+def test_every_shipped_ablation_is_valid_and_described(name):
+    assert descriptions(ABLATIONS)[name]
+    for variant in load_ablation(name):
+        assert load_method(variant.method, variant.overrides).config
+
+
+def heads(variant):
+    field = load_method(variant.method, variant.overrides).config.field.settings
+    return field.geometry_head, field.appearance_head
+
+
+def test_the_papers_rows_take_away_what_their_names_lack():
+    for variant in load_ablation("paper-rows"):
+        parts = set(variant.name.split("-"))
+        geometry, appearance = heads(variant)
+        assert (geometry.name == "imve") == ("imve" in parts)
+        assert (appearance.name == "imia") == ("imia" in parts)
+        losses = load_method(variant.method, variant.overrides).config.losses
+        assert ("depth" in losses) == ("depth" in parts)
+    assert len(load_ablation("paper-rows")) == 5
+
+
+def test_the_sizes_of_embeddings_are_in_their_names():
+    for variant in load_ablation("embedding-sizes"):
+        geometry, appearance = heads(variant)
+        assert variant.name == f"{geometry.settings.frequencies}-{appearance.settings.frequencies}"
+
+
+def test_short_forms(written, tmp_path):
+    name = written(
+        "description: x\nbase: coliags\nvariants:\n  whole:\n  rival: scaffold-gs\n  local: deeper.yaml\n"
+        "  small: [field.features=8, field.children=4]\n  both: {method: 3dgs, set: [field.sh_degree=0]}\n"
+    )
+    variants = {variant.name: (variant.method, variant.overrides) for variant in load_ablation(name)}
+    assert variants == {
+        "whole": ("coliags", ()),
+        "rival": ("scaffold-gs", ()),
+        "local": (str(tmp_path / "deeper.yaml"), ()),
+        "small": ("coliags", ("field.features=8", "field.children=4")),
+        "both": ("3dgs", ("field.sh_degree=0",)),
+    }
 
 
 # Scenes

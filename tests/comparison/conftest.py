@@ -1,0 +1,23 @@
+"""Fixtures of the tests of comparisons."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.scenes import write_wall
+
+
+@pytest.fixture(scope="module")
+def wall(tmp_path_factory):
+    return write_wall(tmp_path_factory.mktemp("data") / "wall")
+
+
+@pytest.fixture
+def written(tmp_path):
+    """Path of a YAML file with a text."""
+
+    def write(text):
+        (tmp_path / "mine.yaml").write_text(text)
+        return str(tmp_path / "mine.yaml")
+
+    return write
