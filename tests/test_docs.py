@@ -19,10 +19,9 @@ import yaml
 
 from coliags_plugin import cli
 from coliags_plugin.checks.method.check import CHECKS
-from coliags_plugin.cli.check import CheckCommand
-from coliags_plugin.cli.config import ConfigCommand
-from coliags_plugin.cli.phantom import PhantomCommand
-from coliags_plugin.cli.train import TrainCommand
+from coliags_plugin.cli.making_runs import TrainCommand
+from coliags_plugin.cli.methods import CheckCommand, ConfigCommand
+from coliags_plugin.cli.scenes import PhantomCommand
 from coliags_plugin.config.method_config import MethodConfig, OptimizerSettings, ScheduleSettings, load_method
 from coliags_plugin.config.registry import REGISTRIES, datamanagers
 from coliags_plugin.core.render_output import OUTPUTS

@@ -32,12 +32,9 @@ class CheckSkippedError(Exception):
 
 
 def line(result: CheckResult, width: int, encoding: str) -> str:
-    """One result: tick, cross or dash, name, seconds and detail.
+    """One result: tick, cross or dash, name padded to ``width``, seconds and detail.
 
-    Args:
-        result: What to write.
-        width: Of the names.
-        encoding: Of where it is printed; words stand for ticks, and escapes for characters, that it does not have.
+    Words stand for ticks, and escapes for characters, that the encoding of where it is printed does not have.
     """
     try:
         "".join(_TICKS.values()).encode(encoding)

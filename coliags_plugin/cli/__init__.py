@@ -1,7 +1,8 @@
-"""The ``coliags`` command line, one module per subcommand; heavy libraries are imported when a command runs."""
+"""The ``coliags`` command line, its commands by what they are about; heavy libraries are imported when one runs."""
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from collections.abc import Sequence
@@ -9,30 +10,18 @@ from typing import Annotated
 
 import tyro
 
-from coliags_plugin.cli.ablate import AblateCommand
-from coliags_plugin.cli.arguments import renamed_argument
-from coliags_plugin.cli.check import CheckCommand
-from coliags_plugin.cli.compare import CompareCommand
-from coliags_plugin.cli.config import ConfigCommand
-from coliags_plugin.cli.coverage import CoverageCommand
-from coliags_plugin.cli.data import DataCommand
+from coliags_plugin.cli.arguments import Runnable, renamed_argument
+from coliags_plugin.cli.comparing import AblateCommand, CompareCommand
 from coliags_plugin.cli.depth import DepthCommand
-from coliags_plugin.cli.doctor import DoctorCommand
-from coliags_plugin.cli.evaluate import EvaluateCommand
-from coliags_plugin.cli.export import ExportCommand
-from coliags_plugin.cli.import_splats import ImportCommand
-from coliags_plugin.cli.list import ListCommand
-from coliags_plugin.cli.mesh import MeshCommand
-from coliags_plugin.cli.phantom import PhantomCommand
+from coliags_plugin.cli.installation import DoctorCommand, WeightsCommand
+from coliags_plugin.cli.making_runs import EvaluateCommand, ImportCommand, TrainCommand
+from coliags_plugin.cli.methods import CheckCommand, ConfigCommand, ListCommand
 from coliags_plugin.cli.poses import PosesCommand
 from coliags_plugin.cli.reconstruct import ReconstructCommand
-from coliags_plugin.cli.render import RenderCommand
-from coliags_plugin.cli.report import ReportCommand
-from coliags_plugin.cli.results import ResultsCommand
-from coliags_plugin.cli.run import run_command
-from coliags_plugin.cli.train import TrainCommand
-from coliags_plugin.cli.view import ViewCommand
-from coliags_plugin.cli.weights import WeightsCommand
+from coliags_plugin.cli.results import ReportCommand, ResultsCommand
+from coliags_plugin.cli.run_outputs import CoverageCommand, ExportCommand, MeshCommand, RenderCommand, ViewCommand
+from coliags_plugin.cli.scenes import DataCommand, PhantomCommand
+from coliags_plugin.core.errors import ReportedError
 
 Command = (
     Annotated[ReconstructCommand, tyro.conf.subcommand("reconstruct")]
@@ -82,3 +71,28 @@ def main(argv: Sequence[str] | None = None) -> None:
         sys.stderr.close()
         sys.exit(1)
     sys.exit(run_command(command))
+
+
+def run_command(command: Runnable) -> int:
+    """Execute a command; reported errors become one line on stderr and an exit status."""
+    from rich.console import Console
+    from rich.logging import RichHandler
+
+    console = Console(file=sys.stderr)
+    logging.basicConfig(
+        level=logging.INFO,
+        format="%(message)s",
+        handlers=[RichHandler(console=console, show_time=False, show_path=False, show_level=False, highlighter=None)],
+    )
+    try:
+        command.run()
+    except ReportedError as error:
+        print(f"coliags: {error}", file=sys.stderr)
+        return error.exit_status
+    except KeyboardInterrupt:
+        print("coliags: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 1
+    return 0

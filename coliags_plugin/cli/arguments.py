@@ -1,15 +1,21 @@
-"""Argument types that several commands share, each with its help, and parsers of their texts."""
+"""Arguments that several commands share, each with its help; their parsing, and checks of output folders."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, Protocol, TypeVar
 
 import tyro
 
 from coliags_plugin.core.errors import InputError
+from coliags_plugin.core.files import refuse_overlap
+
+if TYPE_CHECKING:
+    from coliags_plugin.core.settings import Settings
+
+S = TypeVar("S", bound="Settings")
 
 _PATH = tyro.conf.arg(metavar="PATH")
 
@@ -47,6 +53,23 @@ AnonymousRun = Annotated[
 AsJson = Annotated[bool, tyro.conf.arg(help="Print the summary as JSON.")]
 
 
+class Runnable(Protocol):
+    """Protocol of a parsed command."""
+
+    def run(self) -> None:
+        """Execute the command."""
+
+
+class CommandGroup:
+    """A command of subcommands, one of which is executed."""
+
+    subcommand: Runnable
+
+    def run(self) -> None:
+        """Execute the subcommand."""
+        self.subcommand.run()
+
+
 def renamed_argument(argv: Sequence[str]) -> str:
     """What stands today for an argument of an older release among some that could not be parsed; empty without one."""
     options = {word.partition("=")[0] for word in argv}
@@ -62,11 +85,7 @@ def renamed_argument(argv: Sequence[str]) -> str:
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """``WxH`` -> (width, height), pixels.
-
-    Raises:
-        InputError: The text has another form.
-    """
+    """``WxH`` -> (width, height), pixels."""
     width, _, height = text.lower().partition("x")
     if not (width.isdecimal() and height.isdecimal()):
         raise InputError(f"--size {text}", "WIDTHxHEIGHT in pixels, for instance 338x270")
@@ -74,13 +93,24 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def parse_vector(option: str, text: str) -> tuple[float, float, float]:
-    """``X,Y,Z`` -> three numbers.
-
-    Raises:
-        InputError: The text has another form.
-    """
+    """``X,Y,Z`` -> three numbers."""
     try:
         x, y, z = (float(part) for part in text.split(","))
     except ValueError as error:
         raise InputError(f"{option} {text}", "three numbers X,Y,Z") from error
     return x, y, z
+
+
+def settings_among(kind: type[S], assignments: Sequence[str], prefix: str) -> tuple[S, list[str]]:
+    """Settings from the ``--set`` assignments with a key prefix, and the others, which are the data manager's."""
+    from coliags_plugin.config.assignments import settings_of
+
+    own = [assignment.removeprefix(prefix) for assignment in assignments if assignment.startswith(prefix)]
+    return settings_of(kind, own, prefix), [item for item in assignments if not item.startswith(prefix)]
+
+
+def refuse_output(output: Path, source: Path, overwrite: bool) -> None:
+    """Refuse, before work starts, an output that is, contains or is in the input, or is there without ``overwrite``."""
+    refuse_overlap(output, source)
+    if not overwrite and output.exists() and (not output.is_dir() or any(output.iterdir())):
+        raise InputError(f"{output} already exists", "a new or empty folder", "Choose another, or pass --overwrite")

@@ -1,4 +1,4 @@
-"""``coliags results``: show and export results files."""
+"""Commands on results of evaluations: ``coliags report``, ``coliags results``."""
 
 from __future__ import annotations
 
@@ -8,8 +8,68 @@ from typing import Annotated, Literal
 
 import tyro
 
-from coliags_plugin.cli.arguments import AsJson, Output
+from coliags_plugin.cli import arguments
 from coliags_plugin.cli.summaries import print_summary
+
+
+@dataclass(frozen=True)
+class ReportCommand:
+    """Compare evaluated methods: tables with statistics, held-out views, errors, curves and costs."""
+
+    paths: tyro.conf.Positional[tuple[Path, ...]]
+    """Evaluated run folders, results files (`eval/PROTOCOL/result.json`), or the folder of a `coliags compare`."""
+    output: arguments.OptionalOutput = None
+    """File to write; with several formats, its suffix is replaced by that of each; default: report.html, .md, ..."""
+    methods: arguments.OptionalText = None
+    """Names of methods to show, in this order, separated by commas; default: all."""
+    columns: arguments.OptionalText = None
+    """Metrics to show, separated by commas, or `all`; default: psnr,ssim,lpips,depth_mse,depth_mse_inner,
+    depth_median_error."""
+    reference: arguments.OptionalText = None
+    """Method that the others are compared with; default: coliags, or the best where it is not there."""
+    protocol: str = "paper"
+    """Evaluation protocol to read; NAME-truth: evaluations by `coliags eval RUN --truth SCENE`."""
+    frames: int = 4
+    """Held-out frames to show per scene and test set; the worst ones are added."""
+    title: arguments.OptionalText = None
+    """Heading; default: methods and scenes."""
+    note: arguments.OptionalText = None
+    """A remark shown at the top."""
+    scene: arguments.OptionalPath = None
+    """Run folder whose scene the HTML page lets its reader fly through, offline; needs the extra `viewer`."""
+    format: Annotated[
+        tuple[Literal["html", "markdown", "latex", "csv", "json", "all"], ...], tyro.conf.UseAppendAction
+    ] = ()
+    """What to write, repeatable: html (default), markdown, latex (booktabs), csv (every frame), json (tables), all."""
+    anonymous: bool = False
+    """Leave out absolute paths that results hold (docs/security.md 4)."""
+    json: arguments.AsJson = False
+
+    def run(self) -> None:
+        """Write the report and print the paths."""
+        from coliags_plugin.api.reports import report
+        from coliags_plugin.comparison.report.report import FORMATS
+
+        named = tuple(name for name in self.format if name != "all") or FORMATS[:1]
+        files = report(
+            self.paths,
+            self.output,
+            formats=FORMATS if "all" in self.format else named,
+            methods=_listed(self.methods),
+            columns=_listed(self.columns),
+            reference=self.reference,
+            protocol=self.protocol,
+            frames=self.frames,
+            title=self.title,
+            note=self.note,
+            scene=self.scene,
+            anonymous=self.anonymous,
+        )
+        print_summary(written=[file.resolve() for file in files], as_json=self.json)
+
+
+def _listed(text: str | None) -> tuple[str, ...]:
+    return tuple(filter(None, (part.strip() for part in (text or "").split(","))))
 
 
 @dataclass(frozen=True)
@@ -18,20 +78,22 @@ class ResultsShowCommand:
 
     path: tyro.conf.Positional[Path]
     """Results file, or a run folder, or a folder to search for results files."""
-    json: AsJson = False
+    json: arguments.AsJson = False
 
     def run(self) -> None:
         """Print a table for each."""
+        from coliags_plugin.reporting.model import Block, Fact, FactList
+        from coliags_plugin.reporting.terminal import terminal_text
         from coliags_plugin.results.reading import find_results
         from coliags_plugin.results.summaries import facts, means_summary
 
-        results = find_results([self.path])
-        texts = [
-            "\n".join([str(result), *(f"{name:<16}{text}" for name, text in facts(result).items())])
-            for result in results
-        ]
-        summaries = {"results": [{**means_summary(result), "facts": facts(result)} for result in results]}
-        print_summary("\n".join(texts), summaries, as_json=self.json)
+        blocks: list[Block] = []
+        summaries = []
+        for result in find_results([self.path]):
+            told = facts(result)
+            blocks += [result.table(), FactList([Fact(name, text) for name, text in told.items()])]
+            summaries.append({**means_summary(result), "facts": told})
+        print_summary(terminal_text(blocks), {"results": summaries}, as_json=self.json)
 
 
 @dataclass(frozen=True)
@@ -40,11 +102,11 @@ class ResultsExportCommand:
 
     paths: tyro.conf.Positional[tuple[Path, ...]]
     """Results files, run folders, or folders to search for results files."""
-    output: Output
+    output: arguments.Output
     """File to write; for nerfbaselines a folder."""
     format: Literal["csv", "parquet", "nerfbaselines"] = "csv"
     """Form; parquet needs the extra `tables`."""
-    json: AsJson = False
+    json: arguments.AsJson = False
 
     def run(self) -> None:
         """Write the files."""
@@ -74,12 +136,8 @@ Subcommand = (
 
 
 @dataclass(frozen=True)
-class ResultsCommand:
+class ResultsCommand(arguments.CommandGroup):
     """Show results files, and export them as tables."""
 
     subcommand: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Subcommand]]
     """Subcommand."""
-
-    def run(self) -> None:
-        """Execute the subcommand."""
-        self.subcommand.run()

@@ -17,14 +17,9 @@ def print_summary(
     then: Sequence[str] = (),
     as_json: bool = False,
 ) -> None:
-    """Print a summary for a person or, with ``--json``, for a script.
+    """Print a summary for a person or, with ``--json``, one JSON object for a script: facts, ``written`` and ``next``.
 
-    Args:
-        text: The summary as text; empty without one.
-        facts: The same as JSON values; None: the text.
-        written: Files and folders that were written.
-        then: Commands to type next.
-        as_json: Print one JSON object: the facts, ``written`` and ``next``.
+    ``facts`` say the same as ``text`` in JSON values; ``then`` are commands to type next.
     """
     if as_json:
         told = ({"summary": text} if text else {}) if facts is None else facts
@@ -56,9 +51,7 @@ def train_command(scene: Path, method: str = "coliags", assignments: Sequence[st
 def depth_commands(scene: Path, assignments: Sequence[str] = ()) -> list[str]:
     """The commands that estimate the depth of a scene with poses and points, and train on it.
 
-    Args:
-        scene: The scene.
-        assignments: Options of its data manager, ``datamanager.KEY=VALUE``.
+    ``assignments`` are options of its data manager, ``datamanager.KEY=VALUE``.
     """
     with_depth = scene.with_name(f"{scene.name}-depth")
     options = _set([assignment.removeprefix("datamanager.") for assignment in assignments])

@@ -5,18 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 
-from coliags_plugin.reporting.model import (
-    Block,
-    Bullets,
-    Column,
-    FactList,
-    Folded,
-    Page,
-    Paragraph,
-    Section,
-    Table,
-    TableCell,
-)
+from coliags_plugin.reporting import model
 from coliags_plugin.reporting.numbers import sentence, unit_text
 
 _HEAD = "% Needs \\usepackage{booktabs}, and \\usepackage[T1]{fontenc} for names with underscores."
@@ -49,33 +38,33 @@ _MINUS = re.compile(r"(?<![\w-])-(?=[\d.])")
 _SPECIAL = re.compile("|".join(map(re.escape, _ESCAPES)))
 
 
-def latex_text(page: Page) -> str:
+def latex_text(page: model.Page) -> str:
     """All tables in the order of the page, with the text between them as comments."""
     parts = [_HEAD, _comment(page.title)]
     parts += [_comment(page.note)] if page.note else []
-    parts += [*_blocks([FactList([fact for fact in page.facts if not fact.wide])])]
+    parts += [*_blocks([model.FactList([fact for fact in page.facts if not fact.wide])])]
     parts += [_comment(caution) for caution in page.cautions]
     for section in page.text_sections:
         parts += ["", _comment(f"==== {section.title}"), *_blocks(section.blocks)]
     return "\n".join(parts) + "\n"
 
 
-def _blocks(blocks: Sequence[Block]) -> Iterator[str]:
+def _blocks(blocks: Sequence[model.Block]) -> Iterator[str]:
     for block in blocks:
-        if isinstance(block, Paragraph):
+        if isinstance(block, model.Paragraph):
             yield _comment(block.text)
-        elif isinstance(block, Bullets):
+        elif isinstance(block, model.Bullets):
             yield from (_comment(": ".join(filter(None, (item.lead, item.text)))) for item in block.items)
-        elif isinstance(block, FactList):
+        elif isinstance(block, model.FactList):
             yield from (_comment(f"{fact.name}: {fact.text}") for fact in block.facts if fact.text)
-        elif isinstance(block, (Section, Folded)):
+        elif isinstance(block, (model.Section, model.Folded)):
             yield _comment(f"-- {block.title}")
             yield from _blocks(block.blocks)
-        elif isinstance(block, Table):
+        elif isinstance(block, model.Table):
             yield latex_table(block)
 
 
-def latex_table(table: Table) -> str:
+def latex_table(table: model.Table) -> str:
     """A ``table`` environment with caption, label, footnotes and notes: the columns that are shown."""
     table = table.only_shown()
     marks = {text: note.mark for text, note in table.footnotes.items()}
@@ -100,19 +89,19 @@ def latex_table(table: Table) -> str:
     return "\n".join(lines)
 
 
-def _rows(rows: Sequence[Sequence[TableCell]], marks: dict[str, str]) -> Iterator[str]:
+def _rows(rows: Sequence[Sequence[model.TableCell]], marks: dict[str, str]) -> Iterator[str]:
     for index, row in enumerate(rows):
         if row[0].published and index and not rows[index - 1][0].published:
             yield r"\midrule"
         yield _line([escaped(row[0].text), *(_cell(cell, marks) for cell in row[1:])])
 
 
-def _heading(column: Column) -> str:
+def _heading(column: model.Column) -> str:
     unit = f"[{unit_text(column.unit)}]" if unit_text(column.unit) else ""
     return escaped(" ".join(filter(None, (column.name, column.arrow, unit))))
 
 
-def _cell(cell: TableCell, marks: dict[str, str]) -> str:
+def _cell(cell: model.TableCell, marks: dict[str, str]) -> str:
     mark = f"$^{{{marks[cell.note]}}}$" if cell.note else ""
     if not cell.text:
         return f"--{mark}"

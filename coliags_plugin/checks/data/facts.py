@@ -121,9 +121,6 @@ def moving_step(steps: Float[np.ndarray, "N"]) -> float:
     """Typical step of a camera while it moves: half of the path is made of shorter steps.
 
     Pauses, which have no length, do not count, nor do jumps: the longest tenth of the steps is left out.
-
-    Args:
-        steps: Distances between successive cameras, at least one.
     """
     jumps = max(len(steps) // 10, min(2, len(steps) // 3))
     ordered = np.sort(steps)[: len(steps) - jumps]

@@ -41,12 +41,7 @@ class Finding:
 
 
 def depth_findings(depth: DepthFacts | None, metric: bool) -> Iterator[Finding]:
-    """Implausible depth: mostly unknown, constant, or in another unit.
-
-    Args:
-        depth: Its statistics.
-        metric: Whether lengths are stated to be in mm; False where their unit is unknown.
-    """
+    """Implausible depth: mostly unknown, constant, or in another unit than mm, which ``metric`` says it is in."""
     if depth is None:
         return
     if depth.invalid_share > 0.5:
@@ -213,25 +208,18 @@ def calibration_findings(frames: Sequence[Frame]) -> Iterator[Finding]:
         seen.add(key)
         off = max(abs(camera.cx / camera.width - 0.5), abs(camera.cy / camera.height - 0.5))
         if off > 0.2:
-            yield Finding(
-                "the principal point is far from the middle",
-                f"{frame.name}: ({camera.cx:.4g}, {camera.cy:.4g}) of {camera.width} x {camera.height} px",
-                "Check that the intrinsics are for images of this size",
-            )
+            numbers = f"({camera.cx:.4g}, {camera.cy:.4g}) of {camera.width} x {camera.height} px"
+            advice = "Check that the intrinsics are for images of this size"
+            yield Finding("the principal point is far from the middle", f"{frame.name}: {numbers}", advice)
         ratio = camera.fx / camera.fy
         if not 1 / 1.15 < ratio < 1.15:
-            yield Finding(
-                "pixels are far from square",
-                f"{frame.name}: fx / fy = {ratio:.3g}",
-                "Check the intrinsics, or the working width and height",
-            )
+            advice = "Check the intrinsics, or the working width and height"
+            yield Finding("pixels are far from square", f"{frame.name}: fx / fy = {ratio:.3g}", advice)
         angle = 2.0 * math.degrees(math.atan(0.5 * camera.width / camera.fx))
         if not 25.0 < angle < 160.0:
-            yield Finding(
-                "the field of view is implausible for an endoscope",
-                f"{frame.name}: {angle:.3g} degrees across",
-                "Check the focal length and the image size it is for",
-            )
+            what = "the field of view is implausible for an endoscope"
+            advice = "Check the focal length and the image size it is for"
+            yield Finding(what, f"{frame.name}: {angle:.3g} degrees across", advice)
 
 
 def image_findings(images: ImageFacts) -> Iterator[Finding]:

@@ -15,44 +15,30 @@ from coliags_plugin.checks.data.reprojection import warp_image
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.outputs.charts import Series
 from coliags_plugin.outputs.colormaps import colorize_depth, colorize_rgb_error
-from coliags_plugin.reporting.model import (
-    Bullet,
-    Bullets,
-    Chart,
-    EncodedImage,
-    Fact,
-    Figures,
-    Image,
-    Page,
-    Paragraph,
-    Section,
-    Table,
-    record,
-    simple_table,
-)
+from coliags_plugin.reporting import model
 from coliags_plugin.reporting.numbers import counted, sentence
 
 #: Number of pairs shown.
 _SHOWN = 3
 
 
-def check_page(check: SceneCheck) -> Page:
+def check_page(check: SceneCheck) -> model.Page:
     """Everything that the checks found; in the terminal without pictures, trajectory and origin of the data."""
     name = check.scene.name
     sections = [
-        Section("Suspect", _bullets(check.findings)),
-        Section("Undecided", _bullets(check.undecided)),
-        Section("Agreement", _agreement(check)),
-        Section("Reprojected frames", [_pair_images(*pair) for pair in _shown(check.pairs)], screen_only=True),
-        Section("Trajectory", [_trajectory(check.scene.video)], screen_only=True),
-        Section("Data", [record("Origin of the data", check.scene.provenance)], screen_only=True),
+        model.Section("Suspect", _bullets(check.findings)),
+        model.Section("Undecided", _bullets(check.undecided)),
+        model.Section("Agreement", _agreement(check)),
+        model.Section("Reprojected frames", [_pair_images(*pair) for pair in _shown(check.pairs)], screen_only=True),
+        model.Section("Trajectory", [_trajectory(check.scene.video)], screen_only=True),
+        model.Section("Data", [model.record("Origin of the data", check.scene.provenance)], screen_only=True),
     ]
-    return Page(f"{name}: data check", sections, list(_facts(check)), heading=f"{name}: {verdict(check)}")
+    return model.Page(f"{name}: data check", sections, list(_facts(check)), heading=f"{name}: {verdict(check)}")
 
 
-def _bullets(findings: Sequence[Finding]) -> list[Bullets]:
-    items = [Bullet(" ".join(map(sentence, filter(None, (f.evidence, f.do)))), f.what) for f in findings]
-    return [Bullets(items, warning=True)] if items else []
+def _bullets(findings: Sequence[Finding]) -> list[model.Bullets]:
+    items = [model.Bullet(" ".join(map(sentence, filter(None, (f.evidence, f.do)))), f.what) for f in findings]
+    return [model.Bullets(items, warning=True)] if items else []
 
 
 def verdict(check: SceneCheck) -> str:
@@ -60,41 +46,41 @@ def verdict(check: SceneCheck) -> str:
     return counted(len(check.findings), "suspect finding") if check.findings else "nothing suspect"
 
 
-def _facts(check: SceneCheck) -> Iterator[Fact]:
+def _facts(check: SceneCheck) -> Iterator[model.Fact]:
     scene = check.scene
     data = scene.provenance
     camera = scene.train[0].camera
     counts = {"train": len(scene.train), **{name: len(frames) for name, frames in scene.test_sets.items()}}
     layout, stored = data.get("layout"), data.get("stored_size")
-    yield Fact("format", str(data.get("dataset", "unknown")), note=f"{layout} layout" if layout else "")
-    yield Fact("frames", ", ".join(f"{count} {name}" for name, count in counts.items()))
-    yield Fact("split", str(data.get("split", {}).get("name", "unknown")))
+    yield model.Fact("format", str(data.get("dataset", "unknown")), note=f"{layout} layout" if layout else "")
+    yield model.Fact("frames", ", ".join(f"{count} {name}" for name, count in counts.items()))
+    yield model.Fact("split", str(data.get("split", {}).get("name", "unknown")))
     size = f"{camera.width} x {camera.height} px" + (f", stored {stored[0]} x {stored[1]}" if stored else "")
-    yield Fact("image size", size)
-    yield Fact("lens", str(data["lens"]) if data.get("lens") else "pinhole images")
+    yield model.Fact("image size", size)
+    yield model.Fact("lens", str(data["lens"]) if data.get("lens") else "pinhole images")
     angle = 2.0 * math.degrees(math.atan(0.5 * camera.width / camera.fx))
     focal, center = f"f {camera.fx:.2f}, {camera.fy:.2f}", f"centre {camera.cx:.2f}, {camera.cy:.2f}"
-    yield Fact("calibration", f"{focal}, {center} px, {angle:.1f} degrees across")
-    yield Fact("pose convention", _convention(data.get("pose_convention")))
+    yield model.Fact("calibration", f"{focal}, {center} px, {angle:.1f} degrees across")
+    yield model.Fact("pose convention", _convention(data.get("pose_convention")))
     unit = data.get("unit", "mm")
-    yield Fact("unit of length", str(unit))
+    yield model.Fact("unit of length", str(unit))
     if depth := check.depth:
         values = f"median {depth.median:.4g}, 1 % to 99 %: {depth.nearest:.4g} to {depth.farthest:.4g}"
         unknown = f"{depth.invalid_share:.1%} unknown, of which {depth.clipped_share:.1%} clipped"
-        yield Fact("depth", f"{values}{' mm' if unit == 'mm' else ''}; {unknown}")
+        yield model.Fact("depth", f"{values}{' mm' if unit == 'mm' else ''}; {unknown}")
     else:
-        yield Fact("depth", "none")
+        yield model.Fact("depth", "none")
     if path := check.path:
         steps = f"steps {path.mean_step:.3g} (largest {path.largest_step:.3g} to {path.largest_step_at})"
-        yield Fact("trajectory", f"{path.length:.4g} long, {steps}, turns {path.turn:.3g} degrees in all")
+        yield model.Fact("trajectory", f"{path.length:.4g} long, {steps}, turns {path.turn:.3g} degrees in all")
     images = check.images
     frames = f"mean {images.mean:.0f} of 255, frames {images.darkest_frame:.0f} to {images.brightest_frame:.0f}"
     shares = f"{images.overexposed_share:.1%} white, {images.masked_share:.1%} masked"
-    yield Fact("brightness", f"{frames}, {shares}")
+    yield model.Fact("brightness", f"{frames}, {shares}")
     if lamp := check.lamp:
         correlation = f"rank correlation {lamp.correlation:.2f} (median of {counted(lamp.frames, 'frame')})"
-        yield Fact("brightness and distance", f"{correlation}; below 0, the near is brighter")
-    yield Fact("initial points", f"{len(scene.points)} from {data.get('points', {}).get('source', 'unknown')}")
+        yield model.Fact("brightness and distance", f"{correlation}; below 0, the near is brighter")
+    yield model.Fact("initial points", f"{len(scene.points)} from {data.get('points', {}).get('source', 'unknown')}")
 
 
 def _convention(facts: Any) -> str:
@@ -105,7 +91,7 @@ def _convention(facts: Any) -> str:
     return "; ".join([*words, ", ".join(numbers)] if numbers else words) or "not stated"
 
 
-def _agreement(check: SceneCheck) -> list[Paragraph | Table]:
+def _agreement(check: SceneCheck) -> list[model.Paragraph | model.Table]:
     """Errors by pose hypothesis; nothing where nothing could be compared."""
     gaps = [target.index - source.index for source, target in check.pairs] or [0]
     apart = f"{min(gaps)} to {max(gaps)} frames"
@@ -129,7 +115,7 @@ def _agreement(check: SceneCheck) -> list[Paragraph | Table]:
             [name, *map(_number, (e.error, _percent(e.in_front), e.parallax)), str(e.count)]
             for name, e in check.matches.items()
         ]
-    return [Paragraph(note), simple_table(["poses read as", *head], rows)] if rows else []
+    return [model.Paragraph(note), model.simple_table(["poses read as", *head], rows)] if rows else []
 
 
 def _percent(value: float | None) -> float | None:
@@ -144,7 +130,7 @@ def _shown(pairs: Sequence[tuple[Frame, Frame]]) -> Sequence[tuple[Frame, Frame]
     return pairs[:: max(1, len(pairs) // _SHOWN)][:_SHOWN]
 
 
-def _pair_images(source: Frame, target: Frame) -> Figures:
+def _pair_images(source: Frame, target: Frame) -> model.Figures:
     """Both images; the source warped into the target view and its difference; and the target's depth."""
     images = [(source.image.numpy(), source.name), (target.image.numpy(), target.name)]
     if source.depth is not None and target.depth is not None:
@@ -166,8 +152,9 @@ def _pair_images(source: Frame, target: Frame) -> Figures:
             low, high = (float(value) for value in np.quantile(known, (0.01, 0.99)))
             limits = (low, max(high, low * 1.001))
             images.append((colorize_depth(depth, limits), f"z-depth, {low:.3g} to {high:.3g} scene units"))
-    return Figures(
-        [Image(EncodedImage.png(rgb), caption) for rgb, caption in images], f"{source.name} and {target.name}"
+    return model.Figures(
+        [model.Image(model.EncodedImage.png(rgb), caption) for rgb, caption in images],
+        f"{source.name} and {target.name}",
     )
 
 
@@ -183,16 +170,16 @@ def _checkered(shown: torch.Tensor) -> torch.Tensor:
     return ((rows + columns) % 2 == 0) & shown
 
 
-def _trajectory(video: Sequence[Frame]) -> Figures:
+def _trajectory(video: Sequence[Frame]) -> model.Figures:
     centers = np.stack([frame.camera.center.double().numpy() for frame in video])
     x, y, z = (values.tolist() for values in centers.T)
     frames = [float(frame.index) for frame in video]
     along = [Series("x", 0, frames, x), Series("y", 1, frames, y), Series("z", 2, frames, z)]
     position, depth = "position, scene units", "z, scene units"
-    return Figures(
+    return model.Figures(
         [
-            Chart(along, "frame", position, "Camera centre along the video", legend=True),
-            Chart([Series("path", 3, z, x)], depth, "x, scene units", "From above"),
-            Chart([Series("path", 3, z, y)], depth, "y, scene units", "From the side"),
+            model.Chart(along, "frame", position, "Camera centre along the video", legend=True),
+            model.Chart([Series("path", 3, z, x)], depth, "x, scene units", "From above"),
+            model.Chart([Series("path", 3, z, y)], depth, "y, scene units", "From the side"),
         ]
     )

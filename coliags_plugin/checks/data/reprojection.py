@@ -35,12 +35,7 @@ class ReprojectedPixels:
 
 
 class Pair:
-    """Two frames with depth, the first of which is reprojected into the second under several pose hypotheses.
-
-    Args:
-        source: The frame whose pixels are back-projected.
-        target: The frame that they are projected into.
-    """
+    """Two frames with depth, the first of which is reprojected into the second under several pose hypotheses."""
 
     def __init__(self, source: Frame, target: Frame) -> None:
         depth, there = _known_depth(source), _known_depth(target)
@@ -55,13 +50,7 @@ class Pair:
         self._colors_there = target.image.reshape(-1, 3).double()
 
     def reproject(self, change: Change, scale: float = 1.0, every: int = 1) -> ReprojectedPixels:
-        """Reproject the source's pixels.
-
-        Args:
-            change: Transform of both poses.
-            scale: Factor on both depths.
-            every: Stride of the pixels used.
-        """
+        """Reproject every n-th of the source's pixels, with both poses changed and both depths times ``scale``."""
         points = self._points[::every] * scale
         if not len(points):
             nothing = torch.zeros(0, dtype=torch.float64)

@@ -7,16 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from coliags_plugin.checks.depth import pairing
 from coliags_plugin.checks.depth.measures import DepthErrors, DepthStatistics, measure, median_scale, pooled
-from coliags_plugin.checks.depth.pairing import (
-    FramePairs,
-    Samples,
-    check_same_view,
-    dense_samples,
-    match_frames,
-    sparse_samples,
-    true_depth_at,
-)
+from coliags_plugin.checks.depth.pairing import FramePairs, Samples
 from coliags_plugin.checks.depth.sources import DepthSource
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.progress import Progress
@@ -43,7 +36,7 @@ class DepthCheck:
     #: statistics over all pixels and points of all frames; None where the truth has no such depth
     dense: DepthStatistics | None
     sparse: DepthStatistics | None
-    frames: list[FrameErrors]  # depthErrors of every frame
+    frames: list[FrameErrors]
 
     def as_json(self) -> dict[str, Any]:
         """The same as JSON values; unavailable ones are null."""
@@ -63,20 +56,18 @@ class DepthCheck:
 def check_depth(
     estimate: DepthSource, truth: DepthSource, align_scale: bool = False, progress: Progress | None = None
 ) -> DepthCheck:
-    """Compare estimated with true depth.
+    """Compare estimated with true depth, which is dense, at single points, or both.
 
-    Args:
-        estimate: The depth to judge.
-        truth: The depth to judge it by: dense, at single points, or both.
-        align_scale: Multiply the estimate by the median of true / estimated depth over all pixels.
-        progress: Called after every frame.
-
-    Raises:
-        InputError: The truth is an estimate itself; the views differ; no frame or no pixel is common; or a unit is
-            unknown without ``align_scale``.
+    ``align_scale`` multiplies the estimate by the median of true / estimated depth over all pixels.
     """
-    _check_units(estimate, truth, align_scale)
-    pairs = match_frames(estimate, truth)
+    unknown = [str(source.path) for source in (estimate, truth) if not source.metric]
+    if unknown and not align_scale:
+        raise InputError(
+            f"the unit of length of {' and of '.join(unknown)} is unknown",
+            "lengths in mm",
+            "Pass --align-scale to compare up to one factor, the median of true / estimated depth",
+        )
+    pairs = pairing.match_frames(estimate, truth)
     dense: list[Samples | None] = []
     sparse: list[Samples | None] = []
     for done, (here, there) in enumerate(pairs.indices, start=1):
@@ -87,10 +78,10 @@ def check_depth(
                 "true depth",
                 "Name the estimate first and the truth second",
             )
-        check_same_view(estimate.names[here], estimated, true)
-        surface = true_depth_at(estimated, true)
-        dense.append(None if surface is None else dense_samples(estimated, surface))
-        sparse.append(sparse_samples(estimated, true))
+        pairing.check_same_view(estimate.names[here], estimated, true)
+        surface = pairing.true_depth_at(estimated, true)
+        dense.append(None if surface is None else pairing.dense_samples(estimated, surface))
+        sparse.append(pairing.sparse_samples(estimated, true))
         if progress is not None:
             progress("compare depth", done, len(pairs.indices))
     of_all = [_pooled(dense), _pooled(sparse)]
@@ -111,16 +102,6 @@ def check_depth(
     ]
     unit = "mm" if truth.metric else "units of the truth"
     return DepthCheck(estimate, truth, pairs, unit, scale, measured[0], measured[1], frames)
-
-
-def _check_units(estimate: DepthSource, truth: DepthSource, align_scale: bool) -> None:
-    unknown = [str(source.path) for source in (estimate, truth) if not source.metric]
-    if unknown and not align_scale:
-        raise InputError(
-            f"the unit of length of {' and of '.join(unknown)} is unknown",
-            "lengths in mm",
-            "Pass --align-scale to compare up to one factor, the median of true / estimated depth",
-        )
 
 
 def _pooled(parts: list[Samples | None]) -> Samples | None:

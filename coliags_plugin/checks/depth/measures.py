@@ -69,12 +69,7 @@ class DepthStatistics:
 
 
 def measure(samples: Samples, scale: float = 1.0) -> DepthStatistics:
-    """All statistics of samples.
-
-    Args:
-        samples: Of one frame or of several.
-        scale: Factor on the estimate.
-    """
+    """All statistics of samples of one frame or several, the estimates times ``scale``."""
     true = samples.true.astype(np.float64)
     relative = samples.estimated.astype(np.float64) * scale / true - 1.0
     bins = _bins(samples.confidence, relative)

@@ -24,19 +24,7 @@ from coliags_plugin.outputs.colormaps import (
     stacked,
 )
 from coliags_plugin.outputs.image_files import write_png
-from coliags_plugin.reporting.model import (
-    Block,
-    Chart,
-    ColorBar,
-    EncodedImage,
-    Fact,
-    Figures,
-    Image,
-    Page,
-    Paragraph,
-    Section,
-    simple_table,
-)
+from coliags_plugin.reporting import model
 
 #: Number of frames shown.
 _SHOWN = 4
@@ -46,55 +34,55 @@ _BAR_WIDTH = 320
 _SMALLEST_LIMIT = 0.01
 
 
-def depth_page(check: DepthCheck) -> Page:
+def depth_page(check: DepthCheck) -> model.Page:
     """All results of a comparison; in the terminal without single frames."""
     kinds = (("dense true depth", check.dense), ("single points of true depth", check.sparse))
     sections = [
-        Section(f"Against {kind}", _statistics(check, statistics))
+        model.Section(f"Against {kind}", _statistics(check, statistics))
         for kind, statistics in kinds
         if statistics is not None
     ]
     errors = [[frame.name, *_cells(errors)] for frame in check.frames if (errors := frame.dense or frame.sparse)]
     sections += [
-        Section("Frames", [] if check.dense is None else list(_frames(check)), screen_only=True),
-        Section("Every frame", [simple_table(["frame", *_head(check)], errors)], screen_only=True),
+        model.Section("Frames", [] if check.dense is None else list(_frames(check)), screen_only=True),
+        model.Section("Every frame", [model.simple_table(["frame", *_head(check)], errors)], screen_only=True),
     ]
-    return Page(f"{check.estimate.path.name}: depth check", sections, list(_facts(check)))
+    return model.Page(f"{check.estimate.path.name}: depth check", sections, list(_facts(check)))
 
 
-def _facts(check: DepthCheck) -> Iterator[Fact]:
+def _facts(check: DepthCheck) -> Iterator[model.Fact]:
     sides = zip(("estimate", "truth"), check.pairs.left_out, strict=True)
     left_out = ", ".join(f"{count} of the {name}" for name, count in sides if count)
     matched = f"{len(check.frames)}, matched by {check.pairs.by}"
-    yield Fact("estimate", check.estimate.path.name)
-    yield Fact("truth", check.truth.path.name)
-    yield Fact("frames", f"{matched}; without a partner: {left_out}" if left_out else matched)
+    yield model.Fact("estimate", check.estimate.path.name)
+    yield model.Fact("truth", check.truth.path.name)
+    yield model.Fact("frames", f"{matched}; without a partner: {left_out}" if left_out else matched)
     if check.scale is None:
-        yield Fact("scale", "as given")
+        yield model.Fact("scale", "as given")
     else:
         factor = f"the estimate times {check.scale:.4g}, the median of true / estimated depth"
-        yield Fact("scale", f"aligned: {factor}")
+        yield model.Fact("scale", f"aligned: {factor}")
     errors = [(errors.median, frame.name) for frame in check.frames if (errors := frame.dense or frame.sparse)]
     medians = sorted((median, name) for median, name in errors if median is not None)
     if medians:
         (least, best), (middle, _), (most, worst) = medians[0], medians[len(medians) // 2], medians[-1]
         ends = f"median |dz|/z {least:.2%} ({best}) to {most:.2%} ({worst})"
-        yield Fact("by frame", f"{ends}, {middle:.2%} in the median frame")
+        yield model.Fact("by frame", f"{ends}, {middle:.2%} in the median frame")
 
 
-def _statistics(check: DepthCheck, statistics: DepthStatistics) -> list[Block]:
+def _statistics(check: DepthCheck, statistics: DepthStatistics) -> list[model.Block]:
     """Errors over all pixels and by distance, and the confidence's calibration where there is one."""
     rows = [["all", *_cells(statistics.errors)]]
     if statistics.sure is not None:
         rows.append([f"confidence {SURE:g} or more", *_cells(statistics.sure)])
     rows += [[f"{band.low:g} to {band.high:g} {_unit(check)}", *_cells(band.errors)] for band in statistics.bands]
-    blocks: list[Block] = [simple_table(["true depth", *_head(check)], rows)]
+    blocks: list[model.Block] = [model.simple_table(["true depth", *_head(check)], rows)]
     if statistics.bins:
-        blocks.append(Section("Confidence", _confidence(statistics)))
+        blocks.append(model.Section("Confidence", _confidence(statistics)))
     return blocks
 
 
-def _confidence(statistics: DepthStatistics) -> list[Block]:
+def _confidence(statistics: DepthStatistics) -> list[model.Block]:
     """Stated and observed share of good pixels by confidence."""
     error = statistics.calibration_error
     rows = [
@@ -111,13 +99,13 @@ def _confidence(statistics: DepthStatistics) -> list[Block]:
     series = [Series("observed", 0, stated, observed), Series("calibrated", 1, [0.0, 100.0], [0.0, 100.0])]
     axes = "stated confidence, %", "within 5 %, % of the pixels"
     return [
-        Paragraph(
+        model.Paragraph(
             "no pixel has a confidence above 0"
             if error is None
             else f"expected calibration error {100.0 * error:.3g} %"
         ),
-        simple_table(["confidence", "pixels", "stated, %", "observed within 5 %, %"], rows),
-        Figures([Chart(series, *axes, markers=True, legend=True)]),
+        model.simple_table(["confidence", "pixels", "stated, %", "observed within 5 %, %"], rows),
+        model.Figures([model.Chart(series, *axes, markers=True, legend=True)]),
     ]
 
 
@@ -139,16 +127,16 @@ def _unit(check: DepthCheck) -> str:
     return "mm" if check.truth.metric else "units"
 
 
-def _frames(check: DepthCheck) -> Iterator[Block]:
+def _frames(check: DepthCheck) -> Iterator[model.Block]:
     limit = error_limit(check)
-    yield Paragraph("Errors are hatched where the truth is unknown, and grey where there is no estimate.")
-    yield Figures([ColorBar((0.0, limit), _unit(check), "error", "|dz|", "depth-error")])
+    yield model.Paragraph("Errors are hatched where the truth is unknown, and grey where there is no estimate.")
+    yield model.Figures([model.ColorBar((0.0, limit), _unit(check), "error", "|dz|", "depth-error")])
     for index in np.unique(np.linspace(0, len(check.pairs.indices) - 1, _SHOWN).astype(int)):
         here, there = check.pairs.indices[index]
         images = _frame_images(check, check.estimate.read(here), check.truth.read(there), limit)
         if images:
-            figures = [Image(EncodedImage.png(rgb), caption) for caption, rgb in images.items()]
-            yield Figures(figures, check.estimate.names[here])
+            figures = [model.Image(model.EncodedImage.png(rgb), caption) for caption, rgb in images.items()]
+            yield model.Figures(figures, check.estimate.names[here])
 
 
 def _frame_images(
@@ -179,16 +167,9 @@ def error_limit(check: DepthCheck) -> float:
 def error_map(
     check: DepthCheck, estimate: FrameDepth, truth: FrameDepth, limit: float
 ) -> UInt8[np.ndarray, "H W 3"] | None:
-    """|dz| of a frame, colour-mapped: hatched where the truth is unknown, plain grey where there is no estimate.
+    """|dz| of a frame up to ``limit``: hatched where the truth is unknown, plain grey where there is no estimate.
 
-    Args:
-        check: For its scale.
-        estimate: Of the frame.
-        truth: Of the frame.
-        limit: The error of the last colour, units of the truth.
-
-    Returns:
-        The picture at the estimate's size; None where the truth has no dense depth. [H, W, 3]
+    At the estimate's size; None where the truth has no dense depth. [H, W, 3]
     """
     true = true_depth_at(estimate, truth)
     if true is None or estimate.depth is None:

@@ -62,12 +62,7 @@ def true_depth_at(estimate: FrameDepth, truth: FrameDepth) -> Float[np.ndarray, 
 
 
 def dense_samples(estimate: FrameDepth, true: Float[np.ndarray, "H W"]) -> Samples:
-    """Samples at the estimate's pixels.
-
-    Args:
-        estimate: Of the frame.
-        true: As from :func:`true_depth_at`. [H, W]
-    """
+    """Samples at the estimate's pixels; ``true`` as of :func:`true_depth_at`."""
     known = np.isfinite(true)
     return Samples(_estimated(estimate)[known], true[known], _confidence(estimate, known))
 
@@ -86,7 +81,7 @@ def sparse_samples(estimate: FrameDepth, truth: FrameDepth) -> Samples | None:
 
 
 def check_same_view(name: str, estimate: FrameDepth, truth: FrameDepth) -> None:
-    """Check that two maps of one frame show the same view, if at different sizes."""
+    """Refuse two maps of one frame whose aspect ratios or cameras differ, if at different sizes."""
     (width, height), (true_width, true_height) = estimate.size, truth.size
     if abs(width * true_height / (height * true_width) - 1.0) > _SAME_ASPECT:
         raise InputError(

@@ -49,17 +49,10 @@ class DepthSource:
 def open_depth(
     path: Path, data_format: str | None = None, options: Sequence[str] = (), progress: Progress | None = None
 ) -> DepthSource:
-    """The depth maps of a scene's video, or of a folder of TIFF or NPY files.
+    """The depth maps of a scene's video, or of a folder of float32 TIFF or ``.npy`` files, mm.
 
-    Args:
-        path: A scene's folder; or one of float32 TIFF or ``.npy`` files, mm. 8-bit PNGs of the same stems in a folder
-            ``confidence`` beside the latter are the confidence, 255 = 1.
-        data_format: See :func:`open_scene`.
-        options: Options of the scene's data manager.
-        progress: Called while images are read.
-
-    Raises:
-        InputError: Neither a scene nor such a folder, or it holds no depth.
+    8-bit PNGs of the same stems in a folder ``confidence`` beside the latter are the confidence, 255 = 1. ``options``
+    are those of the scene's data manager.
     """
     if data_format is None and path.is_dir() and not recognised(path):
         files = sorted(file for file in path.iterdir() if file.suffix.lower() in (*_TIFF, ".npy"))

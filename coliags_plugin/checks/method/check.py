@@ -68,16 +68,8 @@ def check_method(
 ) -> Iterator[CheckResult]:
     """Check a method, yielding one result after the other.
 
-    Args:
-        method: Name or path of a method config.
-        folder: An existing folder for what the checks write.
-        overrides: ``key.path=value`` assignments.
-        data: A scene's folder; None: a small phantom, made within ``folder``.
-        data_format: Name of a data manager; None: the method's, or the one that recognises the folder.
-        steps: Length of the runs, 10 or more; schedules are scaled to it.
-
-    Raises:
-        InputError: No such method or data, or ``steps`` is too small.
+    Without ``data``, the scene is a small phantom, made within ``folder``, which exists. Schedules are scaled to
+    ``steps``.
     """
     method_tree(method, overrides)
     if steps < MIN_STEPS:

@@ -57,13 +57,7 @@ class CheckContext:
         return load_method_for(self.data, self.method, changes, self.data_format)
 
     def build(self, run: str, scene: Scene | None = None, method: LoadedMethod | None = None) -> Trainer:
-        """A trainer of the method, of the scene unless another is given.
-
-        Args:
-            run: Name of its run folder, which is not made yet.
-            scene: Another scene.
-            method: Another method.
-        """
+        """A trainer of the method on the scene, unless others are given; its run folder is not made yet."""
         scene = scene or self.scene
         return Trainer(method or self.loaded, scene, str(self.data.resolve()), RunFolder(self.folder / run), SEED, CPU)
 

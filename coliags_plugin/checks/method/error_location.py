@@ -40,9 +40,7 @@ def _nested(path: str, node: Any) -> Iterator[tuple[str, Component]]:
 def describe(error: BaseException, config: MethodConfig | None) -> str:
     """An exception in one line: its message, with type and line in the user's code unless it is a reported one.
 
-    Args:
-        error: As caught, with its traceback.
-        config: Of the method, whose components are the user's code; None where it could not be read.
+    The user's code is that of the components in the config, which is None where it could not be read.
     """
     message = "; ".join(str(error).split("\n"))
     if isinstance(error, ReportedError):

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass
 from itertools import pairwise
-
-from torch import nn
 
 from coliags_plugin.checks.method.context import CheckContext, as_in_new_process
 from coliags_plugin.checks.method.storage import continues_alike
@@ -62,14 +59,11 @@ def _hastened(settings: Settings, steps: int) -> list[str]:
     return [f"strategy.{name}={short if every == shortest else 2 * short}" for name, every in given.items()]
 
 
-@dataclass
 class _Census:
-    """Numbers of rows at one time."""
+    """Numbers of rows at one time: of the field, its groups of one parameter, its own buffers, and the counters.
 
-    count: int  # elements of the field
-    parameters: dict[str, int]  # rows of the groups of one parameter
-    buffers: dict[str, int]  # rows of the field's own buffers; those of its parts may be of another kind
-    counters: dict[str, int]  # rows of the strategy's counters
+    Buffers of the field's parts may be of another kind.
+    """
 
     def __init__(self, trainer: Trainer) -> None:
         model = trainer.model
@@ -87,7 +81,11 @@ def _stepped(trainer: Trainer, start: _Census, before: _Census) -> _Census:
     said = f"step {done['step']}, {before.count} to {now.count} rows: "
     for group, parameters in trainer.model.parameter_groups().items():
         adam = trainer.optimizers.adam[group]
-        _check_adam(group, adam.param_groups[0]["params"], parameters, said)
+        if list(map(id, adam.param_groups[0]["params"])) != list(map(id, parameters)):
+            raise CheckFailedError(
+                f"{said}the optimizer of group '{group}' trains what is no longer the field's; change rows by "
+                "ParameterRows alone"
+            )
         for parameter in parameters:
             for key, value in adam.state.get(parameter, {}).items():
                 if key.startswith("exp_avg") and value.shape != parameter.shape:
@@ -107,11 +105,3 @@ def _stepped(trainer: Trainer, start: _Census, before: _Census) -> _Census:
         if per_row and not rest and length not in (0, per_row * now.count):
             raise CheckFailedError(f"{said}counter '{name}' of the strategy has {length}")
     return now
-
-
-def _check_adam(group: str, trained: list[nn.Parameter], there: list[nn.Parameter], said: str) -> None:
-    if [id(parameter) for parameter in trained] != [id(parameter) for parameter in there]:
-        raise CheckFailedError(
-            f"{said}the optimizer of group '{group}' trains what is no longer the field's; change rows by "
-            "ParameterRows alone"
-        )

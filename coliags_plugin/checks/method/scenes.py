@@ -38,14 +38,9 @@ _LAYOUTS_WITH = {"sparse_depth": "colmap"}
 
 
 def write_phantom(method: str, overrides: Sequence[str], folder: Path) -> Path:
-    """Make the phantom that a method is checked on.
+    """Make the phantom that a method is checked on in a folder.
 
     In the layout of its data manager, where there is one of that name, or in one that has what its losses need.
-
-    Args:
-        method: Name or path of a method config.
-        overrides: ``key.path=value`` assignments.
-        folder: To make it in.
     """
     named = method_tree(method, overrides).find(["datamanager", "name"]).value
     layout = named if named in registry.phantom_layouts else _layout_for_losses(method, overrides)
@@ -95,12 +90,7 @@ def with_one_frame(scene: Scene) -> Scene:
 
 
 def with_ignored_pixels(scene: Scene, spoilt: bool) -> Scene:
-    """The scene with a part of every training image masked out.
-
-    Args:
-        scene: To change.
-        spoilt: Whether the ignored pixels have other colours, and depth that is NaN.
-    """
+    """The scene with a part of every training image masked out; ``spoilt``: of other colours, and depth that is NaN."""
     return replace(scene, train=[_masked(frame.to("cpu"), spoilt) for frame in scene.train])
 
 

@@ -1,4 +1,4 @@
-"""``coliags poses``: one module per subcommand. To add one, add its class to ``Subcommand``."""
+"""``coliags poses``: its subcommands. To add one, add its class to ``Subcommand``."""
 
 from __future__ import annotations
 
@@ -7,11 +7,10 @@ from typing import Annotated
 
 import tyro
 
-from coliags_plugin.cli.poses.align import PosesAlignCommand
-from coliags_plugin.cli.poses.convert import PosesConvertCommand
-from coliags_plugin.cli.poses.sfm import PosesSfmCommand
+from coliags_plugin.cli import arguments
+from coliags_plugin.cli.poses.structure import PosesSfmCommand, PosesTriangulateCommand
 from coliags_plugin.cli.poses.track import PosesTrackCommand
-from coliags_plugin.cli.poses.triangulate import PosesTriangulateCommand
+from coliags_plugin.cli.poses.trajectories import PosesAlignCommand, PosesConvertCommand
 
 Subcommand = (
     Annotated[PosesConvertCommand, tyro.conf.subcommand("convert")]
@@ -23,12 +22,8 @@ Subcommand = (
 
 
 @dataclass(frozen=True)
-class PosesCommand:
+class PosesCommand(arguments.CommandGroup):
     """Convert and compare camera poses, triangulate points, or estimate poses from images or depth."""
 
     subcommand: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Subcommand]]
     """Subcommand."""
-
-    def run(self) -> None:
-        """Execute the subcommand."""
-        self.subcommand.run()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,8 +16,7 @@ if TYPE_CHECKING:
     from coliags_plugin.core.scenes import Scene
     from coliags_plugin.reconstruction.odometry.tracking import Tracking
 
-#: Prefix of the tracking options; all others are the data manager's.
-_OWN = "tracking."
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,6 @@ class PosesTrackCommand:
 
     def run(self) -> None:
         """Track, write the scene and print a summary."""
-        from coliags_plugin.cli.scene_outputs import refuse_output, settings_among
         from coliags_plugin.datamanagers.rgbd.writer import write_rgbd_scene
         from coliags_plugin.engine.data_formats import open_video
         from coliags_plugin.engine.progress import progress_callback
@@ -43,8 +42,8 @@ class PosesTrackCommand:
         from coliags_plugin.reconstruction.odometry.settings import TrackingSettings
         from coliags_plugin.reconstruction.odometry.tracking import track
 
-        refuse_output(self.output, self.scene, self.overwrite)
-        settings, options = settings_among(TrackingSettings, self.set, _OWN)
+        arguments.refuse_output(self.output, self.scene, self.overwrite)
+        settings, options = arguments.settings_among(TrackingSettings, self.set, "tracking.")
         with progress_callback() as progress:
             scene, posed = open_video(self.scene, self.format, options, progress)
             tracking = track(RgbdVideo(scene.train), scene.train[0].camera.intrinsics, settings, progress)
@@ -60,17 +59,14 @@ class PosesTrackCommand:
 
 def _warn_of_losses(tracking: Tracking) -> None:
     """Log a warning that names the lost frames, whose poses are guesses."""
-    import logging
-
     import numpy as np
 
-    log = logging.getLogger(__name__)
     lost = np.flatnonzero(~tracking.tracked)
     if len(lost):
         shown = ", ".join(map(str, lost[:8])) + (f" and {len(lost) - 8} more" if len(lost) > 8 else "")
-        log.warning("frames %s are lost: their poses are guesses at constant velocity", shown)
+        _LOG.warning("frames %s are lost: their poses are guesses at constant velocity", shown)
     for before, after in tracking.jumps:
-        log.warning(
+        _LOG.warning(
             "no motion was found between frames %d and %d: the relative pose of the two segments is a guess",
             before,
             after,

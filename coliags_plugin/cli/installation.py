@@ -1,13 +1,35 @@
-"""``coliags weights lpips``: install the weights that LPIPS needs."""
+"""Commands on the installation: ``coliags doctor``, ``coliags weights``."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import sys
+from dataclasses import asdict, dataclass
 from typing import Annotated, Literal
 
 import tyro
 
-from coliags_plugin.cli.arguments import OptionalPath
+from coliags_plugin.cli import arguments
+from coliags_plugin.cli.summaries import print_summary
+
+
+@dataclass(frozen=True)
+class DoctorCommand:
+    """Report versions and devices, which renderer would be used and why, and where the weights of LPIPS are."""
+
+    json: arguments.AsJson = False
+
+    def run(self) -> None:
+        """Print the results; exit with status 1 where a requirement is missing."""
+        from coliags_plugin.checks.installation import check_installation
+        from coliags_plugin.reporting.model import Fact, FactList
+        from coliags_plugin.reporting.terminal import terminal_text
+
+        results = check_installation()
+        facts = [Fact(f"{'BAD' if each.status == 'failed' else 'ok '} {each.name}", each.detail) for each in results]
+        text = terminal_text([FactList(facts)])
+        print_summary(text, {"checks": [asdict(each) for each in results]}, as_json=self.json)
+        if any(each.status == "failed" for each in results):
+            sys.exit(1)
 
 
 @dataclass(frozen=True)
@@ -18,9 +40,9 @@ class WeightsCommand:
     """Whose weights."""
     net: Literal["vgg", "alex", "squeeze", "all"] | None = None
     """Backbone: VGG's has 528 MiB, AlexNet's 233, SqueezeNet's 5; default: vgg and squeeze, for the protocol paper."""
-    folder: OptionalPath = None
+    folder: arguments.OptionalPath = None
     """Where to install them; default: torch's download cache, where LPIPS finds them."""
-    from_folder: Annotated[OptionalPath, tyro.conf.arg(name="from")] = None
+    from_folder: Annotated[arguments.OptionalPath, tyro.conf.arg(name="from")] = None
     """Copy the files from this folder instead of downloading them."""
 
     def run(self) -> None:

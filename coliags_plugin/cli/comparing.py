@@ -1,4 +1,4 @@
-"""Arguments of ``coliags compare`` and ``coliags ablate``, and what both do with them."""
+"""Commands that compare methods on scenes: ``coliags compare``, ``ablate``."""
 
 from __future__ import annotations
 
@@ -80,3 +80,32 @@ class ComparisonArguments:
         print_summary(str(table), facts, written=[done.folder], then=report, as_json=self.json)
         if done.failures:
             sys.exit(1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompareCommand(ComparisonArguments):
+    """Train and evaluate methods on scenes; what is done is kept, and what was interrupted goes on.
+
+    The same command goes on after any interruption. Exit status 1 if a cell failed; the others are done all the same.
+    """
+
+    methods: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="METHOD...")]
+    """Names of methods (`coliags list methods`) or paths of YAML files."""
+
+    def run(self) -> None:
+        """Compare and print a summary."""
+        self.carry_out(self.methods)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AblateCommand(ComparisonArguments):
+    """Train and evaluate the variants that a file names on scenes; otherwise as compare."""
+
+    file: tyro.conf.Positional[str]
+    """Name of an ablation (`coliags list ablations`) or path of a YAML file."""
+
+    def run(self) -> None:
+        """Compare the variants and print a summary."""
+        from coliags_plugin.comparison.ablations import load_ablation
+
+        self.carry_out(load_ablation(self.file))

@@ -1,0 +1,128 @@
+"""``coliags depth``: dense depth from posed images, and its comparison with the truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from coliags_plugin.cli import arguments
+from coliags_plugin.cli.summaries import print_summary, train_command
+
+_Format = Annotated[str | None, tyro.conf.arg(metavar="NAME")]
+_OptionalLength = Annotated[float | None, tyro.conf.arg(metavar="LENGTH")]
+
+
+@dataclass(frozen=True)
+class DepthEstimateCommand:
+    """Estimate the dense depth of a video with known poses, with its confidence; write it as a scene to train on."""
+
+    scene: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCENE")]
+    """The scene's folder. Depth that it has is ignored."""
+    output: arguments.Output
+    """Folder to create, in nerfstudio's layout."""
+    prior: arguments.OptionalPath = None
+    """Folder of depth maps by image name (.png of 16 bits, .npy or .exr), in any unit, to fit instead of brightness."""
+    near: _OptionalLength = None
+    """Nearest depth, in the scene's unit of length, with --far; default: found from features."""
+    far: _OptionalLength = None
+    """Farthest depth."""
+    jobs: arguments.OptionalInt = None
+    """Number of threads; default: one for each core."""
+    set: arguments.Assignments = ()
+    """An option of the data manager, as width=675, or of estimation, as depth.agreement=0.01 (docs/depth.md)."""
+    format: arguments.DataFormat = None
+    overwrite: arguments.Overwrite = False
+    json: arguments.AsJson = False
+
+    def run(self) -> None:
+        """Estimate, or resume; write the scene and print a summary."""
+        from coliags_plugin.core.errors import InputError
+        from coliags_plugin.engine.data_formats import open_scene
+        from coliags_plugin.engine.progress import progress_callback
+        from coliags_plugin.reconstruction.depth.scene import DepthRequest, estimate_scene, training_options
+        from coliags_plugin.reconstruction.depth.settings import DepthEstimationSettings
+
+        arguments.refuse_output(self.output, self.scene, self.overwrite)
+        if (self.near is None) != (self.far is None):
+            raise InputError("--near without --far, or the reverse", "both or neither")
+        if self.jobs is not None and self.jobs < 1:
+            raise InputError(f"--jobs {self.jobs}", "a number of threads of 1 or more")
+        settings, options = arguments.settings_among(DepthEstimationSettings, self.set, "depth.")
+        with progress_callback() as progress:
+            # Images are read when they are needed, so that memory does not grow with the video.
+            reading = ["initial_points=none", "keep_pixels=false", *options]
+            scene = open_scene(self.scene, self.format, reading, progress)
+            near_far = None if self.near is None or self.far is None else (self.near, self.far)
+            request = DepthRequest(settings, near_far, self.prior, self.jobs)
+            summary = estimate_scene(scene, self.output, request, self.overwrite, progress)
+        train = train_command(self.output, "coliags-estimated-depth", training_options(scene))
+        print_summary(str(summary), written=[self.output], then=[train], as_json=self.json)
+
+
+@dataclass(frozen=True)
+class DepthCheckCommand:
+    """Compare estimated with true depth: error, bias, coverage, and whether the stated confidence is right."""
+
+    estimate: tyro.conf.Positional[Path]
+    """Estimated depth: a scene, or a folder of float32 TIFF or .npy files of z-depth in mm."""
+    truth: tyro.conf.Positional[Path]
+    """The same with true depth, dense or at single points."""
+    align_scale: bool = False
+    """Multiply the estimate by the median of true / estimated depth."""
+    html: arguments.OptionalPath = None
+    """Also write an HTML page with images."""
+    maps: arguments.OptionalPath = None
+    """Also write maps of the error, PNG, to this folder, which must be new or empty."""
+    set: arguments.Assignments = ()
+    """An option of both data managers, for instance max_frames=20."""
+    estimate_format: _Format = None
+    """Dataset format of the estimate (`coliags list datamanagers`); default: recognised from the files."""
+    truth_format: _Format = None
+    """Dataset format of the truth; default: recognised from the files."""
+    anonymous: bool = False
+    """Keep absolute paths out of the JSON (docs/security.md 4)."""
+    json: arguments.AsJson = False
+
+    def run(self) -> None:
+        """Compare, and print the results."""
+        from coliags_plugin.checks.depth.check import check_depth
+        from coliags_plugin.checks.depth.page import depth_page, write_error_maps
+        from coliags_plugin.checks.depth.sources import open_depth
+        from coliags_plugin.core.anonymity import without_places
+        from coliags_plugin.engine.progress import progress_callback
+        from coliags_plugin.reporting.html_page import write_html
+        from coliags_plugin.reporting.terminal import page_text
+
+        with progress_callback() as progress:
+            estimate = open_depth(self.estimate, self.estimate_format, self.set, progress)
+            truth = open_depth(self.truth, self.truth_format, self.set, progress)
+            check = check_depth(estimate, truth, self.align_scale, progress)
+        page = depth_page(check)
+        if self.html is not None:
+            write_html(page, self.html)
+        if self.maps is not None:
+            write_error_maps(check, self.maps)
+        facts = check.as_json()
+        print_summary(
+            page_text(page),
+            without_places(facts) if self.anonymous else facts,
+            written=[path for path in (self.html, self.maps) if path is not None],
+            as_json=self.json,
+        )
+
+
+Subcommand = (
+    Annotated[DepthEstimateCommand, tyro.conf.subcommand("estimate")]
+    | Annotated[DepthCheckCommand, tyro.conf.subcommand("check")]
+)
+
+
+@dataclass(frozen=True)
+class DepthCommand(arguments.CommandGroup):
+    """Estimate the depth of posed images, or compare estimated with true depth."""
+
+    subcommand: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Subcommand]]
+    """Subcommand."""

@@ -1,0 +1,131 @@
+"""Commands on methods and their parts: ``coliags list``, ``config show``, ``check``."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from coliags_plugin.cli import arguments
+from coliags_plugin.cli.summaries import print_summary
+
+
+@dataclass(frozen=True)
+class ListCommand:
+    """List methods, benchmarks and registered components."""
+
+    kind: tyro.conf.Positional[str] = "all"
+    """A kind (methods, benchmarks, ablations, datamanagers, fields, renderers, ...); default: all of them."""
+    json: arguments.AsJson = False
+
+    def run(self) -> None:
+        """Print names by kind, with the source of those that are not built in."""
+        from coliags_plugin.comparison import named_files
+        from coliags_plugin.comparison.ablations import ABLATIONS
+        from coliags_plugin.config.method_files import method_descriptions
+        from coliags_plugin.config.registry import REGISTRIES
+        from coliags_plugin.core.errors import InputError, did_you_mean
+
+        def sources(kind: str) -> dict[str, str]:
+            named = {name: REGISTRIES[kind].source(name) for name in REGISTRIES[kind]}
+            return {name: "" if source == "built in" else f"({source})" for name, source in named.items()}
+
+        descriptions: dict[str, Callable[[], dict[str, str]]] = {
+            "methods": method_descriptions,
+            "benchmarks": named_files.descriptions,
+            "ablations": partial(named_files.descriptions, ABLATIONS),
+            **{kind: partial(sources, kind) for kind in REGISTRIES},
+        }
+        if self.kind not in ("all", *descriptions):
+            raise InputError(
+                f"no kind '{self.kind}'", f"one of {', '.join(descriptions)}", did_you_mean(self.kind, descriptions)
+            )
+        kinds = list(descriptions) if self.kind == "all" else [self.kind]
+        listed = {kind: descriptions[kind]() for kind in kinds}
+        head, indent = ("{}:", "  ") if self.kind == "all" else ("", "")
+        lines = []
+        for kind, rows in listed.items():
+            lines += [head.format(kind)] if head else []
+            lines += [f"{indent}{name:<28}{text}".rstrip() for name, text in rows.items()]
+        print_summary("\n".join(lines), listed, as_json=self.json)
+
+
+@dataclass(frozen=True)
+class ConfigCommand:
+    """Show a method config with everything inherited and every default filled in."""
+
+    action: tyro.conf.Positional[Literal["show"]]
+    """What to do."""
+    method: tyro.conf.Positional[str]
+    """Name of a method or path of a YAML file."""
+    origin: bool = False
+    """Also print the file and line, option or default that each value comes from."""
+    set: arguments.Assignments = ()
+    """Change a value, as for train."""
+
+    def run(self) -> None:
+        """Print YAML."""
+        from coliags_plugin.config.method_config import load_method
+
+        loaded = load_method(self.method, self.set)
+        print(loaded.with_origins() if self.origin else loaded.config.to_yaml(), end="")
+
+
+@dataclass(frozen=True)
+class CheckCommand:
+    """Check that a method trains, resumes, renders and fails as it should, on the CPU; exit status 1 if not."""
+
+    method: tyro.conf.Positional[str]
+    """Name of a method (`coliags list methods`) or path of a YAML file."""
+    steps: int = 20
+    """Length of the runs; schedules are scaled to it."""
+    keep: bool = False
+    """Keep the folder with the phantom and the runs, and print its path."""
+    traceback: bool = False
+    """Print the whole traceback of every exception."""
+    set: arguments.Assignments = ()
+    """Change a value of the method config, as for train."""
+    format: arguments.DataFormat = None
+    data: arguments.OptionalPath = None
+    """A scene's folder; default: a small phantom."""
+    json: arguments.AsJson = False
+
+    def run(self) -> None:
+        """Print one line per check, then a summary."""
+        logger = logging.getLogger("coliags_plugin")
+        level, folder = logger.level, Path(tempfile.mkdtemp(prefix="coliags-check-"))
+        logger.setLevel(logging.WARNING)  # the plans of a dozen runs
+        try:
+            failed = self._print_results(folder)
+        finally:
+            logger.setLevel(level)
+            if not self.keep:
+                shutil.rmtree(folder, ignore_errors=True)
+        if failed:
+            sys.exit(1)
+
+    def _print_results(self, folder: Path) -> bool:
+        """Whether a check failed."""
+        from coliags_plugin.checks.method.check import CHECKS, check_method
+        from coliags_plugin.checks.results import line, summary, tracebacks
+
+        encoding, width = sys.stdout.encoding or "ascii", max(len(check.name) for check in CHECKS)
+        results = []
+        for result in check_method(self.method, folder, self.set, self.data, self.format, self.steps):
+            results.append(result)
+            if not self.json:
+                print(line(result, width, encoding), flush=True)
+        text = summary(results)
+        if self.traceback:
+            text += "\n" + "".join(tracebacks(results, encoding))
+        facts = {"checks": [asdict(result) for result in results]}
+        print_summary(text, facts, written=[folder] if self.keep else [], as_json=self.json)
+        return any(result.status == "failed" for result in results)
