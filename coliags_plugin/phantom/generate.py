@@ -76,6 +76,13 @@ class PreparedPhantom:
         noise = stream(self.settings.seed, Purpose.SENSOR, number)
         return exposure, develop(exposure.radiance, gain, self.settings, noise)
 
+    def wall(
+        self, exposure: Exposure, pose: Float[np.ndarray, "4 4"], pixels: Int[np.ndarray, "N"]
+    ) -> Float[np.ndarray, "N 3"]:
+        """Wall points of lit pixels, world frame."""
+        local = self.sensor.centers[pixels] * exposure.z_depth[pixels, None]
+        return np.asarray(local.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3])
+
     def seen(self, points: Float[np.ndarray, "N 3"], cameras: list[Float[np.ndarray, "4 4"]]) -> Bool[np.ndarray, "N"]:
         """Which points of the wall are seen from at least one of these poses."""
         return seen_from(points, cameras, self.sensor.lens, self.sensor.mask, self.world.tracer)
@@ -206,22 +213,11 @@ def _seen_mask(
 ) -> UInt8[np.ndarray, "P"]:
     """Seen mask: 255 where a training frame sees the pixel's surface point, else 0."""
     hit = np.flatnonzero(exposure.z_depth > 0.0)
-    points = _wall(phantom, exposure, camera_to_world, hit)
+    points = phantom.wall(exposure, camera_to_world, hit)
     mask = np.zeros(len(exposure.z_depth), np.uint8)
     order = nearest_poses_first(camera_to_world, phantom.training_poses)
     mask[hit] = np.where(phantom.seen(points, order), 255, 0)
     return mask
-
-
-def _wall(
-    phantom: PreparedPhantom,
-    exposure: Exposure,
-    camera_to_world: Float[np.ndarray, "4 4"],
-    pixels: Int[np.ndarray, "N"],
-) -> Float[np.ndarray, "N 3"]:
-    """Wall points of the lit pixels, world frame."""
-    local = phantom.sensor.centers[pixels] * exposure.z_depth[pixels, None]
-    return np.asarray(local.astype(np.float64) @ camera_to_world[:3, :3].T + camera_to_world[:3, 3])
 
 
 def _draw_points(
@@ -232,7 +228,7 @@ def _draw_points(
     share = min(-(-_POINTS // len(phantom.training_poses)), len(hit))
     generator = stream(phantom.settings.seed, Purpose.POINTS, index)
     chosen = np.sort(generator.choice(hit, share, replace=False))
-    return _wall(phantom, exposure, phantom.poses[index], chosen), color[chosen]
+    return phantom.wall(exposure, phantom.poses[index], chosen), color[chosen]
 
 
 def _wall_points(

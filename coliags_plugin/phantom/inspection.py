@@ -14,7 +14,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.phantom.centreline import CentreLine
+from coliags_plugin.phantom.colon import CentreLine
 from coliags_plugin.phantom.motion import NEAREST, SHALLOW_END, Curve, draw_sway, times
 from coliags_plugin.phantom.settings import PhantomSettings
 from coliags_plugin.phantom.streams import Purpose, stream
@@ -61,12 +61,9 @@ class _Withdrawal:
         return points + np.einsum("tck,tk->tc", frames[:, :, :2], sideways), frames
 
 
-@dataclass(frozen=True)
-class _Spot:
-    """A near stop, in the centre line's frame."""
-
-    shift: Float[np.ndarray, "3"]  # camera's offset from the withdrawal, mm
-    turn: Float[np.ndarray, "3"]  # rotation vector from the centre line's direction to the spot's, radians
+#: A near stop in the centre line's frame: the camera's offset from the withdrawal, mm, and the rotation vector from the
+#: centre line's direction to the spot's, radians.
+_Spot = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
 
 
 def inspecting_path(centre_line: CentreLine, settings: PhantomSettings, tracer: Tracer) -> Float[np.ndarray, "T 4 4"]:
@@ -78,8 +75,7 @@ def inspecting_path(centre_line: CentreLine, settings: PhantomSettings, tracer: 
     spots = _choose_spots(withdrawal, tracer, settings.seed, generator)
 
     shifts, turns = np.zeros((2, 2 * APPROACHES + 1, 3))
-    shifts[1::2] = [spot.shift for spot in spots]
-    turns[1::2] = [spot.turn for spot in spots]
+    shifts[1::2], turns[1::2] = zip(*spots, strict=True)
     turns[::2] = [
         _far_turn(withdrawal, number / APPROACHES, turns[1::2][max(number - 1, 0) : number + 1], tracer)
         for number in range(APPROACHES + 1)
@@ -156,7 +152,7 @@ def _approach(withdrawal: _Withdrawal, number: int, turn: Float[np.ndarray, "3"]
     reached = float(tracer.clearance(points[middle : middle + 1] + low * course[middle])[0])
     if reached > _CLOSEST + _CLOSER_BEFORE or to_spot - low > _SPOT_WITHIN:
         return None
-    return _Spot(low * away, turn)
+    return low * away, turn
 
 
 def _far_turn(

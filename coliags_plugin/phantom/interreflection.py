@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
 from coliags_plugin.phantom.colon import RADIUS, ColonSurface
 from coliags_plugin.phantom.light import CameraLight
@@ -23,6 +23,8 @@ _PATCH = 5.0
 _SAMPLES = 4
 #: Bounces; at an albedo of .8 the rest is under 1 %.
 _BOUNCES = 24
+#: Pairs of points whose visibility is traced together, which bounds memory.
+_AT_ONCE = 1 << 19
 
 
 @dataclass(frozen=True)
@@ -100,7 +102,11 @@ def form_factors(patches: Patches, tracer: Tracer) -> Float[np.ndarray, "P P"]:
         leaving = np.einsum("ijc,ic->ij", apart, up) / distance
         arriving = -np.einsum("ijc,jc->ij", apart, emitted) / distance
         i, j = np.nonzero((leaving > 0.0) & (arriving > 0.0))
-        clear = _mutually_visible(receiver, up, emitter, (i, j), tracer)
+        clear = np.zeros(len(i), bool)
+        for start in range(0, len(i), _AT_ONCE):
+            part = slice(start, start + _AT_ONCE)
+            # Offset from the wall to avoid self-occlusion.
+            clear[part] = tracer.visible(emitter[j[part]], receiver[i[part]] + 0.05 * up[i[part]])
         i, j = i[clear], j[clear]
         area = patches.areas[j]
         total[i, j] += leaving[i, j] * arriving[i, j] * area / (np.pi * square[i, j] + area)
@@ -153,19 +159,3 @@ def indirect_lights(
         IndirectLight(light.reshape(rows, columns, 3), rows / surface.rows, columns / surface.columns)
         for light in solved
     ]
-
-
-def _mutually_visible(
-    receiver: Float[np.ndarray, "P 3"],
-    up: Float[np.ndarray, "P 3"],
-    emitter: Float[np.ndarray, "P 3"],
-    pairs: tuple[Int[np.ndarray, "M"], Int[np.ndarray, "M"]],
-    tracer: Tracer,
-) -> Bool[np.ndarray, "M"]:
-    i, j = pairs
-    clear = np.empty(len(i), bool)
-    for start in range(0, len(i), 1 << 19):
-        part = slice(start, start + (1 << 19))
-        # Offset from the wall to avoid self-occlusion.
-        clear[part] = tracer.visible(emitter[j[part]], receiver[i[part]] + 0.05 * up[i[part]])
-    return clear

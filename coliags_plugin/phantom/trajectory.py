@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.phantom.centreline import CentreLine
+from coliags_plugin.phantom.colon import CentreLine
 from coliags_plugin.phantom.inspection import inspecting_path
 from coliags_plugin.phantom.motion import NEAREST, SHALLOW_END, draw_sway, rotation, rotation_about, times
 from coliags_plugin.phantom.settings import PhantomSettings

@@ -13,14 +13,8 @@ from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.phantom.generate import generate
 from coliags_plugin.phantom.settings import PhantomSettings
 
-TINY = {
-    "frames": 9,
-    "rotation_views": 2,
-    "mesh_spacing": 1.2,
-    "texture_spacing": 0.4,
-    "interreflection": 0.0,
-    "supersampling": 1,
-}
+COARSE = {"mesh_spacing": 1.2, "texture_spacing": 0.4, "interreflection": 0.0}
+TINY = COARSE | {"frames": 9, "rotation_views": 2, "supersampling": 1}
 
 
 def write_phantom(folder: Path, layout: str, width: int = 64, height: int = 51, **options) -> Path:

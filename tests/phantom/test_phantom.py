@@ -19,17 +19,9 @@ from coliags_plugin.core.errors import InputError
 from coliags_plugin.geometry.lenses.models import LENSES, octagon_mask
 from coliags_plugin.phantom.generate import generate
 from coliags_plugin.phantom.settings import PhantomSettings
-from tests.phantom.phantom_layouts import distance_from_wall
+from tests.phantom import phantom_layouts
 
-TINY = {
-    "width": 48,
-    "height": 38,
-    "frames": 17,
-    "rotation_views": 3,
-    "mesh_spacing": 1.2,
-    "texture_spacing": 0.4,
-    "interreflection": 0.0,
-}
+TINY = phantom_layouts.TINY | {"width": 48, "height": 38, "frames": 17, "rotation_views": 3, "supersampling": 2}
 
 
 @pytest.fixture(scope="module")
@@ -178,7 +170,7 @@ def test_raw_layout_is_the_releases_own(raw):
     z = depth[lit] * (100.0 / 65535.0)
     pose = poses(raw / "pose.txt")[4].reshape(4, 4).T
     points = (directions * z[:, None]) @ pose[:3, :3].T + pose[:3, 3]
-    assert distance_from_wall(raw, torch.from_numpy(points[z < 99.9])).max() < 0.004
+    assert phantom_layouts.distance_from_wall(raw, torch.from_numpy(points[z < 99.9])).max() < 0.004
     unit = normals[..., ::-1][lit] / 65535.0 * 2.0 - 1.0
     np.testing.assert_allclose(np.linalg.norm(unit, axis=1), 1.0, atol=1e-3)
     assert ((unit * directions).sum(axis=1) < 0.05).mean() > 0.99  # towards the camera

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from coliags_plugin.config.registry import datamanagers, phantom_layouts
-from coliags_plugin.core.errors import InputError
 from coliags_plugin.datamanagers.recognition import find_format
 from coliags_plugin.phantom.generate import resolve
 from coliags_plugin.phantom.layouts.base import Layout
-from coliags_plugin.phantom.settings import PhantomSettings, phantom_settings
+from coliags_plugin.phantom.settings import PhantomSettings
 from tests.phantom.phantom_layouts import write_phantom
 
 PAGE = Path(__file__).parents[2] / "docs/phantom.md"
@@ -39,32 +38,18 @@ def test_every_name_is_a_layout_and_every_layout_is_told():
 
 
 @pytest.mark.parametrize("name", phantom_layouts)
-def test_sizes_and_rotation_views_are_as_told(name):
+def test_sizes_rotation_views_and_lenses_are_as_told_and_asked_for(name):
     layout, (_, size, rotation) = layout_of(name), told()[name]
     assert isinstance(layout, Layout)
     assert size == "x".join(map(str, layout.default_size))
     assert (rotation != "none") == layout.has_rotation
-
-
-@pytest.mark.parametrize("name", phantom_layouts)
-def test_settings_resolve_to_what_the_layout_has(name):
-    layout = layout_of(name)
     settings = resolve(PhantomSettings(layout=name), layout)
     assert (settings.width, settings.height) == layout.default_size
     assert settings.rotation_views == (12 if layout.has_rotation else 0)
-
-
-@pytest.mark.parametrize("name", phantom_layouts)
-def test_lens_is_of_the_size_asked_for(name):
-    lens, lit = layout_of(name).lens(64, 51)
+    lens, lit = layout.lens(64, 51)
     assert (lens.width, lens.height) == (64, 51)
     assert lit.shape == (51, 64)
     assert lit.mean() > 0.5
-
-
-def test_an_unknown_layout_is_refused_by_name():
-    with pytest.raises(InputError, match=r"phantom setting layout: .*unknown layout; known are c3vd, c3vd-raw"):
-        phantom_settings({"layout": "c3dv"})
 
 
 #: With a frame that REIM-NeRF validates on, number 25.

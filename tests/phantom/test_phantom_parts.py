@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -31,16 +32,8 @@ COARSE = {"mesh_spacing": 1.2, "texture_spacing": 0.4}
 
 
 def lamp(**changes) -> CameraLight:
-    plain = {
-        "offset": (0.0, 0.0, 0.0),
-        "axis": (0.0, 0.0, 1.0),
-        "spread_law": "cosine",
-        "spread": 0.0,
-        "specular": 0.0,
-        "roughness": 0.3,
-        "f0": 0.028,
-    }
-    return CameraLight(**{**plain, **changes})
+    plain = CameraLight((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), "cosine", 0.0, specular=0.0, roughness=0.3, f0=0.028)
+    return replace(plain, **changes)
 
 
 def grid_surface(grid: np.ndarray, normals: np.ndarray, tangents: np.ndarray) -> ColonSurface:
@@ -48,12 +41,8 @@ def grid_surface(grid: np.ndarray, normals: np.ndarray, tangents: np.ndarray) ->
     rows, columns = grid.shape[:2]
     row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns), indexing="ij")
     following = (column + 1) % columns
-    a, b, c, d = (
-        row * columns + column,
-        (row + 1) * columns + column,
-        row * columns + following,
-        (row + 1) * columns + following,
-    )
+    a, b = row * columns + column, (row + 1) * columns + column
+    c, d = row * columns + following, (row + 1) * columns + following
     triangles = np.stack([np.stack([a, b, c], -1), np.stack([d, c, b], -1)], axis=2).reshape(-1, 3)
     along, across = np.gradient(grid, axis=0), 0.5 * (np.roll(grid, -1, 1) - np.roll(grid, 1, 1))
     areas = np.linalg.norm(np.cross(along, across), axis=-1)
@@ -410,7 +399,7 @@ def test_a_point_is_seen_only_inside_the_frame_in_front_and_unhidden():
         ({"albedo": (1.2, 0.3, 0.2)}, "albedo"),
         ({"spread": float("nan")}, "spread"),
         ({"seed": -1}, "seed"),
-        ({"layout": "c3vd_raw"}, "layout"),
+        ({"layout": "c3vd_raw"}, "phantom setting layout: .*unknown layout; known are c3vd, c3vd-raw"),
         ({"polypes": 3}, "polyps"),
         ({"frames": 60, "pauses": 6}, "leave 0 that move"),
     ],

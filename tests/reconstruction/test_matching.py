@@ -93,34 +93,29 @@ def test_poses_tell_look_alikes_apart():
     cameras = camera(), camera(x=2.0)
     alike = np.ones((4, 128))
     first, second = (features(seen(cam, points), alike) for cam in cameras)
-    np.testing.assert_array_equal(
-        epipolar_matches(first, second, cameras, 1.0, 0.7, 0.7), np.repeat(np.arange(4), 2).reshape(4, 2)
-    )
+    pairs = epipolar_matches(first, second, cameras, 1.0, 0.7, 0.7)
+    np.testing.assert_array_equal(pairs, np.repeat(np.arange(4), 2).reshape(4, 2))
     assert not len(mutual_matches(first, second, 0.7, 0.7))
 
 
 @pytest.mark.parametrize(("off", "count"), [(0.0, 1), (1.3, 1), (1.5, 0)])
 def test_the_epipolar_error_is_sampsons(off, count):
     """Along x, off the common row by d: the Sampson distance is d / sqrt(2)."""
-    cameras = camera(), camera(x=2.0)
-    at = seen(cameras[0], [[0.0, 0, 20]])
-    there = seen(cameras[1], [[0.0, 0, 20]]) + np.array([0.0, off])
-    pairs = epipolar_matches(features(at, np.ones((1, 128))), features(there, np.ones((1, 128))), cameras, *LOOSE)
-    assert len(pairs) == count
+    assert matched_when_moved(-10.0, off) == count
 
 
 @pytest.mark.parametrize(("shift", "scale", "count"), [(-8.0, 1.0, 1), (8.0, 1.0, 0), (-8.0, 2.0, 0), (-8.0, 1.5, 1)])
 def test_rays_must_meet_in_front_and_scales_agree(shift, scale, count):
     """From further right, things in front lie further left."""
-    cameras = camera(), camera(x=2.0)
+    assert matched_when_moved(shift, 0.0, scale) == count
+
+
+def matched_when_moved(x, y, scale=1.0):
+    """Matches of a spot that lies x, y pixels elsewhere in the image of a camera 2 mm to the right."""
+    cameras, alike = (camera(), camera(x=2.0)), np.ones((1, 128))
     at = seen(cameras[0], [[0.0, 0, 20]])
-    pairs = epipolar_matches(
-        features(at, np.ones((1, 128))),
-        features(at + np.array([shift, 0.0]), np.ones((1, 128)), 2.0 * scale),
-        cameras,
-        *LOOSE,
-    )
-    assert len(pairs) == count
+    other = features(at + np.array([x, y]), alike, 2.0 * scale)
+    return len(epipolar_matches(features(at, alike), other, cameras, *LOOSE))
 
 
 def test_cameras_in_one_place_match_nothing():
@@ -131,9 +126,8 @@ def test_cameras_in_one_place_match_nothing():
 def test_pairs_of_a_video():
     assert video_pairs(4, 1) == [(0, 1), (1, 2), (2, 3)]
     assert {second - first for first, second in video_pairs(100, 5)} == {1, 2, 3, 4, 5, 8, 16}
-    assert (
-        len(video_pairs(100, 5)) == len(set(video_pairs(100, 5))) == sum(100 - step for step in (1, 2, 3, 4, 5, 8, 16))
-    )
+    count = sum(100 - step for step in (1, 2, 3, 4, 5, 8, 16))
+    assert len(video_pairs(100, 5)) == len(set(video_pairs(100, 5))) == count
     assert all_pairs(3) == [(0, 1), (0, 2), (1, 2)]
 
 
@@ -142,9 +136,8 @@ def test_highlights_and_masks_yield_no_features():
     image[20:24, 30:34] = 200  # twice as bright as its surroundings
     image[50:52, 60:62] = 255
     image[:, :10] = 118  # brighter, not by enough
-    np.testing.assert_array_equal(
-        np.unique(np.nonzero(highlights(image, FeatureSettings()))[1]), [30, 31, 32, 33, 60, 61]
-    )
+    columns = np.nonzero(highlights(image, FeatureSettings()))[1]
+    np.testing.assert_array_equal(np.unique(columns), [30, 31, 32, 33, 60, 61])
     assert not highlights(image, FeatureSettings(highlight_level=256)).any()
     mask = np.ones((60, 80), bool)
     mask[:, 70:] = False

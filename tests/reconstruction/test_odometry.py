@@ -270,13 +270,17 @@ def edge(source, target, motion):
     return Edge(source, target, motion, 1.0, 0.0, 1.0, 0.0)
 
 
+def motion(poses, source, target):
+    return inverse(poses[target][None])[0] @ poses[source]
+
+
 def registering(poses, bad=(), blind=()):
     """A stand-in that finds exact motions, but nothing for bad frames or blind pairs."""
 
     def register(source, target, guess):
         if {source, target} & set(bad) or any({source, target} == set(pair) for pair in blind):
             return None
-        return edge(source, target, inverse(poses[target][None])[0] @ poses[source])
+        return edge(source, target, motion(poses, source, target))
 
     return register
 
@@ -334,23 +338,23 @@ def test_what_is_filled_in():
 # The pose graph
 
 
+def optimised(path, certain, uncertain, bridges=()):
+    informed = [[(one, 1e4 * np.eye(6)) for one in edges] for edges in (certain, uncertain)]
+    with deterministic_open3d() as open3d:
+        return optimise(open3d, range(len(path)), path, *informed, bridges, 0.25)
+
+
 def test_a_wrong_edge_is_dropped_and_the_others_mend_the_path():
     poses = relative(swaying(12, step=0.05))
-    motion = lambda source, target: inverse(poses[target][None])[0] @ poses[source]  # noqa: E731
     drift = np.eye(4)
     drift[:3, 3] = 0.0, 0.0, 0.004
-    steps = [edge(frame, frame - 1, motion(frame, frame - 1) @ drift) for frame in range(1, 12)]
+    steps = [edge(frame, frame - 1, motion(poses, frame, frame - 1) @ drift) for frame in range(1, 12)]
     drifted = [np.eye(4)]
     for step in steps:
         drifted.append(drifted[-1] @ step.source_to_target)
-    right = [edge(frame, frame - 4, motion(frame, frame - 4)) for frame in range(4, 12)]
+    right = [edge(frame, frame - 4, motion(poses, frame, frame - 4)) for frame in range(4, 12)]
     wrong = edge(9, 2, some_transform(3, extent=1.0))
-    information = 1e4 * np.eye(6)
-    informed = lambda edges: [(one, information) for one in edges]  # noqa: E731
-    with deterministic_open3d() as open3d:
-        found, dropped = optimise(
-            open3d, range(12), np.stack(drifted), informed(steps), informed([*right, wrong]), (), 0.25
-        )
+    found, dropped = optimised(np.stack(drifted), steps, [*right, wrong])
     assert dropped == (wrong,)
     np.testing.assert_array_equal(found[0], np.eye(4))
     before, after = (np.linalg.norm(path[-1][:3, 3] - poses[-1][:3, 3]) for path in (drifted, found))
@@ -359,22 +363,12 @@ def test_a_wrong_edge_is_dropped_and_the_others_mend_the_path():
 
 def test_a_bridge_gives_way_to_an_edge():
     poses = relative(swaying(6, step=0.05))
-    motion = lambda source, target: inverse(poses[target][None])[0] @ poses[source]  # noqa: E731
-    wrong = motion(3, 2).copy()
+    wrong = motion(poses, 3, 2)
     wrong[0, 3] += 0.1
-    steps = [edge(frame, frame - 1, motion(frame, frame - 1)) for frame in (1, 2, 4, 5)]
+    steps = [edge(frame, frame - 1, motion(poses, frame, frame - 1)) for frame in (1, 2, 4, 5)]
     path = poses.copy()
     path[3:] = path[2] @ wrong @ inverse(poses[3:4])[0] @ poses[3:]
-    with deterministic_open3d() as open3d:
-        found, dropped = optimise(
-            open3d,
-            range(6),
-            path,
-            [(step, 1e4 * np.eye(6)) for step in steps],
-            [(edge(4, 1, motion(4, 1)), 1e4 * np.eye(6))],
-            [Bridge(3, 2, wrong)],
-            0.25,
-        )
+    found, dropped = optimised(path, steps, [edge(4, 1, motion(poses, 4, 1))], [Bridge(3, 2, wrong)])
     assert dropped == ()
     np.testing.assert_allclose(found, poses, atol=2e-3)
 
@@ -471,9 +465,6 @@ def test_what_is_refused():
         track([video[0], small, video[2]], PINHOLE, FAST)
     with pytest.raises(InputError, match="no two consecutive frames of 3 could be registered"):
         track(blackened(video, 0, 1, 2), PINHOLE, FAST)
-
-
-def test_frames_without_depth_are_refused():
     frames = [replace(frame, depth=None) for frame in tube_frames(2)]
     with pytest.raises(InputError, match=r"frame 0000 has no depth.*coliags poses sfm"):
         track(RgbdVideo(frames), frames[0].camera.intrinsics, FAST)

@@ -20,7 +20,6 @@ from coliags_plugin.geometry.poses.rigid import rigid
 from coliags_plugin.geometry.poses.trajectory import Trajectory
 from coliags_plugin.outputs.image_files import write_png
 from coliags_plugin.reconstruction.structure.colmap_scene import write_sfm_scene
-from coliags_plugin.reconstruction.structure.features import FeatureSettings
 from coliags_plugin.reconstruction.structure.image_files import file_names, list_images, masks_for
 from coliags_plugin.reconstruction.structure.model_scale import distances_beside, from_diameter, from_distance, scaled
 from coliags_plugin.reconstruction.structure.sfm import Reconstruction, reconstruct
@@ -115,11 +114,8 @@ def test_the_focal_length_of_a_known_camera_model_is_found(phantom):
 
 def test_an_implausible_focal_length_is_refused(tube):
     camera = CameraSettings(model="SIMPLE_PINHOLE", refine=False, focal_factors=(2.5,))
-    refusal(
-        r"implausible focal lengths \(SIMPLE_PINHOLE, focal length 400 px \(23 degrees\).*40 to 150 degrees",
-        tube,
-        SfmSettings(camera=camera),
-    )
+    told = r"implausible focal lengths \(SIMPLE_PINHOLE, focal length 400 px \(23 degrees\).*40 to 150 degrees"
+    refusal(told, tube, SfmSettings(camera=camera))
     wide = camera.model_copy(update={"field_of_view": (20.0, 150.0)})
     assert reconstruct(list_images(tube), SfmSettings(camera=wide)).registered
 
@@ -178,15 +174,12 @@ def test_images_without_motion_are_refused(tube, tmp_path):
 
 
 def test_cameras_that_are_none_are_refused(tube, tmp_path):
-    refusal(
-        "camera model PINHOLES. Expected one of .*OPENCV_FISHEYE",
-        tube,
-        SfmSettings(camera=CameraSettings(model="PINHOLES")),
-    )
-    both = SfmSettings(camera=CameraSettings(model="c3vd", params=(1.0,)))
-    refusal("--params, and --camera c3vd", tube, both)
-    one = SfmSettings(camera=CameraSettings(model="PINHOLE", params=(1.0,)))
-    refusal("1 parameters for PINHOLE. Expected 4: fx, fy, cx, cy", tube, one)
+    for match, camera in (
+        ("camera model PINHOLES. Expected one of .*OPENCV_FISHEYE", CameraSettings(model="PINHOLES")),
+        ("--params, and --camera c3vd", CameraSettings(model="c3vd", params=(1.0,))),
+        ("1 parameters for PINHOLE. Expected 4: fx, fy, cx, cy", CameraSettings(model="PINHOLE", params=(1.0,))),
+    ):
+        refusal(match, tube, SfmSettings(camera=camera))
     write_png(tmp_path / "0.png", read_rgb(list_images(tube)[0]))
     write_png(tmp_path / "1.png", np.zeros((20, 30, 3), np.uint8))
     refusal("1.png is 30 x 20, 0.png 160 x 128. Expected images of one size", tmp_path, KNOWN)
@@ -231,10 +224,6 @@ def test_masks_of_a_file_and_of_a_folder(tmp_path):
     assert masks_for(tmp_path / "masks" / "b.png", images).all()
     with pytest.raises(InputError, match=r"has no mask for c.jpg. Expected c.jpg.png or c.png"):
         masks_for(tmp_path / "masks", [Path("c.jpg")])
-
-
-def test_features_of_structure_from_motion_have_their_own_defaults():
-    assert SfmSettings().features != FeatureSettings()
 
 
 RADIUS = 2.5

@@ -194,11 +194,6 @@ def test_other_frames_or_a_folder_that_is_there_are_refused(found, tmp_path):
 # Refusals
 
 
-def test_one_frame_is_refused():
-    with pytest.raises(InputError, match=r"1 frames\. Expected at least 2"):
-        triangulate(FRAMES[:1])
-
-
 def test_a_camera_that_only_turns_is_refused():
     turned = []
     for frame in FRAMES[:4]:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float32
 
-from coliags_plugin.reconstruction.depth.views import Map, Mask, resized_map
+from coliags_plugin.reconstruction.depth.views import Map, Mask
 
 #: Fast global smoother: strength, and the difference of the 8-bit guide at which smoothing ceases.
 _STRENGTH, _EDGE = 10.0, 12.0
@@ -55,7 +55,10 @@ def smooth_surface(depth: Float32[np.ndarray, "h w"], intensity: Map) -> Map:
 
     Windows of correlation lie on the surface: where its slant is wrong, so is what they find.
     """
-    log_depth = np.log(resized_map(depth, (intensity.shape[1], intensity.shape[0])))
+    import cv2
+
+    resized = cv2.resize(depth, intensity.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    log_depth = np.log(resized.astype(np.float32))
     return np.asarray(np.exp(_smoother(intensity, _SURFACE_STRENGTH, _SURFACE_EDGE)(log_depth)), np.float32)
 
 

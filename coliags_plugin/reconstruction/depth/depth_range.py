@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.reconstruction.libraries import quiet_colmap
 from coliags_plugin.reconstruction.structure.features import (
@@ -64,7 +64,7 @@ def find_range(
         ]
         return _range_of(depths_by_frame, "points of the scene")
     depths_by_frame = [np.zeros(0)] * len(frames)
-    chosen = np.unique(np.linspace(0, len(frames) - 1, min(_FRAMES, len(frames))).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(frames) - 1, min(_FRAMES, len(frames))).round().astype(int)).tolist()
     with quiet_colmap(0):
         extract = feature_extractor(settings)
         features: dict[int, Features] = {}
@@ -74,7 +74,7 @@ def find_range(
                 features[index] = extract(*image_and_mask(frames[index]))
             return features[index]
 
-        for done, index in enumerate(chosen, start=1):
+        for index in with_progress(chosen, "find the depth range", progress):
             partners = [index + step for step in _STEPS if index + step < len(frames)]
             partners += [index - step for step in _STEPS if index - step >= 0 and not partners]
             depths = [
@@ -84,8 +84,6 @@ def find_range(
             depths_by_frame[index] = _agreed(np.stack(depths)) if depths else np.zeros(0)
             for old in [key for key in features if key < index]:
                 del features[old]
-            if progress is not None:
-                progress("find the depth range", done, len(chosen))
     return _range_of(depths_by_frame, "points triangulated between frames")
 
 

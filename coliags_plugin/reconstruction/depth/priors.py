@@ -104,7 +104,7 @@ class LightPrior(DepthPrior):
 
         size = (known.shape[1], known.shape[0])
         image = cv2.resize(frame.image.cpu().numpy(), size, interpolation=cv2.INTER_AREA)
-        design = light_terms(image, usable, Pose.resized(frame.camera, size))
+        design = light_terms(image, usable, Pose.of(frame.camera, size))
         columns = design.reshape(-1, design.shape[-1])
         chosen = np.flatnonzero((weight > 0.0) & usable)
         law = np.zeros(columns.shape[1])

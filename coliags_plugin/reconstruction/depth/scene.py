@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32, Int, UInt8
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.files import atomic_folder
-from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.core.scenes import Frame, Scene
 from coliags_plugin.datamanagers.nerfstudio.writer import EstimatedSceneWriter
 from coliags_plugin.datamanagers.rectification import PAPER_SIZE, fitted
@@ -118,8 +118,8 @@ def _write(
     footprint = float(np.median(estimation.medians)) / float(np.sqrt(k.fx * k.fy))
     voxels = VoxelPoints(_VOXEL * footprint, frames[len(frames) // 2].camera.center.cpu().double().numpy())
     pixels, known = 0, 0
-    for done, stored in enumerate(frames, start=1):
-        frame, (depth, confidence) = stored.to("cpu"), estimation.result(done - 1)
+    for index, stored in enumerate(with_progress(frames, "write", progress)):
+        frame, (depth, confidence) = stored.to("cpu"), estimation.result(index)
         image, mask = image_and_mask(frame)
         if mask is not None:
             confidence = np.where(mask, confidence, np.float32(0.0))
@@ -128,8 +128,6 @@ def _write(
             voxels.add(Pose.of(frame.camera), depth, confidence, image)
         pixels += int(frame.valid.sum())
         known += int((confidence >= _KNOWN).sum())
-        if progress is not None:
-            progress("write", done, len(frames))
     positions, colors = voxels.points()
     if not len(positions):
         raise InputError(

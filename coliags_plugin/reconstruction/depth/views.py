@@ -28,14 +28,10 @@ class Pose:
     camera_to_world: Float[np.ndarray, "4 4"]
 
     @classmethod
-    def of(cls, camera: Camera, reduction: int = 1) -> Pose:
-        """The camera, of an image reduced by a whole number."""
-        return cls.resized(camera, reduced_size(camera.width, camera.height, reduction))
-
-    @classmethod
-    def resized(cls, camera: Camera, size: tuple[int, int]) -> Pose:
-        """The camera, of an image of another width and height."""
-        return cls(camera.intrinsics.resized(*size), camera.camera_to_world.cpu().double().numpy())
+    def of(cls, camera: Camera, size: tuple[int, int] | None = None) -> Pose:
+        """The camera, of an image of another width and height if they are given."""
+        intrinsics = camera.intrinsics if size is None else camera.intrinsics.resized(*size)
+        return cls(intrinsics, camera.camera_to_world.cpu().double().numpy())
 
     @property
     def matrix(self) -> Float[np.ndarray, "3 3"]:
@@ -76,29 +72,19 @@ class Guide:
     usable: Mask  # neither masked nor near a highlight
 
 
-def reduced_size(width: int, height: int, reduction: int) -> tuple[int, int]:
-    """Size of an image reduced by a whole number, at least 8 pixels a side unless it was smaller."""
-    return max(min(8, width), round(width / reduction)), max(min(8, height), round(height / reduction))
-
-
 def guide_of(frame: Frame, reduction: int, features: FeatureSettings) -> Guide:
     """Prepare a frame, reduced by a factor, for matching; ``features`` says what a highlight is."""
     import cv2
 
     image, mask = image_and_mask(frame)
     good = usable(image, mask, features)
-    size = reduced_size(image.shape[1], image.shape[0], reduction)
+    height, width = good.shape
+    # At least 8 pixels a side, unless it was smaller.
+    size = max(min(8, width), round(width / reduction)), max(min(8, height), round(height / reduction))
     green = image[..., 1].astype(np.float32) / 255.0
     if reduction > 1:
         green = cv2.resize(green, size, interpolation=cv2.INTER_AREA)
         good = cv2.resize(good.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
     intensity = np.log(green + _OFFSET).astype(np.float32)
     middle = float(intensity[good].mean()) if good.any() else 0.0
-    return Guide(Pose.of(frame.camera, reduction), np.ascontiguousarray(intensity - np.float32(middle)), good)
-
-
-def resized_map(values: Map, size: tuple[int, int]) -> Float32[np.ndarray, "h w"]:
-    """A map without unknown values at another width and height, bilinearly."""
-    import cv2
-
-    return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_LINEAR), np.float32)
+    return Guide(Pose.of(frame.camera, size), np.ascontiguousarray(intensity - np.float32(middle)), good)

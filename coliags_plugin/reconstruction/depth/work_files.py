@@ -7,6 +7,7 @@ import logging
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +23,11 @@ Arrays = Mapping[str, np.ndarray]
 _REQUEST = "request.json"
 
 
+@dataclass(frozen=True)
 class WorkFolder:
     """The folder of an estimation's work files: one folder for each pass, one file in it for each frame."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    path: Path
 
     def has(self, stage: str, index: int) -> bool:
         """Whether a frame of a pass is there."""

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.geometry.poses.rigid import inverse, rigid
 from coliags_plugin.reconstruction.odometry.registration import Edge
 
@@ -50,7 +50,7 @@ def chain(count: int, register: Register, max_gap: int, progress: Progress | Non
     edges: list[Edge] = []
     bridges: list[Bridge] = []
     failed: list[tuple[int, int]] = []
-    for frame in range(1, count):
+    for frame in with_progress(range(1, count), "track frames", progress):
         edge = register(frame, anchor, power(velocity, frame - anchor))
         if edge is None:
             failed.append((frame - 1, frame))
@@ -69,8 +69,6 @@ def chain(count: int, register: Register, max_gap: int, progress: Progress | Non
             poses[frame] = poses[anchor] @ edge.source_to_target
             velocity = power(edge.source_to_target, 1.0 / (frame - anchor))
             anchor = frame
-        if progress is not None:
-            progress("track frames", frame, count - 1)
     posed = tuple(sorted(poses))
     return Chain(posed, np.stack([poses[frame] for frame in posed]), tuple(edges), tuple(bridges), tuple(failed))
 

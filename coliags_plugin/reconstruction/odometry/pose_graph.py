@@ -41,19 +41,12 @@ def optimise(
     for pose in camera_to_world:
         graph.nodes.append(registration.PoseGraphNode(pose))
 
-    def add(edge: Edge | Bridge, information: np.ndarray, is_uncertain: bool) -> None:
-        graph.edges.append(
-            registration.PoseGraphEdge(
-                node[edge.source], node[edge.target], edge.source_to_target, information, uncertain=is_uncertain
-            )
-        )
-
-    for edge, information in certain:
-        add(edge, information, False)
-    for bridge in bridges:
-        add(bridge, _BRIDGE_INFORMATION * np.eye(6), False)
-    for edge, information in uncertain:
-        add(edge, information, True)
+    links: list[tuple[Edge | Bridge, np.ndarray, bool]] = [(*informed, False) for informed in certain]
+    links += [(bridge, _BRIDGE_INFORMATION * np.eye(6), False) for bridge in bridges]
+    links += [(*informed, True) for informed in uncertain]
+    for link, information, is_uncertain in links:
+        ends, motion = (node[link.source], node[link.target]), link.source_to_target
+        graph.edges.append(registration.PoseGraphEdge(*ends, motion, information, uncertain=is_uncertain))
     registration.global_optimization(
         graph,
         registration.GlobalOptimizationLevenbergMarquardt(),

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.intrinsics import Intrinsics
-from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.geometry.poses.rigid import inverse
 from coliags_plugin.reconstruction.libraries import deterministic_open3d
 from coliags_plugin.reconstruction.odometry.chain import Chain, chain, fill_gaps
@@ -99,34 +99,30 @@ def track(
                 "Check that images, depth and intrinsics match (coliags data check); use every frame of the video; "
                 "or lower --set tracking.min_correlation for noisy images",
             )
-        result = tracker.corrected(path, progress) if settings.pose_graph else Correction(path.camera_to_world)
-    poses = fill_gaps(path.posed, result.camera_to_world, len(video))
+        uncorrected: Correction = path.camera_to_world, (), (), 0
+        corrected = tracker.corrected(path, progress) if settings.pose_graph else uncorrected
+    posed, further, dropped, refused = corrected
+    poses = fill_gaps(path.posed, posed, len(video))
     poses[:, :3, 3] *= unit
     return Tracking(
         camera_to_world=poses,
         tracked=_tracked(path, len(video)),
         term=term,
         edges=_in_units(path.edges, unit),
-        further=_in_units(result.further, unit),
-        dropped=_in_units(result.dropped, unit),
-        refused=result.refused,
+        further=_in_units(further, unit),
+        dropped=_in_units(dropped, unit),
+        refused=refused,
         failed=path.failed,
         jumps=tuple(
             (bridge.target, bridge.source)
             for bridge in path.bridges
-            if not any(edge.target <= bridge.target and bridge.source <= edge.source for edge in result.further)
+            if not any(edge.target <= bridge.target and bridge.source <= edge.source for edge in further)
         ),
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Correction:
-    """Result of pose-graph optimisation, see :class:`Tracking`; lengths in units of the video's median depth."""
-
-    camera_to_world: Float[np.ndarray, "P 4 4"]
-    further: tuple[Edge, ...] = ()
-    dropped: tuple[Edge, ...] = ()
-    refused: int = 0
+#: Poses of the posed frames; further edges, dropped edges and number of refused pairs of :class:`Tracking`.
+Correction = tuple[Float[np.ndarray, "P 4 4"], tuple[Edge, ...], tuple[Edge, ...], int]
 
 
 class _Tracker:
@@ -211,20 +207,18 @@ class _Tracker:
             pose_of = dict(zip(path.posed, poses, strict=True))
             wanted = [pair for pair in pairs if pair not in neighbours]
             edges = []
-            for done, (source, target) in enumerate(wanted, start=1):
+            for source, target in with_progress(wanted, f"pose graph, {kind}", progress):
                 guess = inverse(pose_of[target][None])[0] @ pose_of[source]
                 edge = self.verified_edge(source, target, guess)
                 if edge is not None:
                     edges.append((edge, self._information(edge)))
-                if progress is not None:
-                    progress(f"pose graph, {kind}", done, len(wanted))
             refused += len(wanted) - len(edges)
             if not edges:
                 continue
             uncertain += edges
             poses, dropped = optimise(self._open3d, path.posed, poses, certain, uncertain, path.bridges, settings.prune)
         kept = tuple(edge for edge, _ in uncertain if edge not in dropped)
-        return Correction(poses, kept, dropped, refused)
+        return poses, kept, dropped, refused
 
     def _information(self, edge: Edge) -> Float[np.ndarray, "6 6"]:
         return self._registration.information(edge, self._frames(edge.source), self._frames(edge.target))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +13,7 @@ from coliags_plugin.core.scenes import Frame
 from coliags_plugin.geometry.poses.colmap import posed_model
 from coliags_plugin.geometry.poses.rigid import inverse
 from coliags_plugin.reconstruction.structure.features import Features
-from coliags_plugin.reconstruction.structure.matching import Pairs
+from coliags_plugin.reconstruction.structure.matching import Matches
 
 if TYPE_CHECKING:
     import pycolmap
@@ -24,7 +24,7 @@ def write_database(
     cameras: Sequence[pycolmap.Camera],
     images: Sequence[tuple[str, int]],
     features: Sequence[Features],
-    matches: Mapping[tuple[int, int], Pairs],
+    matches: Matches,
     verified: bool,
 ) -> None:
     """Create a database; image i gets COLMAP's image and frame ID i + 1, camera k its camera and rig ID k + 1.

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.reconstruction.structure.mapping import brightness_correlation, bundle_adjust, depths_of
 from coliags_plugin.reconstruction.structure.sfm_cameras import Start, distortion, field_of_view, is_refined, starts
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
@@ -200,11 +200,9 @@ def find_start(video: MatchedVideo, settings: SfmSettings, progress: Progress | 
         return tried[0]
     part, refined = video.middle(settings.search_images), is_refined(settings.camera)
     hypotheses = []
-    for done, start in enumerate(tried, start=1):
+    for start in with_progress(tried, "try cameras", progress):
         for model in part.mapped(settings, start, None)[:1]:
             hypotheses += both_signs(model, part, refined)
-        if progress is not None:
-            progress("try cameras", done, len(tried))
     plausible = settings.camera.field_of_view
     try:
         chosen = choose(hypotheses, plausible)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float, Int, UInt32
@@ -10,12 +10,14 @@ from scipy.spatial import cKDTree
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.reconstruction.structure.features import Features
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 
+#: Indices of the features that match in two images; and of all pairs of images that were compared.
 Pairs = UInt32[np.ndarray, "M 2"]
+Matches = Mapping[tuple[int, int], Pairs]
 
 #: Features closer than this are duplicates and do not count as the second-best match of each other. Pixels.
 _DUPLICATE_DISTANCE = 2.0
@@ -209,14 +211,12 @@ def alike_pairs(
 
     pairs = {(first, first + step) for step in (1, 2) for first in range(count - step)}
     reached = []
-    for first in range(count):
+    for first in with_progress(range(count), "compare images", progress):
         step = 4
         while first + step < count and alikeness(first, first + step) >= settings.min_alike:
             pairs.add((first, first + step))
             step *= 2
         reached.append(first + step)
-        if progress is not None:
-            progress("compare images", first + 1, count)
     distributed = range(0, count, -(-count // _LOOP_IMAGES))
     for row, first in enumerate(distributed):
         distant = [second for second in distributed[row + 1 :] if second > reached[first]]

@@ -102,15 +102,10 @@ def reconstruct(
                 "Take frames farther apart (the camera has to move) or closer together (they have to overlap), give "
                 "the camera parameters if known, mask what does not move with the scene, or raise max_ratio",
             )
-        return _result(video, _adjusted(models[0], video, settings), models)
-
-
-def _adjusted(model: pycolmap.Reconstruction, video: MatchedVideo, settings: SfmSettings) -> Hypothesis:
-    """The model after refinement of the intrinsics, if they are; reversed in depth if the lamp says so."""
-    refined = is_refined(settings.camera)
-    hypotheses = both_signs(model, video, refined)
-    known = has_known_camera(settings.camera) and not refined
-    return choose(hypotheses, (0.0, 180.0) if known else settings.camera.field_of_view)
+        refined = is_refined(settings.camera)
+        known = has_known_camera(settings.camera) and not refined
+        chosen = choose(both_signs(models[0], video, refined), (0.0, 180.0) if known else settings.camera.field_of_view)
+        return _result(video, chosen, models)
 
 
 def _result(video: MatchedVideo, chosen: Hypothesis, models: Sequence[pycolmap.Reconstruction]) -> Reconstruction:
@@ -120,15 +115,8 @@ def _result(video: MatchedVideo, chosen: Hypothesis, models: Sequence[pycolmap.R
     world_to_camera = np.tile(np.eye(4), (len(registered), 1, 1))
     for row, index in enumerate(registered):
         world_to_camera[row, :3] = model.images[index + 1].cam_from_world().matrix()
-    reconstruction = Reconstruction(
-        images,
-        tuple(registered),
-        inverse(world_to_camera),
-        video.names,
-        model,
-        tuple(other.num_reg_images() for other in models),
-        chosen.correlation,
-    )
+    counts, poses = tuple(other.num_reg_images() for other in models), inverse(world_to_camera)
+    reconstruction = Reconstruction(images, tuple(registered), poses, video.names, model, counts, chosen.correlation)
     if reconstruction.left_out:
         left_out = [path.name for path in reconstruction.left_out]
         shown = ", ".join([*left_out[:10], *(["..."] if len(left_out) > 10 else [])])

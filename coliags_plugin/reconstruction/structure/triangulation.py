@@ -15,14 +15,19 @@ from jaxtyping import Float, Int, UInt8
 from pydantic import Field
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.core.scenes import Frame
 from coliags_plugin.core.settings import Settings
 from coliags_plugin.reconstruction.libraries import quiet_colmap
 from coliags_plugin.reconstruction.structure.colmap_database import frame_model, write_database
-from coliags_plugin.reconstruction.structure.features import FeatureSettings, feature_extractor, image_and_mask
+from coliags_plugin.reconstruction.structure.features import (
+    Features,
+    FeatureSettings,
+    feature_extractor,
+    image_and_mask,
+)
 from coliags_plugin.reconstruction.structure.matching import (
-    Pairs,
+    Matches,
     all_pairs,
     check_motion,
     epipolar_matches,
@@ -148,26 +153,15 @@ def triangulate(
     settings = settings or TriangulationSettings()
     check_motion(frames, 2)
     with quiet_colmap(settings.seed):
-        features = []
         extract = feature_extractor(settings.features)
-        for done, frame in enumerate(frames, start=1):
-            features.append(extract(*image_and_mask(frame)))
-            if progress is not None:
-                progress("find features", done, len(frames))
+        features = [extract(*image_and_mask(frame)) for frame in with_progress(frames, "find features", progress)]
         exhaustive = len(frames) <= settings.exhaustive_up_to
         pairs = all_pairs(len(frames)) if exhaustive else video_pairs(len(frames), settings.overlap)
-        matches: dict[tuple[int, int], Pairs] = {}
-        for done, (first, second) in enumerate(pairs, start=1):
-            matches[first, second] = epipolar_matches(
-                features[first],
-                features[second],
-                (frames[first].camera, frames[second].camera),
-                settings.max_epipolar_error,
-                settings.max_ratio,
-                settings.max_distance,
-            )
-            if progress is not None:
-                progress("match features", done, len(pairs))
+        limits = settings.max_epipolar_error, settings.max_ratio, settings.max_distance
+        matches = {}
+        for first, second in with_progress(pairs, "match features", progress):
+            cameras = frames[first].camera, frames[second].camera
+            matches[first, second] = epipolar_matches(features[first], features[second], cameras, *limits)
         count = sum(len(found) for found in matches.values())
         counts = [len(found) for found in features]
         log.info("%.0f features a frame, %d matches in %d pairs of frames", np.mean(counts), count, len(pairs))
@@ -177,30 +171,14 @@ def triangulate(
                 "overlapping frames with correct poses",
                 "Check the poses (coliags data check), raise max_epipolar_error or lower features.peak_threshold",
             )
-        with tempfile.TemporaryDirectory() as scratch:
-            database = Path(scratch) / "database.db"
-            posed = frame_model(frames)
-            images = [posed.images[number] for number in sorted(posed.images)]
-            write_database(
-                database,
-                [posed.cameras[number] for number in sorted(posed.cameras)],
-                [(image.name, image.camera_id - 1) for image in images],
-                features,
-                matches,
-                verified=True,
-            )
-            model = _triangulate_tracks(posed, database, Path(scratch), frames, settings)
+        model = _triangulated(frames, features, matches, settings)
     return _result(frames, Tracks.of(model, len(frames)), settings, count)
 
 
-def _triangulate_tracks(
-    model: pycolmap.Reconstruction,
-    database: Path,
-    scratch: Path,
-    frames: Sequence[Frame],
-    settings: TriangulationSettings,
+def _triangulated(
+    frames: Sequence[Frame], features: Sequence[Features], matches: Matches, settings: TriangulationSettings
 ) -> pycolmap.Reconstruction:
-    """The model with triangulated points; the settings' reprojection error replaces COLMAP's pixel tolerances."""
+    """The frames' model with points; the settings' reprojection error replaces COLMAP's pixel tolerances."""
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()
@@ -217,8 +195,14 @@ def _triangulate_tracks(
     triangulation.merge_max_reproj_error = triangulation.complete_max_reproj_error = pixels
     degrees = float(np.degrees(np.arctan(pixels / shortest_focal)))
     triangulation.create_max_angle_error = triangulation.continue_max_angle_error = degrees
-    (scratch / "model").mkdir()
-    return pycolmap.triangulate_points(model, str(database), str(scratch), str(scratch / "model"), True, options, False)
+    model = frame_model(frames)
+    images = [(model.images[number].name, model.images[number].camera_id - 1) for number in sorted(model.images)]
+    cameras = [model.cameras[number] for number in sorted(model.cameras)]
+    with tempfile.TemporaryDirectory() as scratch:
+        database, output = Path(scratch) / "database.db", Path(scratch) / "model"
+        output.mkdir()
+        write_database(database, cameras, images, features, matches, verified=True)
+        return pycolmap.triangulate_points(model, str(database), scratch, str(output), True, options, False)
 
 
 def _result(frames: Sequence[Frame], tracks: Tracks, settings: TriangulationSettings, matches: int) -> Triangulation:
@@ -240,21 +224,11 @@ def _result(frames: Sequence[Frame], tracks: Tracks, settings: TriangulationSett
     tracks, shares = tracks.only(certain), shares[certain]
     residuals, depth = tracks.residuals(cameras)
     lengths = tracks.lengths
-    observations = []
-    for index in range(len(frames)):
-        here = tracks.frames == index
-        observations.append(Observations(tracks.pixels[here], depth[here], tracks.points[here]))
-    return Triangulation(
-        tracks.positions,
-        _colors(frames, tracks),
-        np.bincount(tracks.points, np.linalg.norm(residuals, axis=1), len(tracks)) / lengths,
-        shares,
-        lengths,
-        tuple(observations),
-        noise,
-        matches,
-        found,
-    )
+    seen = [tracks.frames == index for index in range(len(frames))]
+    observations = tuple(Observations(tracks.pixels[here], depth[here], tracks.points[here]) for here in seen)
+    errors = np.bincount(tracks.points, np.linalg.norm(residuals, axis=1), len(tracks)) / lengths
+    colors = _colors(frames, tracks)
+    return Triangulation(tracks.positions, colors, errors, shares, lengths, observations, noise, matches, found)
 
 
 def _colors(frames: Sequence[Frame], tracks: Tracks) -> UInt8[np.ndarray, "N 3"]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping
 from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
@@ -13,12 +12,12 @@ import numpy as np
 from jaxtyping import Float
 
 from coliags_plugin.core.errors import InputError
-from coliags_plugin.core.progress import Progress
+from coliags_plugin.core.progress import Progress, with_progress
 from coliags_plugin.reconstruction.structure.colmap_database import write_database
 from coliags_plugin.reconstruction.structure.features import Features, feature_extractor
 from coliags_plugin.reconstruction.structure.image_files import Masks, file_names, mask_of, read_image
 from coliags_plugin.reconstruction.structure.mapping import brightness_at, map_images
-from coliags_plugin.reconstruction.structure.matching import Pairs, alike_pairs, mutual_matches
+from coliags_plugin.reconstruction.structure.matching import Matches, alike_pairs, mutual_matches
 from coliags_plugin.reconstruction.structure.sfm_cameras import Start, starting_cameras, starts
 from coliags_plugin.reconstruction.structure.sfm_settings import SfmSettings
 
@@ -35,7 +34,7 @@ class MatchedVideo:
     sizes: tuple[tuple[int, int], ...]  # width and height
     features: tuple[Features, ...]
     brightness: tuple[Float[np.ndarray, "K"], ...]  # at the features
-    matches: Mapping[tuple[int, int], Pairs]  # by pair of indices
+    matches: Matches
 
     def middle(self, count: int) -> MatchedVideo:
         """At most ``count`` images around the middle: every second or fourth, if there are enough.
@@ -73,7 +72,7 @@ def read_video(
     """Find and match the features of a video's images."""
     extract = feature_extractor(settings.features)
     features, sizes, brightness = [], [], []
-    for done, path in enumerate(images, start=1):
+    for path in with_progress(images, "find features", progress):
         image, mask = read_image(path), mask_of(path, masks)
         height, width = image.shape[:2]
         if mask is not None and mask.shape != (height, width):
@@ -84,17 +83,12 @@ def read_video(
         features.append(extract(image, mask))
         brightness.append(brightness_at(image, features[-1].pixels))
         sizes.append((width, height))
-        if progress is not None:
-            progress("find features", done, len(images))
     starting_cameras(settings.camera, images, sizes, starts(settings.camera)[0])
     pairs = alike_pairs(features, settings, progress)
-    matches = {}
-    for done, (first, second) in enumerate(pairs, start=1):
-        matches[first, second] = mutual_matches(
-            features[first], features[second], settings.max_ratio, settings.max_distance
-        )
-        if progress is not None:
-            progress("match features", done, len(pairs))
+    matches = {
+        (first, second): mutual_matches(features[first], features[second], settings.max_ratio, settings.max_distance)
+        for first, second in with_progress(pairs, "match features", progress)
+    }
     names = file_names([path.stem for path in images], "")
     named = tuple(f"{name}{path.suffix}" for name, path in zip(names, images, strict=True))
     return MatchedVideo(images, named, tuple(sizes), tuple(features), tuple(brightness), matches)

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.core.images import write_mask
@@ -224,13 +225,7 @@ def test_what_gives_no_depth_is_refused(tmp_path, capsys):
     still = write_wall(tmp_path / "still", wall_frames(sideways(6, 0.0)))
     assert "all 6 cameras are at the same position" in refused(capsys, still, *out)
     turning = sideways(6, 1e-4)
-    angles = np.radians(3.0 * np.arange(6))
-    turning[:, 0, 0], turning[:, 0, 2], turning[:, 2, 0], turning[:, 2, 2] = (
-        np.cos(angles),
-        np.sin(angles),
-        -np.sin(angles),
-        np.cos(angles),
-    )
+    turning[:, :3, :3] = Rotation.from_euler("y", 3.0 * np.arange(6)[:, None], degrees=True).as_matrix()
     turned = write_wall(tmp_path / "turned", wall_frames(turning))
     assert "the depth range is unknown" in refused(capsys, turned, *out)
     assert "no frame has 3 others" in refused(capsys, turned, *out, "--near", 20, "--far", 80)
@@ -241,10 +236,11 @@ def noisy(frames, level, seed=0):
     """The frames without what they show, which is camera noise about a level."""
     rng = np.random.default_rng(seed)
     size = frames[0].image.shape
-    images = [np.clip(rng.normal(level, 1.5, size), 0, 255).astype(np.uint8) for _ in frames]
-    return [
-        dataclasses.replace(frame, image=torch.from_numpy(image)) for frame, image in zip(frames, images, strict=True)
-    ]
+
+    def noise():
+        return torch.from_numpy(np.clip(rng.normal(level, 1.5, size), 0, 255).astype(np.uint8))
+
+    return [dataclasses.replace(frame, image=noise()) for frame in frames]
 
 
 @pytest.mark.parametrize("level", [2, 90])

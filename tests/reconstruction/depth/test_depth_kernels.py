@@ -104,41 +104,38 @@ def test_the_parabola_finds_the_minimum_between_steps():
     assert match[0, 0] == 0.0
 
 
-def test_a_plane_seen_by_cameras_at_known_places():
+INNER = (slice(12, -12), slice(16, -16))
+
+
+def swept(sweep_settings, base_of):
+    """The middle one of five frames swept from a surface that is made of its true depth, and that depth."""
     frames = wall_frames(sideways(5))
     guides = [guide_of(frame, 1, NO_HIGHLIGHTS) for frame in frames]
     truth = wall_depth(frames[2].camera)
+    factors, base = ratios(sweep_settings, (20.0, 80.0)), base_of(truth).astype(np.float32)
+    others = [guides[k] for k in (0, 1, 3, 4)]
+    return sweep_frame(guides[2], others, base, factors, sweep_settings, DepthEstimationSettings()), truth
+
+
+def test_a_plane_seen_by_cameras_at_known_places():
     sweep_settings = SweepSettings(step=0.02)
     factors = ratios(sweep_settings, (20.0, 80.0))
     assert factors[0] == 1.0
     assert factors[-1] == pytest.approx(4.0)
-    base = np.full(truth.shape, 20.0, np.float32)
-    found = sweep_frame(
-        guides[2], [guides[k] for k in (0, 1, 3, 4)], base, factors, sweep_settings, DepthEstimationSettings()
-    )
-    inner = (slice(12, -12), slice(16, -16))
-    error = np.abs(found.depth / truth - 1.0)[inner]
+    found, truth = swept(sweep_settings, lambda truth: np.full(truth.shape, 20.0))
+    error = np.abs(found.depth / truth - 1.0)[INNER]
     assert np.median(error) < 0.01
     assert np.percentile(error, 90) < 0.03
-    assert np.median(found.match[inner]) > 0.98
+    assert np.median(found.match[INNER]) > 0.98
 
 
 def test_a_surface_whose_slant_is_wrong_is_swept_to_the_right_one():
     """A smoothness that holds to the shape of the swept surface would keep part of its error: far lumens too near."""
-    frames = wall_frames(sideways(5))
-    guides = [guide_of(frame, 1, NO_HIGHLIGHTS) for frame in frames]
-    truth = wall_depth(frames[2].camera)
-    sweep_settings = DepthEstimationSettings().sweeps[-1]
-    across = np.linspace(-0.06, 0.06, truth.shape[1])
-    base = (truth * np.exp(across)[None]).astype(np.float32)
-    factors = ratios(sweep_settings, (20.0, 80.0))
-    found = sweep_frame(
-        guides[2], [guides[k] for k in (0, 1, 3, 4)], base, factors, sweep_settings, DepthEstimationSettings()
-    )
-    inner = (slice(12, -12), slice(16, -16))
-    error = np.log(found.depth / truth)[inner]
+    across = np.linspace(-0.06, 0.06, 96)
+    found, truth = swept(DepthEstimationSettings().sweeps[-1], lambda truth: truth * np.exp(across)[None])
+    error = np.log(found.depth / truth)[INNER]
     assert np.median(np.abs(error)) < 0.004
-    trend = np.polyfit(np.broadcast_to(across, truth.shape)[inner].ravel(), error.ravel(), 1)[0]
+    trend = np.polyfit(np.broadcast_to(across, truth.shape)[INNER].ravel(), error.ravel(), 1)[0]
     assert abs(trend) < 0.1
 
 

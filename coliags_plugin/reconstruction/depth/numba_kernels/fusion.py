@@ -9,33 +9,19 @@ from coliags_plugin.core.numba_compilation import Array, kernel
 
 @kernel
 def reproject(
-    depth: Array,
-    other: Array,
-    weight: Array,
-    turn: Array,
-    shift: Array,
-    back: Array,
-    origin: np.float32,
-    steps: int,
-    tolerance: np.float32,
-    reprojected: Array,
-    trust: Array,
+    depth: Array,  # first guess of z-depth; float32 [H, W]
+    other: Array,  # z-depth of the neighbour; NaN where unknown; float32 [h, w]
+    weight: Array,  # of its pixels; float32 [h, w]
+    turn: Array,  # pixel of the reference at z-depth 1 -> homogeneous pixel of the neighbour, in its units of z; [3, 3]
+    shift: Array,  # homogeneous pixel of the reference's centre in the neighbour; [3]
+    back: Array,  # pixel of the neighbour at z-depth 1 -> z-depth in the reference; a row; [3]
+    origin: np.float32,  # z-depth of the neighbour's centre in the reference
+    steps: int,  # largest number of iterations
+    tolerance: np.float32,  # relative change of depth at which they have converged
+    reprojected: Array,  # written: z-depth in the reference; NaN where the rays do not meet; float32 [H, W]
+    trust: Array,  # written: weight of the neighbour's pixel; float32 [H, W]
 ) -> None:
-    """Where the rays of one camera meet the depth map of another, by fixed-point iteration from a first guess.
-
-    Args:
-        depth: First guess of z-depth. float32 [H, W]
-        other: z-depth of the neighbour; NaN where unknown. float32 [h, w]
-        weight: Of its pixels. float32 [h, w]
-        turn: Pixel of the reference at z-depth 1 -> homogeneous pixel of the neighbour, in its units of z. [3, 3]
-        shift: Homogeneous pixel of the reference's centre in the neighbour. [3]
-        back: Pixel of the neighbour at z-depth 1 -> z-depth in the reference; a row. [3]
-        origin: z-depth of the neighbour's centre in the reference.
-        steps: Largest number of iterations.
-        tolerance: Relative change of depth at which they have converged.
-        reprojected: Written: z-depth in the reference; NaN where the rays do not meet. float32 [H, W]
-        trust: Written: weight of the neighbour's pixel. float32 [H, W]
-    """
+    """Where the rays of one camera meet the depth map of another, by fixed-point iteration from a first guess."""
     height, width = depth.shape
     rows, columns = other.shape
     for y in range(height):
@@ -79,29 +65,17 @@ def reproject(
 
 @kernel
 def vote(
-    depth: Array,
-    own: Array,
-    candidates: Array,
-    trusts: Array,
-    tolerance: np.float32,
-    fused: Array,
-    votes: Array,
-    against: Array,
-    spread: Array,
+    depth: Array,  # the frame's own z-depth; float32 [H, W]
+    own: Array,  # its weight; float32 [H, W]
+    candidates: Array,  # z-depths by the neighbours; NaN where there is none; float32 [N, H, W]
+    trusts: Array,  # their weights; float32 [N, H, W]
+    tolerance: np.float32,  # relative difference from the median of one that agrees; the group is twice as wide
+    fused: Array,  # written: z-depth; float32 [H, W]
+    votes: Array,  # written: weight of the candidates that agree with it, its own included; float32 [H, W]
+    against: Array,  # written: weight of those that do not; float32 [H, W]
+    spread: Array,  # written: weighted mean relative deviation within the group; float32 [H, W]
 ) -> None:
-    """Weighted median of the densest group of the candidates.
-
-    Args:
-        depth: The frame's own z-depth. float32 [H, W]
-        own: Its weight. float32 [H, W]
-        candidates: z-depths by the neighbours; NaN where there is none. float32 [N, H, W]
-        trusts: Their weights. float32 [N, H, W]
-        tolerance: Relative difference from the median within which a candidate agrees; the group is twice as wide.
-        fused: Written: z-depth. float32 [H, W]
-        votes: Written: weight of the candidates that agree with it, its own included. float32 [H, W]
-        against: Written: weight of those that do not. float32 [H, W]
-        spread: Written: weighted mean relative deviation within the group. float32 [H, W]
-    """
+    """Weighted median of the densest group of the candidates."""
     count, height, width = candidates.shape
     values = np.empty(count + 1, np.float32)
     weights = np.empty(count + 1, np.float32)

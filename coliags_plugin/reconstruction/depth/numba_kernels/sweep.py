@@ -107,35 +107,20 @@ def _correlate(
 
 @kernel
 def sweep(
-    base: Array,
-    ratios: Array,
-    reference: Array,
-    usable: Array,
-    images: Array,
-    masks: Array,
-    turns: Array,
-    shifts: Array,
-    radius: int,
-    floor: float,
-    share: float,
-    cost: Array,
+    base: Array,  # z-depth of the surface that is swept; float32 [H, W]
+    ratios: Array,  # factors on it; float32 [D]
+    reference: Array,  # guide image (log intensity); float32 [H, W]
+    usable: Array,  # 0 where the reference is masked; float32 [H, W]
+    images: Array,  # guides of the neighbours; float32 [N, h, w]
+    masks: Array,  # 0 where a neighbour is masked; uint8 [N, h, w]
+    turns: Array,  # pixel of the reference at z-depth 1 -> homogeneous pixel of the neighbour; float32 [N, 3, 3]
+    shifts: Array,  # homogeneous pixel of the reference's centre in the neighbour; float32 [N, 3]
+    radius: int,  # of the windows, pixels
+    floor: float,  # variance of the guides' noise
+    share: float,  # part of the neighbours that counts at each pixel, the best ones
+    cost: Array,  # written; 0 (equal) to 2, 1 where less than a quarter of the neighbours see it; float32 [H, W, D]
 ) -> None:
-    """Costs of the hypotheses ``base * ratios[d]``: one minus the mean of the best correlations with the neighbours.
-
-    Args:
-        base: z-depth of the surface that is swept. float32 [H, W]
-        ratios: Factors on it. float32 [D]
-        reference: Guide image (log intensity). float32 [H, W]
-        usable: 0 where the reference is masked. float32 [H, W]
-        images: Guides of the neighbours. float32 [N, h, w]
-        masks: 0 where a neighbour is masked. uint8 [N, h, w]
-        turns: Pixel of the reference at z-depth 1 -> homogeneous pixel of the neighbour. float32 [N, 3, 3]
-        shifts: Homogeneous pixel of the reference's centre in the neighbour. float32 [N, 3]
-        radius: Of the windows, pixels.
-        floor: Variance of the guides' noise.
-        share: Part of the neighbours that counts at each pixel, the best ones.
-        cost: Written; 0 (equal) to 2, exactly 1 where fewer than a quarter of the neighbours see it. float32 [H, W, D]
-    """
+    """Costs of the hypotheses ``base * ratios[d]``: one minus the mean of the best correlations with the neighbours."""
     height, width = base.shape
     count = images.shape[0]
     warped = np.empty((height, width), np.float32)
