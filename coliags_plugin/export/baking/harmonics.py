@@ -42,11 +42,7 @@ def fit_harmonics(
 ) -> Float[Tensor, "N B 3"]:
     """Coefficients that reproduce the colours best: weighted least squares per Gaussian, ridge above degree 0.
 
-    Args:
-        views: At least one.
-        kept: Slots to fit, ascending.
-        mean_colors: Their colours where no view shows them.
-        degree: Of the harmonics, B = (degree + 1)^2.
+    Of ascending slots, with B = (degree + 1)^2 each; ``mean_colors`` are theirs where no view shows them.
     """
     bases = (degree + 1) ** 2
     rows = torch.full((int(kept[-1]) + 1,), -1, dtype=torch.int64, device=kept.device)

@@ -24,20 +24,13 @@ class SplatCloud:
 
     The colour seen along a direction is max(0, 0.5 + sum of coefficients times basis), in display sRGB, with the order
     and the signs of 3DGS.
-
-    Attributes:
-        means: Centres.
-        quats_wxyz: Rotations; need not be normalised.
-        scales: Standard deviations along the local axes, three; two for surfels.
-        opacities: In [0, 1].
-        harmonics: Coefficients of spherical harmonics to degree D, B = (D + 1)^2.
     """
 
-    means: Float32[np.ndarray, "N 3"]
-    quats_wxyz: Float32[np.ndarray, "N 4"]
-    scales: Float32[np.ndarray, "N S"]
-    opacities: Float32[np.ndarray, "N"]
-    harmonics: Float32[np.ndarray, "N B 3"]
+    means: Float32[np.ndarray, "N 3"]  # centres
+    quats_wxyz: Float32[np.ndarray, "N 4"]  # rotations; need not be normalised
+    scales: Float32[np.ndarray, "N S"]  # standard deviations along the local axes, three; two for surfels
+    opacities: Float32[np.ndarray, "N"]  # in [0, 1]
+    harmonics: Float32[np.ndarray, "N B 3"]  # coefficients of spherical harmonics to degree D, B = (D + 1)^2
 
     def __len__(self) -> int:
         return len(self.means)

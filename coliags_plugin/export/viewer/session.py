@@ -6,12 +6,9 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.core.rotations import rotation_matrices
@@ -29,31 +26,10 @@ REST = 0.2
 EVERY = 0.5
 
 
-@dataclass
-class Update:
-    """What the last decoding and sending of splats cost, seconds; sending: until they were handed to the connection."""
-
-    count: int
-    decoding: float
-    sending: float
-
-    def __str__(self) -> str:
-        """For the panel."""
-        size = self.count * BYTES_PER_SPLAT / 1e6
-        return (
-            f"{self.count:,} Gaussians, {size:.1f} MB; decoded in {self.decoding:.2f} s, sent in {self.sending:.2f} s"
-        )
-
-
 class Pace:
-    """Decides when work wanted by a moving camera is due: once it rests, and not too often. Thread-safe; seconds.
+    """Decides when work wanted by a moving camera is due: once it rests, and not too often. Thread-safe; seconds."""
 
-    It rests ``rest`` after a movement, and work pauses for ``every`` at least.
-    """
-
-    def __init__(self, rest: float, every: float, clock: Callable[[], float] = time.monotonic) -> None:
-        self.rest = rest
-        self.every = every
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._lock = threading.Lock()
         self._wanted_from: float | None = None
@@ -62,7 +38,7 @@ class Pace:
     def moved(self) -> None:
         """The camera has moved: the work is wanted, once it rests."""
         with self._lock:
-            self._wanted_from = self._clock() + self.rest
+            self._wanted_from = self._clock() + REST
 
     def want(self) -> None:
         """The work is wanted without a movement, as after a change of options."""
@@ -75,7 +51,7 @@ class Pace:
         with self._lock:
             if self._wanted_from is None:
                 return None
-            return max(0.0, max(self._wanted_from, self._ended + self.every) - self._clock())
+            return max(0.0, max(self._wanted_from, self._ended + EVERY) - self._clock())
 
     def begin(self) -> None:
         """The work begins: what is wanted from now on is wanted anew."""
@@ -97,20 +73,17 @@ class Session:
     def __init__(self, client: Any, content: ViewerContent) -> None:
         self._client = client
         self._content = content
-        self._pace = Pace(REST, EVERY)
+        self._pace = Pace()
         self._wake = threading.Event()
         self._closed = False
         self._picture_of: tuple[int, str] | None = None
         self._splats: Any = None
         self._headlight = add_headlight(client.scene, tuple(client.camera.position))
-        self.last_update: Update | None = None
         self.controls = Controls(client, content, self.options_changed, self.go_to)
         client.camera.on_update(lambda _: self.camera_moved())
         if content.decoder is not None:
             self._send(content.decoder.beside, 0.0)
             self._pace.want()
-
-    # ---- What has changed
 
     def camera_moved(self) -> None:
         """The camera of the browser has moved."""
@@ -141,8 +114,6 @@ class Session:
         """The browser has gone."""
         self._closed = True
         self._wake.set()
-
-    # ---- Work
 
     def run(self) -> None:
         """Keep the browser up to date until it has gone."""
@@ -190,8 +161,10 @@ class Session:
         else:
             self._splats.set_gaussians(**arguments)
         self._client.flush()
-        self.last_update = Update(len(splats), decoding, time.perf_counter() - began)
-        self.controls.status = str(self.last_update)
+        size, sending = len(splats) * BYTES_PER_SPLAT / 1e6, time.perf_counter() - began  # handed to the connection
+        self.controls.status = (
+            f"{len(splats):,} Gaussians, {size:.1f} MB; decoded in {decoding:.2f} s, sent in {sending:.2f} s"
+        )
 
     def _update_picture(self, index: int, kind: str) -> None:
         with self._content.lock:
@@ -204,13 +177,8 @@ class Session:
         theirs = self._client.camera
         height, width = theirs.image_height, theirs.image_width
         focal = 0.5 * height / float(torch.tan(torch.tensor(0.5 * theirs.fov)))
+        matrix = torch.eye(4, dtype=torch.float64)
+        matrix[:3, :3] = rotation_matrices(torch.as_tensor(theirs.wxyz, dtype=torch.float64)[None])[0]
+        matrix[:3, 3] = torch.as_tensor(theirs.position, dtype=torch.float64)
         near = self._content.first_camera.near_plane
-        return Camera(focal, focal, 0.5 * width, 0.5 * height, width, height, _matrix(theirs), near)
-
-
-def _matrix(theirs: Any) -> Float[Tensor, "4 4"]:
-    """Pose of viser's camera. [4, 4]"""
-    matrix = torch.eye(4, dtype=torch.float64)
-    matrix[:3, :3] = rotation_matrices(torch.as_tensor(theirs.wxyz, dtype=torch.float64)[None])[0]
-    matrix[:3, 3] = torch.as_tensor(theirs.position, dtype=torch.float64)
-    return matrix
+        return Camera(focal, focal, 0.5 * width, 0.5 * height, width, height, matrix, near)

@@ -106,15 +106,12 @@ class CalibratedLens(Lens):
 
     The calibration itself is never rescaled: pixels are first carried back to the calibrated image, so that
     scaling and cropping are exact for every model.
-
-    Attributes:
-        stretch: Pixels of the calibrated image per pixel of this one, (x, y).
-        origin: Where this image's top left corner lies in the calibrated image, pixels from its corner, (x, y).
     """
 
     width: int
     height: int
-    stretch: tuple[float, float] = (1.0, 1.0)
+    stretch: tuple[float, float] = (1.0, 1.0)  # pixels of the calibrated image per pixel of this one, (x, y)
+    # Where this image's top left corner lies in the calibrated image, pixels from its corner, (x, y).
     origin: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:

@@ -38,32 +38,20 @@ class ErrorStatistics:
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Matched frames of an estimate aligned with a reference, and their errors.
+    """Matched frames of an estimate aligned with a reference, and their errors."""
 
-    Attributes:
-        matches: Matched frames; ``first`` is the estimate's.
-        transform: From the estimate's world to the reference's, by the positions.
-        world_rotation: Rotation between the worlds for the rotation error; that of ``transform`` unless the path is
-            nearly straight.
-        with_scale: Whether the scale was estimated.
-        estimate: The estimate after alignment, camera-to-world: positions by ``transform``, orientations by
-            ``world_rotation``.
-        reference: The reference, camera-to-world.
-        delta: Matched frames between the two poses of a relative error.
-        position_errors: Distance of the centres, units of the reference as all lengths here.
-        rotation_errors_deg: Angle between the cameras.
-        relative_translation_errors, relative_rotation_errors_deg: RPE, P = M - delta.
-    """
-
-    matches: FrameMatches
-    transform: Similarity
+    matches: FrameMatches  # matched frames; ``first`` is the estimate's
+    transform: Similarity  # from the estimate's world to the reference's, by the positions
+    # Rotation between the worlds for the rotation error; that of ``transform`` unless the path is nearly straight.
     world_rotation: WorldRotation
-    with_scale: bool
+    with_scale: bool  # whether the scale was estimated
+    # The estimate after alignment, camera-to-world: positions by ``transform``, orientations by ``world_rotation``.
     estimate: Float[np.ndarray, "M 4 4"]
-    reference: Float[np.ndarray, "M 4 4"]
-    delta: int
-    position_errors: Float[np.ndarray, "M"]
-    rotation_errors_deg: Float[np.ndarray, "M"]
+    reference: Float[np.ndarray, "M 4 4"]  # the reference, camera-to-world
+    delta: int  # matched frames between the two poses of a relative error
+    position_errors: Float[np.ndarray, "M"]  # distance of the centres, units of the reference as all lengths here
+    rotation_errors_deg: Float[np.ndarray, "M"]  # angle between the cameras
+    # RPE, P = M - delta.
     relative_translation_errors: Float[np.ndarray, "P"]
     relative_rotation_errors_deg: Float[np.ndarray, "P"]
 
@@ -112,11 +100,7 @@ class Alignment:
             "path_length": self.path_length,
             "ate_share_of_path": self.ate_share,
             "rotation_deg": vars(self.rotation_deg),
-            "world_rotation": {
-                "rotation": self.world_rotation.rotation.tolist(),
-                "by": self.world_rotation.by,
-                "reason": self.world_rotation.reason,
-            },
+            "world_rotation": vars(self.world_rotation) | {"rotation": self.world_rotation.rotation.tolist()},
             "rpe_delta_frames": self.delta,
             "rpe_translation": vars(self.rpe_translation),
             "rpe_rotation_deg": vars(self.rpe_rotation_deg),
@@ -132,14 +116,10 @@ class Alignment:
 def align(
     estimate: Trajectory, reference: Trajectory, matches: FrameMatches, with_scale: bool = False, delta: int = 1
 ) -> Alignment:
-    """Align the matched frames of an estimate with a reference, and compute the errors.
+    """Align the matched frames of an estimate with a reference, estimate first, and compute the errors.
 
-    Args:
-        estimate: The estimated trajectory.
-        reference: The reference trajectory.
-        matches: From :func:`associate`, estimate first.
-        with_scale: Sim(3) instead of SE(3), for an estimate of arbitrary scale.
-        delta: Matched frames between the two poses of a relative error.
+    With ``with_scale`` by Sim(3) instead of SE(3), for an estimate of arbitrary scale; the two poses of a relative
+    error are ``delta`` matched frames apart.
     """
     if not 1 <= delta < len(matches):
         raise InputError(

@@ -28,11 +28,8 @@ def check_rigid(
 ) -> None:
     """Refuse the first matrix that is not finite, rigid and right-handed, or lies absurdly far away.
 
-    Args:
-        matrices: Transforms.
-        place: What to call the matrix of an index in the message: file and line, or frame.
-        expected: Expectation in the error message for a matrix that is not rigid.
-        do: Advice in that message.
+    ``place`` names the matrix of an index in the message: file and line, or frame; ``expected`` and ``do`` are for one
+    that is not rigid.
     """
     with np.errstate(invalid="ignore"):
         far = np.abs(matrices[:, :3, 3]).max(axis=1) > bounds.LENGTH
@@ -71,13 +68,10 @@ def check_rigid(
 def rotations_from_wxyz(
     quats_wxyz: Float[np.ndarray, "N 4"], place: Callable[[int], str], *, unit: bool
 ) -> Float[np.ndarray, "N 3 3"]:
-    """Rotation matrices from quaternions, w first, which are normalised here.
+    """Rotation matrices from quaternions, w first, which are normalised here; ``place`` names one by its index.
 
-    Args:
-        quats_wxyz: Finite, not zero.
-        place: What to call the quaternion of an index in a message.
-        unit: Refuse a quaternion further than ``RIGID_TOLERANCE`` from unit length: in a format that stores unit
-            quaternions, another length means another column order or a damaged file.
+    With ``unit``, a quaternion further than ``RIGID_TOLERANCE`` from unit length is refused: in a format that stores
+    unit quaternions, another length means another column order or a damaged file.
     """
     lengths = np.linalg.norm(quats_wxyz, axis=1)
     for index in np.flatnonzero(~(lengths > ZERO_QUATERNION) | ~np.isfinite(lengths)):

@@ -21,14 +21,9 @@ _HEAD_BYTES = 65_536
 def read_numbers(
     path: Path, count: int, expected: str, do: str, *, comments: bool = False
 ) -> list[tuple[int, list[float]]]:
-    """Read rows of finite numbers, separated by commas or blanks, each with its line number.
+    """Read rows of so many finite numbers, separated by commas or blanks, each with its line number.
 
-    Args:
-        path: A text file.
-        count: Numbers per row.
-        expected: Expectation in the error message for an invalid line, which names it.
-        do: Advice in that message.
-        comments: Skip lines that begin with ``#``.
+    ``expected`` and ``do`` are for the error about an invalid line. Lines that begin with ``#`` may be comments.
     """
     rows: list[tuple[int, list[float]]] = []
     for number, line in text_lines(path, EXPECTED):

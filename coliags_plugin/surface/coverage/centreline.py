@@ -109,10 +109,7 @@ def find_section(
 ) -> LumenSection:
     """From the first to the last place at which half of the wall was seen, over windows of 10 mm.
 
-    Args:
-        arc: Place of each triangle along the centreline, mm.
-        areas: Of the triangles, mm^2; those that are missing have to be among them.
-        seen: Which triangles were seen.
+    ``arc`` is the place of each triangle along the centreline, mm; wall that is missing has to be among them.
     """
     first = float(np.floor(arc.min()))
     index = (arc - first).astype(int)

@@ -33,25 +33,17 @@ _CELL, _SECTOR, _DRAWS = 10.0, 30.0, 10
 
 @dataclass(frozen=True)
 class CoverageEvaluation:
-    """Scores on the true surface, within the true section.
+    """Scores on the true surface, within the true section."""
 
-    Attributes:
-        surface: Of the measured levels: true surface is called seen where the nearest reconstructed wall is, and lies
-            within 1 mm.
-        rays: Of the rule that a true triangle was seen where the measured wall is within 25 % of the distance along a
-            viewing ray that hits it.
-        all_unseen: Of calling everything unseen.
-        random: Of calling random cells unseen, of the same area as is truly unseen.
-        section: The true section.
-        unseen_share: Share of it that is truly unseen.
-    """
-
+    # Of the measured levels: true surface is called seen where the nearest reconstructed wall is, and lies within 1 mm.
     surface: CoverageScores
+    # Of the rule that a true triangle was seen where the measured wall is within 25 % of the distance along a viewing
+    # ray that hits it.
     rays: CoverageScores
-    all_unseen: CoverageScores
-    random: CoverageScores
-    section: LumenSection
-    unseen_share: float
+    all_unseen: CoverageScores  # of calling everything unseen
+    random: CoverageScores  # of calling random cells unseen, of the same area as is truly unseen
+    section: LumenSection  # the true section
+    unseen_share: float  # share of it that is truly unseen
 
     def as_json(self) -> dict[str, Any]:
         """Scores by name."""

@@ -22,7 +22,7 @@ def clock():
 
 
 def test_a_camera_that_moves_on_is_waited_for(clock):
-    pace = Pace(0.2, 0.5, clock)
+    pace = Pace(clock)
     assert pace.wait() is None
     for _ in range(5):
         pace.moved()
@@ -33,7 +33,7 @@ def test_a_camera_that_moves_on_is_waited_for(clock):
 
 
 def test_a_change_of_options_needs_no_rest_but_work_pauses_after_work(clock):
-    pace = Pace(0.2, 0.5, clock)
+    pace = Pace(clock)
     pace.want()
     assert pace.wait() == 0.0
     pace.begin()
@@ -45,7 +45,7 @@ def test_a_change_of_options_needs_no_rest_but_work_pauses_after_work(clock):
 
 
 def test_a_movement_during_the_work_is_not_lost(clock):
-    pace = Pace(0.2, 0.5, clock)
+    pace = Pace(clock)
     pace.want()
     pace.begin()
     pace.moved()
@@ -56,7 +56,7 @@ def test_a_movement_during_the_work_is_not_lost(clock):
 @given(st.lists(st.tuples(st.floats(0.0, 1.0), st.booleans()), max_size=40))
 def test_work_never_follows_work_too_soon(events):
     clock = Clock()
-    pace = Pace(0.2, 0.5, clock)
+    pace = Pace(clock)
     ended, last_move = -1e9, -1e9
     for passed, moves in events:
         clock.now += passed

@@ -61,12 +61,12 @@ def test_splats_are_seen_from_the_first_frame_on_and_the_slider_moves_the_view(b
         browser.open(viewer.url, WIDTH, HEIGHT)
         until(browser, tmp_path / "first.png", drawn)
         (session,) = viewer.sessions
-        first = session.last_update
+        first = session.controls.status
         before = np.array(session._client.camera.position)
         browser.run("document.querySelector('[role=slider]').focus()")
         browser.key("End", 35)
         ends = time.monotonic() + 60.0
-        while session.controls.frame == 0 or session.last_update is first:
+        while session.controls.frame == 0 or session.controls.status == first:
             assert time.monotonic() < ends
             time.sleep(0.2)
         last = viewer.content.frames[-1].camera.center.numpy()
