@@ -376,7 +376,6 @@ class Run:
 
 
 def _scene_of_size(path: Path, like: Scene) -> Scene:
-    """A scene, read at the working size of another one."""
     from coliags_plugin.engine.data_formats import open_scene
 
     camera = like.train[0].camera
@@ -393,16 +392,7 @@ def load_run(path: str | Path, *, data: str | Path | None = None, device: str = 
 
 
 def _columns(rows: Sequence[Mapping[str, Any]]) -> dict[str, Float[np.ndarray, "T"]]:
-    """Columns of the T rows of a training log.
-
-    Numbers in a part of a row have dotted names (``terms.l1``); what is no number is left out.
-
-    Args:
-        rows: As :meth:`RunFolder.log_rows` reads them. [T]
-
-    Returns:
-        Numbers by name, NaN where a row has none. [T] each
-    """
+    """Numbers of the rows of a training log by dotted name (``terms.l1``), NaN where a row has none. [T] each"""
     import numpy as np
 
     numbers = [_numbers(row) for row in rows]

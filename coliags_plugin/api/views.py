@@ -82,11 +82,7 @@ class RenderedView:
 
 
 def view_of(trained: TrainedRun, of: str | Camera, depth: str, outputs: Sequence[str]) -> RenderedView:
-    """Render a view of a run; see :meth:`coliags_plugin.api.runs.Run.render`.
-
-    Raises:
-        InputError: There is no such frame or output.
-    """
+    """Render a view of a run; see :meth:`coliags_plugin.api.runs.Run.render`."""
     if depth not in DEPTH_KINDS:
         raise InputError(
             f"no kind of depth '{depth}'", f"one of {', '.join(DEPTH_KINDS)}", did_you_mean(depth, DEPTH_KINDS)
@@ -109,7 +105,6 @@ def view_of(trained: TrainedRun, of: str | Camera, depth: str, outputs: Sequence
 
 
 def _frame(scene: Scene, name: str) -> tuple[Frame, Camera]:
-    """The frame of a name, with its camera."""
     frames = {frame.name: frame for part in (scene.train, *scene.test_sets.values()) for frame in part}
     if name not in frames:
         raise InputError(

@@ -52,7 +52,11 @@ class FinishedComparison:
     failures: Sequence[FailureRecord]
 
     def table(self, columns: Sequence[str] = COLUMNS) -> DisplayTable:
-        """Mean of metrics over every method's finished cells, of their main test sets, with the reasons of failures."""
+        """Mean of metrics over every method's finished cells, of their main test sets, with the reasons of failures.
+
+        Raises:
+            InputError: No result has one of the metrics.
+        """
         units = {name: metric.unit for result in self.results for name, metric in result.metrics.items()}
         for name in columns:
             if self.results and name not in units:

@@ -40,7 +40,7 @@ class Executor(ABC):
 
     @abstractmethod
     def check(self, folder: Path, scenes: Sequence[Path]) -> None:
-        """Find out whether tasks will see and can write a folder, and will see scenes."""
+        """Refuse a folder that tasks will not see or cannot write, and scenes that they will not see."""
 
     @abstractmethod
     def start(self, task: Task) -> None:

@@ -114,11 +114,9 @@ class _CellQueue:
 
     @property
     def counts(self) -> str:
-        """Number of cells in each phase, as text."""
         return ", ".join(f"{count} {phase}" for phase, count in Counter(self._phases.values()).items())
 
     def count(self, phase: Phase) -> int:
-        """Number of cells in a phase."""
         return sum(each == phase for each in self._phases.values())
 
     def start_next(self) -> bool:

@@ -32,7 +32,7 @@ class StageRecord:
     """A stage that was begun."""
 
     options: Mapping[str, Any]  # what it depends on, as JSON
-    state: Literal["begun", "failed", "done"] = "begun"
+    state: Literal["begun", "failed", "done"] = "begun"  # failed: for its input
     summary: str = ""  # what came out, in one line
     seconds: float = 0.0  # of the attempt that ended, wall-clock
     files: Mapping[str, str] = field(default_factory=dict)  # what it made, relative to the folder, and what each is
@@ -46,7 +46,7 @@ class Record:
 
     @classmethod
     def of(cls, folder: Path) -> Record:
-        """The record of a folder; empty for one that is new or empty."""
+        """The record of a folder; empty for one that is new or empty, and refused for one of something else."""
         file = folder / RECORD_FILE
         if file.is_file():
             try:

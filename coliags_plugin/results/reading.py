@@ -88,7 +88,7 @@ def _check_version(content: dict[str, Any], path: Path) -> None:
 
 
 def find_results(paths: Sequence[Path]) -> list[Result]:
-    """Read the results at some paths, each once: of files with one key and the same values the first counts.
+    """Read the results at some paths, each once: of files with one key the first counts; other values are refused.
 
     Paths are results files, and folders that are searched for them. Hidden files and folders, such as an interrupted
     evaluation leaves, are not looked into, nor are JSON files of other content.

@@ -230,6 +230,9 @@ class Result(_Part):
         Args:
             metric: Its name.
             set_name: Name of the test set; None: the main one.
+
+        Raises:
+            InputError: There is no such metric or test set.
         """
         chosen = self.main_set if set_name is None else set_name
         for kind, name, known in (("metric", metric, self.metrics), ("test set", chosen, self.sets)):

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from coliags_plugin.outputs.image_files import write_depth_tiff, write_png
-from coliags_plugin.results.hashing import metrics_sha256
 from coliags_plugin.results.reading import write_result
 from coliags_plugin.results.record import (
     CostRecord,
@@ -21,6 +20,7 @@ from coliags_plugin.results.record import (
     SceneRecord,
     SetRecord,
 )
+from tests.results.made import made_result, made_set
 
 HEIGHT, WIDTH = 12, 16
 METRICS = {
@@ -64,8 +64,8 @@ def set_of(
         made["psnr_seen"] = tuple(value + 2.0 for value in made["psnr"])
     profiles = {} if depth is None else {"distance": profile(depth, "mm"), "angle": profile(depth, "degrees")}
     reasons = {"lpips": NO_LPIPS} | ({} if depth is not None else {"depth_mse": "the frame has no true depth"})
-    return SetRecord(
-        frames=tuple(frames),
+    return made_set(
+        tuple(frames),
         values=made | dict(values or {}),
         reasons=reasons,
         predictions_sha256=digest(scene, name, psnr),
@@ -121,7 +121,8 @@ def result_of(
         "checkpoint_bytes": 3 * 2**20,
         "seconds_to_psnr": {"25": 10.0, "30": None},
     }
-    return Result(
+    return made_result(
+        sets,
         key=digest(method, scene, seed, split, steps, config)[:16],
         method=method,
         scene=SceneRecord(name=scene, fingerprint=digest(scene), split=split, train=tuple(train), size=size),
@@ -129,8 +130,6 @@ def result_of(
         seed=seed,
         steps=steps,
         metrics=METRICS,
-        sets=sets,
-        metrics_sha256=metrics_sha256(sets),
         cost=CostRecord(**{**costs, **(cost or {})}),
         config={"name": method, "schedule": {"steps": steps}, **(config or {})},
         software={"package_version": "0.1.0", "git": "abc1234", "threads": 2, **(software or {})},
