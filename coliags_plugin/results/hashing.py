@@ -73,7 +73,7 @@ def training_config(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def training_key(config: Mapping[str, Any], fingerprint: str, seed: int, package_version: str) -> str:
-    """Key of a trained model by its resolved config, 16 hexadecimal digits; how often is logged and saved is no part."""
+    """Key of a trained model by its resolved config, 16 hexadecimal digits; without how often is logged and saved."""
     return _digest([training_config(config), fingerprint, seed, package_version])
 
 

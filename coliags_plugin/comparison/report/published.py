@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -91,32 +91,15 @@ def published_for(part: Part) -> PublishedBenchmark | None:
         return None
     by_name = {run.scene: run.result for run in part.study.runs if part.record(run) is not None}
     scenes = [*by_name.values()]
-    tests: tuple[tuple[PublishedBenchmark, Callable[[list[Result]], bool]], ...] = (
-        (_C3VD, _is_c3vd),
-        (_C3VD_ENDOGSLAM, _is_c3vd_endogslam),
-        (_ROTATECOLON, _is_rotatecolon),
-    )
-    return next((benchmark for benchmark, is_it in tests if is_it(scenes)), None)
-
-
-def _is_c3vd(scenes: list[Result]) -> bool:
-    frames = sorted(sum(_frames(scene)) for scene in scenes)
-    sizes = {scene.scene.size for scene in scenes}
-    return _all_of(scenes, "c3vd", "every-8th") and sizes == {_C3VD_SIZE} and frames == sorted(_C3VD_FRAMES.values())
-
-
-def _is_c3vd_endogslam(scenes: list[Result]) -> bool:
-    named = all(scene.scene.name in _C3VD_FRAMES for scene in scenes)
-    return _all_of(scenes, "c3vd-endogslam", "endogslam") and named and len(scenes) == _ENDOGSLAM_SEQUENCES
-
-
-def _is_rotatecolon(scenes: list[Result]) -> bool:
-    return _all_of(scenes, "rotatecolon", "all-train") and [*map(_frames, scenes)] == [_ROTATECOLON_FRAMES]
-
-
-def _frames(result: Result) -> tuple[int, int]:
-    """Training and test frames."""
-    return len(result.scene.train), len(result.sets[MAIN_SET].frames)
+    frames = [(len(scene.scene.train), len(scene.sets[MAIN_SET].frames)) for scene in scenes]  # training, test
+    if _all_of(scenes, "c3vd", "every-8th"):
+        sizes = {scene.scene.size for scene in scenes}
+        is_whole = sizes == {_C3VD_SIZE} and sorted(map(sum, frames)) == sorted(_C3VD_FRAMES.values())
+        return _C3VD if is_whole else None
+    if _all_of(scenes, "c3vd-endogslam", "endogslam"):
+        named = all(scene.scene.name in _C3VD_FRAMES for scene in scenes)
+        return _C3VD_ENDOGSLAM if named and len(scenes) == _ENDOGSLAM_SEQUENCES else None
+    return _ROTATECOLON if _all_of(scenes, "rotatecolon", "all-train") and frames == [_ROTATECOLON_FRAMES] else None
 
 
 def _all_of(scenes: list[Result], dataset: str, split: str) -> bool:
