@@ -49,15 +49,17 @@ class DiffuseNetwork(nn.Module):
         cosines = (normals * lamps).sum(1, keepdim=True)
         inputs = torch.cat([albedos, distances, normals, lamps, cosines], dim=1)
         dtype = self._reduced_dtype(inputs) if in_training else inputs.dtype
-        layers: list[Any] = list(self.layers)
+        *hidden, (last_weight, last_bias) = (
+            (layer.get_parameter("weight"), layer.get_parameter("bias")) for layer in self.layers
+        )
         values = inputs.to(dtype)
         if dtype == torch.bfloat16:
             values = nn.functional.pad(values, (0, 0, 0, -len(values) % _ROWS))
-        for layer in layers[:-1]:
-            values = torch.relu_(nn.functional.linear(values, layer.weight.to(dtype), layer.bias.to(dtype)))
+        for weight, bias in hidden:
+            values = torch.relu_(nn.functional.linear(values, weight.to(dtype), bias.to(dtype)))
         # The bias, near 1, is added to the small rest in full precision.
-        rest = nn.functional.linear(values, layers[-1].weight.to(dtype))[: len(inputs)]
-        return rest.to(inputs.dtype) + layers[-1].bias
+        rest = nn.functional.linear(values, last_weight.to(dtype))[: len(inputs)]
+        return rest.to(inputs.dtype) + last_bias
 
     def _reduced_dtype(self, inputs: Tensor) -> torch.dtype:
         if inputs.dtype != torch.float32 or self.precision == "float32":

@@ -82,7 +82,7 @@ class ExplicitField(GaussianField[ExplicitT]):
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """One group for each kind of parameter."""
-        return {name: [getattr(self, name)] for name in self.row_parameters}
+        return {name: [self.get_parameter(name)] for name in self.row_parameters}
 
     def rows_added(self) -> None:
         """Extend what rows have besides parameters, after a strategy appended rows to these."""

@@ -60,7 +60,7 @@ class ExplicitGaussians(ExplicitField[ExplicitGaussiansSettings]):
         camera = camera.to(self.means.device, self.means.dtype)
         visible = self._visible(camera)
         means, scales, quats, opacities, sh0, rest = (
-            getattr(self, name).index_select(0, visible) for name in self.row_parameters
+            self.get_parameter(name).index_select(0, visible) for name in self.row_parameters
         )
         directions = nn.functional.normalize(means - camera.center, dim=1)
         return Gaussians(

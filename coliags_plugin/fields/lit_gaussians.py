@@ -168,7 +168,7 @@ class LitGaussians(ExplicitField[LitGaussiansSettings], LitField[LitGaussiansSet
         visible = self._visible(camera)
         visible = visible[self.opacities.detach()[visible].sigmoid() >= MIN_OPACITY]
         means, log_scales, quats, logits, albedos, roughness, f0 = (
-            getattr(self, name).index_select(0, visible) for name in self.row_parameters
+            self.get_parameter(name).index_select(0, visible) for name in self.row_parameters
         )
         scales = log_scales.clamp_max(self._max_log_scale()).exp()
         albedos = albedos.clamp_min(0.0)

@@ -6,7 +6,7 @@ import logging
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -70,11 +70,12 @@ class RadianceMLP(nn.Module):
         """Output of the trunk at normalised coordinates."""
         embedded = cosine_embedding(positions.flatten(0, 1), self.settings.position_frequencies)
         hidden = embedded
-        layer: Any
         for index, layer in enumerate(self.trunk):
-            again = index == self.settings.skip
-            hidden = first_layer(hidden, embedded, layer.weight, layer.bias) if again else layer(hidden)
-            hidden = hidden.relu_()
+            if index == self.settings.skip:
+                weight, bias = layer.get_parameter("weight"), layer.get_parameter("bias")
+                hidden = first_layer(hidden, embedded, weight, bias).relu_()
+            else:
+                hidden = layer(hidden).relu_()
         return hidden
 
     def raw_density(self, hidden: Float[Tensor, "P*S W"], rays: int) -> Float[Tensor, "P S"]:

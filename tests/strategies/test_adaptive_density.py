@@ -9,11 +9,9 @@ import torch
 
 from coliags_plugin.config.components import make_component
 from coliags_plugin.contracts import Schedule
-from coliags_plugin.core.gaussians import Gaussians
-from coliags_plugin.core.render_output import RenderOutput, Splats
 from coliags_plugin.core.rotations import rotation_matrices
 from tests.fields.made import make_field
-from tests.strategies.steps import after_backward, stepped_optimizers
+from tests.strategies.steps import after_backward, make_output, stepped_optimizers
 
 EXTENT = 10.0
 
@@ -29,19 +27,6 @@ def make(**options):
 def make_strategy(steps=30_000, **options):
     component = make_component("strategies", {"name": "adaptive-density", **options})
     return component.target(component.settings, torch.Generator().manual_seed(0), Schedule(steps, 30_000), EXTENT)
-
-
-def make_output(slots, gradients, radii=None, width=200, height=100):
-    """Gaussians of these rows whose projected centres have these gradients along x, in normalised image units."""
-    count = len(slots)
-    means2d = torch.zeros(count, 2, requires_grad=True)
-    means2d.grad = torch.stack([torch.as_tensor(gradients) / (0.5 * width), torch.zeros(count)], dim=1)
-    rows = torch.as_tensor(slots)
-    none = torch.zeros(count, 3)
-    gaussians = Gaussians(none, torch.zeros(count, 4), none, torch.ones(count), none, rows, rows)
-    image = torch.zeros(height, width)
-    drawn = torch.ones(count) if radii is None else torch.as_tensor(radii)
-    return RenderOutput(image[..., None].expand(-1, -1, 3), image, None, splats=Splats(gaussians, means2d, drawn))
 
 
 def test_small_ones_are_cloned():

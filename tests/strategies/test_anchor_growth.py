@@ -7,11 +7,10 @@ import torch
 
 from coliags_plugin.config.components import make_component
 from coliags_plugin.contracts import Schedule
-from coliags_plugin.core.gaussians import Gaussians
-from coliags_plugin.core.render_output import RenderOutput, Splats
 from coliags_plugin.strategies.anchor_growth import one_per_free_cell
 from tests.fields.made import make_field
 from tests.strategies.steps import after_backward, stepped_optimizers
+from tests.strategies.steps import make_output as drawn_output
 
 CHILDREN = 10
 
@@ -35,20 +34,10 @@ def make_judged(field, drawn=0.0, gradient=0.0, seen=0.0, **options):
     return strategy
 
 
-def make_output(slots, gradients, opacity=0.5, visible=None, radii=None, width=200, height=100):
-    """Gaussians of the given slots whose centres have the given pixel gradients (x only)."""
-    n = len(slots)
-    means2d = torch.zeros(n, 2, requires_grad=True)
-    means2d.grad = torch.stack([torch.as_tensor(gradients, dtype=torch.float32), torch.zeros(n)], dim=1)
-    sources = torch.as_tensor(slots, dtype=torch.long)
-    seen = torch.unique(sources // CHILDREN) if visible is None else visible
-    opacities = torch.full((n,), float(opacity))
-    gaussians = Gaussians(
-        torch.zeros(n, 3), torch.zeros(n, 4), torch.ones(n, 3), opacities, torch.zeros(n, 3), sources, seen
-    )
-    image = torch.zeros(height, width)
-    drawn = torch.ones(n) if radii is None else torch.as_tensor(radii)
-    return RenderOutput(image[..., None].expand(-1, -1, 3), image, None, splats=Splats(gaussians, means2d, drawn))
+def make_output(slots, gradients, visible=None, radii=None):
+    """Half transparent children of these slots, whose anchors are visible unless others are given."""
+    seen = torch.unique(torch.as_tensor(slots, dtype=torch.long) // CHILDREN) if visible is None else visible
+    return drawn_output(slots, gradients, radii, seen, 0.5)
 
 
 def test_counts_only_inside_the_window():
@@ -57,10 +46,9 @@ def test_counts_only_inside_the_window():
     for step in (500, 15_000, 20_000):
         assert after_backward(strategy, step, field, rows, make_output([0], [1.0])) == {}
         assert len(strategy.seen) == 0
-    after_backward(strategy, 501, field, rows, make_output([0, 11], [0.01, 0.02]))
+    after_backward(strategy, 501, field, rows, make_output([0, 11], [1.0, 2.0]))
     assert strategy.seen.nonzero().flatten().tolist() == [0, 1]
     assert strategy.opacity_sum[:2].tolist() == [0.5, 0.5]
-    # Pixel gradients times half the width are gradients in normalised image units.
     assert strategy.gradient_sum[[0, 11]].tolist() == pytest.approx([1.0, 2.0])
     assert strategy.drawn[[0, 11]].tolist() == [1.0, 1.0]
 
@@ -257,6 +245,6 @@ def test_never_prunes_everything():
 def test_state_round_trip():
     field, rows = make()
     strategy, other = make_strategy(), make_strategy()
-    after_backward(strategy, 600, field, rows, make_output([0, 11], [0.01, 0.02]))
+    after_backward(strategy, 600, field, rows, make_output([0, 11], [1.0, 2.0]))
     other.load_state_dict(strategy.state_dict())
     assert all(torch.equal(other.state_dict()[k], v) for k, v in strategy.state_dict().items())
