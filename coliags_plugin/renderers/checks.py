@@ -11,11 +11,7 @@ from coliags_plugin.core.render_output import OUTPUTS, SURFEL_OUTPUTS
 
 
 def check_primitive(field: Field, primitives: Collection[str], renderer: str) -> None:
-    """Refuse a field that a renderer cannot draw.
-
-    Raises:
-        InputError: See above.
-    """
+    """Refuse a field that a renderer cannot draw."""
     if field.primitive not in primitives:
         raise InputError(
             f"a field of '{field.primitive}' for the {renderer} renderer",
@@ -25,11 +21,7 @@ def check_primitive(field: Field, primitives: Collection[str], renderer: str) ->
 
 
 def check_outputs(wants: Iterable[str], known: Iterable[str]) -> None:
-    """Refuse outputs that a renderer does not have.
-
-    Raises:
-        InputError: See above.
-    """
+    """Refuse outputs that a renderer does not have."""
     known = tuple(known)
     for name in wants:
         if name not in known:
@@ -37,11 +29,7 @@ def check_outputs(wants: Iterable[str], known: Iterable[str]) -> None:
 
 
 def is_surfels(gaussians: Gaussians) -> bool:
-    """Whether Gaussians are surfels, with two scales each.
-
-    Raises:
-        InputError: They have neither two nor three scales.
-    """
+    """Whether Gaussians are surfels, with two scales each; InputError if they have neither two nor three."""
     scales = gaussians.scales
     if scales.ndim != 2 or scales.shape[1] not in (2, 3):
         raise InputError(
@@ -51,11 +39,7 @@ def is_surfels(gaussians: Gaussians) -> bool:
 
 
 def check_gaussian_outputs(wants: Iterable[str], gaussians: Gaussians) -> None:
-    """Refuse outputs that are neither a splatting renderer's nor features of the Gaussians, and malformed features.
-
-    Raises:
-        InputError: See above.
-    """
+    """Refuse outputs that are neither a splatting renderer's nor features of the Gaussians, and malformed features."""
     check_outputs(wants, (*OUTPUTS, *gaussians.features))
     of_surfels = sorted(SURFEL_OUTPUTS & {*wants} - {*gaussians.features})
     if of_surfels and not is_surfels(gaussians):

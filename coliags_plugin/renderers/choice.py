@@ -23,16 +23,7 @@ class ChosenRenderer:
 
 
 def choose_renderer(component: Component, primitive: str, device: torch.device) -> ChosenRenderer:
-    """Make the renderer of a config; of ``auto``, the first preferred one that can render the field.
-
-    Args:
-        component: The config's renderer node.
-        primitive: Of the field.
-        device: Of the field.
-
-    Raises:
-        InputError: It, or each that ``auto`` prefers, cannot render this field on this device.
-    """
+    """Make the renderer of a config; of ``auto``, the first preferred one that can render the field."""
     if is_auto(component.kind, component.name):
         return _first_of(component, primitive, device)
     obstacle = component.target.obstacle(primitive, device)

@@ -16,7 +16,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from coliags_plugin.renderers.sweeping import Chunk, Cuts, crossing_of_half, padded_rows, sweep
+from coliags_plugin.renderers.splatting import CutSettings
+from coliags_plugin.renderers.sweeping import Chunk, crossing_of_half, padded_rows, sweep
 
 
 def log_alpha_polynomials(
@@ -24,10 +25,8 @@ def log_alpha_polynomials(
 ) -> Float[Tensor, "M 6"]:
     """Coefficients of log(opacity) - |U (offset + p)|^2 / 2 in the monomials of p that :func:`monomials` gives.
 
-    Args:
-        log_opacities: [M]
-        whitenings: u_xx, u_yx, u_yy of the lower triangular U, 1 / pixels. [M, 3]
-        offsets: From the Gaussian's centre to the origin of p, pixels. [M, 2]
+    ``whitenings`` are u_xx, u_yx, u_yy of the lower triangular U, 1 / pixels; ``offsets`` lead from the Gaussian's
+    centre to the origin of p, pixels.
     """
     u_xx, u_yx, u_yy = whitenings.unbind(-1)
     x, y = offsets.unbind(-1)
@@ -57,18 +56,13 @@ def composite(
     features: Float[Tensor, "M F"],
     starts: Int[Tensor, "tiles+1"],
     pixels: Float[Tensor, "6 P"],
-    cuts: Cuts,
+    cuts: CutSettings,
 ) -> Float[Tensor, "tiles F P"]:
     """Sum of weight times feature over the pairs of each tile, at each of its pixels.
 
-    Differentiable (once) in ``polynomials`` and ``features``.
-
-    Args:
-        polynomials: Log alpha of each pair, by tile and front to back: :func:`log_alpha_polynomials`. [M, 6]
-        features: What to composite. [M, F]
-        starts: First pair of each tile, and M. [tiles + 1]
-        pixels: :func:`monomials` of the pixel centres of a tile. [6, P]
-        cuts: Thresholds.
+    Differentiable (once) in ``polynomials``, of :func:`log_alpha_polynomials` by tile and front to back, and in
+    ``features``. ``starts`` is the first pair of each tile, and M; ``pixels`` are the :func:`monomials` of a tile's
+    pixel centres.
     """
     composited: Tensor = _Composite.apply(polynomials, features, starts, pixels, cuts)  # type: ignore[no-untyped-call]
     return composited
@@ -80,7 +74,7 @@ def median_depths(
     depths: Float[Tensor, "M"],
     starts: Int[Tensor, "tiles+1"],
     pixels: Float[Tensor, "6 P"],
-    cuts: Cuts,
+    cuts: CutSettings,
 ) -> Float[Tensor, "tiles P"]:
     """Depth of the pair that brings the transmittance to one half or less; 0 where none does. [tiles, P]"""
     medians = depths.new_zeros(len(starts) - 1, pixels.shape[1])
@@ -91,7 +85,7 @@ def median_depths(
     return medians
 
 
-def _sweep(padded: Tensor, starts: Tensor, pixels: Tensor, cuts: Cuts) -> Iterator[Chunk[None]]:
+def _sweep(padded: Tensor, starts: Tensor, pixels: Tensor, cuts: CutSettings) -> Iterator[Chunk[None]]:
     """Sweep over the pairs of all tiles, the polynomials padded. [M + 1, 6], [tiles + 1], [6, P]"""
 
     def evaluate(rows: Tensor) -> tuple[Tensor, None]:
@@ -102,7 +96,9 @@ def _sweep(padded: Tensor, starts: Tensor, pixels: Tensor, cuts: Cuts) -> Iterat
 
 class _Composite(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, polynomials: Tensor, features: Tensor, starts: Tensor, pixels: Tensor, cuts: Cuts) -> Tensor:
+    def forward(
+        ctx: Any, polynomials: Tensor, features: Tensor, starts: Tensor, pixels: Tensor, cuts: CutSettings
+    ) -> Tensor:
         padded, padded_features = padded_rows(polynomials, 0), torch.nn.functional.pad(features, (0, 0, 0, 1))
         composited = features.new_zeros(len(starts) - 1, features.shape[1], pixels.shape[1])
         for chunk in _sweep(padded, starts, pixels, cuts):

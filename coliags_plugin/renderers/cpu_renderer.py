@@ -65,17 +65,11 @@ def render_gaussians(
     wants: Sequence[str] = ("rgb", "alpha"),
     settings: CpuRendererSettings | None = None,
 ) -> RenderOutput:
-    """Render 3D Gaussians, or surfels where they have two scales, from a camera.
+    """Render float32 3D Gaussians on the CPU, or surfels where they have two scales, from a camera.
 
     Everything but ``radii`` and, of 3D Gaussians, ``depth_median`` is differentiable, once, in the Gaussians and in
     ``camera.camera_to_world``; ``means2d.grad`` is set by ``backward``. The first call on a machine compiles the
     kernels, which takes about half a minute.
-
-    Args:
-        gaussians: Float32, on the CPU.
-        camera: Camera of the view; its pose is cast to float32.
-        wants: Names from :data:`coliags_plugin.core.render_output.OUTPUTS`; rgb and alpha are always included.
-        settings: Defaults if None.
 
     Raises:
         InputError: An output is unknown or not of these Gaussians; a tensor is of the wrong shape, dtype or device; a

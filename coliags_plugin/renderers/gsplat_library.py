@@ -40,11 +40,7 @@ def availability() -> Availability:
 
 @functools.cache
 def load() -> ModuleType:
-    """Import gsplat after testing that it works.
-
-    Raises:
-        InputError: It cannot be used here, with the reason.
-    """
+    """Import gsplat after testing that it works; InputError with the reason where it does not."""
     found = availability()
     if not found.ok:
         raise InputError(

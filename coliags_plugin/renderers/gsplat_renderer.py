@@ -50,11 +50,7 @@ class GsplatRenderer(SplattingRenderer[GsplatRendererSettings]):
         return gsplat_library.availability()
 
     def draw(self, gaussians: Gaussians, camera: Camera, wants: Sequence[str]) -> RenderOutput:
-        """See :func:`render_with_gsplat`.
-
-        Raises:
-            InputError: The Gaussians are not on a CUDA device, or gsplat cannot be used here.
-        """
+        """See :func:`render_with_gsplat`; refuses Gaussians that are not on a CUDA device."""
         if gaussians.means.device.type not in self.devices:
             raise InputError(
                 f"Gaussians on {gaussians.means.device.type} for the gsplat renderer",
@@ -70,16 +66,10 @@ def render_with_gsplat(
     wants: Sequence[str] = ("rgb", "alpha"),
     settings: GsplatRendererSettings | None = None,
 ) -> RenderOutput:
-    """Render 3D Gaussians from a camera.
+    """Render float32 3D Gaussians on a CUDA device from a camera.
 
     Everything but ``depth_median`` and ``radii`` is differentiable, once, in the Gaussians and in
     ``camera.camera_to_world``; ``means2d.grad`` is set by ``backward``.
-
-    Args:
-        gaussians: float32, on a CUDA device.
-        camera: Camera of the view; its pose is cast to the Gaussians' dtype and device.
-        wants: Names from :data:`coliags_plugin.core.render_output.OUTPUTS`; rgb and alpha are always included.
-        settings: Defaults if None.
 
     Raises:
         InputError: An output is unknown, the Gaussians are surfels or not float32, or gsplat cannot be used here.
@@ -146,7 +136,8 @@ def _draw_gaussians(
     maps = split_channels(image[0], parts)
     if "depth_median" in needs:
         maps["depth_median"] = _median_by_definition(gaussians, camera, settings)
-    return DrawnView(maps["rgb"], alpha[0, ..., 0], maps, means2d, _largest(radii[0], visible, means2d))
+    largest = torch.where(visible, radii[0].amax(-1), 0).to(means2d.dtype)
+    return DrawnView(maps["rgb"], alpha[0, ..., 0], maps, means2d, largest)
 
 
 def _draw_nothing(gaussians: Gaussians, camera: Camera, needs: set[str], settings: GsplatRendererSettings) -> DrawnView:
@@ -205,7 +196,3 @@ def _backgrounds(features: Float[Tensor, "N F"], settings: GsplatRendererSetting
     if not any(settings.background):
         return None
     return features.new_tensor([[*settings.background, *[0.0] * (features.shape[-1] - 3)]])
-
-
-def _largest(radii: Tensor, visible: Tensor, like: Tensor) -> Float[Tensor, "N"]:
-    return torch.where(visible, radii.amax(-1), 0).to(like.dtype)

@@ -49,13 +49,8 @@ class ProjectedGaussians:
 def project_gaussians(gaussians: Gaussians, camera: Camera, eps2d: float) -> ProjectedGaussians:
     """Project Gaussians; differentiable in all of them and in ``camera.camera_to_world``.
 
-    Args:
-        gaussians: With three scales each. Their dtype and device are those of the result.
-        camera: Camera of the view; Gaussians whose centre has z <= its near plane are not drawn.
-        eps2d: Added to both diagonal terms of the 2D covariance. Square pixels.
-
-    Raises:
-        InputError: The Gaussians are surfels.
+    Those whose centre has z <= the camera's near plane are not drawn; ``eps2d``, square pixels, is added to both
+    diagonal terms of the 2D covariance.
     """
     if gaussians.scales.shape[-1] != 3:
         raise InputError(
@@ -80,15 +75,7 @@ def project_gaussians(gaussians: Gaussians, camera: Camera, eps2d: float) -> Pro
     row_x = (camera.fx / z)[:, None] * (axes[:, 0] - slope_x[:, None] * axes[:, 2])
     row_y = (camera.fy / z)[:, None] * (axes[:, 1] - slope_y[:, None] * axes[:, 2])
     covariances, whitenings = filtered_covariances(row_x, row_y, eps2d)
-    return ProjectedGaussians(
-        means_camera=local,
-        rotations=rotations,
-        means2d=means2d,
-        depths=z,
-        covariances=covariances,
-        whitenings=whitenings,
-        in_front=in_front,
-    )
+    return ProjectedGaussians(local, rotations, means2d, z, covariances, whitenings, in_front)
 
 
 def filtered_covariances(
@@ -96,13 +83,8 @@ def filtered_covariances(
 ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]]:
     """Covariances V V^T + eps2d I of image points and their whitenings, without cancellation for needles.
 
-    Args:
-        row_x: First row of V, pixels. [N, 3]
-        row_y: Second row of V, pixels. [N, 3]
-        eps2d: Square pixels.
-
-    Returns:
-        As :class:`ProjectedGaussians` has them. [N, 3], [N, 3]
+    ``row_x`` and ``row_y`` are the rows of V in pixels, ``eps2d`` square pixels; the result is as in
+    :class:`ProjectedGaussians`.
     """
     sharp_xx, sharp_yy = row_x.square().sum(-1), row_y.square().sum(-1)
     xx, xy, yy = sharp_xx + eps2d, (row_x * row_y).sum(-1), sharp_yy + eps2d
@@ -121,12 +103,7 @@ def facing_normals(projected: ProjectedGaussians, scales: Float[Tensor, "N 3"]) 
 
 
 def facing(axes: Float[Tensor, "N 3"], sight: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-    """Axes turned around where they point away from the camera. [N, 3]
-
-    Args:
-        axes: In any frame. [N, 3]
-        sight: From the camera to where the axes are, in the same frame. [N, 3]
-    """
+    """Axes turned around where they point away from the camera; ``sight`` leads from it to them, in the same frame."""
     away = (axes * sight).sum(-1, keepdim=True) > 0
     return torch.where(away, -axes, axes)
 

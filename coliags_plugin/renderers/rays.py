@@ -19,14 +19,9 @@ def even_places(
     rays: Float[Tensor, "P 3"],
     generator: torch.Generator | None,
 ) -> Float[Tensor, "P S"]:
-    """One place in each of ``count`` equal intervals between two ends.
+    """One place in each of ``count`` equal intervals between two ends, for as many rays, in their dtype and device.
 
-    Args:
-        near: Start of the first interval.
-        far: End of the last interval.
-        count: S.
-        rays: As many, and of the dtype and device. [P, 3]
-        generator: Draws a place within each interval; None takes the midpoints.
+    The generator draws a place within each interval; None takes the midpoints.
     """
     return near + (far - near) * _shares(len(rays), count, rays, generator)
 
@@ -34,17 +29,12 @@ def even_places(
 def refined_places(
     places: Float[Tensor, "P S"], weights: Float[Tensor, "P S"], count: int, generator: torch.Generator | None
 ) -> Float[Tensor, "P S+N"]:
-    """The places and ``count`` more, distributed like the weights; sorted.
+    """The places, in order and at least three, and ``count`` more, distributed like the weights; sorted.
 
     The distribution is NeRF's: constant between the midpoints of neighbouring places, where it is the weight of the
-    place between them plus :data:`WEIGHT_FLOOR`; the first and the last weight are not used.
-
-    Args:
-        places: In order, at least three. [P, S]
-        weights: Compositing weights at the places. [P, S]
-        count: N.
-        generator: Draws a number within each of N equal intervals of [0, 1], which the inverse of the cumulative
-            distribution makes a place; None takes the midpoints.
+    place between them plus :data:`WEIGHT_FLOOR`; the first and the last weight are not used. The generator draws a
+    number within each of ``count`` equal intervals of [0, 1], which the inverse of the cumulative distribution makes a
+    place; None takes the midpoints.
     """
     edges = 0.5 * (places[:, 1:] + places[:, :-1])
     mass = weights[:, 1:-1] + WEIGHT_FLOOR
@@ -68,12 +58,9 @@ def _shares(rows: int, count: int, like: Tensor, generator: torch.Generator | No
 
 @dataclass(frozen=True)
 class CompositedRays:
-    """Samples along rays and their weights.
+    """Samples along rays: z-depths in scene units, RGB, which is None where only depths are asked for, and weights.
 
-    Attributes:
-        depths: z-depths of the samples, scene units. [P, S]
-        transmittance: Before every sample and behind the last. [P, S+1]
-        colors: RGB of the samples; None where only depths are asked for. [P, S, 3]
+    ``transmittance`` is that before every sample and behind the last.
     """
 
     depths: Float[Tensor, "P S"]
@@ -86,12 +73,7 @@ class CompositedRays:
         return self.transmittance[:, :-1] - self.transmittance[:, 1:]
 
     def output(self, name: str, background: Float[Tensor, "3"]) -> Float[Tensor, "P 1 *C"]:
-        """An output by its name in :data:`coliags_plugin.core.render_output.OUTPUTS`, normals excepted.
-
-        Args:
-            name: For ``rgb`` there must be colours.
-            background: RGB behind the last sample. [3]
-        """
+        """An output of ``core.render_output`` by its name, normals excepted; rgb needs colours. [P, 1] or [P, 1, 3]"""
         alpha = 1.0 - self.transmittance[:, -1:]
         if name == "alpha":
             return alpha
@@ -114,12 +96,9 @@ class CompositedRays:
 def transmittances(
     density: Float[Tensor, "P S"], lengths: Float[Tensor, "P S"], opaque_end: bool
 ) -> Float[Tensor, "P S+1"]:
-    """Transmittance before every sample and behind the last.
+    """Transmittance before every sample and behind the last, from densities per scene unit and lengths in scene units.
 
-    Args:
-        density: Per scene unit. [P, S]
-        lengths: Of the stretches of ray that the samples stand for, scene units. [P, S]
-        opaque_end: The last stretch has no end: it lets nothing through where its density is above 0.
+    With ``opaque_end`` the last stretch has no end: it lets nothing through where its density is above 0.
     """
     absorbed = density * lengths
     if opaque_end:

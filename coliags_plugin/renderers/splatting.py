@@ -55,11 +55,7 @@ class CutSettings(SplattingSettings):
     """z-depth that the output ``distortion`` maps to 1; the near plane is mapped to 0. Scene units."""
 
     def distortion_slope(self, near_plane: float) -> float:
-        """Factor of -1/z in the depths whose differences ``distortion`` measures, scene units.
-
-        Raises:
-            InputError: ``distortion_far`` does not lie beyond the near plane.
-        """
+        """Factor of -1/z in the depths whose differences ``distortion`` measures, scene units."""
         if self.distortion_far <= near_plane:
             raise InputError(
                 f"renderer.distortion_far {self.distortion_far:g} with near_plane {near_plane:g}",
@@ -119,11 +115,7 @@ class SplattingRenderer(Renderer[SplattingT, GaussianField]):
         return self.draw(field.gaussians_in_training(camera, generator), camera, wants)
 
     def check_field(self, field: GaussianField, near_plane: float) -> None:
-        """Refuse a near plane beyond ``distortion_far``.
-
-        Raises:
-            InputError: See above.
-        """
+        """Refuse a near plane beyond ``distortion_far``."""
         if isinstance(self.settings, CutSettings):
             self.settings.distortion_slope(near_plane)
 
@@ -146,12 +138,7 @@ class SplattingRenderer(Renderer[SplattingT, GaussianField]):
 class DrawnView:
     """Composited images of one view.
 
-    Attributes:
-        rgb: Over the background. [H, W, 3]
-        alpha: [H, W]
-        maps: The other outputs, and the accumulated depth if the expected is wanted. [H, W] or [H, W, C]
-        means2d: [N, 2]
-        radii: [N]
+    ``maps`` are the other outputs, and the accumulated depth if the expected is wanted: [H, W] or [H, W, C].
     """
 
     rgb: Float[Tensor, "H W 3"]
@@ -179,9 +166,7 @@ class DrawnView:
 def split_channels(sums: Float[Tensor, "H W F"], features: dict[str, Tensor]) -> dict[str, Tensor]:
     """Composited channels by output; the renderer's own single channels without the last dimension.
 
-    Args:
-        sums: All channels. [H, W, F]
-        features: Those of the Gaussians by output, in the same order. [N, C] each
+    ``features`` are those of the Gaussians by output, in the same order. [N, C] each
     """
     parts = torch.split(sums, [part.shape[1] for part in features.values()], dim=-1)
     return {

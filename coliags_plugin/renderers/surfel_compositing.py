@@ -7,7 +7,6 @@ The definition and its derivatives are written out in ``docs/rendering.md``, sec
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
@@ -15,34 +14,27 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from coliags_plugin.renderers.sweeping import Chunk, Cuts, crossing_of_half, padded_rows, sweep
+from coliags_plugin.renderers.splatting import CutSettings
+from coliags_plugin.renderers.sweeping import Chunk, crossing_of_half, padded_rows, sweep
 from coliags_plugin.renderers.tiles import TilePairs
 
 
-@dataclass(frozen=True)
-class SurfelRules:
-    """Constants of the compositing of surfels.
+class SurfelRules(NamedTuple):
+    """How surfels are composited: they are skipped at pixels where they are nearer than the near plane, a z-depth.
 
-    Attributes:
-        cuts: Thresholds common to all splats.
-        near_plane: A surfel is skipped at pixels where it is nearer than this z-depth.
-        surfel_filter: Standard deviation of the low-pass filter, pixels.
-        depths: Whether depths, their distortion and the median are wanted.
+    ``depths`` tells whether depths, their distortion and the median are wanted.
     """
 
-    cuts: Cuts
+    settings: CutSettings
     near_plane: float
-    surfel_filter: float
     depths: bool
 
 
 class CompositedSurfels(NamedTuple):
     """Sums over the surfels of each tile at each of its pixels, w the weight of a surfel and z its depth there.
 
-    Attributes:
-        features: sum w f. [tiles, F, P]
-        depths: sum w z, sum w / z, sum over pairs i < j of w_i w_j (1/z_i - 1/z_j)^2, and the median depth; 0 unless
-            wanted. [tiles, 4, P]
+    ``features`` are sum w f; ``depths`` are sum w z, sum w / z, sum over pairs i < j of w_i w_j (1/z_i - 1/z_j)^2, and
+    the median depth; 0 unless wanted.
     """
 
     features: Float[Tensor, "tiles F P"]
@@ -55,17 +47,10 @@ def pair_rows(
     log_opacities: Float[Tensor, "M"],
     origins: Float[Tensor, "M 2"],
 ) -> Float[Tensor, "M 13"]:
-    """What :func:`composite_surfels` reads of each pair.
+    """What :func:`composite_surfels` reads of each pair, from its surfel's ``ProjectedSurfels.intersections``.
 
     These are the coefficients of U, V and W in 1, x, y of the offset from the tile's midpoint, D, the offset from there
-    to the filter's centre, and log(opacity).
-
-    Args:
-        intersections: :attr:`coliags_plugin.renderers.surfel_projection.ProjectedSurfels.intersections` of each pair's
-            surfel. [M, 10]
-        filter_centers: Pixels. [M, 2]
-        log_opacities: [M]
-        origins: Midpoints of the tiles, pixels. [M, 2]
+    to the filter's centre, and log(opacity). ``origins`` are the midpoints of the tiles, pixels.
     """
     slopes = intersections[:, 2:8].reshape(-1, 3, 2)
     at_center, plane_offsets = intersections[:, 8], intersections[:, 9:]
@@ -85,12 +70,8 @@ def composite_surfels(
 ) -> CompositedSurfels:
     """Composite the pairs of each tile at each of its pixels; differentiable (once) in ``rows`` and ``features``.
 
-    Args:
-        rows: :func:`pair_rows`, by tile and front to back. [M, 13]
-        features: What to composite beside depths. [M, F]
-        pairs: Their tiles.
-        offsets: Pixel centres of a tile from its midpoint. [P, 2]
-        rules: Constants.
+    ``rows`` are of :func:`pair_rows`, by tile and front to back; ``offsets`` lead from a tile's midpoint to its pixel
+    centres.
     """
     pixels = torch.nn.functional.pad(offsets, (1, 0), value=1.0).T.contiguous()
     return CompositedSurfels(*_CompositeSurfels.apply(rows, features, pairs.starts, pixels, rules))  # type: ignore[no-untyped-call]
@@ -129,12 +110,12 @@ def _sweep(padded: Tensor, starts: Tensor, pixels: Tensor, rules: SurfelRules) -
         u, v = u * inverse_w, v * inverse_w
         x, y = pixels[1] - table[:, 10:11], pixels[2] - table[:, 11:12]
         squared = u * u + v * v
-        filtered = (x * x + y * y) * rules.surfel_filter**-2
+        filtered = (x * x + y * y) * rules.settings.surfel_filter**-2
         on_disc = squared <= filtered
         alphas = torch.exp(table[:, 12:] - 0.5 * torch.where(on_disc, squared, filtered)).mul_(hit)
         return alphas, _Hits(inverse_w, u, v, torch.where(hit, depths, 1.0), on_disc, (x, y))
 
-    return sweep(evaluate, starts, padded.new_ones(pixels.shape[1]), rules.cuts)
+    return sweep(evaluate, starts, padded.new_ones(pixels.shape[1]), rules.settings)
 
 
 class _Spread:
@@ -217,7 +198,7 @@ class _CompositeSurfels(torch.autograd.Function):
                 crossing, crosses = crossing_of_half(chunk)
                 of_z.scatter_add_(1, crossing[:, None], of_median * crosses[:, None])
             gained.mul_(weights)
-            of_log_alphas = chunk.of_log_alphas(gained, behind, rules.cuts.alpha_max)
+            of_log_alphas = chunk.of_log_alphas(gained, behind, rules.settings.alpha_max)
             of_rows[chunk.rows] = _of_rows(
                 hits, of_log_alphas, None if of_z is None else of_z.flatten(0, 1), pixels, rules
             )
@@ -241,6 +222,6 @@ def _of_rows(
         of_w = of_w - of_offsets * hits.depths
         of_offset = of_offsets.sum(1, keepdim=True)
     of_planes = torch.stack([of_u, of_v, of_w], dim=1) @ pixels.T
-    filtered = of_log_alphas * ~hits.on_disc * rules.surfel_filter**-2
+    filtered = of_log_alphas * ~hits.on_disc * rules.settings.surfel_filter**-2
     of_center = torch.stack([(filtered * offset).sum(1) for offset in hits.from_center], dim=1)
     return torch.cat([of_planes.flatten(1), of_offset, of_center, of_log_alphas.sum(1, keepdim=True)], dim=1)

@@ -61,9 +61,7 @@ class ProjectedSurfels:
 def project_surfels(gaussians: Gaussians, camera: Camera) -> ProjectedSurfels:
     """Project surfels; differentiable in all of them and in ``camera.camera_to_world``.
 
-    Args:
-        gaussians: With two scales each. Their dtype and device are those of the result.
-        camera: Camera of the view; surfels whose centre has z <= its near plane are not drawn.
+    Those whose centre has z <= the camera's near plane are not drawn.
     """
     camera = camera.to(gaussians.means.device, gaussians.means.dtype)
     camera_axes = camera.camera_to_world[:3, :3]

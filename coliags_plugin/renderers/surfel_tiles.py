@@ -10,6 +10,7 @@ from torch import Tensor
 
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.renderers.projection import filtered_covariances
+from coliags_plugin.renderers.splatting import CutSettings
 from coliags_plugin.renderers.surfel_projection import ProjectedSurfels
 from coliags_plugin.renderers.tiles import (
     RADIUS_SLACK,
@@ -57,24 +58,10 @@ class SurfelExtents:
 
 @torch.no_grad()
 def surfel_extents(
-    projected: ProjectedSurfels,
-    opacities: Float[Tensor, "N"],
-    camera: Camera,
-    grid: TileGrid,
-    alpha_min: float,
-    surfel_filter: float,
+    projected: ProjectedSurfels, opacities: Float[Tensor, "N"], camera: Camera, grid: TileGrid, settings: CutSettings
 ) -> SurfelExtents:
-    """Compute the extent of each surfel, and whether it overlaps the rectangle of pixel centres.
-
-    Args:
-        projected: The surfels.
-        opacities: [N]
-        camera: Of the view.
-        grid: The tiles.
-        alpha_min: Contributions of smaller alpha are skipped.
-        surfel_filter: Standard deviation of the low-pass filter, pixels.
-    """
-    tau = 2 * torch.log(opacities / alpha_min)
+    """Compute the extent of each surfel, and whether it overlaps the rectangle of pixel centres."""
+    tau = 2 * torch.log(opacities / settings.alpha_min)
     bright = projected.visible & (tau >= 0)
     level = tau.clamp_min(0) + RADIUS_SLACK
     rim = projected.tangents * level.sqrt()[:, None, None]
@@ -94,7 +81,7 @@ def surfel_extents(
     covariances, whitenings = filtered_covariances(flat_x, flat_y, _ELLIPSE_SLACK)
     ellipse_centers = projected.means2d - torch.cat([along_x, along_y], dim=-1)
     halves = covariances[:, ::2].sqrt()
-    squared_radii = level * surfel_filter**2
+    squared_radii = level * settings.surfel_filter**2
     radii = squared_radii.sqrt()[:, None]
     centers = projected.filter_centers
     low = torch.minimum(ellipse_centers - halves, centers - radii)

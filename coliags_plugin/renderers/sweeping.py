@@ -14,6 +14,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from coliags_plugin.renderers.splatting import CutSettings
+
 #: Elements of the largest temporary tensors, by device type: to fit the L2 caches, or to fill the device.
 CHUNK_ELEMENTS = {"cpu": 2**18, "cuda": 2**24}
 #: Finite stand-in for log(0), far below every alpha_min.
@@ -22,21 +24,6 @@ _LOG_ZERO = -1e4
 _MIN_RANKS, _MAX_RANKS = 32, 128
 
 Evaluated = TypeVar("Evaluated")
-
-
-@dataclass(frozen=True)
-class Cuts:
-    """Thresholds of compositing (docs/methods.md 2.2).
-
-    Attributes:
-        alpha_max: Upper bound of alpha.
-        alpha_min: Contributions of smaller alpha are skipped.
-        transmittance_min: Compositing stops before the Gaussian that would bring the transmittance below this.
-    """
-
-    alpha_max: float
-    alpha_min: float
-    transmittance_min: float
 
 
 @dataclass(frozen=True)
@@ -70,14 +57,10 @@ class Chunk(Generic[Evaluated]):
     def of_log_alphas(
         self, gained: Float[Tensor, "G C P"], behind: Float[Tensor, "tiles P"], alpha_max: float
     ) -> Float[Tensor, "R P"]:
-        """Derivatives of the loss with respect to the logarithms of the alphas: own contribution less what it occludes.
+        """Derivatives of the loss with respect to log(alpha): own contribution less what it occludes.
 
-        Behind the stop, and where alpha is clamped, they are 0.
-
-        Args:
-            gained: First-order contribution of each pair; overwritten. [G, C, P]
-            behind: That of all pairs not yet swept; reduced by this chunk's. [tiles, P]
-            alpha_max: Upper bound of alpha.
+        Behind the stop, and where alpha is clamped, they are 0. ``gained`` is the first-order contribution of each pair
+        and is overwritten; ``behind`` is that of all pairs not yet swept, and is reduced by this chunk's.
         """
         hidden = behind[self.tiles][:, None] - gained.cumsum(1)
         behind[self.tiles] = hidden[:, -1]
@@ -90,16 +73,14 @@ def sweep(
     evaluate: Callable[[Int[Tensor, "R"]], tuple[Float[Tensor, "R P"], Evaluated]],
     starts: Int[Tensor, "tiles+1"],
     ones: Float[Tensor, "P"],
-    cuts: Cuts,
+    cuts: CutSettings,
 ) -> Iterator[Chunk[Evaluated]]:
     """Iterate over every tile's pairs front to back until they end or no pixel has transmittance left.
 
-    Args:
-        evaluate: Alphas of pairs at the pixels of their tiles before clamping and cut-off, in a tensor that may be
-            overwritten, and what else the caller wants of these pairs. The alpha of row M, one past the end, must be 0.
-        starts: First pair of each tile, and M. [tiles + 1]
-        ones: 1 for each pixel of a tile; its dtype and device are those of the result. [P]
-        cuts: Thresholds.
+    ``evaluate`` gives alphas of pairs at the pixels of their tiles before clamping and cut-off, in a tensor that may be
+    overwritten, and what else the caller wants of these pairs; the alpha of row M, one past the end, must be 0.
+    ``starts`` is the first pair of each tile, and M; ``ones`` is 1 for each pixel of a tile, of the result's dtype and
+    device.
     """
     budget = CHUNK_ELEMENTS.get(ones.device.type, CHUNK_ELEMENTS["cuda"]) // len(ones)
     alpha_below = _just_below(cuts.alpha_min, ones)

@@ -20,12 +20,7 @@ RADIUS_SLACK = 1e-2
 
 @dataclass(frozen=True)
 class TileGrid:
-    """An image divided into square tiles; the last column and row may extend beyond its edge.
-
-    Attributes:
-        width, height: Image size, pixels.
-        size: Edge of a tile, pixels.
-    """
+    """An image in square tiles of ``size`` pixels; the last column and row may extend beyond its edge."""
 
     width: int
     height: int
@@ -79,10 +74,7 @@ class TileGrid:
 class TilePairs:
     """The M pairs of a tile and a Gaussian that may touch it, by tile and within a tile front to back.
 
-    Attributes:
-        gaussian: Index of the Gaussian. [M]
-        tile: Number of the tile, ascending. [M]
-        starts: First pair of each tile, and the number of pairs at the end. [tiles + 1]
+    ``starts`` is the first pair of each tile, and M at the end.
     """
 
     gaussian: Int[Tensor, "M"]
@@ -140,15 +132,9 @@ def bin_gaussians(projected: ProjectedGaussians, extents: Extents, grid: TileGri
 def tiles_of_boxes(
     low: Float[Tensor, "N 2"], high: Float[Tensor, "N 2"], grid: TileGrid
 ) -> tuple[Int[Tensor, "M"], Int[Tensor, "M"], Int[Tensor, "M"]]:
-    """Pairs of a box and a tile that it touches, in the order of the boxes.
+    """Pairs of a box and a tile that it touches, in the order of the boxes: index of the box, column and row.
 
-    Args:
-        low: Upper left corners of the boxes, pixels. [N, 2]
-        high: Lower right corners, pixels. [N, 2]
-        grid: The tiles. A box beside the image is assigned to tiles at its edge.
-
-    Returns:
-        Index of the box, column and row of the tile. [M], [M], [M]
+    ``low`` and ``high`` are the boxes' corners in pixels. A box beside the image is assigned to tiles at its edge.
     """
     last = low.new_tensor([grid.columns - 1, grid.rows - 1])
     first_tile = (low / grid.size).floor().clamp_min(0).minimum(last).long()

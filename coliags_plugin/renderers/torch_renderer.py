@@ -21,7 +21,6 @@ from coliags_plugin.renderers.splatting import CutSettings, DrawnView, Splatting
 from coliags_plugin.renderers.surfel_compositing import SurfelRules, composite_surfels, pair_rows
 from coliags_plugin.renderers.surfel_projection import project_surfels
 from coliags_plugin.renderers.surfel_tiles import bin_surfels, surfel_extents
-from coliags_plugin.renderers.sweeping import Cuts
 from coliags_plugin.renderers.tiles import TileGrid, bin_gaussians, gaussian_extents
 
 #: Outputs in the order of :attr:`coliags_plugin.renderers.surfel_compositing.CompositedSurfels.depths`.
@@ -59,16 +58,10 @@ def render_gaussians(
     wants: Sequence[str] = ("rgb", "alpha"),
     settings: TorchRendererSettings | None = None,
 ) -> RenderOutput:
-    """Render 3D Gaussians, or surfels where they have two scales, from a camera.
+    """Render 3D Gaussians, or surfels where they have two scales, from a camera, in their dtype and on their device.
 
     Everything but ``radii`` and, of 3D Gaussians, ``depth_median`` is differentiable, once, in the Gaussians and in
     ``camera.camera_to_world``; ``means2d.grad`` is set by ``backward``.
-
-    Args:
-        gaussians: All of one dtype (float32 or float64) on one device. The result is of that dtype.
-        camera: Camera of the view; its pose is cast to the Gaussians' dtype and device.
-        wants: Names from :data:`coliags_plugin.core.render_output.OUTPUTS`; rgb and alpha are always included.
-        settings: Defaults if None.
 
     Raises:
         InputError: An output is unknown or not of these Gaussians, or they have neither two nor three scales.
@@ -83,7 +76,6 @@ def _draw_gaussians(
     gaussians: Gaussians, camera: Camera, wants: Sequence[str], settings: TorchRendererSettings
 ) -> DrawnView:
     grid = TileGrid(camera.width, camera.height, settings.tile_size)
-    cuts = _cuts(settings)
     projected = project_gaussians(gaussians, camera, settings.eps2d)
     extents = gaussian_extents(projected, gaussians.opacities, grid, settings.alpha_min)
     pairs = bin_gaussians(projected, extents, grid)
@@ -103,10 +95,10 @@ def _draw_gaussians(
     offsets = grid.centers(pairs.tile, table.dtype) - of_pairs[:, :2]
     polynomials = log_alpha_polynomials(of_pairs[:, 5], of_pairs[:, 2:5], offsets)
     pixels = monomials(grid.offsets(table))
-    sums = grid.to_image(composite(polynomials, of_pairs[:, 6:], pairs.starts, pixels, cuts))
+    sums = grid.to_image(composite(polynomials, of_pairs[:, 6:], pairs.starts, pixels, settings))
     maps = split_channels(sums, features)
     if "depth_median" in wants:
-        medians = median_depths(polynomials, projected.depths.detach()[pairs.gaussian], pairs.starts, pixels, cuts)
+        medians = median_depths(polynomials, projected.depths.detach()[pairs.gaussian], pairs.starts, pixels, settings)
         maps["depth_median"] = grid.to_image(medians[:, None])[..., 0]
     radii = torch.where(extents.drawn, extents.halves.amax(-1).ceil(), 0.0)
     return _over_background(maps, projected.means2d, radii, settings)
@@ -116,9 +108,8 @@ def _draw_surfels(
     gaussians: Gaussians, camera: Camera, wants: Sequence[str], settings: TorchRendererSettings
 ) -> DrawnView:
     grid = TileGrid(camera.width, camera.height, settings.tile_size)
-    low_pass = settings.surfel_filter
     projected = project_surfels(gaussians, camera)
-    extents = surfel_extents(projected, gaussians.opacities, camera, grid, settings.alpha_min, low_pass)
+    extents = surfel_extents(projected, gaussians.opacities, camera, grid, settings)
     pairs = bin_surfels(projected, extents, grid)
 
     opacities = torch.where(extents.drawn, gaussians.opacities, 1.0)
@@ -127,7 +118,7 @@ def _draw_surfels(
     of_pairs = torch.cat(of_surfels, dim=-1).index_select(0, pairs.gaussian)
     origins = grid.centers(pairs.tile, of_pairs.dtype)
     rows = pair_rows(of_pairs[:, :10], of_pairs[:, 10:12], of_pairs[:, 12], origins)
-    rules = SurfelRules(_cuts(settings), camera.near_plane, low_pass, bool({*_OF_SURFELS, "depth_expected"} & {*wants}))
+    rules = SurfelRules(settings, camera.near_plane, bool({*_OF_SURFELS, "depth_expected"} & {*wants}))
     composited = composite_surfels(rows, of_pairs[:, 13:], pairs, grid.offsets(rows), rules)
     maps = split_channels(grid.to_image(composited.features), features)
     if rules.depths:
@@ -143,10 +134,6 @@ def _over_background(
     alpha = maps["alpha"]
     rgb = maps["rgb"] + (1 - alpha)[..., None] * alpha.new_tensor(settings.background)
     return DrawnView(rgb, alpha, maps, means2d, radii)
-
-
-def _cuts(settings: TorchRendererSettings) -> Cuts:
-    return Cuts(settings.alpha_max, settings.alpha_min, settings.transmittance_min)
 
 
 def _features(gaussians: Gaussians, own: dict[str, Tensor], wants: Sequence[str]) -> dict[str, Float[Tensor, "N C"]]:

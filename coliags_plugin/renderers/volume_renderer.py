@@ -78,11 +78,7 @@ class VolumeRenderer(Renderer[VolumeRendererSettings, RadianceField]):
         return Availability(True, "plain PyTorch, runs wherever PyTorch does")
 
     def check_field(self, field: RadianceField, near_plane: float) -> None:
-        """Refuse a field without bounds where the options leave them to it, and bounds without anything between them.
-
-        Raises:
-            InputError: See above.
-        """
+        """Refuse a field without bounds where the options leave them to it, and bounds with nothing between them."""
         near, far = (float(end) for end in self._bounds(field, near_plane))
         if near >= far:
             raise InputError(
@@ -201,11 +197,7 @@ class VolumeRenderer(Renderer[VolumeRendererSettings, RadianceField]):
         return CompositedRays(places * lines.depth_per_place, behind, rgb)
 
     def _bounds(self, field: RadianceField, near_plane: float) -> tuple[Tensor | float, Tensor | float]:
-        """Where rays start and end, in terms of ``spacing``.
-
-        Raises:
-            InputError: The options leave it to the field, and it does not know.
-        """
+        """Where rays start and end, in terms of ``spacing``, by the options or by the field."""
         far = self.settings.far_plane
         if near_plane > 0.0 and far is not None:
             return near_plane, far
@@ -225,13 +217,8 @@ class VolumeRenderer(Renderer[VolumeRendererSettings, RadianceField]):
 class _Lines:
     """Rays, and places along them, measured in z-depth or in distance.
 
-    Attributes:
-        steps: From one unit of place to the next. [P, 3]
-        directions: Unit vectors. [P, 3]
-        lengths: Of the rays per z-depth. [P, 1]
-        length_per_place: Distance per unit of place. [P, 1]
-        depth_per_place: z-depth per unit of place. [P, 1]
-        reach: Of all the stretches together, in units of place.
+    A unit of place is ``steps`` in space, ``length_per_place`` in distance and ``depth_per_place`` in z-depth;
+    ``lengths`` are those of the rays per z-depth; ``reach`` is that of all the stretches together, in units of place.
     """
 
     steps: Float[Tensor, "P 3"]

@@ -1,8 +1,9 @@
 """gsplat 1.5.3's public functions, without a GPU: its kernels' arithmetic in plain PyTorch, gradients by autograd.
 
-Signatures, argument orders, shapes and assertions are those of gsplat 1.5.3 (Apache-2.0), read in its sources, and so
-are the constants and the habits that its callers must know: only radii are written of what is not drawn (here the rest
-is NaN), and no Gaussians at all end the process (here an exception). Shares no code with the package.
+Argument orders, shapes and assertions are those of gsplat 1.5.3 (Apache-2.0), read in its sources, less the options
+that the package leaves alone, and so are the constants and the habits that its callers must know: only radii are
+written of what is not drawn (here the rest is NaN), and no Gaussians at all end the process (here an exception). Shares
+no code with the package.
 """
 
 from __future__ import annotations
@@ -76,29 +77,13 @@ def _undrawn(values, drawn):
 
 
 def fully_fused_projection(
-    means,
-    covars,
-    quats,
-    scales,
-    viewmats,
-    Ks,
-    width,
-    height,
-    eps2d=0.3,
-    near_plane=0.01,
-    far_plane=1e10,
-    radius_clip=0.0,
-    packed=False,
-    sparse_grad=False,
-    calc_compensations=False,
-    camera_model="pinhole",
-    opacities=None,
+    means, covars, quats, scales, viewmats, Ks, width, height, eps2d=0.3, near_plane=0.01, opacities=None
 ):
-    assert covars is None and not packed and not sparse_grad and not calc_compensations and camera_model == "pinhole"
+    assert covars is None
     _check_inputs(means, quats, scales, viewmats, Ks)
     assert opacities is None or opacities.shape == means.shape[:1]
     turn, local = _placed(means, viewmats)
-    inside = ((local[:, 2] >= near_plane) & (local[:, 2] <= far_plane)).detach()
+    inside = (local[:, 2] >= near_plane).detach()
     x, y, z = torch.where(inside[:, None], local, local.new_tensor([0.0, 0.0, 1.0])).unbind(-1)
     fx, fy, cx, cy = Ks[0, 0, 0].item(), Ks[0, 1, 1].item(), Ks[0, 0, 2].item(), Ks[0, 1, 2].item()
     spread = _rotations(quats.to(PRECISION)) * scales.to(PRECISION)[:, None, :]
@@ -121,29 +106,16 @@ def fully_fused_projection(
             bright = opacities >= ALPHA_MIN
             extend = extend.minimum((2 * (opacities.to(PRECISION) / ALPHA_MIN).log().clamp_min(0)).sqrt())
         radius_x, radius_y = (extend * xx.sqrt()).ceil(), (extend * yy.sqrt()).ceil()
-        drawn = inside & bright & (determinant > 0) & ((radius_x > radius_clip) | (radius_y > radius_clip))
+        drawn = inside & bright & (determinant > 0) & ((radius_x > 0) | (radius_y > 0))
         drawn &= ~_outside(centers, radius_x, radius_y, width, height)
         radii = torch.where(drawn[:, None], torch.stack([radius_x, radius_y], dim=-1), 0).int()[None]
     return radii, _undrawn(centers, drawn), _undrawn(z, drawn), _undrawn(conics, drawn), None
 
 
 @torch.no_grad()
-def isect_tiles(
-    means2d,
-    radii,
-    depths,
-    tile_size,
-    tile_width,
-    tile_height,
-    sort=True,
-    segmented=False,
-    packed=False,
-    n_images=None,
-    image_ids=None,
-    gaussian_ids=None,
-):
+def isect_tiles(means2d, radii, depths, tile_size, tile_width, tile_height):
     n = means2d.shape[-2]
-    assert means2d.shape == (1, n, 2) and radii.shape == (1, n, 2) and depths.shape == (1, n) and sort and not packed
+    assert means2d.shape == (1, n, 2) and radii.shape == (1, n, 2) and depths.shape == (1, n)
     assert radii.dtype == torch.int32 and means2d.dtype == depths.dtype == torch.float32
     counts, keys, owners = [], [], []
     bits = depths[0].contiguous().view(torch.int32).long() & 0xFFFFFFFF
@@ -153,14 +125,13 @@ def isect_tiles(
             counts.append(0)
             continue
         x, y = means2d[0, i].tolist()
-        columns = [
-            min(max(0, math.floor((x - radius_x) / tile_size)), tile_width),
-            min(max(0, math.ceil((x + radius_x) / tile_size)), tile_width),
-        ]
-        rows = [
-            min(max(0, math.floor((y - radius_y) / tile_size)), tile_height),
-            min(max(0, math.ceil((y + radius_y) / tile_size)), tile_height),
-        ]
+        columns, rows = (
+            [
+                min(max(0, end), most)
+                for end in (math.floor((at - reach) / tile_size), math.ceil((at + reach) / tile_size))
+            ]
+            for at, reach, most in ((x, radius_x, tile_width), (y, radius_y, tile_height))
+        )
         tiles = [row * tile_width + column for row in range(*rows) for column in range(*columns)]
         counts.append(len(tiles))
         keys += [(tile << 32) | bits[i].item() for tile in tiles]
@@ -177,23 +148,11 @@ def isect_offset_encode(isect_ids, n_images, tile_width, tile_height):
 
 
 def rasterize_to_pixels(
-    means2d,
-    conics,
-    colors,
-    opacities,
-    image_width,
-    image_height,
-    tile_size,
-    isect_offsets,
-    flatten_ids,
-    backgrounds=None,
-    masks=None,
-    packed=False,
-    absgrad=False,
+    means2d, conics, colors, opacities, width, height, tile_size, isect_offsets, flatten_ids, backgrounds=None
 ):
     n, channels = means2d.shape[-2], colors.shape[-1]
     assert means2d.shape == (1, n, 2) and conics.shape == (1, n, 3) and colors.shape == (1, n, channels)
-    assert opacities.shape == (1, n) and masks is None and not packed and not absgrad
+    assert opacities.shape == (1, n)
     assert backgrounds is None or backgrounds.shape == (1, channels)
     assert all(value.dtype == torch.float32 for value in (means2d, conics, colors, opacities))
     padded, backgrounds = _padded(colors, backgrounds, CHANNELS)
@@ -204,7 +163,7 @@ def rasterize_to_pixels(
         a, b, c = (conics[ids, k, None] for k in range(3))
         return 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
 
-    size = (image_width, image_height, tile_size)
+    size = (width, height, tile_size)
     image, alpha = _composite(power, padded[0], opacities[0], size, isect_offsets, flatten_ids, backgrounds)
     return image[..., :channels].float()[None], alpha.float()[None]
 

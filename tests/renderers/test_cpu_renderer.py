@@ -177,8 +177,9 @@ def test_pixels_on_a_cutoff_are_found(depths, opacity):
     assert on_a_cutoff(gaussians, pinhole()).nonzero().tolist() == [[3, 4]]
 
 
-def test_features_and_the_centres_own_gradient_agree_with_the_definition():
-    gaussians, camera = scene("surfels")
+@of_each
+def test_features_and_the_centres_own_gradient_agree_with_the_definition(primitive):
+    gaussians, camera = scene(primitive)
     gaussians, wants = with_features(gaussians), ("many", "normals", "one", "depth_accumulated")
     ignored = on_a_cutoff(gaussians, camera)
     ours, gradients = drawn(cpu_renderer, gaussians, camera, torch.float32, wants, ignored, of_means2d=0.01)

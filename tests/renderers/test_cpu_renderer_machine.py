@@ -48,7 +48,10 @@ INNER_LOOPS = {
     ),
     "backward": (
         sweep_backward._sweep_entry,
-        (types.int64, types.int64, types.int64, FLOATS, CHANNEL_TUPLE, FLOATS, FLOATS, types.int64, FLOATS),
+        (
+            *(types.int64, types.int64, types.int64, FLOATS, CHANNEL_TUPLE, NOTHING, FLOATS, FLOATS),
+            *(types.int64, types.int64, FLOATS),
+        ),
         5 + 5 + 2 * CHANNELS + 3,
     ),
     "forward, surfels": (

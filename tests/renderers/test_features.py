@@ -10,7 +10,7 @@ import torch
 from coliags_plugin.core.errors import InputError
 from coliags_plugin.renderers import cpu_renderer, gsplat_library, gsplat_renderer, torch_renderer
 from tests.renderers import fake_gsplat
-from tests.renderers.test_torch_renderer import INPUTS, pinhole, random_gaussians, relative
+from tests.renderers.test_torch_renderer import INPUTS, pinhole, random_gaussians
 
 WANTS = ("albedo", "depth_accumulated", "one", "many")
 
@@ -27,45 +27,24 @@ def gaussians_with_features(count=400, dtype=torch.float64):
     )
 
 
-def drawn(module, dtype, background=(0.4, 0.0, 0.9)):
-    gaussians = gaussians_with_features(dtype=dtype)
-    kind = module.CpuRendererSettings if module is cpu_renderer else module.TorchRendererSettings
-    pose = torch.eye(4, dtype=dtype).requires_grad_()
-    camera = replace(pinhole(46, 35, 40.0, 41.0), camera_to_world=pose)
-    output = module.render_gaussians(gaussians, camera, WANTS, kind(background=background))
-    generator = torch.Generator().manual_seed(2)
-    loss = sum((output[k] * torch.randn(output[k].shape, generator=generator).to(dtype)).sum() for k in ("rgb", *WANTS))
-    loss.backward()
-    gradients = {name: getattr(gaussians, name).grad for name in INPUTS}
-    gradients |= {name: value.grad for name, value in gaussians.features.items()}
-    return output, {**gradients, "pose": pose.grad, "means2d": output.splats.means2d.grad}
-
-
-def test_a_feature_equal_to_the_colours_comes_out_as_they_do_over_black():
+@pytest.mark.parametrize("scales", [3, 2], ids=["gaussians3d", "surfels"])
+def test_a_feature_equal_to_the_colours_comes_out_as_they_do_over_black(scales):
     gaussians, camera = random_gaussians(200, 3), pinhole(30, 22, 25.0, 25.0)
-    gaussians = replace(gaussians, features={"copy": gaussians.colors})
-    output = torch_renderer.render_gaussians(gaussians, camera, ("copy",))
+    features = {"copy": gaussians.colors, "one": torch.ones(200, 1).double()}
+    gaussians = replace(gaussians, scales=gaussians.scales[:, :scales], features=features)
+    output = torch_renderer.render_gaussians(gaussians, camera, ("copy", "normals", "one"))
     torch.testing.assert_close(output["copy"], output.rgb)
-
-
-def test_the_kernels_agree_with_the_definition():
-    ours, gradients = drawn(cpu_renderer, torch.float32)
-    true, true_gradients = drawn(torch_renderer, torch.float64)
-    for name in ("rgb", *WANTS):
-        assert ours[name].shape == true[name].shape
-        assert relative(ours[name], true[name]) <= 1e-5, name
-    for name, gradient in gradients.items():
-        assert relative(gradient, true_gradients[name]) <= (1e-4 if name == "pose" else 2e-5), name
+    torch.testing.assert_close(output["one"], output.alpha[..., None])
 
 
 def test_features_change_nothing_else():
-    with_features, _ = drawn(cpu_renderer, torch.float32)
-    gaussians = replace(gaussians_with_features(dtype=torch.float32), features={})
-    camera = pinhole(46, 35, 40.0, 41.0, dtype=torch.float32)
-    kind = cpu_renderer.CpuRendererSettings(background=(0.4, 0.0, 0.9))
-    plain = cpu_renderer.render_gaussians(gaussians, camera, ("depth_accumulated",), kind)
-    assert torch.equal(plain.rgb, with_features.rgb)
-    assert torch.equal(plain["depth_accumulated"], with_features["depth_accumulated"])
+    gaussians, camera = gaussians_with_features(dtype=torch.float32), pinhole(46, 35, 40.0, 41.0, dtype=torch.float32)
+    drawn, plain = (
+        cpu_renderer.render_gaussians(replace(gaussians, features=features), camera, wants)
+        for features, wants in ((gaussians.features, WANTS), ({}, ("depth_accumulated",)))
+    )
+    assert torch.equal(plain.rgb, drawn.rgb)
+    assert torch.equal(plain["depth_accumulated"], drawn["depth_accumulated"])
 
 
 @pytest.mark.parametrize("module", [cpu_renderer, torch_renderer])

@@ -25,12 +25,12 @@ from tests.renderers.test_torch_renderer import (
     INPUTS,
     OUTPUTS,
     SCENES,
-    SUMS,
     FieldOf,
     cast,
     make,
     ours,
     pinhole,
+    random_cotangents,
     relative,
     scene,
     with_gradients,
@@ -74,12 +74,6 @@ def theirs(**options):
         return {name: output[name] for name in OUTPUTS}, output
 
     return draw
-
-
-def random_cotangents(camera, seed=1):
-    generator = torch.Generator().manual_seed(seed)
-    shape = (camera.height, camera.width)
-    return {k: torch.randn(*shape, *([3] * (k in ("rgb", "normals"))), generator=generator) for k in SUMS}
 
 
 def single(name):
@@ -126,61 +120,50 @@ def test_without_gsplat_it_says_how_to_install_it(device, monkeypatch):
     assert not found.ok and found.reason == "gsplat is not installed: pip install coliags_plugin[cuda]"
 
 
+def raising(error):
+    def call(*args, **kwargs):
+        raise error
+
+    return call
+
+
 @pytest.mark.parametrize(
-    ("error", "reason"),
+    ("found", "reason"),
     [
         (ImportError("libcudart.so.12: not found"), "gsplat does not load: ImportError: libcudart.so.12: not found"),
-        (
-            RuntimeError("\nError building 'gsplat_cuda'\n" + "log\n" * 999),
-            "RuntimeError: Error building 'gsplat_cuda'",
-        ),
+        (RuntimeError("\nError building 'gsplat'\n" + "log\n" * 999), "RuntimeError: Error building 'gsplat'"),
         (KeyError(), "gsplat does not load: KeyError"),
+        (
+            {"__version__": "1.4.0+pt24cu121"},
+            "gsplat 1.4.0+pt24cu121 is too old, 1.5 is needed: pip install coliags_plugin[cuda]",
+        ),
+        (
+            {"fully_fused_projection": raising(RuntimeError("no kernel image is available"))},
+            "gsplat 1.5.3 does not work on this device: RuntimeError: no kernel image is available",
+        ),
+        (
+            {"fully_fused_projection": lambda *args, **kwargs: (torch.ones(1, 1, 2), torch.full((1, 1, 2), 3.5))},
+            "a Gaussian that belongs at pixel (4, 4) is put at [3.5, 3.5], radii [[[1.0, 1.0]]]",
+        ),
     ],
 )
-def test_a_gsplat_that_does_not_load_says_why(device, monkeypatch, error, reason):
-    install(monkeypatch, error=error)
-    found = GsplatRenderer.availability()
-    assert not found.ok and found.reason.endswith(reason)
-
-
-def test_an_old_gsplat_is_named(device, monkeypatch):
+def test_a_gsplat_that_cannot_be_used_says_why(device, monkeypatch, found, reason):
     library = fake_gsplat.module()
-    library.__version__ = "1.4.0+pt24cu121"
-    install(monkeypatch, library)
-    found = GsplatRenderer.availability()
-    assert not found.ok
-    assert found.reason == "gsplat 1.4.0+pt24cu121 is too old, 1.5 is needed: pip install coliags_plugin[cuda]"
-
-
-def failing(message):
-    def fully_fused_projection(*args, **kwargs):
-        raise RuntimeError(message) if message else AttributeError("'NoneType' object has no attribute 'projection'")
-
-    library = fake_gsplat.module()
-    library.fully_fused_projection = fully_fused_projection
-    return library
+    if isinstance(found, dict):
+        vars(library).update(found)
+    install(monkeypatch, library, None if isinstance(found, dict) else found)
+    answer = GsplatRenderer.availability()
+    assert not answer.ok and answer.reason.endswith(reason)
 
 
 def test_kernels_that_were_never_built_are_no_attribute_of_none(device, monkeypatch):
-    install(monkeypatch, failing(None))
+    library = fake_gsplat.module()
+    library.fully_fused_projection = raising(AttributeError("'NoneType' object has no attribute 'projection'"))
+    install(monkeypatch, library)
     monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", types.SimpleNamespace(_C=None))
     found = GsplatRenderer.availability()
     assert not found.ok
     assert found.reason == "gsplat 1.5.3 has no CUDA kernels, and found no CUDA toolkit (nvcc) to build them"
-
-
-def test_kernels_that_fail_say_how(device, monkeypatch):
-    install(monkeypatch, failing("no kernel image is available for execution on the device"))
-    found = GsplatRenderer.availability()
-    assert not found.ok and "gsplat 1.5.3 does not work on this device: RuntimeError: no kernel image" in found.reason
-
-
-def test_kernels_that_answer_nonsense_are_not_used(device, monkeypatch):
-    library = fake_gsplat.module()
-    library.fully_fused_projection = lambda *args, **kwargs: (torch.ones(1, 1, 2), torch.full((1, 1, 2), 3.5))
-    install(monkeypatch, library)
-    found = GsplatRenderer.availability()
-    assert not found.ok and "belongs at pixel (4, 4) is put at [3.5, 3.5]" in found.reason
 
 
 def test_a_working_gsplat_is_tried_once(device, monkeypatch):
@@ -344,15 +327,6 @@ def test_an_empty_view_is_the_background_and_a_graph(calls, what):
         assert pose.grad is None or not pose.grad.any()
 
 
-def test_without_gradients_nothing_is_retained(calls):
-    gaussians, camera = single("random")
-    output = render_with_gsplat(gaussians, camera, OUTPUTS)
-    assert not output.rgb.requires_grad and not output.splats.means2d.requires_grad
-    with torch.no_grad():
-        output = render_with_gsplat(cast(gaussians, grad=True), camera, OUTPUTS)
-    assert not output.rgb.requires_grad and not output.splats.means2d.requires_grad
-
-
 def test_the_registered_component_renders_a_field(calls):
     assert registry.renderers.get("gsplat") is GsplatRenderer
     assert GsplatRenderer.outputs == set(OUTPUTS) and GsplatRenderer.primitives == {"gaussians3d"}
@@ -366,19 +340,12 @@ def test_the_registered_component_renders_a_field(calls):
 def test_what_cannot_be_rendered_says_so(calls, monkeypatch):
     gaussians, camera = single("random")
     renderer, field = GsplatRenderer(GsplatRendererSettings()), FieldOf(gaussians)
-    with pytest.raises(InputError, match="whole images"):
-        renderer.render(field, camera, pixels=torch.zeros(3, 2))
-    with pytest.raises(InputError, match="Did you mean 'depth_median'"):
-        renderer.render(field, camera, ("depth_medain",))
     with pytest.raises(InputError, match=r"torch\.float64.*float32"):
         renderer.render(FieldOf(cast(gaussians, torch.float64)), camera)
     with pytest.raises(InputError, match="surfels for the gsplat renderer"):
         render_with_gsplat(dataclasses.replace(gaussians, scales=gaussians.scales[:, :2]), camera)
     monkeypatch.setattr(GsplatRenderer, "devices", frozenset({"cuda"}))
     with pytest.raises(InputError, match="Gaussians on cpu"):
-        renderer.render(field, camera)
-    field.primitive = "radiance"
-    with pytest.raises(InputError, match="radiance"):
         renderer.render(field, camera)
 
 

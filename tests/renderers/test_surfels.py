@@ -9,7 +9,6 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from coliags_plugin.config import registry
@@ -21,8 +20,19 @@ from coliags_plugin.engine.model import Model
 from coliags_plugin.renderers import surfel_compositing, sweeping, torch_renderer
 from coliags_plugin.renderers.torch_renderer import TorchRenderer, TorchRendererSettings, render_gaussians
 from coliags_plugin.renderers.volume_renderer import VolumeRenderer, VolumeRendererSettings
-from tests.renderers.naive_surfels import splat_surfels
-from tests.renderers.test_torch_renderer import INPUTS, cast, make, moved, pinhole, random_gaussians, relative, rigid
+from tests.renderers.naive import splat_surfels
+from tests.renderers.test_torch_renderer import (
+    INPUTS,
+    cast,
+    make,
+    moved,
+    pinhole,
+    random_cotangents,
+    random_gaussians,
+    relative,
+    rigid,
+    with_gradients,
+)
 from tests.renderers.test_torch_renderer import scene as scene_of_gaussians
 
 BACKGROUND = (0.3, 0.1, 0.9)
@@ -95,15 +105,6 @@ SCENES = {
 }
 
 
-def drawn(gaussians, camera, cotangents, draw):
-    """Outputs and the gradients of everything."""
-    gaussians = cast(gaussians, grad=True)
-    pose = camera.camera_to_world.clone().requires_grad_()
-    outputs, splats = draw(gaussians, dataclasses.replace(camera, camera_to_world=pose))
-    sum((outputs[name] * cotangents[name].to(outputs[name])).sum() for name in OUTPUTS).backward()
-    return outputs, splats, {**{k: getattr(gaussians, k).grad for k in INPUTS}, "pose": pose.grad}
-
-
 def ours(**options):
     def draw(gaussians, camera):
         output = render_gaussians(gaussians, camera, OUTPUTS, TorchRendererSettings(background=BACKGROUND, **options))
@@ -116,13 +117,8 @@ def naive(gaussians, camera):
     return splat_surfels(gaussians, camera, BACKGROUND)
 
 
-def random_cotangents(camera, seed=1):
-    generator = torch.Generator().manual_seed(seed)
-    shape = (camera.height, camera.width)
-    return {
-        k: torch.randn(*shape, *([3] * (k in ("rgb", "normals"))), generator=generator, dtype=torch.float64)
-        for k in OUTPUTS
-    }
+def cotangents_of(camera, seed=1):
+    return random_cotangents(camera, OUTPUTS, seed, torch.float64)
 
 
 def without(pixels, cotangents):
@@ -140,14 +136,14 @@ def test_agrees_with_the_naive_renderer(name):
     exact, exact_camera = cast(gaussians, torch.float64), camera.to(dtype=torch.float64)
     grazing = naive(exact, exact_camera)[0]["farthest"] > GRAZING
     assert grazing.float().mean() <= 0.05
-    cotangents = without(grazing, random_cotangents(camera))
-    true, centers, true_gradients = drawn(exact, exact_camera, cotangents, naive)
+    cotangents = without(grazing, cotangents_of(camera))
+    true, centers, true_gradients = with_gradients(naive, exact, exact_camera, cotangents)
     assert all(true[key].any() for key in OUTPUTS if (name, key) != ("one pixel", "depth_median"))
     for dtype, bounds in ((torch.float64, (1e-11, 1e-9)), (torch.float32, SCENES[name])):
         for tile_size in (5, 16) if dtype == torch.float64 else (8,):
             case = (dtype, tile_size)
-            outputs, splats, gradients = drawn(
-                cast(gaussians, dtype), camera.to(dtype=dtype), cotangents, ours(tile_size=tile_size)
+            outputs, splats, gradients = with_gradients(
+                ours(tile_size=tile_size), cast(gaussians, dtype), camera.to(dtype=dtype), cotangents
             )
             for key in OUTPUTS:
                 assert outputs[key].dtype == dtype
@@ -204,12 +200,12 @@ def test_nor_in_float32_where_discs_are_seen_edge_on(seed, monkeypatch):
 @pytest.mark.parametrize("elements", [1, 2000])
 def test_the_size_of_the_working_set_changes_nothing(elements, monkeypatch):
     gaussians, camera = scene("in front of one another")
-    cotangents = random_cotangents(camera)
-    plain, _, gradients = drawn(gaussians, camera, cotangents, ours())
+    cotangents = cotangents_of(camera)
+    plain, _, gradients = with_gradients(ours(), gaussians, camera, cotangents)
     monkeypatch.setitem(sweeping.CHUNK_ELEMENTS, "cpu", elements)
     monkeypatch.setattr(sweeping, "_MIN_RANKS", 3)
     monkeypatch.setattr(sweeping, "_MAX_RANKS", 7)
-    other, _, other_gradients = drawn(gaussians, camera, cotangents, ours())
+    other, _, other_gradients = with_gradients(ours(), gaussians, camera, cotangents)
     for key in OUTPUTS:
         torch.testing.assert_close(other[key], plain[key], rtol=1e-10, atol=1e-10)
     for key, gradient in gradients.items():
@@ -219,7 +215,7 @@ def test_the_size_of_the_working_set_changes_nothing(elements, monkeypatch):
 def test_two_calls_agree_to_the_bit():
     gaussians = cast(as_surfels(random_gaussians(3000, 12, scale=(0.01, 0.08))), torch.float32)
     camera = pinhole(64, 48, 55.0, 55.0, dtype=torch.float32)
-    first, second = (drawn(gaussians, camera, random_cotangents(camera), ours()) for _ in range(2))
+    first, second = (with_gradients(ours(), gaussians, camera, cotangents_of(camera)) for _ in range(2))
     assert all(torch.equal(first[0][k], second[0][k]) for k in OUTPUTS)
     assert all(torch.equal(first[2][k], second[2][k]) for k in first[2])
 
@@ -241,7 +237,7 @@ def smooth_scene():
 
 def test_gradcheck_of_everything_in_the_surfels_and_the_pose():
     gaussians, camera = smooth_scene()
-    cotangents = random_cotangents(camera, 4)
+    cotangents = cotangents_of(camera, 4)
 
     def render(pose, *values):
         replaced = dataclasses.replace(gaussians, **dict(zip(INPUTS, values, strict=True)))
@@ -261,7 +257,7 @@ def test_gradcheck_holds_where_filter_cuts_and_clamps_act():
     scales = depths[:, None] * torch.tensor([[0.09, 0.09], [0.2, 0.001], [0.09, 0.12], [0.002, 0.003]])
     gaussians = make_surfels(means, scales, torch.tensor([1.0, 0.995, 0.999, 0.9]))
     camera = pinhole(17, 3)
-    cotangents = random_cotangents(camera)
+    cotangents = cotangents_of(camera)
     alone = dataclasses.replace(gaussians, **{k: getattr(gaussians, k)[:1] for k in INPUTS})
     assert (render_gaussians(alone, camera).alpha == 0.99).any()
     whole = render_gaussians(gaussians, camera, settings=TorchRendererSettings(transmittance_min=0.0)).alpha
@@ -278,8 +274,8 @@ def test_gradcheck_holds_where_filter_cuts_and_clamps_act():
 @pytest.mark.parametrize("name", ["random", "in front of one another"])
 def test_gradient_of_means2d_is_that_of_moving_the_intersections_alone(name):
     gaussians, camera = scene(name)
-    cotangents = random_cotangents(camera)
-    _, splats, _ = drawn(gaussians, camera, cotangents, ours())
+    cotangents = cotangents_of(camera)
+    _, splats, _ = with_gradients(ours(), gaussians, camera, cotangents)
     shifts = torch.zeros(len(gaussians), 2, dtype=torch.float64, requires_grad=True)
     outputs, centers = splat_surfels(gaussians, camera, BACKGROUND, shifts=shifts)
     sum((outputs[key] * cotangents[key]).sum() for key in OUTPUTS).backward()
@@ -294,7 +290,7 @@ def test_gradient_of_means2d_is_that_of_moving_the_intersections_alone(name):
         return sum((outputs[key] * cotangents[key]).sum() for key in ("rgb", "normals"))
 
     cotangents |= {key: torch.zeros(()) for key in OUTPUTS if key not in ("rgb", "normals")}
-    _, splats, _ = drawn(gaussians, camera, cotangents, ours())
+    _, splats, _ = with_gradients(ours(), gaussians, camera, cotangents)
     step = 1e-6
     difference = (loss(torch.tensor(step).double()) - loss(torch.tensor(-step).double())) / (2 * step)
     torch.testing.assert_close(splats.means2d.grad[most, 0], difference, rtol=1e-4, atol=1e-6)
@@ -306,14 +302,6 @@ def test_the_filter_s_gradient_reaches_the_means_but_not_means2d():
     (output.alpha * torch.arange(9.0)).sum().backward()
     assert gaussians.means.grad[0, 0] != 0
     assert not output.splats.means2d.grad.any() and not gaussians.scales.grad.any()
-
-
-def test_without_gradients_nothing_is_retained():
-    gaussians, camera = smooth_scene()
-    assert not render_gaussians(gaussians, camera).splats.means2d.requires_grad
-    with torch.no_grad():
-        output = render_gaussians(cast(gaussians, grad=True), camera, OUTPUTS)
-    assert not any(output[name].requires_grad for name in OUTPUTS) and not output.splats.means2d.requires_grad
 
 
 # --- closed forms -----------------------------------------------------------------------------------------------------
@@ -467,14 +455,6 @@ def test_surfels_of_equal_depth_keep_the_order_they_came_in():
     )
 
 
-def test_feature_channels_are_composited_as_colours_are():
-    gaussians, camera = scene("random")
-    gaussians = dataclasses.replace(gaussians, features={"copy": gaussians.colors, "one": torch.ones(80, 1).double()})
-    output = render_gaussians(gaussians, camera, ("copy", "normals", "one"))
-    torch.testing.assert_close(output["copy"], output.rgb)
-    torch.testing.assert_close(output["one"], output.alpha[..., None])
-
-
 # --- the component ----------------------------------------------------------------------------------------------------
 
 
@@ -521,12 +501,6 @@ def test_what_cannot_be_rendered_says_so():
         render_gaussians(dataclasses.replace(gaussians, scales=gaussians.scales[:, :1]), camera)
 
 
-@pytest.mark.parametrize("options", [{"surfel_filter": 0.0}, {"distortion_far": 0.0}])
-def test_settings_are_checked(options):
-    with pytest.raises(ValidationError):
-        TorchRendererSettings(**options)
-
-
 @pytest.mark.parametrize(("far", "near"), [(0.2, 0.2), (100.0, 200.0)])
 def test_a_near_plane_beyond_the_end_of_distortion_is_refused(far, near):
     with pytest.raises(InputError, match="distortion_far beyond the near plane"):
@@ -550,11 +524,11 @@ def test_depths_cost_nothing_where_they_are_not_wanted(monkeypatch):
 def test_cuda_gives_the_numbers_of_the_cpu(name):
     gaussians, camera = scene(name)
     grazing = naive(gaussians, camera)[0]["farthest"] > GRAZING
-    cotangents = without(grazing, random_cotangents(camera))
+    cotangents = without(grazing, cotangents_of(camera))
     for dtype, bounds in ((torch.float64, (1e-9, 1e-8)), (torch.float32, [10 * bound for bound in SCENES[name]])):
         results = [
-            drawn(cast(gaussians, dtype, device), camera.to(device, dtype),
-                  {k: v.to(device) for k, v in cotangents.items()}, ours())
+            with_gradients(ours(), cast(gaussians, dtype, device), camera.to(device, dtype),
+                           {k: v.to(device) for k, v in cotangents.items()})
             for device in ("cpu", "cuda")
         ]  # fmt: skip
         (on_cpu, _, cpu_gradients), (on_cuda, _, cuda_gradients) = results

@@ -16,4 +16,9 @@ backward, gather, project backward. Names used throughout:
 - **sums**: derivatives added up over the pixels of an entry, then over the entries of a Gaussian.
 - **crew**: the threads that run a kernel; each takes the next parcel, stretch or tile from a shared counter.
 - **arena**: memory that is kept between renderings.
+
+Arguments of kernels, besides: ``counters`` are zeros from which threads take work; ``view``, ``grid``, ``projections``,
+``bins`` and ``pairs`` are what ``layout`` describes, and ``extras`` or ``measures`` what is composited besides colour;
+``channels`` is any tuple as long as there are channels; ``scratch`` has NUMBERS and INTEGERS for each thread. What is
+written comes last, padded to whole groups.
 """

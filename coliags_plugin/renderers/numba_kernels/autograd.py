@@ -22,17 +22,14 @@ from coliags_plugin.renderers.numba_kernels.pipeline import Pipeline
 def render(
     gaussians: Iterable[Tensor], features: Sequence[Tensor], pose: Tensor, pipeline: Pipeline
 ) -> tuple[Tensor, Tensor, dict[str, Tensor], list[Tensor]]:
-    """Render one view; differentiable, once, in all tensors.
+    """Render one view on a new pipeline; differentiable, once, in all tensors.
 
-    Args:
-        gaussians: Float32 tensors on the CPU, checked for shape, in the order of ``layout.Parameters``.
-        features: Further channels to composite, likewise. [N, C] each
-        pose: camera_to_world; its values are those that the pipeline was made with.
-        pipeline: A new pipeline.
+    ``gaussians`` are float32 tensors on the CPU, checked for shape, in the order of ``layout.Parameters``; ``features`` are
+    further channels to composite, [N, C] each; ``pose`` is the camera_to_world that the pipeline was made with.
 
     Returns:
-        means2d, which holds its gradient after ``backward``; radii; the images by the names of ``layout.Images``, None where not wanted; and the features'
-        images, [H, W, C] each.
+        means2d, which holds its gradient after ``backward``; radii; the images by the names of ``layout.Images``, None where
+        not wanted; and the features' images, [H, W, C] each.
 
     Raises:
         UnusableGaussianError: A Gaussian is not finite, has no direction or a negative scale.

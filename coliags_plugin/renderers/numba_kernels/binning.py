@@ -8,31 +8,12 @@ threads handle on their own; the result is the same however many there are.
 from __future__ import annotations
 
 from coliags_plugin.core.numba_compilation import inline, kernel, part
+from coliags_plugin.renderers.numba_kernels import lanes as vec
 from coliags_plugin.renderers.numba_kernels import layout, surfel_layout
 from coliags_plugin.renderers.numba_kernels.geometry import squared_distance_to_box
-from coliags_plugin.renderers.numba_kernels.lanes import (
-    add,
-    at_most,
-    bits,
-    broadcast,
-    broadcast_all,
-    dot,
-    fma,
-    lane_columns,
-    lane_rows,
-    larger,
-    mul,
-    number,
-    prefetch,
-    select,
-    smaller,
-    splat,
-    sqrt,
-    sub,
-)
 from coliags_plugin.renderers.numba_kernels.sorting import NUMBER
 from coliags_plugin.renderers.numba_kernels.surfel_geometry import may_show
-from coliags_plugin.renderers.numba_kernels.threads import take
+from coliags_plugin.renderers.numba_kernels.threads import pieces, take
 from coliags_plugin.renderers.numba_kernels.tiles import order_tiles
 
 #: Prefetch distance, Gaussians.
@@ -43,22 +24,12 @@ _AHEAD = 8
 def find_pairs(counters, projections, view, grid, circle, keys, pairs, entry_counts):
     """Pair the Gaussians with the tiles they touch.
 
-    Args:
-        counters: Work counters for dynamic scheduling; entries 0 and 1 must be 0.
-        projections: What projection wrote.
-        view: See ``layout``.
-        grid: The tiles.
-        circle: An empty tuple for 3D Gaussians. One with an element for surfels, which also reach a circle; records are
-            their outlines then.
-        keys: See ``sorting``. [Gaussians drawn]
-        pairs: Out, with room for all tiles within bounds. The pairs of a stretch may be anywhere among the others.
-        entry_counts: Out: pairs of each Gaussian. [Gaussians drawn]
+    ``circle`` is an empty tuple for 3D Gaussians, and one with an element for surfels, which also reach a circle; records are
+    their outlines then. ``pairs`` has room for all tiles within bounds, and those of a stretch may be anywhere among the
+    others; ``entry_counts`` is written likewise: pairs of each Gaussian.
     """
     stretches = len(pairs.begins)
-    while True:
-        stretch = take(counters, 0, 1)
-        if stretch >= stretches:
-            break
+    for stretch in pieces(counters, 0, stretches):
         first, last = len(keys) * stretch // stretches, len(keys) * (stretch + 1) // stretches
         begin = take(counters, 1, _tiles_within_bounds(first, last, keys, projections.bounds))
         pairs.begins[stretch] = begin
@@ -73,8 +44,8 @@ def _tiles_within_bounds(first, last, keys, bounds):
     total = 0
     for place in range(first, last):
         at = 4 * (keys[place] & NUMBER)
-        across = int(number(bounds, at + 1)) - int(number(bounds, at)) + 1
-        total += across * (int(number(bounds, at + 3)) - int(number(bounds, at + 2)) + 1)
+        across = int(vec.number(bounds, at + 1)) - int(vec.number(bounds, at)) + 1
+        total += across * (int(vec.number(bounds, at + 3)) - int(vec.number(bounds, at + 2)) + 1)
     return total
 
 
@@ -82,43 +53,40 @@ def _tiles_within_bounds(first, last, keys, bounds):
 def _find_stretch(first, last, pair, counted, projections, view, grid, circle, keys, pairs, entry_counts):
     """Pair the Gaussians with indices ``first`` to ``last`` in the sorted list.
 
-    Writes the pairs from ``pair`` on, and counts those of each tile from ``counted`` on.
-
-    Returns:
-        Index after the last pair.
+    Writes the pairs from ``pair`` on and counts those of each tile from ``counted`` on; returns the index after the last.
     """
     records, bounds = projections.records, projections.bounds
     for tile in range(counted, counted + grid.tiles):
         pairs.tile_counts[tile] = 0
-    block_left = fma(lane_columns(), layout.BLOCK, 0.5)
-    block_top = fma(lane_rows(), layout.BLOCK, 0.5)
+    block_left = vec.fma(vec.lane_columns(), layout.BLOCK, 0.5)
+    block_top = vec.fma(vec.lane_rows(), layout.BLOCK, 0.5)
     for place in range(first, last):
         ahead = keys[min(place + _AHEAD, last - 1)] & NUMBER
-        prefetch(records, layout.ROW * ahead)
-        prefetch(bounds, 4 * ahead)
+        vec.prefetch(records, layout.ROW * ahead)
+        vec.prefetch(bounds, 4 * ahead)
         index = keys[place] & NUMBER
         row, bound = layout.ROW * index, 4 * index
-        u_xx, u_yx = broadcast(records, row + layout.U_XX), broadcast(records, row + layout.U_YX)
-        u_yy = broadcast(records, row + layout.U_YY)
-        slope_upright = broadcast(records, row + layout.SLOPE_UPRIGHT)
-        slope_level = broadcast(records, row + layout.SLOPE_LEVEL)
-        mean_x, mean_y = number(records, row + layout.MEAN_X), number(records, row + layout.MEAN_Y)
-        reach = number(records, row + layout.LOG2_OPACITY) - number(view, layout.VIEW_LOG2_ALPHA_MIN)
-        reach = splat(reach + layout.REACH_SLACK)
-        column_first, column_last = int(number(bounds, bound)), int(number(bounds, bound + 1))
+        u_xx, u_yx = vec.broadcast(records, row + layout.U_XX), vec.broadcast(records, row + layout.U_YX)
+        u_yy = vec.broadcast(records, row + layout.U_YY)
+        slope_upright = vec.broadcast(records, row + layout.SLOPE_UPRIGHT)
+        slope_level = vec.broadcast(records, row + layout.SLOPE_LEVEL)
+        mean_x, mean_y = vec.number(records, row + layout.MEAN_X), vec.number(records, row + layout.MEAN_Y)
+        reach = vec.number(records, row + layout.LOG2_OPACITY) - vec.number(view, layout.VIEW_LOG2_ALPHA_MIN)
+        reach = vec.splat(reach + layout.REACH_SLACK)
+        column_first, column_last = int(vec.number(bounds, bound)), int(vec.number(bounds, bound + 1))
         begin = pair
-        for tile_row in range(int(number(bounds, bound + 2)), int(number(bounds, bound + 3)) + 1):
-            top = sub(add(block_top, tile_row * layout.TILE), mean_y)
-            bottom = add(top, layout.BLOCK - 1)
+        for tile_row in range(int(vec.number(bounds, bound + 2)), int(vec.number(bounds, bound + 3)) + 1):
+            top = vec.sub(vec.add(block_top, tile_row * layout.TILE), mean_y)
+            bottom = vec.add(top, layout.BLOCK - 1)
             for column in range(column_first, column_last + 1):
-                left = sub(add(block_left, column * layout.TILE), mean_x)
-                right = add(left, layout.BLOCK - 1)
+                left = vec.sub(vec.add(block_left, column * layout.TILE), mean_x)
+                right = vec.add(left, layout.BLOCK - 1)
                 nearest = squared_distance_to_box(
                     u_xx, u_yx, u_yy, slope_upright, slope_level, left, right, top, bottom
                 )
                 if len(circle) > 0:
                     nearest = _nearest_of_surfel(nearest, reach, records, row, left, right, top, bottom, view)
-                blocks = bits(at_most(nearest, reach))
+                blocks = vec.bits(vec.at_most(nearest, reach))
                 if blocks:
                     tile = tile_row * grid.columns + column
                     pairs.gaussian[pair] = index
@@ -136,43 +104,37 @@ def _nearest_of_surfel(in_ellipse, reach, records, row, left, right, top, bottom
 
     The sides of the boxes are offsets from the ellipse's centre.
     """
-    if number(records, row + layout.U_XX) == 0.0:
+    if vec.number(records, row + layout.U_XX) == 0.0:
         in_ellipse = _nearest_of_crossing(reach, records, row, left, right, top, bottom, view)
     shift_x, shift_y = _circle(records, row)
-    x = add(larger(sub(left, shift_x), 0.0), smaller(sub(right, shift_x), 0.0))
-    y = add(larger(sub(top, shift_y), 0.0), smaller(sub(bottom, shift_y), 0.0))
-    away = mul(broadcast(view, layout.VIEW_PIXEL_SCALE), (x, y))
-    return smaller(in_ellipse, dot(away, away, 0.0))
+    x = vec.add(vec.larger(vec.sub(left, shift_x), 0.0), vec.smaller(vec.sub(right, shift_x), 0.0))
+    y = vec.add(vec.larger(vec.sub(top, shift_y), 0.0), vec.smaller(vec.sub(bottom, shift_y), 0.0))
+    away = vec.mul(vec.broadcast(view, layout.VIEW_PIXEL_SCALE), (x, y))
+    return vec.smaller(in_ellipse, vec.dot(away, away, 0.0))
 
 
 @part
 def _nearest_of_crossing(reach, records, row, left, right, top, bottom, view):
     """Stands for the distance where a disc crosses the near plane: ``reach`` in boxes where it may be seen."""
-    scale, (shift_x, shift_y) = broadcast(view, layout.VIEW_PIXEL_SCALE), _circle(records, row)
-    half_x, half_y = mul(0.5, sub(right, left)), mul(0.5, sub(bottom, top))
-    x, y = sub(add(left, half_x), shift_x), sub(add(top, half_y), shift_y)
-    x, y, half_x, half_y = mul(scale, (x, y, half_x, half_y))
-    slopes = broadcast_all(records, row + surfel_layout.SLOPES, (0,) * 6)
-    seen = may_show(slopes, sqrt(reach), broadcast(records, row + layout.U_YY), x, y, half_x, half_y)
-    return select(seen, reach, add(reach, 1.0))
+    scale, (shift_x, shift_y) = vec.broadcast(view, layout.VIEW_PIXEL_SCALE), _circle(records, row)
+    half_x, half_y = vec.mul(0.5, vec.sub(right, left)), vec.mul(0.5, vec.sub(bottom, top))
+    x, y = vec.sub(vec.add(left, half_x), shift_x), vec.sub(vec.add(top, half_y), shift_y)
+    x, y, half_x, half_y = vec.mul(scale, (x, y, half_x, half_y))
+    slopes = vec.broadcast_all(records, row + surfel_layout.SLOPES, (0,) * 6)
+    seen = may_show(slopes, vec.sqrt(reach), vec.broadcast(records, row + layout.U_YY), x, y, half_x, half_y)
+    return vec.select(seen, reach, vec.add(reach, 1.0))
 
 
 @inline
 def _circle(records, row):
     """The centre of the circle that a surfel reaches, from that of its ellipse."""
-    x = number(records, row + surfel_layout.CIRCLE_X) - number(records, row + layout.MEAN_X)
-    return x, number(records, row + surfel_layout.CIRCLE_Y) - number(records, row + layout.MEAN_Y)
+    x = vec.number(records, row + surfel_layout.CIRCLE_X) - vec.number(records, row + layout.MEAN_X)
+    return x, vec.number(records, row + surfel_layout.CIRCLE_Y) - vec.number(records, row + layout.MEAN_Y)
 
 
 @kernel
 def place_entries(grid, pairs, bins):
-    """Compute the offset of each tile's pairs.
-
-    Args:
-        grid: The tiles.
-        pairs: What :func:`find_pairs` wrote; the counts of tiles are turned into offsets.
-        bins: Out: ``stretch_entries``, ``starts`` and ``order``.
-    """
+    """Turn the counts of :func:`find_pairs` into offsets; write ``stretch_entries``, ``starts`` and ``order``."""
     stretches = len(pairs.begins)
     total = 0
     for stretch in range(stretches):
@@ -191,19 +153,9 @@ def place_entries(grid, pairs, bins):
 
 @kernel
 def sort_pairs(counters, grid, pairs, bins):
-    """Sort the pairs by tile.
-
-    Args:
-        counters: Work counters for dynamic scheduling; entry 2 must be 0.
-        grid: The tiles.
-        pairs: What :func:`place_entries` left; the offsets are incremented.
-        bins: Out: ``cells``.
-    """
+    """Sort the pairs by tile into ``bins.cells``; the offsets of :func:`place_entries` are incremented."""
     cells, places = bins.cells, pairs.tile_counts
-    while True:
-        stretch = take(counters, 2, 1)
-        if stretch >= len(pairs.begins):
-            break
+    for stretch in pieces(counters, 2, len(pairs.begins)):
         entry, first = bins.stretch_entries[stretch], stretch * grid.tiles
         for pair in range(pairs.begins[stretch], pairs.ends[stretch]):
             at = first + pairs.tile[pair]

@@ -8,29 +8,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from coliags_plugin.core.numba_compilation import inline
+from coliags_plugin.renderers.numba_kernels import lanes as vec
 from coliags_plugin.renderers.numba_kernels import layout
-from coliags_plugin.renderers.numba_kernels.lanes import (
-    LaneMask,
-    Vector,
-    add,
-    at_least,
-    at_most,
-    both,
-    broadcast,
-    broadcast_all,
-    div,
-    dot,
-    fma,
-    greater,
-    larger,
-    less,
-    mul,
-    neg,
-    select,
-    smaller,
-    sqrt,
-    sub,
-)
 
 
 class Projected(NamedTuple):
@@ -51,32 +30,32 @@ class Projected(NamedTuple):
         local_x, local_y: The same for a step along the local axes: rows of J C^T R.
     """
 
-    in_front: LaneMask
-    offset: tuple[Vector, ...]
-    x: Vector
-    y: Vector
-    z: Vector
-    inverse_z: Vector
-    slope_x: Vector
-    slope_y: Vector
-    follows_x: LaneMask
-    follows_y: LaneMask
-    rotation: tuple[tuple[Vector, ...], ...]
-    quaternion: tuple[Vector, ...]
-    inverse_norm: Vector
-    squared_norm: Vector
-    image_x: tuple[Vector, ...]
-    image_y: tuple[Vector, ...]
-    local_x: tuple[Vector, ...]
-    local_y: tuple[Vector, ...]
+    in_front: vec.LaneMask
+    offset: tuple[vec.Vector, ...]
+    x: vec.Vector
+    y: vec.Vector
+    z: vec.Vector
+    inverse_z: vec.Vector
+    slope_x: vec.Vector
+    slope_y: vec.Vector
+    follows_x: vec.LaneMask
+    follows_y: vec.LaneMask
+    rotation: tuple[tuple[vec.Vector, ...], ...]
+    quaternion: tuple[vec.Vector, ...]
+    inverse_norm: vec.Vector
+    squared_norm: vec.Vector
+    image_x: tuple[vec.Vector, ...]
+    image_y: tuple[vec.Vector, ...]
+    local_x: tuple[vec.Vector, ...]
+    local_y: tuple[vec.Vector, ...]
 
 
 @inline
 def camera_axes(view):
     """The camera's axes in the world: right, down, forward."""
     three = (0, 0, 0)
-    right, down = broadcast_all(view, layout.VIEW_RIGHT, three), broadcast_all(view, layout.VIEW_DOWN, three)
-    return right, down, broadcast_all(view, layout.VIEW_FORWARD, three)
+    right, down = vec.broadcast_all(view, layout.VIEW_RIGHT, three), vec.broadcast_all(view, layout.VIEW_DOWN, three)
+    return right, down, vec.broadcast_all(view, layout.VIEW_FORWARD, three)
 
 
 @inline
@@ -84,30 +63,36 @@ def project_axes(mean, quat, view):
     """Everything but scales. ``mean`` and ``quat`` are tuples of lanes, ``view`` the table ``layout`` describes."""
     right, down, forward = camera_axes(view)
     # Subtracting the centre before rotating keeps float32 accurate far from the world's origin.
-    offset = sub(mean, broadcast_all(view, layout.VIEW_CENTER, (0, 0, 0)))
-    z = dot(offset, forward, 0.0)
-    in_front = greater(z, broadcast(view, layout.VIEW_NEAR))
-    x = select(in_front, dot(offset, right, 0.0), 0.0)
-    y = select(in_front, dot(offset, down, 0.0), 0.0)
-    z = select(in_front, z, 1.0)
-    inverse_z = div(1.0, z)
-    free_x, free_y = mul(x, inverse_z), mul(y, inverse_z)
-    slope_x_min, slope_x_max = broadcast(view, layout.VIEW_SLOPE_X_MIN), broadcast(view, layout.VIEW_SLOPE_X_MAX)
-    slope_y_min, slope_y_max = broadcast(view, layout.VIEW_SLOPE_Y_MIN), broadcast(view, layout.VIEW_SLOPE_Y_MAX)
-    slope_x = larger(smaller(free_x, slope_x_max), slope_x_min)
-    slope_y = larger(smaller(free_y, slope_y_max), slope_y_min)
-    follows_x = both(at_least(free_x, slope_x_min), at_most(free_x, slope_x_max))
-    follows_y = both(at_least(free_y, slope_y_min), at_most(free_y, slope_y_max))
+    offset = vec.sub(mean, vec.broadcast_all(view, layout.VIEW_CENTER, (0, 0, 0)))
+    z = vec.dot(offset, forward, 0.0)
+    in_front = vec.greater(z, vec.broadcast(view, layout.VIEW_NEAR))
+    x = vec.select(in_front, vec.dot(offset, right, 0.0), 0.0)
+    y = vec.select(in_front, vec.dot(offset, down, 0.0), 0.0)
+    z = vec.select(in_front, z, 1.0)
+    inverse_z = vec.div(1.0, z)
+    free_x, free_y = vec.mul(x, inverse_z), vec.mul(y, inverse_z)
+    slope_x_min, slope_x_max = (
+        vec.broadcast(view, layout.VIEW_SLOPE_X_MIN),
+        vec.broadcast(view, layout.VIEW_SLOPE_X_MAX),
+    )
+    slope_y_min, slope_y_max = (
+        vec.broadcast(view, layout.VIEW_SLOPE_Y_MIN),
+        vec.broadcast(view, layout.VIEW_SLOPE_Y_MAX),
+    )
+    slope_x = vec.larger(vec.smaller(free_x, slope_x_max), slope_x_min)
+    slope_y = vec.larger(vec.smaller(free_y, slope_y_max), slope_y_min)
+    follows_x = vec.both(vec.at_least(free_x, slope_x_min), vec.at_most(free_x, slope_x_max))
+    follows_y = vec.both(vec.at_least(free_y, slope_y_min), vec.at_most(free_y, slope_y_max))
 
-    squared_norm = dot(quat, quat, 0.0)
-    inverse_norm = div(1.0, sqrt(squared_norm))
-    quaternion = mul(quat, inverse_norm)
+    squared_norm = vec.dot(quat, quat, 0.0)
+    inverse_norm = vec.div(1.0, vec.sqrt(squared_norm))
+    quaternion = vec.mul(quat, inverse_norm)
     rotation = rotation_rows(quaternion)
 
-    per_x = mul(broadcast(view, layout.VIEW_FX), inverse_z)
-    per_y = mul(broadcast(view, layout.VIEW_FY), inverse_z)
-    image_x = mul(per_x, fma(neg(slope_x), forward, right))
-    image_y = mul(per_y, fma(neg(slope_y), forward, down))
+    per_x = vec.mul(vec.broadcast(view, layout.VIEW_FX), inverse_z)
+    per_y = vec.mul(vec.broadcast(view, layout.VIEW_FY), inverse_z)
+    image_x = vec.mul(per_x, vec.fma(vec.neg(slope_x), forward, right))
+    image_y = vec.mul(per_y, vec.fma(vec.neg(slope_y), forward, down))
     local_x, local_y = rotated_back(rotation, image_x), rotated_back(rotation, image_y)
     return Projected(
         in_front, offset, x, y, z, inverse_z, slope_x, slope_y, follows_x, follows_y, rotation, quaternion,
@@ -119,14 +104,14 @@ def project_axes(mean, quat, view):
 def rotation_rows(quaternion):
     """Rows of the rotation matrix of a unit quaternion, w first."""
     w, x, y, z = quaternion
-    two_x, two_y, two_z = add(x, x), add(y, y), add(z, z)
-    xx, yy, zz = mul(x, two_x), mul(y, two_y), mul(z, two_z)
-    xy, xz, yz = mul(x, two_y), mul(x, two_z), mul(y, two_z)
-    wx, wy, wz = mul(w, two_x), mul(w, two_y), mul(w, two_z)
+    two_x, two_y, two_z = vec.add(x, x), vec.add(y, y), vec.add(z, z)
+    xx, yy, zz = vec.mul(x, two_x), vec.mul(y, two_y), vec.mul(z, two_z)
+    xy, xz, yz = vec.mul(x, two_y), vec.mul(x, two_z), vec.mul(y, two_z)
+    wx, wy, wz = vec.mul(w, two_x), vec.mul(w, two_y), vec.mul(w, two_z)
     return (
-        (sub(1.0, add(yy, zz)), sub(xy, wz), add(xz, wy)),
-        (add(xy, wz), sub(1.0, add(xx, zz)), sub(yz, wx)),
-        (sub(xz, wy), add(yz, wx), sub(1.0, add(xx, yy))),
+        (vec.sub(1.0, vec.add(yy, zz)), vec.sub(xy, wz), vec.add(xz, wy)),
+        (vec.add(xy, wz), vec.sub(1.0, vec.add(xx, zz)), vec.sub(yz, wx)),
+        (vec.sub(xz, wy), vec.add(yz, wx), vec.sub(1.0, vec.add(xx, yy))),
     )
 
 
@@ -134,16 +119,16 @@ def rotation_rows(quaternion):
 def rotated_back(rotation, vector):
     """The transposed rotation times a vector: world axes -> local axes."""
     a, b, c = rotation
-    return fma(vector[2], c, fma(vector[1], b, mul(vector[0], a)))
+    return vec.fma(vector[2], c, vec.fma(vector[1], b, vec.mul(vector[0], a)))
 
 
 @inline
 def cross(a, b):
     """Cross product."""
     return (
-        fma(a[1], b[2], neg(mul(a[2], b[1]))),
-        fma(a[2], b[0], neg(mul(a[0], b[2]))),
-        fma(a[0], b[1], neg(mul(a[1], b[0]))),
+        vec.fma(a[1], b[2], vec.neg(vec.mul(a[2], b[1]))),
+        vec.fma(a[2], b[0], vec.neg(vec.mul(a[0], b[2]))),
+        vec.fma(a[0], b[1], vec.neg(vec.mul(a[1], b[0]))),
     )
 
 
@@ -154,25 +139,25 @@ def squared_distance_to_box(u_xx, u_yx, u_yy, slope_upright, slope_level, left, 
     A convex quadratic has its minimum over a box at the centre if that is inside, else on an edge that faces it; along
     an upright edge at dx the best dy is dx cov_xy / cov_xx, clamped to the edge's ends (and likewise for level edges).
     """
-    facing_x = add(larger(left, 0.0), smaller(right, 0.0))
-    facing_y = add(larger(top, 0.0), smaller(bottom, 0.0))
-    along_y = smaller(larger(mul(facing_x, slope_upright), top), bottom)
-    along_x = smaller(larger(mul(facing_y, slope_level), left), right)
-    upright_e, upright_f = mul(u_xx, facing_x), fma(u_yx, facing_x, mul(u_yy, along_y))
-    level_e, level_f = mul(u_xx, along_x), fma(u_yx, along_x, mul(u_yy, facing_y))
-    upright = fma(upright_e, upright_e, mul(upright_f, upright_f))
-    level = fma(level_e, level_e, mul(level_f, level_f))
-    return smaller(upright, level)
+    facing_x = vec.add(vec.larger(left, 0.0), vec.smaller(right, 0.0))
+    facing_y = vec.add(vec.larger(top, 0.0), vec.smaller(bottom, 0.0))
+    along_y = vec.smaller(vec.larger(vec.mul(facing_x, slope_upright), top), bottom)
+    along_x = vec.smaller(vec.larger(vec.mul(facing_y, slope_level), left), right)
+    upright_e, upright_f = vec.mul(u_xx, facing_x), vec.fma(u_yx, facing_x, vec.mul(u_yy, along_y))
+    level_e, level_f = vec.mul(u_xx, along_x), vec.fma(u_yx, along_x, vec.mul(u_yy, facing_y))
+    upright = vec.fma(upright_e, upright_e, vec.mul(upright_f, upright_f))
+    level = vec.fma(level_e, level_e, vec.mul(level_f, level_f))
+    return vec.smaller(upright, level)
 
 
 @inline
 def shortest_axes(scale):
     """Whether the second, and whether the third axis is the shortest; where neither is, the first. Ties go forwards."""
-    return less(scale[1], scale[0]), less(scale[2], smaller(scale[0], scale[1]))
+    return vec.less(scale[1], scale[0]), vec.less(scale[2], vec.smaller(scale[0], scale[1]))
 
 
 @inline
 def shortest_column(rotation, second, third):
     """The column of the rotation that :func:`shortest_axes` chose: the shortest axis in the world."""
     a, b, c = rotation
-    return select(third, (a[2], b[2], c[2]), select(second, (a[1], b[1], c[1]), (a[0], b[0], c[0])))
+    return vec.select(third, (a[2], b[2], c[2]), vec.select(second, (a[1], b[1], c[1]), (a[0], b[0], c[0])))

@@ -85,15 +85,7 @@ VIEW_DISTORTION = 31  # factor of squared differences of reciprocal depths in th
 
 
 class Parameters(NamedTuple):
-    """The Gaussians, or the derivatives with respect to them.
-
-    Attributes:
-        means: [3 for each Gaussian]
-        quats: w first. [4 for each Gaussian]
-        scales: [3 for each Gaussian, 2 for each surfel]
-        opacities: [1 for each Gaussian]
-        colors: [3 for each Gaussian]
-    """
+    """The Gaussians, or the derivatives with respect to them: 3, 4 (w first), 3 (surfels: 2), 1 and 3 numbers for each."""
 
     means: Array
     quats: Array
@@ -115,13 +107,7 @@ FEATURES = Extras(depth=True, inverse_depth=True, normals=True)
 
 
 class Grid(NamedTuple):
-    """The image and its tiles.
-
-    Attributes:
-        width, height: Pixels.
-        columns: Tiles side by side.
-        tiles: All tiles, counted row by row.
-    """
+    """The image in pixels and its tiles, which are counted row by row; ``columns`` of them are side by side."""
 
     width: int
     height: int
@@ -134,7 +120,7 @@ class Projections(NamedTuple):
 
     Attributes:
         records: One row for each Gaussian; anything where it is not drawn.
-        depths: z-depths; 1 where not in front of the camera. [1 for each Gaussian]
+        depths: z-depths; 1 where not in front of the camera.
         bounds: First and last column, first and last row of the tiles within reach. [4 for each Gaussian]
         drawn: One bit for each Gaussian of a group. [groups]
         parcels: Gaussians drawn, -1 where one cannot be used; and tiles within their bounds. [2 for each parcel]
@@ -150,11 +136,8 @@ class Projections(NamedTuple):
 class Pairs(NamedTuple):
     """Pairs of a Gaussian and a tile that it touches, by stretches of the list of Gaussians.
 
-    Attributes:
-        gaussian, tile: Numbers of the two.
-        blocks: Blocks touched, one bit each.
-        begins, ends: Where the pairs of a stretch are. [stretches]
-        tile_counts: How many there are of each stretch and tile. [tiles for each stretch]
+    ``blocks`` are those touched, one bit each; a stretch's pairs are from ``begins`` to ``ends``; ``tile_counts`` tells how
+    many there are of each stretch and tile.
     """
 
     gaussian: Array
@@ -190,10 +173,8 @@ class Bins(NamedTuple):
 class Images(NamedTuple):
     """Images, or the derivatives with respect to them; empty where there are none.
 
-    Attributes:
-        rgb, normals: [3 for each pixel]
-        alpha, depth, inverse_depth, expected, median, distortion: [1 for each pixel]; ``expected`` is depth over alpha,
-            and only surfels have a distortion.
+    ``rgb`` and ``normals`` have 3 numbers for each pixel, the others 1; ``expected`` is depth over alpha, and only surfels
+    have a distortion.
     """
 
     rgb: Array

@@ -38,11 +38,8 @@ class TooManyPairsError(Exception):
 class Layer(NamedTuple):
     """What one pair of sweeps composites.
 
-    Attributes:
-        records: One row for each Gaussian. [16 each]
-        view: Camera and options, see ``layout``.
-        channels: Any tuple as long as there are channels in the records.
-        own: What is composited besides, in the form that the sweeps take it.
+    ``records`` has a row of sixteen for each Gaussian, ``channels`` is any tuple as long as there are channels in them, and
+    ``own`` is what is composited besides, in the form that the sweeps take it.
     """
 
     records: Array
@@ -54,10 +51,8 @@ class Layer(NamedTuple):
 class Pipeline(ABC):
     """Rendering of N Gaussians from one camera, stage by stage, with the intermediate tables.
 
-    Args:
-        view: Camera and options, see ``layout``.
-        width, height: Pixels.
-        wanted: The images to draw; depth is among them if expected is. [fields of layout.Images]
+    ``view`` is that of ``layout``; ``wanted`` are the images to draw, fields of ``layout.Images``; depth is among them if
+    expected is.
     """
 
     #: Scales of a Gaussian.
@@ -139,14 +134,10 @@ class Pipeline(ABC):
     # --- stages -------------------------------------------------------------------------------------------------------
 
     def project(self, gaussians: layout.Parameters) -> tuple[Array, Array, Array]:
-        """Project Gaussians.
+        """Project Gaussians; UnusableGaussianError where one is not finite, has no direction or a negative scale.
 
-        Returns:
-            Projected centres in pixels, radii in pixels, and a table without content of the shape of the Gaussians'
-            sums, which stands for all else in the graph of derivatives. [N, 2], [N], [16 each or more]
-
-        Raises:
-            UnusableGaussianError: One is not finite, has no direction or a negative scale.
+        Returns projected centres in pixels [N, 2], radii in pixels [N], and a table without content of the shape of the Gaussians'
+        sums, which stands for all else in the graph of derivatives.
         """
         self._count = count = len(gaussians.opacities)
         groups, filled, take = -(-count // layout.GROUP), self._filled, self._arena.take
@@ -166,14 +157,7 @@ class Pipeline(ABC):
         return means2d[:count], radii[:count], take("links", self._sums_size(self._main_layer(), filled))
 
     def composite(self) -> layout.Images:
-        """Draw the Gaussians projected.
-
-        Returns:
-            [H, W, 3] or [H, W]; None where not wanted.
-
-        Raises:
-            TooManyPairsError: They cover too many tiles.
-        """
+        """Draw the Gaussians projected: [H, W, 3] or [H, W], None where not wanted. May raise TooManyPairsError."""
         layer = self._main_layer()
         images = self._images(self._wanted, _results.take)
         with _workers() as run:
@@ -183,15 +167,9 @@ class Pipeline(ABC):
         return images
 
     def composite_features(self, features: Array) -> Array:
-        """Composite further channels of the Gaussians over 0, after :meth:`composite` and over the same bins.
+        """Composite features [N, C] over 0, after :meth:`composite` and over the same bins: [H, W, C].
 
         Some channels at a time take the place of the others in the records.
-
-        Args:
-            features: [N, C]
-
-        Returns:
-            [H, W, C]
         """
         grid, width, count = self._grid, self.feature_channels, features.shape[1]
         sweeps = -(-count // width)
@@ -207,15 +185,10 @@ class Pipeline(ABC):
         return result[..., :count]
 
     def composite_features_backward(self, features: Array, of_features: Array) -> tuple[Array, Array, Array]:
-        """Derivatives of :meth:`composite_features`.
+        """Derivatives of :meth:`composite_features`, given those with respect to its result. [H, W, C]
 
-        Args:
-            features: As given to it. [N, C]
-            of_features: Derivative of the loss with respect to its result. [H, W, C]
-
-        Returns:
-            Derivative with respect to the projected centres, the sums of each Gaussian without those of the channels,
-            and the derivative with respect to the features. [N, 2], [16 each or more], [N, C]
+        Returns the derivative with respect to the projected centres [N, 2], the sums of each Gaussian without those of the
+        channels, and the derivative with respect to the features [N, C].
         """
         width, filled, first_sum = self.feature_channels, self._filled, self.first_channel_sum
         layer = self._features_layer(features, 0)
@@ -243,14 +216,10 @@ class Pipeline(ABC):
         return of_means2d[: self._count], sums, result
 
     def composite_backward(self, of_images: layout.Images) -> tuple[Array, Array]:
-        """Derivatives of :meth:`composite`, any number of times.
+        """Derivatives of :meth:`composite`, any number of times, given those with respect to the images, None where 0.
 
-        Args:
-            of_images: Derivatives of the loss with respect to the images; None where 0.
-
-        Returns:
-            Derivative with respect to the projected centres, and the sums of each Gaussian, which are good until the
-            next call. [N, 2], [16 each or more]
+        Returns the derivative with respect to the projected centres [N, 2], and the sums of each Gaussian, which are good until
+        the next call.
         """
         layer, filled, take = self._main_layer(), self._filled, self._arena.take
         entry_sums = take("entry_sums", self._sums_size(layer, int(self._bins.starts[-1])))
@@ -264,15 +233,9 @@ class Pipeline(ABC):
     def project_backward(
         self, gaussians: layout.Parameters, of_means2d: Array | None, gaussian_sums: Array | None
     ) -> tuple[layout.Parameters, Array]:
-        """Derivatives of :meth:`project`.
+        """Derivatives of :meth:`project`, given that of the projected centres and the Gaussians' sums; None where 0.
 
-        Args:
-            gaussians: Those that were projected.
-            of_means2d: Derivative of the loss with respect to the projected centres; None for 0. [N, 2]
-            gaussian_sums: What :meth:`composite_backward` gave; None for 0.
-
-        Returns:
-            Derivatives with respect to the Gaussians, and to the upper three rows of ``camera_to_world``. [3, 4]
+        Returns those with respect to the Gaussians, and to the upper three rows of ``camera_to_world``. [3, 4]
         """
         filled = self._filled
         given = self._arena.take("given_means2d", 2 * filled)

@@ -6,6 +6,7 @@ The formulas are those of ``docs/rendering.md``, section "Projection", for sixte
 from __future__ import annotations
 
 from coliags_plugin.core.numba_compilation import inline, kernel, part
+from coliags_plugin.renderers.numba_kernels import lanes as vec
 from coliags_plugin.renderers.numba_kernels import layout
 from coliags_plugin.renderers.numba_kernels.geometry import (
     camera_axes,
@@ -15,37 +16,7 @@ from coliags_plugin.renderers.numba_kernels.geometry import (
     shortest_column,
     squared_distance_to_box,
 )
-from coliags_plugin.renderers.numba_kernels.lanes import (
-    add,
-    at_least,
-    at_most,
-    bit_count,
-    bits,
-    both,
-    broadcast,
-    ceil,
-    div,
-    dot,
-    floor,
-    fma,
-    greater,
-    lane,
-    lane_sums,
-    larger,
-    load,
-    load_columns,
-    log2,
-    mul,
-    neg,
-    select,
-    smaller,
-    splat,
-    sqrt,
-    store,
-    store_columns,
-    sub,
-)
-from coliags_plugin.renderers.numba_kernels.threads import take
+from coliags_plugin.renderers.numba_kernels.threads import pieces
 
 #: Shorter quaternions (squared) have no direction.
 SMALLEST_SQUARED_NORM = 1e-24
@@ -55,23 +26,12 @@ SMALLEST_SQUARED_NORM = 1e-24
 def project(counters, count, gaussians, tail, view, extras, projections, means2d, radii):
     """Project all Gaussians and compute their extents.
 
-    Args:
-        counters: Work counters for dynamic scheduling; entry 0 must be 0.
-        count: Number of Gaussians.
-        gaussians: The Gaussians. [layout.Parameters]
-        tail: Those behind the last full group, filled up with ones that are not drawn. [layout.Parameters]
-        view: See ``layout``.
-        extras: What is composited besides colour.
-        projections: Out.
-        means2d: Out: projected centres, pixels, padded to whole groups. [2 for each Gaussian]
-        radii: Out: pixels, 0 where not drawn, padded to whole groups. [1 for each Gaussian]
+    Written are ``projections``, ``means2d`` in pixels and ``radii`` in pixels, 0 where not drawn. ``tail`` are the Gaussians
+    behind the last full group, filled up with ones that are not drawn.
     """
     whole_groups = count // layout.GROUP
     per_parcel = layout.PARCEL // layout.GROUP
-    while True:
-        parcel = take(counters, 0, 1)
-        if parcel * layout.PARCEL >= count:
-            break
+    for parcel in pieces(counters, 0, -(-count // layout.PARCEL)):
         first = parcel * per_parcel
         last = min(first + per_parcel, whole_groups)
         drawn, tiles = _project_groups(first, last, first, gaussians, view, extras, projections, means2d, radii)
@@ -87,66 +47,85 @@ def project(counters, count, gaussians, tail, view, extras, projections, means2d
 def _project_groups(first, last, source, gaussians, view, extras, projections, means2d, radii):
     """Project groups ``first`` to ``last``, reading from group ``source`` of the Gaussians on.
 
-    Returns:
-        The number of Gaussians drawn, -1 where one is invalid; and the number of tiles within their bounds.
+    Returns the number of Gaussians drawn, -1 where one is invalid; and the number of tiles within their bounds.
     """
     drawn, tiles, usable = 0, 0, True
     three = (0, 0, 0)
-    log2_alpha_min, low_pass = broadcast(view, layout.VIEW_LOG2_ALPHA_MIN), broadcast(view, layout.VIEW_LOW_PASS)
-    right_edge = sub(broadcast(view, layout.VIEW_WIDTH), 0.5)
-    bottom_edge = sub(broadcast(view, layout.VIEW_HEIGHT), 0.5)
+    log2_alpha_min, low_pass = (
+        vec.broadcast(view, layout.VIEW_LOG2_ALPHA_MIN),
+        vec.broadcast(view, layout.VIEW_LOW_PASS),
+    )
+    right_edge = vec.sub(vec.broadcast(view, layout.VIEW_WIDTH), 0.5)
+    bottom_edge = vec.sub(vec.broadcast(view, layout.VIEW_HEIGHT), 0.5)
     for group in range(first, last):
         row = layout.GROUP * (group - first + source)
-        mean, scale = load_columns(gaussians.means, 3 * row, three), load_columns(gaussians.scales, 3 * row, three)
-        quat, opacity = load_columns(gaussians.quats, 4 * row, (0, 0, 0, 0)), load(gaussians.opacities, row)
-        color = load_columns(gaussians.colors, 3 * row, three)
+        mean, scale = (
+            vec.load_columns(gaussians.means, 3 * row, three),
+            vec.load_columns(gaussians.scales, 3 * row, three),
+        )
+        quat, opacity = vec.load_columns(gaussians.quats, 4 * row, (0, 0, 0, 0)), vec.load(gaussians.opacities, row)
+        color = vec.load_columns(gaussians.colors, 3 * row, three)
         at = project_axes(mean, quat, view)
-        usable = usable and bits(are_usable(mean, at.squared_norm, scale, opacity, color)) == 0xFFFF
+        usable = usable and vec.bits(are_usable(mean, at.squared_norm, scale, opacity, color)) == 0xFFFF
 
-        row_x, row_y = mul(at.local_x, scale), mul(at.local_y, scale)
-        sharp_xx, sharp_yy = dot(row_x, row_x, 0.0), dot(row_y, row_y, 0.0)
-        xx, xy, yy = add(sharp_xx, low_pass), dot(row_x, row_y, 0.0), add(sharp_yy, low_pass)
+        row_x, row_y = vec.mul(at.local_x, scale), vec.mul(at.local_y, scale)
+        sharp_xx, sharp_yy = vec.dot(row_x, row_x, 0.0), vec.dot(row_y, row_y, 0.0)
+        xx, xy, yy = vec.add(sharp_xx, low_pass), vec.dot(row_x, row_y, 0.0), vec.add(sharp_yy, low_pass)
         # xx yy - xy^2 cancels for needles; this sum of squares is the same number (Cauchy-Binet) and does not.
         across = cross(row_x, row_y)
-        determinant = dot(across, across, mul(low_pass, add(add(sharp_xx, sharp_yy), low_pass)))
-        u_xx = div(layout.U_FACTOR, sqrt(xx))
-        u_yy = mul(layout.U_FACTOR, sqrt(div(xx, determinant)))
-        slope_upright, slope_level = div(xy, xx), div(xy, yy)
-        u_yx = neg(mul(u_yy, slope_upright))
-        mean_x = fma(broadcast(view, layout.VIEW_FX), mul(at.x, at.inverse_z), broadcast(view, layout.VIEW_CX))
-        mean_y = fma(broadcast(view, layout.VIEW_FY), mul(at.y, at.inverse_z), broadcast(view, layout.VIEW_CY))
+        determinant = vec.dot(across, across, vec.mul(low_pass, vec.add(vec.add(sharp_xx, sharp_yy), low_pass)))
+        u_xx = vec.div(layout.U_FACTOR, vec.sqrt(xx))
+        u_yy = vec.mul(layout.U_FACTOR, vec.sqrt(vec.div(xx, determinant)))
+        slope_upright, slope_level = vec.div(xy, xx), vec.div(xy, yy)
+        u_yx = vec.neg(vec.mul(u_yy, slope_upright))
+        mean_x = vec.fma(
+            vec.broadcast(view, layout.VIEW_FX), vec.mul(at.x, at.inverse_z), vec.broadcast(view, layout.VIEW_CX)
+        )
+        mean_y = vec.fma(
+            vec.broadcast(view, layout.VIEW_FY), vec.mul(at.y, at.inverse_z), vec.broadcast(view, layout.VIEW_CY)
+        )
 
-        log2_opacity = log2(opacity)
-        reach = sub(log2_opacity, log2_alpha_min)
-        left, right = sub(0.5, mean_x), sub(right_edge, mean_x)
-        top, bottom = sub(0.5, mean_y), sub(bottom_edge, mean_y)
+        log2_opacity = vec.log2(opacity)
+        reach = vec.sub(log2_opacity, log2_alpha_min)
+        left, right = vec.sub(0.5, mean_x), vec.sub(right_edge, mean_x)
+        top, bottom = vec.sub(0.5, mean_y), vec.sub(bottom_edge, mean_y)
         nearest = squared_distance_to_box(u_xx, u_yx, u_yy, slope_upright, slope_level, left, right, top, bottom)
-        shown = both(both(at.in_front, at_least(reach, 0.0)), at_most(nearest, reach))
-        tau = mul(reach, 1.0 / layout.U_FACTOR_SQUARED)
-        half = larger(sqrt(mul(tau, xx)), sqrt(mul(tau, yy)))
-        store(radii, layout.GROUP * group, select(shown, ceil(half), 0.0))
+        shown = vec.both(vec.both(at.in_front, vec.at_least(reach, 0.0)), vec.at_most(nearest, reach))
+        tau = vec.mul(reach, 1.0 / layout.U_FACTOR_SQUARED)
+        half = vec.larger(vec.sqrt(vec.mul(tau, xx)), vec.sqrt(vec.mul(tau, yy)))
+        vec.store(radii, layout.GROUP * group, vec.select(shown, vec.ceil(half), 0.0))
 
-        tau = mul(add(reach, layout.REACH_SLACK), 1.0 / layout.U_FACTOR_SQUARED)
-        half_x, half_y = sqrt(mul(tau, xx)), sqrt(mul(tau, yy))
-        column_first, column_last = tile_at(sub(mean_x, half_x), right_edge), tile_at(add(mean_x, half_x), right_edge)
-        row_first, row_last = tile_at(sub(mean_y, half_y), bottom_edge), tile_at(add(mean_y, half_y), bottom_edge)
-        store_columns(projections.bounds, 4 * layout.GROUP * group, (column_first, column_last, row_first, row_last))
-        area = mul(add(sub(column_last, column_first), 1.0), add(sub(row_last, row_first), 1.0))
-        tiles += int(lane(lane_sums((select(shown, area, 0.0),)), 0))
-        flags = bits(shown)
-        drawn += bit_count(flags)
+        tau = vec.mul(vec.add(reach, layout.REACH_SLACK), 1.0 / layout.U_FACTOR_SQUARED)
+        half_x, half_y = vec.sqrt(vec.mul(tau, xx)), vec.sqrt(vec.mul(tau, yy))
+        column_first, column_last = (
+            tile_at(vec.sub(mean_x, half_x), right_edge),
+            tile_at(vec.add(mean_x, half_x), right_edge),
+        )
+        row_first, row_last = (
+            tile_at(vec.sub(mean_y, half_y), bottom_edge),
+            tile_at(vec.add(mean_y, half_y), bottom_edge),
+        )
+        vec.store_columns(
+            projections.bounds, 4 * layout.GROUP * group, (column_first, column_last, row_first, row_last)
+        )
+        area = vec.mul(vec.add(vec.sub(column_last, column_first), 1.0), vec.add(vec.sub(row_last, row_first), 1.0))
+        tiles += int(vec.lane(vec.lane_sums((vec.select(shown, area, 0.0),)), 0))
+        flags = vec.bits(shown)
+        drawn += vec.bit_count(flags)
         projections.drawn[group] = flags
 
-        store_columns(means2d, 2 * layout.GROUP * group, (mean_x, mean_y))
-        store(projections.depths, layout.GROUP * group, at.z)
-        normal = _facing_normals(at, scale, view) if extras.normals else (splat(0.0), splat(0.0), splat(0.0))
+        vec.store_columns(means2d, 2 * layout.GROUP * group, (mean_x, mean_y))
+        vec.store(projections.depths, layout.GROUP * group, at.z)
+        normal = (
+            _facing_normals(at, scale, view) if extras.normals else (vec.splat(0.0), vec.splat(0.0), vec.splat(0.0))
+        )
         whole = (
             (u_xx, u_yx, u_yy, mean_x, mean_y, log2_opacity)
             + color
             + _without_gaps(at.z, at.inverse_z, normal, extras)
             + (slope_upright, slope_level)
         )
-        store_columns(projections.records, layout.ROW * layout.GROUP * group, whole)
+        vec.store_columns(projections.records, layout.ROW * layout.GROUP * group, whole)
     return (drawn if usable else -1), tiles
 
 
@@ -155,16 +134,18 @@ def are_usable(mean, squared_norm, scale, opacity, color):
     """Whether all numbers are finite, scales are not negative, and the quaternion has a direction."""
     # 0 times infinity or NaN is NaN.
     none = (0.0, 0.0, 0.0)
-    finite = dot(mean, none, dot(scale, none, dot(color, none, mul(opacity, 0.0))))
-    finite = fma(squared_norm, 0.0, finite)
-    positive = at_least(smaller(smaller(scale[0], scale[1]), scale[2]), 0.0)
-    return both(both(at_least(finite, 0.0), positive), at_least(squared_norm, SMALLEST_SQUARED_NORM))
+    finite = vec.dot(mean, none, vec.dot(scale, none, vec.dot(color, none, vec.mul(opacity, 0.0))))
+    finite = vec.fma(squared_norm, 0.0, finite)
+    positive = vec.at_least(vec.smaller(vec.smaller(scale[0], scale[1]), scale[2]), 0.0)
+    return vec.both(vec.both(vec.at_least(finite, 0.0), positive), vec.at_least(squared_norm, SMALLEST_SQUARED_NORM))
 
 
 @inline
 def tile_at(position, edge):
     """Column or row of the tile at a position, clamped to those in the image; finite whatever the position."""
-    return larger(smaller(floor(mul(position, 1.0 / layout.TILE)), floor(mul(edge, 1.0 / layout.TILE))), 0.0)
+    return vec.larger(
+        vec.smaller(vec.floor(vec.mul(position, 1.0 / layout.TILE)), vec.floor(vec.mul(edge, 1.0 / layout.TILE))), 0.0
+    )
 
 
 @inline
@@ -173,9 +154,9 @@ def _facing_normals(at, scale, view):
     second, third = shortest_axes(scale)
     axis = shortest_column(at.rotation, second, third)
     # The line of sight and the axis may be compared in the world as well as in the camera.
-    axis = select(greater(dot(axis, at.offset, 0.0), 0.0), neg(axis), axis)
+    axis = vec.select(vec.greater(vec.dot(axis, at.offset, 0.0), 0.0), vec.neg(axis), axis)
     right, down, forward = camera_axes(view)
-    return dot(axis, right, 0.0), dot(axis, down, 0.0), dot(axis, forward, 0.0)
+    return vec.dot(axis, right, 0.0), vec.dot(axis, down, 0.0), vec.dot(axis, forward, 0.0)
 
 
 @inline
@@ -184,7 +165,7 @@ def _without_gaps(depth, inverse_depth, normal, extras):
     if extras.depth:
         if extras.inverse_depth:
             return depth, inverse_depth, normal[0], normal[1], normal[2]
-        return depth, normal[0], normal[1], normal[2], splat(0.0)
+        return depth, normal[0], normal[1], normal[2], vec.splat(0.0)
     if extras.inverse_depth:
-        return inverse_depth, normal[0], normal[1], normal[2], splat(0.0)
-    return normal[0], normal[1], normal[2], splat(0.0), splat(0.0)
+        return inverse_depth, normal[0], normal[1], normal[2], vec.splat(0.0)
+    return normal[0], normal[1], normal[2], vec.splat(0.0), vec.splat(0.0)

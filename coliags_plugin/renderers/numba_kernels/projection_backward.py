@@ -9,35 +9,11 @@ from __future__ import annotations
 import numpy as np
 
 from coliags_plugin.core.numba_compilation import inline, kernel, part
+from coliags_plugin.renderers.numba_kernels import lanes as vec
 from coliags_plugin.renderers.numba_kernels import layout
 from coliags_plugin.renderers.numba_kernels.geometry import camera_axes, project_axes, shortest_axes, shortest_column
-from coliags_plugin.renderers.numba_kernels.lanes import (
-    add,
-    broadcast,
-    div,
-    dot,
-    fma,
-    from_bits,
-    greater,
-    lane,
-    lane_sums,
-    load,
-    load_columns,
-    lowest_bit,
-    mul,
-    neg,
-    number,
-    prefetch,
-    prefetch_to_write,
-    repeat,
-    select,
-    splat,
-    store,
-    store_columns,
-    sub,
-)
 from coliags_plugin.renderers.numba_kernels.sorting import NUMBER
-from coliags_plugin.renderers.numba_kernels.threads import take
+from coliags_plugin.renderers.numba_kernels.threads import pieces
 
 #: Turn products of two (or four) factors of the scaled U into those of the plain one.
 _PLAIN_SQUARE = 1.0 / layout.U_FACTOR_SQUARED
@@ -48,26 +24,15 @@ _AHEAD = 16
 
 @kernel
 def gather(counters, projections, bins, entry_sums, gaussian_sums, of_means2d):
-    """Sum the gradient sums of each Gaussian's entries.
+    """Sum the gradient sums of each Gaussian's entries, 0 where it is not drawn.
 
-    Args:
-        counters: Work counters for dynamic scheduling; entries 0 and 1 must be 0.
-        projections, bins: What projection and binning wrote.
-        entry_sums: What the backward sweep wrote.
-        gaussian_sums: Out: see ``layout``; 0 where not drawn, padded to whole groups. [16 for each Gaussian]
-        of_means2d: Out: derivative with respect to the projected centres, likewise. [2 for each Gaussian]
+    Written are ``gaussian_sums`` and the derivative with respect to the projected centres.
     """
     groups, count, stretches = len(projections.drawn), len(bins.keys), len(bins.stretch_entries) - 1
     per_parcel = layout.PARCEL // layout.GROUP
-    while True:
-        first = take(counters, 0, per_parcel)
-        if first >= groups:
-            break
+    for first in pieces(counters, 0, groups, per_parcel):
         clear_undrawn(first, min(first + per_parcel, groups), projections.drawn, gaussian_sums, of_means2d)
-    while True:
-        stretch = take(counters, 1, 1)
-        if stretch >= stretches:
-            break
+    for stretch in pieces(counters, 1, stretches):
         first, last = count * stretch // stretches, count * (stretch + 1) // stretches
         entry = bins.stretch_entries[stretch]
         _gather_stretch(first, last, entry, projections.records, bins, entry_sums, gaussian_sums, of_means2d)
@@ -79,9 +44,9 @@ def clear_undrawn(first, last, drawn, gaussian_sums, of_means2d):
     for group in range(first, last):
         flags = drawn[group] ^ 0xFFFF
         while flags:
-            index = layout.GROUP * group + lowest_bit(flags)
+            index = layout.GROUP * group + vec.lowest_bit(flags)
             flags &= flags - 1
-            store(gaussian_sums, layout.ROW * index, 0.0)
+            vec.store(gaussian_sums, layout.ROW * index, 0.0)
             of_means2d[2 * index] = 0.0
             of_means2d[2 * index + 1] = 0.0
 
@@ -92,20 +57,20 @@ def _gather_stretch(first, last, entry, records, bins, entry_sums, gaussian_sums
     square = np.float32(_PLAIN_SQUARE)
     for place in range(first, last):
         ahead = bins.keys[min(place + _AHEAD, last - 1)] & NUMBER
-        prefetch(records, layout.ROW * ahead)
-        prefetch_to_write(gaussian_sums, layout.ROW * ahead)
-        prefetch_to_write(of_means2d, 2 * ahead)
+        vec.prefetch(records, layout.ROW * ahead)
+        vec.prefetch_to_write(gaussian_sums, layout.ROW * ahead)
+        vec.prefetch_to_write(of_means2d, 2 * ahead)
         index = bins.keys[place] & NUMBER
         row = layout.ROW * index
-        total = splat(0.0)
+        total = vec.splat(0.0)
         for _ in range(bins.entry_counts[place]):
-            total = add(total, load(entry_sums, layout.ROW * entry))
+            total = vec.add(total, vec.load(entry_sums, layout.ROW * entry))
             entry += 1
-        store(gaussian_sums, row, total)
-        e, f = lane(total, layout.SUM_E), lane(total, layout.SUM_F)
-        of_x = number(records, row + layout.U_XX) * e + number(records, row + layout.U_YX) * f
+        vec.store(gaussian_sums, row, total)
+        e, f = vec.lane(total, layout.SUM_E), vec.lane(total, layout.SUM_F)
+        of_x = vec.number(records, row + layout.U_XX) * e + vec.number(records, row + layout.U_YX) * f
         of_means2d[2 * index] = square * of_x
-        of_means2d[2 * index + 1] = square * (number(records, row + layout.U_YY) * f)
+        of_means2d[2 * index + 1] = square * (vec.number(records, row + layout.U_YY) * f)
 
 
 @kernel
@@ -114,33 +79,22 @@ def project_backward(
 ):
     """Derivatives of the loss with respect to Gaussians and pose, from the sums of each Gaussian.
 
-    Args:
-        counters: Work counters for dynamic scheduling; entry 0 must be 0.
-        count, gaussians, tail, view, extras: As for ``project``.
-        projections: What that wrote.
-        gaussian_sums: What :func:`gather` wrote.
-        given_means2d: Derivative with respect to the projected centres, padded to whole groups. [2 for each Gaussian]
-        of_gaussians: Out, padded to whole groups. [layout.Parameters]
-        of_pose: Out: derivative with respect to the camera's three axes and its centre in the world, one row for each
-            parcel. [16 for each parcel]
+    ``of_pose`` gets those with respect to the camera's three axes and its centre in the world, one row for each parcel.
     """
     whole_groups = count // layout.GROUP
     per_parcel = layout.PARCEL // layout.GROUP
-    while True:
-        parcel = take(counters, 0, 1)
-        if parcel * layout.PARCEL >= count:
-            break
+    for parcel in pieces(counters, 0, -(-count // layout.PARCEL)):
         first = parcel * per_parcel
         last = min(first + per_parcel, whole_groups)
         pose = _project_groups_backward(
-            first, last, first, repeat(0.0, (0,) * 12), gaussians, view, extras, projections, gaussian_sums,
+            first, last, first, vec.repeat(0.0, (0,) * 12), gaussians, view, extras, projections, gaussian_sums,
             given_means2d, of_gaussians,
         )  # fmt: skip
         if last * layout.GROUP < min((parcel + 1) * layout.PARCEL, count):
             pose = _project_groups_backward(
                 last, last + 1, 0, pose, tail, view, extras, projections, gaussian_sums, given_means2d, of_gaussians
             )
-        store(of_pose, layout.ROW * parcel, lane_sums(pose))
+        vec.store(of_pose, layout.ROW * parcel, vec.lane_sums(pose))
 
 
 @part
@@ -150,78 +104,87 @@ def _project_groups_backward(
     """Groups ``first`` to ``last``, reading from group ``source`` of the Gaussians on. Returns ``pose``, added to."""
     three = (0, 0, 0)
     right, down, forward = camera_axes(view)
-    fx, fy = broadcast(view, layout.VIEW_FX), broadcast(view, layout.VIEW_FY)
+    fx, fy = vec.broadcast(view, layout.VIEW_FX), vec.broadcast(view, layout.VIEW_FY)
     of_right, of_down, of_forward, of_center = pose[0:3], pose[3:6], pose[6:9], pose[9:12]
-    nothing = repeat(0.0, three)
+    nothing = vec.repeat(0.0, three)
     for group in range(first, last):
-        shown = from_bits(projections.drawn[group])
+        shown = vec.from_bits(projections.drawn[group])
         row = layout.GROUP * (group - first + source)
-        mean, scale = load_columns(gaussians.means, 3 * row, three), load_columns(gaussians.scales, 3 * row, three)
-        quat, opacity = load_columns(gaussians.quats, 4 * row, (0, 0, 0, 0)), load(gaussians.opacities, row)
+        mean, scale = (
+            vec.load_columns(gaussians.means, 3 * row, three),
+            vec.load_columns(gaussians.scales, 3 * row, three),
+        )
+        quat, opacity = vec.load_columns(gaussians.quats, 4 * row, (0, 0, 0, 0)), vec.load(gaussians.opacities, row)
         at = project_axes(mean, quat, view)
         row = layout.GROUP * group
-        sums = load_columns(gaussian_sums, layout.ROW * row, (0,) * 16)
-        by_x, by_y = load_columns(given_means2d, 2 * row, (0, 0))
+        sums = vec.load_columns(gaussian_sums, layout.ROW * row, (0,) * 16)
+        by_x, by_y = vec.load_columns(given_means2d, 2 * row, (0, 0))
 
-        row_x, row_y = mul(at.local_x, scale), mul(at.local_y, scale)
+        row_x, row_y = vec.mul(at.local_x, scale), vec.mul(at.local_y, scale)
         by_xx, by_xy, by_yy = _covariance_derivative(
-            load_columns(projections.records, layout.ROW * row, (0,) * 16), sums
+            vec.load_columns(projections.records, layout.ROW * row, (0,) * 16), sums
         )
-        of_row_x = fma(by_xx, row_x, mul(by_xy, row_y))
-        of_row_y = fma(by_xy, row_x, mul(by_yy, row_y))
-        of_scale = fma(of_row_x, at.local_x, mul(of_row_y, at.local_y))
-        of_local_x, of_local_y = mul(of_row_x, scale), mul(of_row_y, scale)
+        of_row_x = vec.fma(by_xx, row_x, vec.mul(by_xy, row_y))
+        of_row_y = vec.fma(by_xy, row_x, vec.mul(by_yy, row_y))
+        of_scale = vec.fma(of_row_x, at.local_x, vec.mul(of_row_y, at.local_y))
+        of_local_x, of_local_y = vec.mul(of_row_x, scale), vec.mul(of_row_y, scale)
 
         # local = R^T image: image gets R local, and R gets image local^T, row by row.
         a, b, c = at.rotation
-        of_image_x = (dot(a, of_local_x, 0.0), dot(b, of_local_x, 0.0), dot(c, of_local_x, 0.0))
-        of_image_y = (dot(a, of_local_y, 0.0), dot(b, of_local_y, 0.0), dot(c, of_local_y, 0.0))
-        of_a = fma(at.image_x[0], of_local_x, mul(at.image_y[0], of_local_y))
-        of_b = fma(at.image_x[1], of_local_x, mul(at.image_y[1], of_local_y))
-        of_c = fma(at.image_x[2], of_local_x, mul(at.image_y[2], of_local_y))
+        of_image_x = (vec.dot(a, of_local_x, 0.0), vec.dot(b, of_local_x, 0.0), vec.dot(c, of_local_x, 0.0))
+        of_image_y = (vec.dot(a, of_local_y, 0.0), vec.dot(b, of_local_y, 0.0), vec.dot(c, of_local_y, 0.0))
+        of_a = vec.fma(at.image_x[0], of_local_x, vec.mul(at.image_y[0], of_local_y))
+        of_b = vec.fma(at.image_x[1], of_local_x, vec.mul(at.image_y[1], of_local_y))
+        of_c = vec.fma(at.image_x[2], of_local_x, vec.mul(at.image_y[2], of_local_y))
 
         # image_x = fx / z (right - slope_x forward), where slope_x follows x / z unless it is clamped.
-        to_right, to_down = mul(mul(fx, at.inverse_z), of_image_x), mul(mul(fy, at.inverse_z), of_image_y)
-        to_forward = neg(fma(at.slope_x, to_right, mul(at.slope_y, to_down)))
-        of_slope_x = select(at.follows_x, neg(dot(forward, to_right, 0.0)), 0.0)
-        of_slope_y = select(at.follows_y, neg(dot(forward, to_down, 0.0)), 0.0)
-        of_x = mul(fma(fx, by_x, of_slope_x), at.inverse_z)
-        of_y = mul(fma(fy, by_y, of_slope_y), at.inverse_z)
-        lost = fma(of_x, at.x, mul(of_y, at.y))
-        lost = dot(at.image_x, of_image_x, dot(at.image_y, of_image_y, lost))
+        to_right, to_down = (
+            vec.mul(vec.mul(fx, at.inverse_z), of_image_x),
+            vec.mul(vec.mul(fy, at.inverse_z), of_image_y),
+        )
+        to_forward = vec.neg(vec.fma(at.slope_x, to_right, vec.mul(at.slope_y, to_down)))
+        of_slope_x = vec.select(at.follows_x, vec.neg(vec.dot(forward, to_right, 0.0)), 0.0)
+        of_slope_y = vec.select(at.follows_y, vec.neg(vec.dot(forward, to_down, 0.0)), 0.0)
+        of_x = vec.mul(vec.fma(fx, by_x, of_slope_x), at.inverse_z)
+        of_y = vec.mul(vec.fma(fy, by_y, of_slope_y), at.inverse_z)
+        lost = vec.fma(of_x, at.x, vec.mul(of_y, at.y))
+        lost = vec.dot(at.image_x, of_image_x, vec.dot(at.image_y, of_image_y, lost))
         of_depth, of_inverse_depth, of_normal = _extra_sums(sums, extras)
-        lost = fma(of_inverse_depth, at.inverse_z, lost)
-        of_z = sub(of_depth, mul(lost, at.inverse_z))
+        lost = vec.fma(of_inverse_depth, at.inverse_z, lost)
+        of_z = vec.sub(of_depth, vec.mul(lost, at.inverse_z))
 
         if extras.normals:
             # The normal is a column of R, turned by its sign, in camera axes.
             second, third = shortest_axes(scale)
             axis = shortest_column(at.rotation, second, third)
-            of_normal = mul(select(greater(dot(axis, at.offset, 0.0), 0.0), -1.0, 1.0), of_normal)
-            of_axis = fma(of_normal[0], right, fma(of_normal[1], down, mul(of_normal[2], forward)))
-            chosen = (select(third, 0.0, select(second, 0.0, 1.0)), select(third, 0.0, select(second, 1.0, 0.0)))
-            chosen = (chosen[0], chosen[1], select(third, 1.0, 0.0))
-            of_a, of_b = fma(of_axis[0], chosen, of_a), fma(of_axis[1], chosen, of_b)
-            of_c = fma(of_axis[2], chosen, of_c)
-            to_right, to_down = fma(of_normal[0], axis, to_right), fma(of_normal[1], axis, to_down)
-            to_forward = fma(of_normal[2], axis, to_forward)
+            of_normal = vec.mul(vec.select(vec.greater(vec.dot(axis, at.offset, 0.0), 0.0), -1.0, 1.0), of_normal)
+            of_axis = vec.fma(of_normal[0], right, vec.fma(of_normal[1], down, vec.mul(of_normal[2], forward)))
+            chosen = (
+                vec.select(third, 0.0, vec.select(second, 0.0, 1.0)),
+                vec.select(third, 0.0, vec.select(second, 1.0, 0.0)),
+            )
+            chosen = (chosen[0], chosen[1], vec.select(third, 1.0, 0.0))
+            of_a, of_b = vec.fma(of_axis[0], chosen, of_a), vec.fma(of_axis[1], chosen, of_b)
+            of_c = vec.fma(of_axis[2], chosen, of_c)
+            to_right, to_down = vec.fma(of_normal[0], axis, to_right), vec.fma(of_normal[1], axis, to_down)
+            to_forward = vec.fma(of_normal[2], axis, to_forward)
 
-        of_mean = select(shown, fma(of_x, right, fma(of_y, down, mul(of_z, forward))), nothing)
-        of_center = sub(of_center, of_mean)
-        of_right = add(of_right, select(shown, fma(of_x, at.offset, to_right), nothing))
-        of_down = add(of_down, select(shown, fma(of_y, at.offset, to_down), nothing))
-        of_forward = add(of_forward, select(shown, fma(of_z, at.offset, to_forward), nothing))
+        of_mean = vec.select(shown, vec.fma(of_x, right, vec.fma(of_y, down, vec.mul(of_z, forward))), nothing)
+        of_center = vec.sub(of_center, of_mean)
+        of_right = vec.add(of_right, vec.select(shown, vec.fma(of_x, at.offset, to_right), nothing))
+        of_down = vec.add(of_down, vec.select(shown, vec.fma(of_y, at.offset, to_down), nothing))
+        of_forward = vec.add(of_forward, vec.select(shown, vec.fma(of_z, at.offset, to_forward), nothing))
 
         of_quat = quaternion_derivative(at.quaternion, of_a, of_b, of_c)
         # Its length does not matter.
-        along = dot(of_quat, at.quaternion, 0.0)
-        of_quat = mul(at.inverse_norm, fma(neg(along), at.quaternion, of_quat))
+        along = vec.dot(of_quat, at.quaternion, 0.0)
+        of_quat = vec.mul(at.inverse_norm, vec.fma(vec.neg(along), at.quaternion, of_quat))
         of_color = (sums[layout.SUM_CHANNELS], sums[layout.SUM_CHANNELS + 1], sums[layout.SUM_CHANNELS + 2])
-        store_columns(of_gaussians.means, 3 * row, of_mean)
-        store_columns(of_gaussians.quats, 4 * row, select(shown, of_quat, repeat(0.0, (0, 0, 0, 0))))
-        store_columns(of_gaussians.scales, 3 * row, select(shown, of_scale, nothing))
-        store(of_gaussians.opacities, row, select(shown, div(sums[layout.SUM_V], opacity), 0.0))
-        store_columns(of_gaussians.colors, 3 * row, select(shown, of_color, nothing))
+        vec.store_columns(of_gaussians.means, 3 * row, of_mean)
+        vec.store_columns(of_gaussians.quats, 4 * row, vec.select(shown, of_quat, vec.repeat(0.0, (0, 0, 0, 0))))
+        vec.store_columns(of_gaussians.scales, 3 * row, vec.select(shown, of_scale, nothing))
+        vec.store(of_gaussians.opacities, row, vec.select(shown, vec.div(sums[layout.SUM_V], opacity), 0.0))
+        vec.store_columns(of_gaussians.colors, 3 * row, vec.select(shown, of_color, nothing))
     return of_right + of_down + of_forward + of_center
 
 
@@ -233,15 +196,19 @@ def _covariance_derivative(record, sums):
     """
     u_xx, u_yx, u_yy = record[layout.U_XX], record[layout.U_YX], record[layout.U_YY]
     sum_ee, sum_ef, sum_ff = sums[layout.SUM_EE], sums[layout.SUM_EF], sums[layout.SUM_FF]
-    right_e, right_f = fma(sum_ee, u_xx, mul(sum_ef, u_yx)), fma(sum_ef, u_xx, mul(sum_ff, u_yx))
-    xx, xy, yy = fma(u_xx, right_e, mul(u_yx, right_f)), mul(u_yy, right_f), mul(u_yy, mul(u_yy, sum_ff))
-    return mul(_PLAIN_FOURTH, (xx, xy, yy))
+    right_e, right_f = vec.fma(sum_ee, u_xx, vec.mul(sum_ef, u_yx)), vec.fma(sum_ef, u_xx, vec.mul(sum_ff, u_yx))
+    xx, xy, yy = (
+        vec.fma(u_xx, right_e, vec.mul(u_yx, right_f)),
+        vec.mul(u_yy, right_f),
+        vec.mul(u_yy, vec.mul(u_yy, sum_ff)),
+    )
+    return vec.mul(_PLAIN_FOURTH, (xx, xy, yy))
 
 
 @inline
 def _extra_sums(sums, extras):
     """The sums of depth, inverse depth and normal, stored consecutively after those of colour."""
-    zero = splat(0.0)
+    zero = vec.splat(0.0)
     if extras.depth:
         if extras.inverse_depth:
             return sums[9], sums[10], (sums[11], sums[12], sums[13])
@@ -255,15 +222,19 @@ def _extra_sums(sums, extras):
 def quaternion_derivative(quaternion, a, b, c):
     """Derivative with respect to a unit quaternion, w first, from that with respect to the rows of its rotation."""
     w, x, y, z = quaternion
-    turn_x, turn_y, turn_z = sub(c[1], b[2]), sub(a[2], c[0]), sub(b[0], a[1])
-    xy, xz, yz = add(a[1], b[0]), add(a[2], c[0]), add(b[2], c[1])
-    less_x, less_y, less_z = mul(-2.0, add(b[1], c[2])), mul(-2.0, add(a[0], c[2])), mul(-2.0, add(a[0], b[1]))
-    return mul(
+    turn_x, turn_y, turn_z = vec.sub(c[1], b[2]), vec.sub(a[2], c[0]), vec.sub(b[0], a[1])
+    xy, xz, yz = vec.add(a[1], b[0]), vec.add(a[2], c[0]), vec.add(b[2], c[1])
+    less_x, less_y, less_z = (
+        vec.mul(-2.0, vec.add(b[1], c[2])),
+        vec.mul(-2.0, vec.add(a[0], c[2])),
+        vec.mul(-2.0, vec.add(a[0], b[1])),
+    )
+    return vec.mul(
         2.0,
         (
-            fma(x, turn_x, fma(y, turn_y, mul(z, turn_z))),
-            fma(w, turn_x, fma(y, xy, fma(z, xz, mul(x, less_x)))),
-            fma(w, turn_y, fma(x, xy, fma(z, yz, mul(y, less_y)))),
-            fma(w, turn_z, fma(x, xz, fma(y, yz, mul(z, less_z)))),
+            vec.fma(x, turn_x, vec.fma(y, turn_y, vec.mul(z, turn_z))),
+            vec.fma(w, turn_x, vec.fma(y, xy, vec.fma(z, xz, vec.mul(x, less_x)))),
+            vec.fma(w, turn_y, vec.fma(x, xy, vec.fma(z, yz, vec.mul(y, less_y)))),
+            vec.fma(w, turn_z, vec.fma(x, xz, vec.fma(y, yz, vec.mul(z, less_z)))),
         ),
     )

@@ -7,9 +7,9 @@ counts are summed in order, so the result does not depend on their number.
 from __future__ import annotations
 
 from coliags_plugin.core.numba_compilation import kernel
+from coliags_plugin.renderers.numba_kernels import lanes as vec
 from coliags_plugin.renderers.numba_kernels import layout
-from coliags_plugin.renderers.numba_kernels.lanes import lowest_bit
-from coliags_plugin.renderers.numba_kernels.threads import take
+from coliags_plugin.renderers.numba_kernels.threads import pieces
 
 #: Largest number of bits of a digit.
 DIGIT_BITS = 11
@@ -23,25 +23,17 @@ NUMBER = (1 << 32) - 1
 def collect(counters, depth_bits, drawn, places, keys, lowest, highest):
     """Write the sort keys: depth bits in the upper half, index of the Gaussian in the lower.
 
-    Args:
-        counters: Work counters for dynamic scheduling; entry 0 must be 0.
-        depth_bits: The depths' bits, which order positive numbers as the numbers do. [padded to whole groups]
-        drawn: One bit for each Gaussian of a group. [groups]
-        places: Offset of the first key of each parcel of Gaussians. [parcels]
-        keys: Out. [Gaussians drawn]
-        lowest, highest: Out: the range of depth bits in each parcel. [parcels]
+    The bits of positive floats order as the numbers do. ``places`` is the offset of the first key of each parcel; ``lowest``
+    and ``highest`` are written: the range of depth bits in each parcel.
     """
     per_parcel = layout.PARCEL // layout.GROUP
-    while True:
-        parcel = take(counters, 0, 1)
-        if parcel >= len(places):
-            break
+    for parcel in pieces(counters, 0, len(places)):
         low, high = NUMBER, 0
         place = places[parcel]
         for group in range(parcel * per_parcel, min((parcel + 1) * per_parcel, len(drawn))):
             flags = drawn[group]
             while flags:
-                index = layout.GROUP * group + lowest_bit(flags)
+                index = layout.GROUP * group + vec.lowest_bit(flags)
                 flags &= flags - 1
                 depth = int(depth_bits[index])
                 keys[place] = depth << 32 | index
@@ -52,20 +44,8 @@ def collect(counters, depth_bits, drawn, places, keys, lowest, highest):
 
 @kernel
 def count_digits(counters, stretches, keys, lowest, shift, mask, digits):
-    """Histogram of the digits of each stretch.
-
-    Args:
-        counters: Work counters for dynamic scheduling; entry 0 must be 0.
-        stretches: Number of stretches.
-        keys: Keys to sort.
-        lowest: Least depth bits.
-        shift, mask: Where the digit is in depth bits less ``lowest``.
-        digits: Out. [DIGITS for each stretch]
-    """
-    while True:
-        stretch = take(counters, 0, 1)
-        if stretch >= stretches:
-            break
+    """Histogram of the digits, ``mask`` after ``shift`` of depth bits less ``lowest``. [DIGITS for each stretch]"""
+    for stretch in pieces(counters, 0, stretches):
         start = stretch * DIGITS
         for digit in range(mask + 1):
             digits[start + digit] = 0
@@ -85,18 +65,8 @@ def place_digits(stretches, mask, digits):
 
 @kernel
 def move_by_digit(counters, stretches, keys, lowest, shift, mask, digits, moved):
-    """Scatter the keys by digit.
-
-    Args:
-        counters: Work counters for dynamic scheduling; entry 1 must be 0.
-        stretches, keys, lowest, shift, mask: As for :func:`count_digits`.
-        digits: Offsets, which are incremented.
-        moved: Out.
-    """
-    while True:
-        stretch = take(counters, 1, 1)
-        if stretch >= stretches:
-            break
+    """Scatter the keys into ``moved`` by digit; the offsets in ``digits`` are incremented."""
+    for stretch in pieces(counters, 1, stretches):
         start = stretch * DIGITS
         for place in range(len(keys) * stretch // stretches, len(keys) * (stretch + 1) // stretches):
             key = keys[place]

@@ -61,11 +61,8 @@ ROW_CHANNELS = layout.ROW - SUM_CHANNELS
 class Measures(NamedTuple):
     """What is composited that differs from pixel to pixel of a surfel: tuples with one element where wanted, else none.
 
-    Attributes:
-        depth: z-depth, for the accumulated and the expected depth.
-        inverse_depth: Its reciprocal.
-        median: z-depth of the surfel at which transmittance falls to one half.
-        distortion: Squared differences of reciprocal depths.
+    ``depth`` is for the accumulated and the expected depth; ``median`` is the depth of the surfel at which transmittance falls
+    to one half; ``distortion`` are squared differences of reciprocal depths.
     """
 
     depth: tuple[object, ...]

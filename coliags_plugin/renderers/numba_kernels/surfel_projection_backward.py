@@ -13,38 +13,13 @@ from __future__ import annotations
 import numpy as np
 
 from coliags_plugin.core.numba_compilation import inline, kernel, part
+from coliags_plugin.renderers.numba_kernels import lanes as vec
 from coliags_plugin.renderers.numba_kernels import layout, surfel_layout
 from coliags_plugin.renderers.numba_kernels.geometry import camera_axes
-from coliags_plugin.renderers.numba_kernels.lanes import (
-    add,
-    broadcast,
-    div,
-    dot,
-    fma,
-    from_bits,
-    greater,
-    lane,
-    lane_sums,
-    load,
-    load_columns,
-    mul,
-    narrow,
-    neg,
-    number,
-    prefetch,
-    prefetch_to_write,
-    repeat,
-    select,
-    splat,
-    store,
-    store_columns,
-    sub,
-    widen,
-)
 from coliags_plugin.renderers.numba_kernels.projection_backward import clear_undrawn, quaternion_derivative
 from coliags_plugin.renderers.numba_kernels.sorting import NUMBER
 from coliags_plugin.renderers.numba_kernels.surfel_geometry import place_surfels
-from coliags_plugin.renderers.numba_kernels.threads import take
+from coliags_plugin.renderers.numba_kernels.threads import pieces
 
 #: Turns products of two of the scaled e and f into those of standard deviations; and of one.
 _PLAIN_SQUARE = 1.0 / layout.U_FACTOR_SQUARED
@@ -55,33 +30,20 @@ _AHEAD = 16
 
 @kernel
 def gather_surfels(counters, records, drawn, bins, view, channels, entry_sums, surfel_sums, of_means2d):
-    """Sum the gradient sums of each surfel's entries.
+    """Sum the gradient sums of each surfel's entries, 0 where it is not drawn.
 
-    Args:
-        counters: Work counters for dynamic scheduling; entries 0 and 1 must be 0.
-        records, drawn, bins: What projection and binning wrote.
-        view: See ``layout``.
-        channels: Any tuple as long as there are channels.
-        entry_sums: What the backward sweep wrote.
-        surfel_sums: Out: likewise, padded to whole groups; 0 where not drawn. [16 for each surfel, and perhaps 1]
-        of_means2d: Out: derivative with respect to the projected centres, likewise. [2 for each surfel]
+    Written are ``surfel_sums`` and the derivative with respect to the projected centres.
     """
     groups, count, stretches = len(drawn), len(bins.keys), len(bins.stretch_entries) - 1
     per_parcel = layout.PARCEL // layout.GROUP
-    while True:
-        first = take(counters, 0, per_parcel)
-        if first >= groups:
-            break
+    for first in pieces(counters, 0, groups, per_parcel):
         last = min(first + per_parcel, groups)
         clear_undrawn(first, last, drawn, surfel_sums, of_means2d)
         if len(channels) > surfel_layout.ROW_CHANNELS:
             for group in range(first, last):
                 if drawn[group] != 0xFFFF:
                     _clear_further(group, drawn[group], groups, surfel_sums)
-    while True:
-        stretch = take(counters, 1, 1)
-        if stretch >= stretches:
-            break
+    for stretch in pieces(counters, 1, stretches):
         first, last = count * stretch // stretches, count * (stretch + 1) // stretches
         entry = bins.stretch_entries[stretch]
         _gather_stretch(first, last, entry, groups, records, bins, view, channels, entry_sums, surfel_sums, of_means2d)
@@ -99,30 +61,30 @@ def _clear_further(group, flags, groups, surfel_sums):
 @part
 def _gather_stretch(first, last, entry, groups, records, bins, view, channels, entry_sums, surfel_sums, of_means2d):
     """Surfels with indices ``first`` to ``last`` in the sorted list, whose entries are those from ``entry`` on."""
-    scale, square = number(view, layout.VIEW_PIXEL_SCALE), np.float32(_PLAIN_SQUARE)
+    scale, square = vec.number(view, layout.VIEW_PIXEL_SCALE), np.float32(_PLAIN_SQUARE)
     entries_further, surfels_further = layout.ROW * bins.starts[-1], layout.ROW * layout.GROUP * groups
     for place in range(first, last):
         ahead = bins.keys[min(place + _AHEAD, last - 1)] & NUMBER
-        prefetch(records, layout.ROW * ahead)
-        prefetch_to_write(surfel_sums, layout.ROW * ahead)
-        prefetch_to_write(of_means2d, 2 * ahead)
+        vec.prefetch(records, layout.ROW * ahead)
+        vec.prefetch_to_write(surfel_sums, layout.ROW * ahead)
+        vec.prefetch_to_write(of_means2d, 2 * ahead)
         index = bins.keys[place] & NUMBER
         row = layout.ROW * index
-        total, further = splat(0.0), np.float32(0.0)
+        total, further = vec.splat(0.0), np.float32(0.0)
         for _ in range(bins.entry_counts[place]):
-            total = add(total, load(entry_sums, layout.ROW * entry))
+            total = vec.add(total, vec.load(entry_sums, layout.ROW * entry))
             if len(channels) > surfel_layout.ROW_CHANNELS:
-                further += number(entry_sums, entries_further + entry)
+                further += vec.number(entry_sums, entries_further + entry)
             entry += 1
-        store(surfel_sums, row, total)
+        vec.store(surfel_sums, row, total)
         if len(channels) > surfel_layout.ROW_CHANNELS:
             surfel_sums[surfels_further + index] = further
-        e, f = square * lane(total, surfel_layout.SUM_E), square * lane(total, surfel_layout.SUM_F)
-        c = lane(total, surfel_layout.SUM_C)
+        e, f = square * vec.lane(total, surfel_layout.SUM_E), square * vec.lane(total, surfel_layout.SUM_F)
+        c = vec.lane(total, surfel_layout.SUM_C)
         for axis in range(2):
-            of_center = number(records, row + surfel_layout.U_X + axis) * e
-            of_center += number(records, row + surfel_layout.V_X + axis) * f
-            of_center += number(records, row + surfel_layout.Q_X + axis) * c
+            of_center = vec.number(records, row + surfel_layout.U_X + axis) * e
+            of_center += vec.number(records, row + surfel_layout.V_X + axis) * f
+            of_center += vec.number(records, row + surfel_layout.Q_X + axis) * c
             of_means2d[2 * index + axis] = scale * of_center
 
 
@@ -130,36 +92,21 @@ def _gather_stretch(first, last, entry, groups, records, bins, view, channels, e
 def project_surfels_backward(
     counters, count, surfels, tail, view, channels, drawn, surfel_sums, given_means2d, of_surfels, of_pose
 ):
-    """Derivatives of the loss with respect to surfels and pose, from the sums of each surfel.
-
-    Args:
-        counters: Work counters for dynamic scheduling; entry 0 must be 0.
-        count, surfels, tail, view: As for ``project_surfels``.
-        channels: Any tuple as long as there are channels.
-        drawn: What that wrote.
-        surfel_sums: What :func:`gather_surfels` wrote.
-        given_means2d: Derivative with respect to the projected centres, padded to whole groups. [2 for each surfel]
-        of_surfels: Out, padded to whole groups. [layout.Parameters]
-        of_pose: Out: derivative with respect to the camera's three axes and its centre in the world, one row for each
-            parcel. [16 for each parcel]
-    """
+    """Derivatives of the loss with respect to surfels and pose: as ``projection_backward.project_backward``."""
     whole_groups = count // layout.GROUP
     per_parcel = layout.PARCEL // layout.GROUP
-    while True:
-        parcel = take(counters, 0, 1)
-        if parcel * layout.PARCEL >= count:
-            break
+    for parcel in pieces(counters, 0, -(-count // layout.PARCEL)):
         first = parcel * per_parcel
         last = min(first + per_parcel, whole_groups)
         pose = _project_groups_backward(
-            first, last, first, repeat(0.0, (0,) * 12), surfels, view, channels, drawn, surfel_sums, given_means2d,
+            first, last, first, vec.repeat(0.0, (0,) * 12), surfels, view, channels, drawn, surfel_sums, given_means2d,
             of_surfels,
         )  # fmt: skip
         if last * layout.GROUP < min((parcel + 1) * layout.PARCEL, count):
             pose = _project_groups_backward(
                 last, last + 1, 0, pose, tail, view, channels, drawn, surfel_sums, given_means2d, of_surfels
             )
-        store(of_pose, layout.ROW * parcel, lane_sums(pose))
+        vec.store(of_pose, layout.ROW * parcel, vec.lane_sums(pose))
 
 
 @part
@@ -169,64 +116,65 @@ def _project_groups_backward(
     """Groups ``first`` to ``last``, reading from group ``source`` of the surfels on. Returns ``pose``, added to."""
     three = (0, 0, 0)
     right, down, forward = camera_axes(view)
-    fx, fy = broadcast(view, layout.VIEW_FX), broadcast(view, layout.VIEW_FY)
-    filtered = mul(_PLAIN_SQUARE, broadcast(view, layout.VIEW_PIXEL_SCALE))
+    fx, fy = vec.broadcast(view, layout.VIEW_FX), vec.broadcast(view, layout.VIEW_FY)
+    filtered = vec.mul(_PLAIN_SQUARE, vec.broadcast(view, layout.VIEW_PIXEL_SCALE))
     of_right, of_down, of_forward, of_center = pose[0:3], pose[3:6], pose[6:9], pose[9:12]
-    nothing = repeat(0.0, three)
+    nothing = vec.repeat(0.0, three)
     for group in range(first, last):
-        shown = from_bits(drawn[group])
+        shown = vec.from_bits(drawn[group])
         row = layout.GROUP * (group - first + source)
-        mean, scale = load_columns(surfels.means, 3 * row, three), load_columns(surfels.scales, 2 * row, (0, 0))
-        quat, opacity = load_columns(surfels.quats, 4 * row, (0, 0, 0, 0)), load(surfels.opacities, row)
+        mean, scale = vec.load_columns(surfels.means, 3 * row, three), vec.load_columns(surfels.scales, 2 * row, (0, 0))
+        quat, opacity = vec.load_columns(surfels.quats, 4 * row, (0, 0, 0, 0)), vec.load(surfels.opacities, row)
         at = place_surfels(mean, quat, view)
         row = layout.GROUP * group
-        sums = load_columns(surfel_sums, layout.ROW * row, (0,) * 16)
-        by_x, by_y = load_columns(given_means2d, 2 * row, (0, 0))
+        sums = vec.load_columns(surfel_sums, layout.ROW * row, (0,) * 16)
+        by_x, by_y = vec.load_columns(given_means2d, 2 * row, (0, 0))
 
         # The filter's centre moves with the surfel, and is no part of the derivative with respect to means2d.
-        by_x = fma(filtered, sums[surfel_layout.SUM_DX], by_x)
-        by_y = fma(filtered, sums[surfel_layout.SUM_DY], by_y)
-        of_x, of_y = mul(mul(fx, by_x), at.inverse_z), mul(mul(fy, by_y), at.inverse_z)
-        lost = fma(of_x, at.x, mul(of_y, at.y))
-        of_z = mul(sub(sums[surfel_layout.SUM_C], lost), at.inverse_z)
+        by_x = vec.fma(filtered, sums[surfel_layout.SUM_DX], by_x)
+        by_y = vec.fma(filtered, sums[surfel_layout.SUM_DY], by_y)
+        of_x, of_y = vec.mul(vec.mul(fx, by_x), at.inverse_z), vec.mul(vec.mul(fy, by_y), at.inverse_z)
+        lost = vec.fma(of_x, at.x, vec.mul(of_y, at.y))
+        of_z = vec.mul(vec.sub(sums[surfel_layout.SUM_C], lost), at.inverse_z)
 
-        ee, ef, ff = mul(
-            _PLAIN_SQUARE, widen((sums[surfel_layout.SUM_EE], sums[surfel_layout.SUM_EF], sums[surfel_layout.SUM_FF]))
+        ee, ef, ff = vec.mul(
+            _PLAIN_SQUARE,
+            vec.widen((sums[surfel_layout.SUM_EE], sums[surfel_layout.SUM_EF], sums[surfel_layout.SUM_FF])),
         )
-        ce, cf = mul(mul(_PLAIN, widen((sums[surfel_layout.SUM_CE], sums[surfel_layout.SUM_CF]))), scale)
-        ratio = div(widen(scale[0]), scale[1])
-        of_scale = narrow((div(ee, scale[0]), div(ff, scale[1])))
-        of_first = fma(ee, at.of_first, fma(mul(ef, ratio), at.of_second, mul(ce, at.of_z)))
-        of_second = fma(div(ef, ratio), at.of_first, fma(ff, at.of_second, mul(cf, at.of_z)))
-        of_normal = mul(0.0, at.normal)
+        ce, cf = vec.mul(vec.mul(_PLAIN, vec.widen((sums[surfel_layout.SUM_CE], sums[surfel_layout.SUM_CF]))), scale)
+        ratio = vec.div(vec.widen(scale[0]), scale[1])
+        of_scale = vec.narrow((vec.div(ee, scale[0]), vec.div(ff, scale[1])))
+        of_first = vec.fma(ee, at.of_first, vec.fma(vec.mul(ef, ratio), at.of_second, vec.mul(ce, at.of_z)))
+        of_second = vec.fma(vec.div(ef, ratio), at.of_first, vec.fma(ff, at.of_second, vec.mul(cf, at.of_z)))
+        of_normal = vec.mul(0.0, at.normal)
         if len(channels) > 3:
             # In camera axes, turned by its sign.
             given = _normal_sums(sums, surfel_sums, layout.ROW * layout.GROUP * len(drawn) + row)
-            given = mul(select(greater(at.height, 0.0), -1.0, 1.0), given)
-            of_normal = fma(given[0], right, fma(given[1], down, mul(widen(given[2]), forward)))
+            given = vec.mul(vec.select(vec.greater(at.height, 0.0), -1.0, 1.0), given)
+            of_normal = vec.fma(given[0], right, vec.fma(given[1], down, vec.mul(vec.widen(given[2]), forward)))
 
         of_right = _turned(of_right, right, at, of_x, of_first, of_second, of_normal, shown)
         of_down = _turned(of_down, down, at, of_y, of_first, of_second, of_normal, shown)
         of_forward = _turned(of_forward, forward, at, of_z, of_first, of_second, of_normal, shown)
-        of_mean = narrow(fma(of_x, right, fma(of_y, down, mul(of_z, forward))))
-        of_mean = select(shown, of_mean, nothing)
-        of_center = sub(of_center, of_mean)
+        of_mean = vec.narrow(vec.fma(of_x, right, vec.fma(of_y, down, vec.mul(of_z, forward))))
+        of_mean = vec.select(shown, of_mean, nothing)
+        of_center = vec.sub(of_center, of_mean)
 
         a = (of_first[0], of_second[0], of_normal[0])
         b = (of_first[1], of_second[1], of_normal[1])
         c = (of_first[2], of_second[2], of_normal[2])
         of_quat = quaternion_derivative(at.quaternion, a, b, c)
         # Its length does not matter.
-        along = dot(of_quat, at.quaternion, 0.0)
-        of_quat = narrow(mul(at.inverse_norm, fma(neg(along), at.quaternion, of_quat)))
+        along = vec.dot(of_quat, at.quaternion, 0.0)
+        of_quat = vec.narrow(vec.mul(at.inverse_norm, vec.fma(vec.neg(along), at.quaternion, of_quat)))
         of_color = (
             sums[surfel_layout.SUM_CHANNELS], sums[surfel_layout.SUM_CHANNELS + 1], sums[surfel_layout.SUM_CHANNELS + 2]
         )  # fmt: skip
-        store_columns(of_surfels.means, 3 * row, of_mean)
-        store_columns(of_surfels.quats, 4 * row, select(shown, of_quat, repeat(0.0, (0, 0, 0, 0))))
-        store_columns(of_surfels.scales, 2 * row, select(shown, of_scale, repeat(0.0, (0, 0))))
-        store(of_surfels.opacities, row, select(shown, div(sums[surfel_layout.SUM_V], opacity), 0.0))
-        store_columns(of_surfels.colors, 3 * row, select(shown, of_color, nothing))
+        vec.store_columns(of_surfels.means, 3 * row, of_mean)
+        vec.store_columns(of_surfels.quats, 4 * row, vec.select(shown, of_quat, vec.repeat(0.0, (0, 0, 0, 0))))
+        vec.store_columns(of_surfels.scales, 2 * row, vec.select(shown, of_scale, vec.repeat(0.0, (0, 0))))
+        vec.store(of_surfels.opacities, row, vec.select(shown, vec.div(sums[surfel_layout.SUM_V], opacity), 0.0))
+        vec.store_columns(of_surfels.colors, 3 * row, vec.select(shown, of_color, nothing))
     return of_right + of_down + of_forward + of_center
 
 
@@ -234,7 +182,7 @@ def _project_groups_backward(
 def _normal_sums(sums, surfel_sums, further):
     """The sums of the normal's components; the last is behind the rows of sixteen."""
     first = surfel_layout.SUM_CHANNELS + 3
-    return sums[first], sums[first + 1], load(surfel_sums, further)
+    return sums[first], sums[first + 1], vec.load(surfel_sums, further)
 
 
 @inline
@@ -244,8 +192,8 @@ def _turned(total, axis, at, of_offset, of_first, of_second, of_normal, shown):
     All depend on this axis by the products with it of offset and local axes, whose derivatives are ``of_offset`` and the
     products of the axis with those of the local axes.
     """
-    change = mul(of_offset, at.offset)
-    change = fma(dot(axis, of_first, 0.0), at.first, change)
-    change = fma(dot(axis, of_second, 0.0), at.second, change)
-    change = narrow(fma(dot(axis, of_normal, 0.0), at.normal, change))
-    return add(total, select(shown, change, (0.0, 0.0, 0.0)))
+    change = vec.mul(of_offset, at.offset)
+    change = vec.fma(vec.dot(axis, of_first, 0.0), at.first, change)
+    change = vec.fma(vec.dot(axis, of_second, 0.0), at.second, change)
+    change = vec.narrow(vec.fma(vec.dot(axis, of_normal, 0.0), at.normal, change))
+    return vec.add(total, vec.select(shown, change, (0.0, 0.0, 0.0)))

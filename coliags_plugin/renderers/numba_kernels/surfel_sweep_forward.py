@@ -7,30 +7,8 @@ The formulas are those of ``docs/rendering.md``, section "Surfels".
 from __future__ import annotations
 
 from coliags_plugin.core.numba_compilation import kernel, part
+from coliags_plugin.renderers.numba_kernels import lanes as vec
 from coliags_plugin.renderers.numba_kernels import layout, surfel_layout
-from coliags_plugin.renderers.numba_kernels.lanes import (
-    add,
-    at_least,
-    at_most,
-    bits,
-    both,
-    broadcast,
-    broadcast_all,
-    div,
-    exp2,
-    fma,
-    greater,
-    larger,
-    load,
-    load_all,
-    mul,
-    neg,
-    select,
-    smaller,
-    store,
-    store_all,
-    sub,
-)
 from coliags_plugin.renderers.numba_kernels.surfel_tiles import (
     FETCHED,
     INVERSE_DEPTH,
@@ -38,8 +16,8 @@ from coliags_plugin.renderers.numba_kernels.surfel_tiles import (
     intersect,
     scaled_pixels,
 )
-from coliags_plugin.renderers.numba_kernels.threads import take
-from coliags_plugin.renderers.numba_kernels.tiles import ALPHA, CHUNK, TRANSMITTANCE, copy_to_image, tile_sweep
+from coliags_plugin.renderers.numba_kernels.threads import pieces, take
+from coliags_plugin.renderers.numba_kernels.tiles import ALPHA, CHUNK, TRANSMITTANCE, image_copies, tile_sweep
 
 # A block's vectors: transmittance, alpha, channels, sums of the measures and the median; of the reciprocal depths 1/z
 # the first and the sums of differences to it and of their squares.
@@ -63,28 +41,16 @@ INTEGERS = CHUNK + layout.BLOCKS * CHUNK + layout.BLOCKS
 
 @kernel
 def sweep_surfels(counters, records, remainders, bins, view, grid, channels, measures, scratch, composited, images):
-    """Composite all tiles.
+    """Composite all tiles; writes ``bins.reached``, the images that are not empty, and ``composited``.
 
-    Args:
-        counters: Work counters for dynamic scheduling; entries 0 and 1 must be 0.
-        records, remainders, bins: What projection and binning wrote; ``bins.reached`` is written here.
-        view: See ``layout``.
-        grid: The image and its tiles.
-        channels: Any tuple as long as there are channels.
-        measures: What is composited besides. [surfel_layout.Measures]
-        scratch: NUMBERS and INTEGERS for each thread.
-        composited: Out, for the backward sweep: alpha, channels without background, depth and inverse depth, and the
-            mean and the summed squared differences of the latter, by tile and block. [16 for each block and each]
-        images: Out; those that are empty are not written.
+    The last is for the backward sweep, vectors by tile and block: alpha, channels without background, depth and inverse depth,
+    and the mean and the summed squared differences of the latter.
     """
     thread = take(counters, 1, 1)
     rows = scratch.numbers[thread * NUMBERS : (thread + 1) * NUMBERS]
     state, source = rows[CHUNK * FETCHED :], (records, remainders, view)
     blocks = scratch.integers[thread * INTEGERS : (thread + 1) * INTEGERS]
-    while True:
-        place = take(counters, 0, 1)
-        if place >= grid.tiles:
-            break
+    for place in pieces(counters, 0, grid.tiles):
         tile = bins.order[place]
         bins.reached[tile] = _sweep_tile(tile, source, bins, view, grid, channels, measures, rows, state, blocks)
         _finish_tile(tile, channels, measures, view, state, composited)
@@ -93,98 +59,100 @@ def sweep_surfels(counters, records, remainders, bins, view, grid, channels, mea
 
 @part
 def _sweep_block(block, count, listed, rows, channels, measures, view, state):
-    """Composite the first ``count`` rows listed into one block.
-
-    Returns:
-        Whether any pixel has transmittance left.
-    """
+    """Composite the first ``count`` rows listed into one block; whether any pixel has transmittance left."""
     x, y = scaled_pixels(block, view)
-    log2_alpha_min, alpha_max = broadcast(view, layout.VIEW_LOG2_ALPHA_MIN), broadcast(view, layout.VIEW_ALPHA_MAX)
-    transmittance_min = broadcast(view, layout.VIEW_TRANSMITTANCE_MIN)
+    log2_alpha_min, alpha_max = (
+        vec.broadcast(view, layout.VIEW_LOG2_ALPHA_MIN),
+        vec.broadcast(view, layout.VIEW_ALPHA_MAX),
+    )
+    transmittance_min = vec.broadcast(view, layout.VIEW_TRANSMITTANCE_MIN)
     at = _STATE * block
-    transmittance, alpha_sum = load(state, at + TRANSMITTANCE), load(state, at + ALPHA)
-    sums = load_all(state, at + _CHANNELS, channels)
-    depths = load_all(state, at + _DEPTH, measures.depth)
-    inverse_depths = load_all(state, at + _INVERSE_DEPTH, measures.inverse_depth)
-    medians = load_all(state, at + _MEDIAN, measures.median)
-    nearest = load_all(state, at + _NEAREST, measures.distortion)
-    differences = load_all(state, at + _DIFFERENCE, measures.distortion)
-    squares = load_all(state, at + _SQUARE, measures.distortion)
+    transmittance, alpha_sum = vec.load(state, at + TRANSMITTANCE), vec.load(state, at + ALPHA)
+    sums = vec.load_all(state, at + _CHANNELS, channels)
+    depths = vec.load_all(state, at + _DEPTH, measures.depth)
+    inverse_depths = vec.load_all(state, at + _INVERSE_DEPTH, measures.inverse_depth)
+    medians = vec.load_all(state, at + _MEDIAN, measures.median)
+    nearest = vec.load_all(state, at + _NEAREST, measures.distortion)
+    differences = vec.load_all(state, at + _DIFFERENCE, measures.distortion)
+    squares = vec.load_all(state, at + _SQUARE, measures.distortion)
     running = 1
     for place in range(count):
         row = listed[place]
         d_x, d_y, q, inverse_q, e, f, hit = intersect(rows, row, x, y)
-        squared = smaller(fma(e, e, mul(f, f)), fma(d_x, d_x, mul(d_y, d_y)))
-        log2_alpha = sub(broadcast(rows, row + surfel_layout.LOG2_OPACITY), squared)
-        alpha = smaller(exp2(log2_alpha), alpha_max)
-        alpha = select(both(hit, at_least(log2_alpha, log2_alpha_min)), alpha, 0.0)
-        behind = mul(transmittance, sub(1.0, alpha))
-        drawn = at_least(behind, transmittance_min)
-        weight = select(drawn, mul(alpha, transmittance), 0.0)
-        sums = fma(weight, broadcast_all(rows, row + surfel_layout.CHANNELS, channels), sums)
-        z = mul(broadcast(rows, row + surfel_layout.DEPTH), inverse_q)
-        depths = fma(weight, z, depths)
-        inverse_z = mul(broadcast(rows, row + INVERSE_DEPTH), q)
-        inverse_depths = fma(weight, inverse_z, inverse_depths)
+        squared = vec.smaller(vec.fma(e, e, vec.mul(f, f)), vec.fma(d_x, d_x, vec.mul(d_y, d_y)))
+        log2_alpha = vec.sub(vec.broadcast(rows, row + surfel_layout.LOG2_OPACITY), squared)
+        alpha = vec.smaller(vec.exp2(log2_alpha), alpha_max)
+        alpha = vec.select(vec.both(hit, vec.at_least(log2_alpha, log2_alpha_min)), alpha, 0.0)
+        behind = vec.mul(transmittance, vec.sub(1.0, alpha))
+        drawn = vec.at_least(behind, transmittance_min)
+        weight = vec.select(drawn, vec.mul(alpha, transmittance), 0.0)
+        sums = vec.fma(weight, vec.broadcast_all(rows, row + surfel_layout.CHANNELS, channels), sums)
+        z = vec.mul(vec.broadcast(rows, row + surfel_layout.DEPTH), inverse_q)
+        depths = vec.fma(weight, z, depths)
+        inverse_z = vec.mul(vec.broadcast(rows, row + INVERSE_DEPTH), q)
+        inverse_depths = vec.fma(weight, inverse_z, inverse_depths)
         if len(measures.median) > 0:
-            crosses = both(both(drawn, greater(transmittance, 0.5)), at_most(behind, 0.5))
-            medians = select(crosses, z, medians)
+            crosses = vec.both(vec.both(drawn, vec.greater(transmittance, 0.5)), vec.at_most(behind, 0.5))
+            medians = vec.select(crosses, z, medians)
         if len(measures.distortion) > 0:
             # Squares of differences to a depth among them lose little where 1/z hardly differs; those of 1/z would.
-            nearest = select(greater(alpha_sum, 0.0), nearest, inverse_z)
-            moved = sub(inverse_z, nearest)
-            of_weight = mul(weight, moved)
-            differences, squares = add(differences, of_weight), fma(of_weight, moved, squares)
-        alpha_sum = add(alpha_sum, weight)
+            nearest = vec.select(vec.greater(alpha_sum, 0.0), nearest, inverse_z)
+            moved = vec.sub(inverse_z, nearest)
+            of_weight = vec.mul(weight, moved)
+            differences, squares = vec.add(differences, of_weight), vec.fma(of_weight, moved, squares)
+        alpha_sum = vec.add(alpha_sum, weight)
         # Once zero it stays zero, so compositing does not resume.
-        transmittance = select(drawn, behind, 0.0)
-        running = bits(drawn)
+        transmittance = vec.select(drawn, behind, 0.0)
+        running = vec.bits(drawn)
         if not running:
             break
-    store(state, at + TRANSMITTANCE, transmittance)
-    store(state, at + ALPHA, alpha_sum)
-    store_all(state, at + _CHANNELS, sums)
-    store_all(state, at + _DEPTH, depths)
-    store_all(state, at + _INVERSE_DEPTH, inverse_depths)
-    store_all(state, at + _MEDIAN, medians)
-    store_all(state, at + _NEAREST, nearest)
-    store_all(state, at + _DIFFERENCE, differences)
-    store_all(state, at + _SQUARE, squares)
+    vec.store(state, at + TRANSMITTANCE, transmittance)
+    vec.store(state, at + ALPHA, alpha_sum)
+    vec.store_all(state, at + _CHANNELS, sums)
+    vec.store_all(state, at + _DEPTH, depths)
+    vec.store_all(state, at + _INVERSE_DEPTH, inverse_depths)
+    vec.store_all(state, at + _MEDIAN, medians)
+    vec.store_all(state, at + _NEAREST, nearest)
+    vec.store_all(state, at + _DIFFERENCE, differences)
+    vec.store_all(state, at + _SQUARE, squares)
     return running
 
 
 _sweep_tile = tile_sweep(fetch_surfels, _sweep_block, FETCHED, _STATE)
+_copy_to_image, _ = image_copies(_STATE)
 
 
 @part
 def _finish_tile(tile, channels, measures, view, state, composited):
     """Store the blocks' sums in ``composited``; then add the background, divide depth by alpha, and find the distortion."""
     width = 1 + len(channels) + len(measures.depth) + len(measures.inverse_depth) + 2 * len(measures.distortion)
-    background = broadcast_all(view, layout.VIEW_BACKGROUND, (0, 0, 0))
+    background = vec.broadcast_all(view, layout.VIEW_BACKGROUND, (0, 0, 0))
     for block in range(layout.BLOCKS):
         at, target = _STATE * block, 16 * width * (layout.BLOCKS * tile + block)
-        alpha = load(state, at + ALPHA)
-        covered = greater(alpha, 0.0)
-        store(composited, target, alpha)
-        store_all(composited, target + 16, load_all(state, at + _CHANNELS, channels))
+        alpha = vec.load(state, at + ALPHA)
+        covered = vec.greater(alpha, 0.0)
+        vec.store(composited, target, alpha)
+        vec.store_all(composited, target + 16, vec.load_all(state, at + _CHANNELS, channels))
         target += 16 * (1 + len(channels))
         if len(measures.depth) > 0:
-            depth = load(state, at + _DEPTH)
-            store(composited, target, depth)
-            store(state, at + _EXPECTED, select(covered, div(depth, alpha), 0.0))
+            depth = vec.load(state, at + _DEPTH)
+            vec.store(composited, target, depth)
+            vec.store(state, at + _EXPECTED, vec.select(covered, vec.div(depth, alpha), 0.0))
             target += 16
         if len(measures.inverse_depth) > 0:
-            store(composited, target, load(state, at + _INVERSE_DEPTH))
+            vec.store(composited, target, vec.load(state, at + _INVERSE_DEPTH))
             target += 16
         if len(measures.distortion) > 0:
-            difference = load(state, at + _DIFFERENCE)
-            mean = select(covered, div(difference, alpha), 0.0)
-            squares = larger(fma(neg(difference), mean, load(state, at + _SQUARE)), 0.0)
-            store(composited, target, add(load(state, at + _NEAREST), mean))
-            store(composited, target + 16, squares)
-            store(state, at + _DISTORTION, mul(broadcast(view, layout.VIEW_DISTORTION), mul(alpha, squares)))
-        color = load_all(state, at + _CHANNELS, (0, 0, 0))
-        store_all(state, at + _CHANNELS, fma(sub(1.0, alpha), background, color))
+            difference = vec.load(state, at + _DIFFERENCE)
+            mean = vec.select(covered, vec.div(difference, alpha), 0.0)
+            squares = vec.larger(vec.fma(vec.neg(difference), mean, vec.load(state, at + _SQUARE)), 0.0)
+            vec.store(composited, target, vec.add(vec.load(state, at + _NEAREST), mean))
+            vec.store(composited, target + 16, squares)
+            vec.store(
+                state, at + _DISTORTION, vec.mul(vec.broadcast(view, layout.VIEW_DISTORTION), vec.mul(alpha, squares))
+            )
+        color = vec.load_all(state, at + _CHANNELS, (0, 0, 0))
+        vec.store_all(state, at + _CHANNELS, vec.fma(vec.sub(1.0, alpha), background, color))
 
 
 @part
@@ -203,8 +171,3 @@ def _write_tile(tile, grid, channels, measures, state, images):
         (_DISTORTION, images.distortion),
     ):
         _copy_to_image(vector, state, tile, grid, 1, 0, image)
-
-
-@part
-def _copy_to_image(vector, state, tile, grid, depth, channel, image):
-    copy_to_image(vector, state, _STATE, tile, grid, depth, channel, image)

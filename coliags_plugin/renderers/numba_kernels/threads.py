@@ -12,6 +12,7 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
+from coliags_plugin.core.numba_compilation import part
 from coliags_plugin.renderers.numba_kernels.lanes import Intrinsic, Values
 
 if TYPE_CHECKING:
@@ -31,6 +32,15 @@ def take(typingctx: Context, counters: types.Type, index: types.Type, amount: ty
         return builder.atomic_rmw("add", builder.gep(data, [place]), amount, "monotonic")
 
     return types.int64(counters, types.intp, types.int64), generate
+
+
+@part
+def pieces(counters, index, end, step=1):
+    """Iterate over the pieces of work 0, ``step``, ... before ``end`` that this thread is the first to take."""
+    piece = take(counters, index, step)
+    while piece < end:
+        yield piece
+        piece = take(counters, index, step)
 
 
 class Crew:

@@ -7,24 +7,15 @@ from collections.abc import Callable
 import numpy as np
 
 from coliags_plugin.core.numba_compilation import inline, part
+from coliags_plugin.renderers.numba_kernels import lanes as vec
 from coliags_plugin.renderers.numba_kernels import layout
-from coliags_plugin.renderers.numba_kernels.lanes import (
-    bits,
-    both,
-    lane_columns,
-    lane_rows,
-    less,
-    load,
-    number,
-    prefetch,
-    select,
-    store,
-)
 
 #: Entries of a tile fetched at a time: their rows fit into the first-level cache beside the blocks' state.
 CHUNK = 128
 #: Prefetch distance of records, entries.
 _AHEAD = 32
+#: The same of the memory of the sums.
+_SUMS_AHEAD = 12
 
 # The first vectors of a block in the forward sweeps.
 TRANSMITTANCE = 0
@@ -39,32 +30,26 @@ MEDIAN_DEPTH = layout.SLOPE_UPRIGHT
 
 @part
 def fetch_chunk(first, last, alive, corner_x, corner_y, projections, cells, rows, blocks):
-    """Fetch entries ``first`` to ``last`` of a tile.
+    """Fetch the rows of entries ``first`` to ``last`` of a tile, and the alive blocks that each touches.
 
-    Args:
-        first, last: Among ``cells``.
-        alive: Blocks with transmittance left, one bit each.
-        corner_x, corner_y: First pixel of the tile.
-        projections, cells: See ``layout``.
-        rows: Out. [16 for each entry]
-        blocks: Out: those of the alive blocks that the entry touches. [1 for each entry]
+    ``alive`` has one bit for each block with transmittance left; the corner is the first pixel of the tile.
     """
     records = projections.records
     middle_x, middle_y = np.float32(corner_x + layout.TILE // 2), np.float32(corner_y + layout.TILE // 2)
     for entry in range(first, last):
-        prefetch(records, layout.ROW * cells[layout.CELL * min(entry + _AHEAD, last - 1)])
+        vec.prefetch(records, layout.ROW * cells[layout.CELL * min(entry + _AHEAD, last - 1)])
         index = cells[layout.CELL * entry]
         mine = cells[layout.CELL * entry + 1] & alive
         blocks[entry - first] = mine
         if mine:
             source, target = layout.ROW * index, layout.ROW * (entry - first)
-            store(rows, target, load(records, source))
-            x = number(records, source + layout.MEAN_X) - middle_x
-            y = number(records, source + layout.MEAN_Y) - middle_y
-            turned = number(records, source + layout.U_YX) * x + number(records, source + layout.U_YY) * y
-            rows[target + OFFSET_E] = -number(records, source + layout.U_XX) * x
+            vec.store(rows, target, vec.load(records, source))
+            x = vec.number(records, source + layout.MEAN_X) - middle_x
+            y = vec.number(records, source + layout.MEAN_Y) - middle_y
+            turned = vec.number(records, source + layout.U_YX) * x + vec.number(records, source + layout.U_YY) * y
+            rows[target + OFFSET_E] = -vec.number(records, source + layout.U_XX) * x
             rows[target + OFFSET_F] = -turned
-            rows[target + MEDIAN_DEPTH] = number(projections.depths, index)
+            rows[target + MEDIAN_DEPTH] = vec.number(projections.depths, index)
 
 
 @inline
@@ -84,7 +69,7 @@ def block_corner(block):
 def inside(block, across, down):
     """Which pixels of a block are among the first ``across`` columns and ``down`` rows of its tile."""
     x, y = block_corner(block)
-    return both(less(lane_columns(), across - x), less(lane_rows(), down - y))
+    return vec.both(vec.less(vec.lane_columns(), across - x), vec.less(vec.lane_rows(), down - y))
 
 
 @inline
@@ -99,13 +84,6 @@ def list_by_block(count, stride, blocks, listed, counts):
 
     Branch-free, as branches would be unpredictable, and four blocks at a time: every row is written to every list, and
     kept where the length of the list is incremented.
-
-    Args:
-        count: Entries of the chunk.
-        stride: Numbers of a fetched row.
-        blocks: The blocks that each touches.
-        listed: Out: places of rows. [CHUNK for each block]
-        counts: Out: how many. [blocks]
     """
     for block in range(0, layout.BLOCKS, 4):
         a, b, c, d = CHUNK * block, CHUNK * (block + 1), CHUNK * (block + 2), CHUNK * (block + 3)
@@ -123,11 +101,8 @@ def list_by_block(count, stride, blocks, listed, counts):
 def tile_sweep(fetch: Callable[..., None], sweep_block: Callable[..., int], row: int, size: int) -> Callable[..., int]:
     """Compile a forward sweep through one tile's entries; it leaves the pixels in ``state``, and returns where it stopped.
 
-    Args:
-        fetch: As :func:`fetch_chunk`.
-        sweep_block: Composites the rows listed into one block; returns whether any pixel has transmittance left.
-        row: Numbers of a fetched row.
-        size: Numbers of a block's vectors.
+    ``fetch`` is as :func:`fetch_chunk`; ``sweep_block`` composites the rows listed into one block and returns whether any
+    pixel has transmittance left. A fetched row has ``row`` numbers, a block's vectors ``size``.
     """
 
     @part
@@ -138,10 +113,10 @@ def tile_sweep(fetch: Callable[..., None], sweep_block: Callable[..., int], row:
         alive = 0
         for block in range(layout.BLOCKS):
             at, pixels = size * block, inside(block, across, down)
-            store(state, at + TRANSMITTANCE, select(pixels, 1.0, 0.0))
+            vec.store(state, at + TRANSMITTANCE, vec.select(pixels, 1.0, 0.0))
             for vector in range(ALPHA, size, 16):
-                store(state, at + vector, 0.0)
-            if bits(pixels):
+                vec.store(state, at + vector, 0.0)
+            if vec.bits(pixels):
                 alive |= 1 << block
         first, last = bins.starts[tile], bins.starts[tile + 1]
         while first < last and alive:
@@ -158,29 +133,62 @@ def tile_sweep(fetch: Callable[..., None], sweep_block: Callable[..., int], row:
     return sweep_tile
 
 
-@inline
-def copy_to_image(vector, state, stride, tile, grid, depth, channel, image):
-    """Copy one vector of a tile's blocks to one of the ``depth`` channels of an image; to an empty one nothing.
+def tile_sweep_backward(fetch: Callable[..., None], sweep_entry: Callable[..., int], row: int) -> Callable[..., None]:
+    """Compile a backward sweep through those of one tile's entries that were reached; arguments as of :func:`tile_sweep`.
 
-    The vectors of the blocks are ``stride`` numbers apart: a constant where this is inlined, for speed.
+    ``sweep_entry`` accumulates one entry's sums over its blocks and returns the blocks with transmittance left.
     """
-    if len(image):
+
+    @part
+    def sweep_tile(tile, source, bins, view, grid, channels, own, rows, state, blocks, entry_sums):
         corner_x, corner_y, across, down = tile_corner(tile, grid)
-        for y in range(down):
-            first = ((corner_y + y) * grid.width + corner_x) * depth + channel
-            for x in range(across):
-                image[first + x * depth] = number(state, vector + place_in_blocks(x, y, stride))
+        cells, further = bins.cells, layout.ROW * bins.starts[grid.tiles]
+        alive = 0
+        for block in range(layout.BLOCKS):
+            if vec.bits(inside(block, across, down)):
+                alive |= 1 << block
+        first, last = bins.starts[tile], bins.reached[tile]
+        while first < last:
+            end = min(first + CHUNK, last)
+            fetch(first, end, alive, corner_x, corner_y, source, cells, rows, blocks)
+            for entry in range(first, end):
+                ahead = cells[layout.CELL * min(entry + _SUMS_AHEAD, last - 1) + 2]
+                vec.prefetch_to_write(entry_sums, layout.ROW * ahead)
+                fetched, mine = row * (entry - first), blocks[entry - first] & alive
+                number = cells[layout.CELL * entry + 2]
+                target, beyond = layout.ROW * number, further + number
+                alive = sweep_entry(fetched, mine, alive, rows, channels, own, view, state, target, beyond, entry_sums)
+            first = end
+
+    return sweep_tile
 
 
-@inline
-def copy_from_image(image, depth, channel, tile, grid, vector, state, stride):
-    """The opposite of :func:`copy_to_image`; from an empty image nothing is copied."""
-    if len(image):
-        corner_x, corner_y, across, down = tile_corner(tile, grid)
-        for y in range(down):
-            first = ((corner_y + y) * grid.width + corner_x) * depth + channel
-            for x in range(across):
-                state[vector + place_in_blocks(x, y, stride)] = number(image, first + x * depth)
+def image_copies(stride: int) -> tuple[Callable[..., None], Callable[..., None]]:
+    """Compile what copies a vector of a tile's blocks to one of the ``depth`` channels of an image, and the opposite.
+
+    The vectors of the blocks are ``stride`` numbers apart: a constant, for speed. Nothing is copied to or from an empty
+    image.
+    """
+
+    @part
+    def to_image(vector, state, tile, grid, depth, channel, image):
+        if len(image):
+            corner_x, corner_y, across, down = tile_corner(tile, grid)
+            for y in range(down):
+                first = ((corner_y + y) * grid.width + corner_x) * depth + channel
+                for x in range(across):
+                    image[first + x * depth] = vec.number(state, vector + place_in_blocks(x, y, stride))
+
+    @part
+    def from_image(image, depth, channel, tile, grid, vector, state):
+        if len(image):
+            corner_x, corner_y, across, down = tile_corner(tile, grid)
+            for y in range(down):
+                first = ((corner_y + y) * grid.width + corner_x) * depth + channel
+                for x in range(across):
+                    state[vector + place_in_blocks(x, y, stride)] = vec.number(image, first + x * depth)
+
+    return to_image, from_image
 
 
 @part
