@@ -24,9 +24,8 @@ from coliags_plugin.contracts import GaussianField
 from coliags_plugin.core.cameras import Camera
 from coliags_plugin.export.baking.averages import mean_gaussians
 from coliags_plugin.export.viewer.content import spread
-from coliags_plugin.export.viewer.decoding import ViewDecoder
 from coliags_plugin.export.viewer.library import import_viser, start_server, stop_server
-from coliags_plugin.export.viewer.splats import BYTES_PER_SPLAT, on_wire, shown, wire_unit
+from coliags_plugin.export.viewer.splats import BYTES_PER_SPLAT, ViewDecoder, on_wire, shown, wire_unit
 
 
 @dataclass(frozen=True)
